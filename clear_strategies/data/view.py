@@ -1,0 +1,86 @@
+"""What training sees: views of a scene at two scales, the cloud it starts from, and where each came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from jaxtyping import Float
+from torch import Tensor
+
+from rasterizers.interface import Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photo:
+    """An image, float32 in [0, 1], and the camera on its pixel grid."""
+
+    camera: Camera
+    image: Float[Tensor, "H W 3"]
+
+    def __post_init__(self) -> None:
+        found = tuple(self.image.shape)
+        if found != (self.camera.height, self.camera.width, 3):
+            raise ValueError(
+                f"an image of {self.camera.width}x{self.camera.height} pixels has shape "
+                f"({self.camera.height}, {self.camera.width}, 3), got {found}."
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """One view v: I_LR^v, I_HR^v and C^v at both scales; HR is exactly an integer times LR.
+
+    Args:
+        lr: the authentic low-resolution observation.
+        hr: the super-resolved reference. Never the truth.
+        truth: the real image at HR, for evaluation only; training never touches it.
+        reference: where `hr` came from, e.g. "onnx span_x4.onnx".
+    """
+
+    name: str
+    lr: Photo
+    hr: Photo
+    truth: Float[Tensor, "H W 3"] | None = None
+    reference: str = "unknown"
+
+    @property
+    def factor(self) -> int:
+        """HR pixels per LR pixel."""
+        return self.hr.camera.width // self.lr.camera.width
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointCloud:
+    """Initial points: positions in world units, colours in [0, 1].
+
+    Args:
+        source: one phrase for the printed plan: which points, how many images made them.
+        saw_test_views: whether test views had a part in them ("no", "yes", "unknown").
+    """
+
+    means: Float[Tensor, "N 3"]
+    colors: Float[Tensor, "N 3"]
+    source: str
+    saw_test_views: str = "no"
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Everything a run needs to know about its input.
+
+    Args:
+        background: the colour behind the Gaussians, RGB in [0, 1].
+        synthetic_prior: the references were made from the truth (the demo); reports say so.
+        notes: label -> fact, in the order they are printed in the plan and saved as provenance.
+    """
+
+    name: str
+    train: tuple[View, ...]
+    test: tuple[View, ...]
+    cloud: PointCloud
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    synthetic_prior: bool = False
+    notes: dict[str, str] = field(default_factory=dict)

@@ -1,0 +1,29 @@
+"""The errors a user can meet. Each message holds the rule, the value found, and the remedy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class ClearError(Exception):
+    """Base of every error that is told to the user in one line."""
+
+
+class DataError(ClearError, ValueError):
+    """Input that cannot be used: `file: field: what is wrong: what to do`."""
+
+    def __init__(self, file: str | Path, field: str, problem: str, remedy: str) -> None:
+        self.file, self.field, self.problem, self.remedy = str(file), field, problem, remedy
+        super().__init__(": ".join(_one_line(part) for part in (self.file, field, problem, remedy)))
+
+
+class StrategyConflict(ClearError, TypeError):
+    """Two strategies answer a question that only one may answer."""
+
+
+class AnchorError(ClearError, RuntimeError):
+    """The number of Gaussians changed after their anchor was taken (Eq. 16)."""
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

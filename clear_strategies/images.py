@@ -1,0 +1,103 @@
+"""Floor 0: operators on images. Every image is float, [H, W, C], in [0, 1] where it is a photograph.
+
+D and U are here once, for the data set that makes LR images, for P2G's evidence and for the evaluation:
+a reliability measured with another kernel than the one that made LR measures the kernel (METHOD, F21).
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal, get_args
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
+
+DownKernel = Literal["bicubic", "bilinear", "lanczos", "area"]
+UpKernel = Literal["bicubic", "bilinear", "nearest"]
+
+_PIL_FILTERS: Final = {
+    "bicubic": Image.Resampling.BICUBIC,
+    "bilinear": Image.Resampling.BILINEAR,
+    "lanczos": Image.Resampling.LANCZOS,
+}
+
+
+def downsample(
+    image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = "bicubic"
+) -> Float[Tensor, "h w 3"]:
+    """D: reduce by a whole factor, antialiased; the result lies in [0, 1].
+
+    "bicubic", "bilinear" and "lanczos" are PIL's resize, 8 bits per pass, as the published protocols make
+    their LR images; "area" is the mean of each factor × factor block, not rounded. Not differentiable.
+
+    Raises:
+        ValueError: unknown kernel, or a size that is not a multiple of `factor`.
+    """
+    _require_member("downsampling kernel", kernel, get_args(DownKernel))
+    height, width = image.shape[:2]
+    if height % factor or width % factor:
+        raise ValueError(
+            f"{width}x{height} is not a multiple of {factor}; crop it with images.crop_to_multiple first."
+        )
+    if factor == 1:
+        return image.clone()
+    if kernel == "area":
+        return _hwc(F.avg_pool2d(_nchw(image), factor)).clamp(0, 1)
+    pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    small = Image.fromarray(pixels).resize((width // factor, height // factor), _PIL_FILTERS[kernel])
+    return torch.from_numpy(np.array(small)).to(image) / 255
+
+
+def upsample(
+    image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel = "bicubic"
+) -> Float[Tensor, "H W C"]:
+    """U: enlarge by a whole factor, clamped to [0, 1]. "bicubic" is PIL's (a = -0.5).
+
+    Raises:
+        ValueError: unknown kernel.
+    """
+    _require_member("upsampling kernel", kernel, get_args(UpKernel))
+    if factor == 1:
+        return image.clone()
+    size = (image.shape[0] * factor, image.shape[1] * factor)
+    if kernel == "nearest":
+        return _hwc(F.interpolate(_nchw(image), size=size, mode="nearest"))
+    # antialias selects PIL's cubic (a = -0.5); without it torch uses a = -0.75.
+    large = F.interpolate(_nchw(image), size=size, mode=kernel, antialias=True, align_corners=False)
+    return _hwc(large).clamp(0, 1)
+
+
+def crop_to_multiple(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:
+    """Drop rows at the bottom and columns at the right until both sizes are multiples of `factor`."""
+    height, width = (size - size % factor for size in image.shape[:2])
+    return image[:height, :width]
+
+
+def patch_means(values: Float[Tensor, "H W C"], patch: int) -> Float[Tensor, "ph pw"]:
+    """Avg_p: mean over pixels and channels of each patch × patch square, aligned at the top-left.
+
+    A partial patch at the right or bottom border is averaged over the pixels that exist (METHOD, F22).
+    """
+    mean = values.mean(dim=2)[None, None]
+    return F.avg_pool2d(mean, patch, ceil_mode=True, count_include_pad=False)[0, 0]
+
+
+def quantize(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
+    """Round to 8 bits, as an image file would."""
+    return (image.clamp(0, 1) * 255).round() / 255
+
+
+def _nchw(image: Float[Tensor, "H W C"]) -> Float[Tensor, "1 C H W"]:
+    return image.permute(2, 0, 1)[None].contiguous()
+
+
+def _hwc(batch: Float[Tensor, "1 C H W"]) -> Float[Tensor, "H W C"]:
+    return batch[0].permute(1, 2, 0).contiguous()
+
+
+def _require_member(what: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise ValueError(f"{what} must be one of {', '.join(allowed)}, got {value!r}.")

@@ -1,0 +1,63 @@
+"""Splats and a camera in, an image and its transpose out. Usable alone: knows nothing of strategies."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from rasterizers.interface import (
+    BackendUnavailable,
+    Camera,
+    Rasterizer,
+    RasterSettings,
+    Rendering,
+    SplatGradients,
+    Splats,
+    Traits,
+)
+
+__all__ = [
+    "BackendUnavailable",
+    "Camera",
+    "RasterSettings",
+    "Rasterizer",
+    "Rendering",
+    "SplatGradients",
+    "Splats",
+    "Traits",
+    "available",
+    "load",
+]
+
+# name -> module that defines `create(**settings)`, fastest first: "auto" takes the first that is available.
+# A backend imports its library only when it is created, so listing one here costs nothing.
+_BACKENDS: dict[str, str] = {"torch": "rasterizers.reference"}
+
+
+def load(name: str = "auto", **settings: Any) -> Rasterizer:
+    """The rasterizer called `name` ("auto": the fastest that runs here).
+
+    `settings` are the fields of `RasterSettings`, plus whatever a backend documents of its own.
+
+    Raises:
+        BackendUnavailable: it cannot run here; the message says why and what to do.
+        ValueError: no backend has that name.
+    """
+    if name == "auto":
+        name = next(n for n, why_not in available().items() if why_not is None)
+    if name not in _BACKENDS:
+        raise ValueError(f"unknown rasterizer {name!r}; choose one of auto, {', '.join(_BACKENDS)}.")
+    rasterizer: Rasterizer = importlib.import_module(_BACKENDS[name]).create(**settings)
+    return rasterizer
+
+
+def available() -> dict[str, str | None]:
+    """Every backend by name, fastest first; the value is None, or the reason why it cannot run here."""
+    reasons: dict[str, str | None] = {}
+    for name in _BACKENDS:
+        try:
+            load(name)
+            reasons[name] = None
+        except BackendUnavailable as reason:
+            reasons[name] = str(reason)
+    return reasons
