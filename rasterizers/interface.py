@@ -184,9 +184,7 @@ class Rasterizer(Protocol):
     @property
     def traits(self) -> Traits: ...
 
-    def __call__(
-        self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None
-    ) -> Rendering:
+    def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
         """Draw; tiles not asked for show the background, and `vjp` honours the mask."""
         ...
 
@@ -229,8 +227,7 @@ class RasterSettings:
             raise ValueError(f"near must be > 0, got {self.near}.")
         if not 0 < self.alpha_min < self.alpha_max < 1:
             raise ValueError(
-                "0 < alpha_min < alpha_max < 1 must hold, got "
-                f"alpha_min={self.alpha_min}, alpha_max={self.alpha_max}."
+                f"0 < alpha_min < alpha_max < 1 must hold, got alpha_min={self.alpha_min}, alpha_max={self.alpha_max}."
             )
         if not 0 <= self.transmittance_min < 1:
             raise ValueError(f"transmittance_min must lie in [0, 1), got {self.transmittance_min}.")

@@ -1,0 +1,102 @@
+"""The specification: a rasterizer in pure torch, float32 and float64, written to be read.
+
+Three steps, each a file: `projection` (Gaussians to screen-space ellipses), `tiles` (which ellipse may touch which
+tile, front to back) and `blend` (compositing, and its transpose). Projection is differentiated by autograd, blending
+by hand: autograd would keep a dozen tensors per pixel-Gaussian pair, the hand-written transpose keeps none.
+
+Every other backend is judged against this one. It is also usable: memory is bounded by `lanes`, not by the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
+from rasterizers.reference.blend import blend, blend_vjp
+from rasterizers.reference.projection import Projection, project
+from rasterizers.reference.tiles import TileGrid, TileLists, list_tiles
+
+_TRAITS: Final = Traits(
+    devices=frozenset({"cpu", "cuda"}),
+    dtypes=frozenset({torch.float32, torch.float64}),
+    shared_pass=True,
+    shared_scales=False,
+    deterministic=True,  # on the CPU; index_add_ on CUDA is not
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceRasterizer(RasterSettings):
+    """Pure torch. `lanes` bounds the working set: pixel-Gaussian pairs blended at a time (16 bytes to 100 each)."""
+
+    lanes: int = 1 << 19
+
+    def __post_init__(self) -> None:
+        RasterSettings.__post_init__(self)
+        if self.lanes < 1:
+            raise ValueError(f"lanes must be at least 1 pair, got {self.lanes}.")
+
+    @property
+    def traits(self) -> Traits:
+        return _TRAITS
+
+    def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
+        _require_usable(splats)
+        grid = TileGrid(camera.width, camera.height, self.tile)
+        projection = project(splats, camera, self)
+        lists = list_tiles(projection, grid, tiles)
+        return ReferenceRendering(self, grid, projection, lists)
+
+    def render_scales(self, jobs: Sequence[tuple[Splats, Camera]]) -> list[Rendering]:
+        return [self(splats, camera) for splats, camera in jobs]
+
+
+class ReferenceRendering:
+    """The picture, and the lists that its transpose walks again."""
+
+    def __init__(self, settings: ReferenceRasterizer, grid: TileGrid, projection: Projection, lists: TileLists) -> None:
+        self._settings, self._grid, self._projection = settings, grid, projection
+        n = projection.n_splats
+        self.means2d: Float[Tensor, "N 2"] = projection.scatter(projection.means2d.detach(), n)
+        self.visible: Bool[Tensor, " N"] = projection.scatter(lists.visible, n)
+        tiles, transmittance, self._passes = blend(projection.table(), lists, grid, settings, settings.lanes)
+        self.image: Float[Tensor, "H W 3"] = grid.to_image(tiles)
+        self.alpha: Float[Tensor, "H W"] = 1 - grid.to_image(transmittance[..., None])[..., 0]
+
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
+        """One traversal for all K; see `Rendering.vjp`."""
+        expected = tuple(self.image.shape)
+        if cotangents.dim() != 4 or tuple(cotangents.shape[1:]) != expected:
+            raise ValueError(f"cotangents must be [K, {', '.join(map(str, expected))}], got {tuple(cotangents.shape)}.")
+        v = torch.stack([self._grid.to_tiles(c.to(self.image)) for c in cotangents])
+        table = self._projection.table()
+        return self._projection.vjp(blend_vjp(table, self._passes, self._grid, self._settings, v))
+
+
+def create(**settings: Any) -> ReferenceRasterizer:
+    """The backend called "torch"; `settings` are the fields of `ReferenceRasterizer`."""
+    known = [f.name for f in fields(ReferenceRasterizer)]
+    unknown = sorted(set(settings) - set(known))
+    if unknown:
+        raise ValueError(f"unknown rasterizer setting {unknown[0]!r}; known are {', '.join(known)}.")
+    if "background" in settings:
+        settings["background"] = tuple(float(c) for c in settings["background"])
+    return ReferenceRasterizer(**settings)
+
+
+def _require_usable(splats: Splats) -> None:
+    """One fused reduction a tensor: NaN or infinity is named here, not found later as a hole in the picture."""
+    for field in fields(splats):
+        value = getattr(splats, field.name)
+        if value is None or value.numel() == 0:
+            continue
+        if not bool(torch.isfinite(value.sum())) and not bool(torch.isfinite(value).all()):
+            bad = (~torch.isfinite(value)).flatten(1).any(1) if value.dim() > 1 else ~torch.isfinite(value)
+            index = int(bad.nonzero()[0])
+            raise ValueError(f"splats.{field.name} must be finite; Gaussian {index} is not ({int(bad.sum())} in all).")

@@ -1,0 +1,194 @@
+"""Front-to-back compositing of tile lists, and its transpose for K image cotangents in one walk.
+
+    α_i = min(α_max, o_i exp(-½ dᵀ Σ'⁻¹ d)),   T_i = Π_{j<i} (1 - α_j),   I = Σ_i T_i α_i c_i + T_end·background
+
+A pair with α_i < α_min is passed over; a pixel ends *before* the Gaussian that would take its transmittance below
+`transmittance_min`. The work is done in batches of tiles × slabs of their lists: [B tiles, L pairs, P pixels].
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from rasterizers.interface import RasterSettings
+from rasterizers.reference.projection import CONIC, MEAN, OPACITY, RGB
+from rasterizers.reference.tiles import TileGrid, TileLists
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pass:
+    """What the transpose needs of a batch: its tiles, each slab's pairs with the T on entering it, and T_end."""
+
+    tiles: Int[Tensor, " B"]
+    slabs: list[tuple[Int[Tensor, "B L"], Float[Tensor, "B P"]]]
+    end: Float[Tensor, "B P"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Slab:
+    """One slab composited: the rows of the table, and per pair and pixel α, T before and after it, and its weight.
+
+    Args:
+        splat: o·exp(…), before the cap and the cut.
+        kept: 1 where the pixel has not ended, 0 after; None if none of these pixels ends in this slab.
+        dx, dy: pixel centre minus Gaussian centre.
+    """
+
+    rows: Float[Tensor, "B L 9"]
+    splat: Float[Tensor, "B L P"]
+    alpha: Float[Tensor, "B L P"]
+    before: Float[Tensor, "B L P"]
+    after: Float[Tensor, "B L P"]
+    kept: Float[Tensor, "B L P"] | None
+
+    @property
+    def weights(self) -> Float[Tensor, "B L P"]:
+        weights = self.alpha * self.before
+        return weights if self.kept is None else weights * self.kept
+
+    def end(self, so_far: Float[Tensor, "B P"]) -> Float[Tensor, "B P"]:
+        """T of the pixels as they end: the last T that was kept."""
+        if self.kept is None:
+            return self.after[:, -1]
+        return torch.minimum(so_far, torch.where(self.kept > 0, self.after, 1.0).amin(1))
+
+
+@torch.no_grad()
+def blend(
+    table: Float[Tensor, "M1 9"], lists: TileLists, grid: TileGrid, settings: RasterSettings, lanes: int
+) -> tuple[Float[Tensor, "T P 3"], Float[Tensor, "T P"], list[Pass]]:
+    """Colour and final transmittance of every pixel of every tile, and what `blend_vjp` needs."""
+    n_tiles, pixels = grid.rows * grid.columns, grid.tile**2
+    background = table.new_tensor(settings.background)
+    colors = background.expand(n_tiles, pixels, 3).clone()
+    transmittance = table.new_ones(n_tiles, pixels)
+    passes = []
+    for tiles in lists.batches(pixels, lanes):
+        color = table.new_zeros(len(tiles), pixels, 3)
+        through = end = table.new_ones(len(tiles), pixels)  # `through` falls on after a pixel has ended
+        slabs = []
+        for pairs in lists.slabs(tiles):
+            if bool((through < settings.transmittance_min).all()):
+                break
+            slabs.append((pairs, through))
+            slab = _composite(table[pairs], tiles, grid, settings, through)
+            color += slab.weights.transpose(1, 2) @ slab.rows[..., RGB]
+            through, end = slab.after[:, -1], slab.end(end)
+        colors[tiles] = color + end[..., None] * background
+        transmittance[tiles] = end
+        passes.append(Pass(tiles, slabs, end))
+    return colors, transmittance, passes
+
+
+@torch.no_grad()
+def blend_vjp(
+    table: Float[Tensor, "M1 9"],
+    passes: list[Pass],
+    grid: TileGrid,
+    settings: RasterSettings,
+    cotangents: Float[Tensor, "K T P 3"],
+) -> Float[Tensor, "K M1 9"]:
+    """Gradient of Σ cotangent·image with respect to the table, back to front.
+
+    With s_i = c_i·v and `behind` = Σ_{j>i} T_j α_j s_j + T_end background·v:  ∂/∂α_i = T_i s_i - behind / (1 - α_i).
+    """
+    background = table.new_tensor(settings.background)
+    monomials = _monomials(grid.tile, table)
+    gradients = table.new_zeros(len(cotangents), *table.shape)
+    for batch in passes:
+        v = cotangents[:, batch.tiles]
+        behind = batch.end * (v @ background)
+        for pairs, through in reversed(batch.slabs):
+            slab = _composite(table[pairs], batch.tiles, grid, settings, through)
+            weights = slab.weights
+            # Where the cap binds, or α was cut to 0, the picture does not depend on the ellipse.
+            sensitivity = slab.alpha * _at_least(settings.alpha_max - slab.splat, 0)
+            if slab.kept is not None:
+                sensitivity *= slab.kept
+            one_minus_alpha = 1 - slab.alpha
+            for k, v_k in enumerate(v):
+                s = slab.rows[..., RGB] @ v_k.transpose(1, 2)
+                blended = weights * s
+                tail = blended.flip(1).cumsum(1).flip(1)  # includes i itself
+                d_alpha = slab.before * s - (tail - blended + behind[k][:, None]) / one_minus_alpha
+                d_rows = _table_gradient(slab.rows, d_alpha * sensitivity, weights @ v_k, batch.tiles, grid, monomials)
+                gradients[k].index_add_(0, pairs.flatten(), d_rows.flatten(0, 1))
+                behind[k] += tail[:, 0]
+    return gradients
+
+
+def _composite(
+    rows: Float[Tensor, "B L 9"],
+    tiles: Int[Tensor, " B"],
+    grid: TileGrid,
+    settings: RasterSettings,
+    through: Float[Tensor, "B P"],
+) -> Slab:
+    u, v = rows[..., MEAN].unbind(-1)
+    A, B, C = rows[..., CONIC].unbind(-1)
+    pixel = torch.arange(grid.tile, device=rows.device) + 0.5
+    dx = ((tiles % grid.columns * grid.tile)[:, None] + pixel)[:, None, None, :] - u[..., None, None]
+    dy = ((tiles // grid.columns * grid.tile)[:, None] + pixel)[:, None, :, None] - v[..., None, None]
+    A, B, C = (x[..., None, None] for x in (A, B, C))
+
+    exponent = torch.addcmul(-0.5 * A * dx * dx, -B * dx, dy).sub_(0.5 * C * dy * dy)
+    splat = exponent.flatten(2).exp_().mul_(rows[..., OPACITY])
+    alpha = _cut_below(splat.clamp_max(settings.alpha_max), settings.alpha_min)
+    after = torch.cumprod(1 - alpha, dim=1).mul_(through[:, None])
+    before = torch.cat((through[:, None], after[:, :-1]), dim=1)
+    ends = bool((after[:, -1] < settings.transmittance_min).any())
+    kept = _at_least(after, settings.transmittance_min) if ends else None
+    return Slab(rows, splat, alpha, before, after, kept)
+
+
+def _table_gradient(
+    rows: Float[Tensor, "B L 9"],
+    q: Float[Tensor, "B L P"],
+    d_rgb: Float[Tensor, "B L 3"],
+    tiles: Int[Tensor, " B"],
+    grid: TileGrid,
+    monomials: Float[Tensor, "P 6"],
+) -> Float[Tensor, "B L 9"]:
+    """From q = ∂L/∂(log splat) per pixel to the row's gradient, by way of q's moments about the Gaussian's centre."""
+    # Moments about the tile's centre first: one product serves all tiles.
+    m, mx, my, mxx, mxy, myy = (q @ monomials).unbind(-1)
+    u, v = rows[..., MEAN].unbind(-1)
+    A, B, C = rows[..., CONIC].unbind(-1)
+    ox = ((tiles % grid.columns + 0.5) * grid.tile)[:, None] - u
+    oy = ((tiles // grid.columns + 0.5) * grid.tile)[:, None] - v
+    qx, qy = mx + ox * m, my + oy * m
+    qxx = mxx + 2 * ox * mx + ox * ox * m
+    qxy = mxy + ox * my + oy * mx + ox * oy * m
+    qyy = myy + 2 * oy * my + oy * oy * m
+    d_opacity = m / rows[..., OPACITY][..., 0].clamp_min(torch.finfo(rows.dtype).tiny)
+    d_mean_conic_opacity = (A * qx + B * qy, B * qx + C * qy, -0.5 * qxx, -qxy, -0.5 * qyy, d_opacity)
+    return torch.cat((torch.stack(d_mean_conic_opacity, dim=-1), d_rgb), dim=-1)
+
+
+def _monomials(tile: int, like: Tensor) -> Float[Tensor, "P 6"]:
+    offset = torch.arange(tile, dtype=like.dtype, device=like.device) + 0.5 - tile / 2
+    y, x = torch.meshgrid(offset, offset, indexing="ij")
+    x, y = x.flatten(), y.flatten()
+    return torch.stack((torch.ones_like(x), x, y, x * x, x * y, y * y), dim=-1)
+
+
+# torch.where with a scalar is ten times slower on a CPU than these.
+def _cut_below(x: Tensor, limit: float) -> Tensor:
+    """X where x >= limit, else 0."""
+    return F.threshold(x, _just_below(limit, x.dtype), 0.0)
+
+
+def _at_least(x: Tensor, limit: float) -> Tensor:
+    """1 where x >= limit, else 0."""
+    return (x >= limit).to(x.dtype)
+
+
+def _just_below(limit: float, dtype: torch.dtype) -> float:
+    at = torch.tensor(limit, dtype=dtype)
+    return float(torch.nextafter(at, torch.tensor(-math.inf, dtype=dtype)))

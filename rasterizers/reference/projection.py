@@ -1,0 +1,205 @@
+"""Gaussians to screen: EWA projection with the 2D Mip kernel, view-dependent colour, and the way back.
+
+Only Gaussians that can contribute (in front of the near plane, opaque enough) are projected at all.
+Determinants come from the factor T of Σ = T Tᵀ, as sums of squared minors (Cauchy-Binet): `a c - b²` loses
+every digit of a needle (STRESS row 6), this form has only positive terms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
+
+# A projected centre may lie outside the image by this share of the half field of view before the Jacobian is clamped.
+_FRUSTUM_MARGIN = 0.3
+
+# Columns of the table that blending reads, one row per projected Gaussian.
+MEAN, CONIC, OPACITY, RGB = slice(0, 2), slice(2, 5), slice(5, 6), slice(6, 9)
+TABLE_WIDTH = 9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Projection:
+    """M of N Gaussians on the screen, with the graph that leads back to their attributes.
+
+    Args:
+        rows: which of the N splats each row is.
+        means2d: centre, px. conics: (A, B, C) of ½(A dx² + 2B dx dy + C dy²), 1/px².
+        opacities: after the Mip compensation.
+        half_extents: half the bounding box of the region where alpha may reach alpha_min, px.
+        power_max: the exponent at which alpha has fallen to alpha_min.
+        leaves: copies of the splats' rows (means, quats, scales, opacities) that the graph starts from.
+        raw_rgb: colour before its clamp at 0. basis: Y of this view's directions.
+    """
+
+    n_splats: int
+    rows: Int[Tensor, " M"]
+    means2d: Float[Tensor, "M 2"]
+    conics: Float[Tensor, "M 3"]
+    opacities: Float[Tensor, " M"]
+    rgb: Float[Tensor, "M 3"]
+    depths: Float[Tensor, " M"]
+    half_extents: Float[Tensor, "M 2"]
+    power_max: Float[Tensor, " M"]
+    leaves: tuple[Tensor, Tensor, Tensor, Tensor]
+    raw_rgb: Float[Tensor, "M 3"]
+    basis: Float[Tensor, "M B1"]
+
+    def table(self) -> Float[Tensor, "M1 9"]:
+        """What blending reads, plus one empty row that pads the tile lists."""
+        columns = (self.means2d, self.conics, self.opacities[:, None], self.rgb)
+        table = torch.cat(columns, dim=1).detach()
+        return torch.cat((table, table.new_zeros(1, TABLE_WIDTH)))
+
+    def scatter(self, values: Tensor, n: int) -> Tensor:
+        """Rows back to all N splats, zeros (or False) elsewhere."""
+        out = values.new_zeros(n, *values.shape[1:])
+        out[self.rows] = values
+        return out
+
+    def vjp(self, table_gradients: Float[Tensor, "K M1 9"]) -> SplatGradients:
+        """From gradients of the table to gradients of the splats."""
+        outputs = (self.means2d, self.conics, self.opacities, self.rgb)
+        inputs = (*self.leaves, self.raw_rgb)
+        pulled = []
+        for g in table_gradients[:, : self.rows.shape[0]]:
+            cotangents = (g[:, MEAN], g[:, CONIC], g[:, OPACITY][:, 0], g[:, RGB])
+            gradients = torch.autograd.grad(outputs, inputs, cotangents, retain_graph=True, materialize_grads=True)
+            pulled.append([*gradients, g[:, MEAN]])
+        means, quats, scales, opacities, rgb, screen = (
+            torch.stack([self.scatter(g, self.n_splats) for g in attribute]) for attribute in zip(*pulled, strict=True)
+        )
+        return SplatGradients(
+            means, quats, scales, opacities, screen, rgb, basis=self.scatter(self.basis, self.n_splats)
+        )
+
+
+def project(splats: Splats, camera: Camera, settings: RasterSettings) -> Projection:
+    """Σ' = J W Σ Wᵀ Jᵀ + kernel·I and u = π(μ), for every Gaussian that can contribute."""
+    pose = camera.world_to_camera.to(splats.means)
+    rows = _candidates(splats, pose, settings)
+    means, quats, scales, opacities = leaves = tuple(
+        x.detach()[rows].requires_grad_() for x in (splats.means, splats.quats, splats.scales, splats.opacities)
+    )
+    with torch.enable_grad():
+        x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+        means2d = torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), dim=-1)
+
+        # T = J W R(q) diag(s): the two rows of a 2 x 3 factor of Σ'.
+        axes = pose[:3, :3] @ (rotation_matrix(quats) * scales[:, None, :])
+        jx, jy = _jacobian(x / z, y / z, camera)
+        row_x = (camera.fx * axes[:, 0] + jx[:, None] * axes[:, 2]) / z[:, None]
+        row_y = (camera.fy * axes[:, 1] + jy[:, None] * axes[:, 2]) / z[:, None]
+
+        a, b, c = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
+        root_det = torch.linalg.vector_norm(torch.linalg.cross(row_x, row_y), dim=-1)  # √det Σ', det = Σ minors²
+        k = settings.kernel
+        det = root_det * root_det + k * (a + c) + k * k
+        conics = torch.stack((c + k, -b, a + k), dim=-1) / det[:, None]
+        if settings.antialiased:
+            opacities = opacities * root_det * torch.rsqrt(det)
+
+        basis = spherical_harmonics(_directions(means, camera.center.to(means)), splats.shN.shape[1])
+        coefficients = torch.cat((splats.sh0.detach()[rows], splats.shN.detach()[rows]), dim=1)
+        raw_rgb = (basis[:, :, None] * coefficients).sum(1) + 0.5
+        if splats.rgb_offset is not None:
+            raw_rgb = raw_rgb + splats.rgb_offset.detach()[rows]
+        rgb = raw_rgb.clamp_min(0)
+
+    with torch.no_grad():
+        # alpha >= alpha_min  <=>  exponent <= power_max. A little generous: only the pixel decides (see blend).
+        power_max = (opacities / settings.alpha_min).log() * (1 + 1e-3) + 1e-3
+        half = torch.sqrt(2 * power_max.clamp_min(0)[:, None] * torch.stack((a + k, c + k), dim=-1))
+    return Projection(
+        len(splats),
+        rows,
+        means2d,
+        conics,
+        opacities,
+        rgb,
+        z.detach(),
+        half,
+        power_max,
+        leaves,
+        raw_rgb,
+        basis.detach(),
+    )
+
+
+def rotation_matrix(quats: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
+    """Wxyz quaternions of any length to rotations; the zero quaternion is the identity, with zero gradient."""
+    largest = quats.detach().abs().amax(-1, keepdim=True)
+    identity = torch.zeros_like(quats)
+    identity[:, 0] = 1
+    # Scaled by the largest component first: |q|² neither overflows nor underflows (STRESS row 16).
+    q = torch.where(largest > 0, quats / largest.clamp_min(torch.finfo(quats.dtype).tiny), identity)
+    w, x, y, z = (q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)).unbind(-1)
+    return torch.stack(
+        (
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ),
+        dim=-1,
+    ).unflatten(-1, (3, 3))  # fmt: skip
+
+
+def spherical_harmonics(directions: Float[Tensor, "M 3"], bands: int) -> Float[Tensor, "M B1"]:
+    """Y: the constant band and `bands` more (0, 3, 8 or 15), real, with the signs that 3DGS stores.
+
+    Raises:
+        ValueError: `bands` is none of these.
+    """
+    if bands not in (0, 3, 8, 15):
+        raise ValueError(f"shN must hold 0, 3, 8 or 15 bands, got {bands}.")
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, 0.28209479177387814)]
+    if bands >= 3:
+        c1 = 0.4886025119029199
+        basis += [-c1 * y, c1 * z, -c1 * x]
+    if bands >= 8:
+        xx, yy, zz = x * x, y * y, z * z
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if bands >= 15:
+        basis += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+def _candidates(splats: Splats, pose: Float[Tensor, "4 4"], settings: RasterSettings) -> Int[Tensor, " M"]:
+    """Conditions to keep, not to cull: NaN fails each of them."""
+    depth = splats.means.detach() @ pose[2, :3] + pose[2, 3]
+    keep: Bool[Tensor, " N"] = (depth > settings.near) & (splats.opacities.detach() >= settings.alpha_min)
+    return keep.nonzero()[:, 0]
+
+
+def _jacobian(tan_x: Tensor, tan_y: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """The off-axis entries of J, times z. Clamped far outside the image, where the affine approximation explodes."""
+    margin_x = _FRUSTUM_MARGIN * camera.width / (2 * camera.fx)
+    margin_y = _FRUSTUM_MARGIN * camera.height / (2 * camera.fy)
+    left, right = -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x
+    top, bottom = -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y
+    return -camera.fx * tan_x.clamp(left, right), -camera.fy * tan_y.clamp(top, bottom)
+
+
+def _directions(means: Float[Tensor, "M 3"], center: Float[Tensor, " 3"]) -> Float[Tensor, "M 3"]:
+    offset = means - center
+    return offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True)

@@ -1,0 +1,162 @@
+"""Which Gaussian may touch which tile, front to back, without touching a pixel.
+
+The lists are generous and exact decisions are left to `blend`: a pair listed in vain costs time, a pair missing
+would cost correctness. Ties in depth are broken by index (stable sorts), so the order is total.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from rasterizers.reference.projection import Projection
+
+
+@dataclass(frozen=True, slots=True)
+class TileGrid:
+    """An image cut into squares of `tile` pixels; the last row and column may hang over."""
+
+    width: int
+    height: int
+    tile: int
+
+    @property
+    def columns(self) -> int:
+        return -(-self.width // self.tile)
+
+    @property
+    def rows(self) -> int:
+        return -(-self.height // self.tile)
+
+    def to_image(self, tiles: Float[Tensor, "T P C"]) -> Float[Tensor, "H W C"]:
+        t, channels = self.tile, tiles.shape[-1]
+        image = tiles.view(self.rows, self.columns, t, t, channels).transpose(1, 2)
+        image = image.reshape(self.rows * t, self.columns * t, channels)
+        return image[: self.height, : self.width].contiguous()
+
+    def to_tiles(self, image: Float[Tensor, "H W C"]) -> Float[Tensor, "T P C"]:
+        t, channels = self.tile, image.shape[-1]
+        padded = image.new_zeros(self.rows * t, self.columns * t, channels)
+        padded[: self.height, : self.width] = image
+        tiles = padded.view(self.rows, t, self.columns, t, channels).transpose(1, 2)
+        return tiles.reshape(self.rows * self.columns, t * t, channels)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileLists:
+    """(tile, Gaussian) pairs sorted by tile, then depth, then index.
+
+    Args:
+        gaussians: row of the projection table of each pair.
+        starts, lengths: the pairs of tile i are `gaussians[starts[i] : starts[i] + lengths[i]]`.
+        visible: rows that may touch at least one tile of the image, asked for or not.
+    """
+
+    gaussians: Int[Tensor, " pairs"]
+    starts: Int[Tensor, " T"]
+    lengths: Int[Tensor, " T"]
+    visible: Bool[Tensor, " M"]
+
+    def batches(self, lanes_per_pair: int, lanes: int) -> list[Int[Tensor, " B"]]:
+        """Non-empty tiles, those with similarly long lists together, each batch one pair deep within `lanes`."""
+        order = torch.argsort(self.lengths, descending=True, stable=True)
+        order = order[: int((self.lengths > 0).sum())]
+        per_batch = max(1, lanes // (lanes_per_pair * _SLAB))
+        return list(order.split(per_batch)) if len(order) else []
+
+    def slabs(self, tiles: Int[Tensor, " B"]) -> list[Int[Tensor, "B L"]]:
+        """The lists of some tiles, side by side and cut across into slabs; short lists end in the table's empty row."""
+        depth = int(self.lengths[tiles].max())
+        return [self._slab(tiles, first, min(_SLAB, depth - first)) for first in range(0, depth, _SLAB)]
+
+    def _slab(self, tiles: Int[Tensor, " B"], first: int, depth: int) -> Int[Tensor, "B L"]:
+        position = first + torch.arange(depth, device=tiles.device)[None]
+        inside = position < self.lengths[tiles, None]
+        pairs = torch.where(inside, self.starts[tiles, None] + position, 0)
+        return torch.where(inside, self.gaussians[pairs], len(self.visible))
+
+
+_SLAB = 64  # pairs of one tile that are blended at a time; saturated tiles stop between slabs
+
+
+@torch.no_grad()
+def list_tiles(projection: Projection, grid: TileGrid, demand: Bool[Tensor, "th tw"] | None) -> TileLists:
+    """Pair each projected Gaussian with the tiles its ellipse of alpha >= alpha_min may reach.
+
+    Raises:
+        ValueError: the demand mask has not one entry per tile.
+    """
+    n_tiles = grid.rows * grid.columns
+    if demand is not None and tuple(demand.shape) != (grid.rows, grid.columns):
+        raise ValueError(
+            f"the tile mask must be [{grid.rows}, {grid.columns}] for {grid.width}x{grid.height} pixels "
+            f"in tiles of {grid.tile}, got {tuple(demand.shape)}."
+        )
+    rows = torch.argsort(projection.depths, stable=True)
+    means, half = projection.means2d.detach()[rows], projection.half_extents[rows]
+    first, last = _tile_range(means - half, grid), _tile_range(means + half, grid)
+    spans = (last - first + 1).clamp_min(0)
+    touches = (projection.power_max[rows] > 0) & _overlaps(means, half, grid)
+    counts = torch.where(touches, spans[:, 0] * spans[:, 1], 0)
+
+    # Expand Gaussian by Gaussian, in depth order: pair j is the k-th tile of its Gaussian's box.
+    owner = torch.repeat_interleave(torch.arange(len(rows), device=rows.device), counts)
+    k = torch.arange(len(owner), device=rows.device) - (counts.cumsum(0) - counts)[owner]
+    tile_x = first[owner, 0] + k % spans[owner, 0].clamp_min(1)
+    tile_y = first[owner, 1] + k // spans[owner, 0].clamp_min(1)
+    reached = _ellipse_reaches(projection, rows[owner], tile_x, tile_y, grid)
+    owner, tile = owner[reached], (tile_y * grid.columns + tile_x)[reached]
+
+    visible = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
+    visible[rows[owner]] = True
+    if demand is not None:
+        asked = demand.to(tile.device).flatten()[tile]
+        owner, tile = owner[asked], tile[asked]
+
+    by_tile = torch.argsort(tile, stable=True)  # keeps the depth order within each tile
+    lengths = torch.bincount(tile, minlength=n_tiles)
+    return TileLists(rows[owner[by_tile]], lengths.cumsum(0) - lengths, lengths, visible)
+
+
+def _tile_range(corner: Float[Tensor, "M 2"], grid: TileGrid) -> Int[Tensor, "M 2"]:
+    limit = corner.new_tensor((grid.columns - 1, grid.rows - 1))
+    # Clamped as float: a huge splat's corner does not fit an integer.
+    return (corner / grid.tile).floor().clamp(min=torch.zeros_like(limit), max=limit).long()
+
+
+def _overlaps(means: Tensor, half: Tensor, grid: TileGrid) -> Bool[Tensor, " M"]:
+    size = means.new_tensor((grid.width, grid.height))
+    return ((means + half > 0) & (means - half < size)).all(-1)
+
+
+def _ellipse_reaches(
+    projection: Projection, row: Tensor, tile_x: Tensor, tile_y: Tensor, grid: TileGrid
+) -> Bool[Tensor, " pairs"]:
+    """Whether the smallest exponent over a tile's pixel centres' box is within power_max: exact, not a bounding box.
+
+    A convex quadratic over a box is smallest at its centre if that is inside, else on one of the (at most two) sides
+    that face it; on a side the minimiser is the clamped vertex of a parabola.
+    """
+    u, v = projection.means2d.detach()[row].unbind(-1)
+    A, B, C = projection.conics.detach()[row].unbind(-1)
+    left, top = tile_x * grid.tile + 0.5 - u, tile_y * grid.tile + 0.5 - v
+    right, bottom = left + grid.tile - 1, top + grid.tile - 1
+    near_x, near_y = _nearest_to_zero(left, right), _nearest_to_zero(top, bottom)
+    on_side_x = torch.clamp(-B * near_x / C, top, bottom)
+    on_side_y = torch.clamp(-B * near_y / A, left, right)
+    power = torch.minimum(
+        _power(A, B, C, near_x, on_side_x),
+        _power(A, B, C, on_side_y, near_y),
+    )
+    return power <= projection.power_max[row]
+
+
+def _nearest_to_zero(low: Tensor, high: Tensor) -> Tensor:
+    return torch.clamp(torch.zeros_like(low), low, high)
+
+
+def _power(A: Tensor, B: Tensor, C: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
+    return 0.5 * (A * dx * dx + C * dy * dy) + B * dx * dy
