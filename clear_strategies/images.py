@@ -25,9 +25,7 @@ _PIL_FILTERS: Final = {
 }
 
 
-def downsample(
-    image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = "bicubic"
-) -> Float[Tensor, "h w 3"]:
+def downsample(image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = "bicubic") -> Float[Tensor, "h w 3"]:
     """D: reduce by a whole factor, antialiased; the result lies in [0, 1].
 
     "bicubic", "bilinear" and "lanczos" are PIL's resize, 8 bits per pass, as the published protocols make
@@ -39,9 +37,7 @@ def downsample(
     _require_member("downsampling kernel", kernel, get_args(DownKernel))
     height, width = image.shape[:2]
     if height % factor or width % factor:
-        raise ValueError(
-            f"{width}x{height} is not a multiple of {factor}; crop it with images.crop_to_multiple first."
-        )
+        raise ValueError(f"{width}x{height} is not a multiple of {factor}; crop it with images.crop_to_multiple first.")
     if factor == 1:
         return image.clone()
     if kernel == "area":
@@ -51,9 +47,7 @@ def downsample(
     return torch.from_numpy(np.array(small)).to(image) / 255
 
 
-def upsample(
-    image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel = "bicubic"
-) -> Float[Tensor, "H W C"]:
+def upsample(image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel = "bicubic") -> Float[Tensor, "H W C"]:
     """U: enlarge by a whole factor, clamped to [0, 1]. "bicubic" is PIL's (a = -0.5).
 
     Raises:

@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from rasterizers.geometry import rotation_matrix, spherical_harmonics
 from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
 
 # A projected centre may lie outside the image by this share of the half field of view before the Jacobian is clamped.
@@ -83,8 +84,11 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings) -> Project
     """Σ' = J W Σ Wᵀ Jᵀ + kernel·I and u = π(μ), for every Gaussian that can contribute."""
     pose = camera.world_to_camera.to(splats.means)
     rows = _candidates(splats, pose, settings)
-    means, quats, scales, opacities = leaves = tuple(
-        x.detach()[rows].requires_grad_() for x in (splats.means, splats.quats, splats.scales, splats.opacities)
+    means, quats, scales, opacities = leaves = (
+        splats.means.detach()[rows].requires_grad_(),
+        splats.quats.detach()[rows].requires_grad_(),
+        splats.scales.detach()[rows].requires_grad_(),
+        splats.opacities.detach()[rows].requires_grad_(),
     )
     with torch.enable_grad():
         x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
@@ -109,6 +113,8 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings) -> Project
         raw_rgb = (basis[:, :, None] * coefficients).sum(1) + 0.5
         if splats.rgb_offset is not None:
             raw_rgb = raw_rgb + splats.rgb_offset.detach()[rows]
+        if not raw_rgb.requires_grad:
+            raw_rgb.requires_grad_()  # without higher bands colour hangs on no direction, and nothing else made a graph
         rgb = raw_rgb.clamp_min(0)
 
     with torch.no_grad():
@@ -131,64 +137,11 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings) -> Project
     )
 
 
-def rotation_matrix(quats: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
-    """Wxyz quaternions of any length to rotations; the zero quaternion is the identity, with zero gradient."""
-    largest = quats.detach().abs().amax(-1, keepdim=True)
-    identity = torch.zeros_like(quats)
-    identity[:, 0] = 1
-    # Scaled by the largest component first: |q|² neither overflows nor underflows (STRESS row 16).
-    q = torch.where(largest > 0, quats / largest.clamp_min(torch.finfo(quats.dtype).tiny), identity)
-    w, x, y, z = (q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)).unbind(-1)
-    return torch.stack(
-        (
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ),
-        dim=-1,
-    ).unflatten(-1, (3, 3))  # fmt: skip
-
-
-def spherical_harmonics(directions: Float[Tensor, "M 3"], bands: int) -> Float[Tensor, "M B1"]:
-    """Y: the constant band and `bands` more (0, 3, 8 or 15), real, with the signs that 3DGS stores.
-
-    Raises:
-        ValueError: `bands` is none of these.
-    """
-    if bands not in (0, 3, 8, 15):
-        raise ValueError(f"shN must hold 0, 3, 8 or 15 bands, got {bands}.")
-    x, y, z = directions.unbind(-1)
-    basis = [torch.full_like(x, 0.28209479177387814)]
-    if bands >= 3:
-        c1 = 0.4886025119029199
-        basis += [-c1 * y, c1 * z, -c1 * x]
-    if bands >= 8:
-        xx, yy, zz = x * x, y * y, z * z
-        basis += [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * zz - xx - yy),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-        ]
-    if bands >= 15:
-        basis += [
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ]
-    return torch.stack(basis, dim=-1)
-
-
 def _candidates(splats: Splats, pose: Float[Tensor, "4 4"], settings: RasterSettings) -> Int[Tensor, " M"]:
     """Conditions to keep, not to cull: NaN fails each of them."""
     depth = splats.means.detach() @ pose[2, :3] + pose[2, 3]
-    keep: Bool[Tensor, " N"] = (depth > settings.near) & (splats.opacities.detach() >= settings.alpha_min)
-    return keep.nonzero()[:, 0]
+    keep: Tensor = (depth > settings.near) & (splats.opacities.detach() >= settings.alpha_min)
+    return torch.nonzero(keep)[:, 0]
 
 
 def _jacobian(tan_x: Tensor, tan_y: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
@@ -202,4 +155,5 @@ def _jacobian(tan_x: Tensor, tan_y: Tensor, camera: Camera) -> tuple[Tensor, Ten
 
 def _directions(means: Float[Tensor, "M 3"], center: Float[Tensor, " 3"]) -> Float[Tensor, "M 3"]:
     offset = means - center
-    return offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+    length: Tensor = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+    return offset / length

@@ -65,7 +65,7 @@ class TileLists:
         order = torch.argsort(self.lengths, descending=True, stable=True)
         order = order[: int((self.lengths > 0).sum())]
         per_batch = max(1, lanes // (lanes_per_pair * _SLAB))
-        return list(order.split(per_batch)) if len(order) else []
+        return list(torch.split(order, per_batch)) if len(order) else []
 
     def slabs(self, tiles: Int[Tensor, " B"]) -> list[Int[Tensor, "B L"]]:
         """The lists of some tiles, side by side and cut across into slabs; short lists end in the table's empty row."""

@@ -1,0 +1,222 @@
+"""Floor 3: asks the strategies in the paper's order and does the arithmetic. Every host uses this one object.
+Eq. 8, 13
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from clear_strategies.errors import StrategyConflict
+from clear_strategies.evidence import Evidence
+from clear_strategies.gradients import Grads, Shot, conflict_ratio, to_ndc
+from clear_strategies.ledger import Ledger
+from clear_strategies.objective import Objective
+from clear_strategies.strategy import Screens, Strategy, answers
+
+if TYPE_CHECKING:
+    from clear_strategies.data.view import View
+
+_log = logging.getLogger(__name__)
+
+_ONE_ANSWER: Final = ("gate", "observe", "route", "correct", "score")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Update:
+    """What one iteration decided.
+
+    Args:
+        grads: the merged gradient by attribute, for the optimizer.
+        score: S_i, what densification goes by; `ordinary` is what it would go by without strategies.
+        conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
+        losses: scalars by name. readings: the strategies' own numbers, for logs.
+    """
+
+    grads: Grads
+    score: Float[Tensor, " N"]
+    ordinary: Float[Tensor, " N"]
+    evidence: Evidence | None
+    conflict: Mapping[str, float] = field(default_factory=dict)
+    losses: Mapping[str, float] = field(default_factory=dict)
+    readings: Mapping[str, float] = field(default_factory=dict)
+
+
+class Conductor:
+    """Strategies in concert.
+
+    Args:
+        strategies: in any order: the hook decides when each is asked. None at all is the paper's baseline.
+        objective: the losses and their weights.
+        statistics_from: iteration from which densification statistics want the HR render although λ_HR = 0; None:
+            as soon as λ_HR > 0 (METHOD, F11).
+
+    Raises:
+        StrategyConflict: two strategies answer a question that only one may.
+    """
+
+    def __init__(
+        self, *strategies: Strategy, objective: Objective | None = None, statistics_from: int | None = None
+    ) -> None:
+        self.strategies = strategies
+        self.objective = objective if objective is not None else Objective()
+        self.ledger = Ledger()
+        self._statistics_from = statistics_from
+        self._one: dict[str, Strategy] = {}
+        for hook in _ONE_ANSWER:
+            owners = [s for s in strategies if answers(s, hook)]
+            if len(owners) > 1:
+                first, second = (type(s).__name__ for s in owners[:2])
+                raise StrategyConflict(
+                    f"{first} and {second} both implement {hook}(); exactly one strategy may. Remove one, or write a "
+                    "strategy that combines them."
+                )
+            if owners:
+                self._one[hook] = owners[0]
+        self._regularizers = [s for s in strategies if answers(s, "regularize")]
+        for s in strategies:
+            if not any(answers(s, hook) for hook in (*_ONE_ANSWER, "regularize", "may_densify", "after_step")):
+                _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
+
+    def on_fit_start(self, n_views: int, seed: int) -> None:
+        for s in self.strategies:
+            s.on_fit_start(n_views, seed)
+
+    def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
+        """zᵗ, before render; None: every Gaussian takes part."""
+        if "gate" not in self._one:
+            return None
+        z = self._one["gate"].gate(t, n)
+        if z is None:
+            self.ledger.skip("gate", "no Gaussian is dropped at this rate")
+        return z
+
+    def wants_hr(self, t: int) -> bool:
+        """Whether the HR scale has any use at t: λ_HR > 0, or a densification score that needs it."""
+        if self.objective.lambda_hr(t) > 0:
+            return True
+        collecting = self._statistics_from is not None and t > self._statistics_from
+        return "score" in self._one and collecting and self.may_densify(t)
+
+    def update(self, params: Mapping[str, Tensor], lr: Shot, hr: Shot | None, view: View, t: int) -> Update:
+        """The merged gradient of one view, in place of `backward()`.
+
+        Args:
+            params: raw parameters by attribute. lr, hr: this view rendered at both scales; hr None skips it.
+        """
+        o, λ, stage = self.objective, self.objective.lambda_hr(t), self.ledger.stage
+        with stage("losses LR"):
+            l_lr = o.lr(lr.image, view.lr.image)  # Eq. 4
+        with stage("backward LR"):
+            (g_lr,) = lr.pull(l_lr.cotangents)
+        if hr is None:
+            self.ledger.skip("backward HR", "lambda_HR = 0")
+            screens = self._screens(λ, g_lr, lr, None, None, None)
+            with stage("strategies"):
+                g = g_lr + self._regularize(params, t)
+            return Update(g, screens.ordinary, screens.ordinary, None, {}, l_lr.values, self._readings())
+
+        with stage("losses HR"):
+            l_hr = o.hr(hr.image, view.hr.image)  # Eq. 5
+        with stage("backward HR"):
+            g_base, *rest = hr.pull(l_hr.cotangents)  # one backward pass, K = 2
+        g_hf = rest[0] if rest else None
+
+        with stage("strategies"):
+            screens = self._screens(λ, g_lr, lr, g_base, g_hf, hr)
+            e = self._ask("observe", None, view, hr)  # q, a, w        Eq. 9, 10
+            g_hr = g_base
+            if g_hf is not None:
+                m = self._ask("route", 1.0, e)  # m              Eq. 12
+                g_hf = g_hf * m * o.lambda_hf
+                g_hr = g_base + g_hf  # g^HR           Eq. 13
+            base_lr, base_hr = _without_detail(g_lr), _without_detail(g_hr)
+            conflict: Mapping[str, float] = {}
+            if λ > 0:
+                conflict = conflict_ratio(base_lr, base_hr)  # before correction
+                base_hr = self._ask("correct", base_hr, base_lr, base_hr, e)  # corrected      Eq. 6, 7, 11
+            g = base_lr + base_hr * λ  # Eq. 8
+            if g_hf is not None:
+                g["detail"] = g_hf["detail"] * λ  # f_det: never corrected, never from L_base
+            g = g + self._regularize(params, t)  # Eq. 16
+            score = self._ask("score", None, e, screens)  # S^dens         Eq. 14
+        return Update(
+            g, screens.ordinary if score is None else score, screens.ordinary, e, conflict,
+            {**l_lr.values, **l_hr.values}, self._readings(),
+        )  # fmt: skip
+
+    def after_step(self, params: Mapping[str, Tensor], t: int) -> None:
+        for s in self.strategies:
+            s.after_step(params, t)
+
+    def may_densify(self, t: int) -> bool:
+        return all(s.may_densify(t) for s in self.strategies)
+
+    def on_resize(self, parents: Int[Tensor, " M"]) -> None:
+        for s in self.strategies:
+            s.on_resize(parents)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Every strategy's per-Gaussian tensors, as "<class>.<name>"."""
+        return {f"{type(s).__name__}.{name}": rows for s in self.strategies for name, rows in s.state.items()}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Give each strategy its tensors back.
+
+        Raises:
+            ValueError: a tensor belongs to no strategy that is here.
+        """
+        by_name = {type(s).__name__: s for s in self.strategies}
+        for s in self.strategies:
+            s.state.clear()
+        for key, rows in tensors.items():
+            owner, _, name = key.partition(".")
+            if owner not in by_name:
+                raise ValueError(f"state {key!r} belongs to no strategy of this run ({', '.join(by_name) or 'none'}).")
+            by_name[owner].state[name] = rows.clone()
+
+    def _ask(self, hook: str, unanswered: Any, *arguments: Any) -> Any:
+        owner = self._one.get(hook)
+        return unanswered if owner is None else getattr(owner, hook)(*arguments)
+
+    def _regularize(self, params: Mapping[str, Tensor], t: int) -> Grads:
+        total = Grads()
+        for s in self._regularizers:
+            g = s.regularize(params, t)
+            if g is None:
+                self.ledger.skip("regularize", "no anchor yet")
+            else:
+                total = total + g
+        return total
+
+    def _screens(
+        self, λ: float, g_lr: Grads, lr: Shot, g_base: Grads | None, g_hf: Grads | None, hr: Shot | None
+    ) -> Screens:
+        screen_lr = to_ndc(_screen(g_lr), lr.image)
+        base = to_ndc(_screen(g_base), hr.image) if g_base is not None and hr is not None else None
+        hf = to_ndc(_screen(g_hf), hr.image) if g_hf is not None and hr is not None else None
+        total = screen_lr
+        if base is not None:
+            total = total + λ * base
+        if hf is not None:
+            total = total + λ * self.objective.lambda_hf * hf
+        return Screens(screen_lr, base, hf, torch.linalg.vector_norm(total, dim=-1))
+
+    def _readings(self) -> dict[str, float]:
+        return {name: value for s in self.strategies for name, value in s.readings.items()}
+
+
+def _without_detail(g: Grads) -> Grads:
+    return Grads({name: value for name, value in g.items() if name != "detail"})
+
+
+def _screen(g: Grads) -> Tensor:
+    if g.screen is None:
+        raise ValueError("a Shot's pull() must set .screen on every Grads it returns.")
+    return g.screen

@@ -1,0 +1,67 @@
+"""Floor 0: what an SR reference is worth, Gaussian by Gaussian, and how a patch map reaches a Gaussian."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+Lookup = Literal["nearest", "bilinear"]
+Outside = Literal["clamp", "neutral"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """q_i and a_i of one view, in [0, 1]; both are 0 for a Gaussian that the view does not see (METHOD, F24)."""
+
+    reliability: Float[Tensor, " N"]
+    demand: Float[Tensor, " N"]
+
+    @property
+    def weight(self) -> Float[Tensor, " N"]:
+        """w_i = q_i a_i."""
+        return self.reliability * self.demand  # Eq. 10
+
+
+def lift(
+    patch_map: Float[Tensor, "ph pw"],
+    centers: Float[Tensor, "N 2"],
+    visible: Bool[Tensor, " N"],
+    patch: float,
+    size: tuple[int, int],
+    lookup: Lookup = "nearest",
+    outside: Outside = "clamp",
+) -> Float[Tensor, " N"]:
+    """The value of the patch p(u_i) in which each projected centre lies.  Eq. 10
+
+    Args:
+        centers: u_i in pixels of the image that the patches tile. patch: their edge in those pixels.
+        size: (width, height) of that image.
+        lookup: "nearest" patch, or "bilinear" between patch centres.
+        outside: a visible Gaussian whose centre lies outside the image takes the border patch ("clamp") or 0
+            ("neutral"). Invisible ones are 0 in any case.
+    """
+    grid = centers / patch
+    if lookup == "bilinear":
+        values = _bilinear(patch_map, grid)
+    else:
+        column = grid[:, 0].floor().clamp(0, patch_map.shape[1] - 1).long()
+        row = grid[:, 1].floor().clamp(0, patch_map.shape[0] - 1).long()
+        values = patch_map[row, column]
+    counted = visible
+    if outside == "neutral":
+        limit = centers.new_tensor(size)
+        counted = counted & ((centers >= 0) & (centers < limit)).all(-1)
+    return torch.where(counted, values, torch.zeros_like(values))
+
+
+def _bilinear(patch_map: Float[Tensor, "ph pw"], grid: Float[Tensor, "N 2"]) -> Float[Tensor, " N"]:
+    extent = grid.new_tensor((patch_map.shape[1], patch_map.shape[0]))
+    points = (2 * grid / extent - 1)[None, None]
+    return F.grid_sample(patch_map[None, None], points, mode="bilinear", padding_mode="border", align_corners=False)[
+        0, 0, 0
+    ]

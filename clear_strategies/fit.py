@@ -1,0 +1,319 @@
+"""Floor 4: the training loop. `iterate` is one step of the method; `fit` is everything around it.
+
+Nothing here is random by itself: the view of iteration t, its dropout mask and the children of its splits are functions
+of (seed, t), so a resumed run is bitwise the run that was never interrupted.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from clear_strategies import checkpoint
+from clear_strategies.checkpoint import Checkpoint
+from clear_strategies.conductor import Conductor, Update
+from clear_strategies.data.view import Scene, View
+from clear_strategies.density import Density, DensitySettings, cameras_extent
+from clear_strategies.errors import ClearError, DataError
+from clear_strategies.field import GaussianField
+from clear_strategies.mip import MipFilter
+from clear_strategies.optim import Adam, LearningRates
+from clear_strategies.schedules import REFERENCE_ITERATIONS, milestone
+from rasterizers.interface import Rasterizer
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """How long, and what is looked at on the way.
+
+    Args:
+        iterations: steps, one view each. scale_schedule: stretch every milestone from 10,000 iterations to these.
+        seed: of view order, dropout and splits.
+        max_degree: of spherical harmonics; one more is active every `degree_every` iterations.
+        probe_every: iterations between looks at the test views; 0: never. probe_views: how many of them.
+        checkpoint_every: iterations between checkpoints; 0: only when interrupted. keep: how many stay.
+    """
+
+    iterations: int = 10_000
+    scale_schedule: bool = True
+    seed: int = 0
+    max_degree: int = 3
+    degree_every: int = milestone(1_000)
+    probe_every: int = milestone(1_000)
+    probe_views: int = 3
+    checkpoint_every: int = milestone(2_500)
+    keep: int = 3
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(f"iterations must be at least 1, got {self.iterations}.")
+        if self.max_degree not in (0, 1, 2, 3):
+            raise ValueError(f"max_degree must be 0, 1, 2 or 3, got {self.max_degree}.")
+        if self.keep < 1:
+            raise ValueError(f"keep must be at least 1 checkpoint, got {self.keep}.")
+
+    @property
+    def stretch(self) -> float:
+        """The factor on milestones."""
+        return self.iterations / REFERENCE_ITERATIONS if self.scale_schedule else 1.0
+
+
+class Interrupted(ClearError):
+    """The run was asked to stop (Ctrl-C, SIGTERM); it finished its step and saved."""
+
+    def __init__(self, signum: int, saved: Path | None, t: int) -> None:
+        self.signum = signum
+        where = f"Go on with fit.resume={saved}" if saved else "Nothing was saved: this run keeps no checkpoints"
+        super().__init__(f"stopped by {signal.Signals(signum).name} before iteration {t}. {where}.")
+
+    @property
+    def exit_code(self) -> int:
+        return 128 + self.signum
+
+
+@dataclass(slots=True)
+class TrainState:
+    """Everything that changes while training. `t` is the iteration to come, from 1."""
+
+    field: GaussianField
+    conductor: Conductor
+    optimizer: Adam
+    density: Density
+    settings: FitSettings
+    mip: MipFilter
+    views: tuple[View, ...]
+    t: int = 1
+    history: list[dict[str, float]] = field(default_factory=list)
+
+    @classmethod
+    def start(
+        cls,
+        scene: Scene,
+        conductor: Conductor,
+        *,
+        settings: FitSettings,
+        density: DensitySettings,
+        rates: LearningRates,
+        mip: MipFilter,
+    ) -> TrainState:
+        """The state before the first iteration; milestones in the settings are already those of this run."""
+        theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree)
+        extent = cameras_extent(torch.stack([view.hr.camera.center.float() for view in scene.train]))
+        white = all(c == 1.0 for c in scene.background)
+        control = Density(density, len(theta), extent=extent, seed=settings.seed, white_background=white)
+        optimizer = Adam(theta.raw(), rates, extent)
+        conductor.on_fit_start(len(scene.train), settings.seed)
+        state = cls(theta, conductor, optimizer, control, settings, mip, scene.train)
+        state.refilter()
+        return state
+
+    def view(self) -> View:
+        """The view of this iteration: every view once, in random order, then again in another."""
+        epoch, position = divmod(self.t - 1, len(self.views))
+        generator = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + epoch)
+        return self.views[int(torch.randperm(len(self.views), generator=generator)[position])]
+
+    def refilter(self) -> None:
+        """Make the 3D filter anew from where the Gaussians are now."""
+        cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]
+        self.field.update_filter(cameras, self.mip.variance)
+
+    def filter_due(self) -> bool:
+        """Structure changes refresh the filter themselves; between and after them it follows the moving means."""
+        return self.t % self.mip.every == 0 and self.t <= self.settings.iterations - self.mip.last
+
+    def checkpoint(self, config: Mapping[str, Any]) -> Checkpoint:
+        tensors: dict[str, Tensor] = {}
+        for prefix, table in (
+            ("field", {**self.field.raw(), "filter_3d": self.field.filter_3d}),
+            ("optimizer", self.optimizer.state_dict()),
+            ("density", self.density.state_dict()),
+            ("strategies", self.conductor.state_dict()),
+        ):
+            tensors |= {f"{prefix}/{name}": value for name, value in table.items()}
+        facts = {"optimizer_steps": float(self.optimizer.steps), "degree": float(self.field.degree)}
+        return Checkpoint(self.t, tensors, config, facts, self.history)
+
+    def restore(self, saved: Checkpoint, source: Path) -> None:
+        """Go on from a checkpoint.
+
+        Raises:
+            DataError: its tensors do not belong to this run.
+        """
+        tables: dict[str, dict[str, Tensor]] = {}
+        for name, value in saved.tensors.items():
+            prefix, _, rest = name.partition("/")
+            tables.setdefault(prefix, {})[rest] = value
+        try:
+            parameters = tables["field"]
+            self.field = GaussianField(parameters, degree=int(saved.facts["degree"]))
+            self.field.filter_3d = parameters["filter_3d"].clone()
+            self.optimizer.load_state_dict(tables["optimizer"], int(saved.facts["optimizer_steps"]))
+            self.density.load_state_dict(tables["density"])
+            self.conductor.load_state_dict(tables.get("strategies", {}))
+        except (KeyError, ValueError) as error:
+            raise DataError(
+                source, "tensors", f"do not fit this run ({error})", "resume with the run's own config"
+            ) from error
+        self.t = saved.t
+        self.history = list(saved.history)
+
+
+def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
+    """One iteration, in the paper's order."""
+    t, θ, ask, stage = s.t, s.field, s.conductor, s.conductor.ledger.stage
+    θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
+    view, hr_wanted = s.view(), ask.wants_hr(t)
+    z = ask.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
+    with stage("render LR + HR" if hr_wanted else "render LR"):
+        lr, hr = θ.render_scales(rasterizer, view, gate=z, hr=hr_wanted)  # Î_LR, Î_HR     Eq. 2, 3
+    if hr is None:
+        ask.ledger.skip("render LR + HR", "lambda_HR = 0")
+    u = ask.update(θ.raw(), lr, hr, view, t)
+    with stage("optimizer"):
+        s.optimizer.step(θ.raw(), u.grads, lr.visible if hr is None else lr.visible | hr.visible)
+        θ.constrain()
+    ask.after_step(θ.raw(), t)  # θᵃ at t = t_a  Eq. 16       SVS
+    s.density.accumulate(u, lr if hr is None else hr, t)  # S^dens         Eq. 14
+    with stage("density and filter"):
+        if ask.may_densify(t):
+            if s.density.due(t):
+                ask.on_resize(s.density.restructure(θ, s.optimizer, t))  # clone · split · prune = parents[M]
+                s.refilter()
+            if s.density.reset_due(t):
+                s.density.reset_opacity(θ, s.optimizer)
+        if s.filter_due():
+            s.refilter()
+    s.history.append(_row(s, u, lr.image, view))
+    s.t += 1
+    return u
+
+
+Progress = Callable[[TrainState], None]
+
+
+def fit(
+    state: TrainState,
+    scene: Scene,
+    rasterizer: Rasterizer,
+    *,
+    checkpoints: Path | None = None,
+    config: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> TrainState:
+    """Iterate to the end, looking at test views and saving checkpoints on the way.
+
+    Args:
+        checkpoints: where to save; None saves nothing. config: what a resumed run must agree with.
+        progress: called after each iteration.
+
+    Raises:
+        Interrupted: after a signal, once the step is done and saved.
+        FloatingPointError: a parameter became NaN or infinite; the message names it.
+    """
+    settings = state.settings
+
+    def save() -> Path | None:
+        if checkpoints is None:
+            return None
+        return checkpoint.save(checkpoints, state.checkpoint(config or {}), keep=settings.keep)
+
+    began = time.perf_counter() - (state.history[-1]["seconds"] if state.history else 0.0)
+    with _deferred_signals() as pending:
+        while state.t <= settings.iterations:
+            iterate(state, rasterizer)
+            done = state.t - 1
+            state.history[-1]["seconds"] = time.perf_counter() - began
+            if settings.probe_every and (done % settings.probe_every == 0 or done == settings.iterations):
+                with state.conductor.ledger.stage("probe test views"):
+                    state.history[-1]["psnr_test"] = _probe(state, scene, rasterizer)
+            if progress is not None:
+                progress(state)
+            if pending:
+                raise Interrupted(pending[0], save(), state.t)
+            if settings.checkpoint_every and done % settings.checkpoint_every == 0 and done < settings.iterations:
+                _require_finite(state)
+                save()
+    _require_finite(state)
+    save()
+    return state
+
+
+def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, float]:
+    """One line of the history."""
+    mse = float((lr_image.clamp(0, 1) - view.lr.image).square().mean())
+    row = {
+        "t": float(s.t),
+        "lambda_hr": s.conductor.objective.lambda_hr(s.t),
+        "psnr_train_lr": _psnr(mse),
+        "n_gaussians": float(len(s.field)),
+        "detail_abs": float(s.field.detail.data.abs().mean()),
+    }
+    row |= {f"loss_{name}": value for name, value in u.losses.items()}
+    row |= {("conflict" if group == "gaussian" else f"conflict_{group}"): share for group, share in u.conflict.items()}
+    return row | dict(u.readings)
+
+
+def _psnr(mse: float) -> float:
+    return -10 * math.log10(max(mse, 1e-10))
+
+
+def _probe(state: TrainState, scene: Scene, rasterizer: Rasterizer) -> float:
+    """Mean PSNR of the first few test views at HR."""
+    values = []
+    for view in scene.test[: state.settings.probe_views]:
+        if view.truth is not None:
+            image = state.field.render(rasterizer, view.hr.camera).clamp(0, 1)
+            mse = float((image - view.truth).square().mean())
+            values.append(_psnr(mse))
+    return sum(values) / len(values) if values else float("nan")
+
+
+def _require_finite(state: TrainState) -> None:
+    for name, value in state.field.raw().items():
+        finite = torch.isfinite(value)
+        if not bool(finite.all()):
+            bad = (~finite).flatten(1).any(1) if value.dim() > 1 else ~finite
+            raise FloatingPointError(
+                f"t={state.t - 1}: {name} of {int(bad.sum())} Gaussians is not finite, first Gaussian "
+                f"{int(bad.nonzero()[0])}. The last checkpoint is from before that; lower the learning rates."
+            )
+
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def _deferred_signals() -> Iterator[list[int]]:
+    """Collect the first SIGINT or SIGTERM instead of dying in the middle of a step; a second one acts at once."""
+    pending: list[int] = []
+
+    def note(signum: int, _frame: FrameType | None) -> None:
+        pending.append(signum)
+        _log.warning("%s: finishing this step, then saving. Once more to leave at once.", signal.Signals(signum).name)
+        for s in _SIGNALS:
+            signal.signal(s, before[s])
+
+    try:
+        before = {s: signal.signal(s, note) for s in _SIGNALS}
+    except ValueError:  # not the main thread: signals are somebody else's
+        yield pending
+        return
+    try:
+        yield pending
+    finally:
+        for s, handler in before.items():
+            signal.signal(s, handler)

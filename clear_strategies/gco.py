@@ -1,0 +1,191 @@
+"""GCO: Gaussian-wise conflict-aware optimization. HR gradients that fight the authentic LR ones are corrected to the
+margin, Gaussian by Gaussian and group by group; LR gradients are never changed.  Eq. 6, 7, 11
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import ClassVar, Final, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from clear_strategies.evidence import Evidence
+from clear_strategies.gradients import CONFLICT_GROUPS, Grads, row_dot, row_norm, scale_rows
+from clear_strategies.strategy import Strategy
+
+_log = logging.getLogger(__name__)
+
+# A Gaussian whose axes are equally long does not change when it is turned: in exact arithmetic its rotation gradient
+# is 0, in floating point it is noise that would "conflict" one time in five (STRESS §2.3).
+_ROTATION_NOISE: Final = 2.0**-18
+
+# ω at its lower bound in this share of the corrections means that the prior agrees with LR and GCO does nothing.
+_INACTIVE_SHARE: Final = 0.9
+
+
+@dataclass(frozen=True)
+class GCO(Strategy):
+    """Correct conflicting HR gradients.
+
+    Args:
+        tolerance: τ_c in [0, 1): cosines down to -τ_c are no conflict.
+        weight_min, weight_max: bounds of ω where a conflict is corrected, 0 <= min <= max <= 1.
+        bound: what the bounds hold: "omega", or the "coefficient" ω|d|/‖g_LR‖² (the rival reading, METHOD F28).
+        eps: "relative:r" scales ε with the mean gradient norms of the group, so that no change of the losses' unit
+            changes a decision; "absolute:x" takes the paper's symbol literally (1e-8 finds almost nothing).
+        groups: the attributes that are compared and corrected, each on its own.
+
+    The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
+    Without evidence q = 0: nothing speaks for the prior, the authentic gradient prevails (METHOD, F32).
+
+    Raises:
+        ValueError: a setting is outside its range.
+    """
+
+    fused: ClassVar[str | None] = "gco"
+
+    tolerance: float = 0.05
+    weight_min: float = 0.05
+    weight_max: float = 0.75
+    bound: Literal["omega", "coefficient"] = "omega"
+    eps: str = "relative:1e-12"
+    groups: tuple[str, ...] = CONFLICT_GROUPS
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "groups", tuple(self.groups))
+        if not 0 <= self.tolerance < 1:
+            raise ValueError(f"tolerance must lie in [0, 1), got {self.tolerance}.")
+        if not 0 <= self.weight_min <= self.weight_max <= 1:
+            raise ValueError(
+                f"0 <= weight_min <= weight_max <= 1 must hold, got {self.weight_min} and {self.weight_max}."
+            )
+        if self.bound not in ("omega", "coefficient"):
+            raise ValueError(f"bound must be omega or coefficient, got {self.bound!r}.")
+        unknown = sorted(set(self.groups) - set(CONFLICT_GROUPS))
+        if unknown:
+            raise ValueError(f"groups must be among {', '.join(CONFLICT_GROUPS)}, got {unknown[0]!r}.")
+        _parse_eps(self.eps)
+
+    def correct(self, lr: Grads, hr: Grads, evidence: Evidence | None) -> Grads:
+        """g̃_HR for every group, and what was done in `readings`."""
+        corrected, done = Grads(hr), []
+        for group in self.groups:
+            if group in lr and group in hr:
+                corrected[group], correction = self._correct_group(group, lr, hr, evidence)
+                done.append(correction)
+        self._report(done, evidence)
+        return corrected
+
+    def _correct_group(self, group: str, lr: Grads, hr: Grads, evidence: Evidence | None) -> tuple[Tensor, Correction]:
+        g_lr, g_hr = lr[group], hr[group]
+        dot, n_lr, n_hr = row_dot(g_lr, g_hr), row_norm(g_lr), row_norm(g_hr)
+        eps_cos, eps_corr = self._epsilons(n_lr, n_hr)
+        n = n_lr * n_hr
+        c = torch.where(n > 0, dot / (n + eps_cos).clamp_min(_TINY), 0.0)  # Eq. 6
+        conflict = c < -self.tolerance
+        if group == "quats":
+            conflict &= ~(_turns_nothing(lr) | _turns_nothing(hr))
+
+        # Only the rows in conflict are touched; every other row is handed back bit for bit.
+        i = conflict.nonzero()[:, 0]
+        q = evidence.reliability[i].double() if evidence is not None else 0.0
+        s = ((-c[i] - self.tolerance) / (1 - self.tolerance)).clamp(0, 1)
+        omega = s * (1 - q)  # Eq. 11
+        d = dot[i] + self.tolerance * n[i]
+        coefficient = d / (n_lr[i].square() + eps_corr)
+        if self.bound == "omega":
+            omega = omega.clamp(self.weight_min, self.weight_max)
+            step = omega * coefficient
+        else:
+            step = -(omega * coefficient).abs().clamp(self.weight_min, self.weight_max)
+        corrected = g_hr.clone()
+        corrected[i] = (g_hr[i].double() - scale_rows(g_lr[i].double(), step)).to(g_hr.dtype)  # Eq. 7
+        compared = int((n > 0).sum())
+        return corrected, Correction(group, compared, len(i), omega, n, eps_cos)
+
+    def _epsilons(self, n_lr: Tensor, n_hr: Tensor) -> tuple[float, float]:
+        """ε of the cosine and of the correction: both carry the unit gradient²."""
+        kind, value = _parse_eps(self.eps)
+        if kind == "absolute":
+            return value, value
+        both = (n_lr > 0) & (n_hr > 0)
+        if not bool(both.any()):
+            return 0.0, 0.0
+        mean_lr, mean_hr = float(n_lr[both].mean()), float(n_hr[both].mean())
+        return value * mean_lr * mean_hr, value * mean_lr**2
+
+    def _report(self, done: list[Correction], evidence: Evidence | None) -> None:
+        compared, corrected = sum(c.compared for c in done), sum(c.corrected for c in done)
+        omegas = torch.cat([c.omega for c in done]) if corrected else None
+        self.readings["corrected"] = corrected / compared if compared else float("nan")
+        self.readings["mean_omega"] = float(omegas.mean()) if omegas is not None else float("nan")
+        for c in done:
+            self.readings[f"corrected_{c.group}"] = c.corrected / c.compared if c.compared else float("nan")
+        if _parse_eps(self.eps)[0] == "absolute":
+            self._warn_of_epsilon(done)
+        if omegas is not None and evidence is not None and self.weight_min > 0:
+            at_bound = float((omegas <= self.weight_min).double().mean())
+            self.readings["omega_at_lower_bound"] = at_bound
+            if at_bound > _INACTIVE_SHARE and self._first("inactive"):
+                _log.info(
+                    "GCO is inactive: omega sits at its lower bound %g in %.0f %% of the corrections, because the "
+                    "prior agrees with the LR images (reliability near 1).", self.weight_min, 100 * at_bound,
+                )  # fmt: skip
+
+    def _warn_of_epsilon(self, done: Iterable[Correction]) -> None:
+        """Below 20 ε a conflict loses strength; below τ/(1 - τ) ε none can be seen at all (STRESS §2.1)."""
+        for c in done:
+            if not c.compared or c.eps == 0:
+                continue
+            ratio = float(c.product[c.product > 0].median()) / c.eps
+            if ratio < self.tolerance / (1 - self.tolerance) and self._first(f"eps cannot {c.group}"):
+                _log.warning(
+                    "GCO cannot fire for %s: the median of |g_LR||g_HR| is %.2g of eps=%s. Use eps=relative:1e-12.",
+                    c.group, ratio, self.eps,
+                )  # fmt: skip
+            elif ratio < 20 and self._first(f"eps weak {c.group}"):
+                _log.warning(
+                    "GCO is weakened for %s: the median of |g_LR||g_HR| is only %.2g times eps=%s.",
+                    c.group, ratio, self.eps,
+                )  # fmt: skip
+
+    def _first(self, what: str) -> bool:
+        said = what in self.cache
+        self.cache[what] = True
+        return not said
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """What was done to one group: Gaussians compared and corrected, their ω, and ‖g_LR‖‖g_HR‖ beside ε."""
+
+    group: str
+    compared: int
+    corrected: int
+    omega: Float[Tensor, " M"]
+    product: Float[Tensor, " N"]
+    eps: float
+
+
+_TINY: Final = torch.finfo(torch.float64).tiny
+
+
+def _turns_nothing(g: Grads) -> Bool[Tensor, " N"]:
+    if "scales" not in g:
+        return torch.zeros_like(g["quats"][:, 0], dtype=torch.bool)
+    return row_norm(g["quats"]) <= _ROTATION_NOISE * row_norm(g["scales"])
+
+
+def _parse_eps(eps: str) -> tuple[str, float]:
+    kind, _, number = str(eps).partition(":")
+    try:
+        value = float(number)
+    except ValueError:
+        value = -1.0
+    if kind not in ("relative", "absolute") or not 0 <= value < float("inf"):
+        raise ValueError(f'eps must be "relative:<number >= 0>" or "absolute:<number >= 0>", got {eps!r}.')
+    return kind, value

@@ -1,0 +1,72 @@
+"""Floor 4: the 3D smoothing filter of Mip-Splatting: no Gaussian is thinner than the cameras can sample (METHOD, B)."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.schedules import milestone
+from rasterizers.interface import Camera
+
+_log = logging.getLogger(__name__)
+
+_NEAR: Final = 0.2  # Mip-Splatting's: a camera samples what lies farther in front of it than this …
+_MARGIN: Final = 0.15  # … and projects into its image enlarged by this share on each side
+
+
+@dataclass(frozen=True, slots=True)
+class MipFilter:
+    """When and how the 3D filter is made.
+
+    Args:
+        variance: of the filter, in squared sampling intervals (px² at the finest camera); 0 switches it off.
+        cameras: which training cameras set the sampling rate; the finer ones are "hr".
+        every: iterations between updates once densification has stopped (it is also updated with every change).
+        last: no update in this many last iterations of a run.
+    """
+
+    variance: float = 0.2
+    cameras: Literal["hr", "lr"] = "hr"
+    every: int = 100
+    last: int = milestone(100)
+
+    def __post_init__(self) -> None:
+        if not self.variance >= 0:
+            raise ValueError(f"variance must be >= 0, got {self.variance}.")
+        if self.cameras not in ("hr", "lr"):
+            raise ValueError(f"cameras must be hr or lr, got {self.cameras!r}.")
+        if self.every < 1:
+            raise ValueError(f"every must be at least 1 iteration, got {self.every}.")
+
+
+@torch.no_grad()
+def filter_std(means: Float[Tensor, "N 3"], cameras: Sequence[Camera], variance: float) -> Float[Tensor, " N"]:
+    """f_i = √variance · z_min / f_max: the filter's standard deviation in world units.
+
+    z_min is the smallest depth among the cameras that see the centre, f_max the largest focal length of all. A
+    Gaussian that none sees takes the largest z_min of the others; if none is seen at all there is no filter.
+    """
+    if variance == 0 or not len(means):
+        return means.new_zeros(len(means))
+    z_min = means.new_full((len(means),), torch.inf)
+    for camera in cameras:
+        pose = camera.world_to_camera.to(means)
+        x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+        u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+        inside = (u >= -_MARGIN * camera.width) & (u <= (1 + _MARGIN) * camera.width)
+        inside &= (v >= -_MARGIN * camera.height) & (v <= (1 + _MARGIN) * camera.height)
+        z_min = torch.where((z > _NEAR) & inside, torch.minimum(z_min, z), z_min)
+    seen = z_min.isfinite()
+    if not bool(seen.any()):
+        _log.warning("no training camera sees any Gaussian: the 3D filter is off.")
+        return means.new_zeros(len(means))
+    z_min = torch.where(seen, z_min, z_min[seen].max())
+    std: Tensor = z_min * (math.sqrt(variance) / max(camera.fx for camera in cameras))
+    return std

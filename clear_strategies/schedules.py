@@ -1,0 +1,137 @@
+"""Floor 0: numbers that change with the iteration, and the milestones that scale with a run's length.
+
+Every milestone of the method is written for 10,000 iterations (the paper's length). `scaled` stretches them to another
+length, so that a short run still passes through each phase: warm-up, densification, decay, anchor.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any, Final, Literal, TypeVar
+
+REFERENCE_ITERATIONS: Final = 10_000
+_MILESTONE: Final = "milestone"
+
+Settings = TypeVar("Settings")
+
+
+def milestone(default: int) -> Any:
+    """A dataclass field that holds an iteration number of a 10,000-iteration run; `scaled` stretches it."""
+    return field(default=default, metadata={_MILESTONE: True})
+
+
+def scaled(settings: Settings, factor: float) -> Settings:
+    """A copy of a frozen dataclass with its milestones, and those of settings inside it, times `factor` (rounded)."""
+    changes: dict[str, Any] = {}
+    for f in fields(settings):  # type: ignore[arg-type]
+        if not f.init:
+            continue
+        value = getattr(settings, f.name)
+        if f.metadata.get(_MILESTONE):
+            changes[f.name] = round(value * factor)
+        elif is_dataclass(value) and not isinstance(value, type):
+            changes[f.name] = scaled(value, factor)
+    return replace(settings, **changes)  # type: ignore[type-var]
+
+
+def milestones(settings: Any) -> dict[str, int]:
+    """Every milestone of a settings dataclass, with dotted names for those inside it; for the printed plan."""
+    found: dict[str, int] = {}
+    for f in fields(settings):
+        value = getattr(settings, f.name)
+        if f.metadata.get(_MILESTONE):
+            found[f.name] = value
+        elif f.init and is_dataclass(value) and not isinstance(value, type):
+            found |= {f"{f.name}.{name}": t for name, t in milestones(value).items()}
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class WarmupDecay:
+    """λ(t): 0 until `start`, linear to `peak` at `full`, flat to `decay_from`, then down to `final` at `end`.
+
+    The paper: 0, warm-up 500 to 3,000, 1.0, decay after 5,000; neither the decay's shape nor its floor is given
+    (METHOD, F19).
+
+    Raises:
+        ValueError: the milestones are out of order, or a weight is negative.
+    """
+
+    peak: float = 1.0
+    final: float = 0.1
+    decay: Literal["linear", "cosine", "exponential"] = "linear"
+    start: int = milestone(500)
+    full: int = milestone(3_000)
+    decay_from: int = milestone(5_000)
+    end: int = milestone(10_000)
+
+    def __post_init__(self) -> None:
+        if not self.start <= self.full <= self.decay_from <= self.end:
+            raise ValueError(
+                "start <= full <= decay_from <= end must hold, got "
+                f"{self.start}, {self.full}, {self.decay_from}, {self.end}."
+            )
+        if self.peak < 0 or self.final < 0:
+            raise ValueError(f"weights must be >= 0, got peak={self.peak}, final={self.final}.")
+        if self.decay not in ("linear", "cosine", "exponential"):
+            raise ValueError(f"decay must be linear, cosine or exponential, got {self.decay!r}.")
+        if self.decay == "exponential" and not (self.final > 0 and self.peak > 0):
+            raise ValueError(f"exponential decay needs peak and final > 0, got {self.peak}, {self.final}.")
+
+    def __call__(self, t: int) -> float:
+        if t <= self.start:
+            return 0.0
+        if t < self.full:
+            return self.peak * (t - self.start) / (self.full - self.start)
+        if t <= self.decay_from:
+            return self.peak
+        if t >= self.end:
+            return self.final
+        share = (t - self.decay_from) / (self.end - self.decay_from)
+        if self.decay == "exponential":
+            return self.peak * math.pow(self.final / self.peak, share)
+        if self.decay == "cosine":
+            share = (1 - math.cos(math.pi * share)) / 2
+        return self.peak + (self.final - self.peak) * share
+
+
+@dataclass(frozen=True, slots=True)
+class Ramp:
+    """p_t: linear from 0 to `maximum` at iteration `full` (DropGaussian), or constant.
+
+    Raises:
+        ValueError: `maximum` is outside [0, 1).
+    """
+
+    maximum: float = 0.2
+    shape: Literal["linear", "constant"] = "linear"
+    full: int = milestone(10_000)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.maximum < 1:
+            raise ValueError(f"a dropout rate must lie in [0, 1), got {self.maximum}.")
+        if self.shape not in ("linear", "constant"):
+            raise ValueError(f"shape must be linear or constant, got {self.shape!r}.")
+
+    def __call__(self, t: int) -> float:
+        if self.shape == "constant" or t >= self.full:
+            return self.maximum
+        return self.maximum * t / self.full
+
+
+@dataclass(frozen=True, slots=True)
+class LogLinear:
+    """A learning rate falling from `initial` to `final`, log-linearly, by iteration `end` (3DGS's positions)."""
+
+    initial: float = 1.6e-4
+    final: float = 1.6e-6
+    end: int = milestone(10_000)
+
+    def __post_init__(self) -> None:
+        if not (self.initial > 0 and self.final > 0):
+            raise ValueError(f"learning rates must be > 0, got {self.initial} and {self.final}.")
+
+    def __call__(self, t: int) -> float:
+        share = min(max(t / max(self.end, 1), 0.0), 1.0)
+        return self.initial * math.pow(self.final / self.initial, share)

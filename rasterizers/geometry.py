@@ -1,0 +1,65 @@
+"""What every backend and every trainer agrees on: rotations from quaternions, and spherical harmonics."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SH_C0: Final = 0.28209479177387814
+"""The constant band: rgb = SH_C0 · sh0 + 1/2."""
+
+
+def rotation_matrix(quats: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
+    """Quaternions (wxyz, any length) to rotations; the zero quaternion is the identity, with zero gradient."""
+    largest = quats.detach().abs().amax(-1, keepdim=True)
+    identity = torch.zeros_like(quats)
+    identity[:, 0] = 1
+    # Scaled by the largest component first: |q|² neither overflows nor underflows (STRESS row 16).
+    q = torch.where(largest > 0, quats / largest.clamp_min(torch.finfo(quats.dtype).tiny), identity)
+    w, x, y, z = (q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)).unbind(-1)
+    return torch.stack(
+        (
+            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        ),
+        dim=-1,
+    ).view(-1, 3, 3)  # fmt: skip
+
+
+def spherical_harmonics(directions: Float[Tensor, "M 3"], bands: int) -> Float[Tensor, "M B1"]:
+    """Y: the constant band and `bands` more (0, 3, 8 or 15), real, with the signs that 3DGS stores.
+
+    Raises:
+        ValueError: `bands` is none of these.
+    """
+    if bands not in (0, 3, 8, 15):
+        raise ValueError(f"shN must hold 0, 3, 8 or 15 bands, got {bands}.")
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, SH_C0)]
+    if bands >= 3:
+        c1 = 0.4886025119029199
+        basis += [-c1 * y, c1 * z, -c1 * x]
+    if bands >= 8:
+        xx, yy, zz = x * x, y * y, z * z
+        basis += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * zz - xx - yy),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (xx - yy),
+        ]
+    if bands >= 15:
+        basis += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, dim=-1)

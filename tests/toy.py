@@ -1,0 +1,64 @@
+"""A scene small enough for a test: a few random Gaussians, seen from an arc, at LR 24x16 and HR 96x64."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+import rasterizers
+from clear_strategies import images
+from clear_strategies.data.view import Photo, PointCloud, Scene, View
+from rasterizers import Camera, Splats
+
+FACTOR = 4
+RASTERIZER = rasterizers.load("torch", tile=8)
+
+
+def camera(angle: float, width: int = 96, height: int = 64) -> Camera:
+    """Four units from the origin, looking at it, `angle` radians to the side."""
+    c, s = math.cos(angle), math.sin(angle)
+    pose = torch.tensor([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 4], [0, 0, 0, 1.0]])
+    return Camera(pose, fx=width * 1.1, fy=width * 1.1, cx=width / 2, cy=height / 2, width=width, height=height)
+
+
+def splats(n: int = 40, seed: int = 0, dtype: torch.dtype = torch.float32, bands: int = 3) -> Splats:
+    """Anisotropic Gaussians of mixed opacity in a box around the origin."""
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g).to(dtype)
+
+    return Splats(
+        means=normal(n, 3) * torch.tensor([1.1, 0.7, 0.8], dtype=dtype),
+        quats=normal(n, 4),
+        scales=(normal(n, 3) * 0.5 - 1.8).exp(),
+        opacities=torch.sigmoid(normal(n) + 1),
+        sh0=normal(n, 1, 3),
+        shN=normal(n, bands, 3) * 0.2,
+    )
+
+
+def scene(n: int = 40, seed: int = 0, train: int = 3, test: int = 1) -> Scene:
+    """Views of `splats`; the SR reference is the truth with noise of its own in each view."""
+    truth = splats(n, seed)
+    views = []
+    for i in range(train + test):
+        hr_camera = camera(-0.3 + 0.6 * i / (train + test - 1))
+        image = images.quantize(RASTERIZER(truth, hr_camera).image)
+        noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(100 * seed + i)) * 0.03
+        lr = Photo(hr_camera.scaled(1 / FACTOR), images.downsample(image, FACTOR))
+        hr = Photo(hr_camera, images.quantize(image + noise))
+        views.append(View(f"view{i}", lr, hr, truth=image, reference="truth with noise"))
+    g = torch.Generator().manual_seed(seed + 7)
+    means = truth.means + torch.randn(n, 3, generator=g) * 0.05
+    cloud = PointCloud(means, torch.rand(n, 3, generator=g), source="toy")
+    # The held-out view lies between training views.
+    held = set(range(1, 2 * test, 2))
+    return Scene(
+        "toy",
+        train=tuple(v for i, v in enumerate(views) if i not in held),
+        test=tuple(v for i, v in enumerate(views) if i in held),
+        cloud=cloud,
+    )
