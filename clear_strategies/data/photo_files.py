@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import logging
 import os
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ from typing import Final
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from torch import Tensor
 
 from clear_strategies.errors import DataError
@@ -29,45 +30,80 @@ _log = logging.getLogger(__name__)
 SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
 _MAX_PIXELS: Final = 100_000_000
+_FOLDERS: Final = ("images", "images_2", "images_4", "images_8")
 _EXIF_ORIENTATION: Final = 0x0112
+_TIFF_BITS_PER_SAMPLE: Final = 258
 
 
 def read_image(
     path: Path,
     *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: tuple[float, float, float] | None = None,
     expect: tuple[int, int] | None = None,
     max_pixels: int = _MAX_PIXELS,
 ) -> Float[Tensor, "H W 3"]:
     """RGB in [0, 1], float32.
 
     Args:
-        background: what shows through where the image has (straight) alpha. expect: (width, height) it must have.
+        background: RGB in [0, 1] behind (straight) alpha: rgb · alpha + background · (1 - alpha). None: black, logged.
+        expect: (width, height) the image must have.
+        max_pixels: refused above it, before anything is decoded.
 
     Raises:
-        DataError: not a PNG, JPEG, WebP or TIFF, damaged, too large, turned by EXIF, or of another size.
+        DataError: not a PNG, JPEG, WebP or TIFF, damaged, too large, turned by EXIF, of an unknown colour mode, or of
+            another size.
     """
     with _opened(path, max_pixels) as image:
         if expect is not None and image.size != expect:
             raise DataError(
-                path, "size", f"is {image.width}x{image.height} where {expect[0]}x{expect[1]} is expected",
+                path,
+                "size",
+                f"is {image.width}x{image.height} where {expect[0]}x{expect[1]} is expected",
                 "use images of the size the cameras were made for",
-            )  # fmt: skip
+            )
         try:
             image.load()
-        except (OSError, SyntaxError, ValueError) as error:
+        except Exception as error:  # damaged bytes make PIL's decoders raise nearly anything
             raise DataError(path, "pixels", f"cannot be decoded ({error})", "replace the damaged file") from error
+        _refuse_turned(path, image)
         pixels = _to_float(path, image)
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
-    if alpha.shape[2]:
-        rgb = rgb * alpha + np.asarray(background, np.float32) * (1 - alpha)
+    if alpha.size and alpha.min() < 1:
+        if background is None:
+            _log.info("%s has transparent pixels: composited over black.", path.name)
+        rgb = rgb * alpha + np.asarray(background or (0, 0, 0), np.float32) * (1 - alpha)
     return torch.from_numpy(np.ascontiguousarray(rgb))
 
 
 def image_size(path: Path, *, max_pixels: int = _MAX_PIXELS) -> tuple[int, int]:
-    """(width, height), from the header only."""
+    """(width, height), from the header only.
+
+    Raises:
+        DataError: as `read_image`, as far as the header tells.
+    """
     with _opened(path, max_pixels) as image:
         return image.size
+
+
+def image_folder(root: Path, name: str | None = None) -> Path:
+    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8 (logged).
+
+    Raises:
+        DataError: it is not there.
+    """
+    present = [folder for folder in _FOLDERS if (root / folder).is_dir()]
+    if not root.is_dir():
+        raise DataError(root, "folder", "is not there", "check the path")
+    if name is not None:
+        if not (root / name).is_dir():
+            there = f"choose one of {', '.join(present)}" if present else "check the path"
+            raise DataError(root / name, "images", "is no folder", there)
+        return root / name
+    if not present:
+        raise DataError(root, "images", f"has none of the folders {', '.join(_FOLDERS)}", "name the folder of photos")
+    if len(present) > 1 or present[0] != "images":
+        _log.info("%s: photos are read from %s (there are: %s).", root.name, present[0], ", ".join(present))
+    return root / present[0]
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -84,6 +120,12 @@ def list_images(folder: Path) -> list[Path]:
     return found
 
 
+def frame_number(name: str) -> int | None:
+    """The last number in a file's name: 26 of "train/r_26.png"; None where there is none."""
+    digits = re.findall(r"[0-9]+", Path(name).stem)
+    return int(digits[-1]) if digits else None
+
+
 def write_png(path: Path, image: Float[Tensor, "H W 3"]) -> None:
     """8-bit PNG, atomically; values outside [0, 1] are clamped."""
     pixels = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
@@ -92,73 +134,94 @@ def write_png(path: Path, image: Float[Tensor, "H W 3"]) -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def inside(root: Path, name: str, *, file: Path) -> Path:
+def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) -> Path:
     """`root / name`, if that is inside `root` after symbolic links are followed.
 
     Args:
         file: where the name was read, for the message.
+        allow_outside: accept absolute names and links out of `root`: for data sets that one trusts.
 
     Raises:
         DataError: the name is absolute or leads out of `root`.
     """
     if not name or "\0" in name:
         raise DataError(file, "file name", f"{name!r} is no file name", "name an image inside the data set's folder")
-    target = (root / name).resolve()
-    if os.path.isabs(name) or not target.is_relative_to(root.resolve()):  # noqa: PTH117 - also "C:\\" on Windows
+    if allow_outside:
+        return root / name
+    try:
+        within = not os.path.isabs(name) and (root / name).resolve().is_relative_to(root.resolve())  # noqa: PTH117
+    except (OSError, RuntimeError) as error:  # links in a circle, names beyond the system's limit
+        raise DataError(file, "file name", f"{name[:80]!r} cannot be followed ({error})", "rename the file") from error
+    if not within:
         raise DataError(
-            file, "file name", f"{name!r} leads out of {root}", "keep the images inside the data set's folder"
+            file,
+            "file name",
+            f"{name!r} leads out of {root}",
+            "keep the images inside the data set's folder, or allow files outside of it",
         )
-    return target
+    return root / name
 
 
 @contextmanager
 def _opened(path: Path, max_pixels: int) -> Iterator[Image.Image]:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # our own limit follows
+            warnings.simplefilter("ignore")  # our own limit follows, and what PIL doubts fails when it is decoded
             image = Image.open(path, formats=_FORMATS)
     except FileNotFoundError as error:
         raise DataError(path, "file", "is not there", "check the path") from error
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
+    except Exception as error:  # damaged headers make PIL raise nearly anything
         raise DataError(
             path, "file", f"is no readable image ({type(error).__name__})", f"use one of {', '.join(_FORMATS)}"
         ) from error
     with image:
         if image.width * image.height > max_pixels:
             raise DataError(
-                path, "size", f"{image.width}x{image.height} is more than {max_pixels:,} pixels",
+                path,
+                "size",
+                f"{image.width}x{image.height} is more than {max_pixels:,} pixels",
                 "downsample the images before training",
-            )  # fmt: skip
-        try:
-            orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
-        except (OSError, SyntaxError, ValueError, KeyError):
-            orientation = 1  # an unreadable EXIF block turns nothing
-        if orientation not in (0, 1):
-            raise DataError(
-                path, "EXIF orientation", f"is {orientation}: the photo is stored turned, and its camera may not be",
-                "turn the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result",
-            )  # fmt: skip
+            )
+        # Only a PNG may keep its EXIF block behind the pixels; `read_image` asks again when those are decoded.
+        if image.format != "PNG" or "exif" in image.info:
+            _refuse_turned(path, image)
         yield image
+
+
+def _refuse_turned(path: Path, image: Image.Image) -> None:
+    try:
+        orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+    except Exception as error:  # as above
+        _log.info("%s: its EXIF block cannot be read (%s) and is not used.", path.name, error)
+        return
+    if orientation not in (0, 1):
+        raise DataError(
+            path,
+            "EXIF orientation",
+            f"is {orientation}: the photo is stored turned, and its camera may not be",
+            "turn the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result",
+        )
 
 
 def _to_float(path: Path, image: Image.Image) -> Float[np.ndarray, "H W C"]:
     """[H, W, 3 or 4] in [0, 1]."""
-    if image.mode in ("I;16", "I;16B", "I;16L", "I"):
-        grey = np.asarray(image, np.float32) / 65535
+    if image.format in ("PNG", "TIFF", "WEBP") and getattr(image, "n_frames", 1) > 1:
+        raise DataError(path, "pages", "are several in one file", "save each picture as a file of its own")
+    if image.mode in ("I;16", "I;16B", "I;16L", "I;16N"):
+        grey = np.asarray(image).astype(np.float32) / 65535
         return np.repeat(grey[..., None], 3, axis=2)
-    if image.format in ("PNG", "TIFF") and _bits_per_channel(image) == 16:
+    if _bits_per_channel(image) == 16:
         return _read_sixteen_bits(path)
     if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
-        raise DataError(path, "colour mode", f"is {image.mode}", "convert the image to RGB")
+        raise DataError(path, "colour mode", f"is {image.mode}", "convert the image to 8-bit or 16-bit RGB")
     has_alpha = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
     return np.asarray(image.convert("RGBA" if has_alpha else "RGB"), np.float32) / 255
 
 
 def _bits_per_channel(image: Image.Image) -> int:
     if image.format == "PNG":
-        mode = image.tile[0][3] if image.tile else ""
-        return 16 if isinstance(mode, str) and ";16" in mode else 8
-    bits = getattr(image, "tag_v2", {}).get(258, (8,))
+        return 16 if getattr(image, "_sixteen_bits", False) else 8
+    bits = getattr(image, "tag_v2", {}).get(_TIFF_BITS_PER_SAMPLE, (8,))
     return int(max(bits)) if isinstance(bits, tuple) else int(bits)
 
 
