@@ -143,7 +143,7 @@ class Panel(Surface):
             t = ((np.asarray(self.center) - origin) @ normal) / (rays @ normal)
             u, v = self._coordinates(origin + t[:, None] * rays)
             inside = (t > 1e-6) & (np.abs(u) <= 1) & (np.abs(v) <= 1)
-        return np.where(inside, t, np.inf)
+        return np.asarray(np.where(inside, t, np.inf))
 
     def surface(self, points: Array) -> tuple[Array, Array]:
         u, v = self._coordinates(points)
@@ -267,7 +267,7 @@ def _sample(texture: str, uv: Array, footprint: float) -> Array:
     y0, y1 = np.clip(y0, 0, height - 1), np.clip(y0 + 1, 0, height - 1)
     upper = level[y0, x0] * (1 - fx) + level[y0, x1] * fx
     lower = level[y1, x0] * (1 - fx) + level[y1, x1] * fx
-    return upper * (1 - fy) + lower * fy
+    return np.asarray(upper * (1 - fy) + lower * fy)
 
 
 @lru_cache(maxsize=32)

@@ -55,6 +55,8 @@ class ViewSettings:
     lr_folder: str | None = None
 
     def __post_init__(self) -> None:
+        if self.train_names is not None:
+            object.__setattr__(self, "train_names", tuple(self.train_names))
         if self.train is not None and self.train < 1:
             raise ValueError(f"train must be at least 1 view, got {self.train}.")
         if self.sr_scale < 1 or self.shrink < 1:

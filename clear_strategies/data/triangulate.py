@@ -84,7 +84,8 @@ def find_features(photo: Photo, settings: TriangulationSettings) -> Features:
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     size = (grey.shape[1] * settings.enlarge, grey.shape[0] * settings.enlarge)
     large = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)
-    found, descriptors = cv2.SIFT_create(contrastThreshold=settings.contrast).detectAndCompute(large, None)
+    sift = cv2.SIFT_create(contrastThreshold=settings.contrast)  # type: ignore[attr-defined]
+    found, descriptors = sift.detectAndCompute(large, None)
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     # OpenCV's pixel (0, 0) has its centre at (0, 0), ours at (0.5, 0.5).

@@ -166,7 +166,7 @@ class DnnSuperres:
 
         if not Path(self.path).is_file():
             raise DataError(self.path, "file", "is not there", "set prior.path to the model")
-        network = cv2.dnn_superres.DnnSuperResImpl_create()
+        network = cv2.dnn_superres.DnnSuperResImpl_create()  # type: ignore[attr-defined]
         try:
             network.readModel(self.path)
             network.setModel(self.model, factor)
