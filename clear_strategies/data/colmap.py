@@ -1,0 +1,371 @@
+"""COLMAP's sparse models, binary and text, read strictly: every count is held against the bytes that are left before
+anything is allocated, every number must be finite, every id known, and every byte accounted for.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.data.cameras import Lens, by_name, make_frame
+from clear_strategies.data.capture import Capture, SfmPoints
+from clear_strategies.data.photo_files import inside
+from clear_strategies.errors import DataError
+from rasterizers.geometry import rotation_matrix
+
+# name -> COLMAP's number for the model, and how many parameters it has.
+_MODELS: Final = {
+    "SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4), "SIMPLE_RADIAL": (2, 4), "RADIAL": (3, 5), "OPENCV": (4, 8),
+    "OPENCV_FISHEYE": (5, 8), "FULL_OPENCV": (6, 12),
+}  # fmt: skip
+_MODEL_OF_ID: Final = {number: name for name, (number, _) in _MODELS.items()}
+_WRITE_AGAIN: Final = "export the model again"
+_LONGEST_NAME: Final = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """A registered image: COLMAP's id, world-to-camera as (w, x, y, z) and translation, its camera and file name."""
+
+    id: int
+    quat: tuple[float, ...]
+    translation: tuple[float, ...]
+    camera: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """Positions, 8-bit colours, and the track: point `track[j, 0]` was seen by image `track[j, 1]`."""
+
+    means: np.ndarray
+    colors: np.ndarray
+    track: np.ndarray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """A sparse model as its files tell it."""
+
+    folder: Path
+    lenses: dict[int, Lens]
+    images: list[Image]
+    points: Points
+
+
+def read(root: str | Path, images: str = "images") -> Capture:
+    """A capture from `root` with its sparse model in sparse/0, sparse, colmap/sparse/0 or root itself.
+
+    Args:
+        images: folder of the photos below root; where their size is another than the model's, cameras are rescaled.
+
+    Raises:
+        DataError: the model or an image cannot be used.
+    """
+    root = Path(root)
+    model = read_model(find_model(root))
+    folder = root / images
+    if not folder.is_dir():
+        raise DataError(folder, "folder", "is not there", "set data.reader.images to the folder of the photos")
+    frames = []
+    for image in model.images:
+        path = inside(folder, image.name, file=model.folder)
+        frames.append(make_frame(image.name, path, model.lenses[image.camera], pose_of(image), sfm_id=image.id))
+    notes = {"poses": f"COLMAP {model.folder.name}, {len(model.images)} images"}
+    if any(lens.distorts for lens in model.lenses.values()):
+        notes["lens"] = "distortion removed by OpenCV"
+    sizes = {(f.camera.width, f.camera.height) for f in frames} - {(c.width, c.height) for c in model.lenses.values()}
+    if sizes:
+        width, height = sorted(sizes)[0]
+        notes["cameras"] = f"rescaled to the photos' size, {width}x{height}"
+    return Capture(root.resolve().name, by_name(frames, model.folder), sfm_points(model), notes=notes)
+
+
+def find_model(root: Path) -> Path:
+    """The folder of the sparse model.
+
+    Raises:
+        DataError: there is none.
+    """
+    if not root.is_dir():
+        raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
+    for candidate in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0", root):
+        if (candidate / "cameras.bin").is_file() or (candidate / "cameras.txt").is_file():
+            return candidate
+    raise DataError(
+        root, "sparse model", "no cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0 or here",
+        "run COLMAP first, or use data=photos for photos without poses",
+    )  # fmt: skip
+
+
+def read_model(folder: Path) -> Model:
+    """Cameras, images and points of a model folder; binary files come first and never give way to text silently.
+
+    Raises:
+        DataError: a file is missing or not what it should be.
+    """
+    binary = (folder / "cameras.bin").is_file()
+    ending = ".bin" if binary else ".txt"
+    cameras, images = (_cameras_bin, _images_bin) if binary else (_cameras_txt, _images_txt)
+    lenses = cameras(folder / f"cameras{ending}")
+    registered = images(folder / f"images{ending}")
+    for image in registered:
+        if image.camera not in lenses:
+            raise DataError(
+                folder / f"images{ending}", image.name, f"has the unknown camera {image.camera}", _WRITE_AGAIN
+            )
+    file = folder / f"points3D{ending}"
+    points = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.int64))
+    if file.exists():
+        points = _points_bin(file) if binary else _points_txt(file)
+        unknown = np.setdiff1d(points.track[:, 1], [image.id for image in registered])
+        if len(unknown):
+            raise DataError(file, "track", f"names the unknown image {unknown[0]}", _WRITE_AGAIN)
+    return Model(folder, lenses, registered, points)
+
+
+def pose_of(image: Image) -> Float[Tensor, "4 4"]:
+    """World-to-camera."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = rotation_matrix(torch.tensor([image.quat], dtype=torch.float64))[0]
+    pose[:3, 3] = torch.tensor(image.translation, dtype=torch.float64)
+    return pose
+
+
+def sfm_points(model: Model) -> SfmPoints | None:
+    """The model's points with their tracks; None where it has none."""
+    p = model.points
+    if not len(p.means):
+        return None
+    return SfmPoints(
+        means=torch.from_numpy(p.means).float(),
+        colors=torch.from_numpy(p.colors).float() / 255,
+        point=torch.from_numpy(np.ascontiguousarray(p.track[:, 0])),
+        seen_by=torch.from_numpy(np.ascontiguousarray(p.track[:, 1])),
+        source=f"{len(p.means):,} points of COLMAP {model.folder.name}, triangulated from all {len(model.images)} images",
+    )
+
+
+class _Bytes:
+    """A cursor that never reads, and never promises to read, past the end."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self.data = path.read_bytes()
+        except OSError as error:
+            raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
+        self.path, self.at = path, 0
+
+    @property
+    def left(self) -> int:
+        return len(self.data) - self.at
+
+    def take(self, layout: str, field: str) -> tuple[float, ...]:
+        size = struct.calcsize(layout)
+        if size > self.left:
+            raise DataError(self.path, field, f"needs {size} bytes, {self.left} are left: truncated", _WRITE_AGAIN)
+        values = struct.unpack_from(layout, self.data, self.at)
+        self.at += size
+        return values
+
+    def count(self, field: str, record: int) -> int:
+        """A 64-bit count of records of at least `record` bytes each."""
+        (n,) = self.take("<Q", field)
+        if n * record > self.left:
+            raise DataError(
+                self.path, field, f"says {n} records of {record} bytes, {self.left} bytes are left", _WRITE_AGAIN
+            )
+        return int(n)
+
+    def skip(self, size: int) -> None:
+        self.at += size
+
+    def text(self, field: str) -> str:
+        end = self.data.find(b"\0", self.at, self.at + _LONGEST_NAME)
+        if end < 0:
+            raise DataError(self.path, field, "is no text that ends", _WRITE_AGAIN)
+        raw, self.at = self.data[self.at : end], end + 1
+        try:
+            return raw.decode()
+        except UnicodeDecodeError as error:
+            raise DataError(self.path, field, "is no UTF-8 text", _WRITE_AGAIN) from error
+
+    def finish(self) -> None:
+        if self.left:
+            raise DataError(self.path, "end", f"{self.left} bytes are left over", _WRITE_AGAIN)
+
+
+def _cameras_bin(path: Path) -> dict[int, Lens]:
+    file = _Bytes(path)
+    lenses: dict[int, Lens] = {}
+    for i in range(file.count("number of cameras", 24 + 3 * 8)):
+        number, kind, width, height = (int(x) for x in file.take("<iiQQ", f"camera {i}"))
+        name = _MODEL_OF_ID.get(kind, f"number {kind}")
+        parameters = file.take(f"<{_parameters(path, name)}d", f"parameters of camera {i}")
+        _put(path, lenses, number, _lens(path, f"camera {number}", name, width, height, parameters))
+    file.finish()
+    return lenses
+
+
+def _images_bin(path: Path) -> list[Image]:
+    file = _Bytes(path)
+    found: dict[int, Image] = {}
+    for i in range(file.count("number of images", 4 + 7 * 8 + 4 + 1 + 8)):
+        field = f"image {i}"
+        number, *pose = file.take("<i7d", field)
+        (camera,) = file.take("<i", field)
+        name = file.text(f"name of image {i}")
+        file.skip(24 * file.count(f"2D points of {name!r}", 24))
+        _put(path, found, int(number), _image(path, int(number), tuple(pose), int(camera), name))
+    file.finish()
+    return list(found.values())
+
+
+def _points_bin(path: Path) -> Points:
+    file = _Bytes(path)
+    n = file.count("number of points", 8 + 24 + 3 + 8 + 8)
+    means, colors, track, seen = np.zeros((n, 3)), np.zeros((n, 3), np.uint8), [], set()
+    for i in range(n):
+        number, x, y, z, r, g, b, _ = file.take("<Q3d3Bd", f"point {i}")
+        means[i], colors[i] = (x, y, z), (r, g, b)
+        seen.add(number)
+        length = file.count(f"track of point {i}", 8)
+        entries = np.frombuffer(file.data, "<i4", 2 * length, file.at).reshape(-1, 2)[:, 0]
+        file.skip(8 * length)
+        track.append(np.stack((np.full(length, i), entries), axis=1).astype(np.int64))
+    file.finish()
+    if len(seen) != n:
+        raise DataError(path, "point id", "occurs twice", _WRITE_AGAIN)
+    return _checked_points(path, means, colors, track)
+
+
+def _cameras_txt(path: Path) -> dict[int, Lens]:
+    lenses: dict[int, Lens] = {}
+    for line, cells in _lines(path):
+        if len(cells) < 4:
+            raise DataError(path, f"line {line}", f"has {len(cells)} of at least 5 columns", _WRITE_AGAIN)
+        width, height = _integer(path, line, cells[2]), _integer(path, line, cells[3])
+        expected = _parameters(path, cells[1])
+        if len(cells) != 4 + expected:
+            raise DataError(
+                path, f"line {line}", f"has {len(cells) - 4} parameters, {cells[1]} has {expected}", _WRITE_AGAIN
+            )
+        parameters = tuple(_number(path, line, c) for c in cells[4:])
+        lens = _lens(path, f"line {line}", cells[1], width, height, parameters)
+        _put(path, lenses, _integer(path, line, cells[0]), lens)
+    return lenses
+
+
+def _images_txt(path: Path) -> list[Image]:
+    """Two lines an image; the second, its 2D points, may be empty."""
+    found: dict[int, Image] = {}
+    lines = [(i, text) for i, text in _raw_lines(path) if not text.startswith("#")]
+    while lines and not lines[-1][1].strip() and len(lines) % 2:
+        lines.pop()
+    if len(lines) % 2:
+        raise DataError(path, f"line {lines[-1][0]}", "has no second line with its 2D points", _WRITE_AGAIN)
+    for line, text in lines[::2]:
+        cells = text.split(maxsplit=9)
+        if len(cells) != 10:
+            raise DataError(path, f"line {line}", f"has {len(cells)} of 10 columns", _WRITE_AGAIN)
+        number, camera = _integer(path, line, cells[0]), _integer(path, line, cells[8])
+        pose = tuple(_number(path, line, c) for c in cells[1:8])
+        _put(path, found, number, _image(path, number, pose, camera, cells[9].strip()))
+    return list(found.values())
+
+
+def _points_txt(path: Path) -> Points:
+    means, colors, track, seen = [], [], [], set()
+    for line, cells in _lines(path):
+        if len(cells) < 8 or len(cells) % 2:
+            raise DataError(path, f"line {line}", f"has {len(cells)} columns where 8 and pairs belong", _WRITE_AGAIN)
+        means.append([_number(path, line, c) for c in cells[1:4]])
+        rgb = [_integer(path, line, c) for c in cells[4:7]]
+        if not all(0 <= c <= 255 for c in rgb):
+            raise DataError(path, f"line {line}", f"has the colour {rgb}", "colours lie in 0..255")
+        colors.append(rgb)
+        seen.add(cells[0])
+        images = [_integer(path, line, c) for c in cells[8::2]]
+        track.append(np.array([(len(means) - 1, image) for image in images], np.int64).reshape(-1, 2))
+    if len(seen) != len(means):
+        raise DataError(path, "point id", "occurs twice", _WRITE_AGAIN)
+    return _checked_points(path, np.array(means).reshape(-1, 3), np.array(colors, np.uint8).reshape(-1, 3), track)
+
+
+def _checked_points(path: Path, means: np.ndarray, colors: np.ndarray, track: list[np.ndarray]) -> Points:
+    if not np.isfinite(means).all():
+        bad = int(np.flatnonzero(~np.isfinite(means).all(1))[0])
+        raise DataError(path, f"point {bad}", "is not finite", "remove the point")
+    return Points(means, colors, np.concatenate(track) if track else np.zeros((0, 2), np.int64))
+
+
+def _parameters(path: Path, model: str) -> int:
+    if model not in _MODELS:
+        raise DataError(
+            path, "camera model", f"{model[:40]} is not supported", "undistort with `colmap image_undistorter` first"
+        )
+    return _MODELS[model][1]
+
+
+def _lens(path: Path, where: str, model: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
+    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        f, cx, cy, *radial = p  # one focal length; k1 and k2 as far as given, no tangential terms
+        distortion = (*radial, *[0.0] * (4 - len(radial))) if radial else ()
+        return Lens(width, height, f, f, cx, cy, distortion).check(path, where)
+    fx, fy, cx, cy, *rest = p
+    return Lens(width, height, fx, fy, cx, cy, tuple(rest), fisheye=model == "OPENCV_FISHEYE").check(path, where)
+
+
+def _image(path: Path, number: int, pose: tuple[float, ...], camera: int, name: str) -> Image:
+    if not all(map(math.isfinite, pose)):
+        raise DataError(path, name or f"image {number}", "has a pose that is not finite", _WRITE_AGAIN)
+    norm = math.sqrt(sum(x * x for x in pose[:4]))
+    if not 0.5 < norm < 2:
+        raise DataError(
+            path, name or f"image {number}", f"has a rotation quaternion of length {norm:.3g}", _WRITE_AGAIN
+        )
+    return Image(number, pose[:4], pose[4:], camera, name)
+
+
+def _put(path: Path, table: dict[int, Any], number: int, value: Any) -> None:
+    if number in table:
+        raise DataError(path, f"id {number}", "occurs twice", _WRITE_AGAIN)
+    table[number] = value
+
+
+def _raw_lines(path: Path) -> list[tuple[int, str]]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
+    except UnicodeDecodeError as error:
+        raise DataError(path, "file", "is no UTF-8 text", _WRITE_AGAIN) from error
+    return list(enumerate(text.splitlines(), start=1))
+
+
+def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    for number, text in _raw_lines(path):
+        if text.strip() and not text.startswith("#"):
+            yield number, text.split()
+
+
+def _number(path: Path, line: int, cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError as error:
+        raise DataError(path, f"line {line}", f"has {cell[:40]!r} where a number belongs", _WRITE_AGAIN) from error
+
+
+def _integer(path: Path, line: int, cell: str) -> int:
+    if not cell.lstrip("-").isascii() or not cell.lstrip("-").isdigit() or len(cell) > 18:
+        raise DataError(path, f"line {line}", f"has {cell[:40]!r} where a whole number belongs", _WRITE_AGAIN)
+    return int(cell)
