@@ -1,14 +1,11 @@
-"""From the cameras of files to the pinholes of this library: poses checked, sizes matched, lenses straightened.
-
-Every reader ends here. A `Lens` is what files describe: a pinhole, perhaps bent by OpenCV's polynomials, for images of
-some size. `posed_photo` fits it to the image that is there, undistorts on loading, and gives a `Frame`.
-"""
+"""Lenses and poses as the readers find them, and the pinhole cameras they become."""
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
 from pathlib import Path
 from typing import Final
 
@@ -22,20 +19,15 @@ from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
 
-Color = tuple[float, float, float]
-
-_ROTATION_TOLERANCE: Final = 1e-3  # what text files with six digits keep, and no scaled or mirrored frame does
-_BORDER_SAMPLES: Final = 33
+_LARGEST_SIDE: Final = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """How a camera bends rays onto a `width` × `height` image; pixel (0, 0) has its centre at (0.5, 0.5).
+    """Intrinsics in pixels of a width × height image whose first pixel is centred at (0.5, 0.5).
 
     Args:
-        fx, fy, cx, cy: px.
-        distortion: OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) of its fisheye; empty: a pinhole.
-        fisheye: which of the two.
+        distortion: OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) with `fisheye`; empty: a pinhole.
     """
 
     width: int
@@ -47,211 +39,148 @@ class Lens:
     distortion: tuple[float, ...] = ()
     fisheye: bool = False
 
-    @property
-    def straight(self) -> bool:
-        """Nothing to undistort. A fisheye bends even when its coefficients are 0."""
-        return not self.fisheye and not any(self.distortion)
-
-    def checked(self, file: Path, field: str) -> Lens:
-        """The lens itself, if a camera can have it.
+    def check(self, file: Path, where: str) -> Lens:
+        """Itself.
 
         Raises:
-            DataError: a number is not finite, or lies where no camera's does.
+            DataError: a number is not finite, a focal length or size not positive.
         """
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        remedy = "check the calibration"
-        if not all(map(math.isfinite, numbers)):
-            raise DataError(file, field, f"has a number that is not finite: {numbers}", remedy)
-        if not (0 < self.width <= 1_000_000 and 0 < self.height <= 1_000_000):
-            raise DataError(file, field, f"has an image size of {self.width}x{self.height} pixels", remedy)
-        if not all(1e-3 <= f / self.width <= 1e6 for f in (self.fx, self.fy)):
-            raise DataError(
-                file, field, f"has focal lengths {self.fx:g}, {self.fy:g} px for {self.width} px of width", remedy
-            )
-        if not (-self.width <= self.cx <= 2 * self.width and -self.height <= self.cy <= 2 * self.height):
-            raise DataError(
-                file, field, f"has its principal point ({self.cx:g}, {self.cy:g}) px far outside the image", remedy
-            )
+        if not all(math.isfinite(x) and abs(x) < 1e12 for x in numbers):
+            raise DataError(file, where, f"has intrinsics that are not finite: {numbers}", "estimate the cameras again")
+        if not (self.fx > 0 and self.fy > 0):
+            problem = f"has focal lengths {self.fx:g}, {self.fy:g}; they must be > 0"
+            raise DataError(file, where, problem, "check the camera")
+        if not (0 < self.width < _LARGEST_SIDE and 0 < self.height < _LARGEST_SIDE):
+            raise DataError(file, where, f"has size {self.width}x{self.height}", "check the camera")
         return self
 
-    def resized(self, width: int, height: int, file: Path) -> Lens:
-        """The same lens for an image scaled to another size, each axis by its own factor.
+    @property
+    def distorts(self) -> bool:
+        return self.fisheye or any(k != 0 for k in self.distortion)
 
-        Raises:
-            DataError: one factor, up to a pixel of rounding, does not explain both sizes: `file` is another image.
-        """
-        low = max((width - 1) / self.width, (height - 1) / self.height)
-        high = min((width + 1) / self.width, (height + 1) / self.height)
-        if low > high:
-            raise DataError(
-                file,
-                "size",
-                f"is {width}x{height}, which is no scaled {self.width}x{self.height} as its camera has it",
-                "use the images that the cameras were made for, scaled but not cropped",
-            )
-        x, y = width / self.width, height / self.height
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens on another pixel grid, each axis by its own factor."""
+        sx, sy = width / self.width, height / self.height
         return replace(
-            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
-    def pinhole(self, file: Path) -> Lens:
-        """The pinhole an undistorted image has: same size, zoomed until no pixel lacks data.
-
-        Raises:
-            DataError: the distortion folds the image over itself, so that no such pinhole exists.
-        """
-        if self.straight:
+    def undistorted(self) -> Lens:
+        """The pinhole whose whole image is filled once distortion is removed, at the same size."""
+        if not self.distorts:
             return replace(self, distortion=())
-        pinhole = _largest_pinhole(self)
-        if pinhole is None:
-            raise DataError(
-                file,
-                "distortion",
-                f"{self.distortion} cannot be undistorted over a whole {self.width}x{self.height} image",
-                "check the calibration, or undistort the images first (e.g. with `colmap image_undistorter`)",
-            )
-        return pinhole
-
-    def undistort(self, image: Float[Tensor, "H W 3"], pinhole: Lens) -> Float[Tensor, "H W 3"]:
-        """The picture `pinhole` would have taken; bicubic, in [0, 1]."""
         import cv2
 
-        x, y = _sampling_maps(self, pinhole)
-        straightened = cv2.remap(image.numpy(), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        return torch.from_numpy(straightened).clamp(0, 1)
+        size, coefficients = (self.width, self.height), np.array(self.distortion, float)
+        if self.fisheye:
+            K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+                self._matrix(), coefficients, size, np.eye(3), balance=0
+            )
+        else:
+            K, _ = cv2.getOptimalNewCameraMatrix(self._matrix(), coefficients, size, 0)
+        return Lens(self.width, self.height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]) + 0.5, float(K[1, 2]) + 0.5)
 
-    def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """K in OpenCV's pixel convention: the first pixel's centre lies at (0, 0)."""
-        return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1]])
+    def undistort(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+        """The image that `undistorted` sees."""
+        if not self.distorts:
+            return image
+        import cv2
 
-    def _with_matrix(self, K: Float[np.ndarray, "3 3"]) -> Lens:
-        fx, fy, cx, cy = (float(x) for x in (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
-        return Lens(self.width, self.height, fx, fy, cx, cy)
+        target, size, coefficients = self.undistorted(), (self.width, self.height), np.array(self.distortion, float)
+        init = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
+        maps = init(self._matrix(), coefficients, np.eye(3), target._matrix(), size, cv2.CV_32FC1)
+        result = cv2.remap(image.numpy(), maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return torch.from_numpy(result).clamp(0, 1)
 
-
-def world_to_camera(file: Path, field: str, camera_to_world: Float[np.ndarray, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Invert a rigid pose in OpenCV axes; the rotation is replaced by the nearest exact one.
-
-    Raises:
-        DataError: not finite, the last row is not (0, 0, 0, 1), or the upper left is no rotation (within 1e-3).
-    """
-    remedy = "export camera-to-world matrices that are rotations and translations"
-    if not np.isfinite(camera_to_world).all():
-        raise DataError(file, field, "has a number that is not finite", remedy)
-    if not np.array_equal(camera_to_world[3], [0, 0, 0, 1]):
-        raise DataError(file, field, f"has the last row {camera_to_world[3].tolist()}, not 0 0 0 1", remedy)
-    rotation, center = camera_to_world[:3, :3], camera_to_world[:3, 3]
-    if np.abs(rotation).max() > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > _ROTATION_TOLERANCE:
-        raise DataError(file, field, "is no rotation: its rows are not orthonormal within 1e-3", remedy)
-    if np.linalg.det(rotation) < 0:
-        raise DataError(file, field, "mirrors the world (determinant -1)", remedy)
-    left, _, right = np.linalg.svd(rotation)
-    pose = np.eye(4)
-    pose[:3, :3] = (left @ right).T
-    pose[:3, 3] = -pose[:3, :3] @ center
-    return torch.from_numpy(pose)
+    def _matrix(self) -> np.ndarray:
+        """OpenCV's: its first pixel is centred at (0, 0)."""
+        return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
 
 
-def posed_photo(
+def make_frame(
     name: str,
-    path: Path,
+    image: Path,
     lens: Lens,
     pose: Float[Tensor, "4 4"],
     *,
-    background: Color | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     split: str | None = None,
     sfm_id: int | None = None,
 ) -> Frame:
-    """A photo and its camera; only the image's header is read now.
-
-    Args:
-        lens: of an image of any size; fitted to the size that `path` has.
-        pose: world to camera, OpenCV axes.
+    """A frame whose lens is fitted to the image's real size and whose image is undistorted when it is loaded.
 
     Raises:
-        DataError: the image is not there or not usable, or its size is not the lens's, scaled.
+        DataError: the image is not there, or its shape is not the lens's.
     """
-    lens = lens.resized(*image_size(path), file=path)
-    pinhole = lens.pinhole(path)
-    camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, pinhole.width, pinhole.height)
-    return Frame(name, camera, partial(_load, path, lens, pinhole, background), split, sfm_id)
+    width, height = image_size(image)
+    if abs(width / height - lens.width / lens.height) > 0.02 * width / height:
+        raise DataError(
+            image, "size", f"is {width}x{height}, but its camera is for {lens.width}x{lens.height}: another shape",
+            "use the images that the cameras were estimated from, or a scaled copy of them",
+        )  # fmt: skip
+    fitted = lens.resized(width, height)
+    pinhole = fitted.undistorted()
+    camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
+
+    def load() -> Float[Tensor, "H W 3"]:
+        return fitted.undistort(read_image(image, background=background, expect=(width, height)))
+
+    return Frame(name, camera, load, split=split, sfm_id=sfm_id)
 
 
-def lens_notes(lenses: list[Lens], frames: list[Frame]) -> dict[str, str]:
-    """What became of the lenses on the way to the frames, for the printed plan."""
-    notes = {}
-    pairs = list(zip(lenses, frames, strict=True))
-    scaled = [(a, b.camera) for a, b in pairs if (a.width, a.height) != (b.camera.width, b.camera.height)]
-    if scaled:
-        lens, camera = scaled[0]
-        notes["intrinsics"] = (
-            f"{len(scaled)} of {len(frames)} cameras rescaled to their images, "
-            f"e.g. {lens.width}x{lens.height} to {camera.width}x{camera.height}: "
-            f"x {camera.width / lens.width:.5g}, y {camera.height / lens.height:.5g}"
-        )
-    bent = [(a, b.camera) for a, b in pairs if not a.straight]
-    if bent:
-        lens, camera = bent[0]
-        notes["undistortion"] = (
-            f"{len(bent)} of {len(frames)} photos undistorted on loading (OpenCV, bicubic, no borders), "
-            f"e.g. fx {lens.fx * camera.width / lens.width:.5g} to {camera.fx:.5g} px"
-        )
-    return notes
+def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4 4"]:
+    """World-to-camera (OpenCV axes) from a camera-to-world matrix with OpenGL axes (x right, y up, z back).
+
+    Raises:
+        DataError: not a rigid 3x4 or 4x4 matrix of finite numbers.
+    """
+    remedy = "write camera-to-world matrices: a rotation, a translation, last row 0 0 0 1"
+    rows = matrix if isinstance(matrix, list) else []
+    if len(rows) not in (3, 4) or not all(_is_row(row) for row in rows):
+        raise DataError(file, where, "is no 3x4 or 4x4 matrix of finite numbers", remedy)
+    full = np.eye(4)
+    full[: len(rows)] = np.array(rows, float)
+    if np.abs(full[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise DataError(file, where, f"has the last row {full[3].tolist()}", remedy)
+    rotation = full[:3, :3] * np.array([1.0, -1.0, -1.0])  # OpenGL's y and z point the other way
+    return rigid_inverse(file, where, rotation, full[:3, 3])
 
 
-def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None) -> Float[Tensor, "H W 3"]:
-    image = read_image(path, background=background, expect=(lens.width, lens.height))
-    return image if lens.straight else lens.undistort(image, pinhole)
+def rigid_inverse(file: Path, where: str, rotation: np.ndarray, center: np.ndarray) -> Float[Tensor, "4 4"]:
+    """World-to-camera from a camera's axes (columns) and centre.
+
+    Raises:
+        DataError: the axes are not orthonormal and right-handed within 1e-3.
+    """
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or abs(np.linalg.det(rotation) - 1) > 1e-3:
+        raise DataError(
+            file, where, f"holds no rotation (determinant {np.linalg.det(rotation):.4g})",
+            "remove scale and reflection from the camera-to-world matrices",
+        )  # fmt: skip
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ center
+    return torch.from_numpy(pose)
 
 
-@lru_cache(maxsize=64)  # the frames of a capture share few lenses
-def _largest_pinhole(lens: Lens) -> Lens | None:
-    import cv2
+def by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:
+    """Frames in order of names.
 
-    size, K, bend = (lens.width, lens.height), lens.matrix(), np.array(lens.distortion)
-    try:
-        if lens.fisheye:
-            new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, bend, size, np.eye(3), balance=0.0)
-        else:
-            new, _ = cv2.getOptimalNewCameraMatrix(K, bend, size, alpha=0)
-    except cv2.error:
-        return None
-    pinhole = lens._with_matrix(new)
-    sane = all(map(math.isfinite, (pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy)))
-    if not (sane and all(0.1 < a / b < 10 for a, b in ((pinhole.fx, lens.fx), (pinhole.fy, lens.fy)))):
-        return None
-    return pinhole if _covers(lens, pinhole) else None
+    Raises:
+        DataError: two have the same name, or there is none.
+    """
+    if not frames:
+        raise DataError(file, "frames", "there is none", "give a capture with at least one posed photo")
+    ordered = tuple(sorted(frames, key=lambda f: f.name))
+    for frame, following in itertools.pairwise(ordered):
+        if frame.name == following.name:
+            raise DataError(file, "file name", f"{frame.name!r} belongs to two frames", "give each photo one pose")
+    return ordered
 
 
-def _covers(lens: Lens, pinhole: Lens) -> bool:
-    """Whether the border of the new image comes from inside the old one, up to OpenCV's approximation of it."""
-    import cv2
-
-    along = np.linspace(0, 1, _BORDER_SAMPLES)
-    border = np.concatenate([np.stack(np.broadcast_arrays(*side), 1) for side in _sides(along)])
-    rays = (border * [lens.width, lens.height] - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
-    bend = np.array(lens.distortion)
-    if lens.fisheye:
-        pixels = cv2.fisheye.distortPoints(rays[:, None], lens.matrix(), bend)[:, 0]
-    else:
-        homogeneous = np.column_stack((rays, np.ones(len(rays))))
-        pixels = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), lens.matrix(), bend)[0][:, 0]
-    slack = 1 + 0.01 * max(lens.width, lens.height)
-    inside = (pixels >= -slack) & (pixels <= np.array([lens.width, lens.height]) + slack)
-    return bool(inside.all())
+def _is_row(row: object) -> bool:
+    return isinstance(row, list) and len(row) == 4 and all(_is_number(x) for x in row)
 
 
-def _sides(along: Float[np.ndarray, " n"]) -> list[tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]]:
-    zero, one = np.zeros(1), np.ones(1)
-    return [(along, zero), (along, one), (zero, along), (one, along)]
-
-
-@lru_cache(maxsize=1)
-def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
-    """Where in the distorted image each pixel of the new one lies."""
-    import cv2
-
-    maps = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
-    size, bend = (lens.width, lens.height), np.array(lens.distortion)
-    x, y = maps(lens.matrix(), bend, np.eye(3), pinhole.matrix(), size, cv2.CV_32FC1)
-    return x, y
+def _is_number(x: object) -> bool:
+    return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < 1e18
