@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Final, Protocol
+from typing import Final, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -44,6 +44,7 @@ class Grads(dict[str, Tensor]):
         return Grads({name: self[name] for name in names if name in self})
 
 
+@runtime_checkable
 class Shot(Protocol):
     """A rendering as strategies and hosts see it."""
 

@@ -89,13 +89,14 @@ def curves(path: Path, history: Sequence[Mapping[str, float]], milestones: Mappi
         _draw(right, history, "mean_omega", "mean ω of corrections", "#aa3377", smooth=True)
         _draw(right, history, "mean_q", "mean reliability q", "#66ccee", smooth=True)
         right.set_ylim(0, 1.05)
-        right.legend(fontsize=8, loc="lower right", frameon=False)
+        right.legend(fontsize=8, loc="center right", frameon=False)
     for axis in axes.flatten():
         axis.grid(alpha=0.25, linewidth=0.5)
-        for name, t in milestones.items():
+        for t in sorted(set(milestones.values())):
+            name = ", ".join(mark for mark, at in milestones.items() if at == t)
             axis.axvline(t, color="#999999", linewidth=0.7, linestyle=":")
             if axis is structure:
-                axis.text(t, 0.98, f" {name}", rotation=90, fontsize=6.5, va="top", ha="right", color="#777777",
+                axis.text(t, 0.98, f"{name} ", rotation=90, fontsize=6.5, va="top", ha="right", color="#777777",
                           transform=axis.get_xaxis_transform())  # fmt: skip
         if axis.get_legend_handles_labels()[0]:
             axis.legend(fontsize=8, frameon=False, loc="best")

@@ -136,6 +136,7 @@ class SplatGradients:
         return self.basis[None, :, 1:, None] * self.rgb[:, :, None, :]
 
 
+@runtime_checkable
 class Rendering(Protocol):
     """A picture and its transpose."""
 

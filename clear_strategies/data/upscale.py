@@ -12,7 +12,7 @@ import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -26,6 +26,7 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 
+@runtime_checkable
 class Prior(Protocol):
     """A frozen image super-resolution model."""
 

@@ -26,7 +26,7 @@ class Pass:
     """What the transpose needs of a batch: its tiles, each slab's pairs with the T on entering it, and T_end."""
 
     tiles: Int[Tensor, " B"]
-    slabs: list[tuple[Int[Tensor, "B L"], Float[Tensor, "B P"]]]
+    slabs: list[tuple[Int[Tensor, "B _"], Float[Tensor, "B P"]]]
     end: Float[Tensor, "B P"]
 
 

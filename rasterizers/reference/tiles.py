@@ -60,14 +60,14 @@ class TileLists:
     lengths: Int[Tensor, " T"]
     visible: Bool[Tensor, " M"]
 
-    def batches(self, lanes_per_pair: int, lanes: int) -> list[Int[Tensor, " B"]]:
+    def batches(self, lanes_per_pair: int, lanes: int) -> list[Int[Tensor, " _"]]:
         """Non-empty tiles, those with similarly long lists together, each batch one pair deep within `lanes`."""
         order = torch.argsort(self.lengths, descending=True, stable=True)
         order = order[: int((self.lengths > 0).sum())]
         per_batch = max(1, lanes // (lanes_per_pair * _SLAB))
         return list(torch.split(order, per_batch)) if len(order) else []
 
-    def slabs(self, tiles: Int[Tensor, " B"]) -> list[Int[Tensor, "B L"]]:
+    def slabs(self, tiles: Int[Tensor, " B"]) -> list[Int[Tensor, "B _"]]:
         """The lists of some tiles, side by side and cut across into slabs; short lists end in the table's empty row."""
         depth = int(self.lengths[tiles].max())
         return [self._slab(tiles, first, min(_SLAB, depth - first)) for first in range(0, depth, _SLAB)]

@@ -1,0 +1,234 @@
+"""The contract of a rasterizer, as checks that any implementation can run, ours or a third party's.
+
+    from rasterizers.testing import check_rasterizer
+    check_rasterizer(lambda **settings: MyRasterizer(**settings))
+
+Each check raises `ContractError` with what was expected and what was found.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from rasterizers.interface import Camera, Rasterizer, SplatGradients, Splats
+from rasterizers.reference import ReferenceRasterizer
+
+Make = Callable[..., Rasterizer]
+
+_ATTRIBUTES: Final = ("means", "quats", "scales", "opacities", "sh0", "shN", "rgb_offset")
+# Finite differences need a picture without cut-offs: each is a step.
+_SMOOTH: Final = {"alpha_min": 1e-9, "transmittance_min": 0.0, "alpha_max": 1 - 1e-6}
+
+
+class ContractError(AssertionError):
+    """An implementation does not do what the interface promises."""
+
+
+def check_rasterizer(make: Make) -> None:
+    """Run every check.
+
+    Args:
+        make: builds the rasterizer from the fields of `RasterSettings`.
+
+    Raises:
+        ContractError: the first promise that does not hold.
+    """
+    for check in CHECKS:
+        check(make)
+
+
+def check_gradients_are_finite_differences(make: Make) -> None:
+    """The transpose is the transpose: directional derivatives of every attribute."""
+    rasterizer = make(background=(0.2, 0.5, 0.9), **_SMOOTH)
+    dtype = _widest(rasterizer)
+    splats, camera = scene(24, dtype=dtype, seed=1), _camera(40, 30)
+    g = torch.Generator().manual_seed(2)
+    v = torch.randn(1, 30, 40, 3, generator=g).to(dtype)
+    gradients = rasterizer(splats, camera).vjp(v)
+    step, tolerance = (1e-6, 1e-4) if dtype == torch.float64 else (1e-2, 2e-2)
+    for name in _ATTRIBUTES:
+        value, gradient = getattr(splats, name), gradient_of(gradients, name)[0]
+        for _ in range(3):
+            direction = torch.randn(value.shape, generator=g).to(dtype)
+            if name in ("opacities", "scales"):
+                direction = direction * value * 0.3
+            direction = direction / torch.linalg.vector_norm(direction)
+            ends = [rasterizer(replace(splats, **{name: value + s * step * direction}), camera).image for s in (1, -1)]
+            numeric = float(((ends[0] - ends[1]) * v[0]).sum()) / (2 * step)
+            analytic = float((gradient * direction).sum())
+            scale = max(abs(numeric), float(gradient.abs().max()) * 1e-2, 1e-9)
+            _require(
+                abs(numeric - analytic) <= tolerance * scale, f"∂/∂{name}: {analytic:.8g}, by differences {numeric:.8g}"
+            )
+
+
+def check_cotangents_together_equal_one_by_one(make: Make) -> None:
+    """K cotangents in one call are K calls with one."""
+    rasterizer = make()
+    dtype = _widest(rasterizer)
+    splats, camera = scene(60, dtype=dtype), _camera(48, 33)
+    rendering = rasterizer(splats, camera)
+    v = torch.randn(3, 33, 48, 3, generator=torch.Generator().manual_seed(3)).to(dtype)
+    together = rendering.vjp(v)
+    for k in range(3):
+        alone = rendering.vjp(v[k : k + 1])
+        for name in (*_ATTRIBUTES, "screen"):
+            _close(gradient_of(together, name)[k], gradient_of(alone, name)[0], 1e-5, f"cotangent {k} of {name}")
+
+
+def check_dropped_equals_absent(make: Make) -> None:
+    """Opacity 0: the same picture as without the Gaussian, invisible, and no gradient."""
+    rasterizer = make()
+    dtype = _widest(rasterizer)
+    splats, camera = scene(50, dtype=dtype), _camera(48, 33)
+    kept = torch.arange(50) % 3 != 0
+    gated = replace(splats, opacities=splats.opacities * kept)
+    rendering, without = rasterizer(gated, camera), rasterizer(select(splats, kept), camera)
+    _close(rendering.image, without.image, 1e-6, "the picture")
+    _require(not bool(rendering.visible[~kept].any()), "a dropped Gaussian counts as visible")
+    v = torch.ones(1, 33, 48, 3, dtype=dtype)
+    gradients, expected = rendering.vjp(v), without.vjp(v)
+    for name in _ATTRIBUTES:
+        rows = gradient_of(gradients, name)[0]
+        _require(float(rows[~kept].abs().max()) == 0, f"a dropped Gaussian has a gradient of {name}")
+        _close(rows[kept], gradient_of(expected, name)[0], 1e-5, f"the others' {name}")
+
+
+def check_nothing_to_draw(make: Make) -> None:
+    """No Gaussian, or none in view: the background, alpha 0, gradients of the right shape and 0."""
+    background = (0.1, 0.6, 0.3)
+    rasterizer = make(background=background)
+    dtype, camera = _widest(rasterizer), _camera(19, 11)
+    behind = scene(5, dtype=dtype)
+    behind = replace(behind, means=behind.means - torch.tensor([0, 0, 100.0], dtype=dtype))
+    for splats in (select(behind, torch.zeros(5, dtype=torch.bool)), behind):
+        rendering = rasterizer(splats, camera)
+        _close(rendering.image, torch.tensor(background, dtype=dtype).expand(11, 19, 3), 1e-7, "the background")
+        _require(float(rendering.alpha.abs().max()) == 0, "alpha is not 0 where nothing is")
+        gradients = rendering.vjp(torch.ones(2, 11, 19, 3, dtype=dtype))
+        for name in _ATTRIBUTES:
+            found = gradient_of(gradients, name)
+            _require(found.shape[:2] == (2, len(splats)), f"the gradient of {name} has shape {tuple(found.shape)}")
+            _require(found.numel() == 0 or float(found.abs().max()) == 0, f"the gradient of {name} is not 0")
+
+
+def check_tile_mask(make: Make) -> None:
+    """Tiles asked for are as without a mask, the others show the background and send no gradient."""
+    rasterizer = make(tile=8)
+    dtype = _widest(rasterizer)
+    splats, camera = scene(60, dtype=dtype), _camera(48, 33)
+    mask = torch.rand(5, 6, generator=torch.Generator().manual_seed(4)) < 0.5
+    pixels = mask.repeat_interleave(8, 0).repeat_interleave(8, 1)[:33, :48]
+    full, partial = rasterizer(splats, camera), rasterizer(splats, camera, tiles=mask)
+    _close(partial.image[pixels], full.image[pixels], 1e-6, "pixels asked for")
+    _require(float(partial.image[~pixels].abs().max()) == 0, "pixels not asked for are not background")
+    v = torch.randn(1, 33, 48, 3, generator=torch.Generator().manual_seed(5)).to(dtype)
+    found, expected = partial.vjp(v), full.vjp(v * pixels[None, :, :, None])
+    for name in _ATTRIBUTES:
+        _close(gradient_of(found, name), gradient_of(expected, name), 1e-5, f"the gradient of {name} under a mask")
+
+
+def check_equal_depths_have_an_order(make: Make) -> None:
+    """Coincident depths are drawn by index, whatever the number of threads: the same picture, bit for bit."""
+    rasterizer = make()
+    dtype = _widest(rasterizer)
+    splats = scene(40, dtype=dtype)
+    splats = replace(splats, means=torch.cat((splats.means[:, :2], torch.full((40, 1), 5.0, dtype=dtype)), 1))
+    first, second = (rasterizer(splats, _camera(32, 32)).image for _ in range(2))
+    _require(bool((first == second).all()), "two renderings of one scene differ")
+
+
+def check_agrees_with_the_reference(make: Make) -> None:
+    """Picture and gradients of the float64 reference, at the default cut-offs, for SH degrees 0 to 3."""
+    rasterizer = make()
+    for bands in (0, 3, 8, 15):
+        splats, camera = scene(300, bands=bands), _camera(65, 47)
+        exact = ReferenceRasterizer()(to(splats, torch.float64), camera)
+        dtype = torch.float32 if torch.float32 in rasterizer.traits.dtypes else torch.float64
+        found = rasterizer(to(splats, dtype), camera)
+        error = (found.image.double() - exact.image).abs()
+        _require(float((error <= 5e-6).double().mean()) >= 0.999, f"{bands} bands: more than 0.1 % of values are off")
+        _require(float(error.max()) <= 8e-3, f"{bands} bands: a value is off by {float(error.max()):.2g}")
+        v = torch.randn(1, 47, 65, 3, generator=torch.Generator().manual_seed(6))
+        ours, truth = found.vjp(v.to(dtype)), exact.vjp(v.double())
+        for name in (*_ATTRIBUTES, "screen"):
+            _close(
+                gradient_of(ours, name).double(), gradient_of(truth, name), 1e-3, f"{bands} bands: gradient of {name}"
+            )
+
+
+CHECKS: Final[Sequence[Callable[[Make], None]]] = (
+    check_gradients_are_finite_differences,
+    check_cotangents_together_equal_one_by_one,
+    check_dropped_equals_absent,
+    check_nothing_to_draw,
+    check_tile_mask,
+    check_equal_depths_have_an_order,
+    check_agrees_with_the_reference,
+)
+
+
+def scene(n: int, *, seed: int = 0, bands: int = 3, dtype: torch.dtype = torch.float32) -> Splats:
+    """Anisotropic Gaussians of mixed size and opacity in front of `_camera`, some off-screen."""
+    g = torch.Generator().manual_seed(seed)
+    z = 2 + 4 * torch.rand(n, 1, generator=g)
+    means = torch.cat(((torch.rand(n, 2, generator=g) - 0.5) * 1.6 * z, z), dim=1)
+    splats = Splats(
+        means=means,
+        quats=torch.randn(n, 4, generator=g),
+        scales=torch.exp(torch.randn(n, 3, generator=g) * 0.6 - 2.2) * z / 3,
+        opacities=torch.sigmoid(torch.randn(n, generator=g) * 1.5 + 0.5),
+        sh0=torch.randn(n, 1, 3, generator=g),
+        shN=torch.randn(n, bands, 3, generator=g) * 0.2,
+        rgb_offset=torch.randn(n, 3, generator=g) * 0.1,
+    )
+    return to(splats, dtype)
+
+
+def to(splats: Splats, dtype: torch.dtype) -> Splats:
+    """The splats in another precision."""
+    return _map(splats, lambda x: x.to(dtype))
+
+
+def select(splats: Splats, rows: Tensor) -> Splats:
+    """Some of the splats."""
+    return _map(splats, lambda x: x[rows])
+
+
+def gradient_of(gradients: SplatGradients, name: str) -> Tensor:
+    """A gradient by the attribute's name; `rgb_offset` has the colour's."""
+    found: Tensor = getattr(gradients, "rgb" if name == "rgb_offset" else name)
+    return found
+
+
+def _map(splats: Splats, f: Callable[[Tensor], Tensor]) -> Splats:
+    changed: dict[str, Any] = {
+        name: f(getattr(splats, name)) for name in _ATTRIBUTES if getattr(splats, name) is not None
+    }
+    return replace(splats, **changed)
+
+
+def _camera(width: int, height: int) -> Camera:
+    return Camera(torch.eye(4), 0.9 * width, 0.9 * width, 0.52 * width, 0.47 * height, width, height)
+
+
+def _widest(rasterizer: Rasterizer) -> torch.dtype:
+    return torch.float64 if torch.float64 in rasterizer.traits.dtypes else torch.float32
+
+
+def _close(found: Tensor, expected: Tensor, tolerance: float, what: str) -> None:
+    """Relative in the L2 norm, so that rounding of tiny entries does not count."""
+    scale = float(torch.linalg.vector_norm(expected)) or 1.0
+    error = float(torch.linalg.vector_norm(found - expected)) / scale
+    _require(math.isfinite(error) and error <= tolerance, f"{what}: relative error {error:.3g}, allowed {tolerance:g}")
+
+
+def _require(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise ContractError(otherwise)

@@ -1,0 +1,177 @@
+"""The reference rasterizer: the public contract, and what only the specification has to show."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import rasterizers
+from rasterizers import Camera, Splats
+from rasterizers.geometry import SH_C0, rotation_matrix, spherical_harmonics
+from rasterizers.reference import ReferenceRasterizer
+from rasterizers.testing import CHECKS, ContractError, check_rasterizer, scene, to
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
+def test_contract(check):
+    check(lambda **settings: rasterizers.load("torch", **settings))
+
+
+def test_the_contract_can_fail():
+    class Wrong:
+        """Forgets the background."""
+
+        def __init__(self, **settings):
+            settings["background"] = (0.0, 0.0, 0.0)
+            self.inner = rasterizers.load("torch", **settings)
+            self.traits = self.inner.traits
+
+        def __call__(self, *arguments, **options):
+            return self.inner(*arguments, **options)
+
+        def render_scales(self, jobs):
+            return self.inner.render_scales(jobs)
+
+    with pytest.raises(ContractError, match="background"):
+        check_rasterizer(Wrong)
+
+
+def one(opacity=0.8, scale=0.1, color=0.5, z=2.0, dtype=torch.float64) -> Splats:
+    """A grey ball in the middle of the view."""
+    return Splats(
+        means=torch.tensor([[0.0, 0.0, z]], dtype=dtype),
+        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=dtype),
+        scales=torch.full((1, 3), scale, dtype=dtype),
+        opacities=torch.tensor([opacity], dtype=dtype),
+        sh0=torch.full((1, 1, 3), (color - 0.5) / SH_C0, dtype=dtype),
+        shN=torch.zeros(1, 0, 3, dtype=dtype),
+    )
+
+
+def odd_camera(focal=40.0) -> Camera:
+    """The centre of pixel (10, 10) looks straight ahead."""
+    return Camera(torch.eye(4), focal, focal, 10.5, 10.5, 21, 21)
+
+
+def test_a_ball_has_the_opacity_that_mip_splatting_gives_it():
+    # σ' = f s / z = 40 · 0.1 / 2 = 2 px; with the kernel σ'² = 4.1; compensation √(16 / 16.81) = 4 / 4.1.
+    rendering = rasterizers.load("torch")(one(), odd_camera())
+    assert rendering.alpha[10, 10] == pytest.approx(0.8 * 4 / 4.1, rel=1e-12)
+    assert rendering.image[10, 10, 0] == pytest.approx(0.5 * 0.8 * 4 / 4.1, rel=1e-12)
+    assert rendering.alpha[10, 12] == pytest.approx(0.8 * 4 / 4.1 * math.exp(-0.5 * 4 / 4.1), rel=1e-12)
+    assert rendering.means2d[0].tolist() == [10.5, 10.5]
+
+
+def test_the_nearer_ball_covers_the_farther():
+    near, far = one(opacity=0.5, color=1.0, z=2.0), one(opacity=0.9, color=0.2, z=3.0)
+    both = Splats(*(torch.cat((getattr(far, f), getattr(near, f))) for f in Splats.__slots__[:6]))
+    settings = {"kernel": 0.0, "antialiased": False}
+    pixel = rasterizers.load("torch", **settings)(both, odd_camera()).image[10, 10, 0]
+    assert pixel == pytest.approx(0.5 * 1.0 + 0.5 * 0.9 * 0.2, rel=1e-12)
+
+
+def test_alpha_is_capped_and_opacity_is_not():
+    rendering = rasterizers.load("torch", kernel=0.0)(one(opacity=1.25), odd_camera())
+    assert rendering.alpha[10, 10] == pytest.approx(0.99)
+    assert rendering.alpha[10, 12] == pytest.approx(1.25 * math.exp(-0.5), rel=1e-12)
+
+
+def test_a_pixel_ends_before_its_transmittance_falls_below_the_limit():
+    stack = one(opacity=0.9)
+    five = Splats(*(getattr(stack, f).repeat(5, *[1] * (getattr(stack, f).dim() - 1)) for f in Splats.__slots__[:6]))
+    # The transmittance goes 0.1, 0.01, 0.001, …: the last one not below the limit stays.
+    for limit, left in ((5e-4, 1e-3), (5e-3, 1e-2), (0.5, 1.0)):
+        rasterizer = rasterizers.load("torch", kernel=0.0, transmittance_min=limit)
+        assert 1 - rasterizer(five, odd_camera()).alpha[10, 10] == pytest.approx(left, rel=1e-9)
+
+
+@pytest.mark.parametrize("tile", [4, 8, 16, 32])
+@pytest.mark.parametrize("lanes", [1, 4096, 1 << 20])
+def test_tiles_and_batches_do_not_change_the_picture(tile, lanes):
+    splats, camera = scene(200, dtype=torch.float64), Camera(torch.eye(4), 40.0, 40.0, 20.0, 15.0, 41, 33)
+    expected = rasterizers.load("torch", tile=8)(splats, camera)
+    found = rasterizers.load("torch", tile=tile, lanes=lanes)(splats, camera)
+    assert torch.allclose(found.image, expected.image, atol=1e-14)
+    v = torch.ones(1, 33, 41, 3, dtype=torch.float64)
+    assert torch.allclose(found.vjp(v).means, expected.vjp(v).means, rtol=1e-9, atol=1e-12)
+
+
+def test_scaled_cameras_see_the_same_rays():
+    camera = Camera(torch.eye(4), 40.0, 44.0, 17.0, 15.0, 40, 32)
+    small = camera.scaled(1 / 4)
+    assert (small.fx, small.fy, small.cx, small.cy, small.width, small.height) == (10.0, 11.0, 4.25, 3.75, 10, 8)
+    with pytest.raises(ValueError, match="whole number of pixels"):
+        camera.scaled(1 / 3)
+
+
+def test_quaternions_of_any_length_turn_alike():
+    q = torch.tensor([[0.3, -0.2, 0.8, 0.1]])
+    expected = rotation_matrix(q)
+    for scale in (1e-30, 1e-10, 1e10, 1e18):
+        assert torch.allclose(rotation_matrix(q * scale), expected, atol=1e-6)
+    zero = torch.zeros(1, 4, requires_grad=True)
+    matrix = rotation_matrix(zero)
+    assert torch.equal(matrix[0], torch.eye(3))
+    (gradient,) = torch.autograd.grad(matrix.sum(), zero)
+    assert torch.equal(gradient, torch.zeros(1, 4))
+
+
+def test_spherical_harmonics_are_orthonormal():
+    g = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(200_000, 3, generator=g, dtype=torch.float64), dim=-1)
+    Y = spherical_harmonics(directions, 15)
+    gram = 4 * math.pi * Y.T @ Y / len(Y)
+    assert torch.allclose(gram, torch.eye(16, dtype=torch.float64), atol=0.03)
+
+
+def test_needles_keep_a_positive_determinant():
+    g = torch.Generator().manual_seed(0)
+    n = 200
+    splats = to(scene(n, seed=3), torch.float32)
+    needles = torch.stack((torch.full((n,), 1e-5), torch.full((n,), 1e-5), torch.rand(n, generator=g) * 10), dim=1)
+    splats = replace(splats, scales=needles)
+    rendering = rasterizers.load("torch")(splats, Camera(torch.eye(4), 500.0, 500.0, 32.0, 32.0, 64, 64))
+    gradients = rendering.vjp(torch.ones(1, 64, 64, 3))
+    assert rendering.image.isfinite().all()
+    assert all(getattr(gradients, name).isfinite().all() for name in ("means", "quats", "scales", "opacities", "rgb"))
+
+
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh0"])
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_number_that_is_not_finite_is_named(field, value):
+    splats = scene(10)
+    bad = getattr(splats, field).clone()
+    bad[7] = value
+    with pytest.raises(ValueError, match=rf"splats\.{field} must be finite; Gaussian 7"):
+        rasterizers.load("torch")(replace(splats, **{field: bad}), odd_camera())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"kernel": -1}, "kernel must be"),
+        ({"near": 0}, "near must be"),
+        ({"alpha_min": 0}, "alpha_min"),
+        ({"alpha_max": 1.5}, "alpha_max"),
+        ({"tile": 0}, "tile must be"),
+        ({"background": (0, 0, 2)}, "background must be"),
+        ({"kernels": 0.1}, "unknown rasterizer setting 'kernels'"),
+    ],
+)
+def test_settings_outside_their_range_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        rasterizers.load("torch", **settings)
+
+
+def test_an_unknown_backend_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match="choose one of auto, torch"):
+        rasterizers.load("cuda")
+    assert rasterizers.available()["torch"] is None
+
+
+def test_lanes_must_be_positive():
+    with pytest.raises(ValueError, match="lanes"):
+        ReferenceRasterizer(lanes=0)

@@ -1,0 +1,229 @@
+"""The conductor: Eq. 8 and 13, exclusivity, and the strategies' contract."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+import toy
+from torch import Tensor
+
+from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, Strategy, StrategyConflict, kernels
+from clear_strategies.field import GaussianField
+from clear_strategies.schedules import WarmupDecay
+from clear_strategies.testing import CHECKS, ContractError, check_strategy
+
+ALWAYS = WarmupDecay(start=0, full=1, decay_from=10, end=10)
+
+
+@dataclass(frozen=True)
+class Halve(Strategy):
+    """A strategy of somebody else: half of every HR gradient."""
+
+    share: float = 0.5
+
+    def correct(self, lr, hr, evidence):
+        return hr * self.share
+
+
+@pytest.mark.parametrize(
+    "make", [GCO, P2G, SVS, Halve, lambda: SVS(anchor_strength=0.0)], ids=["GCO", "P2G", "SVS", "own", "loose"]
+)
+@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
+def test_contract(make, check):
+    check(make)
+
+
+@dataclass(frozen=True)
+class Careless(Strategy):
+    """Changes what it was only shown."""
+
+    def correct(self, lr, hr, evidence):
+        hr["means"] *= 2
+        return hr
+
+
+@dataclass(frozen=True)
+class Forgetful(Strategy):
+    """Draws from global random state."""
+
+    def gate(self, t, n):
+        return (torch.rand(n) > 0.5).float()
+
+
+@dataclass(frozen=True)
+class Secretive(Strategy):
+    """Remembers outside `state`."""
+
+    def score(self, evidence, screens):
+        self.cache["calls"] = self.cache.get("calls", 0) + 1
+        return screens.ordinary * self.cache["calls"]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [(Careless, "changed in place"), (Forgetful, "derive randomness"), (Secretive, "does not continue")],
+)
+def test_the_contract_can_fail(make, message):
+    with pytest.raises(ContractError, match=message):
+        check_strategy(make)
+
+
+def field_and_view(dtype=torch.float64, degree=1):
+    scene = toy.scene()
+    field = GaussianField.from_cloud(scene.cloud)
+    g = torch.Generator().manual_seed(3)
+    for value in field.raw().values():
+        value.add_(torch.randn(value.shape, generator=g), alpha=0.05)
+    field.degree = degree
+    field.update_filter([v.hr.camera for v in scene.train], 0.2)
+    return field.to(dtype), scene.train[1]
+
+
+def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective, λ: float) -> Grads:
+    """The same loss, told to autograd: every step from raw parameters to images by torch's own derivatives."""
+    raw = {name: value.clone().requires_grad_() for name, value in field.raw().items()}
+    scales = torch.hypot(raw["scales"].exp(), field.filter_3d[:, None])
+    opacities = raw["opacities"].sigmoid() * (raw["scales"].exp() / scales).prod(-1)
+    bands = (field.degree + 1) ** 2 - 1
+
+    class Draw(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, camera, *inputs):
+            from rasterizers import Splats
+
+            ctx.rendering = toy.RASTERIZER(Splats(*inputs), camera)
+            return ctx.rendering.image
+
+        @staticmethod
+        def backward(ctx, cotangent):
+            g = ctx.rendering.vjp(cotangent[None])
+            values = (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN, g.rgb)
+            return None, *(v[0] for v in values)
+
+    class Loss(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, kernel, x, y):
+            value, ctx.gradient = kernel(x, y)
+            return value
+
+        @staticmethod
+        def backward(ctx, cotangent):
+            return None, cotangent * ctx.gradient, None
+
+    def photometric(x: Tensor, y: Tensor) -> Tensor:
+        return 0.8 * Loss.apply(kernels.l1, x, y) + 0.2 * (1 - Loss.apply(kernels.ssim, x, y))
+
+    common = (raw["means"], raw["quats"], scales, opacities, raw["sh0"], raw["shN"][:, :bands])
+    zero = torch.zeros_like(raw["detail"])
+    lr = Draw.apply(view.lr.camera, *common, zero)
+    hr = Draw.apply(view.hr.camera, *common, raw["detail"])
+    loss = photometric(lr, view.lr.image.double()) + λ * (
+        photometric(hr, view.hr.image.double())
+        + objective.lambda_hf * Loss.apply(kernels.haar_l1, hr, view.hr.image.double())
+    )
+    gradients = torch.autograd.grad(loss, list(raw.values()))
+    return Grads(dict(zip(raw, gradients, strict=True)))
+
+
+@pytest.mark.parametrize("hf", [0.2, 0.0])
+def test_without_strategies_it_is_autograd_of_the_summed_loss(hf):
+    field, view = field_and_view()
+    objective = Objective(lambda_hr=ALWAYS, lambda_hf=hf)
+    conductor = Conductor(objective=objective)
+    lr, hr = field.render_scales(toy.RASTERIZER, view)
+    view = _double(view)
+    found = conductor.update(field.raw(), lr, hr, view, 5).grads
+    expected = autograd_of_the_summed_loss(field, view, objective, 1.0)
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        scale = float(expected[name].abs().max())
+        assert torch.allclose(found[name], expected[name], atol=1e-9 * scale, rtol=1e-7), name
+
+
+def test_the_detail_feature_moves_by_routed_high_frequencies_alone():
+    field, view = field_and_view()
+    view = _double(view)
+    objective = Objective(lambda_hr=ALWAYS)
+    lr, hr = field.render_scales(toy.RASTERIZER, view)
+    p2g = P2G()
+    update = Conductor(GCO(), p2g, objective=objective).update(field.raw(), lr, hr, view, 5)
+    _, g_hf = hr.pull(objective.hr(hr.image, view.hr.image).cotangents)
+    m = p2g.route(update.evidence)
+    assert torch.allclose(update.grads["detail"], 0.2 * m[:, None] * g_hf["detail"], rtol=1e-6, atol=1e-15)
+    without = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0))
+    lr, hr = field.render_scales(toy.RASTERIZER, view)
+    assert "detail" not in without.update(field.raw(), lr, hr, view, 5).grads
+
+
+def test_routing_weighs_the_high_frequency_gradient_only():
+    field, view = field_and_view()
+    view = _double(view)
+    objective = Objective(lambda_hr=ALWAYS)
+    lr, hr = field.render_scales(toy.RASTERIZER, view)
+    p2g = P2G()
+    update = Conductor(p2g, objective=objective).update(field.raw(), lr, hr, view, 5)
+    (g_lr,) = lr.pull(objective.lr(lr.image, view.lr.image).cotangents)
+    g_base, g_hf = hr.pull(objective.hr(hr.image, view.hr.image).cotangents)
+    m = p2g.route(update.evidence)[:, None]
+    expected = g_lr["means"] + g_base["means"] + 0.2 * m * g_hf["means"]
+    assert torch.allclose(update.grads["means"], expected, rtol=1e-6, atol=1e-15)
+
+
+def test_two_owners_of_one_question_are_refused():
+    with pytest.raises(StrategyConflict, match=r"GCO and Halve both implement correct\(\)"):
+        Conductor(GCO(), Halve())
+
+
+def test_the_order_of_strategies_does_not_matter():
+    field, view = field_and_view()
+    view = _double(view)
+    grads = []
+    for strategies in ((GCO(), P2G(), SVS()), (SVS(), P2G(), GCO())):
+        lr, hr = field.render_scales(toy.RASTERIZER, view)
+        grads.append(
+            Conductor(*strategies, objective=Objective(lambda_hr=ALWAYS)).update(field.raw(), lr, hr, view, 5).grads
+        )
+    assert all(torch.equal(grads[0][name], grads[1][name]) for name in grads[0])
+
+
+def test_hr_is_wanted_only_while_it_has_a_use():
+    objective = Objective(lambda_hr=WarmupDecay(start=10, full=20, decay_from=30, end=40))
+    plain = Conductor(objective=objective, statistics_from=5)
+    assert [plain.wants_hr(t) for t in (5, 6, 10, 11)] == [False, False, False, True]
+    scoring = Conductor(P2G(), objective=objective, statistics_from=5)
+    assert [scoring.wants_hr(t) for t in (5, 6, 10, 11)] == [False, True, True, True]
+    never = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0)))
+    assert not any(never.wants_hr(t) for t in range(0, 10_000, 100))
+
+
+def test_conflict_is_measured_before_correction_and_for_the_baseline_too():
+    field, view = field_and_view()
+    view = _double(view)
+    ratios = []
+    for strategies in ((), (GCO(),)):
+        lr, hr = field.render_scales(toy.RASTERIZER, view)
+        conductor = Conductor(*strategies, objective=Objective(lambda_hr=ALWAYS))
+        ratios.append(conductor.update(field.raw(), lr, hr, view, 5).conflict)
+    assert ratios[0] == ratios[1]
+    assert set(ratios[0]) == {"means", "sh0", "shN", "opacities", "scales", "quats", "gaussian"}
+    assert 0 < max(ratios[0].values()) < 1
+
+
+def test_a_strategy_without_hooks_is_warned_of(caplog):
+    @dataclass(frozen=True)
+    class Idle(Strategy):
+        pass
+
+    Conductor(Idle())
+    assert "Idle implements no hook" in caplog.text
+
+
+def _double(view):
+    from dataclasses import replace
+
+    from clear_strategies.data.view import Photo
+
+    return replace(
+        view, lr=Photo(view.lr.camera, view.lr.image.double()), hr=Photo(view.hr.camera, view.hr.image.double())
+    )

@@ -1,0 +1,200 @@
+"""GCO: Eq. 6, 7 and 11 by property and by hand-computed values."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from clear_strategies import CONFLICT_GROUPS, GCO, Evidence, Grads
+
+WIDTHS = {"means": (3,), "sh0": (1, 3), "shN": (15, 3), "opacities": (), "scales": (3,), "quats": (4,)}
+
+
+def grads(group: str, *rows: Tensor) -> Grads:
+    return Grads({group: torch.stack(rows).view(len(rows), *WIDTHS[group])})
+
+
+def random_pair(seed: int, n: int = 200, norm_lr: float = 1.0, norm_hr: float = 1.0) -> tuple[Grads, Grads]:
+    g = torch.Generator().manual_seed(seed)
+    lr = Grads({name: norm_lr * torch.randn(n, *shape, generator=g) for name, shape in WIDTHS.items()})
+    hr = Grads({name: norm_hr * torch.randn(n, *shape, generator=g) for name, shape in WIDTHS.items()})
+    return lr, hr
+
+
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    return (a.double() * b.double()).flatten(1).sum(1) if a.dim() > 1 else a.double() * b.double()
+
+
+def test_values_worked_out_by_hand():
+    # l = (1, 0, 0), h = (-3, 4, 0): c = -3/5, d = -3 + 0.05·5 = -2.75, s = (0.6 - 0.05) / 0.95.
+    l, h = torch.tensor([1.0, 0, 0]), torch.tensor([-3.0, 4, 0])
+    s = 0.55 / 0.95
+    assert 0.05 < s < 0.75
+    found = GCO(eps="relative:0").correct(grads("means", l), grads("means", h), None)["means"][0]
+    assert found.tolist() == pytest.approx([-3 + s * 2.75, 4, 0], rel=1e-6)
+
+
+def test_reliability_softens_the_correction_and_the_lower_bound_holds():
+    l, h = torch.tensor([1.0, 0, 0]), torch.tensor([-3.0, 4, 0])
+    for q, omega in ((0.5, 0.5 * 0.55 / 0.95), (1.0, 0.05), (0.0, 0.55 / 0.95)):
+        evidence = Evidence(torch.tensor([q]), torch.tensor([1.0]))
+        found = GCO(eps="relative:0").correct(grads("means", l), grads("means", h), evidence)["means"][0]
+        assert float(found[0]) == pytest.approx(-3 + omega * 2.75, rel=1e-6)
+
+
+def test_opposite_gradients_are_corrected_up_to_the_upper_bound():
+    found = GCO(eps="relative:0").correct(
+        Grads({"opacities": torch.tensor([2.0])}), Grads({"opacities": torch.tensor([-1.0])}), None
+    )
+    # c = -1, s = 1 -> ω = 0.75; d = -2 + 0.05·2 = -1.9; -1 + 0.75·1.9/4·2
+    assert float(found["opacities"]) == pytest.approx(-1 + 0.75 * 1.9 / 2, rel=1e-6)
+
+
+@given(seed=st.integers(0, 10_000), tolerance=st.floats(0, 0.9))
+@settings(max_examples=30, deadline=None)
+def test_full_correction_lands_on_the_margin(seed, tolerance):
+    lr, hr = random_pair(seed)
+    whole = GCO(tolerance=tolerance, weight_min=1.0, weight_max=1.0, eps="relative:0").correct(lr, hr, None)
+    for group in CONFLICT_GROUPS:
+        n = dot(lr[group], lr[group]).sqrt() * dot(hr[group], hr[group]).sqrt()
+        conflict = dot(lr[group], hr[group]) < -(tolerance + 1e-9) * n
+        if group == "quats":
+            continue
+        after = dot(lr[group], whole[group])
+        assert torch.allclose(after[conflict], -tolerance * n[conflict], rtol=1e-5, atol=float(n.max()) * 1e-6)
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_rows_without_conflict_are_bitwise_untouched_and_lr_always_is(seed):
+    lr, hr = random_pair(seed)
+    before = {name: value.clone() for name, value in lr.items()}
+    found = GCO().correct(lr, hr, None)
+    for group in CONFLICT_GROUPS:
+        c = dot(lr[group], hr[group]) / (dot(lr[group], lr[group]).sqrt() * dot(hr[group], hr[group]).sqrt())
+        calm = c >= -0.05 + 1e-9
+        assert torch.equal(found[group][calm], hr[group][calm])
+        assert torch.equal(lr[group], before[group])
+
+
+def test_weight_zero_changes_nothing():
+    lr, hr = random_pair(1)
+    found = GCO(weight_min=0.0, weight_max=0.0).correct(lr, hr, None)
+    assert all(torch.equal(found[group], hr[group]) for group in CONFLICT_GROUPS)
+
+
+@given(seed=st.integers(0, 1_000))
+@settings(max_examples=20, deadline=None)
+def test_correction_helps_lr_and_never_lengthens_more_than_the_gradient(seed):
+    lr, hr = random_pair(seed)
+    found = GCO().correct(lr, hr, None)
+    for group in CONFLICT_GROUPS:
+        assert (dot(found[group], lr[group]) >= dot(hr[group], lr[group]) - 1e-6).all()
+        assert (dot(found[group], found[group]) <= dot(hr[group], hr[group]) * (1 + 1e-6)).all()
+
+
+@given(seed=st.integers(0, 1_000), i=st.integers(-60, 60), j=st.integers(-60, 60))
+@settings(max_examples=60, deadline=None)
+def test_decisions_do_not_change_when_a_loss_is_scaled_by_a_power_of_two(seed, i, j):
+    lr, hr = random_pair(seed, n=50)
+    found = GCO().correct(lr, hr, None)
+    scaled = GCO().correct(lr * 2.0**i, hr * 2.0**j, None)
+    for group in CONFLICT_GROUPS:
+        assert torch.equal(scaled[group], found[group] * 2.0**j), group
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e-6, 1e-12, 1e3])
+def test_decisions_do_not_change_with_the_unit_of_the_losses(factor):
+    lr, hr = random_pair(3)
+    found, scaled = GCO().correct(lr, hr, None), GCO().correct(lr * factor, hr * factor, None)
+    for group in CONFLICT_GROUPS:
+        moved = (found[group] != hr[group]).flatten(1).any(1) if hr[group].dim() > 1 else found[group] != hr[group]
+        after = scaled[group] != (hr * factor)[group]
+        assert torch.equal(after.flatten(1).any(1) if after.dim() > 1 else after, moved)
+
+
+@pytest.mark.parametrize("norm", [1e-38, 1e-30, 1e-20, 1e-6, 1.0, 1e6, 1e15])
+def test_accurate_at_every_scale_of_gradients(norm):
+    lr, hr = random_pair(4, norm_lr=norm, norm_hr=norm)
+    found = GCO(eps="relative:0").correct(lr, hr, None)
+    for group in CONFLICT_GROUPS:
+        l, h = lr[group].double().reshape(200, -1), hr[group].double().reshape(200, -1)
+        n = l.norm(dim=1) * h.norm(dim=1)
+        c = (l * h).sum(1) / n
+        omega = ((-c - 0.05) / 0.95).clamp(0, 1).clamp(0.05, 0.75) * (c < -0.05)
+        expected = h - (omega * ((l * h).sum(1) + 0.05 * n) / (l * l).sum(1))[:, None] * l
+        error = (found[group].double().reshape(200, -1) - expected).norm(dim=1) / h.norm(dim=1)
+        if norm > 1e-37:  # below, float32 itself is subnormal
+            assert float(error.max()) < 1.2e-7
+
+
+def test_zero_gradients_are_no_conflict():
+    zero, some = torch.zeros(3), torch.tensor([1.0, 2, 3])
+    for l, h in ((zero, some), (some, zero), (zero, zero)):
+        found = GCO().correct(grads("means", l), grads("means", h), None)["means"]
+        assert torch.equal(found[0], h)
+        assert found.isfinite().all()
+
+
+def test_rotation_noise_of_isotropic_gaussians_is_gated():
+    lr, hr = random_pair(5, norm_lr=1e-6, norm_hr=1e-6)
+    lr["quats"], hr["quats"] = lr["quats"] * 1e-7, hr["quats"] * 1e-7
+    gco = GCO()
+    found = gco.correct(lr, hr, None)
+    assert torch.equal(found["quats"], hr["quats"])
+    assert gco.readings["corrected_quats"] == 0
+    assert gco.readings["corrected_scales"] > 0
+
+
+def test_the_detail_feature_is_never_touched():
+    lr, hr = random_pair(6)
+    hr["detail"] = torch.randn(200, 3)
+    lr["detail"] = -hr["detail"]
+    assert torch.equal(GCO().correct(lr, hr, None)["detail"], hr["detail"])
+
+
+def test_an_absolute_epsilon_that_disables_correction_is_warned_of(caplog):
+    lr, hr = random_pair(7, norm_lr=1e-6, norm_hr=1e-6)
+    with caplog.at_level(logging.WARNING):
+        found = GCO(eps="absolute:1e-8").correct(lr, hr, None)
+    assert torch.equal(found["means"], hr["means"])
+    assert "cannot fire for means" in caplog.text
+
+
+def test_a_prior_that_agrees_with_lr_makes_it_inactive_and_says_so(caplog):
+    lr, hr = random_pair(8)
+    evidence = Evidence(torch.full((200,), 0.99), torch.ones(200))
+    with caplog.at_level(logging.INFO):
+        gco = GCO()
+        gco.correct(lr, hr, evidence)
+        gco.correct(lr, hr, evidence)
+    assert caplog.text.count("GCO is inactive") == 1
+    assert gco.readings["mean_omega"] == pytest.approx(0.05, abs=1e-3)
+
+
+def test_the_rival_reading_bounds_the_coefficient():
+    l, h = torch.tensor([1.0, 0, 0]), torch.tensor([-30.0, 40, 0])
+    found = GCO(bound="coefficient", eps="relative:0").correct(grads("means", l), grads("means", h), None)["means"]
+    assert float(found[0, 0]) == pytest.approx(-30 + 0.75)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"tolerance": 1.2}, r"tolerance must lie in \[0, 1\), got 1.2"),
+        ({"tolerance": math.nan}, "tolerance"),
+        ({"weight_min": 0.8}, "weight_min <= weight_max"),
+        ({"eps": "1e-8"}, "eps must be"),
+        ({"eps": "relative:-1"}, "eps must be"),
+        ({"groups": ("means", "colour")}, "groups must be among"),
+    ],
+)
+def test_settings_outside_their_range_are_refused(setting, message):
+    with pytest.raises(ValueError, match=message):
+        GCO(**setting)

@@ -1,0 +1,111 @@
+"""P2G: Eq. 9, 10, 12 and 14."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+import toy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clear_strategies import P2G, Evidence, Screens, images
+from clear_strategies.evidence import lift
+from clear_strategies.field import GaussianField
+from clear_strategies.p2g import patch_evidence
+
+
+def test_reliability_is_one_where_the_reference_agrees_with_lr():
+    hr = images.quantize(torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)))
+    for kernel in ("bicubic", "bilinear", "lanczos", "area"):
+        R, _ = patch_evidence(images.downsample(hr, 4, kernel), hr, 4, down=kernel)
+        assert torch.allclose(R, torch.ones_like(R), atol=1e-6)
+
+
+def test_reliability_worked_out_by_hand():
+    # The reference is brighter by 0.05 in the left half: R = exp(-1) there, 1 in the right half.
+    lr, hr = torch.full((16, 32, 3), 0.4), torch.full((64, 128, 3), 0.4)
+    hr[:, :64] += 0.05
+    R, _ = patch_evidence(lr, hr, 4, down="area")
+    assert R.shape == (1, 2)
+    assert R[0].tolist() == pytest.approx([math.exp(-1), 1.0], rel=1e-5)
+
+
+def test_flat_references_demand_nothing_and_one_textured_patch_everything():
+    flat = torch.full((128, 128, 3), 0.6)
+    _, A = patch_evidence(images.downsample(flat, 4), flat, 4)
+    assert float(A.abs().max()) < 1e-3
+    textured = flat.clone()
+    textured[:64, :64] += 0.2 * (torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)) - 0.5)
+    _, A = patch_evidence(images.downsample(textured, 4), textured, 4)
+    assert A[0, 0] == 1
+    assert float(A[1, 1]) < 1e-3
+
+
+def test_a_patch_with_the_mean_detail_demands_one_half():
+    noise = torch.rand(128, 128, 3, generator=torch.Generator().manual_seed(0))
+    _, A = patch_evidence(images.downsample(noise, 4), noise, 4)
+    assert torch.allclose(A, torch.full_like(A, 0.5), atol=0.03)
+
+
+def test_images_in_eight_bit_units_are_refused():
+    with pytest.raises(ValueError, match=r"I_HR must lie in \[0, 1\]"):
+        patch_evidence(torch.rand(16, 16, 3), 255 * torch.rand(64, 64, 3), 4)
+
+
+def test_lifting_takes_the_patch_of_the_centre_and_the_border_outside():
+    patches = torch.tensor([[0.1, 0.2], [0.3, 0.4]])
+    u = torch.tensor([[0.0, 0.0], [15.9, 15.9], [16.0, 0.0], [3.0, 20.0], [-50.0, 40.0], [99.0, 99.0], [20.0, 20.0]])
+    visible = torch.tensor([True] * 6 + [False])
+    found = lift(patches, u, visible, 16, (32, 32))
+    assert found.tolist() == pytest.approx([0.1, 0.1, 0.2, 0.3, 0.3, 0.4, 0.0])
+    neutral = lift(patches, u, visible, 16, (32, 32), outside="neutral")
+    assert neutral.tolist() == pytest.approx([0.1, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0])
+    between = lift(patches, torch.tensor([[16.0, 16.0], [8.0, 8.0]]), visible[:2], 16, (32, 32), lookup="bilinear")
+    assert between.tolist() == pytest.approx([0.25, 0.1])
+
+
+@given(q=st.floats(0, 1, width=32), a=st.floats(0, 1, width=32), floor=st.floats(0, 1))
+@settings(max_examples=50, deadline=None)
+def test_routing_lies_between_the_floor_and_one(q, a, floor):
+    m = P2G(floor=floor).route(Evidence(torch.tensor([q]), torch.tensor([a])))
+    assert float(m) == pytest.approx(floor + (1 - floor) * q * a, rel=1e-5, abs=1e-6)
+
+
+def test_observation_is_made_once_a_view_and_invisible_gaussians_have_none(caplog):
+    view = toy.scene().train[0]
+    _, shot = GaussianField.from_cloud(toy.scene().cloud).render_scales(toy.RASTERIZER, view)
+    p2g = P2G()
+    with caplog.at_level("INFO"):
+        first, second = p2g.observe(view, shot), p2g.observe(view, shot)
+    assert caplog.text.count(view.name) == 1
+    assert torch.equal(first.reliability, second.reliability)
+    assert not first.weight[~shot.visible].any()
+    assert (first.reliability[shot.visible] > 0).all()
+
+
+def screens(ordinary, hf):
+    n = len(ordinary)
+    return Screens(torch.zeros(n, 2), torch.zeros(n, 2), torch.tensor(hf), torch.tensor(ordinary))
+
+
+def test_scores():
+    e = Evidence(torch.tensor([1.0, 0.5]), torch.tensor([0.5, 0.5]))
+    s = screens([1.0, 3.0], [[3.0, 4.0], [0.0, 2.0]])
+    assert P2G(score_by="evidence").score(e, s).tolist() == pytest.approx([2.5, 0.5])
+    assert P2G(score_by="gradient").score(e, s) is None
+    # S has mean 1.5, the ordinary statistic 2: S counts 4/3.
+    assert P2G(score_by="sum").score(e, s).tolist() == pytest.approx([1 + 2.5 * 4 / 3, 3 + 0.5 * 4 / 3])
+    assert P2G(score_by="max").score(e, s).tolist() == pytest.approx([2.5 * 4 / 3, 3.0])
+    assert P2G().score(None, s) is None
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [{"reliability_scale": 0}, {"floor": 1.1}, {"patch": 0}, {"detail_eps": 0}],
+)
+def test_settings_outside_their_range_are_refused(setting):
+    (name,) = setting
+    with pytest.raises(ValueError, match=name):
+        P2G(**setting)

@@ -1,0 +1,127 @@
+"""SVS: Eq. 15 and 16."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import toy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clear_strategies import SVS, AnchorError
+from clear_strategies.field import GaussianField
+from clear_strategies.schedules import Ramp
+from clear_strategies.svs import PAPER_WEIGHTS, dropout_mask
+
+
+@given(p=st.floats(0, 0.95), seed=st.integers(0, 2**31), t=st.integers(1, 10_000))
+@settings(max_examples=50, deadline=None)
+def test_mask_is_zero_or_the_inverse_keep_rate(p, seed, t):
+    z = dropout_mask(500, p, seed, t)
+    assert bool(((z == 0) | ((z * (1 - p) - 1).abs() < 1e-5)).all())
+    assert torch.equal(z, dropout_mask(500, p, seed, t))
+
+
+def test_mask_has_its_rate_and_changes_with_seed_and_iteration():
+    assert float((dropout_mask(100_000, 0.2, 0, 1) == 0).float().mean()) == pytest.approx(0.2, abs=0.005)
+    assert not torch.equal(dropout_mask(1000, 0.2, 0, 1), dropout_mask(1000, 0.2, 0, 2))
+    assert not torch.equal(dropout_mask(1000, 0.2, 0, 1), dropout_mask(1000, 0.2, 1, 1))
+
+
+def test_both_scales_lose_the_same_gaussians():
+    scene = toy.scene()
+    field = GaussianField.from_cloud(scene.cloud)
+    z = dropout_mask(len(field), 0.5, 0, 1)
+    lr, hr = field.render_scales(toy.RASTERIZER, scene.train[0], gate=z)
+    assert not lr.visible[z == 0].any()
+    assert not hr.visible[z == 0].any()
+    assert hr.visible[z > 0].any()
+
+
+def test_dropout_ramps_linearly_and_costs_nothing_at_rate_zero():
+    ramp = Ramp(maximum=0.2, full=100)
+    assert [ramp(0), ramp(50), ramp(100), ramp(200)] == pytest.approx([0, 0.1, 0.2, 0.2])
+    assert SVS(dropout=Ramp(maximum=0.0)).gate(5, 10) is None
+
+
+def params(n=20, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return {
+        "means": torch.randn(n, 3, generator=g), "scales": torch.randn(n, 3, generator=g),
+        "opacities": torch.randn(n, generator=g), "detail": torch.randn(n, 3, generator=g),
+    }  # fmt: skip
+
+
+def test_anchor_pulls_back_with_twice_the_weighted_distance():
+    svs = SVS(anchor_start=10, anchor_strength=0.01, anchor_weights={"scales": 0.5, "opacities": 0.1})
+    svs.on_fit_start(3, 0)
+    theta = params()
+    svs.after_step(theta, 9)
+    assert svs.regularize(theta, 10) is None
+    svs.after_step(theta, 10)
+    assert all(not g.any() for g in svs.regularize(theta, 11).values())
+    moved = {name: value + 0.3 for name, value in theta.items()}
+    g = svs.regularize(moved, 11)
+    assert set(g) == {"scales", "opacities"}
+    assert torch.allclose(g["scales"], torch.full((20, 3), 2 * 0.01 * 0.5 * 0.3), atol=1e-7)
+    assert torch.allclose(g["opacities"], torch.full((20,), 2 * 0.01 * 0.1 * 0.3), atol=1e-7)
+
+
+def test_anchored_positions_do_not_depend_on_the_unit_of_the_world():
+    for unit in (1.0, 1000.0):
+        svs = SVS(anchor_start=1, anchor_weights=PAPER_WEIGHTS)
+        svs.on_fit_start(3, 0)
+        theta = params()
+        theta["means"] = theta["means"] * unit
+        svs.after_step(theta, 1)
+        theta["means"] = theta["means"] * 1.1
+        pull = svs.regularize(theta, 2)["means"] * unit  # ∂/∂(x / unit)
+        if unit == 1.0:
+            expected = pull
+    assert torch.allclose(pull, expected, rtol=1e-4)
+
+
+def test_the_mean_reading_divides_by_the_number_of_gaussians():
+    pulls = []
+    for reduction in ("sum", "mean"):
+        svs = SVS(anchor_start=1, reduction=reduction)
+        svs.on_fit_start(3, 0)
+        theta = params()
+        svs.after_step(theta, 1)
+        theta["scales"] = theta["scales"] + 1
+        pulls.append(svs.regularize(theta, 2)["scales"])
+    assert torch.allclose(pulls[0], pulls[1] * 20)
+
+
+def test_densification_ends_when_the_anchor_is_taken():
+    svs = SVS(anchor_start=10)
+    assert svs.may_densify(9)
+    assert not svs.may_densify(10)
+
+
+def test_a_changed_number_of_gaussians_under_an_anchor_is_an_error():
+    svs = SVS(anchor_start=5)
+    svs.on_fit_start(3, 0)
+    svs.after_step(params(), 5)
+    with pytest.raises(AnchorError, match="t=5 for 20 Gaussians, now there are 21"):
+        svs.regularize(params(21), 6)
+    with pytest.raises(AnchorError, match="Stop densification at t_a"):
+        svs.on_resize(torch.arange(19))
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"anchor_strength": -1}, "anchor_strength"),
+        ({"anchor_weights": {"mean": 1}}, "anchor_weights"),
+        ({"anchor_weights": {"means": -1}}, "anchor_weights"),
+    ],
+)
+def test_settings_outside_their_range_are_refused(setting, message):
+    with pytest.raises(ValueError, match=message):
+        SVS(**setting)
+
+
+def test_a_dropout_rate_of_one_is_refused():
+    with pytest.raises(ValueError, match=r"\[0, 1\)"):
+        Ramp(maximum=1.0)
