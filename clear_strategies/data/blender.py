@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from pathlib import Path
 from typing import Final
@@ -9,14 +10,21 @@ from typing import Final
 from clear_strategies.data import strict_json
 from clear_strategies.data.cameras import Lens, by_name, make_frame, pose_from_opengl
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.photo_files import image_size, inside
+from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
 from clear_strategies.errors import DataError
+
+_log = logging.getLogger(__name__)
 
 _WHITE: Final = (1.0, 1.0, 1.0)
 
 
-def read(root: str | Path) -> Capture:
+def read(root: str | Path, *, background: tuple[float, float, float] = _WHITE) -> Capture:
     """A scene folder; frames are named by their file (r_2), test frames get "test/" before it.
+
+    Frames keep the order of the files, which is the protocols' numbering: by name, r_10 would come before r_2.
+
+    Args:
+        background: RGB in [0, 1], under the images' alpha.
 
     Raises:
         DataError: something is missing or not what it should be.
@@ -24,15 +32,20 @@ def read(root: str | Path) -> Capture:
     root = Path(root)
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
-    train = _frames(root, root / "transforms_train.json", "train")
-    test = _frames(root, root / "transforms_test.json", "test")
-    # The order of the file is the protocol's numbering; by_name only guards against two frames of one name.
-    by_name([*train, *test], root)
-    notes = {"poses": "transforms_train.json, transforms_test.json", "background": "white under the images' alpha"}
-    return Capture(root.resolve().name, (*train, *test), None, _WHITE, notes)
+    frames = _frames(root, root / "transforms_train.json", "train", background)
+    files = ["transforms_train.json"]
+    if (root / "transforms_test.json").exists():
+        frames += _frames(root, root / "transforms_test.json", "test", background)
+        files.append("transforms_test.json")
+    else:
+        _log.warning("%s has no transforms_test.json: there are no test views.", root)
+    by_name(frames, root)  # refuses two frames of one name
+    color = "white" if background == _WHITE else f"RGB {background}"
+    notes = {"poses": ", ".join(files), "order": "of the files", "background": f"{color} under the images' alpha"}
+    return Capture(root.resolve().name, tuple(frames), None, background, notes)
 
 
-def _frames(root: Path, file: Path, split: str) -> list[Frame]:
+def _frames(root: Path, file: Path, split: str, background: tuple[float, float, float]) -> list[Frame]:
     content = strict_json.read_object(file)
     angle = strict_json.number(file, "camera_angle_x", content.get("camera_angle_x"))
     if not 0 < angle < math.pi:
@@ -40,11 +53,11 @@ def _frames(root: Path, file: Path, split: str) -> list[Frame]:
     frames = []
     for i, frame in enumerate(strict_json.frames_of(file, content)):
         name = strict_json.file_path(file, i, frame)
-        path = inside(root, name if Path(name).suffix else f"{name}.png", file=file)
+        path = inside(root, name if name.lower().endswith(SUFFIXES) else f"{name}.png", file=file)
         pose = pose_from_opengl(file, f"frames[{i}].transform_matrix", frame.get("transform_matrix"))
         width, height = image_size(path)
         focal = width / (2 * math.tan(angle / 2))
         lens = Lens(width, height, focal, focal, width / 2, height / 2).check(file, "camera_angle_x")
         label = path.stem if split == "train" else f"{split}/{path.stem}"
-        frames.append(make_frame(label, path, lens, pose, background=_WHITE, split=split))
+        frames.append(make_frame(label, path, lens, pose, background=background, split=split))
     return frames

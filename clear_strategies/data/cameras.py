@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Final
 
@@ -20,6 +21,7 @@ from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
 
 _LARGEST_SIDE: Final = 1 << 20
+_BORDER_SAMPLES: Final = 33
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,58 +45,69 @@ class Lens:
         """Itself.
 
         Raises:
-            DataError: a number is not finite, a focal length or size not positive.
+            DataError: a number is not finite, or lies where no camera's does.
         """
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(math.isfinite(x) and abs(x) < 1e12 for x in numbers):
             raise DataError(file, where, f"has intrinsics that are not finite: {numbers}", "estimate the cameras again")
-        if not (self.fx > 0 and self.fy > 0):
-            problem = f"has focal lengths {self.fx:g}, {self.fy:g}; they must be > 0"
-            raise DataError(file, where, problem, "check the camera")
         if not (0 < self.width < _LARGEST_SIDE and 0 < self.height < _LARGEST_SIDE):
             raise DataError(file, where, f"has size {self.width}x{self.height}", "check the camera")
+        if not all(1e-3 < f / self.width < 1e6 for f in (self.fx, self.fy)):
+            problem = f"has focal lengths {self.fx:g}, {self.fy:g} px where the image is {self.width} px wide"
+            raise DataError(file, where, problem, "check the camera")
+        if not (-self.width < self.cx < 2 * self.width and -self.height < self.cy < 2 * self.height):
+            problem = f"has its principal point ({self.cx:g}, {self.cy:g}) px far outside the image"
+            raise DataError(file, where, problem, "check the camera")
         return self
 
     @property
     def distorts(self) -> bool:
         return self.fisheye or any(k != 0 for k in self.distortion)
 
-    def resized(self, width: int, height: int) -> Lens:
-        """The same lens on another pixel grid, each axis by its own factor."""
+    def resized(self, width: int, height: int, file: Path) -> Lens:
+        """The same lens for an image scaled to another size, each axis by its own factor.
+
+        Raises:
+            DataError: one factor, up to a pixel of rounding, does not explain both sizes: `file` is another image.
+        """
+        low = max((width - 1) / self.width, (height - 1) / self.height)
+        high = min((width + 1) / self.width, (height + 1) / self.height)
+        if low > high:
+            raise DataError(
+                file, "size", f"is {width}x{height}, but its camera is for {self.width}x{self.height}: another shape",
+                "use the images that the cameras were estimated from, or a scaled copy of them",
+            )  # fmt: skip
         sx, sy = width / self.width, height / self.height
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
-    def undistorted(self) -> Lens:
-        """The pinhole whose whole image is filled once distortion is removed, at the same size."""
+    def undistorted(self, file: Path) -> Lens:
+        """The pinhole of the undistorted image: the same size, zoomed until every pixel has data.
+
+        Raises:
+            DataError: the distortion folds the image over itself, so that there is no such pinhole.
+        """
         if not self.distorts:
             return replace(self, distortion=())
+        pinhole = _filled_pinhole(self)
+        if pinhole is None:
+            raise DataError(
+                file, "distortion", f"{self.distortion} cannot be removed from a {self.width}x{self.height} image",
+                "check the camera, or undistort the images first (e.g. with `colmap image_undistorter`)",
+            )  # fmt: skip
+        return pinhole
+
+    def undistort(self, image: Float[Tensor, "H W 3"], pinhole: Lens) -> Float[Tensor, "H W 3"]:
+        """The image that `pinhole` sees; bicubic, in [0, 1]."""
         import cv2
 
-        size, coefficients = (self.width, self.height), np.array(self.distortion, float)
-        if self.fisheye:
-            K = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
-                self._matrix(), coefficients, size, np.eye(3), balance=0
-            )
-        else:
-            K, _ = cv2.getOptimalNewCameraMatrix(self._matrix(), coefficients, size, 0)
-        return Lens(self.width, self.height, float(K[0, 0]), float(K[1, 1]), float(K[0, 2]) + 0.5, float(K[1, 2]) + 0.5)
-
-    def undistort(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-        """The image that `undistorted` sees."""
-        if not self.distorts:
-            return image
-        import cv2
-
-        target, size, coefficients = self.undistorted(), (self.width, self.height), np.array(self.distortion, float)
-        init = cv2.fisheye.initUndistortRectifyMap if self.fisheye else cv2.initUndistortRectifyMap
-        maps = init(self._matrix(), coefficients, np.eye(3), target._matrix(), size, cv2.CV_32FC1)
-        result = cv2.remap(image.numpy(), maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        x, y = _sampling_maps(self, pinhole)
+        result = cv2.remap(image.numpy(), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         return torch.from_numpy(result).clamp(0, 1)
 
-    def _matrix(self) -> np.ndarray:
-        """OpenCV's: its first pixel is centred at (0, 0)."""
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """K as OpenCV has it: the first pixel is centred at (0, 0)."""
         return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
 
 
@@ -104,29 +117,45 @@ def make_frame(
     lens: Lens,
     pose: Float[Tensor, "4 4"],
     *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: tuple[float, float, float] | None = None,
     split: str | None = None,
     sfm_id: int | None = None,
 ) -> Frame:
-    """A frame whose lens is fitted to the image's real size and whose image is undistorted when it is loaded.
+    """A frame whose lens is fitted to the image's real size; only the image's header is read now.
+
+    Args:
+        lens: for the image at any size. pose: world to camera, OpenCV axes.
+        background: RGB in [0, 1] behind transparent pixels; None: black, logged.
 
     Raises:
         DataError: the image is not there, or its shape is not the lens's.
     """
     width, height = image_size(image)
-    if abs(width / height - lens.width / lens.height) > 0.02 * width / height:
-        raise DataError(
-            image, "size", f"is {width}x{height}, but its camera is for {lens.width}x{lens.height}: another shape",
-            "use the images that the cameras were estimated from, or a scaled copy of them",
-        )  # fmt: skip
-    fitted = lens.resized(width, height)
-    pinhole = fitted.undistorted()
+    fitted = lens.resized(width, height, image)
+    pinhole = fitted.undistorted(image)
     camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
+    return Frame(name, camera, partial(_load, image, fitted, pinhole, background), split=split, sfm_id=sfm_id)
 
-    def load() -> Float[Tensor, "H W 3"]:
-        return fitted.undistort(read_image(image, background=background, expect=(width, height)))
 
-    return Frame(name, camera, load, split=split, sfm_id=sfm_id)
+def lens_notes(lenses: Sequence[Lens], frames: Sequence[Frame]) -> dict[str, str]:
+    """What became of each frame's lens, for the printed plan."""
+    notes = {}
+    pairs = [(lens, frame.camera) for lens, frame in zip(lenses, frames, strict=True)]
+    scaled = [(a, b) for a, b in pairs if (a.width, a.height) != (b.width, b.height)]
+    if scaled:
+        lens, camera = scaled[0]
+        notes["cameras"] = (
+            f"{len(scaled)} of {len(frames)} rescaled to their photos, e.g. {lens.width}x{lens.height} to "
+            f"{camera.width}x{camera.height}: x {camera.width / lens.width:.5g}, y {camera.height / lens.height:.5g}"
+        )
+    bent = [(a, b) for a, b in pairs if a.distorts]
+    if bent:
+        lens, camera = bent[0]
+        notes["lens"] = (
+            f"{len(bent)} of {len(frames)} photos undistorted by OpenCV (bicubic, no borders), "
+            f"e.g. fx {lens.fx * camera.width / lens.width:.5g} to {camera.fx:.5g} px"
+        )
+    return notes
 
 
 def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4 4"]:
@@ -158,8 +187,10 @@ def rigid_inverse(file: Path, where: str, rotation: np.ndarray, center: np.ndarr
             file, where, f"holds no rotation (determinant {np.linalg.det(rotation):.4g})",
             "remove scale and reflection from the camera-to-world matrices",
         )  # fmt: skip
+    left, _, right = np.linalg.svd(rotation)  # the nearest exact rotation: files keep six digits
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ center
+    pose[:3, :3] = (left @ right).T
+    pose[:3, 3] = -pose[:3, :3] @ center
     return torch.from_numpy(pose)
 
 
@@ -176,6 +207,61 @@ def by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:
         if frame.name == following.name:
             raise DataError(file, "file name", f"{frame.name!r} belongs to two frames", "give each photo one pose")
     return ordered
+
+
+def _load(
+    path: Path, lens: Lens, pinhole: Lens, background: tuple[float, float, float] | None
+) -> Float[Tensor, "H W 3"]:
+    image = read_image(path, background=background, expect=(lens.width, lens.height))
+    return lens.undistort(image, pinhole) if lens.distorts else image
+
+
+@lru_cache(maxsize=64)  # the frames of a capture share few lenses
+def _filled_pinhole(lens: Lens) -> Lens | None:
+    import cv2
+
+    size, K, bend = (lens.width, lens.height), lens.matrix(), np.array(lens.distortion)
+    try:
+        if lens.fisheye:
+            new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, bend, size, np.eye(3), balance=0.0)
+        else:
+            new, _ = cv2.getOptimalNewCameraMatrix(K, bend, size, alpha=0)
+    except cv2.error:
+        return None
+    fx, fy, cx, cy = (float(x) for x in (new[0, 0], new[1, 1], new[0, 2] + 0.5, new[1, 2] + 0.5))
+    if not (all(map(math.isfinite, (cx, cy))) and 0.1 < fx / lens.fx < 10 and 0.1 < fy / lens.fy < 10):
+        return None
+    pinhole = Lens(lens.width, lens.height, fx, fy, cx, cy)
+    return pinhole if _covers(lens, pinhole) else None
+
+
+def _covers(lens: Lens, pinhole: Lens) -> bool:
+    """Whether the border of the new image comes from inside the old one, up to OpenCV's approximation of it."""
+    import cv2
+
+    t = np.linspace(0, 1, _BORDER_SAMPLES)
+    zero, one = np.zeros_like(t), np.ones_like(t)
+    border = np.concatenate([np.stack(side, 1) for side in ((t, zero), (t, one), (zero, t), (one, t))])
+    rays = (border * [lens.width, lens.height] - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
+    bend = np.array(lens.distortion)
+    if lens.fisheye:
+        pixels = cv2.fisheye.distortPoints(rays[:, None], lens.matrix(), bend)[:, 0]
+    else:
+        homogeneous = np.column_stack((rays, np.ones(len(rays))))
+        pixels = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), lens.matrix(), bend)[0][:, 0]
+    slack = 1 + 0.01 * max(lens.width, lens.height)
+    return bool(((pixels >= -slack) & (pixels <= np.array([lens.width, lens.height]) + slack)).all())
+
+
+@lru_cache(maxsize=1)
+def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
+    """Where in the distorted image each pixel of the new one lies."""
+    import cv2
+
+    maps = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
+    size, bend = (lens.width, lens.height), np.array(lens.distortion)
+    x, y = maps(lens.matrix(), bend, np.eye(3), pinhole.matrix(), size, cv2.CV_32FC1)
+    return x, y
 
 
 def _is_row(row: object) -> bool:

@@ -4,9 +4,11 @@ anything is allocated, every number must be finite, every id known, and every by
 
 from __future__ import annotations
 
+import logging
 import math
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -16,20 +18,26 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.cameras import Lens, by_name, make_frame
+from clear_strategies.data.cameras import Lens, by_name, lens_notes, make_frame
 from clear_strategies.data.capture import Capture, SfmPoints
-from clear_strategies.data.photo_files import inside
+from clear_strategies.data.photo_files import image_folder, inside, list_images
 from clear_strategies.errors import DataError
 from rasterizers.geometry import rotation_matrix
+
+_log = logging.getLogger(__name__)
 
 # name -> COLMAP's number for the model, and how many parameters it has.
 _MODELS: Final = {
     "SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4), "SIMPLE_RADIAL": (2, 4), "RADIAL": (3, 5), "OPENCV": (4, 8),
-    "OPENCV_FISHEYE": (5, 8), "FULL_OPENCV": (6, 12),
+    "OPENCV_FISHEYE": (5, 8), "FULL_OPENCV": (6, 12), "SIMPLE_RADIAL_FISHEYE": (8, 4), "RADIAL_FISHEYE": (9, 5),
 }  # fmt: skip
 _MODEL_OF_ID: Final = {number: name for name, (number, _) in _MODELS.items()}
 _WRITE_AGAIN: Final = "export the model again"
 _LONGEST_NAME: Final = 4096
+_NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
+_WHOLE: Final = re.compile(r"-?[0-9]{1,18}")
+_FARTHEST: Final = 1e12  # from the origin, world units; beyond it float32 keeps nothing of a scene
+_UNEVEN: Final = 1e-6  # lengths of quaternions further from 1 are told
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,40 +62,74 @@ class Points:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """A sparse model as its files tell it."""
+    """A sparse model as its files tell it; `ending` of those files is .bin or .txt."""
 
     folder: Path
+    ending: str
     lenses: dict[int, Lens]
     images: list[Image]
     points: Points
 
 
-def read(root: str | Path, images: str = "images") -> Capture:
+def read(
+    root: str | Path,
+    images: str | None = None,
+    *,
+    background: tuple[float, float, float] | None = None,
+    allow_outside: bool = False,
+) -> Capture:
     """A capture from `root` with its sparse model in sparse/0, sparse, colmap/sparse/0 or root itself.
 
     Args:
         images: folder of the photos below root; where their size is another than the model's, cameras are rescaled.
+            None: images, images_2, images_4, images_8, the first that is there.
+        background: RGB in [0, 1] behind transparent pixels; None: black.
+        allow_outside: follow file names and links that lead out of that folder.
 
     Raises:
         DataError: the model or an image cannot be used.
     """
     root = Path(root)
     model = read_model(find_model(root))
-    folder = root / images
-    if not folder.is_dir():
-        raise DataError(folder, "folder", "is not there", "set data.reader.images to the folder of the photos")
-    frames = []
-    for image in model.images:
-        path = inside(folder, image.name, file=model.folder)
-        frames.append(make_frame(image.name, path, model.lenses[image.camera], pose_of(image), sfm_id=image.id))
-    notes = {"poses": f"COLMAP {model.folder.name}, {len(model.images)} images"}
-    if any(lens.distorts for lens in model.lenses.values()):
-        notes["lens"] = "distortion removed by OpenCV"
-    sizes = {(f.camera.width, f.camera.height) for f in frames} - {(c.width, c.height) for c in model.lenses.values()}
-    if sizes:
-        width, height = sorted(sizes)[0]
-        notes["cameras"] = f"rescaled to the photos' size, {width}x{height}"
-    return Capture(root.resolve().name, by_name(frames, model.folder), sfm_points(model), notes=notes)
+    folder = image_folder(root, images)
+    listing = model.folder / f"images{model.ending}"
+    paths = {image.name: _photo(folder, image.name, listing, allow_outside) for image in model.images}
+    return capture(root, model, folder, paths, background=background)
+
+
+def capture(
+    root: Path,
+    model: Model,
+    folder: Path,
+    paths: Mapping[str, Path],
+    *,
+    background: tuple[float, float, float] | None = None,
+) -> Capture:
+    """A capture of a model whose photos have been found: `paths` by the model's names, below `folder`.
+
+    Raises:
+        DataError: an image cannot be used.
+    """
+    frames = [
+        make_frame(
+            paths[image.name].relative_to(folder).as_posix(), paths[image.name], model.lenses[image.camera],
+            pose_of(image), background=background, sfm_id=image.id,
+        )
+        for image in model.images
+    ]  # fmt: skip
+    notes = {"poses": f"COLMAP {_label(root, model)} ({model.ending[1:]}), {len(frames)} images", "photos": folder.name}
+    unposed = sorted({p.name for p in list_images(folder)} - {p.name for p in paths.values()})
+    if unposed:
+        notes["without pose"] = f"{len(unposed)} photos, not used: {', '.join(unposed[:8])}"
+        _log.info("%s: %d photos have no pose and are not used: %s.", root, len(unposed), ", ".join(unposed[:8]))
+    notes |= lens_notes([model.lenses[image.camera] for image in model.images], frames)
+    uneven = sum(abs(math.hypot(*image.quat) - 1) > _UNEVEN for image in model.images)
+    if uneven:
+        notes["rotations"] = f"{uneven} quaternions were not of length 1 and were normalised"
+    points = sfm_points(model, _label(root, model))
+    if points is None:
+        notes["points"] = "the model has none"
+    return Capture(root.resolve().name, by_name(frames, model.folder), points, background or (0.0, 0.0, 0.0), notes)
 
 
 def find_model(root: Path) -> Path:
@@ -99,7 +141,10 @@ def find_model(root: Path) -> Path:
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     for candidate in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0", root):
-        if (candidate / "cameras.bin").is_file() or (candidate / "cameras.txt").is_file():
+        if _is_model(candidate):
+            others = [p.name for p in sorted(candidate.parent.glob("[1-9]*")) if candidate.name == "0" and _is_model(p)]
+            if others:
+                _log.warning("%s: model 0 is used; COLMAP's other models (%s) are not.", root, ", ".join(others))
             return candidate
     raise DataError(
         root, "sparse model", "no cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0 or here",
@@ -113,11 +158,13 @@ def read_model(folder: Path) -> Model:
     Raises:
         DataError: a file is missing or not what it should be.
     """
-    binary = (folder / "cameras.bin").is_file()
+    binary = any((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D"))
     ending = ".bin" if binary else ".txt"
     cameras, images = (_cameras_bin, _images_bin) if binary else (_cameras_txt, _images_txt)
     lenses = cameras(folder / f"cameras{ending}")
     registered = images(folder / f"images{ending}")
+    if not registered:
+        raise DataError(folder / f"images{ending}", "images", "there is none", "run COLMAP's mapper to its end")
     for image in registered:
         if image.camera not in lenses:
             raise DataError(
@@ -125,12 +172,14 @@ def read_model(folder: Path) -> Model:
             )
     file = folder / f"points3D{ending}"
     points = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.int64))
-    if file.exists():
+    if not file.exists():
+        _log.info("%s has no %s: the capture has no points.", folder, file.name)
+    else:
         points = _points_bin(file) if binary else _points_txt(file)
         unknown = np.setdiff1d(points.track[:, 1], [image.id for image in registered])
         if len(unknown):
             raise DataError(file, "track", f"names the unknown image {unknown[0]}", _WRITE_AGAIN)
-    return Model(folder, lenses, registered, points)
+    return Model(folder, ending, lenses, registered, points)
 
 
 def pose_of(image: Image) -> Float[Tensor, "4 4"]:
@@ -141,8 +190,8 @@ def pose_of(image: Image) -> Float[Tensor, "4 4"]:
     return pose
 
 
-def sfm_points(model: Model) -> SfmPoints | None:
-    """The model's points with their tracks; None where it has none."""
+def sfm_points(model: Model, label: str) -> SfmPoints | None:
+    """The model's points with their tracks, `label` for the printed plan; None where it has none."""
     p = model.points
     if not len(p.means):
         return None
@@ -151,8 +200,30 @@ def sfm_points(model: Model) -> SfmPoints | None:
         colors=torch.from_numpy(p.colors).float() / 255,
         point=torch.from_numpy(np.ascontiguousarray(p.track[:, 0])),
         seen_by=torch.from_numpy(np.ascontiguousarray(p.track[:, 1])),
-        source=f"{len(p.means):,} points of COLMAP {model.folder.name}, triangulated from all {len(model.images)} images",
+        source=f"COLMAP {label}, {len(p.means):,} points, triangulated from all {len(model.images)} images",
     )
+
+
+def _label(root: Path, model: Model) -> str:
+    """The model's place in the scene, sparse/0."""
+    return model.folder.relative_to(root).as_posix() if model.folder.is_relative_to(root) else model.folder.name
+
+
+def _is_model(folder: Path) -> bool:
+    return any((folder / f"{name}{ending}").is_file() for name in ("cameras", "images") for ending in (".bin", ".txt"))
+
+
+def _photo(folder: Path, name: str, listing: Path, allow_outside: bool) -> Path:
+    """The photo of this name, or the only one that differs in its ending alone: images_4 often holds PNG for JPG."""
+    path = inside(folder, name, file=listing, allow_outside=allow_outside)
+    if path.is_file():
+        return path
+    twins = [p for p in path.parent.glob("*") if p.stem == path.stem and p.is_file()]
+    if len(twins) != 1:
+        raise DataError(
+            listing, name, f"is not in {folder}", "set data.reader.images to the folder that the model was made from"
+        )
+    return twins[0]
 
 
 class _Bytes:
@@ -169,7 +240,7 @@ class _Bytes:
     def left(self) -> int:
         return len(self.data) - self.at
 
-    def take(self, layout: str, field: str) -> tuple[float, ...]:
+    def take(self, layout: str, field: str) -> tuple[Any, ...]:
         size = struct.calcsize(layout)
         if size > self.left:
             raise DataError(self.path, field, f"needs {size} bytes, {self.left} are left: truncated", _WRITE_AGAIN)
@@ -266,20 +337,24 @@ def _cameras_txt(path: Path) -> dict[int, Lens]:
 
 
 def _images_txt(path: Path) -> list[Image]:
-    """Two lines an image; the second, its 2D points, may be empty."""
+    """Two lines an image: its pose, and its 2D points, which are not used and may be none."""
     found: dict[int, Image] = {}
-    lines = [(i, text) for i, text in _raw_lines(path) if not text.startswith("#")]
-    while lines and not lines[-1][1].strip() and len(lines) % 2:
-        lines.pop()
-    if len(lines) % 2:
-        raise DataError(path, f"line {lines[-1][0]}", "has no second line with its 2D points", _WRITE_AGAIN)
-    for line, text in lines[::2]:
+    lines = iter(_raw_lines(path))
+    for line, text in lines:
+        if not text.strip() or text.startswith("#"):
+            continue
         cells = text.split(maxsplit=9)
         if len(cells) != 10:
             raise DataError(path, f"line {line}", f"has {len(cells)} of 10 columns", _WRITE_AGAIN)
         number, camera = _integer(path, line, cells[0]), _integer(path, line, cells[8])
         pose = tuple(_number(path, line, c) for c in cells[1:8])
         _put(path, found, number, _image(path, number, pose, camera, cells[9].strip()))
+        second = next(lines, None)
+        if second is None or len(second[1].split()) % 3 or second[1].startswith("#"):
+            raise DataError(
+                path, f"line {line + 1}", "is no line of 2D points (X Y POINT3D_ID, or empty) for the image above it",
+                _WRITE_AGAIN,
+            )  # fmt: skip
     return list(found.values())
 
 
@@ -293,7 +368,7 @@ def _points_txt(path: Path) -> Points:
         if not all(0 <= c <= 255 for c in rgb):
             raise DataError(path, f"line {line}", f"has the colour {rgb}", "colours lie in 0..255")
         colors.append(rgb)
-        seen.add(cells[0])
+        seen.add(_integer(path, line, cells[0]))
         images = [_integer(path, line, c) for c in cells[8::2]]
         track.append(np.array([(len(means) - 1, image) for image in images], np.int64).reshape(-1, 2))
     if len(seen) != len(means):
@@ -302,8 +377,9 @@ def _points_txt(path: Path) -> Points:
 
 
 def _checked_points(path: Path, means: np.ndarray, colors: np.ndarray, track: list[np.ndarray]) -> Points:
-    if not np.isfinite(means).all():
-        bad = int(np.flatnonzero(~np.isfinite(means).all(1))[0])
+    near = (np.abs(means) < _FARTHEST).all(1)
+    if not near.all():
+        bad = int(np.flatnonzero(~near)[0])
         raise DataError(path, f"point {bad}", "is not finite", "remove the point")
     return Points(means, colors, np.concatenate(track) if track else np.zeros((0, 2), np.int64))
 
@@ -317,16 +393,17 @@ def _parameters(path: Path, model: str) -> int:
 
 
 def _lens(path: Path, where: str, model: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
-    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
-        f, cx, cy, *radial = p  # one focal length; k1 and k2 as far as given, no tangential terms
+    fisheye = model.endswith("_FISHEYE")
+    if model not in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"):
+        f, cx, cy, *radial = p  # one focal length; k1 and k2 as far as given; the further terms are 0
         distortion = (*radial, *[0.0] * (4 - len(radial))) if radial else ()
-        return Lens(width, height, f, f, cx, cy, distortion).check(path, where)
+        return Lens(width, height, f, f, cx, cy, distortion, fisheye).check(path, where)
     fx, fy, cx, cy, *rest = p
-    return Lens(width, height, fx, fy, cx, cy, tuple(rest), fisheye=model == "OPENCV_FISHEYE").check(path, where)
+    return Lens(width, height, fx, fy, cx, cy, tuple(rest), fisheye).check(path, where)
 
 
 def _image(path: Path, number: int, pose: tuple[float, ...], camera: int, name: str) -> Image:
-    if not all(map(math.isfinite, pose)):
+    if not all(abs(x) < _FARTHEST for x in pose):
         raise DataError(path, name or f"image {number}", "has a pose that is not finite", _WRITE_AGAIN)
     norm = math.sqrt(sum(x * x for x in pose[:4]))
     if not 0.5 < norm < 2:
@@ -349,7 +426,9 @@ def _raw_lines(path: Path) -> list[tuple[int, str]]:
         raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
     except UnicodeDecodeError as error:
         raise DataError(path, "file", "is no UTF-8 text", _WRITE_AGAIN) from error
-    return list(enumerate(text.splitlines(), start=1))
+    if text.startswith("\ufeff"):
+        raise DataError(path, "line 1", "starts with a byte-order mark", "save it as UTF-8 without one")
+    return list(enumerate(text.split("\n"), start=1))
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -359,13 +438,13 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 
 def _number(path: Path, line: int, cell: str) -> float:
-    try:
-        return float(cell)
-    except ValueError as error:
-        raise DataError(path, f"line {line}", f"has {cell[:40]!r} where a number belongs", _WRITE_AGAIN) from error
+    if not _NUMBER.fullmatch(cell):
+        hint = "write a decimal point, not a comma" if "," in cell else _WRITE_AGAIN
+        raise DataError(path, f"line {line}", f"has {cell[:40]!r} where a finite number belongs", hint)
+    return float(cell)
 
 
 def _integer(path: Path, line: int, cell: str) -> int:
-    if not cell.lstrip("-").isascii() or not cell.lstrip("-").isdigit() or len(cell) > 18:
+    if not _WHOLE.fullmatch(cell):
         raise DataError(path, f"line {line}", f"has {cell[:40]!r} where a whole number belongs", _WRITE_AGAIN)
     return int(cell)

@@ -3,31 +3,53 @@
 from __future__ import annotations
 
 import io
+import logging
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, Literal
+from tokenize import TokenError
+from typing import Final
 
 import numpy as np
 from numpy.lib import format as npy_format
 
 from clear_strategies.data import colmap
-from clear_strategies.data.cameras import Lens, by_name, make_frame, rigid_inverse
-from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.photo_files import list_images
+from clear_strategies.data.cameras import Lens, by_name, lens_notes, make_frame, rigid_inverse
+from clear_strategies.data.capture import Capture
+from clear_strategies.data.photo_files import image_folder, inside, list_images
 from clear_strategies.errors import DataError
 
+_log = logging.getLogger(__name__)
+
+Color = tuple[float, float, float]
+
 _COLUMNS: Final = 17  # a 3 x 5 matrix [R | t | height width focal], then the near and far bounds
+# What numpy's parser of the header's Python literal raises on damaged ones.
+_HEADER_ERRORS: Final = (
+    ValueError,
+    KeyError,
+    SyntaxError,
+    TypeError,
+    EOFError,
+    RecursionError,
+    MemoryError,
+    TokenError,
+)
 _REMEDY: Final = "write it with LLFF's img2poses again"
 
 
 def read(
-    root: str | Path, images: str | None = None, poses: Literal["auto", "colmap", "poses_bounds"] = "auto"
+    root: str | Path,
+    images: str | None = None,
+    poses: str = "auto",
+    *,
+    background: Color | None = None,
 ) -> Capture:
     """An LLFF scene.
 
     Args:
         images: folder of the photos below root; None: images, images_2, images_4, images_8, the first that is there.
         poses: "colmap" (sparse/0), "poses_bounds", or "auto": COLMAP's where they are.
+        background: RGB in [0, 1] behind transparent pixels; None: black.
 
     Raises:
         DataError: something is missing or not what it should be.
@@ -37,43 +59,33 @@ def read(
         raise DataError("config", "data.reader.poses", f"is {poses!r}", "use auto, colmap or poses_bounds")
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
-    folder = _image_folder(root, images)
-    has_model = (root / "sparse").is_dir()
+    folder = image_folder(root, images)
+    has_model = any((root / layout).is_dir() for layout in ("sparse", "colmap/sparse"))
     if poses == "colmap" or (poses == "auto" and has_model):
-        return _from_colmap(root, folder)
-    frames = _from_bounds(root / "poses_bounds.npy", folder)
-    points = None
-    if has_model:
-        points = colmap.sfm_points(colmap.read_model(colmap.find_model(root)))
-        frames = [replace(f, sfm_id=i) for f, i in zip(frames, _model_ids(root, len(frames)), strict=True)]
-    notes = {"poses": "poses_bounds.npy", "photos": folder.name}
-    return Capture(root.resolve().name, by_name(frames, folder), points, notes=notes)
+        return _from_colmap(root, folder, background)
+    return _from_bounds(root, folder, has_model, background)
 
 
-def _from_colmap(root: Path, folder: Path) -> Capture:
+def _from_colmap(root: Path, folder: Path, background: Color | None) -> Capture:
     model = colmap.read_model(colmap.find_model(root))
-    registered = sorted(model.images, key=lambda image: image.name)
-    paths = {p.name: p for p in list_images(folder)}
-    notes = {"poses": f"COLMAP {model.folder.name}, {len(registered)} images", "photos": folder.name}
-    if not all(image.name in paths for image in registered):
-        # images_4 and the like were renamed by LLFF's scripts, in the order of the originals.
-        if len(paths) != len(registered):
-            raise DataError(
-                folder, "images", f"holds {len(paths)} images, the model {len(registered)} under other names",
-                "set data.reader.images to the folder that the model was made from",
-            )  # fmt: skip
-        notes["names"] = f"photos of {folder.name} matched to the model's by order"
-        chosen = [paths[name] for name in sorted(paths)]
-    else:
-        chosen = [paths[image.name] for image in registered]
-    frames = [
-        make_frame(path.name, path, model.lenses[image.camera], colmap.pose_of(image), sfm_id=image.id)
-        for image, path in zip(registered, chosen, strict=True)
-    ]
-    return Capture(root.resolve().name, by_name(frames, folder), colmap.sfm_points(model), notes=notes)
+    registered = sorted(image.name for image in model.images)
+    files = {p.name: inside(folder, p.name, file=folder) for p in list_images(folder)}
+    if all(name in files for name in registered):
+        return colmap.capture(root, model, folder, {name: files[name] for name in registered}, background=background)
+    # images_4 and the like were renamed by LLFF's scripts, in the order of the originals.
+    if len(files) != len(registered):
+        raise DataError(
+            folder, "images", f"holds {len(files)} images, the model {len(registered)} under other names",
+            "set data.reader.images to the folder that the model was made from",
+        )  # fmt: skip
+    ordered = dict(zip(registered, (files[name] for name in sorted(files)), strict=True))
+    found = colmap.capture(root, model, folder, ordered, background=background)
+    first = f"{registered[0]} is {ordered[registered[0]].name}"
+    return replace(found, notes={**found.notes, "names": f"photos matched to the model's by order ({first})"})
 
 
-def _from_bounds(file: Path, folder: Path) -> list[Frame]:
+def _from_bounds(root: Path, folder: Path, has_model: bool, background: Color | None) -> Capture:
+    file = root / "poses_bounds.npy"
     table = _read_table(file)
     paths = list_images(folder)
     if len(paths) != len(table):
@@ -83,15 +95,43 @@ def _from_bounds(file: Path, folder: Path) -> list[Frame]:
             f"there are {len(table)}, but {folder.name} holds {len(paths)} images",
             "give one row an image",
         )
-    frames = []
+    model = colmap.read_model(colmap.find_model(root)) if has_model else None
+    ids = _ids_by_order(model, len(paths))
+    frames, lenses = [], []
     for i, (row, path) in enumerate(zip(table, paths, strict=True)):
         pose = row[:15].reshape(3, 5)
         height, width, focal = pose[:, 4]
         down, right, back = pose[:, 0], pose[:, 1], pose[:, 2]  # LLFF's axes
         rotation = np.stack((right, down, -back), axis=1)
         lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2).check(file, f"row {i}")
-        frames.append(make_frame(path.name, path, lens, rigid_inverse(file, f"row {i}", rotation, pose[:, 3])))
-    return frames
+        world_to_camera = rigid_inverse(file, f"row {i}", rotation, pose[:, 3])
+        inside(folder, path.name, file=folder)
+        lenses.append(lens)
+        frames.append(make_frame(path.name, path, lens, world_to_camera, background=background, sfm_id=ids[i]))
+    near, far = table[:, 15].min(), table[:, 16].max()
+    if not 0 < near < far:
+        raise DataError(file, "bounds", f"are {near:g} and {far:g}; 0 < near < far must hold", _REMEDY)
+    notes = {
+        "poses": f"poses_bounds.npy, {len(frames)} images",
+        "photos": folder.name,
+        "depths": f"{near:.4g} to {far:.4g} world units, says poses_bounds.npy",
+        **lens_notes(lenses, frames),
+    }
+    points = None
+    if model is not None and ids[0] is not None:  # LLFF's poses stand in the frame of the COLMAP model they came from
+        points = colmap.sfm_points(model, model.folder.relative_to(root).as_posix())
+    return Capture(root.resolve().name, by_name(frames, folder), points, background or (0.0, 0.0, 0.0), notes)
+
+
+def _ids_by_order(model: colmap.Model | None, n: int) -> list[int | None]:
+    """The model's ids of the n photos: both in order of names."""
+    if model is None:
+        return [None] * n
+    registered = sorted(model.images, key=lambda image: image.name)
+    if len(registered) != n:
+        _log.info("%s has %d of %d photos: its points are not used.", model.folder, len(registered), n)
+        return [None] * n
+    return [image.id for image in registered]
 
 
 def _read_table(file: Path) -> np.ndarray:
@@ -105,7 +145,7 @@ def _read_table(file: Path) -> np.ndarray:
         version = npy_format.read_magic(stream)
         reader = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}[version]
         shape, fortran, dtype = reader(stream)
-    except (ValueError, KeyError, SyntaxError, TypeError, EOFError) as error:
+    except _HEADER_ERRORS as error:
         raise DataError(file, "header", f"is no .npy header ({str(error)[:80]})", _REMEDY) from error
     if dtype.kind != "f":
         raise DataError(file, "header", f"has the type {dtype}, not floating point", _REMEDY)
@@ -119,17 +159,3 @@ def _read_table(file: Path) -> np.ndarray:
     if not np.isfinite(table).all() or np.abs(table).max() > 1e12:
         raise DataError(file, "values", "are not all finite", _REMEDY)
     return table
-
-
-def _image_folder(root: Path, images: str | None) -> Path:
-    if images is not None:
-        return root / images
-    for name in ("images", "images_2", "images_4", "images_8"):
-        if (root / name).is_dir():
-            return root / name
-    raise DataError(root, "images", "there is no images, images_2, images_4 or images_8", "set data.reader.images")
-
-
-def _model_ids(root: Path, n: int) -> list[int | None]:
-    registered = sorted(colmap.read_model(colmap.find_model(root)).images, key=lambda image: image.name)
-    return [image.id for image in registered] if len(registered) == n else [None] * n

@@ -4,26 +4,46 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from itertools import takewhile
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
 
 import torch
 
 from clear_strategies.data import strict_json
-from clear_strategies.data.cameras import Lens, by_name, make_frame, pose_from_opengl
-from clear_strategies.data.capture import Capture, Frame, SfmPoints
-from clear_strategies.data.photo_files import image_size, inside
+from clear_strategies.data.cameras import Lens, by_name, lens_notes, make_frame, pose_from_opengl
+from clear_strategies.data.capture import Capture, SfmPoints
+from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
 from clear_strategies.data.ply import read_points
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
 
-_SUPPORTED = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE")
+# Distortion keys of each model, in OpenCV's order. nerfstudio's OPENCV has a k4 that OpenCV's polynomial lacks.
+_MODELS: Final = {
+    "PINHOLE": (),
+    "SIMPLE_PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+_INTRINSICS: Final = (
+    "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x", "camera_angle_y",
+    "camera_model", "is_fisheye",
+)  # fmt: skip
+_SPLITS: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
 
 
-def read(root: str | Path) -> Capture:
-    """A folder with transforms.json, or that file.
+def read(
+    root: str | Path, *, background: tuple[float, float, float] | None = None, allow_outside: bool = False
+) -> Capture:
+    """A folder with transforms.json, or that file. Poses stay as they are, `applied_transform` included.
+
+    Args:
+        background: RGB in [0, 1] behind transparent pixels; None: black.
+        allow_outside: follow file names and links that lead out of the folder.
 
     Raises:
         DataError: something is missing or not what it should be.
@@ -32,77 +52,117 @@ def read(root: str | Path) -> Capture:
     file = given if given.suffix == ".json" else given / "transforms.json"
     folder = file.parent
     content = strict_json.read_object(file)
+    entries = strict_json.frames_of(file, content)
     splits = _splits(file, content)
-    frames = []
-    for i, frame in enumerate(strict_json.frames_of(file, content)):
-        frames.append(_frame(folder, file, i, {**_shared(content), **frame}, splits))
-    if any("mask_path" in frame for frame in strict_json.frames_of(file, content)):
-        _log.warning("%s: masks are not used.", file)
-    notes = {"poses": file.name}
-    if any(key in content for key in ("k1", "k2", "k3", "k4", "p1", "p2")):
-        notes["lens"] = "distortion removed by OpenCV"
-    return Capture(folder.resolve().name, by_name(frames, file), _points(folder, file, content), notes=notes)
+    names = [strict_json.file_path(file, i, entry) for i, entry in enumerate(entries)]
+    short = _short_names(names)
+    shared: dict[str, Any] = {key: content[key] for key in _INTRINSICS if key in content}
+    lenses, frames = [], []
+    for i, (name, entry) in enumerate(zip(names, entries, strict=True)):
+        where = f"frames[{i}]"
+        path = _photo(folder, name, file, allow_outside)
+        pose = pose_from_opengl(file, f"{where}.transform_matrix", entry.get("transform_matrix"))
+        lens = _lens(file, where, {**shared, **entry}, path)
+        lenses.append(lens)
+        frames.append(make_frame(short[i], path, lens, pose, background=background, split=splits.get(name)))
+    notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(lenses, frames)}
+    if splits:
+        notes["split"] = _split_note(file, names, splits)
+    masked = sum("mask_path" in entry for entry in entries)
+    if masked:
+        _log.warning("%s: masks (of %d frames) are not used.", file, masked)
+        notes["masks"] = f"not used ({masked} frames have one)"
+    points = _points(folder, file, content, allow_outside)
+    return Capture(folder.resolve().name, by_name(frames, file), points, background or (0.0, 0.0, 0.0), notes)
 
 
-def _frame(folder: Path, file: Path, i: int, frame: Mapping[str, Any], splits: Mapping[str, str]) -> Frame:
-    where = f"frames[{i}]"
-    name = strict_json.file_path(file, i, dict(frame))
-    path = inside(folder, name, file=file)
-    pose = pose_from_opengl(file, f"{where}.transform_matrix", frame.get("transform_matrix"))
-    return make_frame(path.name, path, _lens(file, where, frame, path), pose, split=splits.get(name))
+def _short_names(names: Sequence[str]) -> list[str]:
+    """Names without the folders that all of them share."""
+    parts = [PurePosixPath(name).parts for name in names]
+    first, last = min(part[:-1] for part in parts), max(part[:-1] for part in parts)  # what these share, all share
+    shared = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(first, last, strict=False))))
+    return ["/".join(part[shared:]) for part in parts]
 
 
-def _lens(file: Path, where: str, frame: Mapping[str, Any], image: Path) -> Lens:
+def _photo(folder: Path, name: str, file: Path, allow_outside: bool) -> Path:
+    """instant-ngp leaves out the ending where it is .png."""
+    path = inside(folder, name, file=file, allow_outside=allow_outside)
+    if name.lower().endswith(SUFFIXES) or path.is_file():
+        return path
+    return inside(folder, f"{name}.png", file=file, allow_outside=allow_outside)
+
+
+def _lens(file: Path, where: str, values: Mapping[str, Any], image: Path) -> Lens:
     def number(key: str, default: float | None = None) -> float:
-        value = frame.get(key, default)
-        if value is None:
-            raise DataError(
-                file, f"{where}.{key}", "is missing, for the frame and for all", "give fl_x or camera_angle_x"
-            )
-        return strict_json.number(file, f"{where}.{key}", value)
+        return strict_json.number(file, f"{where}.{key}", values.get(key, default))
 
-    model = frame.get("camera_model", "OPENCV")
-    if model not in _SUPPORTED:
-        raise DataError(file, "camera_model", f"is {str(model)[:40]!r}", f"use one of {', '.join(_SUPPORTED)}")
-    real_width, real_height = image_size(image)
-    width, height = number("w", real_width), number("h", real_height)
-    if "fl_x" in frame:
-        fx = number("fl_x")
-    else:
-        angle = number("camera_angle_x")
+    def focal(key: str, angle_key: str, size: float, default: float | None) -> float:
+        if key in values:
+            return number(key)
+        if angle_key not in values and default is not None:
+            return default
+        if angle_key not in values:
+            raise DataError(file, f"{where}.{key}", "is missing, for the frame and for all", f"give it or {angle_key}")
+        angle = number(angle_key)
         if not 0 < angle < math.pi:
             raise DataError(
-                file, "camera_angle_x", f"is {angle:g}; it must lie in (0, pi) radians", "correct the field"
+                file, f"{where}.{angle_key}", f"is {angle:g}; it must lie in (0, pi) radians", "correct the field"
             )
-        fx = width / (2 * math.tan(angle / 2))
-    fisheye = model == "OPENCV_FISHEYE"
-    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
-    distortion = tuple(number(key, 0.0) for key in keys)
+        return size / (2 * math.tan(angle / 2))
+
+    real_width, real_height = image_size(image)
+    width, height = number("w", float(real_width)), number("h", float(real_height))
+    fx = focal("fl_x", "camera_angle_x", width, None)
+    fy = focal("fl_y", "camera_angle_y", height, fx)
     cx, cy = number("cx", width / 2), number("cy", height / 2)
-    return Lens(round(width), round(height), fx, number("fl_y", fx), cx, cy, distortion, fisheye).check(file, where)
-
-
-def _shared(content: Mapping[str, Any]) -> dict[str, Any]:
-    keys = ("fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x", "camera_model")
-    return {key: content[key] for key in keys if key in content}
+    model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else values.get("camera_model", "OPENCV")
+    if not isinstance(model, str) or model not in _MODELS:
+        found = repr(model)[:40] if isinstance(model, str) else f"a {type(model).__name__}"
+        raise DataError(file, f"{where}.camera_model", f"is {found}", f"use one of {', '.join(_MODELS)}")
+    keys = _MODELS[model]
+    unused = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if key not in keys and number(key, 0.0) != 0]
+    if unused:
+        raise DataError(
+            file, f"{where}.{unused[0]}", f"is not 0, but {model} has no such term that OpenCV could undistort",
+            "set camera_model to what the coefficients belong to, or undistort the images first",
+        )  # fmt: skip
+    bend = tuple(number(key, 0.0) for key in keys)
+    distortion = (*bend, *[0.0] * (4 - len(bend))) if bend else ()
+    fisheye = model == "OPENCV_FISHEYE"
+    return Lens(round(width), round(height), fx, fy, cx, cy, distortion, fisheye).check(file, where)
 
 
 def _splits(file: Path, content: Mapping[str, Any]) -> dict[str, str]:
     splits: dict[str, str] = {}
-    for key, split in (("train_filenames", "train"), ("val_filenames", "test"), ("test_filenames", "test")):
+    for key, split in _SPLITS.items():
         names = content.get(key, [])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
             raise DataError(file, key, "is no list of file names", "correct the field")
+        both = sorted(name for name in names if splits.get(name, split) != split)
+        if both:
+            raise DataError(file, key, f"{both[0]!r} is for training, too", "list each photo once")
         splits |= dict.fromkeys(names, split)
     return splits
 
 
-def _points(folder: Path, file: Path, content: Mapping[str, Any]) -> SfmPoints | None:
+def _split_note(file: Path, names: Sequence[str], splits: Mapping[str, str]) -> str:
+    """How many frames the file's own lists give to each side; what they leave out is said aloud."""
+    missing = sorted(set(splits) - set(names))
+    if missing:
+        raise DataError(file, "split", f"lists {missing[0]!r}, which is no frame's file_path", "correct the lists")
+    counts = {side: sum(splits.get(name) == side for name in names) for side in ("train", "test")}
+    neither = len(names) - sum(counts.values())
+    if neither:
+        _log.warning("%s: %d frames are in none of its split lists and are not used.", file, neither)
+    return f"the file's own: {counts['train']} train, {counts['test']} test, {neither} in neither"
+
+
+def _points(folder: Path, file: Path, content: Mapping[str, Any], allow_outside: bool) -> SfmPoints | None:
     name = content.get("ply_file_path")
     if name is None:
         return None
     if not isinstance(name, str):
         raise DataError(file, "ply_file_path", "is no text", "name the point cloud's file")
-    cloud = read_points(inside(folder, name, file=file))
+    cloud = read_points(inside(folder, name, file=file, allow_outside=allow_outside))
     none = torch.zeros(0, dtype=torch.long)
-    return SfmPoints(cloud.means, cloud.colors, none, none, f"{len(cloud):,} points of {name}, made from all images")
+    return SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")

@@ -31,8 +31,8 @@ SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
 _MAX_PIXELS: Final = 100_000_000
 _FOLDERS: Final = ("images", "images_2", "images_4", "images_8")
+_LONGEST_NAME: Final = 1024
 _EXIF_ORIENTATION: Final = 0x0112
-_TIFF_BITS_PER_SAMPLE: Final = 258
 
 
 def read_image(
@@ -61,12 +61,15 @@ def read_image(
                 f"is {image.width}x{image.height} where {expect[0]}x{expect[1]} is expected",
                 "use images of the size the cameras were made for",
             )
+        sixteen_bits = ";16" in str(
+            getattr(image, "tile", "")
+        )  # how the file's bytes are laid out; decoding forgets it
         try:
             image.load()
         except Exception as error:  # damaged bytes make PIL's decoders raise nearly anything
             raise DataError(path, "pixels", f"cannot be decoded ({error})", "replace the damaged file") from error
         _refuse_turned(path, image)
-        pixels = _to_float(path, image)
+        pixels = _to_float(path, image, sixteen_bits)
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
     if alpha.size and alpha.min() < 1:
         if background is None:
@@ -144,14 +147,18 @@ def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) ->
     Raises:
         DataError: the name is absolute or leads out of `root`.
     """
-    if not name or "\0" in name:
-        raise DataError(file, "file name", f"{name!r} is no file name", "name an image inside the data set's folder")
+    if not 0 < len(name) <= _LONGEST_NAME or "\0" in name:
+        raise DataError(
+            file, "file name", f"{name[:80]!r} is no file name", "name an image inside the data set's folder"
+        )
     if allow_outside:
         return root / name
     try:
         within = not os.path.isabs(name) and (root / name).resolve().is_relative_to(root.resolve())  # noqa: PTH117
-    except (OSError, RuntimeError) as error:  # links in a circle, names beyond the system's limit
-        raise DataError(file, "file name", f"{name[:80]!r} cannot be followed ({error})", "rename the file") from error
+    except (OSError, RuntimeError, ValueError) as error:  # links in a circle, names no system can have
+        raise DataError(
+            file, "file name", f"{name[:80]!r} cannot be followed ({type(error).__name__})", "rename the file"
+        ) from error
     if not within:
         raise DataError(
             file,
@@ -203,26 +210,19 @@ def _refuse_turned(path: Path, image: Image.Image) -> None:
         )
 
 
-def _to_float(path: Path, image: Image.Image) -> Float[np.ndarray, "H W C"]:
+def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.ndarray, "H W C"]:
     """[H, W, 3 or 4] in [0, 1]."""
     if image.format in ("PNG", "TIFF", "WEBP") and getattr(image, "n_frames", 1) > 1:
         raise DataError(path, "pages", "are several in one file", "save each picture as a file of its own")
     if image.mode in ("I;16", "I;16B", "I;16L", "I;16N"):
         grey = np.asarray(image).astype(np.float32) / 65535
         return np.repeat(grey[..., None], 3, axis=2)
-    if _bits_per_channel(image) == 16:
+    if sixteen_bits:
         return _read_sixteen_bits(path)
     if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
         raise DataError(path, "colour mode", f"is {image.mode}", "convert the image to 8-bit or 16-bit RGB")
     has_alpha = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
     return np.asarray(image.convert("RGBA" if has_alpha else "RGB"), np.float32) / 255
-
-
-def _bits_per_channel(image: Image.Image) -> int:
-    if image.format == "PNG":
-        return 16 if getattr(image, "_sixteen_bits", False) else 8
-    bits = getattr(image, "tag_v2", {}).get(_TIFF_BITS_PER_SAMPLE, (8,))
-    return int(max(bits)) if isinstance(bits, tuple) else int(bits)
 
 
 def _read_sixteen_bits(path: Path) -> Float[np.ndarray, "H W C"]:

@@ -113,7 +113,7 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
         test = frames[:: views.test_every]
         pool = [f for i, f in enumerate(frames) if i % views.test_every]
     if views.train_names is not None:
-        by_name = {Path(f.name).stem: f for f in frames}
+        by_name = {Path(f.name).stem: f for f in (pool if any(f.split for f in frames) else frames)}
         missing = [name for name in views.train_names if name not in by_name]
         if missing:
             raise DataError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,15 +22,28 @@ def read_object(path: Path) -> dict[str, Any]:
     def refuse_constant(name: str) -> Any:
         raise ValueError(f"{name} is no JSON number")
 
+    def finite(digits: str) -> float:
+        value = float(digits)
+        if not math.isfinite(value):
+            raise ValueError(f"{digits[:40]} is beyond the range of a float")
+        return value
+
     def refuse_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        if len({key for key, _ in pairs}) != len(pairs):
-            raise ValueError("a key occurs twice in one object")
-        return dict(pairs)
+        value = dict(pairs)
+        if len(value) != len(pairs):
+            keys = [key for key, _ in pairs]
+            raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)!r} occurs twice in one object")
+        return value
 
     try:
         if path.stat().st_size > _LARGEST:
             raise DataError(path, "size", f"is more than {_LARGEST >> 20} MiB", "check the path")
-        value = json.loads(path.read_bytes(), parse_constant=refuse_constant, object_pairs_hook=refuse_twice)
+        value = json.loads(
+            path.read_text("utf-8"),
+            parse_constant=refuse_constant,
+            parse_float=finite,
+            object_pairs_hook=refuse_twice,
+        )
     except OSError as error:
         raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
     except RecursionError as error:
@@ -47,8 +61,11 @@ def number(path: Path, where: str, value: Any) -> float:
     Raises:
         DataError: it is none.
     """
+    if value is None:
+        raise DataError(path, where, "is missing", "give a number")
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e18:
-        raise DataError(path, where, f"is {str(value)[:40]!r} where a finite number belongs", "correct the field")
+        found = repr(value)[:40] if isinstance(value, str | int | float) else f"a {type(value).__name__}"
+        raise DataError(path, where, f"is {found} where a finite number belongs", "correct the field")
     return float(value)
 
 

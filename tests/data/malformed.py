@@ -1,0 +1,325 @@
+"""Malformed inputs: tiny good scenes with one thing spoilt. Each must be refused in one line that names the file.
+
+`CASES` serves the readers' tests and the command line's: a case builds its scene and says which `data=` reads it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from tests.data import tiny
+
+GOOD: dict[str, Callable[[Path], Path]] = {
+    "colmap": tiny.colmap_bin,
+    "colmap_txt": tiny.colmap_txt,
+    "llff": tiny.llff,
+    "blender": tiny.blender,
+    "nerfstudio": tiny.nerfstudio,
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One malformed scene.
+
+    Args:
+        good: which tiny scene it is made from. spoil: what is done to the scene's folder.
+        pattern: regular expression that the message must match, from the file's name on.
+    """
+
+    name: str
+    good: str
+    spoil: Callable[[Path], object]
+    pattern: str
+
+    def build(self, folder: Path) -> tuple[str, Path]:
+        """(`data=` name, path of the scene)."""
+        root = folder / "scene"
+        root.mkdir()
+        GOOD[self.good](root)
+        self.spoil(root)
+        return self.good.removesuffix("_txt"), root
+
+
+def bomb(width: int, height: int) -> bytes:
+    """A PNG of a few bytes whose header promises width x height pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
+
+
+class Canary:
+    """Unpickling it leaves a file behind: whoever reads the scene must not."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.path),)
+
+
+Spoil = Callable[[Path], object]
+
+
+def remove(name: str) -> Spoil:
+    return lambda root: (root / name).unlink()
+
+
+def write(name: str, data: bytes) -> Spoil:
+    return lambda root: (root / name).write_bytes(data)
+
+
+def cut(name: str, size: int) -> Spoil:
+    """Keep the first `size` bytes, or all but the last -size."""
+    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:size])
+
+
+def append(name: str, data: bytes) -> Spoil:
+    return lambda root: (root / name).write_bytes((root / name).read_bytes() + data)
+
+
+def patch(name: str, at: int, layout: str, *values: float) -> Spoil:
+    """Overwrite packed numbers at a byte offset."""
+
+    def spoil(root: Path) -> None:
+        data = bytearray((root / name).read_bytes())
+        struct.pack_into(layout, data, at, *values)
+        (root / name).write_bytes(bytes(data))
+
+    return spoil
+
+
+def replace(name: str, old: str, new: str) -> Spoil:
+    """Replace the first occurrence of a text, which must be there."""
+
+    def spoil(root: Path) -> None:
+        text = (root / name).read_text()
+        if old not in text:
+            raise LookupError(f"{old!r} is not in {name}: the case would spoil nothing")
+        (root / name).write_text(text.replace(old, new, 1))
+
+    return spoil
+
+
+def edit(name: str, change: Callable[[dict[str, Any]], object]) -> Spoil:
+    """Change a JSON file's object in place."""
+
+    def spoil(root: Path) -> None:
+        value = json.loads((root / name).read_text())
+        change(value)
+        tiny.write_json(root / name, value)
+
+    return spoil
+
+
+def edit_frame(name: str, **values: object) -> Spoil:
+    return edit(name, lambda value: value["frames"][1].update(values))
+
+
+def save_image(name: str, **options: Any) -> Spoil:
+    """A photo of another kind in the place of a good one."""
+    size = options.pop("size", (tiny.WIDTH, tiny.HEIGHT))
+    mode = options.pop("mode", "RGB")
+    return lambda root: Image.new(mode, size).save(root / name, **options)
+
+
+def save_table(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+    return lambda root: np.save(root / "poses_bounds.npy", change(np.load(root / "poses_bounds.npy")))
+
+
+def npy_header(text: str) -> bytes:
+    body = text.encode().ljust(118 - 1) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(body)) + body
+
+
+def pickled_table(root: Path) -> None:
+    array = np.array([[Canary(root / "canary")]], dtype=object)
+    np.save(root / "poses_bounds.npy", array, allow_pickle=True)
+
+
+def raw_pickle(root: Path) -> None:
+    (root / "poses_bounds.npy").write_bytes(pickle.dumps(Canary(root / "canary")))
+
+
+def link_outside(name: str) -> Spoil:
+    """The photo becomes a link to a file beside the scene's folder."""
+
+    def spoil(root: Path) -> None:
+        outside = root.parent / "outside.png"
+        outside.write_bytes((root / name).read_bytes())
+        (root / name).unlink()
+        (root / name).symlink_to(outside)
+
+    return spoil
+
+
+def link_in_circle(name: str) -> Spoil:
+    def spoil(root: Path) -> None:
+        (root / name).unlink()
+        (root / name).symlink_to(root / name)
+
+    return spoil
+
+
+def turned(root: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (tiny.WIDTH, tiny.HEIGHT)).save(root / "images/b.png", format="JPEG", exif=exif)
+
+
+def truncated_jpeg(root: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (tiny.HEIGHT, tiny.WIDTH, 3), np.uint8)
+    Image.fromarray(pixels).save(root / "images/b.png", format="JPEG", quality=95)
+    cut("images/b.png", -200)(root)
+
+
+def two_images_of_one_name(root: Path) -> None:
+    file = root / "sparse/0/images.bin"
+    file.write_bytes(file.read_bytes().replace(b"b.png\0", b"a.png\0"))
+
+
+def name_without_end(root: Path) -> None:
+    cut(IMAGES, NAME_AT)(root)
+    append(IMAGES, b"x" * 300)(root)
+
+
+CAMERAS, IMAGES, POINTS = (f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D"))
+CAMERAS_TXT, IMAGES_TXT, POINTS_TXT = (f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D"))
+QUATERNION_AT = 8 + 4  # in images.bin: behind the count and the first id
+NAME_AT = QUATERNION_AT + 7 * 8 + 4
+TRAIN, SHARED = "transforms_train.json", "transforms.json"
+
+CASES = [
+    # COLMAP, binary
+    Case("no model", "colmap", remove(CAMERAS), r"cameras\.bin: file"),
+    Case("no photos", "colmap", lambda root: (root / "images").rename(root / "photos"), r"scene: images: has none"),
+    Case("photo absent", "colmap", remove("images/b.png"), r"images\.bin: b\.png: is not in"),
+    Case("empty file", "colmap", write(IMAGES, b""), r"images\.bin: number of images: .*truncated"),
+    Case("cameras truncated", "colmap", cut(CAMERAS, -1), r"cameras\.bin: .*bytes"),
+    Case("images truncated", "colmap", cut(IMAGES, -9), r"images\.bin: .*left"),
+    Case("points truncated", "colmap", cut(POINTS, -3), r"points3D\.bin: .*left"),
+    Case("trailing bytes", "colmap", append(POINTS, b"\0" * 5), r"points3D\.bin: end: 5 bytes"),
+    Case("count beyond file", "colmap", patch(IMAGES, 0, "<Q", 2**61), r"images\.bin: number of images: says 23058"),
+    Case("2D count beyond file", "colmap", patch(IMAGES, NAME_AT + 6, "<Q", 2**60), r"images\.bin: 2D points of 'a"),
+    Case("track beyond file", "colmap", patch(POINTS, 8 + 8 + 24 + 3 + 8, "<Q", 2**59), r"points3D\.bin: track of"),
+    Case("zero quaternion", "colmap", patch(IMAGES, QUATERNION_AT, "<4d", 0, 0, 0, 0), r"images\.bin: a\.png: .*leng"),
+    Case("NaN pose", "colmap", patch(IMAGES, QUATERNION_AT, "<d", float("nan")), r"images\.bin: a\.png: .*finite"),
+    Case("infinite translation", "colmap", patch(IMAGES, QUATERNION_AT + 32, "<d", float("inf")), r"a\.png: .*finite"),
+    Case("NaN point", "colmap", patch(POINTS, 16, "<d", float("nan")), r"points3D\.bin: point 0: .*finite"),
+    Case("point beyond float32", "colmap", patch(POINTS, 16, "<d", 1e300), r"points3D\.bin: point 0: .*finite"),
+    Case("unknown camera id", "colmap", patch(IMAGES, NAME_AT - 4, "<i", 9), r"images\.bin: a\.png: .*camera 9"),
+    Case("duplicate image id", "colmap", patch(IMAGES, 8, "<i", 2), r"images\.bin: id 2: occurs twice"),
+    Case("duplicate name", "colmap", two_images_of_one_name, r"file name: 'a\.png' belongs to two"),
+    Case("duplicate point id", "colmap", patch(POINTS, 8, "<Q", 2), r"points3D\.bin: .*occurs twice"),
+    Case("unknown image in track", "colmap", patch(POINTS, 8 + 8 + 24 + 3 + 8 + 8, "<i", 77), r"unknown image 77"),
+    Case("unknown camera model", "colmap", patch(CAMERAS, 12, "<i", 42), r"cameras\.bin: camera model: number 42"),
+    Case("no focal length", "colmap", patch(CAMERAS, 32, "<d", 0.0), r"cameras\.bin: camera 1: .*focal"),
+    Case("size of zero", "colmap", patch(CAMERAS, 16, "<Q", 0), r"cameras\.bin: camera 1: has size 0x12"),
+    Case("principal point far away", "colmap", patch(CAMERAS, 48, "<d", 1e6), r"cameras\.bin: .*principal point"),
+    Case("name is no UTF-8", "colmap", patch(IMAGES, NAME_AT, "<B", 0xFF), r"images\.bin: name of image 0: .*UTF-8"),
+    Case("name without end", "colmap", name_without_end, r"images\.bin: name of image 0: is no text"),
+    Case("images of another shape", "colmap", save_image("images/b.png", size=(16, 9)), r"b\.png: size: is 16x9"),
+    Case("symlink leads out", "colmap", link_outside("images/b.png"), r"images\.bin: file name: 'b\.png' leads out"),
+    Case("symlink in a circle", "colmap", link_in_circle("images/b.png"), r"images\.bin: .*b\.png"),
+    Case("image bomb", "colmap", write("images/b.png", bomb(60000, 60000)), r"b\.png: (size|file): .*(pixels|Bomb)"),
+    Case("text named .png", "colmap", write("images/b.png", b"not a picture\n" * 9), r"b\.png: file: is no readable"),
+    Case("GIF named .png", "colmap", save_image("images/b.png", format="GIF", mode="L"), r"b\.png: file: is no read"),
+    Case("empty photo", "colmap", write("images/b.png", b""), r"b\.png: file: is no readable"),
+    Case("photo truncated", "colmap", cut("images/b.png", -60), r"b\.png: pixels: cannot be decoded"),
+    Case("JPEG truncated", "colmap", truncated_jpeg, r"b\.png: pixels: cannot be decoded"),
+    Case("photo turned by EXIF", "colmap", turned, r"b\.png: EXIF orientation: is 6"),
+    Case("CMYK photo", "colmap", save_image("images/b.png", format="TIFF", mode="CMYK"), r"b\.png: colour mode: is CM"),
+    # COLMAP, text
+    Case("txt beside broken bin", "colmap_txt", write(CAMERAS, b"\1"), r"cameras\.bin: number of cameras"),
+    Case("txt byte-order mark", "colmap_txt", replace(CAMERAS_TXT, "#", "\ufeff#"), r"cameras\.txt: line 1: .*byte-order"),
+    Case("txt decimal comma", "colmap_txt", replace(CAMERAS_TXT, "20.0", "20,0"), r"cameras\.txt: line 2: .*comma"),
+    Case("txt NaN", "colmap_txt", replace(POINTS_TXT, "3.0", "nan"), r"points3D\.txt: line 2: has 'nan'"),
+    Case("txt 1e999", "colmap_txt", replace(CAMERAS_TXT, "20.0", "1e999"), r"cameras\.txt: line 2: .*finite"),
+    Case("txt too few parameters", "colmap_txt", replace(CAMERAS_TXT, " 8 6", " 8"), r"cameras\.txt: line 2: has 3 param"),
+    Case("txt column missing", "colmap_txt", replace(IMAGES_TXT, " 1 a.png", " a.png"), r"images\.txt: line 3: has 9"),
+    Case("txt second line missing", "colmap_txt", replace(IMAGES_TXT, "a.png\n\n", "a.png\n"), r"images\.txt: line 4"),
+    Case("txt last line missing", "colmap_txt", replace(IMAGES_TXT, "c.png\n8.0 6.0 -1\n", "c.png"), r"images\.txt: line 8"),
+    Case("txt odd track", "colmap_txt", replace(POINTS_TXT, "0.5 1 0", "0.5 1"), r"points3D\.txt: line 2: has 11 col"),
+    Case("txt colour 300", "colmap_txt", replace(POINTS_TXT, "255", "300"), r"points3D\.txt: line 2: has the colour"),
+    Case("txt 5000 digits", "colmap_txt", replace(CAMERAS_TXT, "16", "1" * 5000), r"cameras\.txt: line 2: .*whole"),
+    Case("txt absolute path", "colmap_txt", replace(IMAGES_TXT, "a.png", "/etc/passwd"), r"images\.txt: .*leads out"),
+    Case("txt path traversal", "colmap_txt", replace(IMAGES_TXT, "a.png", "../../x.png"), r"images\.txt: .*leads out"),
+    # LLFF
+    Case("npy absent", "llff", remove("poses_bounds.npy"), r"poses_bounds\.npy: file: .*No such file"),
+    Case("npy truncated", "llff", cut("poses_bounds.npy", -8), r"poses_bounds\.npy: size: .*asks for 408 bytes, 400"),
+    Case("npy trailing bytes", "llff", append("poses_bounds.npy", b"\0"), r"poses_bounds\.npy: size"),
+    Case("npy of objects", "llff", pickled_table, r"poses_bounds\.npy: header: .*object"),
+    Case("pickle named .npy", "llff", raw_pickle, r"poses_bounds\.npy: header: is no \.npy"),
+    Case("npy header asks TiB", "llff",
+         write("poses_bounds.npy", npy_header("{'descr': '<f8', 'fortran_order': False, 'shape': (999999, 17), }")),
+         r"poses_bounds\.npy: size: the header asks for 135999864 bytes"),
+    Case("npy header nests", "llff", write("poses_bounds.npy", npy_header("-" * 100)), r"poses_bounds\.npy: header"),
+    Case("npy wrong columns", "llff", save_table(lambda t: t[:, :15]), r"header: has the shape \(3, 15\)"),
+    Case("npy whole numbers", "llff", save_table(lambda t: t.astype(np.int64)), r"header: has the type int64"),
+    Case("npy too few rows", "llff", save_table(lambda t: t[:2]), r"poses_bounds\.npy: rows: there are 2"),
+    Case("npy NaN", "llff", save_table(lambda t: np.where(t == t[1, 3], np.nan, t)), r"poses_bounds\.npy: values"),
+    Case("npy not rotations", "llff", save_table(lambda t: t * 1.5), r"poses_bounds\.npy: row 0: .*rotation"),
+    Case("npy bounds turned round", "llff", save_table(lambda t: t[:, [*range(15), 16, 15]]), r"bounds: are 9 and 1"),
+    Case("LLFF images of another shape", "llff", save_image("images_4/b.png", size=(12, 16)), r"b\.png: size: is 12x16"),
+    # Blender
+    Case("JSON absent", "blender", remove(TRAIN), r"transforms_train\.json: file"),
+    Case("no JSON", "blender", write(TRAIN, b"{'a': 1}"), r"transforms_train\.json: json: is not valid"),
+    Case("JSON list", "blender", write(TRAIN, b"[]"), r"transforms_train\.json: json: is a list"),
+    Case("deep JSON", "blender", write(TRAIN, b"[" * 100_000), r"transforms_train\.json: json: .*deep"),
+    Case("JSON not UTF-8", "blender", write(TRAIN, b'{"a": "\xff"}'), r"transforms_train\.json: json"),
+    Case("5000 digits", "blender", write(TRAIN, b'{"camera_angle_x": ' + b"7" * 5000 + b"}"), r"json: is not valid"),
+    Case("no frames", "blender", edit(TRAIN, lambda v: v.update(frames=[])), r"transforms_train\.json: frames"),
+    Case("no angle", "blender", edit(TRAIN, lambda v: v.pop("camera_angle_x")), r"camera_angle_x: is missing"),
+    Case("angle beyond pi", "blender", edit(TRAIN, lambda v: v.update(camera_angle_x=4)), r"camera_angle_x: is 4"),
+    Case("two frames of one file", "blender", edit_frame(TRAIN, file_path="./train/a"), r"'a' belongs to two"),
+    Case("frame without image", "blender", edit_frame(TRAIN, file_path="./train/x"), r"x\.png: file: is not there"),
+    Case("path leads out", "blender", edit_frame(TRAIN, file_path="../../x"), r"train\.json: file name: .*leads out"),
+    Case("path with a surrogate", "blender", edit_frame(TRAIN, file_path="\ud800"), r"train\.json: file name"),
+    Case("path of 5000 letters", "blender", edit_frame(TRAIN, file_path="x" * 5000), r"file name: 'x+' is no file name"),
+    # nerfstudio
+    Case("NaN constant", "nerfstudio", replace(SHARED, '"fl_x": 20.0', '"fl_x": NaN'), r"json: is not valid \(NaN"),
+    Case("1e999", "nerfstudio", replace(SHARED, '"fl_x": 20.0', '"fl_x": 1e999'), r"json: is not valid \(1e999"),
+    Case("duplicate key", "nerfstudio", replace(SHARED, '"fl_x"', '"h": 12, "fl_x"'), r"the key 'h' occurs twice"),
+    Case("number of 100 digits", "nerfstudio", edit(SHARED, lambda v: v.update(fl_x=10**100)), r"fl_x: is 1000"),
+    Case("text for a number", "nerfstudio", edit(SHARED, lambda v: v.update(cx="8")), r"frames\[0\]\.cx: is '8'"),
+    Case("true for a number", "nerfstudio", edit(SHARED, lambda v: v.update(cx=True)), r"frames\[0\]\.cx: is True"),
+    Case("no intrinsics", "nerfstudio", edit(SHARED, lambda v: v.pop("fl_x")), r"frames\[0\]\.fl_x: is missing"),
+    Case("360 degree camera", "nerfstudio", edit(SHARED, lambda v: v.update(camera_model="EQUIRECTANGULAR")),
+         r"frames\[0\]\.camera_model: is 'EQUIRECTANGULAR'"),
+    Case("k4 of a perspective camera", "nerfstudio", edit(SHARED, lambda v: v.update(k4=0.1)), r"frames\[0\]\.k4"),
+    Case("lens that folds", "nerfstudio", edit(SHARED, lambda v: v.update(k1=-40.0)), r"a\.png: distortion: .*removed"),
+    Case("matrix 2x4", "nerfstudio", edit_frame(SHARED, transform_matrix=[[1, 0, 0, 0], [0, 1, 0, 0]]),
+         r"frames\[1\]\.transform_matrix: is no 3x4"),
+    Case("matrix missing", "nerfstudio", edit(SHARED, lambda v: v["frames"][1].pop("transform_matrix")),
+         r"frames\[1\]\.transform_matrix: is no 3x4"),
+    Case("matrix mirrors", "nerfstudio", edit_frame(SHARED, transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()),
+         r"frames\[1\]\.transform_matrix: holds no rotation"),
+    Case("matrix scales", "nerfstudio", edit_frame(SHARED, transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()),
+         r"frames\[1\]\.transform_matrix: holds no rotation"),
+    Case("matrix last row", "nerfstudio", edit_frame(SHARED, transform_matrix=np.diag([1.0, 1, 1, 2]).tolist()),
+         r"frames\[1\]\.transform_matrix: has the last row"),
+    Case("file_path missing", "nerfstudio", edit_frame(SHARED, file_path=None), r"frames\[1\]\.file_path: is missing"),
+    Case("absolute file_path", "nerfstudio", edit_frame(SHARED, file_path="/etc/hostname"), r"file name: .*leads out"),
+    Case("w and h of another shape", "nerfstudio", edit(SHARED, lambda v: v.update(w=12, h=16)), r"a\.png: size"),
+    Case("split lists overlap", "nerfstudio",
+         edit(SHARED, lambda v: v.update(train_filenames=["images/a.png"], test_filenames=["images/a.png"])),
+         r"test_filenames: 'images/a\.png' is for training"),
+    Case("split lists a stranger", "nerfstudio", edit(SHARED, lambda v: v.update(test_filenames=["images/z.png"])),
+         r"split: lists 'images/z\.png'"),
+    Case("PLY absent", "nerfstudio", edit(SHARED, lambda v: v.update(ply_file_path="p.ply")), r"p\.ply: file"),
+    Case("PLY leads out", "nerfstudio", edit(SHARED, lambda v: v.update(ply_file_path="../p.ply")), r"file name"),
+]  # fmt: skip

@@ -1,0 +1,65 @@
+"""NeRF-synthetic: OpenGL poses, RGBA over white, the order and the numbers of the protocol."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from clear_strategies.data import blender
+from clear_strategies.data.photo_files import frame_number
+from tests.data import tiny
+
+PROTOCOL = {2, 16, 26, 55, 73, 76, 86, 93}
+
+
+def test_cameras_are_opencv_and_splits_are_those_of_the_files(tmp_path: Path) -> None:
+    capture = blender.read(tiny.blender(tmp_path))
+    assert [(f.name, f.split) for f in capture.frames] == [("a", "train"), ("b", "train"), ("test/c", "test")]
+    assert capture.background == (1.0, 1.0, 1.0)
+    for i, frame in enumerate(capture.frames):
+        camera = frame.camera
+        np.testing.assert_allclose(camera.world_to_camera.numpy(), tiny.world_to_camera(i), atol=1e-12)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((20, 20, 8, 6))
+
+
+def test_transparent_pixels_are_white(tmp_path: Path) -> None:
+    tiny.blender(tmp_path)
+    Image.new("RGBA", (tiny.WIDTH, tiny.HEIGHT), (0, 0, 0, 51)).save(tmp_path / "train/a.png")
+    image = blender.read(tmp_path).frames[0].load()
+    torch.testing.assert_close(image, torch.full((tiny.HEIGHT, tiny.WIDTH, 3), 0.8))
+    black = blender.read(tmp_path, background=(0.0, 0.0, 0.0)).frames[0].load()
+    assert black.max() == 0
+
+
+def test_the_order_is_that_of_the_file_and_endings_may_be_given(tmp_path: Path) -> None:
+    tiny.blender(tmp_path)
+    for i, name in enumerate(("r_2", "r_10")):
+        (tmp_path / "train" / tiny.NAMES[i]).rename(tmp_path / f"train/{name}.png")
+    frames = [{"file_path": f"train/{name}.png", "transform_matrix": tiny.opengl(0)} for name in ("r_2", "r_10")]
+    tiny.write_json(tmp_path / "transforms_train.json", {"camera_angle_x": 0.7, "frames": frames})
+    assert [frame.name for frame in blender.read(tmp_path).frames] == ["r_2", "r_10", "test/c"]
+
+
+def test_a_scene_without_test_views_is_read_and_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tiny.blender(tmp_path) / "transforms_test.json").unlink()
+    assert [frame.split for frame in blender.read(tmp_path).frames] == ["train", "train"]
+    assert "no test views" in caplog.text
+
+
+def test_the_protocols_frames_of_lego_are_found_by_number(shared_data: Path) -> None:
+    capture = blender.read(shared_data / "lego")
+    train = {frame_number(frame.name): frame for frame in capture.frames if frame.split == "train"}
+    assert set(train) >= PROTOCOL
+    assert len(train) == 25
+    assert [frame_number(f.name) for f in capture.frames if f.split == "test"] == list(range(0, 200, 8))
+    for number in sorted(PROTOCOL):
+        camera = train[number].camera
+        assert camera.center.norm() == pytest.approx(4.031, abs=1e-3)  # on NeRF's sphere around the scene
+        forward = camera.world_to_camera[2, :3]
+        assert (-camera.center / camera.center.norm()) @ forward == pytest.approx(1, abs=1e-5)  # looking at its middle
+    assert train[2].camera.fx == pytest.approx(1111.111, abs=1e-3)
+    assert (train[2].load()[0, 0] == 1).all()

@@ -1,0 +1,184 @@
+"""COLMAP models: both layouts give the same scene, lenses are straightened, photos are found."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from clear_strategies.data import colmap, photo_files
+from clear_strategies.data.cameras import Lens
+from clear_strategies.errors import DataError
+from tests.data import tiny
+
+LAYOUTS = {"bin": tiny.colmap_bin, "txt": tiny.colmap_txt}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_cameras_photos_and_points_are_those_of_the_files(layout: str, tmp_path: Path) -> None:
+    capture = colmap.read(LAYOUTS[layout](tmp_path))
+    assert [frame.name for frame in capture.frames] == list(tiny.NAMES)
+    assert [frame.sfm_id for frame in capture.frames] == [1, 2, 3]
+    for i, frame in enumerate(capture.frames):
+        camera = frame.camera
+        np.testing.assert_allclose(camera.world_to_camera.numpy(), tiny.world_to_camera(i), atol=1e-12)
+        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        assert intrinsics == (20, 20, 8, 6, 16, 12)
+        assert torch.equal(frame.load(), photo_files.read_image(tmp_path / "images" / frame.name))
+    points = capture.points
+    assert points is not None
+    assert points.means.tolist() == [list(p) for p in tiny.POINTS]
+    torch.testing.assert_close(points.colors, torch.tensor([[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]]))
+    pairs = sorted(zip(points.point.tolist(), points.seen_by.tolist(), strict=True))
+    assert pairs == [(0, 1), (0, 2), (1, 2), (1, 3)]
+    assert points.source == "COLMAP sparse/0, 2 points, triangulated from all 3 images"
+    assert capture.notes["poses"] == f"COLMAP sparse/0 ({layout}), 3 images"
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_the_model_is_found_in_every_usual_place(place: str, tmp_path: Path) -> None:
+    tiny.colmap_bin(tmp_path / "made")
+    (tmp_path / "scene").mkdir()
+    shutil.copytree(tmp_path / "made/sparse/0", tmp_path / "scene" / place, dirs_exist_ok=True)
+    shutil.copytree(tmp_path / "made/images", tmp_path / "scene/images")
+    assert len(colmap.read(tmp_path / "scene").frames) == 3
+
+
+def test_smaller_photos_rescale_their_cameras_per_axis(tmp_path: Path) -> None:
+    tiny.write_photos(tiny.colmap_bin(tmp_path) / "images_2", size=(8, 7))
+    capture = colmap.read(tmp_path, images="images_2")
+    camera = capture.frames[0].camera
+    assert (camera.fx, camera.cx, camera.cy, camera.width, camera.height) == (10, 4, 3.5, 8, 7)
+    assert camera.fy == pytest.approx(20 * 7 / 12)
+    assert "16x12 to 8x7" in capture.notes["cameras"]
+
+
+def test_photos_may_differ_from_the_model_in_their_ending(tmp_path: Path) -> None:
+    image = tiny.colmap_bin(tmp_path) / "images/b.png"
+    Image.open(image).save(image.with_suffix(".jpg"))
+    image.unlink()
+    assert [frame.name for frame in colmap.read(tmp_path).frames] == ["a.png", "b.jpg", "c.png"]
+
+
+def test_photos_without_a_pose_and_further_models_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    shutil.copy(tiny.colmap_bin(tmp_path) / "images/a.png", tmp_path / "images/d.png")
+    shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
+    with caplog.at_level("INFO"):
+        capture = colmap.read(tmp_path)
+    assert capture.notes["without pose"] == "1 photos, not used: d.png"
+    assert "other models (1) are not" in caplog.text
+
+
+def test_a_model_without_points_is_a_capture_without_points(tmp_path: Path) -> None:
+    (tiny.colmap_bin(tmp_path) / "sparse/0/points3D.bin").unlink()
+    capture = colmap.read(tmp_path)
+    assert capture.points is None
+    assert capture.notes["points"] == "the model has none"
+
+
+def test_a_quaternion_of_another_length_is_normalised_and_told(tmp_path: Path) -> None:
+    file = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
+    file.write_text(file.read_text().replace("1 1.0 0.0 0.0 0.0", "1 1.5 0.0 0.0 0.0"))
+    capture = colmap.read(tmp_path)
+    np.testing.assert_allclose(capture.frames[0].camera.world_to_camera.numpy(), tiny.world_to_camera(0))
+    assert capture.notes["rotations"].startswith("1 quaternions")
+
+
+def test_the_scene_folder_is_not_written_to(tmp_path: Path) -> None:
+    tiny.colmap_bin(tmp_path)
+    before = sorted((p, p.stat().st_mtime_ns) for p in tmp_path.rglob("*"))
+    for frame in colmap.read(tmp_path).frames:
+        frame.load()
+    assert sorted((p, p.stat().st_mtime_ns) for p in tmp_path.rglob("*")) == before
+
+
+LENSES = [
+    Lens(160, 120, 150.0, 140.0, 82.0, 57.0, (-0.2, 0.05, 0.002, -0.001)),
+    Lens(160, 120, 150.0, 150.0, 80.0, 60.0, (0.15, 0.0, 0.0, 0.0)),
+    Lens(160, 120, 100.0, 100.0, 80.0, 60.0, (0.05, -0.01, 0.002, 0.0), fisheye=True),
+]
+
+
+def distorted(lens: Lens, rays: np.ndarray) -> np.ndarray:
+    """Where the lens images rays (x, y, 1), by the formulas of OpenCV's manual."""
+    x, y = rays[..., 0], rays[..., 1]
+    r = np.hypot(x, y)
+    if lens.fisheye:
+        k1, k2, k3, k4 = lens.distortion
+        theta = np.arctan(r)
+        scale = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8) / np.maximum(r, 1e-12)
+        x, y = x * scale, y * scale
+    else:
+        k1, k2, p1, p2 = lens.distortion
+        radial = 1 + k1 * r**2 + k2 * r**4
+        x, y = (
+            x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
+            y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
+        )
+    return np.stack((x * lens.fx + lens.cx, y * lens.fy + lens.cy), -1)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=["opencv", "radial", "fisheye"])
+def test_undistortion_is_the_lens_formula_and_leaves_no_border(lens: Lens) -> None:
+    """A smooth function of the distorted position, sampled through the new pinhole's rays, is what `undistort` gives."""
+    file = Path("scene")
+    pinhole = lens.undistorted(file)
+    v, u = np.meshgrid(np.arange(120) + 0.5, np.arange(160) + 0.5, indexing="ij")
+
+    def picture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.stack((x / 160, y / 120, 0.5 + 0.4 * np.sin(x / 15) * np.cos(y / 12)), -1)
+
+    photo = torch.from_numpy(picture(u, v).astype(np.float32))
+    rays = np.stack(((u - pinhole.cx) / pinhole.fx, (v - pinhole.cy) / pinhole.fy), -1)
+    source = distorted(lens, rays)
+    assert source.min() > -1
+    assert (source < [161, 121]).all()
+    expected = picture(source[..., 0], source[..., 1])[2:-2, 2:-2]
+    found = lens.undistort(photo, pinhole).numpy()[2:-2, 2:-2]
+    assert np.abs(found - expected).max() < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters"),
+    [
+        ("SIMPLE_RADIAL", (20.0, 8.0, 6.0, 0.1)),
+        ("OPENCV", (20.0, 20.0, 8.0, 6.0, 0.1, 0.01, 0.001, 0.0)),
+        ("OPENCV_FISHEYE", (20.0, 20.0, 8.0, 6.0, 0.1, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_distorted_models_become_pinholes_and_say_so(model: str, parameters: tuple[float, ...], tmp_path: Path) -> None:
+    capture = colmap.read(tiny.colmap_bin(tmp_path, model, parameters))
+    assert capture.notes["lens"].startswith("3 of 3 photos undistorted by OpenCV")
+    raw = photo_files.read_image(tmp_path / "images/a.png")
+    assert capture.frames[0].load().shape == raw.shape
+    assert not torch.equal(capture.frames[0].load(), raw)
+    assert capture.frames[0].camera.fx != 20
+
+
+def test_a_lens_that_opencv_lacks_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    tiny.colmap_bin(tmp_path, "FOV", (20.0, 20.0, 8.0, 6.0, 0.9))
+    with pytest.raises(DataError, match="image_undistorter"):
+        colmap.read(tmp_path)
+
+
+@pytest.mark.parametrize("scene", ["kitchen360", "real_room", "strecha_fountain"])
+def test_real_points_project_into_the_photos_that_saw_them(scene: str, shared_data: Path) -> None:
+    capture = colmap.read(shared_data / scene)
+    points = capture.points
+    assert points is not None
+    for frame in capture.frames:
+        camera = frame.camera
+        seen = points.means[points.point[points.seen_by == frame.sfm_id]].double()
+        local = seen @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        x, y = camera.fx * local[:, 0] / local[:, 2] + camera.cx, camera.fy * local[:, 1] / local[:, 2] + camera.cy
+        inside = (local[:, 2] > 0) & (x > -3) & (x < camera.width + 3) & (y > -3) & (y < camera.height + 3)
+        assert len(seen) > 0
+        assert inside.float().mean() > 0.99
+    assert cv2.imread(str(shared_data / scene / "images" / capture.frames[0].name)).shape == tuple(
+        capture.frames[0].load().shape
+    )

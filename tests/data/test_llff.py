@@ -1,0 +1,78 @@
+"""LLFF: axes, resolution, and the two sources of poses."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from clear_strategies.data import llff
+from clear_strategies.data.capture import Capture
+from clear_strategies.errors import DataError
+from tests.data import tiny
+
+
+def test_poses_and_focal_lengths_are_turned_to_opencv_at_the_photos_size(tmp_path: Path) -> None:
+    capture = llff.read(tiny.llff(tmp_path))
+    for i, frame in enumerate(capture.frames):
+        camera = frame.camera
+        np.testing.assert_allclose(camera.world_to_camera.numpy(), tiny.world_to_camera(i), atol=1e-12)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((20, 20, 8, 6))
+    assert capture.notes["depths"].startswith("1.5 to 9")
+    assert "64x48 to 16x12" in capture.notes["cameras"]
+    assert capture.points is None
+
+
+def test_fortran_order_and_float32_are_read_the_same(tmp_path: Path) -> None:
+    table = np.load(tiny.llff(tmp_path) / "poses_bounds.npy")
+    np.save(tmp_path / "poses_bounds.npy", np.asfortranarray(table.astype(">f4")))
+    camera = llff.read(tmp_path).frames[2].camera
+    np.testing.assert_allclose(camera.world_to_camera.numpy(), tiny.world_to_camera(2), atol=1e-6)
+
+
+def test_colmap_is_preferred_and_renamed_photos_are_matched_by_order(tmp_path: Path) -> None:
+    tiny.colmap_bin(tmp_path)
+    tiny.llff(tmp_path)
+    shutil.rmtree(tmp_path / "images")
+    for i, name in enumerate(tiny.NAMES):
+        (tmp_path / "images_4" / name).rename(tmp_path / "images_4" / f"image{i:03d}.png")
+    capture = llff.read(tmp_path)
+    assert [frame.name for frame in capture.frames] == ["image000.png", "image001.png", "image002.png"]
+    assert [frame.sfm_id for frame in capture.frames] == [1, 2, 3]
+    assert capture.notes["names"] == "photos matched to the model's by order (a.png is image000.png)"
+    assert capture.points is not None
+    (tmp_path / "images_4/image001.png").unlink()
+    with pytest.raises(DataError, match="holds 2 images, the model 3 under other names"):
+        llff.read(tmp_path)
+
+
+def test_an_unknown_source_of_poses_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="use auto, colmap or poses_bounds"):
+        llff.read(tiny.llff(tmp_path), poses="best")
+
+
+@pytest.mark.parametrize(("scene", "views", "size"), [("fern", 20, (1008, 756)), ("horns", 62, (504, 378))])
+def test_both_sources_of_poses_agree_up_to_a_similarity(
+    scene: str, views: int, size: tuple[int, int], shared_data: Path
+) -> None:
+    ours, theirs = (llff.read(shared_data / scene, poses=poses) for poses in ("colmap", "poses_bounds"))
+    assert len(ours.frames) == len(theirs.frames) == views
+    assert [f.name for f in ours.frames] == [f.name for f in theirs.frames]
+    a, b = rotations(ours), rotations(theirs)
+    relative = (a[1:] @ a[:1].mT) @ (b[1:] @ b[:1].mT).mT
+    cosine = (relative.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    assert torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max() < 1
+    p, q = (torch.stack([f.camera.center for f in c.frames]) for c in (ours, theirs))
+    ratio = torch.pdist(p) / torch.pdist(q)
+    assert ratio.max() / ratio.min() < 1.02
+    for frame, other in zip(ours.frames, theirs.frames, strict=True):
+        assert (frame.camera.width, frame.camera.height) == size
+        assert frame.camera.fx == pytest.approx(other.camera.fx, rel=0.02)
+    assert tuple(ours.frames[-1].load().shape) == (size[1], size[0], 3)
+
+
+def rotations(capture: Capture) -> torch.Tensor:
+    return torch.stack([frame.camera.world_to_camera[:3, :3] for frame in capture.frames])

@@ -1,0 +1,100 @@
+"""transforms.json: intrinsics wherever they stand, poses, splits, points."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clear_strategies.data import nerfstudio
+from tests.data import tiny
+
+
+def changed(root: Path, change: Callable[[dict[str, Any]], object]) -> Path:
+    """The tiny scene with another transforms.json."""
+    value = json.loads((tiny.nerfstudio(root) / "transforms.json").read_text())
+    change(value)
+    tiny.write_json(root / "transforms.json", value)
+    return root
+
+
+def test_cameras_are_opencv_and_frames_sorted(tmp_path: Path) -> None:
+    capture = nerfstudio.read(changed(tmp_path, lambda value: value["frames"].reverse()))
+    assert [frame.name for frame in capture.frames] == list(tiny.NAMES)
+    for i, frame in enumerate(capture.frames):
+        camera = frame.camera
+        np.testing.assert_allclose(camera.world_to_camera.numpy(), tiny.world_to_camera(i), atol=1e-12)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 20, 8, 6)
+    assert nerfstudio.read(tmp_path / "transforms.json").frames[0].name == "a.png"
+
+
+def test_a_frames_own_intrinsics_win_over_the_shared_ones(tmp_path: Path) -> None:
+    capture = nerfstudio.read(changed(tmp_path, lambda v: v["frames"][1].update(fl_x=30, cx=7.5)))
+    assert [frame.camera.fx for frame in capture.frames] == [20, 30, 20]
+    assert [frame.camera.cx for frame in capture.frames] == [8, 7.5, 8]
+
+
+def test_instant_ngp_gives_angles_and_leaves_out_endings(tmp_path: Path) -> None:
+    def change(value: dict[str, Any]) -> None:
+        frames = [{**frame, "file_path": frame["file_path"][:-4]} for frame in value["frames"]]
+        value.clear()
+        value.update(camera_angle_x=2 * np.arctan(0.4), aabb_scale=16, frames=frames)
+
+    camera = nerfstudio.read(changed(tmp_path, change)).frames[0].camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((20, 20, 8, 6))
+
+
+def test_sizes_that_differ_from_the_photos_rescale_the_cameras(tmp_path: Path) -> None:
+    double = {"w": 32, "h": 24, "fl_x": 40.0, "fl_y": 40.0, "cx": 16.0, "cy": 12.0}
+    capture = nerfstudio.read(changed(tmp_path, lambda value: value.update(double)))
+    assert (capture.frames[0].camera.fx, capture.frames[0].camera.cy) == (20, 6)
+    assert "32x24 to 16x12" in capture.notes["cameras"]
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "SIMPLE_RADIAL"])
+def test_distortion_is_removed_and_told(model: str, tmp_path: Path) -> None:
+    capture = nerfstudio.read(changed(tmp_path, lambda value: value.update(camera_model=model, k1=0.05)))
+    assert capture.notes["lens"].startswith("3 of 3 photos undistorted")
+    assert capture.frames[0].load().shape == (12, 16, 3)
+
+
+def test_the_files_lists_split_the_frames_and_the_rest_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    lists = {"train_filenames": ["images/b.png"], "val_filenames": ["images/a.png"], "test_filenames": []}
+    capture = nerfstudio.read(changed(tmp_path, lambda value: value.update(lists)))
+    assert [frame.split for frame in capture.frames] == ["test", "train", None]
+    assert "1 frames are in none" in caplog.text
+
+
+def test_masks_are_ignored_aloud(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    capture = nerfstudio.read(changed(tmp_path, lambda v: v["frames"][0].update(mask_path="m.png")))
+    assert "masks" in caplog.text
+    assert capture.notes["masks"].startswith("not used (1")
+
+
+def test_points_of_a_ply_have_no_tracks(tmp_path: Path) -> None:
+    changed(tmp_path, lambda value: value.update(ply_file_path="points.ply", applied_transform=[[1, 0, 0, 5]]))
+    properties = "".join(f"property float {axis}\n" for axis in "xyz")
+    colors = "".join(f"property uchar {color}\n" for color in ("red", "green", "blue"))
+    header = f"ply\nformat ascii 1.0\nelement vertex 1\n{properties}{colors}end_header\n"
+    (tmp_path / "points.ply").write_text(f"{header}1 2 3 255 0 51\n")
+    points = nerfstudio.read(tmp_path).points
+    assert points is not None
+    assert points.means.tolist() == [[1, 2, 3]]
+    assert points.colors[0].tolist() == pytest.approx([1, 0, 0.2])
+    assert len(points.point) == len(points.seen_by) == 0
+    assert points.source == "points.ply, 1 points without tracks"
+
+
+def test_names_keep_the_folders_that_tell_them_apart(tmp_path: Path) -> None:
+    tiny.nerfstudio(tmp_path)
+    for side in ("left", "right"):
+        tiny.write_photos(tmp_path / "images" / side)
+    frames = [{"file_path": f"images/{s}/a.png", "transform_matrix": tiny.opengl(0)} for s in ("left", "right")]
+    tiny.write_json(tmp_path / "transforms.json", {"fl_x": 20.0, "frames": frames})
+    assert [frame.name for frame in nerfstudio.read(tmp_path).frames] == ["left/a.png", "right/a.png"]

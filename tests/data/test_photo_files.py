@@ -1,0 +1,163 @@
+"""The image reader keeps every bit it can read and refuses what it cannot."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from clear_strategies.data import photo_files
+from clear_strategies.errors import DataError
+
+ENDINGS = (".png", ".jpg", ".webp", ".tiff")
+
+
+def save(path: Path, pixels: np.ndarray, **options: object) -> Path:
+    Image.fromarray(pixels).save(path, **options)
+    return path
+
+
+def test_eight_bits_become_their_share_of_255(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.png", np.array([[[0, 51, 255], [102, 204, 1]]], np.uint8))
+    expected = torch.tensor([[[0.0, 0.2, 1.0], [0.4, 0.8, 1 / 255]]])
+    torch.testing.assert_close(photo_files.read_image(path), expected)
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("ending", [".png", ".tiff"])
+def test_sixteen_bits_stay_sixteen_bits(channels: int, ending: str, tmp_path: Path) -> None:
+    values = np.array([[[1000, 2000, 65535, 65535]], [[257, 1, 0, 65535]]], np.uint16)
+    stored = {1: values[..., 0], 3: values[..., 2::-1], 4: values[..., [2, 1, 0, 3]]}[channels]  # OpenCV writes BGR(A)
+    path = tmp_path / f"a{ending}"
+    assert cv2.imwrite(str(path), stored)
+    expected = (values[..., [0, 0, 0]] if channels == 1 else values[..., :3]) / 65535
+    torch.testing.assert_close(photo_files.read_image(path), torch.tensor(expected, dtype=torch.float32))
+
+
+def test_sixteen_bit_grey_with_alpha_is_composited(tmp_path: Path) -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 1, 1, 16, 4, 0, 0, 0))  # 16 bits, grey with alpha
+    pixels = chunk(b"IDAT", zlib.compress(b"\0" + struct.pack(">HH", 65535, 13107)))  # white, alpha 0.2
+    path = tmp_path / "a.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + pixels + chunk(b"IEND", b""))
+    torch.testing.assert_close(photo_files.read_image(path), torch.full((1, 1, 3), 0.2))
+
+
+def test_straight_alpha_is_composited_over_the_background(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.png", np.array([[[255, 0, 0, 51], [9, 9, 9, 0]]], np.uint8))
+    found = photo_files.read_image(path, background=(1.0, 1.0, 0.5))
+    torch.testing.assert_close(found, torch.tensor([[[1.0, 0.8, 0.4], [1.0, 1.0, 0.5]]]))
+
+
+def test_without_a_background_alpha_lies_over_black_and_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = save(tmp_path / "a.png", np.array([[[255, 0, 0, 51]]], np.uint8))
+    with caplog.at_level("INFO"):
+        torch.testing.assert_close(photo_files.read_image(path), torch.tensor([[[0.2, 0.0, 0.0]]]))
+    assert "a.png has transparent pixels" in caplog.text
+
+
+def test_grey_and_palette_become_rgb(tmp_path: Path) -> None:
+    grey = save(tmp_path / "grey.png", np.array([[51]], np.uint8))
+    torch.testing.assert_close(photo_files.read_image(grey), torch.full((1, 1, 3), 0.2))
+    Image.new("RGB", (1, 1), (0, 51, 255)).quantize(2).save(tmp_path / "palette.png")
+    torch.testing.assert_close(photo_files.read_image(tmp_path / "palette.png"), torch.tensor([[[0.0, 0.2, 1.0]]]))
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_header_tells_the_size(ending: str, tmp_path: Path) -> None:
+    path = save(tmp_path / f"a{ending}", np.zeros((12, 16, 3), np.uint8))
+    assert photo_files.image_size(path) == (16, 12)
+    assert photo_files.read_image(path, expect=(16, 12)).shape == (12, 16, 3)
+    with pytest.raises(DataError, match="is 16x12 where 12x16 is expected"):
+        photo_files.read_image(path, expect=(12, 16))
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("orientation", [3, 6])
+def test_a_photo_to_be_turned_is_refused(ending: str, orientation: int, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = save(tmp_path / f"a{ending}", np.zeros((12, 16, 3), np.uint8), exif=exif)
+    with pytest.raises(DataError, match=f"EXIF orientation: is {orientation}"):
+        photo_files.read_image(path)
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_every_cut_of_a_file_is_refused(ending: str, tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8)
+    path = save(tmp_path / f"a{ending}", pixels)
+    data = path.read_bytes()
+    for size in range(0, len(data) - 24, 23):  # a PNG without its last chunk, or a JPEG without its end, is whole
+        path.write_bytes(data[:size])
+        with pytest.raises(DataError):
+            photo_files.read_image(path)
+
+
+def test_the_limit_of_pixels_is_held_before_decoding(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.png", np.zeros((12, 16, 3), np.uint8))
+    assert photo_files.image_size(path, max_pixels=192) == (16, 12)
+    with pytest.raises(DataError, match="16x12 is more than 191 pixels"):
+        photo_files.image_size(path, max_pixels=191)
+
+
+def test_an_animation_is_refused(tmp_path: Path) -> None:
+    frames = [Image.new("RGB", (8, 8), color) for color in ("red", "blue")]
+    frames[0].save(tmp_path / "a.png", save_all=True, append_images=frames[1:])
+    with pytest.raises(DataError, match="pages"):
+        photo_files.read_image(tmp_path / "a.png")
+
+
+def test_writing_and_reading_is_the_identity_on_eight_bits(tmp_path: Path) -> None:
+    image = torch.randint(0, 256, (7, 5, 3), generator=torch.Generator().manual_seed(0)) / 255
+    photo_files.write_png(tmp_path / "new" / "a.png", image)
+    torch.testing.assert_close(photo_files.read_image(tmp_path / "new" / "a.png"), image)
+    assert [p.name for p in (tmp_path / "new").iterdir()] == ["a.png"]
+
+
+def test_images_are_listed_by_name_and_by_ending(tmp_path: Path) -> None:
+    for name in ("b.JPG", "a.png", "notes.txt", "c.tif"):
+        (tmp_path / name).touch()
+    (tmp_path / "folder.png").mkdir()
+    assert [p.name for p in photo_files.list_images(tmp_path)] == ["a.png", "b.JPG", "c.tif"]
+
+
+def test_the_first_of_the_usual_folders_is_taken_and_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with pytest.raises(DataError, match="has none of the folders"):
+        photo_files.image_folder(tmp_path)
+    (tmp_path / "images_8").mkdir()
+    (tmp_path / "images_4").mkdir()
+    with caplog.at_level("INFO"):
+        assert photo_files.image_folder(tmp_path).name == "images_4"
+    assert "images_4" in caplog.text
+    assert photo_files.image_folder(tmp_path, "images_8").name == "images_8"
+    with pytest.raises(DataError, match="choose one of images_4, images_8"):
+        photo_files.image_folder(tmp_path, "images")
+
+
+@pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/../../x", "", "a\0b", "\ud800", "link/x"])
+def test_names_that_lead_out_are_refused(name: str, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "link").symlink_to(tmp_path)
+    with pytest.raises(DataError, match="file name"):
+        photo_files.inside(root, name, file=root / "list.txt")
+
+
+def test_names_inside_are_kept_and_outside_ones_can_be_allowed(tmp_path: Path) -> None:
+    assert photo_files.inside(tmp_path, "a/../b.png", file=tmp_path) == tmp_path / "a/../b.png"
+    assert photo_files.inside(tmp_path, "/x.png", file=tmp_path, allow_outside=True) == Path("/x.png")
+
+
+def test_frame_numbers_are_the_last_of_the_name() -> None:
+    names = ("train/r_26.png", "image007.png", "r_2", "view.png")
+    assert [photo_files.frame_number(name) for name in names] == [26, 7, 2, None]

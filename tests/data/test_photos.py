@@ -1,0 +1,91 @@
+"""Photos without poses: structure from motion finds the true cameras, up to a similarity, and keeps them."""
+
+from __future__ import annotations
+
+import builtins
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from clear_strategies.data import colmap, photos
+from clear_strategies.errors import DataError
+
+pycolmap = pytest.importorskip("pycolmap")
+
+
+def test_poses_are_those_of_the_ground_truth(
+    shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Five views of fountain-P11 at 384x256: rotations within 1 degree, centres within 2 % of the cameras' spread."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    truth = colmap.read(shared_data / "strecha_fountain").frames[2:7]
+    for frame in truth:
+        with Image.open(shared_data / "strecha_fountain/images" / frame.name) as image:
+            image.resize((384, 256), Image.Resampling.LANCZOS).save(folder / frame.name, quality=97)
+    capture = photos.read(folder, tmp_path / "cache", threads=1)
+    assert [frame.name for frame in capture.frames] == [frame.name for frame in truth]
+    assert "estimated by pycolmap from all 5 photos, 5 could be placed" in capture.notes["poses"]
+    assert capture.points is not None
+    assert len(capture.points.means) > 100
+
+    found, real = (torch.stack([f.camera.world_to_camera[:3, :3] for f in fs]) for fs in (capture.frames, truth))
+    relative = (found[1:] @ found[:1].mT) @ (real[1:] @ real[:1].mT).mT
+    cosine = (relative.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    assert torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max() < 1
+    p, q = (np.stack([f.camera.center.numpy() for f in frames]) for frames in (capture.frames, truth))
+    p, q = p - p.mean(0), q - q.mean(0)
+    u, s, vt = np.linalg.svd(q.T @ p)
+    aligned = p @ (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).T * s.sum() / (p**2).sum()
+    assert np.linalg.norm(aligned - q, axis=1).max() < 0.02 * np.linalg.norm(q, axis=1).max()
+
+    # A second reading takes the kept poses: nothing is estimated, and nothing was written among the photos.
+    monkeypatch.setattr(photos, "_reconstruct", None)
+    again = photos.read(folder, tmp_path / "cache", threads=1)
+    for one, other in zip(capture.frames, again.frames, strict=True):
+        assert torch.equal(one.camera.world_to_camera, other.camera.world_to_camera)
+    assert sorted(p.name for p in folder.iterdir()) == [frame.name for frame in truth]
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
+def flat_photos(folder: Path, count: int) -> Path:
+    folder.mkdir()
+    for i in range(count):
+        Image.new("RGB", (64, 48), (40 * i, 90, 120)).save(folder / f"{i}.png")
+    return folder
+
+
+def test_photos_that_show_nothing_are_refused_with_what_to_do(tmp_path: Path) -> None:
+    folder = flat_photos(tmp_path / "photos", 3)
+    with pytest.raises(DataError, match="take more photos that overlap") as refusal:
+        photos.read(folder, tmp_path / "cache", threads=1)
+    assert "\n" not in str(refusal.value)
+    assert list((tmp_path / "cache").iterdir()) == []
+
+
+def test_two_photos_are_too_few(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="there are 2, poses need at least 3"):
+        photos.read(flat_photos(tmp_path / "photos", 2), tmp_path / "cache")
+
+
+def test_the_cache_may_not_lie_among_the_photos(tmp_path: Path) -> None:
+    folder = flat_photos(tmp_path / "photos", 3)
+    with pytest.raises(DataError, match="lies among the photos"):
+        photos.read(folder, folder / "cache")
+
+
+def test_without_pycolmap_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real_import = builtins.__import__
+
+    def no_pycolmap(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name == "pycolmap":
+            raise ImportError("No module named 'pycolmap'")
+        return real_import(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", no_pycolmap)
+    with pytest.raises(DataError, match=r"clear-strategies\[colmap\]"):
+        photos.read(flat_photos(tmp_path / "photos", 3), tmp_path / "cache")

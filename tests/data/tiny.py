@@ -1,0 +1,126 @@
+"""Tiny good scenes on disk: three views of 16x12 px in every format that a reader reads.
+
+The readers' tests compare with the cameras here; the malformed inputs are these scenes with one thing spoilt.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+WIDTH, HEIGHT = 16, 12
+FOCAL = 20.0
+NAMES = ("a.png", "b.png", "c.png")
+# Turned about y by 0, 10 and 20 degrees: (w, x, y, z) of COLMAP's world-to-camera rotations.
+QUATERNIONS = tuple((math.cos(math.radians(a) / 2), 0.0, math.sin(math.radians(a) / 2), 0.0) for a in (0, 10, 20))
+TRANSLATIONS = ((0.0, 0.0, 1.0), (0.1, 0.0, 1.0), (0.2, -0.1, 1.5))
+POINTS = ((0.0, 0.0, 3.0), (0.5, -0.25, 4.0))
+COLORS = ((255, 0, 51), (0, 102, 255))
+TRACKS = ((1, 2), (2, 3))  # image ids; 0-based 2D indices are all 0
+MODEL_NUMBERS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FOV": 7}
+
+
+def world_to_camera(view: int) -> np.ndarray:
+    """The pose of a view, by the textbook formula for a turn about y."""
+    angle = math.radians(10 * view)
+    pose = np.eye(4)
+    pose[:3, :3] = [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+    pose[:3, 3] = TRANSLATIONS[view]
+    return pose
+
+
+def opengl(view: int) -> list[list[float]]:
+    """Camera-to-world with x right, y up, z back."""
+    return (np.linalg.inv(world_to_camera(view)) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
+
+
+def write_photos(folder: Path, size: tuple[int, int] = (WIDTH, HEIGHT), mode: str = "RGB") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, name in enumerate(NAMES):
+        pixels = np.random.default_rng(i).integers(0, 256, (size[1], size[0], len(mode)), np.uint8)
+        Image.fromarray(pixels).save(folder / name)
+
+
+def colmap_bin(root: Path, model: str = "PINHOLE", parameters: tuple[float, ...] = (FOCAL, FOCAL, 8, 6)) -> Path:
+    """images/ and sparse/0 in COLMAP's binary layout."""
+    write_photos(root / "images")
+    sparse = root / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    camera = struct.pack("<QiiQQ", 1, 1, MODEL_NUMBERS[model], WIDTH, HEIGHT)
+    (sparse / "cameras.bin").write_bytes(camera + struct.pack(f"<{len(parameters)}d", *parameters))
+    images = struct.pack("<Q", len(NAMES))
+    for i, name in enumerate(NAMES):
+        images += struct.pack("<i7di", i + 1, *QUATERNIONS[i], *TRANSLATIONS[i], 1) + name.encode() + b"\0"
+        images += struct.pack("<Qddq", 1, 8.0, 6.0, -1)
+    (sparse / "images.bin").write_bytes(images)
+    points = struct.pack("<Q", len(POINTS))
+    for i, (xyz, rgb, track) in enumerate(zip(POINTS, COLORS, TRACKS, strict=True)):
+        points += struct.pack("<Q3d3BdQ", i + 1, *xyz, *rgb, 0.5, len(track))
+        points += b"".join(struct.pack("<ii", image, 0) for image in track)
+    (sparse / "points3D.bin").write_bytes(points)
+    return root
+
+
+def colmap_txt(root: Path) -> Path:
+    """The same scene in COLMAP's text layout."""
+    write_photos(root / "images")
+    sparse = root / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    cameras = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 PINHOLE {WIDTH} {HEIGHT} {FOCAL} {FOCAL} 8 6\n"
+    (sparse / "cameras.txt").write_text(cameras)
+    images = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
+    for i, name in enumerate(NAMES):
+        images += " ".join(map(repr, (i + 1, *QUATERNIONS[i], *TRANSLATIONS[i], 1))) + f" {name}\n"
+        images += "8.0 6.0 -1\n" if i else "\n"
+    (sparse / "images.txt").write_text(images)
+    points = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
+    for i, (xyz, rgb, track) in enumerate(zip(POINTS, COLORS, TRACKS, strict=True)):
+        points += " ".join(map(str, (i + 1, *xyz, *rgb, 0.5))) + "".join(f" {image} 0" for image in track) + "\n"
+    (sparse / "points3D.txt").write_text(points)
+    return root
+
+
+def poses_bounds() -> np.ndarray:
+    """LLFF's table for images of 64x48, four times the size of the photos; its axes are down, right, back."""
+    rows = []
+    for view in range(len(NAMES)):
+        pose = np.linalg.inv(world_to_camera(view))
+        right, down, forward, center = pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3]
+        matrix = np.stack((down, right, -forward, center, [4 * HEIGHT, 4 * WIDTH, 4 * FOCAL]), axis=1)
+        rows.append([*matrix.ravel(), 1.5, 9.0])
+    return np.array(rows)
+
+
+def llff(root: Path) -> Path:
+    """images_4/ and poses_bounds.npy, no COLMAP model."""
+    write_photos(root / "images_4")
+    np.save(root / "poses_bounds.npy", poses_bounds())
+    return root
+
+
+def blender(root: Path) -> Path:
+    """Two training views and a test view, RGBA."""
+    write_photos(root / "train", mode="RGBA")
+    angle = 2 * math.atan(WIDTH / (2 * FOCAL))
+    for split, views in (("train", (0, 1)), ("test", (2,))):
+        frames = [{"file_path": f"./train/{NAMES[i][0]}", "transform_matrix": opengl(i)} for i in views]
+        write_json(root / f"transforms_{split}.json", {"camera_angle_x": angle, "frames": frames})
+    return root
+
+
+def nerfstudio(root: Path) -> Path:
+    """images/ and transforms.json with shared intrinsics and no distortion."""
+    write_photos(root / "images")
+    frames = [{"file_path": f"images/{name}", "transform_matrix": opengl(i)} for i, name in enumerate(NAMES)]
+    shared = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 8.0, "cy": 6.0, "w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV"}
+    write_json(root / "transforms.json", {**shared, "frames": frames})
+    return root
+
+
+def write_json(path: Path, value: object) -> None:
+    path.write_text(json.dumps(value, indent=1))

@@ -1,0 +1,257 @@
+"""The field through clone, split, prune and reset: every per-Gaussian tensor stays with its Gaussian."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+import toy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clear_strategies import SVS, Conductor, Update
+from clear_strategies.data.view import PointCloud
+from clear_strategies.density import Density, DensityError, DensitySettings, cameras_extent
+from clear_strategies.field import GaussianField
+from clear_strategies.gradients import Grads
+from clear_strategies.mip import filter_std
+from clear_strategies.optim import Adam, LearningRates
+from clear_strategies.testing import StubShot
+from rasterizers.geometry import SH_C0
+
+
+def cloud(n=12, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return PointCloud(torch.randn(n, 3, generator=g), torch.rand(n, 3, generator=g), "random")
+
+
+def tagged(n=12):
+    """A field whose every tensor carries its Gaussian's number, with optimizer and statistics alike."""
+    field = GaussianField.from_cloud(cloud(n))
+    number = torch.arange(n, dtype=torch.float32)
+    field.detail.data[:] = number[:, None]
+    optimizer = Adam(field.raw(), LearningRates(), extent=1.0)
+    for moments in (optimizer.first, optimizer.second):
+        moments["detail"][:] = number[:, None] + 0.5
+    density = Density(DensitySettings(start=0, stop=100, statistics_from=0, min_gaussians=1), n, extent=1.0, seed=0)
+    return field, optimizer, density
+
+
+def test_start_as_in_3dgs():
+    points = PointCloud(torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]]), torch.full((4, 3), 0.75), "four")
+    field = GaussianField.from_cloud(points)
+    # Root mean square distance to the three others, from the first point: √((1 + 4 + 9) / 3).
+    assert field.scales.data[0].exp().tolist() == pytest.approx([math.sqrt(14 / 3)] * 3)
+    assert torch.allclose(field.opacities.data.sigmoid(), torch.full((4,), 0.1))
+    assert torch.allclose(field.sh0.data[:, 0] * SH_C0 + 0.5, torch.full((4, 3), 0.75))
+    assert not field.detail.data.any()
+    assert field.max_degree == 3
+
+
+@given(
+    chosen=st.lists(st.booleans(), min_size=12, max_size=12),
+    large=st.lists(st.booleans(), min_size=12, max_size=12),
+    faint=st.lists(st.booleans(), min_size=12, max_size=12),
+)
+@settings(max_examples=40, deadline=None)
+def test_every_tensor_follows_its_gaussian(chosen, large, faint):
+    field, optimizer, density = tagged()
+    wanted, big, gone = (torch.tensor(x) for x in (chosen, large, faint))
+    if bool(gone.all()):
+        return
+    field.scales.data[:] = torch.where(big, 0.5, 0.005).log()[:, None]
+    field.opacities.data[:] = torch.where(gone, torch.logit(torch.tensor(0.001)), torch.tensor(0.0))
+    density.score[:] = density.ordinary[:] = wanted.float()
+    density.count[:] = 1
+    parents = density.restructure(field, optimizer, 10)
+    numbers = parents.float()
+    assert torch.equal(field.detail.data[:, 0], numbers)
+    fresh = optimizer.first["detail"][:, 0] == 0
+    assert torch.equal(optimizer.first["detail"][~fresh, 0], numbers[~fresh] + 0.5)
+    assert {len(p) for p in field.raw().values()} == {len(parents)} == {len(field.filter_3d)}
+    assert {len(m) for m in optimizer.first.values()} == {len(parents)} == {len(density.count)}
+    expected = [
+        0 if gone[i] else 2 if wanted[i] else 1  # a clone beside it, or two children instead of it
+        for i in range(12)
+    ]
+    assert torch.bincount(parents, minlength=12).tolist() == expected
+
+
+def test_split_children_are_smaller_and_lie_inside_their_parent_and_clones_are_copies():
+    field, optimizer, density = tagged(2)
+    field.scales.data[:] = torch.tensor([[0.5, 0.5, 0.5], [0.001, 0.001, 0.001]]).log()
+    density.score[:] = density.ordinary[:] = 1.0
+    density.count[:] = 1
+    means = field.means.data.clone()
+    parents = density.restructure(field, optimizer, 10)
+    assert parents.tolist() == [1, 1, 0, 0]
+    assert torch.equal(field.means.data[:2], means[[1, 1]])
+    assert torch.allclose(field.scales.data[2:].exp(), torch.full((2, 3), 0.5 / 1.6))
+    offset = (field.means.data[2:] - means[0]).norm(dim=1)
+    assert ((offset > 0) & (offset < 0.5 * 6)).all()
+    assert not torch.equal(field.means.data[2], field.means.data[3])
+
+
+def test_quantile_mode_picks_as_many_as_the_ordinary_rule_but_by_score():
+    field, optimizer, density = tagged()
+    density.count[:] = 1
+    density.ordinary[:3] = 1.0  # three pass the threshold
+    density.score[5:10] = torch.tensor([5.0, 4, 3, 2, 1]) * 1e-9
+    parents = density.restructure(field, optimizer, 10)
+    assert torch.bincount(parents, minlength=12)[5:8].tolist() == [2, 2, 2]
+    assert len(parents) == 15
+
+
+def test_the_cap_binds_and_is_said(caplog):
+    field, optimizer, _ = tagged()
+    density = Density(DensitySettings(start=0, stop=100, max_gaussians=14), 12, extent=1.0, seed=0)
+    density.score[:] = density.ordinary[:] = torch.arange(12) + 1.0
+    density.count[:] = 1
+    assert len(density.restructure(field, optimizer, 10)) == 14
+    assert "the cap of 14 Gaussians binds: 12 want to densify, 2 may" in caplog.text
+
+
+def test_pruning_never_empties_the_field():
+    field, optimizer, density = tagged()
+    field.opacities.data[:] = -10
+    with pytest.raises(DensityError, match="would leave 0 of 12 Gaussians"):
+        density.restructure(field, optimizer, 10)
+
+
+def test_statistics_are_means_over_the_views_that_saw_a_gaussian():
+    density = Density(DensitySettings(start=0, stop=100, statistics_from=0), 3, extent=1.0, seed=0)
+
+    seen = StubShot(torch.zeros(2, 2, 3), torch.zeros(3, 2), torch.tensor([True, True, False]), [])
+    for value in (1.0, 3.0):
+        score = torch.full((3,), value)
+        density.accumulate(Update(Grads(), score, score * 2, None), seen, 5)
+    seen.visible = torch.tensor([True, False, False])
+    density.accumulate(Update(Grads(), torch.full((3,), 8.0), torch.zeros(3), None), seen, 6)
+    assert (density.score / density.count.clamp_min(1)).tolist() == pytest.approx([4, 2, 0])
+    assert density.count.tolist() == [3, 2, 0]
+
+
+def test_rounds_fall_inside_the_window_and_at_least_ten_fit():
+    settings = DensitySettings(start=50, stop=500)
+    assert settings.interval == 45
+    density = Density(settings, 1, extent=1.0, seed=0)
+    assert [t for t in range(1, 600) if density.due(t)] == list(range(90, 500, 45))
+    assert DensitySettings().interval == 100
+
+
+def test_opacity_reset_acts_on_what_is_drawn():
+    field, optimizer, density = tagged()
+    field.filter_3d = torch.full((12,), 0.3)
+    field.opacities.data[:] = torch.linspace(-8, 8, 12)
+    before = field.filtered_opacities()
+    optimizer.first["opacities"][:] = 1
+    density.reset_opacity(field, optimizer)
+    assert torch.allclose(field.filtered_opacities(), before.clamp_max(0.01), rtol=1e-4)
+    assert not optimizer.first["opacities"].any()
+
+
+def test_white_backgrounds_get_an_early_reset():
+    white = Density(DensitySettings(), 1, extent=1.0, seed=0, white_background=True)
+    black = Density(DensitySettings(), 1, extent=1.0, seed=0)
+    assert [t for t in range(1, 10_001) if white.reset_due(t)] == [500, 3000]
+    assert [t for t in range(1, 10_001) if black.reset_due(t)] == [3000]
+
+
+def test_an_anchor_follows_a_reordering_of_its_gaussians():
+    svs = SVS(anchor_start=1)
+    conductor = Conductor(svs)
+    conductor.on_fit_start(3, 0)
+    field, _, _ = tagged()
+    conductor.after_step(field.raw(), 1)
+    order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
+    field.take(order, torch.zeros(12, dtype=torch.bool))
+    conductor.on_resize(order)
+    assert all(not g.any() for g in svs.regularize(field.raw(), 2).values())
+
+
+def test_adam_is_torchs_adam():
+    field, _, _ = tagged()
+    params = {name: value.clone() for name, value in field.raw().items()}
+    rates = LearningRates(detail_decay=0.0)
+    ours = Adam(params, rates, extent=2.0)
+    theirs = {name: value.clone().requires_grad_() for name, value in params.items()}
+    g = torch.Generator().manual_seed(0)
+    optimizers = {n: torch.optim.Adam([p], lr=1.0, eps=1e-15) for n, p in theirs.items()}
+    for t in range(1, 6):
+        grads = {name: torch.randn(value.shape, generator=g) * 1e-6 for name, value in params.items()}
+        ours.step(params, grads)
+        for name, optimizer in optimizers.items():
+            optimizer.param_groups[0]["lr"] = rates.at(t, 2.0)[name]
+            theirs[name].grad = grads[name]
+            optimizer.step()
+    for name, value in params.items():
+        assert torch.allclose(value, theirs[name].detach(), rtol=1e-5, atol=1e-7), name
+
+
+def test_visible_rows_only_leaves_the_others_where_they_are():
+    field, _, _ = tagged()
+    params = field.raw()
+    adam = Adam(params, LearningRates(rows="visible"), extent=1.0)
+    before = params["means"].clone()
+    seen = torch.arange(12) < 5
+    adam.step(params, {name: torch.ones_like(value) for name, value in params.items()}, seen)
+    assert torch.equal(params["means"][5:], before[5:])
+    assert (params["means"][:5] != before[:5]).all()
+
+
+def test_the_3d_filter_by_hand_and_unseen_gaussians_take_the_largest():
+    camera = toy.camera(0.0)
+    means = torch.tensor([[0.0, 0, 0], [0, 0, 4], [0, 0, -100]])  # depths 4, 8, behind
+    f = filter_std(means, [camera], 0.2)
+    assert f.tolist() == pytest.approx([4 / camera.fx * 0.2**0.5, 8 / camera.fx * 0.2**0.5, 8 / camera.fx * 0.2**0.5])
+    assert not filter_std(means[2:], [camera], 0.2).any()
+    assert not filter_std(means, [camera], 0.0).any()
+
+
+def test_filtered_opacity_sends_its_gradient_into_the_scales():
+    scene = toy.scene(12)
+    field = GaussianField.from_cloud(scene.cloud).double()
+    field.filter_3d = torch.full((12,), 0.2, dtype=torch.float64)
+    view = scene.train[0]
+    v = torch.randn(1, 64, 96, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    import rasterizers
+
+    smooth = rasterizers.load("torch", alpha_min=1e-9, transmittance_min=0.0)
+    _, hr = field.render_scales(smooth, view)
+    (gradient,) = hr.pull(v)
+    g = torch.Generator().manual_seed(1)
+    for name in ("scales", "opacities", "means", "quats", "detail"):
+        direction = torch.randn(gradient[name].shape, generator=g, dtype=torch.float64)
+        values = []
+        for sign in (1, -1):
+            field.raw()[name].add_(direction, alpha=sign * 1e-6)
+            values.append(float((field.render_scales(smooth, view)[1].image * v[0]).sum()))
+            field.raw()[name].sub_(direction, alpha=sign * 1e-6)
+        numeric = (values[0] - values[1]) / 2e-6
+        assert float((gradient[name] * direction).sum()) == pytest.approx(numeric, rel=1e-4, abs=1e-6), name
+
+
+def test_lr_does_not_see_the_detail_feature():
+    scene = toy.scene(12)
+    field = GaussianField.from_cloud(scene.cloud)
+    plain_lr, plain_hr = field.render_scales(toy.RASTERIZER, scene.train[0])
+    field.detail.data += 0.2
+    lr, hr = field.render_scales(toy.RASTERIZER, scene.train[0])
+    assert torch.equal(lr.image, plain_lr.image)
+    assert not torch.equal(hr.image, plain_hr.image)
+    assert "detail" not in lr.pull(torch.ones(1, 16, 24, 3))[0]
+
+
+def test_extent_of_cameras():
+    centers = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0]])
+    assert cameras_extent(centers) == pytest.approx(1.1)
+    assert cameras_extent(centers[:1]) > 0
+
+
+def test_parameters_are_kept_where_they_can_move():
+    field, _, _ = tagged()
+    field.opacities.data[0], field.scales.data[0] = 50.0, -90.0
+    field.constrain()
+    assert field.opacities.data[0] == 15
+    assert (field.scales.data[0] == -20).all()

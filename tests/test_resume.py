@@ -1,0 +1,197 @@
+"""A run that stops and goes on is bitwise the run that never stopped, for every subset of strategies.
+
+The schedule is compressed so that warm-up, densification, pruning, the opacity reset, the decay of λ_HR and the anchor
+all happen inside twenty iterations, and the test asserts that they did.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+
+import pytest
+import torch
+import toy
+
+from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, checkpoint
+from clear_strategies.density import DensitySettings
+from clear_strategies.fit import FitSettings, TrainState, fit, iterate
+from clear_strategies.mip import MipFilter
+from clear_strategies.optim import LearningRates
+from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
+
+ITERATIONS = 20
+# 3 warm-up starts · 2 to 12 densify and prune · 6, 12 reset · 8 warm · 12 anchor · 14 decay. Cuts around each.
+CUTS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 19)
+SUBSETS = [s for k in range(4) for s in itertools.combinations(("gco", "p2g", "svs"), k)]
+
+
+def start(names: tuple[str, ...], iterations: int = ITERATIONS) -> TrainState:
+    make = {
+        "gco": GCO,
+        "p2g": P2G,
+        "svs": lambda: SVS(
+            dropout=Ramp(full=ITERATIONS),
+            anchor_start=12,
+            anchor_weights={"means": 1.0, "scales": 1.0, "sh0": 0.1, "detail": 0.1},
+        ),
+    }
+    objective = Objective(lambda_hr=WarmupDecay(start=3, full=8, decay_from=14, end=ITERATIONS))
+    return TrainState.start(
+        SCENE,
+        Conductor(*(make[name]() for name in names), objective=objective, statistics_from=1),
+        settings=FitSettings(
+            iterations=iterations, scale_schedule=False, degree_every=6, probe_every=0, checkpoint_every=0, seed=5
+        ),
+        density=DensitySettings(
+            start=1,
+            stop=13,
+            statistics_from=1,
+            every=5,
+            reset_every=6,
+            threshold=1e-5,
+            prune_opacity=0.0095,
+            min_gaussians=2,
+        ),
+        rates=LearningRates(means=LogLinear(end=ITERATIONS), detail_decay=0.01),
+        mip=MipFilter(every=7, last=1),
+    )
+
+
+SCENE = toy.scene(16, seed=2, train=3, test=1)
+
+
+def tensors(state: TrainState) -> dict[str, torch.Tensor]:
+    return dict(state.checkpoint({}).tensors)
+
+
+def without_time(history: list[dict[str, float]]) -> str:
+    return json.dumps([{k: v for k, v in row.items() if k != "seconds"} for row in history])
+
+
+@pytest.mark.parametrize("names", SUBSETS, ids=lambda s: "+".join(s) or "none")
+def test_resuming_is_bitwise(names, tmp_path, caplog):
+    whole = start(names)
+    saved = {}
+    with caplog.at_level(logging.INFO):
+        for t in range(1, ITERATIONS + 1):
+            if t in CUTS:
+                saved[t] = checkpoint.save(tmp_path / str(t), whole.checkpoint({"names": list(names)}))
+            iterate(whole, toy.RASTERIZER)
+    _assert_that_everything_happened(whole, names, caplog.text)
+    expected, history = tensors(whole), without_time(whole.history)
+    for t, path in saved.items():
+        resumed = start(names)
+        resumed.restore(checkpoint.load(path), path)
+        assert resumed.t == t
+        while resumed.t <= ITERATIONS:
+            iterate(resumed, toy.RASTERIZER)
+        found = tensors(resumed)
+        assert found.keys() == expected.keys()
+        different = [name for name in expected if not torch.equal(found[name], expected[name])]
+        assert not different, f"cut before t={t}: {different}"
+        assert without_time(resumed.history) == history
+
+
+def _assert_that_everything_happened(state: TrainState, names: tuple[str, ...], log: str) -> None:
+    λ = [row["lambda_hr"] for row in state.history]
+    assert λ[2] == 0
+    assert 0 < λ[4] < 1
+    assert λ[10] == 1
+    assert λ[-1] == pytest.approx(0.1)
+    assert "t=5:" in log
+    assert "t=10:" in log
+    assert any(f"{k} split" in log or f"{k} cloned" in log for k in range(1, 30))
+    assert any(f"{k} pruned" in log for k in range(1, 30))
+    assert state.field.degree == 3
+    if "svs" in names:
+        assert state.conductor.strategies[-1].state["means"].shape[0] == len(state.field)
+    if "gco" in names:
+        assert any(row.get("corrected", 0) > 0 for row in state.history)
+    if "p2g" in names:
+        assert any(row.get("mean_q", 0) > 0 for row in state.history)
+
+
+def test_the_same_seed_is_the_same_run_and_another_is_not():
+    runs = []
+    for seed in (5, 5, 6):
+        state = start(("gco", "p2g", "svs"))
+        state.settings = FitSettings(iterations=8, scale_schedule=False, probe_every=0, checkpoint_every=0, seed=seed)
+        fit(state, SCENE, toy.RASTERIZER)
+        runs.append(tensors(state))
+    assert all(torch.equal(runs[0][name], runs[1][name]) for name in runs[0])
+    assert any(runs[0][n].shape != runs[2][n].shape or not torch.equal(runs[0][n], runs[2][n]) for n in runs[0])
+
+
+@pytest.fixture
+def saved(tmp_path):
+    state = start(("svs",))
+    iterate(state, toy.RASTERIZER)
+    return checkpoint.save(tmp_path, state.checkpoint({"a": 1}))
+
+
+@pytest.mark.parametrize("name", ["tensors.safetensors", "history.json"])
+def test_a_flipped_bit_is_found(saved, name):
+    data = bytearray((saved / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (saved / name).write_bytes(data)
+    with pytest.raises(DataError, match=rf"{name}: sha256: is not what the manifest says"):
+        checkpoint.load(saved)
+
+
+def test_a_missing_file_an_edited_manifest_and_a_newer_format_are_refused(saved):
+    manifest = saved / "manifest.json"
+    good = manifest.read_text()
+    for edit, message in (
+        (lambda m: m | {"format": 99}, "format: is 99"),
+        (lambda m: {k: v for k, v in m.items() if k != "t"}, "t: is missing"),
+    ):
+        manifest.write_text(json.dumps(edit(json.loads(good))))
+        with pytest.raises(DataError, match=message):
+            checkpoint.load(saved)
+    manifest.write_text("{")
+    with pytest.raises(DataError, match="is not valid JSON"):
+        checkpoint.load(saved)
+    manifest.write_text(good)
+    (saved / "tensors.safetensors").unlink()
+    with pytest.raises(DataError, match="cannot be read"):
+        checkpoint.load(saved)
+
+
+def test_a_failed_save_leaves_the_old_checkpoint_and_no_rest(saved, monkeypatch):
+    before = checkpoint.load(saved)
+    calls = itertools.count()
+
+    def full(*_):
+        if next(calls) >= 1:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint.os, "fsync", full)
+    state = start(("svs",))
+    state.t = 9
+    with pytest.raises(OSError, match="No space left"):
+        checkpoint.save(saved.parent, state.checkpoint({}))
+    monkeypatch.undo()
+    assert [p.name for p in saved.parent.iterdir()] == [saved.name]
+    assert checkpoint.load(saved.parent).t == before.t
+
+
+def test_the_last_few_are_kept_and_the_newest_is_found(tmp_path):
+    state = start(())
+    for t in (1, 2, 3, 4, 5):
+        state.t = t
+        checkpoint.save(tmp_path / "checkpoints", state.checkpoint({}), keep=2)
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["step_0000004", "step_0000005"]
+    assert checkpoint.load(tmp_path).t == 5
+    with pytest.raises(DataError, match="no checkpoint is here"):
+        checkpoint.load(tmp_path / "elsewhere")
+
+
+def test_a_checkpoint_of_other_strategies_is_refused(tmp_path):
+    state = start(("svs",))
+    for _ in range(13):
+        iterate(state, toy.RASTERIZER)
+    path = checkpoint.save(tmp_path, state.checkpoint({}))
+    with pytest.raises(DataError, match="belongs to no strategy of this run"):
+        start(("gco",)).restore(checkpoint.load(path), path)
