@@ -22,9 +22,8 @@ def write_bytes(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         partial.replace(path)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
+    finally:
+        partial.unlink(missing_ok=True)  # there only if something, Ctrl-C too, went wrong above
 
 
 def write_text(path: Path, text: str) -> None:
@@ -34,7 +33,7 @@ def write_text(path: Path, text: str) -> None:
 
 def write_json(path: Path, value: Any) -> None:
     """JSON, atomically; NaN and infinities become null, which JSON has no other word for."""
-    write_text(path, json.dumps(_without_nan(value), indent=1, ensure_ascii=False) + "\n")
+    write_text(path, json.dumps(_without_nan(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def write_csv(path: Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> None:

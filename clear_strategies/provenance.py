@@ -60,5 +60,6 @@ def _git() -> str:
 
 
 def _run(root: Path, *arguments: str) -> str:
-    command = ["git", "-C", str(root), *arguments]
+    # Looking must not take the lock of a checkout that someone is working in.
+    command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout  # noqa: S603

@@ -5,6 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
+
+# Small tensors: a second thread costs more than it brings, above all beside other test processes.
+torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

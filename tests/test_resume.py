@@ -15,7 +15,8 @@ import torch
 import toy
 
 from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, checkpoint
-from clear_strategies.density import DensitySettings
+from clear_strategies.density import DensitySettings, cameras_extent
+from clear_strategies.field import GaussianField
 from clear_strategies.fit import FitSettings, TrainState, fit, iterate
 from clear_strategies.mip import MipFilter
 from clear_strategies.optim import LearningRates
@@ -24,7 +25,17 @@ from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 ITERATIONS = 20
 # 3 warm-up starts · 2 to 12 densify and prune · 6, 12 reset · 8 warm · 12 anchor · 14 decay. Cuts around each.
 CUTS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 19)
+SCENE = toy.scene(16, seed=2, train=3, test=1)
 SUBSETS = [s for k in range(4) for s in itertools.combinations(("gco", "p2g", "svs"), k)]
+
+
+def _size_that_prunes_the_two_largest() -> float:
+    extent = cameras_extent(torch.stack([v.hr.camera.center for v in SCENE.train]))
+    sizes = GaussianField.from_cloud(SCENE.cloud).scales.data.exp()[:, 0].sort().values
+    return float(sizes[-3]) * 1.001 / extent
+
+
+PRUNE_WORLD = _size_that_prunes_the_two_largest()
 
 
 def start(names: tuple[str, ...], iterations: int = ITERATIONS) -> TrainState:
@@ -51,15 +62,14 @@ def start(names: tuple[str, ...], iterations: int = ITERATIONS) -> TrainState:
             every=5,
             reset_every=6,
             threshold=1e-5,
-            prune_opacity=0.0095,
+            prune_opacity=0.005,
+            prune_world=PRUNE_WORLD,
             min_gaussians=2,
+            max_gaussians=40,
         ),
         rates=LearningRates(means=LogLinear(end=ITERATIONS), detail_decay=0.01),
         mip=MipFilter(every=7, last=1),
     )
-
-
-SCENE = toy.scene(16, seed=2, train=3, test=1)
 
 
 def tensors(state: TrainState) -> dict[str, torch.Tensor]:

@@ -1,0 +1,57 @@
+"""A file is there whole or as it was before, and JSON and CSV say what cannot be said as a number."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from clear_strategies import files
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "results.json"
+    files.write_text(target, "old")
+
+    def interrupted(descriptor: int) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("os.fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        files.write_text(target, "new")
+    assert target.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_folders_are_made_and_a_file_is_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "a" / "b" / "ω.txt"
+    files.write_text(target, "1")
+    files.write_text(target, "ω̃ = 2")
+    assert target.read_text(encoding="utf-8") == "ω̃ = 2"
+
+
+def test_json_has_null_where_a_number_is_not_finite(tmp_path: Path) -> None:
+    value = {"a": [math.nan, 1.5, (math.inf,)], "b": {"c": -math.inf, 3: "λ"}}
+    files.write_json(tmp_path / "v.json", value)
+    assert json.loads((tmp_path / "v.json").read_text(encoding="utf-8")) == {
+        "a": [None, 1.5, [None]],
+        "b": {"c": None, "3": "λ"},
+    }
+
+
+def test_csv_leaves_a_missing_cell_and_a_nan_empty(tmp_path: Path) -> None:
+    rows: list[dict[str, object]] = [
+        {"t": 1, "loss": 0.5, "ignored": 9},
+        {"t": 2, "loss": math.nan},
+        {"t": 3, "why": 'a, "b"'},
+    ]
+    files.write_csv(tmp_path / "t.csv", rows, ["t", "loss", "why"])
+    with (tmp_path / "t.csv").open(newline="") as file:
+        assert list(csv.reader(file)) == [
+            ["t", "loss", "why"], ["1", "0.5", ""], ["2", "", ""], ["3", "", 'a, "b"'],
+        ]  # fmt: skip
