@@ -1,15 +1,22 @@
-"""PLY files: point clouds in, Gaussians out and in, in the layout that 3DGS made the standard. Strict about counts."""
+"""PLY files: point clouds in and out, Gaussians in and out in the layout that 3DGS made the standard.
+
+The reader believes nothing: a header is bounded, and its counts are held against the bytes that are there before a
+single one is allocated.
+"""
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import BinaryIO, Final
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.lib.recfunctions import structured_to_unstructured
 from torch import Tensor
 
 from clear_strategies.data.view import PointCloud
@@ -17,18 +24,24 @@ from clear_strategies.errors import DataError
 from clear_strategies.files import write_bytes
 from rasterizers.geometry import SH_C0
 
+_log = logging.getLogger(__name__)
+
 _TYPES: Final = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
-_ORDERS: Final[dict[str, Literal["<", ">", "="]]] = {
-    "binary_little_endian": "<",
-    "binary_big_endian": ">",
-    "ascii": "=",
-}
-_LONGEST_HEADER: Final = 1 << 16
-_REST_COUNTS: Final = (0, 9, 24, 45)
+_FORMATS: Final = ("ascii", "binary_little_endian", "binary_big_endian")
+_LONGEST_HEADER: Final = 1 << 16  # bytes
+_LONGEST_COUNT: Final = 20  # digits
+_BANDS: Final = (0, 3, 8, 15)  # (degree + 1)² - 1
+
+_XYZ: Final = ("x", "y", "z")
+_NORMAL: Final = ("nx", "ny", "nz")
+_RGB: Final = ("red", "green", "blue")
+_DC: Final = ("f_dc_0", "f_dc_1", "f_dc_2")
+_SCALE: Final = ("scale_0", "scale_1", "scale_2")
+_ROTATION: Final = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +49,11 @@ class GaussianPly:
     """Gaussians as the standard layout stores them: raw parameters, everything view-dependent included.
 
     Args:
-        sh0, shN: colour coefficients. opacities: logit. scales: log. quats: wxyz.
+        sh0, shN: colour as spherical harmonics; B in {0, 3, 8, 15} bands in `shN`.
+        opacities: logit. scales: natural logarithm. quats: wxyz, any norm.
+
+    Raises:
+        ValueError: the shapes do not belong together.
     """
 
     means: Float[Tensor, "N 3"]
@@ -46,156 +63,280 @@ class GaussianPly:
     scales: Float[Tensor, "N 3"]
     quats: Float[Tensor, "N 4"]
 
+    def __post_init__(self) -> None:
+        n, bands = len(self.means), self.shN.shape[1]
+        if bands not in _BANDS:
+            raise ValueError(f"shN must have 0, 3, 8 or 15 bands, got {bands}.")
+        shapes = {"means": (n, 3), "sh0": (n, 1, 3), "shN": (n, bands, 3), "opacities": (n,)}
+        for name, shape in {**shapes, "scales": (n, 3), "quats": (n, 4)}.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {found}.")
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
 
 def write_gaussians(path: Path, g: GaussianPly, *, comments: Sequence[str] = ("SplatRenderMode: mip",)) -> None:
     """Binary little-endian, atomically.
 
     Args:
         comments: header comments; "SplatRenderMode: mip" tells viewers to draw with opacity compensation.
+
+    Raises:
+        ValueError: a number is not finite.
     """
-    n = len(g.means)
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    names += [f"f_rest_{i}" for i in range(g.shN.shape[1] * 3)]
-    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
-    rest = g.shN.transpose(1, 2).reshape(n, -1)  # channel-major
-    columns = (g.means, torch.zeros(n, 3), g.sh0[:, 0], rest, g.opacities[:, None], g.scales, g.quats)
-    table = torch.cat([c.detach().cpu().float() for c in columns], dim=1).numpy().astype("<f4")
-    _write(path, table.tobytes(), [f"property float {name}" for name in names], n, comments)
-
-
-def write_points(path: Path, cloud: PointCloud) -> None:
-    """Positions and 8-bit colours, atomically."""
-    row = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    table = np.zeros(len(cloud), row)
-    table["xyz"] = cloud.means.cpu().numpy()
-    table["rgb"] = (cloud.colors.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    properties = [f"property float {name}" for name in "xyz"]
-    properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    _write(path, table.tobytes(), properties, len(cloud), (cloud.source,))
+    rest = g.shN.transpose(1, 2).reshape(len(g), g.shN.shape[1] * 3)  # channel-major
+    groups = (
+        (_XYZ, g.means), (_NORMAL, torch.zeros_like(g.means)), (_DC, g.sh0[:, 0]), (_rest_names(rest.shape[1]), rest),
+        (("opacity",), g.opacities[:, None]), (_SCALE, g.scales), (_ROTATION, g.quats),
+    )  # fmt: skip
+    names = [name for group, _ in groups for name in group]
+    columns = torch.cat([values.detach().cpu().float() for _, values in groups], dim=1).numpy()
+    finite = np.isfinite(columns)
+    if not finite.all():
+        i, k = np.argwhere(~finite)[0]
+        raise ValueError(f"Gaussians must be finite, got {names[k]} = {columns[i, k]} in number {i}.")
+    _write(path, columns.astype("<f4", copy=False).view([(name, "<f4") for name in names])[:, 0], comments)
 
 
 def read_gaussians(path: Path) -> GaussianPly:
-    """Read the standard layout.
+    """Read the standard layout; properties outside it are named in a warning and left out.
 
     Raises:
         DataError: not such a file: damaged, truncated, or a property is missing or not finite.
     """
     table = _read_vertices(path)
-    rest = sorted((name for name in table.dtype.names or () if name.startswith("f_rest_")), key=lambda n: int(n[7:]))
-    if len(rest) not in _REST_COUNTS:
+    rest = _rest_names(sum(name.startswith("f_rest_") for name in _names(table)))
+    if len(rest) not in {3 * bands for bands in _BANDS}:
         raise DataError(path, "f_rest", f"has {len(rest)} properties where 0, 9, 24 or 45 belong", "export it again")
-    higher = _columns(path, table, rest) if rest else torch.zeros(len(table), 0)
+    layout = {*_XYZ, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION}
+    extra = [name for name in _names(table) if name not in layout]
+    if extra:
+        _log.warning("%s: %s: not in the 3DGS layout, not read.", path, ", ".join(extra))
     return GaussianPly(
-        means=_columns(path, table, ["x", "y", "z"]),
-        sh0=_columns(path, table, ["f_dc_0", "f_dc_1", "f_dc_2"])[:, None],
-        shN=higher.view(len(table), 3, -1).transpose(1, 2).contiguous(),
-        opacities=_columns(path, table, ["opacity"])[:, 0],
-        scales=_columns(path, table, [f"scale_{i}" for i in range(3)]),
-        quats=_columns(path, table, [f"rot_{i}" for i in range(4)]),
+        means=_columns(path, table, _XYZ),
+        sh0=_columns(path, table, _DC)[:, None],
+        shN=_columns(path, table, rest).view(len(table), 3, len(rest) // 3).transpose(1, 2).contiguous(),
+        opacities=_columns(path, table, ("opacity",))[:, 0],
+        scales=_columns(path, table, _SCALE),
+        quats=_columns(path, table, _ROTATION),
     )
 
 
-def read_points(path: Path) -> PointCloud:
-    """Positions and colours (red, green, blue, or f_dc of a Gaussian file); grey where there are none.
+def write_points(path: Path, cloud: PointCloud) -> None:
+    """Positions (float) and colours (8 bits), binary little-endian, atomically.
 
     Raises:
-        DataError: not a PLY, damaged, truncated, or not finite.
+        ValueError: a number is not finite.
+    """
+    if not bool(cloud.means.isfinite().all() and cloud.colors.isfinite().all()):
+        raise ValueError("points must be finite, got NaN or infinity. Remove them first.")
+    table = np.zeros(len(cloud), [*((name, "<f4") for name in _XYZ), *((name, "u1") for name in _RGB)])
+    shades = (cloud.colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8)
+    for name, column in zip((*_XYZ, *_RGB), (*cloud.means.detach().cpu().T, *shades.T), strict=True):
+        table[name] = column.numpy()
+    _write(path, table, (cloud.source,))
+
+
+def read_points(path: Path) -> PointCloud:
+    """Positions and colours: red, green, blue (8 or 16 bits, or floats in [0, 1]), or f_dc of a Gaussian file, else grey.
+
+    Raises:
+        DataError: not a PLY, damaged, truncated, not finite, or with colours out of range.
     """
     table = _read_vertices(path)
-    names = table.dtype.names or ()
-    means = _columns(path, table, ["x", "y", "z"])
-    if {"red", "green", "blue"} <= set(names):
-        colors = _columns(path, table, ["red", "green", "blue"])
-        if table.dtype["red"].kind in "iu":
-            colors = colors / float(np.iinfo(table.dtype["red"]).max)
-    elif "f_dc_0" in names:
-        colors = _columns(path, table, ["f_dc_0", "f_dc_1", "f_dc_2"]) * SH_C0 + 0.5
+    names = set(_names(table))
+    means = _columns(path, table, _XYZ)
+    if names & set(_RGB):
+        colors, how = _rgb(path, table), ""
+    elif names & set(_DC):
+        colors, how = (_columns(path, table, _DC) * SH_C0 + 0.5).clamp(0, 1), ", the centres of Gaussians"
     else:
-        colors = torch.full_like(means, 0.5)
-    return PointCloud(means, colors.clamp(0, 1), source=f"PLY {path.name}", saw_test_views="unknown")
+        colors, how = torch.full_like(means, 0.5), ", without colours"
+        _log.warning("%s: has no colours, its points are grey.", path)
+    return PointCloud(means, colors, f"{len(means):,} points of {path.name}{how}", saw_test_views="unknown")
 
 
-def _write(path: Path, data: bytes, properties: Sequence[str], n: int, comments: Sequence[str]) -> None:
+@dataclass(frozen=True, slots=True)
+class _Element:
+    """`element name count`, and the names and types of its row; None where a list makes rows uneven."""
+
+    name: str
+    count: int
+    row: dict[str, str] | None
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        return np.dtype(list((self.row or {}).items()))
+
+    @property
+    def bytes(self) -> int:
+        return self.count * self.dtype.itemsize
+
+    @property
+    def values(self) -> int:
+        return self.count * len(self.row or {})
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    """What a file says of itself: elements before the vertices (all even), the vertices, elements after them.
+
+    Args:
+        body: offset of the first byte after the header.
+    """
+
+    form: str
+    before: tuple[_Element, ...]
+    vertex: _Element
+    after: tuple[_Element, ...]
+    body: int
+
+
+def _write(path: Path, table: np.ndarray, comments: Sequence[str]) -> None:
+    kinds = {"f4": "float", "u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(c.split())}" for c in comments)]
-    lines += [f"element vertex {n}", *properties, "end_header"]
-    write_bytes(path, "\n".join(lines).encode() + b"\n" + data)
+    lines += [f"element vertex {len(table)}"]
+    lines += [f"property {kinds[table.dtype[name].str[1:]]} {name}" for name in _names(table)]
+    header = "\n".join([*lines, "end_header\n"])
+    write_bytes(path, header.encode("ascii", "replace") + table.tobytes())  # some readers take headers for ASCII
 
 
 def _read_vertices(path: Path) -> np.ndarray:
-    """The vertex element as a structured array; every count is held against the bytes that are there."""
+    """The vertex element as a structured array."""
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            header = _parse_header(path, file.read(_LONGEST_HEADER))
+            file.seek(header.body)
+            if header.form == "ascii":
+                return _read_ascii(path, header, file.read())
+            return _read_binary(path, header, file, path.stat().st_size - header.body)
     except OSError as error:
         raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
-    order, count, row, body = _parse_header(path, data)
-    if order == "ascii":
-        return _read_ascii(path, data[body:], count, row)
-    needed, left = count * row.itemsize, len(data) - body
-    if needed > left:
-        problem = f"says {count} vertices of {row.itemsize} bytes, but {left} bytes are left"
-        raise DataError(path, "element vertex", problem, "the file is truncated; write it again")
-    return np.frombuffer(data, row.newbyteorder(_ORDERS[order]), count, body)
 
 
-def _parse_header(path: Path, data: bytes) -> tuple[str, int, np.dtype, int]:  # noqa: PLR0912 - one case a line
-    """(format, vertex count, row type, where the body starts)."""
-    end = data.find(b"end_header", 0, _LONGEST_HEADER)
-    if not data.startswith(b"ply") or end < 0:
-        raise DataError(path, "header", "is no PLY header", "give a .ply file")
-    newline = data.find(b"\n", end)
-    if newline < 0:
-        raise DataError(path, "header", "has no body after end_header", "the file is truncated; write it again")
-    order, count, elements, properties = "", -1, 0, []
-    for line in data[:end].decode("latin-1").splitlines()[1:]:
-        match line.split():
-            case [] | ["comment" | "obj_info", *_]:
-                continue
-            case ["format", kind, "1.0"] if kind in _ORDERS:
-                order = kind
-            case ["element", "vertex", number] if number.isdigit() and len(number) < 16 and elements == 0:
-                count, elements = int(number), 1
-            case ["element", _, number] if number.isdigit() and count >= 0:
-                elements += 1  # faces and the like may follow; they are not read
-            case ["property", kind, name] if kind in _TYPES:
-                if elements == 1:
-                    properties.append((name, _TYPES[kind]))
-            case ["property", "list", *_] if elements > 1:
-                continue
-            case _:
-                raise DataError(path, "header", f"has a line that is not understood: {line[:80]!r}", "export it again")
-    if not order or count < 0:
-        raise DataError(path, "header", "lacks its format or `element vertex` as the first element", "export it again")
-    if not properties or len({name for name, _ in properties}) != len(properties):
-        raise DataError(path, "element vertex", "has no property, or one twice", "export it again")
-    return order, count, np.dtype(properties), newline + 1
+def _read_binary(path: Path, header: _Header, file: BinaryIO, left: int) -> np.ndarray:
+    vertex, skipped = header.vertex, sum(e.bytes for e in header.before)
+    _check_length(path, header, skipped + vertex.bytes, sum(e.bytes for e in header.after), left, "bytes")
+    file.seek(skipped, os.SEEK_CUR)
+    row = vertex.dtype.newbyteorder("<" if header.form == "binary_little_endian" else ">")
+    return np.frombuffer(file.read(vertex.bytes), row, vertex.count)
 
 
-def _read_ascii(path: Path, body: bytes, count: int, row: np.dtype) -> np.ndarray:
-    lines = body.decode("latin-1").splitlines()
-    if count > len(lines):
-        problem = f"says {count} vertices, but {len(lines)} lines are left"
-        raise DataError(path, "element vertex", problem, "the file is truncated; write it again")
-    width = len(row.names or ())
-    table = np.zeros(count, row)
-    for i, line in enumerate(lines[:count]):
-        cells = line.split()
-        if len(cells) != width:
-            raise DataError(path, f"vertex {i}", f"has {len(cells)} values where {width} belong", "export it again")
-        try:
-            table[i] = tuple(float(c) if row[k].kind == "f" else int(c) for k, c in enumerate(cells))
-        except (ValueError, OverflowError) as error:
-            raise DataError(path, f"vertex {i}", f"is not numeric ({error})", "export it again") from error
+def _read_ascii(path: Path, header: _Header, body: bytes) -> np.ndarray:
+    """Values are counted, not lines: that is what tells where a vertex ends."""
+    vertex, skipped, words = header.vertex, sum(e.values for e in header.before), body.split()
+    _check_length(path, header, skipped + vertex.values, sum(e.values for e in header.after), len(words), "values")
+    try:
+        numbers = np.array([float(word) for word in words[skipped : skipped + vertex.values]])
+    except ValueError as error:
+        raise DataError(path, "element vertex", f"is not numeric ({error})", "export it again") from error
+    table = np.zeros(vertex.count, vertex.dtype)
+    for name, column in zip(_names(table), numbers.reshape(vertex.count, -1).T, strict=True):
+        kind = table.dtype[name]
+        if kind.kind in "iu":
+            limits = np.iinfo(kind)
+            wrong = ~((column >= limits.min) & (column <= limits.max) & (column == np.round(column)))
+            if wrong.any():
+                problem = f"must be whole and in [{limits.min}, {limits.max}], is {column[wrong][0]:g}"
+                raise DataError(path, name, problem, "export it again")
+        with np.errstate(over="ignore"):  # what overflows becomes infinite, and is found by _columns
+            table[name] = column
     return table
 
 
+def _check_length(path: Path, header: _Header, needed: int, after: int, left: int, unit: str) -> None:
+    """Hold the header's counts against what follows it."""
+    if needed > left:
+        problem = f"says {header.vertex.count} vertices, which need {needed} {unit}, but {left} are left"
+        raise DataError(path, "element vertex", problem, "the file is truncated; write it again")
+    if all(e.row is not None for e in header.after) and needed + after != left:
+        problem = f"says that {needed + after} {unit} follow, but {left} do"
+        raise DataError(path, "header", problem, "the file is damaged; write it again")
+
+
+def _parse_header(path: Path, head: bytes) -> _Header:
+    lines, body = _header_lines(path, head)
+    form, elements = "", list[_Element]()
+    for line in lines:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case ["format", kind, "1.0"] if kind in _FORMATS and not form:
+                form = kind
+            case ["element", name, count] if form and name not in {e.name for e in elements}:
+                elements.append(_Element(name, _count(path, name, count), {}))
+            case ["property", "list", _, _, _] if elements and elements[-1].name != "vertex":
+                elements[-1] = replace(elements[-1], row=None)
+            case ["property", kind, name] if elements and kind in _TYPES and name not in (elements[-1].row or {}):
+                if elements[-1].row is not None:
+                    elements[-1].row[name] = _TYPES[kind]
+            case _:
+                problem = f"has a line that is not understood there: {line[:80]!r}"
+                raise DataError(path, "header", problem, "export it again, with plain numbers in the vertices")
+    at = next((i for i, e in enumerate(elements) if e.name == "vertex"), None)
+    if at is None or not elements[at].row:
+        raise DataError(path, "element vertex", "is missing or has no properties", "give a file of points")
+    before, vertex, after = tuple(elements[:at]), elements[at], tuple(elements[at + 1 :])
+    if any(e.row is None for e in before):
+        raise DataError(path, "element vertex", "comes after an element with lists", "write the vertices first")
+    return _Header(form, before, vertex, after, body)
+
+
+def _header_lines(path: Path, head: bytes) -> tuple[list[str], int]:
+    """(lines between `ply` and `end_header`, offset after them)."""
+    if head.split(b"\n", 1)[0].strip() != b"ply":
+        raise DataError(path, "header", "does not begin with a line `ply`", "give a .ply file")
+    lines, body = list[str](), 0
+    for line in head.split(b"\n")[:-1]:  # what follows the last newline is no whole line
+        body += len(line) + 1
+        lines.append(line.decode("latin-1").strip())
+        if lines[-1] == "end_header":
+            return lines[1:-1], body
+    problem = f"has no line `end_header` in its first {_LONGEST_HEADER} bytes"
+    raise DataError(path, "header", problem, "the file is truncated; write it again")
+
+
+def _count(path: Path, element: str, text: str) -> int:
+    if not (text.isascii() and text.isdecimal() and len(text) <= _LONGEST_COUNT):
+        problem = f"must say a whole number >= 0, says {text[:40]!r}"
+        raise DataError(path, f"element {element}", problem, "export it again")
+    return int(text)
+
+
+def _names(table: np.ndarray) -> tuple[str, ...]:
+    return table.dtype.names or ()
+
+
+def _rest_names(count: int) -> tuple[str, ...]:
+    return tuple(f"f_rest_{i}" for i in range(count))
+
+
+def _rgb(path: Path, table: np.ndarray) -> Float[Tensor, "N 3"]:
+    """Colours in [0, 1]. Unsigned integers of 8 or 16 bits fill their range."""
+    colors = _columns(path, table, _RGB)
+    kinds = {table.dtype[name].str[1:] for name in _RGB}
+    if kinds <= {"u1"} or kinds <= {"u2"}:
+        return colors / (255 if kinds <= {"u1"} else 65535)
+    if not all(kind.startswith("f") for kind in kinds):
+        raise DataError(path, "red, green, blue", "must be all uchar, ushort or floats", "export it again")
+    if len(colors) and not (colors.min() >= 0 and colors.max() <= 1):
+        problem = f"must lie in [0, 1] where they are floats, span [{colors.min():g}, {colors.max():g}]"
+        raise DataError(path, "red, green, blue", problem, "scale the colours, or export them as uchar")
+    return colors
+
+
 def _columns(path: Path, table: np.ndarray, names: Sequence[str]) -> Float[Tensor, "N C"]:
-    missing = [name for name in names if name not in (table.dtype.names or ())]
+    """Properties as float32, all of them there and finite."""
+    missing = [name for name in names if name not in _names(table)]
     if missing:
-        raise DataError(
-            path, missing[0], "is missing from the vertices", "export with all properties of the 3DGS layout"
-        )
-    columns = np.stack([table[name].astype(np.float32) for name in names], axis=1)
-    if not np.isfinite(columns).all():
-        row = int(np.flatnonzero(~np.isfinite(columns).all(1))[0])
-        raise DataError(path, ", ".join(names), f"is not finite in vertex {row}", "remove the vertex")
+        problem = f"is missing from the vertices, which have {', '.join(_names(table))}"
+        raise DataError(path, missing[0], problem, "export it again, with this property")
+    with np.errstate(over="ignore"):  # what overflows becomes infinite
+        columns = np.array(structured_to_unstructured(table[list(names)], np.float32))
+    finite = np.isfinite(columns)
+    if not finite.all():
+        i, k = np.argwhere(~finite)[0]
+        raise DataError(path, names[k], f"is not finite in vertex {i}", "remove the vertex, or export it again")
     return torch.from_numpy(columns)

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.data.capture import SfmPoints
+from clear_strategies.data.neighbours import remove_outliers, voxel_grid
 from clear_strategies.data.ply import read_points
-from clear_strategies.data.triangulate import TriangulationSettings, triangulate
+from clear_strategies.data.triangulate import TriangulationSettings, project, sample_colors, triangulate
 from clear_strategies.data.view import Photo, PointCloud
 from clear_strategies.errors import DataError
 
@@ -23,7 +25,7 @@ _log = logging.getLogger(__name__)
 
 Init = Literal["auto", "triangulated", "sfm_train", "sfm", "ply", "random"]
 
-_ENOUGH: Final = 50  # triangulated points with which `auto` is content
+_FEWEST_SAMPLES: Final = 4  # projected points from which a view's depth is interpolated
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,21 +36,28 @@ class CloudSettings:
         init: "triangulated" from the training LR images under their known poses; "sfm_train": the scene's points seen
             by at least `min_views` training views (still triangulated from all views); "sfm": all of the scene's
             points; "ply": a given file; "random" in the cameras' common box; "auto": the best honest one, that is
-            triangulated where at least 50 points come of it, else random.
+            triangulated where at least `enough` points come of it, else random.
         path: the PLY file for init=ply.
-        densify: add points between those found, at interpolated inverse depth, one every `stride` LR pixels per view.
-        random_points: how many for init=random. box: half-edge of their box around the origin, world units; None: the
-            box that all cameras look into.
-        outlier_neighbours, outlier_ratio: points whose mean distance to that many neighbours exceeds the average by more
-            than `ratio` standard deviations are removed; 0 neighbours: none are.
+        min_views: training views that must have seen a point, for init=sfm_train.
+        enough: triangulated points with which init=auto is content.
+        densify: add points between those found, at interpolated inverse depth, one every `stride` LR px of each view;
+            "auto": unless there are as many already. Random points are not points of the scene and never densified.
+        random_points: how many for init=random.
+        box: half-edge of their box around the origin, world units; None: the box that the cameras have in common.
+        outlier_neighbours, outlier_ratio: points whose mean distance to that many nearest (the point itself is the
+            first) exceeds the average by more than `ratio` standard deviations are removed; 0 neighbours: none are.
         voxel: points are averaged in cubes of this edge, world units; None: they are not.
         max_points: a random choice of these at most.
+
+    Raises:
+        ValueError: a number is outside its range, or init=ply without a path.
     """
 
     init: Init = "auto"
     path: str | None = None
     min_views: int = 2
-    densify: bool = True
+    enough: int = 50
+    densify: bool | Literal["auto"] = "auto"
     stride: int = 2
     random_points: int = 10_000
     box: float | None = None
@@ -61,14 +70,19 @@ class CloudSettings:
     def __post_init__(self) -> None:
         if self.init not in get_args(Init):
             raise ValueError(f"init must be one of {', '.join(get_args(Init))}, got {self.init!r}.")
-        if self.stride < 1 or self.random_points < 1 or self.max_points < 1 or self.min_views < 1:
-            raise ValueError("stride, random_points, max_points and min_views must be at least 1.")
-        if self.outlier_neighbours < 0 or self.outlier_ratio <= 0:
-            raise ValueError("outlier_neighbours must be >= 0 and outlier_ratio > 0.")
-        if self.voxel is not None and not self.voxel > 0:
-            raise ValueError(f"voxel must be > 0 world units or null, got {self.voxel}.")
         if self.init == "ply" and not self.path:
-            raise ValueError("init=ply needs the file: set data.cloud.path.")
+            raise ValueError("init=ply needs a file, got none. Set path to it.")
+        if self.densify not in (True, False, "auto"):
+            raise ValueError(f"densify must be true, false or auto, got {self.densify!r}.")
+        for name in ("min_views", "enough", "stride", "random_points", "max_points"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}.")
+        if self.outlier_neighbours < 0 or self.outlier_neighbours == 1:
+            raise ValueError(f"outlier_neighbours must be 0 or at least 2, got {self.outlier_neighbours}.")
+        for name in ("box", "outlier_ratio", "voxel"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be finite and > 0, got {value}.")
 
 
 def initial_cloud(
@@ -77,225 +91,250 @@ def initial_cloud(
     *,
     sfm: SfmPoints | None = None,
     train_ids: Sequence[int] = (),
+    background: tuple[float, float, float] | None = None,
     seed: int = 0,
 ) -> PointCloud:
     """The cloud a run starts from.
 
     Args:
-        photos: the training views at LR. sfm: the scene's own points, if it has some. train_ids: their ids of the
-            training frames.
+        photos: the training views at LR.
+        sfm: the scene's own points, if it has some. train_ids: their ids of the training frames.
+        background: a colour behind which there is no surface (Blender's white), RGB in [0, 1].
 
     Raises:
         DataError: the cloud that was asked for cannot be had from this scene.
     """
-    cloud = _chosen(settings, photos, sfm, train_ids, seed)
-    if settings.outlier_neighbours and len(cloud) > settings.outlier_neighbours and settings.init != "random":
-        kept = remove_outliers(cloud.means, settings.outlier_neighbours, settings.outlier_ratio)
-        _log.info("%d of %d points removed as outliers.", len(cloud) - len(kept), len(cloud))
-        cloud = replace(cloud, means=cloud.means[kept], colors=cloud.colors[kept])
-    if settings.densify and not cloud.source.startswith("random"):
-        cloud = densify(cloud, photos, settings.stride)
+    found = _found_points(settings, photos, sfm, train_ids)
+    if found is None:
+        cloud = random_cloud(photos, settings.random_points, seed, settings.box)
+    else:
+        cloud = _densified(settings, _without_outliers(settings, found), photos, background)
     if settings.voxel is not None:
         means, colors = voxel_grid(cloud.means, cloud.colors, settings.voxel)
-        cloud = replace(cloud, means=means, colors=colors, source=f"{cloud.source}, voxels of {settings.voxel:g}")
+        cloud = replace(cloud, means=means, colors=colors, source=f"{cloud.source}, in voxels of {settings.voxel:g}")
     if len(cloud) > settings.max_points:
         chosen = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(seed))[: settings.max_points]
-        _log.info("%d of %d points chosen at random (cloud.max_points).", settings.max_points, len(cloud))
-        cloud = replace(cloud, means=cloud.means[chosen], colors=cloud.colors[chosen])
+        _log.info("%d of %d points chosen at random (max_points).", settings.max_points, len(cloud))
+        cloud = _subset(cloud, chosen.sort().values)
     return cloud
 
 
-def _chosen(
-    settings: CloudSettings, photos: Sequence[Photo], sfm: SfmPoints | None, train_ids: Sequence[int], seed: int
-) -> PointCloud:
-    match settings.init:
-        case "ply":
-            return read_points(Path(str(settings.path)))
-        case "random":
-            return random_cloud(photos, settings.random_points, seed, settings.box)
-        case "sfm" | "sfm_train":
-            if sfm is None:
-                raise DataError(
-                    "scene", "points", f"there are none, but data.cloud.init={settings.init}", "use init=triangulated"
-                )
-            return from_tracks(sfm, train_ids if settings.init == "sfm_train" else None, settings.min_views)
-        case "triangulated":
-            cloud = triangulate(photos, settings.triangulation)
-            if len(cloud) == 0:
-                raise DataError(
-                    "scene", "points", "no point could be triangulated from the training LR images",
-                    "use data.cloud.init=random, or more or closer views",
-                )  # fmt: skip
-            return cloud
-        case _:
-            cloud = triangulate(photos, settings.triangulation)
-            if len(cloud) >= _ENOUGH:
-                _log.info("init: auto chose %s.", cloud.source)
-                return cloud
-            _log.warning(
-                "init: auto chose random points: only %d could be triangulated from the training LR images.", len(cloud)
-            )
-            return random_cloud(photos, settings.random_points, seed, settings.box)
-
-
-def from_tracks(sfm: SfmPoints, train_ids: Sequence[int] | None, min_views: int) -> PointCloud:
-    """The scene's own points; with `train_ids`, those that at least `min_views` of these frames saw.
+def from_tracks(sfm: SfmPoints, train_ids: Sequence[int], min_views: int) -> PointCloud:
+    """The scene's own points that at least `min_views` of these frames saw.
 
     Their positions were triangulated from all views, test views too: no filter undoes that, and the cloud says so.
+
+    Raises:
+        DataError: there is no such point, or nobody knows who saw which.
     """
-    if train_ids is None:
-        return PointCloud(sfm.means.float(), sfm.colors.float(), sfm.source, saw_test_views="yes")
+    if len(sfm.point) == 0:
+        raise DataError("scene", "points", "come without tracks", "use init=triangulated, or init=sfm for all of them")
     observed = torch.isin(sfm.seen_by, torch.tensor(list(train_ids), dtype=sfm.seen_by.dtype))
-    pairs = torch.unique(torch.stack((sfm.point[observed], sfm.seen_by[observed]), dim=1), dim=0)
-    counts = torch.bincount(pairs[:, 0], minlength=len(sfm.means))
-    kept = counts >= min_views
-    if not bool(kept.any()):
-        raise DataError(
-            "scene",
-            "points",
-            f"none is seen by {min_views} training views",
-            "lower data.cloud.min_views, or use another init",
-        )
-    source = f"{int(kept.sum()):,} of the scene's points, seen by >= {min_views} training views ({sfm.source})"
-    return PointCloud(sfm.means[kept].float(), sfm.colors[kept].float(), source, saw_test_views="yes")
+    sightings = torch.unique(torch.stack((sfm.point[observed], sfm.seen_by[observed]), dim=1), dim=0)
+    kept = torch.nonzero(torch.bincount(sightings[:, 0], minlength=len(sfm.means)) >= min_views)[:, 0]
+    if len(kept) == 0:
+        problem = f"none is seen by {min_views} of the {len(train_ids)} training views"
+        raise DataError("scene", "points", problem, "lower min_views, or use init=triangulated")
+    source = f"{len(kept):,} points seen by >= {min_views} training views, of {sfm.source}"
+    return _subset(PointCloud(sfm.means.float(), sfm.colors.float(), source, saw_test_views="yes"), kept)
 
 
 def random_cloud(photos: Sequence[Photo], count: int, seed: int, box: float | None = None) -> PointCloud:
-    """Uniform points of near-grey colour, in a box around the origin, or in the one that all cameras look into."""
-    g = torch.Generator().manual_seed(seed)
-    if box is not None:
-        low, high, where = torch.full((3,), -box), torch.full((3,), box), f"[-{box:g}, {box:g}]³"
+    """Uniform points, nearly grey, in a box.
+
+    Args:
+        box: half-edge of the box around the origin, world units; None: `common_box`.
+    """
+    if box is None:
+        (low, high), where = common_box(photos), "the cameras' common box"
     else:
-        low, high = common_box(photos)
-        where = "the cameras' common box"
+        low, high, where = torch.full((3,), -box), torch.full((3,), box), f"[-{box:g}, {box:g}]³"
+    g = torch.Generator().manual_seed(seed)
     means = low + (high - low) * torch.rand(count, 3, generator=g)
+    # Nearly: equal colours would give all of them equal gradients.
     colors = 0.5 + (torch.rand(count, 3, generator=g) - 0.5) * 0.1
     return PointCloud(means, colors, f"random: {count:,} points in {where}")
 
 
 def common_box(photos: Sequence[Photo]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-    """An axis-aligned box of what most cameras see: around the point closest to all their axes.
+    """(smallest, largest corner) of a cube around the ball in the middle of what the cameras look at.
 
-    Cameras that look in parallel have no such point; theirs lies where they look, as far as they are apart times ten.
+    The middle is the point closest to all optical axes. Where they are nearly parallel there is none: then it lies ahead
+    of the cameras, ten times as far as they are apart.
     """
-    centers = torch.stack([p.camera.center.double() for p in photos])
-    forward = torch.stack([p.camera.world_to_camera[2, :3].double() for p in photos])
-    # Least squares over lines: Σ (I - d dᵀ) (x - c) = 0, held a little at the cameras' reach where lines are parallel.
-    projector = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
+    cameras = [photo.camera for photo in photos]
+    centers = torch.stack([c.center.double().cpu() for c in cameras])
+    axes = torch.stack([c.world_to_camera[2, :3].double().cpu() for c in cameras])
     spread = float(torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()) or 1.0
-    reach = centers.mean(0) + forward.mean(0) * 10 * spread
-    weight = 1e-3 * len(photos)
-    left = projector.sum(0) + weight * torch.eye(3, dtype=torch.float64)
-    middle = torch.linalg.solve(left, (projector @ centers[:, :, None]).sum(0)[:, 0] + weight * reach)
-    distance = torch.linalg.vector_norm(centers - middle, dim=-1).mean()
-    narrowest = min(0.5 * min(p.camera.width / p.camera.fx, p.camera.height / p.camera.fy) for p in photos)
-    half = float(distance) * narrowest
+    ahead = centers.mean(0) + axes.mean(0) * 10 * spread
+
+    # Least squares over lines, Σ (I - d dᵀ)(x - c) = 0, held a little at `ahead` in case they are parallel.
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    hold = 1e-3 * len(cameras)
+    right = (across @ centers[:, :, None]).sum(0)[:, 0] + hold * ahead
+    middle = torch.linalg.solve(across.sum(0) + hold * torch.eye(3, dtype=torch.float64), right)
+
+    distance = float(torch.linalg.vector_norm(centers - middle, dim=-1).mean())
+    narrowest = min(math.atan(min(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
+    half = distance * math.sin(narrowest)  # the ball touches the sides of the narrowest frustum
     return (middle - half).float(), (middle + half).float()
 
 
-def densify(cloud: PointCloud, photos: Sequence[Photo], stride: int) -> PointCloud:
-    """Add, per training view, a point every `stride` pixels at the interpolated inverse depth of the cloud.
+def densify(
+    cloud: PointCloud, photos: Sequence[Photo], stride: int, background: tuple[float, float, float] | None = None
+) -> PointCloud:
+    """Add, per view, a point every `stride` pixels at the interpolated inverse depth of the cloud.
 
-    Inverse depth is linear on planes. Between the projected points it is interpolated linearly, outside their hull it is
-    the nearest point's. Points hidden behind others would bend the surface: of those falling on one cell of `stride`
-    pixels only the nearest to the camera counts.
+    Inverse depth is linear on planes. It is interpolated linearly between the projected points; outside their hull it is
+    the nearest point's. Pixels of the background's colour show no surface and get no point.
     """
-    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-    from scipy.spatial import QhullError
-
     means, colors = [cloud.means], [cloud.colors]
-    for photo in photos:
-        camera = photo.camera
+    for i, photo in enumerate(photos):
         pixels, inverse_depth = _visible_samples(cloud.means, photo, 2 * stride)
-        if len(pixels) < 4:
+        if len(pixels) < _FEWEST_SAMPLES:
+            _log.warning("view %d is not densified: only %d points project into it.", i, len(pixels))
             continue
-        x = np.arange(stride / 2, camera.width, stride)
-        y = np.arange(stride / 2, camera.height, stride)
-        grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        try:
-            values = LinearNDInterpolator(pixels, inverse_depth)(grid)
-        except QhullError:  # all on a line
-            values = np.full(len(grid), np.nan)
-        nearest = NearestNDInterpolator(pixels, inverse_depth)(grid)
-        z = torch.from_numpy(1 / np.where(np.isfinite(values), values, nearest))
-        u = torch.from_numpy(grid)
-        local = torch.stack(((u[:, 0] - camera.cx) / camera.fx * z, (u[:, 1] - camera.cy) / camera.fy * z, z), -1)
-        pose = camera.world_to_camera.double()
-        means.append(((local - pose[:3, 3]) @ pose[:3, :3]).float())
-        column, row = u[:, 0].long(), u[:, 1].long()
-        colors.append(photo.image[row, column])
-    added = sum(len(m) for m in means[1:])
-    source = f"{cloud.source}, densified by {added:,} points at interpolated inverse depth"
+        grid = _pixel_grid(photo, stride)
+        shades = sample_colors(photo.image, grid)
+        if background is not None:
+            surface = ((shades - torch.tensor(background)).abs() > 2 / 255).any(dim=1)
+            grid, shades = grid[surface], shades[surface]
+        means.append(_back_projected(photo, grid, 1 / _interpolated(pixels, inverse_depth, grid)))
+        colors.append(shades)
+    added = sum(map(len, means[1:]))
+    if added == 0:
+        _log.warning("densify added no point.")
+        return cloud
+    source = f"{cloud.source}, densified by {added:,} at interpolated inverse depth"
     return replace(cloud, means=torch.cat(means), colors=torch.cat(colors), source=source)
 
 
-def _visible_samples(means: Float[Tensor, "N 3"], photo: Photo, cell: int) -> tuple[np.ndarray, np.ndarray]:
-    """(pixels, inverse depths) of the points in view, the nearest one of each cell."""
-    camera, pose = photo.camera, photo.camera.world_to_camera.double()
-    local = means.double() @ pose[:3, :3].T + pose[:3, 3]
-    z = local[:, 2]
-    u = camera.fx * local[:, 0] / z + camera.cx
-    v = camera.fy * local[:, 1] / z + camera.cy
-    inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    pixels, depth = torch.stack((u, v), -1)[inside].numpy(), z[inside].numpy()
-    order = np.argsort(depth, kind="stable")
-    cells = (pixels[order] // cell).astype(np.int64) @ np.array([1, 1 << 20])
-    _, first = np.unique(cells, return_index=True)
-    kept = order[first]
-    return pixels[kept], 1 / depth[kept]
+def _found_points(
+    settings: CloudSettings, photos: Sequence[Photo], sfm: SfmPoints | None, train_ids: Sequence[int]
+) -> PointCloud | None:
+    """Points of the scene's surfaces, or None where random ones must do."""
+    match settings.init:
+        case "random":
+            return None
+        case "ply":
+            return _from_file(Path(str(settings.path)))
+        case "sfm" | "sfm_train":
+            return _from_scene(settings, sfm, train_ids)
+        case "triangulated":
+            cloud = triangulate(photos, settings.triangulation)
+            if len(cloud) == 0:
+                problem = f"none could be triangulated from the {len(photos)} training LR images"
+                raise DataError("scene", "points", problem, "use init=random, or more or closer views")
+            return cloud
+        case "auto":
+            return _triangulated_if_enough(settings, photos, sfm)
 
 
-def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) -> Tensor:
-    """Indices of the points to keep: mean distance to their neighbours at most `ratio` deviations above the average.
+def _triangulated_if_enough(
+    settings: CloudSettings, photos: Sequence[Photo], sfm: SfmPoints | None
+) -> PointCloud | None:
+    cloud = triangulate(photos, settings.triangulation)
+    if sfm is not None:
+        _log.info("init: auto leaves the scene's own points unused, test views had a part in them.")
+    if len(cloud) >= settings.enough:
+        _log.info("init: auto chose %s.", cloud.source)
+        return cloud
+    problem = "init: auto chose random points: only %d (of %d that are enough) come from the training LR images."
+    _log.warning(problem, len(cloud), settings.enough)
+    return None
 
-    Open3D's definition (the point itself is its own first neighbour; sample standard deviation); by open3d where it is
-    installed, else by scipy, with the same result.
+
+def _from_file(path: Path) -> PointCloud:
+    cloud = read_points(path)
+    if len(cloud) == 0:
+        raise DataError(path, "element vertex", "has no points", "give another file, or use another init")
+    return cloud
+
+
+def _from_scene(settings: CloudSettings, sfm: SfmPoints | None, train_ids: Sequence[int]) -> PointCloud:
+    if sfm is None or len(sfm.means) == 0:
+        problem = f"there are none, but init={settings.init} asks for them"
+        raise DataError("scene", "points", problem, "use init=triangulated or init=random")
+    if settings.init == "sfm_train":
+        return from_tracks(sfm, train_ids, settings.min_views)
+    return PointCloud(sfm.means.float(), sfm.colors.float(), sfm.source, saw_test_views="yes")
+
+
+def _without_outliers(settings: CloudSettings, cloud: PointCloud) -> PointCloud:
+    if settings.outlier_neighbours == 0:
+        return cloud
+    if len(cloud) <= settings.outlier_neighbours:
+        _log.info("%d points are too few to tell outliers.", len(cloud))
+        return cloud
+    kept = remove_outliers(cloud.means, settings.outlier_neighbours, settings.outlier_ratio)
+    if len(kept) == 0:
+        _log.warning("outliers were kept: the points coincide, so all of them would have gone.")
+        return cloud
+    _log.info("%d of %d points removed as outliers.", len(cloud) - len(kept), len(cloud))
+    return _subset(cloud, kept)
+
+
+def _densified(
+    settings: CloudSettings,
+    cloud: PointCloud,
+    photos: Sequence[Photo],
+    background: tuple[float, float, float] | None,
+) -> PointCloud:
+    grid = sum(len(_pixel_grid(photo, settings.stride)) for photo in photos)
+    if settings.densify == "auto" and len(cloud) >= grid:
+        _log.info("densify: auto adds nothing to %d points, the views' grids hold %d.", len(cloud), grid)
+        return cloud
+    return densify(cloud, photos, settings.stride, background) if settings.densify else cloud
+
+
+def _subset(cloud: PointCloud, index: Int[Tensor, " K"]) -> PointCloud:
+    return replace(cloud, means=cloud.means[index], colors=cloud.colors[index])
+
+
+def _pixel_grid(photo: Photo, stride: int) -> Float[Tensor, "G 2"]:
+    """The centres of the image's squares of `stride` pixels."""
+    x = torch.arange(stride / 2, photo.camera.width, stride, dtype=torch.float64)
+    y = torch.arange(stride / 2, photo.camera.height, stride, dtype=torch.float64)
+    return torch.cartesian_prod(x, y)
+
+
+def _visible_samples(
+    means: Float[Tensor, "N 3"], photo: Photo, cell: int
+) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, " V"]]:
+    """(pixels, inverse depths) of the points in view.
+
+    Who saw which is not always known. Points hidden behind others would bend the surface, so of those that fall on one
+    square of `cell` pixels only the nearest to the camera counts.
     """
-    points = means.double().cpu().numpy()
-    open3d = _open3d()
-    if open3d is not None:
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-        _, kept = cloud.remove_statistical_outlier(nb_neighbors=neighbours, std_ratio=ratio)
-        return torch.tensor(sorted(kept), dtype=torch.long)
-    from scipy.spatial import cKDTree
-
-    k = min(neighbours, len(points))
-    distances = np.asarray(cKDTree(points).query(points, k=k)[0]).reshape(len(points), k).mean(1)
-    valid = distances > 0
-    if valid.sum() < 2:
-        return torch.arange(len(points))
-    limit = distances[valid].mean() + ratio * distances[valid].std(ddof=1)
-    return torch.from_numpy(np.flatnonzero(valid & (distances < limit)))
+    camera = photo.camera
+    pixels, depth = project(camera, means)
+    size = torch.tensor([camera.width, camera.height])
+    inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+    pixels, depth = pixels[inside], depth[inside]
+    order = torch.argsort(depth, stable=True)
+    column, row = (pixels[order] / cell).long().unbind(dim=1)
+    _, first = np.unique((row * camera.width + column).numpy(), return_index=True)
+    kept = order[torch.from_numpy(first)]
+    return pixels[kept].numpy(), (1 / depth[kept]).numpy()
 
 
-def voxel_grid(
-    means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], edge: float
-) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
-    """Average positions and colours in cubes of `edge` aligned half a cube below the smallest corner (Open3D's grid)."""
-    points = means.double().cpu().numpy()
-    open3d = _open3d()
-    if open3d is not None:
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-        cloud.colors = open3d.utility.Vector3dVector(colors.double().cpu().numpy())
-        small = cloud.voxel_down_sample(edge)
-        merged = np.concatenate((np.asarray(small.points), np.asarray(small.colors)), axis=1)
-    else:
-        cells = np.floor((points - (points.min(0) - edge / 2)) / edge).astype(np.int64)
-        _, owner = np.unique(cells, axis=0, return_inverse=True)
-        owner = owner.reshape(-1)
-        values = np.concatenate((points, colors.double().cpu().numpy()), axis=1)
-        merged = np.stack([np.bincount(owner, column) for column in values.T], axis=1) / np.bincount(owner)[:, None]
-    merged = merged[np.lexsort(merged.T)]  # neither library promises an order; ours is fixed
-    both = torch.from_numpy(merged)
-    return both[:, :3].to(means), both[:, 3:].to(colors)
+def _interpolated(
+    pixels: Float[np.ndarray, "V 2"], values: Float[np.ndarray, " V"], at: Float[Tensor, "G 2"]
+) -> Float[Tensor, " G"]:
+    """Linear between the samples, the nearest one's value outside their hull."""
+    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+    from scipy.spatial import QhullError
 
-
-def _open3d() -> Any:
-    """The module, or None where it is not installed or its system libraries are missing."""
+    result = np.asarray(NearestNDInterpolator(pixels, values)(at.numpy()))
     try:
-        import open3d
-    except ImportError as reason:
-        _log.info("scipy instead of open3d (%s).", " ".join(str(reason).split()))
-        return None
-    _log.info("open3d %s.", open3d.__version__)
-    return open3d
+        linear = np.asarray(LinearNDInterpolator(pixels, values)(at.numpy()))
+    except QhullError:  # all samples on one line: it has no inside
+        return torch.from_numpy(result)
+    return torch.from_numpy(np.where(np.isfinite(linear), linear, result))
+
+
+def _back_projected(photo: Photo, pixels: Float[Tensor, "G 2"], depth: Float[Tensor, " G"]) -> Float[Tensor, "G 3"]:
+    camera, pose = photo.camera, photo.camera.world_to_camera.double().cpu()
+    x = (pixels[:, 0] - camera.cx) / camera.fx * depth
+    y = (pixels[:, 1] - camera.cy) / camera.fy * depth
+    return ((torch.stack((x, y, depth), dim=1) - pose[:3, 3]) @ pose[:3, :3]).float()

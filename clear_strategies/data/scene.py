@@ -79,7 +79,9 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     train = tuple(_view(frame, capture, views, prior, required=True) for frame in train_frames)
     test = tuple(_view(frame, capture, views, prior, required=False) for frame in test_frames)
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
-    points = initial_cloud(cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, seed=seed)
+    points = initial_cloud(
+        cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, background=capture.background, seed=seed
+    )
     sample = train[0]
     made = {
         "hr": f"{'PIL ' if views.downsample != 'area' else ''}{views.downsample} of the HR photo"

@@ -1,0 +1,103 @@
+"""Cleaning a cloud by looking at neighbours: outliers go, crowds are averaged. Open3D where it is installed, else SciPy.
+
+Both paths follow Open3D's definitions to the letter, so a cloud does not depend on which of them ran.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Final
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+_log = logging.getLogger(__name__)
+
+_LARGEST_CELL: Final = np.iinfo(np.int32).max  # Open3D counts voxels along an axis in an int
+
+
+def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) -> Int[Tensor, " K"]:
+    """Indices, ascending, of the points that lie as close to their neighbours as the others do.
+
+    A point's measure is the mean distance to its `neighbours` nearest points, itself included; it stays if that is below
+    the average by at most `ratio` standard deviations. A point whose nearest ones all coincide with it (measure 0) goes.
+
+    Args:
+        neighbours: at least 2, since the first is the point itself.
+
+    Raises:
+        ValueError: neighbours below 2, or a ratio that is not positive.
+    """
+    if neighbours < 2 or not ratio > 0:
+        raise ValueError(f"neighbours must be >= 2 and ratio > 0, got {neighbours} and {ratio}.")
+    points = means.detach().double().cpu().numpy()
+    if len(points) < 2:
+        return torch.arange(len(points))
+    open3d = _open3d("outlier removal")
+    if open3d is not None:
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+        _, kept = cloud.remove_statistical_outlier(nb_neighbors=neighbours, std_ratio=ratio)
+        return torch.tensor(sorted(kept), dtype=torch.long)
+
+    from scipy.spatial import cKDTree
+
+    distances, _ = cKDTree(points).query(points, k=min(neighbours, len(points)))
+    measure = np.mean(distances, axis=1)
+    apart = measure > 0
+    # Coinciding points count in n, though not in the sums: Open3D's average, not that of the points apart.
+    n = len(points)
+    average = measure.sum() / n
+    deviation = np.sqrt(np.square(measure[apart] - average).sum() / (n - 1))
+    return torch.from_numpy(np.flatnonzero(apart & (measure < average + ratio * deviation)))
+
+
+def voxel_grid(
+    means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], edge: float
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    """One point per occupied cube: the averages of its positions and colours, ordered by cube.
+
+    Args:
+        edge: of a cube, world units. The grid begins half a cube below the smallest coordinates.
+
+    Raises:
+        ValueError: edge is not positive, or so small that cubes cannot be counted.
+    """
+    if not edge > 0:
+        raise ValueError(f"edge must be > 0 world units, got {edge}.")
+    points = means.detach().double().cpu().numpy()
+    if len(points) == 0:
+        return means, colors
+    origin = points.min(axis=0) - edge / 2
+    if float(np.ptp(points, axis=0).max()) >= edge * _LARGEST_CELL:
+        raise ValueError(f"edge must be at least the cloud's extent / {_LARGEST_CELL}, got {edge}. Enlarge the voxel.")
+    shades = colors.detach().double().cpu().numpy()
+    open3d = _open3d("the voxel grid")
+    if open3d is not None:
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+        cloud.colors = open3d.utility.Vector3dVector(shades)
+        merged = cloud.voxel_down_sample(edge)
+        both = np.concatenate((np.asarray(merged.points), np.asarray(merged.colors)), axis=1)
+        # Open3D's order is that of a hash map; ours is that of the cubes.
+        both = both[np.lexsort(np.floor((both[:, 2::-1] - origin[::-1]) / edge).T)]
+    else:
+        cubes = np.floor((points - origin) / edge).astype(np.int64)
+        _, owner, count = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
+        columns = np.concatenate((points, shades), axis=1).T
+        both = np.stack([np.bincount(owner.reshape(-1), column) for column in columns], axis=1) / count[:, None]
+    averages = torch.from_numpy(both)
+    return averages[:, :3].to(means), averages[:, 3:].to(colors)
+
+
+def _open3d(task: str) -> Any:
+    """The module, or None where it is not installed or its system libraries are missing."""
+    try:
+        import open3d
+    except (ImportError, OSError) as reason:
+        _log.info(
+            "SciPy does %s: open3d (extra [open3d]) cannot be imported (%s).", task, " ".join(str(reason).split())
+        )
+        return None
+    _log.info("open3d %s does %s.", open3d.__version__, task)
+    return open3d

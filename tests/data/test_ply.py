@@ -1,0 +1,265 @@
+"""PLY: bytes by hand, roundtrips as a property, and a table of malformed files that each get one line."""
+
+from __future__ import annotations
+
+import struct
+from contextlib import suppress
+from pathlib import Path
+
+import hypothesis.extra.numpy as hnp
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from clear_strategies.data.ply import GaussianPly, read_gaussians, read_points, write_gaussians, write_points
+from clear_strategies.data.view import PointCloud
+from clear_strategies.errors import DataError
+
+_ROUNDTRIP = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+_NUMBERS = st.floats(width=32, allow_nan=False, allow_infinity=False)
+
+
+def gaussians(n: int, bands: int, seed: int = 0) -> GaussianPly:
+    g = torch.Generator().manual_seed(seed)
+    shapes = ((n, 3), (n, 1, 3), (n, bands, 3), (n,), (n, 3), (n, 4))
+    return GaussianPly(*(torch.randn(shape, generator=g) for shape in shapes))
+
+
+def header(*lines: str, form: str = "binary_little_endian") -> bytes:
+    return "\n".join(["ply", f"format {form} 1.0", *lines, "end_header\n"]).encode("latin-1")
+
+
+XYZ = ("property float x", "property float y", "property float z")
+POINT = struct.pack("<3f", 1, 2, 3)
+
+
+def test_gaussians_are_written_byte_for_byte_in_the_standard_layout(tmp_path: Path) -> None:
+    shN = torch.arange(9.0).view(1, 3, 3) + 10  # band b, channel c: 10 + 3b + c
+    one = GaussianPly(
+        means=torch.tensor([[1.0, 2, 3]]),
+        sh0=torch.tensor([[[4.0, 5, 6]]]),
+        shN=shN,
+        opacities=torch.tensor([7.0]),
+        scales=torch.tensor([[-1.0, -2, -3]]),
+        quats=torch.tensor([[0.5, 0.25, 0.125, 0]]),
+    )
+    write_gaussians(tmp_path / "g.ply", one)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{i}" for i in range(9)]
+    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    text = "ply\nformat binary_little_endian 1.0\ncomment SplatRenderMode: mip\nelement vertex 1\n"
+    text += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    channel_major = (10, 13, 16, 11, 14, 17, 12, 15, 18)
+    values = (1, 2, 3, 0, 0, 0, 4, 5, 6, *channel_major, 7, -1, -2, -3, 0.5, 0.25, 0.125, 0)
+    assert (tmp_path / "g.ply").read_bytes() == text.encode() + struct.pack("<26f", *values)
+
+
+def test_points_are_written_byte_for_byte(tmp_path: Path) -> None:
+    cloud = PointCloud(torch.tensor([[1.0, 2, 3]]), torch.tensor([[0.0, 0.5, 1.0]]), "two\nlines, [-1, 1]³")
+    write_points(tmp_path / "p.ply", cloud)
+    rgb = tuple(f"property uchar {name}" for name in ("red", "green", "blue"))
+    expected = header("comment two lines, [-1, 1]?", "element vertex 1", *XYZ, *rgb) + POINT + bytes((0, 128, 255))
+    assert (tmp_path / "p.ply").read_bytes() == expected
+
+
+@_ROUNDTRIP
+@given(n=st.integers(0, 5), bands=st.sampled_from((0, 3, 8, 15)), data=st.data())
+def test_gaussians_survive_a_roundtrip_bitwise(tmp_path: Path, n: int, bands: int, data: st.DataObject) -> None:
+    shapes = ((n, 3), (n, 1, 3), (n, bands, 3), (n,), (n, 3), (n, 4))
+    arrays = [data.draw(hnp.arrays(np.float32, shape, elements=_NUMBERS)) for shape in shapes]
+    g = GaussianPly(*map(torch.from_numpy, arrays))
+    write_gaussians(tmp_path / "g.ply", g)
+    again = read_gaussians(tmp_path / "g.ply")
+    for name in ("means", "sh0", "shN", "opacities", "scales", "quats"):
+        assert torch.equal(getattr(again, name).view(torch.int32), getattr(g, name).contiguous().view(torch.int32))
+
+
+@_ROUNDTRIP
+@given(
+    hnp.arrays(np.float32, (4, 3), elements=_NUMBERS),
+    hnp.arrays(np.uint8, (4, 3)),
+)
+def test_points_survive_a_roundtrip_bitwise(tmp_path: Path, means: np.ndarray, shades: np.ndarray) -> None:
+    cloud = PointCloud(torch.from_numpy(means), torch.from_numpy(shades).float() / 255, "test")
+    write_points(tmp_path / "p.ply", cloud)
+    again = read_points(tmp_path / "p.ply")
+    assert torch.equal(again.means, cloud.means)
+    assert torch.equal(again.colors, cloud.colors)
+    assert again.saw_test_views == "unknown"
+
+
+_ROW = ("element vertex 2", *XYZ, "property uchar red", "property uchar green", "property uchar blue")
+
+
+@pytest.mark.parametrize(
+    ("form", "body"),
+    [
+        ("binary_little_endian", struct.pack("<3f3B3f3B", 1, 2, 3, 255, 0, 51, 4, 5, 6, 0, 255, 0)),
+        ("binary_big_endian", struct.pack(">3f3B3f3B", 1, 2, 3, 255, 0, 51, 4, 5, 6, 0, 255, 0)),
+        ("ascii", b"1 2 3 255 0 51\n4 5 6 0 255 0\n"),
+    ],
+)
+def test_each_format_reads_the_same(tmp_path: Path, form: str, body: bytes) -> None:
+    file = tmp_path / "p.ply"
+    file.write_bytes(header(*_ROW, form=form).replace(b"\n", b"\r\n") + body)
+    cloud = read_points(file)
+    assert cloud.means.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert torch.allclose(cloud.colors, torch.tensor([[1, 0, 0.2], [0, 1, 0]]))
+
+
+def test_doubles_normals_and_16_bit_colours_are_understood(tmp_path: Path) -> None:
+    lines = ["element vertex 1", *(f"property double {c}" for c in "xyz"), "property float nx"]
+    lines += [f"property ushort {c}" for c in ("red", "green", "blue")]
+    (tmp_path / "p.ply").write_bytes(header(*lines) + struct.pack("<3df3H", 1, 2, 3, 9, 65535, 0, 13107))
+    cloud = read_points(tmp_path / "p.ply")
+    assert cloud.means.tolist() == [[1, 2, 3]]
+    assert torch.allclose(cloud.colors, torch.tensor([[1, 0, 0.2]]))
+
+
+def test_a_gaussian_files_colours_are_its_constant_band(tmp_path: Path) -> None:
+    g = gaussians(1, 3)
+    g.sh0[:] = torch.tensor([0.0, 1.0, -9.0])
+    write_gaussians(tmp_path / "g.ply", g)
+    # 0.5 + f_dc · 1 / (2 √π), then into [0, 1]
+    assert torch.allclose(read_points(tmp_path / "g.ply").colors, torch.tensor([[0.5, 0.7820948, 0.0]]))
+
+
+def test_points_without_colours_are_grey_and_say_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "p.ply").write_bytes(header("element vertex 1", *XYZ) + POINT)
+    assert read_points(tmp_path / "p.ply").colors.tolist() == [[0.5, 0.5, 0.5]]
+    assert "has no colours" in caplog.text
+
+
+def test_elements_before_and_after_the_vertices_are_skipped(tmp_path: Path) -> None:
+    lines = ["element camera 2", "property short id", "element vertex 1", *XYZ]
+    lines += ["element face 1", "property list uchar int vertex_indices"]
+    faces = struct.pack("<B3i", 3, 0, 0, 0)
+    (tmp_path / "p.ply").write_bytes(header(*lines) + struct.pack("<2h", 8, 9) + POINT + faces)
+    assert read_points(tmp_path / "p.ply").means.tolist() == [[1, 2, 3]]
+    (tmp_path / "a.ply").write_bytes(header(*lines, form="ascii") + b"8\n9\n1 2 3\n3 0 0 0\n")
+    assert read_points(tmp_path / "a.ply").means.tolist() == [[1, 2, 3]]
+
+
+def test_properties_outside_the_gaussian_layout_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_gaussians(tmp_path / "g.ply", gaussians(1, 0))
+    content = (tmp_path / "g.ply").read_bytes()
+    extra = content.replace(b"end_header", b"property float filter_3D\nend_header") + struct.pack("<f", 1)
+    (tmp_path / "g.ply").write_bytes(extra)
+    read_gaussians(tmp_path / "g.ply")
+    assert "filter_3D" in caplog.text
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    file = tmp_path / "g.ply"
+    write_gaussians(file, gaussians(2, 3))
+    before = file.read_bytes()
+    bad = gaussians(2, 3)
+    bad.scales[1, 2] = torch.nan
+    with pytest.raises(ValueError, match="scale_2 = nan in number 1"):
+        write_gaussians(file, bad)
+    with pytest.raises(ValueError, match="finite"):
+        write_points(file, PointCloud(torch.full((1, 3), torch.inf), torch.zeros(1, 3), "test"))
+    assert file.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_shapes_that_do_not_belong_together_are_refused() -> None:
+    good = gaussians(2, 3)
+    with pytest.raises(ValueError, match="shN must have 0, 3, 8 or 15 bands, got 4"):
+        GaussianPly(good.means, good.sh0, torch.zeros(2, 4, 3), good.opacities, good.scales, good.quats)
+
+
+_XYZ_1 = ("element vertex 1", *XYZ)
+_RGB_FLOAT = tuple(f"property float {c}" for c in ("red", "green", "blue"))
+_MALFORMED = {
+    "empty": (b"", "does not begin with a line `ply`"),
+    "not a ply": (b"plywood\nformat ascii 1.0\n", "does not begin with a line `ply`"),
+    "no end of the header": (b"ply\nformat ascii 1.0\nelement vertex 1\n", "no line `end_header`"),
+    "endless header": (b"ply\n" + b"comment x\n" * 10_000 + b"end_header\n", "no line `end_header`"),
+    "end_header in a comment": (b"ply\nformat ascii 1.0\ncomment end_header\n", "no line `end_header`"),
+    "no format": (b"ply\nelement vertex 1\nproperty float x\nend_header\n", "'element vertex 1'"),
+    "unknown format": (header(*_XYZ_1, form="binary_middle_endian"), "'format binary_middle_endian 1.0'"),
+    "unknown type": (header("element vertex 1", "property half x"), "'property half x'"),
+    "negative count": (header("element vertex -1", *XYZ), "says '-1'"),
+    "count with an exponent": (header("element vertex 1e3", *XYZ), "says '1e3'"),
+    "count that is no ASCII digit": (header("element vertex ²", *XYZ), "whole number"),
+    "count of thousands of digits": (header("element vertex " + "9" * 5000, *XYZ), "whole number"),
+    "count 2^63": (header(f"element vertex {2**63}", *XYZ) + POINT, "which need 110680464442257309696 bytes"),
+    "count 2^63 in ascii": (header(f"element vertex {2**63}", *XYZ, form="ascii") + b"1 2 3", "but 3 are left"),
+    "count 2^63 before": (header(f"element a {2**63}", "property char b", *_XYZ_1) + POINT, "but 12 are left"),
+    "truncated": (header(*_XYZ_1) + POINT[:-1], "which need 12 bytes, but 11 are left"),
+    "bytes too many": (header(*_XYZ_1) + POINT + b"\0", "12 bytes follow, but 13 do"),
+    "truncated ascii": (header(*_XYZ_1, form="ascii") + b"1 2\n", "which need 3 values, but 2 are left"),
+    "words in ascii": (header(*_XYZ_1, form="ascii") + b"1 2 three\n", "is not numeric"),
+    "fraction in a uchar": (header(*_ROW, form="ascii") + b"1 2 3 0 0.5 0 " * 2, "green: must be whole"),
+    "256 in a uchar": (header(*_ROW, form="ascii") + b"1 2 3 0 256 0 " * 2, "is 256"),
+    "NaN in a uchar": (header(*_ROW, form="ascii") + b"1 2 3 0 nan 0 " * 2, "is nan"),
+    "no vertices": (header("element face 1", "property int a") + b"1234", "element vertex: is missing"),
+    "no properties": (header("element vertex 9"), "has no properties"),
+    "property twice": (header(*_XYZ_1, "property float x"), "'property float x'"),
+    "element twice": (header(*_XYZ_1, "element vertex 1"), "'element vertex 1'"),
+    "property of nothing": (header("property float x"), "'property float x'"),
+    "list in the vertices": (header(*_XYZ_1, "property list uchar int a"), "'property list uchar int a'"),
+    "list before the vertices": (header("element f 1", "property list uchar int a", *_XYZ_1), "with lists"),
+    "no z": (header("element vertex 1", *XYZ[:2]) + POINT[:8], "z: is missing from the vertices, which have x, y"),
+    "no blue": (header(*_XYZ_1, *_RGB_FLOAT[:2]) + bytes(20), "blue: is missing"),
+    "NaN": (header(*_XYZ_1) + struct.pack("<3f", 1, np.nan, 3), "y: is not finite in vertex 0"),
+    "too large for a float": (
+        header("element vertex 1", *(p.replace("float", "double") for p in XYZ)) + struct.pack("<3d", 1, 2, 1e300),
+        "z: is not finite",
+    ),
+    "float colours up to 255": (header(*_XYZ_1, *_RGB_FLOAT) + struct.pack("<6f", 1, 2, 3, 255, 0, 0), r"in \[0, 1\]"),
+    "signed colours": (
+        header(*_XYZ_1, *(p.replace("float", "int") for p in _RGB_FLOAT)) + POINT + bytes(12),
+        "all uchar, ushort or floats",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "message"), _MALFORMED.values(), ids=_MALFORMED.keys())
+def test_malformed_points_get_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+    file = tmp_path / "bad.ply"
+    file.write_bytes(content)
+    with pytest.raises(DataError, match=message) as caught:
+        read_points(file)
+    assert str(caught.value).startswith(f"{file}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"property float opacity", b"property float opacitx", "opacity: is missing"),
+        (b"property float rot_3", b"property float rot_4", "rot_3: is missing"),
+        (b"property float f_rest_8", b"property float f_rest_x", "f_rest_8: is missing"),
+        (b"property float f_rest_8", b"property float other__8", "has 8 properties where 0, 9, 24 or 45 belong"),
+    ],
+)
+def test_a_gaussian_file_with_other_properties_is_refused(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+    file = tmp_path / "g.ply"
+    write_gaussians(file, gaussians(1, 3))
+    file.write_bytes(file.read_bytes().replace(old, new))
+    with pytest.raises(DataError, match=message):
+        read_gaussians(file)
+
+
+def test_a_missing_file_and_a_folder_get_one_line(tmp_path: Path) -> None:
+    for path in (tmp_path / "absent.ply", tmp_path):
+        with pytest.raises(DataError, match="file: cannot be read"):
+            read_points(path)
+
+
+@_ROUNDTRIP
+@given(st.data())
+def test_no_damage_raises_anything_but_the_one_line(tmp_path: Path, data: st.DataObject) -> None:
+    file = tmp_path / "g.ply"
+    write_gaussians(file, gaussians(2, 0))
+    content = bytearray(file.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    file.write_bytes(content[: data.draw(st.integers(0, len(content)))])
+    for read in (read_points, read_gaussians):
+        with suppress(DataError):
+            read(file)

@@ -1,0 +1,186 @@
+"""Triangulation: a textured plane at a known depth, single points by hand, and each filter on its own."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clear_strategies.data.triangulate import (
+    Features,
+    Pairs,
+    TriangulationSettings,
+    find_features,
+    match,
+    one_per_track,
+    project,
+    sample_colors,
+    triangulate,
+    triangulate_pair,
+)
+from clear_strategies.data.view import Photo
+from rasterizers.interface import Camera
+
+
+def camera(x: float, width: int = 100, height: int = 100, focal: float = 100.0) -> Camera:
+    """At (x, 0, 0), looking along z."""
+    pose = torch.eye(4)
+    pose[0, 3] = -x
+    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+
+
+def plane_photos(count: int, width: int = 120, height: int = 90) -> list[Photo]:
+    """A plane at z = 4: cameras 0.4 apart with f = 100 px see it shifted by whole 10 px."""
+    noise = np.random.default_rng(0).random((height, width + 10 * count, 3)).astype(np.float32)
+    texture = cv2.GaussianBlur(noise, (0, 0), 2)
+    texture = torch.from_numpy((texture - texture.min()) / np.ptp(texture))
+    return [
+        Photo(camera(0.4 * i, width, height), texture[:, 10 * i : 10 * i + width].contiguous()) for i in range(count)
+    ]
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_a_plane_is_found_where_it_is(count: int) -> None:
+    photos = plane_photos(count)
+    cloud = triangulate(photos)
+    assert len(cloud) > 100
+    assert (cloud.means[:, 2] - 4).abs().median() < 0.02
+    assert (cloud.means[:, 2] - 4).abs().quantile(0.95) < 0.15
+    assert cloud.saw_test_views == "no"
+    assert f"the {count} training LR images" in cloud.source
+    # The colour is the texture's at that place.
+    pixels, _ = project(photos[0].camera, cloud.means)
+    inside = (pixels[:, 0] < 120) & (pixels[:, 0] > 0)
+    assert torch.allclose(cloud.colors[inside], sample_colors(photos[0].image, pixels[inside]), atol=0.1)
+
+
+def test_a_point_seen_by_three_views_is_one_point() -> None:
+    pairwise = sum(len(triangulate([a, b])) for a, b in zip(plane_photos(3), plane_photos(3)[1:], strict=False))
+    assert len(triangulate(plane_photos(3))) < pairwise
+
+
+def test_the_same_photos_give_the_same_cloud() -> None:
+    one, two = triangulate(plane_photos(2)), triangulate(plane_photos(2))
+    assert torch.equal(one.means, two.means)
+    assert torch.equal(one.colors, two.colors)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_flat_images_give_an_empty_cloud(count: int) -> None:
+    cloud = triangulate([Photo(camera(0.1 * i), torch.full((100, 100, 3), 0.5)) for i in range(count)])
+    assert cloud.means.shape == cloud.colors.shape == (0, 3)
+
+
+def test_one_photo_gives_an_empty_cloud() -> None:
+    assert len(triangulate(plane_photos(1))) == 0
+
+
+def judged(x: tuple[float, float], y: tuple[float, float], **limits: float) -> tuple[list[float], float, bool]:
+    """Cameras at x = 0 and x = 1; (point, angle, believed)."""
+    settings = TriangulationSettings(**limits)  # type: ignore[arg-type]
+    pixels = (torch.tensor([p], dtype=torch.float64) for p in (x, y))
+    points, angle, good = triangulate_pair(camera(0), camera(1), *pixels, settings)
+    return points[0].tolist(), float(angle[0]), bool(good[0])
+
+
+def test_two_rays_meet_where_they_should() -> None:
+    # (0.5, 0, 5) lies at 50 + 100 · 0.5 / 5 = 60 and at 50 - 10 = 40; half the angle is atan(0.5 / 5).
+    point, angle, good = judged((60, 50), (40, 50))
+    assert point == pytest.approx([0.5, 0, 5], abs=1e-9)
+    assert angle == pytest.approx(2 * math.degrees(math.atan(0.1)))
+    assert good
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "limits"),
+    [
+        ((40, 50), (60, 50), {}),  # behind both cameras
+        ((60, 50), (40, 53), {"reprojection": 9.0}),  # 3 px off the epipolar line
+        ((60, 50), (40, 53), {"epipolar": 9.0}),  # 1.5 px from the nearest point's images
+        ((50.5, 50), (49.5, 50), {"angle": 1.0}),  # 100 away: 0.57 degrees
+    ],
+)
+def test_each_filter_alone_rejects(x: tuple[float, float], y: tuple[float, float], limits: dict[str, float]) -> None:
+    assert not judged(x, y, **limits)[2]
+    loose = {"epipolar": 9.0, "reprojection": 9.0, "angle": 0.1}
+    assert judged(x, y, **loose)[2] == (x[0] > y[0])
+
+
+def test_rays_from_one_centre_are_not_believed() -> None:
+    pixel = torch.tensor([[60.0, 50.0]], dtype=torch.float64)
+    assert not triangulate_pair(camera(0), camera(0), pixel, pixel, TriangulationSettings())[2].any()
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.floats(2, 9)), st.floats(-1, 1))
+def test_triangulation_inverts_projection(point: tuple[float, float, float], turn: float) -> None:
+    turned = torch.eye(4)
+    turned[:3, :3] = torch.tensor(
+        [[math.cos(turn), 0, math.sin(turn)], [0, 1, 0], [-math.sin(turn), 0, math.cos(turn)]]
+    )
+    turned[:3, 3] = torch.tensor([-1.0, 0.3, 12.0])
+    a, b = camera(0), Camera(turned, 90.0, 110.0, 40.0, 60.0, 100, 100)
+    world = torch.tensor([point], dtype=torch.float64)
+    (x, _), (y, _) = project(a, world), project(b, world)
+    found, _, _ = triangulate_pair(a, b, x, y, TriangulationSettings())
+    assert torch.allclose(found, world, atol=1e-5)
+
+
+@pytest.mark.parametrize("center", [(30.5, 20.5), (31.0, 22.0), (40.3, 30.7)])
+@pytest.mark.parametrize("enlarge", [1, 2])
+def test_a_blob_is_found_at_its_centre(center: tuple[float, float], enlarge: int) -> None:
+    """In our pixels, whose centres lie at halves."""
+    y, x = torch.meshgrid(torch.arange(60) + 0.5, torch.arange(80) + 0.5, indexing="ij")
+    blob = torch.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / 8)
+    view = Photo(camera(0, 80, 60), blob[..., None].expand(60, 80, 3))
+    found = find_features(view, TriangulationSettings(enlarge=enlarge)).pixels
+    assert torch.linalg.vector_norm(found - torch.tensor(center), dim=1).min() < 0.05
+
+
+def features(*descriptors: tuple[float, ...]) -> Features:
+    rows = torch.zeros(len(descriptors), 128)
+    rows[:, :2] = torch.tensor(descriptors)
+    return Features(torch.zeros(len(rows), 2, dtype=torch.float64), torch.nn.functional.normalize(rows, dim=1))
+
+
+def test_a_match_is_mutual_and_unambiguous() -> None:
+    a = features((1, 0), (0, 1))
+    assert match(a, features((0, 1), (1, 0)), 0.85).tolist() == [[0, 1], [1, 0]]
+    # Both of a prefer b's first; it prefers a's second.
+    assert match(features((1, 0.2), (1, 0)), features((1, 0), (-1, 0)), 0.85).tolist() == [[1, 0]]
+    # Two of b are as near as each other.
+    assert match(a, features((1, 0.1), (1, -0.1)), 0.85).tolist() == []
+    assert match(a, features((1, 0)), 0.85).tolist() == []
+
+
+def test_tracks_keep_their_widest_pair_and_contradictions_go() -> None:
+    # Features 0, 1 in view 0; 2, 3 in view 1; 4 in view 2.
+    view = torch.tensor([0, 0, 1, 1, 2])
+    pairs = torch.tensor([[0, 2], [2, 4], [0, 4]])
+    consistent = Pairs(torch.zeros(3, 3), pairs, torch.tensor([1.0, 3.0, 2.0]))
+    assert one_per_track(consistent, view).tolist() == [1]
+    # 0 and 1, both in view 0, would be the same point.
+    contradictory = Pairs(torch.zeros(2, 3), torch.tensor([[0, 2], [1, 2]]), torch.tensor([1.0, 2.0]))
+    assert one_per_track(contradictory, view).tolist() == []
+    separate = Pairs(torch.zeros(2, 3), torch.tensor([[0, 2], [1, 3]]), torch.tensor([1.0, 2.0]))
+    assert sorted(one_per_track(separate, view).tolist()) == [0, 1]
+
+
+def test_colours_are_sampled_between_pixel_centres() -> None:
+    image = torch.tensor([[[0.0, 0, 0], [1.0, 1, 1]]])
+    at = torch.tensor([[0.5, 0.5], [1.0, 0.5], [1.25, 0.5], [1.5, 0.5], [0.1, 0.2]])
+    assert torch.allclose(sample_colors(image, at)[:, 0], torch.tensor([0, 0.5, 0.75, 1, 0]))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("enlarge", 0), ("contrast", 0.0), ("ratio", 1.1), ("epipolar", -1.0), ("reprojection", math.nan), ("angle", 0.0)],
+)
+def test_settings_out_of_range_are_named(field: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{field} must .* got {value}"):
+        TriangulationSettings(**{field: value})  # type: ignore[arg-type]

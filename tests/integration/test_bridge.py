@@ -1,0 +1,99 @@
+"""The bridge in a host of the smallest kind: torch parameters, torch.optim, a renderer that speaks autograd."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import toy
+
+from clear_strategies import GCO, P2G, SVS, Conductor, Objective
+from clear_strategies.field import GaussianField
+from clear_strategies.schedules import WarmupDecay
+from integration.bridge import AutogradShot, joint_loss, joint_update
+from rasterizers import Splats
+
+OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
+
+
+class Draw(torch.autograd.Function):
+    """A host's differentiable renderer: splats in, image and projected centres out."""
+
+    @staticmethod
+    def forward(ctx, camera, probe, *splats):
+        ctx.rendering = toy.RASTERIZER(Splats(*splats), camera)
+        ctx.mark_non_differentiable(ctx.rendering.visible)
+        return ctx.rendering.image, ctx.rendering.visible
+
+    @staticmethod
+    def backward(ctx, cotangent, _):
+        g = ctx.rendering.vjp(cotangent[None])
+        return None, g.screen[0], *(x[0] for x in (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN, g.rgb))
+
+
+class Host:
+    """Somebody else's trainer."""
+
+    def __init__(self, scene):
+        self.field = GaussianField.from_cloud(scene.cloud)
+        self.field.degree = 3
+        self.params = {name: value.clone().requires_grad_() for name, value in self.field.raw().items()}
+
+    def render(self, camera, z=None, detail=True):
+        p = self.params
+        opacities = p["opacities"].sigmoid() if z is None else p["opacities"].sigmoid() * z
+        offset = p["detail"] if detail else torch.zeros_like(p["detail"])
+        drawn = (p["means"], p["quats"], p["scales"].exp(), opacities, p["sh0"], p["shN"], offset)
+        probe = toy.RASTERIZER(Splats(*(x.detach() for x in drawn)), camera).means2d.requires_grad_()
+        image, visible = Draw.apply(camera, probe, *drawn)
+        params = p if detail else {name: value for name, value in p.items() if name != "detail"}
+        return AutogradShot(image, probe, visible, params)
+
+
+@pytest.mark.parametrize("strategies", [(), (GCO(),), (P2G(),), (SVS(),), (GCO(), P2G(), SVS())], ids=len)
+def test_backward_hands_out_the_conductors_gradient(strategies):
+    scene = toy.scene(20)
+    host, view = Host(scene), scene.train[0]
+    conductor = Conductor(*strategies, objective=OBJECTIVE)
+    conductor.on_fit_start(3, 0)
+    z = conductor.gate(5, 20)
+    lr, hr = host.render(view.lr.camera, z, detail=False), host.render(view.hr.camera, z)
+    (2.0 * joint_loss(conductor, host.params, lr, hr, view, 5)).backward()
+
+    ours = Conductor(*strategies, objective=OBJECTIVE)
+    ours.on_fit_start(3, 0)
+    shots = host.field.render_scales(toy.RASTERIZER, view, gate=ours.gate(5, 20))
+    expected = ours.update(host.field.raw(), *shots, view, 5).grads
+    for name, p in host.params.items():
+        scale = float(expected[name].abs().max())
+        assert torch.allclose(p.grad, 2 * expected[name], atol=1e-4 * scale, rtol=1e-3), name
+
+
+def test_its_value_is_the_honest_loss():
+    scene = toy.scene(20)
+    host, view = Host(scene), scene.train[0]
+    conductor = Conductor(GCO(), objective=OBJECTIVE)
+    lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+    loss, update = joint_update(conductor, host.params, lr, hr, view, 50)
+    l = update.losses
+    assert float(loss) == pytest.approx(l["lr"] + l["base"] + 0.2 * l["hf"], rel=1e-6)
+    assert update.score.shape == (20,)
+
+
+def test_an_unmodified_loop_trains():
+    scene = toy.scene(20)
+    host = Host(scene)
+    conductor = Conductor(GCO(), P2G(), SVS(), objective=OBJECTIVE)
+    conductor.on_fit_start(3, 0)
+    optimizer = torch.optim.Adam(list(host.params.values()), lr=5e-3, eps=1e-15)
+    losses = []
+    for t in range(1, 25):
+        view = scene.train[t % 3]
+        z = conductor.gate(t, 20)
+        lr, hr = host.render(view.lr.camera, z, detail=False), host.render(view.hr.camera, z)
+        optimizer.zero_grad()
+        loss = joint_loss(conductor, host.params, lr, hr, view, t)
+        loss.backward()
+        optimizer.step()
+        conductor.after_step(host.params, t)
+        losses.append(float(loss))
+    assert sum(losses[-3:]) < 0.9 * sum(losses[:3])
