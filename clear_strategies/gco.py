@@ -5,7 +5,7 @@ margin, Gaussian by Gaussian and group by group; LR gradients are never changed.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final, Literal
 
@@ -53,7 +53,7 @@ class GCO(Strategy):
     weight_max: float = 0.75
     bound: Literal["omega", "coefficient"] = "omega"
     eps: str = "relative:1e-12"
-    groups: tuple[str, ...] = CONFLICT_GROUPS
+    groups: Sequence[str] = CONFLICT_GROUPS
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", tuple(self.groups))

@@ -106,6 +106,8 @@ def _scene(config: DictConfig, seed: int) -> Any:
     from clear_strategies.data.scene import prepare, save_lr
     from clear_strategies.data.upscale import Cached
 
+    if OmegaConf.is_missing(config.data, "path"):
+        raise DataError("config", "data.path", "is needed by this data set and missing", "add data.path=FOLDER")
     capture = _instantiate(config.data.reader, "data.reader")
     views = _instantiate(config.data.views, "data.views")
     cloud = _instantiate(config.data.cloud, "data.cloud")
