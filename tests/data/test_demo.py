@@ -1,0 +1,296 @@
+"""The demo room: exact, anti-aliased, deterministic, with features at LR scale, and a prior that lies where it says."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from clear_strategies import images
+from clear_strategies.data import demo
+from clear_strategies.data.capture import Capture
+from clear_strategies.data.demo import Ball, DemoPrior, Finish, Panel
+from clear_strategies.errors import DataError
+from rasterizers import Camera
+
+WIDTH, HEIGHT, FACTOR = 128, 96, 4
+
+
+@cache
+def capture() -> Capture:
+    return demo.read(width=WIDTH, height=HEIGHT)
+
+
+def frontal(width: int = 40, height: int = 30) -> Camera:
+    """At the origin, looking along z, 90 degrees wide."""
+    return Camera(torch.eye(4).double(), width / 2, width / 2, width / 2, height / 2, width, height)
+
+
+def test_three_of_twelve_views_train_and_lie_inside_the_arc() -> None:
+    splits = [frame.split for frame in capture().frames]
+    assert [i for i, split in enumerate(splits) if split == "train"] == [2, 6, 10]
+    assert splits.count("test") == 9
+
+
+@given(train=st.integers(2, 7), more=st.integers(1, 9))
+@settings(max_examples=40, deadline=None)
+def test_as_many_views_train_as_were_asked_for(train: int, more: int) -> None:
+    frames = demo.read(width=8, height=8, views=train + more, train=train).frames
+    assert sum(frame.split == "train" for frame in frames) == train
+    assert len({frame.name for frame in frames}) == train + more
+
+
+@pytest.mark.parametrize(("views", "train"), [(3, 3), (12, 1), (2, 4)])
+def test_impossible_splits_are_refused(views: int, train: int) -> None:
+    with pytest.raises(ValueError, match=r"2 <= train < views must hold"):
+        demo.read(views=views, train=train)
+
+
+def test_photos_fit_their_cameras_are_eight_bit_and_fill_the_picture() -> None:
+    for frame in capture().frames[::5]:
+        photo = frame.load()
+        assert photo.shape == (HEIGHT, WIDTH, 3)
+        assert photo.dtype == torch.float32
+        assert torch.equal(photo, images.quantize(photo))
+        assert demo.depth(frame.camera).isfinite().all()
+        assert 0.3 < photo.mean() < 0.6
+        assert (photo == 1).float().mean() < 0.02
+
+
+def test_a_photo_is_cast_once_and_is_the_same_whenever_it_is_cast() -> None:
+    frame = capture().frames[3]
+    assert frame.load() is frame.load()
+    assert torch.equal(frame.load(), demo.render(frame.camera))
+
+
+def test_cameras_look_at_the_room_upright_from_different_places() -> None:
+    centers = []
+    for frame in capture().frames:
+        rotation = frame.camera.world_to_camera[:3, :3]
+        assert torch.allclose(rotation @ rotation.T, torch.eye(3).double(), atol=1e-12)
+        assert torch.det(rotation) == pytest.approx(1)
+        assert abs(float(rotation[0, 1])) < 1e-12  # the x axis is level
+        assert float(rotation[1, 1]) > 0.95  # and y points down
+        centers.append(frame.camera.center)
+    assert float((centers[0] - centers[-1]).norm()) == pytest.approx(1.5)
+
+
+def test_neighbouring_views_agree_where_depth_says_they_see_the_same_place() -> None:
+    """Back-project view 5 by its depth into view 6: what is not hidden there has the same colour."""
+    a, b = capture().frames[5], capture().frames[6]
+    depth = demo.depth(a.camera).double()
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    local = torch.stack(((x - a.camera.cx) / a.camera.fx, (y - a.camera.cy) / a.camera.fy, torch.ones_like(x)), -1)
+    world = (local * depth[..., None] - a.camera.world_to_camera[:3, 3]) @ a.camera.world_to_camera[:3, :3]
+    there = world @ b.camera.world_to_camera[:3, :3].T + b.camera.world_to_camera[:3, 3]
+    u = there[..., 0] / there[..., 2] * b.camera.fx + b.camera.cx
+    v = there[..., 1] / there[..., 2] * b.camera.fy + b.camera.cy
+    grid = torch.stack((2 * u / WIDTH - 1, 2 * v / HEIGHT - 1), -1)[None].float()
+
+    def at(values: Tensor) -> Tensor:
+        return torch.nn.functional.grid_sample(values[None], grid, align_corners=False)[0]
+
+    seen = (at(demo.depth(b.camera).float()[None])[0] - there[..., 2]).abs() < 0.02
+    same = (at(b.load().permute(2, 0, 1)).permute(1, 2, 0) - a.load()).abs().mean(-1)[seen]
+    other = (b.load() - a.load()).abs().mean(-1)[seen]
+    assert seen.float().mean() > 0.7
+    assert same.mean() < 0.05
+    assert same.mean() < 0.6 * other.mean()
+
+
+def test_photos_are_free_of_aliasing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near the limit of many rays without prefiltering; one ray a pixel, which does alias, is five times further away."""
+    camera = demo.read(width=96, height=72).frames[5].camera
+    photo = demo.render(camera)
+    sample = demo._Texture.sample
+    monkeypatch.setattr(demo._Texture, "sample", lambda self, at, footprint: sample(self, at, np.ones_like(footprint)))
+    monkeypatch.setattr(demo, "_RAYS", 16)
+    limit = demo.render(camera)
+    monkeypatch.setattr(demo, "_RAYS", 1)
+    aliased = demo.render(camera)
+
+    def rms(image: Tensor) -> float:
+        return float((image - limit).square().mean().sqrt())
+
+    assert rms(photo) < 3 / 255
+    assert rms(aliased) > 5 * rms(photo)
+
+
+def test_depths_span_near_and_far_and_parallax_shows_at_lr() -> None:
+    first, last = capture().frames[0], capture().frames[-1]
+    depth = demo.depth(first.camera)
+    near, far = float(depth.quantile(0.02)), float(depth.quantile(0.98))
+    assert far > 1.6 * near
+    # The same baseline moves near things further, by more than two LR pixels.
+    baseline = float((first.camera.center - last.camera.center).norm())
+    assert baseline * first.camera.fx / FACTOR * (1 / near - 1 / far) > 2
+
+
+def test_lr_has_features_that_triangulate_onto_the_surfaces() -> None:
+    import cv2
+
+    a, b = (demo.read(width=256, height=192).frames[i] for i in (2, 6))
+    sift = cv2.SIFT_create(contrastThreshold=0.01)  # type: ignore[attr-defined]
+    found = []
+    for frame in (a, b):
+        lr = (images.downsample(frame.load(), FACTOR) * 255).round().byte().numpy()
+        found.append(sift.detectAndCompute(cv2.resize(lr, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC), None))
+    (keys_a, codes_a), (keys_b, codes_b) = found
+    pairs = [m for m, n in cv2.BFMatcher().knnMatch(codes_a, codes_b, k=2) if m.distance < 0.7 * n.distance]
+    projections = [(f.camera.world_to_camera[:3].numpy(), f.camera.scaled(1 / FACTOR)) for f in (a, b)]
+    matrices = [np.array([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]]) @ pose for pose, c in projections]
+    # Keypoint coordinates have pixel centres at whole numbers of the enlarged image.
+    x = (np.array([keys_a[m.queryIdx].pt for m in pairs]) + 0.5) / 2
+    y = (np.array([keys_b[m.trainIdx].pt for m in pairs]) + 0.5) / 2
+    points = cv2.triangulatePoints(*matrices, x.T, y.T)
+    z = (matrices[0] @ (points / points[3]))[2]
+    true = demo.depth(a.camera).numpy()[(x[:, 1] * FACTOR).astype(int), (x[:, 0] * FACTOR).astype(int)]
+    assert len(pairs) > 60
+    assert np.median(np.abs(z / true - 1)) < 0.05
+
+
+def test_depth_of_a_panel_is_its_plane() -> None:
+    panel = Panel(Finish("brick"), center=(0.0, 0.0, 4.0), right=(2.0, 0.0, 0.0), down=(0.0, 1.0, 0.0))
+    depth = panel.depth(demo._Rays.through(frontal(), 0, 30, 1))
+    # 90 degrees wide: at z = 4 the picture is 8 wide and 6 high, 5 px a unit; the panel is 4 by 2 units.
+    assert np.isfinite(depth).sum() == 20 * 10
+    assert np.all(depth[10:20, 10:30] == 4)
+
+
+def test_depth_of_a_ball_is_nearest_at_its_centre() -> None:
+    ball = Ball(Finish("moon"), center=(0.0, 0.0, 3.0), radius=1.0)
+    depth = ball.depth(demo._Rays.through(frontal(101, 101), 0, 101, 1))
+    assert depth[50, 50] == pytest.approx(2)
+    assert np.nanmin(depth) == depth[50, 50]
+    # Its outline is seen at sin(angle) = 1/3, tan(angle) = 0.3536: 17.86 px from the middle.
+    assert np.isfinite(depth[50]).sum() == 2 * 17 + 1
+
+
+@pytest.mark.parametrize("k", range(19))
+def test_charts_invert_and_normals_have_unit_length(k: int) -> None:
+    surface = demo._room()[k]
+    at = np.random.default_rng(k).uniform(0.05, 0.95, (50, 2))
+    points = surface.points(at)
+    assert np.allclose(surface.chart(points), at, atol=1e-4)
+    assert np.allclose(np.linalg.norm(surface.normal(points), axis=-1), 1)
+
+
+def test_a_box_is_closed_and_faces_outwards() -> None:
+    faces = demo._box("coffee", x=0.0, z=5.0, size=(2.0, 1.0, 1.0), turn=0.3)
+    middle = np.array([0.0, demo._FLOOR - 0.5, 5.0])
+    for face in faces:
+        outwards = np.asarray([face.center]) - middle
+        normal = face.normal(outwards)
+        assert float((normal * outwards).sum()) == pytest.approx(1.0 if abs(normal[0, 0]) > 0.9 else 0.5)
+        assert np.allclose(np.cross(normal, outwards), 0)
+
+
+def test_shadows_fall_behind_what_stands_in_the_light() -> None:
+    ball = Ball(Finish("moon"), center=(0.0, 0.0, 0.0), radius=1.0)
+    panel = Panel(Finish("brick"), center=(0.0, 0.0, 0.0), right=(1.0, 0.0, 0.0), down=(0.0, 1.0, 0.0))
+    points = np.array([[0, 0, 3], [0.5, 0, 3], [1.5, 0, 3], [3, 0, 0], [0, 0, -1.5], [0, 0, 0.0]])
+    lamp = np.array([0.0, 0.0, -3.0])
+    # Halfway between lamp and z = 3 the line passes the plane z = 0 at half the x.
+    assert panel.blocks(points, lamp).tolist() == [True, True, True, False, False, False]
+    assert ball.blocks(points, lamp)[:5].tolist() == [True, True, True, False, False]
+    assert not panel.blocks(np.array([[2.5, 0, 3.0]]), lamp)[0]
+
+
+def test_textures_are_means_at_coarser_levels_and_mirrored_when_repeated() -> None:
+    image = np.arange(64, dtype=np.float32).reshape(8, 8, 1)
+    texture = demo._Texture.of(image)
+    assert texture.widths.tolist() == [8, 4]
+    middle = np.array([[0.5, 0.5]], np.float32)
+    assert texture.sample(middle, np.array([2.0], np.float32)) == pytest.approx(31.5)
+    corner = np.array([[1 / 16, 1 / 16], [2 - 1 / 16, 1 / 16], [-1 / 16, 2 + 1 / 16]], np.float32)
+    assert np.allclose(texture.sample(corner, np.ones(3, np.float32)), 0)
+
+
+# --- the prior -------------------------------------------------------------------------------------------------------
+
+
+def prior(**settings: float) -> DemoPrior:
+    return DemoPrior({f.name: f.load for f in capture().frames}, patch=32, **settings)  # type: ignore[arg-type]
+
+
+def lr_of(i: int) -> tuple[str, Tensor, Tensor]:
+    frame = capture().frames[i]
+    return frame.name, images.downsample(frame.load(), FACTOR), frame.load()
+
+
+@given(share=st.floats(0, 1))
+@settings(max_examples=12, deadline=None)
+def test_exactly_that_share_of_the_patches_is_wrong(share: float) -> None:
+    name, lr, truth = lr_of(2)
+    difference = images.patch_means((prior(share=share)(name, lr, FACTOR) - truth).abs(), 32)
+    assert int((difference > 0).sum()) == round(share * 12)  # 128x96: 4 x 3 patches
+
+
+def test_without_strength_or_share_it_is_the_truth() -> None:
+    name, lr, truth = lr_of(2)
+    assert torch.equal(prior(strength=0.0)(name, lr, FACTOR), truth)
+    assert torch.equal(prior(share=0.0)(name, lr, FACTOR), truth)
+
+
+def test_errors_repeat_with_the_seed_and_differ_between_views_and_seeds() -> None:
+    name, lr, truth = lr_of(2)
+    first = prior(seed=1)(name, lr, FACTOR)
+    assert torch.equal(first, prior(seed=1)(name, lr, FACTOR))
+    assert not torch.equal(first, prior(seed=2)(name, lr, FACTOR))
+    other, other_lr, other_truth = lr_of(3)
+    wrong = images.patch_means((first - truth).abs(), 32) > 0
+    other_wrong = images.patch_means((prior(seed=1)(other, other_lr, FACTOR) - other_truth).abs(), 32) > 0
+    assert not torch.equal(wrong, other_wrong)
+
+
+def test_some_errors_agree_with_lr_and_some_do_not_so_that_reliability_spreads() -> None:
+    reliability = []
+    for i in range(12):
+        name, lr, _ = lr_of(i)
+        residual = (images.downsample(prior()(name, lr, FACTOR), FACTOR) - lr).abs()
+        reliability.append(torch.exp(-images.patch_means(residual, 8) / 0.05).flatten())
+    found = torch.cat(reliability)
+    assert found.median() > 0.95
+    assert found.quantile(0.02) < 0.4
+    assert ((found > 0.4) & (found < 0.9)).float().mean() > 0.1
+
+
+def test_it_is_better_than_bicubic_and_worse_than_the_truth() -> None:
+    errors = []
+    for i in range(12):
+        name, lr, truth = lr_of(i)
+        sr, smooth = prior()(name, lr, FACTOR), images.upsample(lr, FACTOR)
+        errors.append([float((sr - truth).square().mean()), float((smooth - truth).square().mean())])
+    ours, bicubic = np.mean(errors, axis=0)
+    assert 0 < 10 * math.log10(bicubic / ours) < 6
+
+
+def test_its_label_says_that_it_is_synthetic() -> None:
+    assert prior().label == "demo (synthetic: truth with seeded errors in 30% of the patches)"
+
+
+def test_it_leaves_the_truth_as_it_was_and_crops_it_as_hr_is_cropped() -> None:
+    whole = torch.rand(34, 35, 3)
+    before = whole.clone()
+    made = DemoPrior({"a": lambda: whole}, share=1.0, patch=8)("a", images.downsample(whole[:32, :32], 4), 4)
+    assert made.shape == (32, 32, 3)
+    assert torch.equal(whole, before)
+
+
+def test_a_truth_of_another_size_is_refused_in_one_line() -> None:
+    with pytest.raises(DataError, match=r"a: truth: is 64x64 where HR is 32x32: use the photos at their own size"):
+        DemoPrior({"a": lambda: torch.rand(64, 64, 3)})("a", torch.rand(8, 8, 3), 4)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"share": 1.5}, {"share": -0.1}, {"strength": -1.0}, {"strength": math.nan}, {"patch": 0}]
+)
+def test_settings_out_of_range_are_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="must"):
+        DemoPrior({}, **bad)  # type: ignore[arg-type]
