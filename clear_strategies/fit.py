@@ -239,7 +239,9 @@ def fit(
             state.history[-1]["seconds"] = time.perf_counter() - began
             if settings.probe_every and (done % settings.probe_every == 0 or done == settings.iterations):
                 with state.conductor.ledger.stage("probe test views"):
-                    state.history[-1]["psnr_test"] = _probe(state, scene, rasterizer)
+                    psnr = _probe(state, scene, rasterizer)
+                if psnr is not None:
+                    state.history[-1]["psnr_test"] = psnr
             if progress is not None:
                 progress(state)
             if pending:
@@ -271,15 +273,15 @@ def _psnr(mse: float) -> float:
     return -10 * math.log10(max(mse, 1e-10))
 
 
-def _probe(state: TrainState, scene: Scene, rasterizer: Rasterizer) -> float:
-    """Mean PSNR of the first few test views at HR."""
+def _probe(state: TrainState, scene: Scene, rasterizer: Rasterizer) -> float | None:
+    """Mean PSNR of the first few test views at HR; None where HR is unknown."""
     values = []
     for view in scene.test[: state.settings.probe_views]:
         if view.truth is not None:
             image = state.field.render(rasterizer, view.hr.camera).clamp(0, 1)
             mse = float((image - view.truth).square().mean())
             values.append(_psnr(mse))
-    return sum(values) / len(values) if values else float("nan")
+    return sum(values) / len(values) if values else None
 
 
 def _require_finite(state: TrainState) -> None:

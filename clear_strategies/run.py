@@ -187,8 +187,13 @@ def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> Non
     skipped = []
     if conductor.objective.lambda_hf == 0:
         skipped.append("high-frequency loss (lambda_hf = 0)")
-    if (start := conductor.objective.lambda_hr.start) > 0:
-        skipped.append(f"HR scale until iteration {start} (lambda_HR = 0)")
+    hr = conductor.objective.lambda_hr
+    if hr.peak == hr.final == 0:
+        skipped.append("HR scale throughout (lambda_HR = 0)")
+        if idle := [name for name in config.strategies if name in ("gco", "p2g")]:
+            _log.warning("lambda_HR is 0 throughout: %s has no effect.", " and ".join(idle))
+    elif hr.start > 0:
+        skipped.append(f"HR scale until iteration {hr.start} (lambda_HR = 0)")
     if state.mip.variance == 0:
         skipped.append("3D filter (variance 0)")
     lines["skipped"] = "; ".join(skipped) or "nothing"

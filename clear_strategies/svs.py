@@ -4,6 +4,7 @@ and HR disagree; once the structure has settled, an anchor holds the field near 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar, Final, Literal
@@ -16,6 +17,8 @@ from clear_strategies.errors import AnchorError
 from clear_strategies.gradients import ATTRIBUTES, Grads
 from clear_strategies.schedules import Ramp, milestone
 from clear_strategies.strategy import Strategy
+
+_log = logging.getLogger(__name__)
 
 # Geometry is held, appearance may still be refined (METHOD, F40). Position in units of the scene's extent.
 PAPER_WEIGHTS: Final[Mapping[str, float]] = {
@@ -62,6 +65,10 @@ class SVS(Strategy):
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
         self.cache["seed"] = seed
+        if self.dropout.maximum == 0 and (self.anchor_strength == 0 or not any(self.anchor_weights.values())):
+            _log.warning(
+                "SVS drops nothing and anchors nothing: it only ends densification at t=%d.", self.anchor_start
+            )
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """zᵗ: 0 for the dropped, 1 / (1 - p_t) for the rest; a function of (seed, t)."""
