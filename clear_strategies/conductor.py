@@ -163,8 +163,8 @@ class Conductor:
             s.on_resize(parents)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Every strategy's per-Gaussian tensors, as "<class>.<name>"."""
-        return {f"{type(s).__name__}.{name}": rows for s in self.strategies for name, rows in s.state.items()}
+        """Every strategy's per-Gaussian tensors, as "<class>.<name>" ("<class>2.<name>" for a second of one class)."""
+        return {f"{owner}.{name}": rows for owner, s in self._by_name().items() for name, rows in s.state.items()}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Give each strategy its tensors back.
@@ -172,7 +172,7 @@ class Conductor:
         Raises:
             ValueError: a tensor belongs to no strategy that is here.
         """
-        by_name = {type(s).__name__: s for s in self.strategies}
+        by_name = self._by_name()
         for s in self.strategies:
             s.state.clear()
         for key, rows in tensors.items():
@@ -180,6 +180,14 @@ class Conductor:
             if owner not in by_name:
                 raise ValueError(f"state {key!r} belongs to no strategy of this run ({', '.join(by_name) or 'none'}).")
             by_name[owner].state[name] = rows.clone()
+
+    def _by_name(self) -> dict[str, Strategy]:
+        named: dict[str, Strategy] = {}
+        for s in self.strategies:
+            kind = type(s).__name__
+            same = sum(type(other).__name__ == kind for other in named.values())
+            named[kind if same == 0 else f"{kind}{same + 1}"] = s
+        return named
 
     def _ask(self, hook: str, unanswered: Any, *arguments: Any) -> Any:
         owner = self._one.get(hook)

@@ -11,7 +11,8 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -215,42 +216,32 @@ def _marks(state: Any) -> dict[str, int]:
     return marks
 
 
-class _progress:  # noqa: N801 - used as a context manager
+@contextmanager
+def _progress(state: Any) -> Iterator[Callable[[Any], None]]:
     """A bar with loss, PSNR, Gaussians, conflict ratio and the time that is left."""
+    from tqdm import tqdm
+    from tqdm.contrib.logging import logging_redirect_tqdm
 
-    def __init__(self, state: Any) -> None:
-        self.total, self.done = state.settings.iterations, state.t - 1
+    shown: dict[str, str] = {}
+    every = 0.5 if sys.stderr.isatty() else 15  # seconds; a log file needs no animation
+    total, done = state.settings.iterations, state.t - 1
+    with (
+        logging_redirect_tqdm(),
+        tqdm(total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=every) as bar,
+    ):
 
-    def __enter__(self) -> Any:
-        from tqdm import tqdm
-        from tqdm.contrib.logging import logging_redirect_tqdm
+        def update(state: Any) -> None:
+            row = state.history[-1]
+            shown["loss"] = f"{row['loss_lr'] + row['lambda_hr'] * row.get('loss_base', 0.0):.4f}"
+            shown["N"] = f"{int(row['n_gaussians']):,}"
+            if not math.isnan(row.get("conflict", math.nan)):
+                shown["conflict"] = f"{row['conflict']:.2f}"
+            if "psnr_test" in row:
+                shown["psnr"] = f"{row['psnr_test']:.2f} dB"
+            bar.set_postfix(shown, refresh=False)
+            bar.update(1)
 
-        self.bar = tqdm(
-            total=self.total,
-            initial=self.done,
-            unit="it",
-            dynamic_ncols=True,
-            mininterval=0.5 if sys.stderr.isatty() else 15,
-        )
-        self.redirect = logging_redirect_tqdm()
-        self.redirect.__enter__()
-        self.shown: dict[str, str] = {}
-        return self.update
-
-    def update(self, state: Any) -> None:
-        row = state.history[-1]
-        self.shown["loss"] = f"{row['loss_lr'] + row['lambda_hr'] * row.get('loss_base', 0.0):.4f}"
-        self.shown["N"] = f"{int(row['n_gaussians']):,}"
-        if not math.isnan(row.get("conflict", math.nan)):
-            self.shown["conflict"] = f"{row['conflict']:.2f}"
-        if "psnr_test" in row:
-            self.shown["psnr"] = f"{row['psnr_test']:.2f} dB"
-        self.bar.set_postfix(self.shown, refresh=False)
-        self.bar.update(1)
-
-    def __exit__(self, *_: object) -> None:
-        self.redirect.__exit__(None, None, None)
-        self.bar.close()
+        yield update
 
 
 def _leave_results(

@@ -227,3 +227,21 @@ def _double(view):
     return replace(
         view, lr=Photo(view.lr.camera, view.lr.image.double()), hr=Photo(view.hr.camera, view.hr.image.double())
     )
+
+
+def test_two_strategies_of_one_class_keep_their_states_apart():
+    @dataclass(frozen=True)
+    class Remember(Strategy):
+        value: float = 0.0
+
+        def regularize(self, params, t):
+            return None
+
+        def after_step(self, params, t):
+            self.state["kept"] = torch.full((3,), self.value)
+
+    first = Conductor(Remember(1.0), Remember(2.0))
+    first.after_step({}, 1)
+    second = Conductor(Remember(1.0), Remember(2.0))
+    second.load_state_dict(first.state_dict())
+    assert [s.state["kept"][0].item() for s in second.strategies] == [1.0, 2.0]
