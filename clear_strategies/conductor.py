@@ -112,7 +112,7 @@ class Conductor:
         """
         o, λ, stage = self.objective, self.objective.lambda_hr(t), self.ledger.stage
         with stage("losses LR"):
-            l_lr = o.lr(lr.image, view.lr.image)  # Eq. 4
+            l_lr = o.lr(lr.image.detach(), view.lr.image)  # Eq. 4
         with stage("backward LR"):
             (g_lr,) = lr.pull(l_lr.cotangents)
         if hr is None:
@@ -123,7 +123,7 @@ class Conductor:
             return Update(g, screens.ordinary, screens.ordinary, None, {}, l_lr.values, self._readings())
 
         with stage("losses HR"):
-            l_hr = o.hr(hr.image, view.hr.image)  # Eq. 5
+            l_hr = o.hr(hr.image.detach(), view.hr.image)  # Eq. 5
         with stage("backward HR"):
             g_base, *rest = hr.pull(l_hr.cotangents)  # one backward pass, K = 2
         g_hf = rest[0] if rest else None

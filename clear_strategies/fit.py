@@ -71,6 +71,10 @@ class FitSettings:
         return self.iterations / REFERENCE_ITERATIONS if self.scale_schedule else 1.0
 
 
+class DivergedError(ClearError, FloatingPointError):
+    """A parameter is no longer a finite number; the last checkpoint is from before that."""
+
+
 class Interrupted(ClearError):
     """The run was asked to stop (Ctrl-C, SIGTERM); it finished its step and saved."""
 
@@ -222,7 +226,7 @@ def fit(
 
     Raises:
         Interrupted: after a signal, once the step is done and saved.
-        FloatingPointError: a parameter became NaN or infinite; the message names it.
+        DivergedError: a parameter became NaN or infinite; the message names it.
     """
     settings = state.settings
 
@@ -289,7 +293,7 @@ def _require_finite(state: TrainState) -> None:
         finite = torch.isfinite(value)
         if not bool(finite.all()):
             bad = (~finite).flatten(1).any(1) if value.dim() > 1 else ~finite
-            raise FloatingPointError(
+            raise DivergedError(
                 f"t={state.t - 1}: {name} of {int(bad.sum())} Gaussians is not finite, first Gaussian "
                 f"{int(bad.nonzero()[0])}. The last checkpoint is from before that; lower the learning rates."
             )

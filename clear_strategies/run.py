@@ -2,7 +2,8 @@
 
 Composes the configuration, prints the plan, trains, and leaves in Hydra's run folder: metrics.json, history.csv,
 conflict.csv, timing.csv, renders/, contact_sheet.png, curves.png, point_cloud.ply and checkpoints/. Exit codes: 0, 2 for
-input that cannot be used, 130 and 143 when stopped by a signal (after saving).
+input that cannot be used, 3 where
+the disk is full or read-only, 130 and 143 when stopped by a signal (after saving).
 """
 
 from __future__ import annotations
@@ -55,6 +56,9 @@ def main(config: DictConfig) -> float | None:
     except Interrupted as stopped:
         _log.error("%s", stopped)
         sys.exit(stopped.exit_code)
+    except OSError as error:  # a full or read-only disk; unusable input is a DataError
+        _log.error("%s: %s. Earlier checkpoints are untouched.", error.filename or "output", error.strerror or error)
+        sys.exit(3)
     except (ClearError, BackendUnavailable, OmegaConfBaseException, InstantiationException, ValueError) as error:
         if isinstance(error, ValueError) and not isinstance(error, ClearError) and not _is_ours(error):
             raise
