@@ -75,6 +75,7 @@ def run(config: DictConfig, folder: Path) -> float | None:
     import torch
 
     from clear_strategies.conductor import Conductor
+    from clear_strategies.data.scene import save_lr
     from clear_strategies.fit import FitSettings, TrainState, fit
     from clear_strategies.schedules import scaled
 
@@ -91,6 +92,9 @@ def run(config: DictConfig, folder: Path) -> float | None:
         *strategies, objective=objective, statistics_from=round(config.statistics_from * settings.stretch)
     )
     scene = _scene(config, settings.seed)
+    if config.data.save_lr is not None:
+        save_lr(scene, Path(config.data.save_lr))
+        return None
     rasterizer, backend = _rasterizer(config, scene.background)
 
     state = TrainState.start(
@@ -108,26 +112,24 @@ def run(config: DictConfig, folder: Path) -> float | None:
 
 
 def _scene(config: DictConfig, seed: int) -> Any:
-    from clear_strategies.data.scene import prepare, save_lr
-    from clear_strategies.data.upscale import Cached
+    from clear_strategies.data.scene import prepare
+    from clear_strategies.data.upscale import Bicubic, Cached
 
     if OmegaConf.is_missing(config.data, "path"):
         raise DataError("config", "data.path", "is needed by this data set and missing", "add data.path=FOLDER")
     capture = _instantiate(config.data.reader, "data.reader")
     views = _instantiate(config.data.views, "data.views")
     cloud = _instantiate(config.data.cloud, "data.cloud")
-    target = config.prior.get("_target_")
-    if target is None:  # prior=auto
+    if config.data.save_lr is not None:
+        prior = Bicubic()  # the images that the real prior reads may not exist yet
+    elif config.prior.get("_target_") is None:  # prior=auto
         name = "demo" if capture.name == "demo" else "bicubic"
         chosen = OmegaConf.load(CONF / "prior" / f"{name}.yaml")
         prior = _prior(chosen, capture)
         _log.info("prior: auto chose %s.", prior.label)
     else:
         prior = _prior(config.prior, capture)
-    scene = prepare(capture, views, Cached(prior) if hasattr(prior, "files") else prior, cloud, seed=seed)
-    if config.data.save_lr is not None:
-        save_lr(scene, Path(config.data.save_lr))
-    return scene
+    return prepare(capture, views, Cached(prior) if hasattr(prior, "files") else prior, cloud, seed=seed)
 
 
 def _prior(config: Any, capture: Any) -> Any:

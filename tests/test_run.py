@@ -169,6 +169,26 @@ def test_a_strategy_of_another_package(tmp_path):
     assert "GCO and Mine both implement correct()" in clash.stdout + clash.stderr
 
 
+def test_lr_images_are_written_for_an_external_model_whose_results_come_back(tmp_path):
+    """data.save_lr writes and stops; whatever enlarges those files is then a prior."""
+    from PIL import Image
+
+    from clear_strategies.data.photo_files import list_images
+
+    written = run("data.save_lr=lr", *TINY, cwd=tmp_path)
+    assert written.returncode == 0, written.stderr
+    assert not list(tmp_path.glob("outputs/**/metrics.json"))
+    (tmp_path / "sr").mkdir()
+    for path in list_images(tmp_path / "lr"):
+        with Image.open(path) as image:
+            image.resize((image.width * 4, image.height * 4), Image.Resampling.LANCZOS).save(
+                tmp_path / "sr" / f"{path.stem}_x4.png"
+            )
+    result = run("prior=images", "prior.path=sr", "prior.suffix=_x4", "hydra.run.dir=out", *TINY, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "images sr" in result.stdout + result.stderr
+
+
 BAD_SETTINGS = {
     "+strategy=gco strategies.gco.bound=both": "bound must be omega or coefficient",
     "+strategy=p2g strategies.p2g.score_by=best": "score_by must be one of",

@@ -138,12 +138,16 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
 
 
 def save_lr(scene: Scene, folder: Path) -> None:
-    """Write the training and test LR images as PNG, e.g. for an external SR model (prior=images reads its results)."""
+    """Write the training and test LR images as PNG for an external SR model; prior=images reads its results."""
     from clear_strategies.data.photo_files import write_png
 
     for view in (*scene.train, *scene.test):
         write_png(folder / f"{Path(view.name).stem}.png", view.lr.image)
-    _log.info("%d LR images written to %s.", len(scene.train) + len(scene.test), folder)
+    _log.info(
+        "%d LR images written to %s. Super-resolve them, then train with prior=images prior.path=<results>.",
+        len(scene.train) + len(scene.test),
+        folder,
+    )
 
 
 def _spread(n: int, count: int) -> list[int]:
