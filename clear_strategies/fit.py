@@ -193,13 +193,14 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     ask.after_step(θ.raw(), t)  # θᵃ at t = t_a  Eq. 16       SVS
     s.density.accumulate(u, lr if hr is None else hr, t)  # S^dens         Eq. 14
     with stage("density and filter"):
-        if ask.may_densify(t):
-            if s.density.due(t):
-                ask.on_resize(s.density.restructure(θ, s.optimizer, t))  # clone · split · prune = parents[M]
-                s.refilter()
-            if s.density.reset_due(t):
-                s.density.reset_opacity(θ, s.optimizer)
-        if s.filter_due():
+        may_change = ask.may_densify(t)
+        restructured = may_change and s.density.due(t)
+        if restructured:
+            ask.on_resize(s.density.restructure(θ, s.optimizer, t))  # clone · split · prune = parents[M]
+            s.refilter()
+        if may_change and s.density.reset_due(t):
+            s.density.reset_opacity(θ, s.optimizer)
+        if s.filter_due() and not restructured:  # the means have not moved since
             s.refilter()
     s.history.append(_row(s, u, lr.image, view))
     s.t += 1
@@ -260,11 +261,10 @@ def fit(
 
 def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, float]:
     """One line of the history."""
-    mse = float((lr_image.clamp(0, 1) - view.lr.image).square().mean())
     row = {
         "t": float(s.t),
         "lambda_hr": s.conductor.objective.lambda_hr(s.t),
-        "psnr_train_lr": _psnr(mse),
+        "psnr_train_lr": _psnr(lr_image, view.lr.image),
         "n_gaussians": float(len(s.field)),
         "detail_abs": float(s.field.detail.data.abs().mean()),
     }
@@ -273,7 +273,8 @@ def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, fl
     return row | dict(u.readings)
 
 
-def _psnr(mse: float) -> float:
+def _psnr(image: Tensor, target: Tensor) -> float:
+    mse = float((image.clamp(0, 1) - target).square().mean())
     return -10 * math.log10(max(mse, 1e-10))
 
 
@@ -282,9 +283,7 @@ def _probe(state: TrainState, scene: Scene, rasterizer: Rasterizer) -> float | N
     values = []
     for view in scene.test[: state.settings.probe_views]:
         if view.truth is not None:
-            image = state.field.render(rasterizer, view.hr.camera).clamp(0, 1)
-            mse = float((image - view.truth).square().mean())
-            values.append(_psnr(mse))
+            values.append(_psnr(state.field.render(rasterizer, view.hr.camera), view.truth))
     return sum(values) / len(values) if values else None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Final, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float
@@ -38,10 +38,6 @@ class Grads(dict[str, Tensor]):
         return Grads({name: scale_rows(value, weight) for name, value in self.items()})
 
     __rmul__ = __mul__
-
-    def only(self, names: Iterable[str]) -> Grads:
-        """The attributes among `names` that are here."""
-        return Grads({name: self[name] for name in names if name in self})
 
 
 @runtime_checkable

@@ -113,7 +113,7 @@ def run(config: DictConfig, folder: Path) -> float | None:
 
 def _scene(config: DictConfig, seed: int) -> Any:
     from clear_strategies.data.scene import prepare
-    from clear_strategies.data.upscale import Bicubic, Cached
+    from clear_strategies.data.upscale import Bicubic, Cached, Network
 
     if OmegaConf.is_missing(config.data, "path"):
         raise DataError("config", "data.path", "is needed by this data set and missing", "add data.path=FOLDER")
@@ -129,7 +129,7 @@ def _scene(config: DictConfig, seed: int) -> Any:
         _log.info("prior: auto chose %s.", prior.label)
     else:
         prior = _prior(config.prior, capture)
-    return prepare(capture, views, Cached(prior) if hasattr(prior, "files") else prior, cloud, seed=seed)
+    return prepare(capture, views, Cached(prior) if isinstance(prior, Network) else prior, cloud, seed=seed)
 
 
 def _prior(config: Any, capture: Any) -> Any:
@@ -146,9 +146,8 @@ def _rasterizer(config: DictConfig, background: tuple[float, float, float]) -> t
     settings["background"] = tuple(settings["background"])
     name = str(config.rasterizer.name)
     if name == "auto":
-        reasons = rasterizers.available()
-        name = next(n for n, why_not in reasons.items() if why_not is None)
-        for other, why_not in reasons.items():
+        name = rasterizers.fastest()
+        for other, why_not in rasterizers.available().items():
             if why_not is not None:
                 _log.info("rasterizer %s is not available: %s", other, why_not)
     return rasterizers.load(name, **settings), name

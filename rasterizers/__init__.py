@@ -26,6 +26,7 @@ __all__ = [
     "Splats",
     "Traits",
     "available",
+    "fastest",
     "load",
 ]
 
@@ -44,11 +45,16 @@ def load(name: str = "auto", **settings: Any) -> Rasterizer:
         ValueError: no backend has that name.
     """
     if name == "auto":
-        name = next(n for n, why_not in available().items() if why_not is None)
+        name = fastest()
     if name not in _BACKENDS:
         raise ValueError(f"unknown rasterizer {name!r}; choose one of auto, {', '.join(_BACKENDS)}.")
     rasterizer: Rasterizer = importlib.import_module(_BACKENDS[name]).create(**settings)
     return rasterizer
+
+
+def fastest() -> str:
+    """The name that "auto" stands for here."""
+    return next(name for name, why_not in available().items() if why_not is None)
 
 
 def available() -> dict[str, str | None]:

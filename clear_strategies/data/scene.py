@@ -109,13 +109,14 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
         DataError: a named view does not exist, or there are too few.
     """
     frames = list(capture.frames)
-    if any(f.split for f in frames):
+    own_split = any(f.split for f in frames)
+    if own_split:
         pool, test = [f for f in frames if f.split == "train"], [f for f in frames if f.split == "test"]
     else:
         test = frames[:: views.test_every]
         pool = [f for i, f in enumerate(frames) if i % views.test_every]
     if views.train_names is not None:
-        by_name = {Path(f.name).stem: f for f in (pool if any(f.split for f in frames) else frames)}
+        by_name = {Path(f.name).stem: f for f in (pool if own_split else frames)}
         missing = [name for name in views.train_names if name not in by_name]
         if missing:
             raise DataError(
