@@ -1,0 +1,15 @@
+// Python's view of the trainer's hot loops. Nothing but borders: types and shapes are checked, the GIL is let go.
+#include <nanobind/nanobind.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include "bind_losses.hpp"
+#include "bind_step.hpp"
+#include "isa.hpp"
+
+NB_MODULE(CLEAR_MODULE, m) {
+  m.attr("isa") = CLEAR_ISA;
+  m.def("instruction_sets", &clear::instruction_sets);
+  clear::bind_losses(m);
+  clear::bind_step(m);
+}

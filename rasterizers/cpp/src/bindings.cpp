@@ -1,0 +1,13 @@
+// Python's view of the trainer's hot loops. Nothing but borders: types and shapes are checked, the GIL is let go.
+#include <nanobind/nanobind.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/vector.h>
+
+#include "isa.hpp"
+
+namespace nb = nanobind;
+
+NB_MODULE(CLEAR_MODULE, m) {
+  m.attr("isa") = CLEAR_ISA;
+  m.def("instruction_sets", &clear::instruction_sets);
+}

@@ -1,0 +1,46 @@
+"""Compiled kernels: which instruction set this processor has, and the module that was built for it."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+from functools import cache
+from types import ModuleType
+from typing import Final
+
+from rasterizers.interface import BackendUnavailable
+
+_log = logging.getLogger(__name__)
+
+_ISAS: Final = ("avx512", "avx2", "baseline")  # best first
+_OVERRIDE: Final = "CLEAR_ISA"  # for tests and comparisons
+
+
+@cache
+def load_kernels(package: str) -> ModuleType:
+    """The fastest of `package`'s modules `_avx512`, `_avx2`, `_baseline` that this processor runs.
+
+    Raises:
+        BackendUnavailable: none was built, or `CLEAR_ISA` names one that cannot run here.
+    """
+    try:
+        baseline = importlib.import_module(f"{package}._baseline")
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"the compiled kernels of {package} are not installed ({error}). This is a pure-Python installation: install a "
+            "C++20 compiler (Debian: apt install g++; macOS: xcode-select --install) and install clear-strategies again."
+        ) from error
+    runs_here = [*baseline.instruction_sets(), "baseline"]
+    wanted = os.environ.get(_OVERRIDE)
+    if wanted and wanted not in runs_here:
+        raise BackendUnavailable(f"{_OVERRIDE}={wanted} cannot run here; this processor has {', '.join(runs_here)}.")
+    for isa in [wanted] if wanted else [isa for isa in _ISAS if isa in runs_here]:
+        try:
+            module = importlib.import_module(f"{package}._{isa}")
+        except ImportError as error:
+            _log.warning("%s was not built for %s: %s", package, isa, error)
+            continue
+        _log.debug("%s: kernels for %s.", package, isa)
+        return module
+    raise BackendUnavailable(f"{package} was not built for {wanted}; unset {_OVERRIDE}.")
