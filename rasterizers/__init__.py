@@ -32,7 +32,7 @@ __all__ = [
 
 # name -> module that defines `create(**settings)`, fastest first: "auto" takes the first that is available.
 # A backend imports its library only when it is created, so listing one here costs nothing.
-_BACKENDS: dict[str, str] = {"torch": "rasterizers.reference"}
+_BACKENDS: dict[str, str] = {"cpp": "rasterizers.cpp", "torch": "rasterizers.reference"}
 
 
 def load(name: str = "auto", **settings: Any) -> Rasterizer:

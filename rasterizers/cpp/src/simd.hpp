@@ -16,6 +16,7 @@ namespace clear {
 inline constexpr int kLanes = 16;
 
 #define CLEAR_INLINE inline __attribute__((always_inline))
+#define CLEAR_LAMBDA __attribute__((always_inline))
 
 #if defined(__AVX512F__)
 inline constexpr int kRegisterBytes = 64;
@@ -61,6 +62,7 @@ struct Native {
   static CLEAR_INLINE Mask mask_and(Mask a, Mask b) { return a & b; }
   static CLEAR_INLINE Mask mask_and_not(Mask a, Mask b) { return a & Mask(~b) & all; }
   static CLEAR_INLINE std::uint32_t bits(Mask m) { return m & all; }
+  static CLEAR_INLINE Mask from_bits(std::uint32_t b) { return Mask(b) & all; }
   static CLEAR_INLINE Register minimum(Register a, Register b) {
     if constexpr (sizeof(T) == 4) return (Register)_mm512_min_ps((__m512)a, (__m512)b);
     else return (Register)_mm512_min_pd((__m512d)a, (__m512d)b);
@@ -110,6 +112,11 @@ struct Native {
     for (int i = 0; i < width; ++i) b |= std::uint32_t(m[i] != 0) << i;
     return b;
 #endif
+  }
+  static CLEAR_INLINE Mask from_bits(std::uint32_t b) {
+    Mask m;
+    for (int i = 0; i < width; ++i) m[i] = -(typename IntegerOf<T>::type)((b >> i) & 1);
+    return m;
   }
   // NaN as x86 has it: the second operand wins.
   static CLEAR_INLINE Register minimum(Register a, Register b) {
@@ -174,6 +181,11 @@ struct Mask {
     return b;
   }
   CLEAR_INLINE bool any() const { return bits() != 0; }
+  static CLEAR_INLINE Mask from_bits(std::uint32_t b) {
+    Mask m;
+    for (int i = 0; i < registers; ++i) m.r[i] = Native<T>::from_bits(b >> (i * Native<T>::width));
+    return m;
+  }
 };
 
 template <class T>
