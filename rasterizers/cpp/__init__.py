@@ -89,13 +89,7 @@ class _Frame:
         # Kept here because the native frame only borrows them.
         self.opacities = [job.opacities.detach().contiguous() for job, _ in jobs]
         self.offsets = [None if job.rgb_offset is None else job.rgb_offset.detach().contiguous() for job, _ in jobs]
-        self.means2d = [like.new_empty(n, 2) for _ in jobs]
-        self.visible = [torch.empty(n, dtype=torch.bool) for _ in jobs]
-        self._basis: Tensor | None = None
-
-        frame = getattr(load_kernels(__name__), _FRAMES[dtype])
-        pose = camera.world_to_camera.double()
-        self.native = frame(
+        self.native = getattr(load_kernels(__name__), _FRAMES[dtype])(
             kernel=settings.kernel,
             near=settings.near,
             alpha_min=settings.alpha_min,
@@ -103,10 +97,13 @@ class _Frame:
             transmittance_min=settings.transmittance_min,
             background=list(settings.background),
             antialiased=settings.antialiased,
-            world_to_camera=pose.flatten().tolist(),
+            world_to_camera=camera.world_to_camera.double().flatten().tolist(),
             center=camera.center.double().tolist(),
             budget=settings.memory << 20,
         )
+        self.means2d = [self.empty(n, 2) for _ in jobs]
+        self.visible = [torch.empty(n, dtype=torch.bool) for _ in jobs]
+        self._basis: Tensor | None = None
         grids = [[c.fx, c.fy, c.cx, c.cy, float(c.width), float(c.height)] for c in self.cameras]
         if not self.native.project(
             *self.shared, grids, self.opacities, self.offsets, self.means2d, self.visible, self.threads
@@ -114,11 +111,16 @@ class _Frame:
             for job, _ in jobs:
                 require_finite(job)
 
+    def empty(self, *shape: int) -> Tensor:
+        """A tensor to be filled, of memory that a picture before it has used: fresh pages cost more than the filling."""
+        fresh: Tensor = self.native.empty(shape)
+        return fresh
+
     def basis(self) -> Float[Tensor, "N B1"]:
         """Y of this pose's directions, the same for all screens; made when first asked for."""
         if self._basis is None:
             means, shN = self.shared[0], self.shared[4]
-            self._basis = means.new_empty(len(means), shN.shape[1] + 1)
+            self._basis = self.empty(len(means), shN.shape[1] + 1)
             self.native.basis(*self.shared, self._basis, self.threads)
         return self._basis
 
@@ -128,12 +130,12 @@ class CppRendering:
 
     def __init__(self, frame: _Frame, screen: int, tiles: Bool[Tensor, "th tw"] | None) -> None:
         self._frame, self._screen = frame, screen
-        camera, like = frame.cameras[screen], frame.means2d[screen]
+        camera = frame.cameras[screen]
         if tiles is not None:
             require_tiles(tiles, camera.width, camera.height, frame.settings.tile)
             tiles = tiles.to("cpu", torch.bool).contiguous()
-        self.image: Float[Tensor, "H W 3"] = like.new_empty(camera.height, camera.width, 3)
-        self.alpha: Float[Tensor, "H W"] = like.new_empty(camera.height, camera.width)
+        self.image: Float[Tensor, "H W 3"] = frame.empty(camera.height, camera.width, 3)
+        self.alpha: Float[Tensor, "H W"] = frame.empty(camera.height, camera.width)
         self.means2d: Float[Tensor, "N 2"] = frame.means2d[screen]
         self.visible: Bool[Tensor, " N"] = frame.visible[screen]
         frame.native.draw(screen, self.image, self.alpha, tiles, frame.settings.tile, frame.threads)
@@ -142,8 +144,8 @@ class CppRendering:
         """One traversal for up to three cotangents; see `Rendering.vjp`."""
         require_cotangents(cotangents, self.image)
         k, n, frame = len(cotangents), len(self.visible), self._frame
-        means, quats, scales, screen, rgb = (self.image.new_empty(k, n, width) for width in (3, 4, 3, 2, 3))
-        opacities = self.image.new_empty(k, n)
+        means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
+        opacities = frame.empty(k, n)
         frame.native.vjp(
             self._screen, cotangents.detach().to(self.image).contiguous(), *frame.shared,
             means, quats, scales, opacities, screen, rgb, frame.threads,

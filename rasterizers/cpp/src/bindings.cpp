@@ -5,6 +5,8 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <memory>
+
 #include "frame.hpp"
 #include "isa.hpp"
 
@@ -34,6 +36,19 @@ Splats<T> splats_of(const Read<T, -1, 3>& means, const Read<T, -1, 4>& quats, co
   require(bands == 0 || bands == 3 || bands == 8 || bands == 15, "shN must hold 0, 3, 8 or 15 bands");
   require(n == 0 || bands == 0 || (shN.stride(2) == 1 && shN.stride(1) == 3), "each row of shN must be contiguous");
   return {n, means.data(), quats.data(), scales.data(), sh0.data(), shN.data(), n ? shN.stride(0) : 0, int(bands)};
+}
+
+// A torch tensor whose memory goes back to the recycler when it is freed: gradients of one iteration are the next one's.
+template <class T>
+nb::ndarray<nb::pytorch, T> empty(const std::vector<std::size_t>& shape) {
+  std::size_t size = 1;
+  for (std::size_t edge : shape) size *= edge;
+  auto buffer = std::make_unique<Buffer<T>>();
+  buffer->reserve_lost(std::max<std::size_t>(size, 1));
+  T* data = buffer->data();
+  nb::capsule owner(buffer.get(), [](void* p) noexcept { delete static_cast<Buffer<T>*>(p); });
+  buffer.release();
+  return nb::ndarray<nb::pytorch, T>(data, shape.size(), shape.data(), owner);
 }
 
 // (fx, fy, cx, cy, width, height)
@@ -88,6 +103,7 @@ void bind_frame(nb::module_& m, const char* name) {
              nb::gil_scoped_release release;
              return self.project(splats, std::move(targets), threads);
            })
+      .def_static("empty", &empty<T>, nb::rv_policy::reference)
       .def("pairs", &F::pairs)
       .def("draw",
            [](F& self, int i, Write<T, -1, -1, 3> image, Write<T, -1, -1> alpha,

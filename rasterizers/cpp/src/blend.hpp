@@ -8,6 +8,7 @@
 #include <climits>
 
 #include "blocks.hpp"
+#include "columns.hpp"
 
 namespace clear {
 
@@ -40,6 +41,32 @@ struct BlockColour {
   T r[kLanes], g[kLanes], b[kLanes];
 };
 
+// A block's pixels in an [height, width, C] image; blocks may hang over its edge.
+template <int C, class T>
+CLEAR_INLINE void load_block(const T* image, int width, int height, int X, int Y, Lanes<T> (&channels)[C]) {
+  T pixels[kLanes * C];
+  const int columns = std::min(kBlock, width - X), rows = std::min(kBlock, height - Y);
+  if (columns < kBlock || rows < kBlock) std::memset(pixels, 0, sizeof pixels);
+  for (int y = 0; y < rows; ++y) {
+    const T* from = image + (std::int64_t(Y + y) * width + X) * C;
+    if (columns == kBlock) std::memcpy(pixels + y * kBlock * C, from, sizeof(T) * kBlock * C);
+    else std::copy(from, from + columns * C, pixels + y * kBlock * C);
+  }
+  load_rows<C>(pixels, 0, kLanes, channels);
+}
+
+template <int C, class T>
+CLEAR_INLINE void store_block(T* image, int width, int height, int X, int Y, const Lanes<T> (&channels)[C]) {
+  T pixels[kLanes * C];
+  store_rows<C>(pixels, 0, kLanes, channels);
+  const int columns = std::min(kBlock, width - X), rows = std::min(kBlock, height - Y);
+  for (int y = 0; y < rows; ++y) {
+    T* to = image + (std::int64_t(Y + y) * width + X) * C;
+    if (columns == kBlock) std::memcpy(to, pixels + y * kBlock * C, sizeof(T) * kBlock * C);
+    else std::copy(pixels + y * kBlock * C, pixels + (y * kBlock + columns) * C, to);
+  }
+}
+
 // log2 of a Gaussian's α before the cap, at the pixels.
 template <class T>
 CLEAR_INLINE Lanes<T> exponent(const Ellipse<T>& e, const Lanes<T>& dx, const Lanes<T>& dy) {
@@ -48,21 +75,28 @@ CLEAR_INLINE Lanes<T> exponent(const Ellipse<T>& e, const Lanes<T>& dx, const La
   return L(e.peak) - dx * along - L(e.C) * dy * dy;
 }
 
-// One segment's part of a block; `colour` and `end` go on from where the segment before left them.
+// One segment's part of a block; after the first, `colour` and `end` go on from where the segment before left them.
 template <class T>
 void blend_block(const Segment<T>& segment, int block, int X, int Y, const Settings<T>& s, BlockColour<T>& colour,
                  BlockEnd<T>& end) {
   using L = Lanes<T>;
   const PixelCentres<T> pixel(X, Y);
   const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, transmittance_min = s.transmittance_min;
-  L through = L::load(end.transmittance), r = L::load(colour.r), g = L::load(colour.g), b = L::load(colour.b);
-  T open[kLanes];
-  for (int i = 0; i < kLanes; ++i) open[i] = end.ended[i] == INT_MAX ? T(1) : T(0);
-  Mask<T> alive = L::load(open) > L(T(0));
+  L through = T(1), r = T(0), g = T(0), b = T(0);
+  Mask<T> alive = Mask<T>::from_bits(0xffff);
+  if (segment.first == 0) {
+    std::fill_n(end.ended, kLanes, INT_MAX);
+  } else {
+    through = L::load(end.transmittance), r = L::load(colour.r), g = L::load(colour.g), b = L::load(colour.b);
+    std::uint32_t open = 0;
+    for (int i = 0; i < kLanes; ++i) open |= std::uint32_t(end.ended[i] == INT_MAX) << i;
+    alive = Mask<T>::from_bits(open);
+  }
+  const Ellipse<T>* ellipses = segment.ellipses.data();
   const std::uint16_t* list = segment.list(block);
   const int n = segment.lengths[block];
   for (int i = 0; i < n; ++i) {
-    const Ellipse<T>& e = segment.ellipses[list[i]];
+    const Ellipse<T>& e = ellipses[list[i]];
     const L dx = pixel.x - L(e.u), dy = pixel.y - L(e.v);
     const L alpha = minimum(exp2(exponent(e, dx, dy)), alpha_max);
     const Mask<T> counts = (alpha >= alpha_min) & alive;
@@ -91,10 +125,9 @@ struct BlockPull {
   T q[K][kRows][kLanes], weight[kRows][kLanes];
   T offset_x[kRows], offset_y[kRows];  // from the Gaussian's centre to the block's
   int place[kRows];
-  int count = 0;
 
   // Lanes become Gaussians: rows are transposed, then a sum over pixels is fifteen additions for sixteen Gaussians.
-  CLEAR_INLINE void flush(const T (&cotangent)[K][3][kLanes], Pulled<T>* sums) {
+  CLEAR_INLINE void flush(int count, const T (&cotangent)[K][3][kLanes], Pulled<T>* sums) {
     using L = Lanes<T>;
     if (!count) return;
     for (int i = count; i < kRows; ++i) {
@@ -125,7 +158,6 @@ struct BlockPull {
         (L::load(row) + out[i]).store(row);
       }
     }
-    count = 0;
   }
 
  private:
@@ -170,13 +202,15 @@ void blend_block_vjp(const Segment<T>& segment, int block, int X, int Y, const S
 
   // Ends, counted from this segment's first pair: exact in T.
   T ends[kLanes];
+  const std::int32_t before = std::int32_t(segment.first);
   int last = 0;
   for (int i = 0; i < kLanes; ++i) {
-    const std::int64_t e = std::clamp<std::int64_t>(std::int64_t(end.ended[i]) - segment.first, 0, kSegment);
-    ends[i] = T(e), last = std::max(last, int(e));
+    const int e = std::min(std::max(end.ended[i] - before, 0), kSegment);
+    ends[i] = T(e), last = std::max(last, e);
   }
   const L ended = L::load(ends);
-  const int n = int(std::lower_bound(list, list + segment.lengths[block], last) - list);
+  int n = segment.lengths[block];
+  if (last < segment.count) n = int(std::lower_bound(list, list + n, last) - list);
   if (!n) return;
 
   L through = L::load(back.transmittance), v[K][3], behind[K];
@@ -185,9 +219,11 @@ void blend_block_vjp(const Segment<T>& segment, int block, int X, int Y, const S
     for (int c = 0; c < 3; ++c) v[k][c] = L::load(cotangent[k][c]);
   }
   BlockPull<T, K> pull;
+  int count = 0;
+  const Ellipse<T>* ellipses = segment.ellipses.data();
   for (int i = n - 1; i >= 0; --i) {
     const int place = list[i];
-    const Ellipse<T>& e = segment.ellipses[place];
+    const Ellipse<T>& e = ellipses[place];
     const L dx = pixel.x - L(e.u), dy = pixel.y - L(e.v);
     const L free = exp2(exponent(e, dx, dy)), capped = minimum(free, alpha_max);
     const Mask<T> kept = (capped >= alpha_min) & (ended > L(T(place)));
@@ -197,19 +233,19 @@ void blend_block_vjp(const Segment<T>& segment, int block, int X, int Y, const S
     through *= over;
     const L weight = through * alpha;
     const Mask<T> moves = kept & (free <= alpha_max);
-    weight.store(pull.weight[pull.count]);
+    weight.store(pull.weight[count]);
     for (int k = 0; k < K; ++k) {
       const L light = v[k][0] * L(e.r) + v[k][1] * L(e.g) + v[k][2] * L(e.b);
       const L d_alpha = through * light - behind[k] * over;
-      where(moves, alpha * d_alpha).store(pull.q[k][pull.count]);
+      where(moves, alpha * d_alpha).store(pull.q[k][count]);
       behind[k] += weight * light;
     }
-    pull.offset_x[pull.count] = centre_x - e.u;
-    pull.offset_y[pull.count] = centre_y - e.v;
-    pull.place[pull.count] = place;
-    if (++pull.count == pull.kRows) pull.flush(cotangent, sums);
+    pull.offset_x[count] = centre_x - e.u;
+    pull.offset_y[count] = centre_y - e.v;
+    pull.place[count] = place;
+    if (++count == pull.kRows) pull.flush(count, cotangent, sums), count = 0;
   }
-  pull.flush(cotangent, sums);
+  pull.flush(count, cotangent, sums);
   through.store(back.transmittance);
   for (int k = 0; k < K; ++k) behind[k].store(back.behind[k]);
 }

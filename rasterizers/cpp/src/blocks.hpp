@@ -7,21 +7,22 @@
 namespace clear {
 
 inline constexpr int kSegment = 2048;
+inline constexpr int kListStride = kSegment + 32;  // lists 4 KiB apart would all compete for the same lines of the cache
 
 // A segment of a bin: its Gaussians, copied side by side, and for each block the places of those that reach it, in order.
 template <class T>
 struct Segment {
   Buffer<Ellipse<T>> ellipses;
-  Buffer<std::uint16_t> places;  // [block][kSegment]
+  Buffer<std::uint16_t> places;  // [block][kListStride]
   int lengths[kBlocks];
   std::int64_t first;  // the segment's first pair, counted from the bin's first
   int count;
 
   Segment() {
     ellipses.reserve_lost(kSegment);
-    places.reserve_lost(std::size_t(kBlocks) * kSegment);
+    places.reserve_lost(std::size_t(kBlocks) * kListStride);
   }
-  const std::uint16_t* list(int block) const { return places.data() + std::size_t(block) * kSegment; }
+  const std::uint16_t* list(int block) const { return places.data() + std::size_t(block) * kListStride; }
 };
 
 // Sixteen Gaussians against all blocks of the bin whose corner is (X, Y). Row of blocks by row of blocks: where is the
@@ -74,20 +75,20 @@ void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_
   const std::int64_t begin = bins.starts[bin] + first;
   const int n = out.count = int(std::min<std::int64_t>(kSegment, bins.starts[bin + 1] - begin));
   out.first = first;
-  const Pair* pairs = bins.pairs.data() + begin;
+  const std::uint32_t* pairs = bins.pairs.data() + begin;
   std::uint64_t* masks = bins.masks.data() + begin;
   const T X = T(bin % bins.columns * kBin), Y = T((bins.first_row + bin / bins.columns) * kBin);
   std::uint16_t* next[kBlocks];
-  for (int b = 0; b < kBlocks; ++b) next[b] = out.places.data() + std::size_t(b) * kSegment;
+  for (int b = 0; b < kBlocks; ++b) next[b] = out.places.data() + std::size_t(b) * kListStride;
   constexpr int ahead = 24;
-  for (int i = 0; i < std::min(n, ahead); ++i) __builtin_prefetch(&ellipses[pairs[i].splat]);
+  for (int i = 0; i < std::min(n, ahead); ++i) __builtin_prefetch(&ellipses[pairs[i]]);
   for (int start = 0; start < n; start += kLanes) {
     const int count = std::min(kLanes, n - start);
     Lanes<T> rows[kLanes];
     for (int i = 0; i < kLanes; ++i) {
       const int at = start + std::min(i, count - 1);
-      if (at + ahead < n) __builtin_prefetch(&ellipses[pairs[at + ahead].splat]);
-      rows[i] = Lanes<T>::load(&ellipses[pairs[at].splat].u);
+      if (at + ahead < n) __builtin_prefetch(&ellipses[pairs[at + ahead]]);
+      rows[i] = Lanes<T>::load(&ellipses[pairs[at]].u);
       if (i < count) rows[i].store(&out.ellipses[at].u);
     }
     if (!bins.has_masks) {

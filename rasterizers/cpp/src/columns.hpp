@@ -11,24 +11,38 @@ namespace clear {
 template <int C, class T>
 CLEAR_INLINE void load_rows(const T* tensor, std::int64_t row, int count, Lanes<T> (&columns)[C]) {
   const T* p = tensor + row * C;
-  T padded[C * kLanes], split[C][kLanes];
+  T padded[C * kLanes];
+  [[maybe_unused]] T split[C][kLanes];
   if (count < kLanes) {
     for (int i = 0; i < kLanes; ++i)
       for (int c = 0; c < C; ++c) padded[C * i + c] = p[C * std::min(i, count - 1) + c];
     p = padded;
   }
-  for (int i = 0; i < kLanes; ++i)
-    for (int c = 0; c < C; ++c) split[c][i] = p[C * i + c];
-  for (int c = 0; c < C; ++c) columns[c] = Lanes<T>::load(split[c]);
+  if constexpr (C == 3) {
+    load_triples(p, columns);
+  } else if constexpr (C == 1) {
+    columns[0] = Lanes<T>::load(p);
+  } else {
+    for (int i = 0; i < kLanes; ++i)
+      for (int c = 0; c < C; ++c) split[c][i] = p[C * i + c];
+    for (int c = 0; c < C; ++c) columns[c] = Lanes<T>::load(split[c]);
+  }
 }
 
 template <int C, class T>
 CLEAR_INLINE void store_rows(T* tensor, std::int64_t row, int count, const Lanes<T> (&columns)[C]) {
-  T split[C][kLanes], joined[C * kLanes];
-  for (int c = 0; c < C; ++c) columns[c].store(split[c]);
+  [[maybe_unused]] T split[C][kLanes];
+  T joined[C * kLanes];
   T* p = count == kLanes ? tensor + row * C : joined;
-  for (int i = 0; i < kLanes; ++i)
-    for (int c = 0; c < C; ++c) p[C * i + c] = split[c][i];
+  if constexpr (C == 3) {
+    store_triples(p, columns);
+  } else if constexpr (C == 1) {
+    columns[0].store(p);
+  } else {
+    for (int c = 0; c < C; ++c) columns[c].store(split[c]);
+    for (int i = 0; i < kLanes; ++i)
+      for (int c = 0; c < C; ++c) p[C * i + c] = split[c][i];
+  }
   if (count < kLanes) std::memcpy(tensor + row * C, joined, sizeof(T) * C * count);
 }
 

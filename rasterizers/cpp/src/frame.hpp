@@ -34,9 +34,8 @@ class Frame {
   bool project(const Splats<T>& splats, std::vector<Target<T>> targets, int threads) {
     views_.clear();
     n_ = splats.n;
-    if (!clear::project(pose_, settings_, splats, targets, palette_, threads)) return false;
+    if (!clear::project(pose_, settings_, splats, targets, palette_, depths_, threads)) return false;
     // One order over the union of what any screen shows.
-    const Pose<T>& p = pose_;
     order_by_depth<T>(
         n_,
         [&](std::int64_t i) {
@@ -44,15 +43,11 @@ class Frame {
             if (t.visible[i]) return true;
           return false;
         },
-        [&](std::int64_t i) {
-          const T* m = splats.means + 3 * i;
-          return p.R[6] * m[0] + p.R[7] * m[1] + p.R[8] * m[2] + p.t[2];
-        },
-        order_, threads);
+        [&](std::int64_t i) { return depths_[i]; }, order_, threads);
     for (Target<T>& target : targets) {
       View view;
       view.target = std::move(target);
-      cover(view.target.screen, view.target.ellipses, n_, view.ranges, view.pairs_in_row, threads);
+      view.pairs_in_row = count_pairs(view.target.screen.rows(), view.target.ranges, n_, threads);
       views_.push_back(std::move(view));
     }
     return true;
@@ -69,7 +64,7 @@ class Frame {
     const Screen<T>& screen = view.target.screen;
     ask_for(view, demand);
     view.ends.reserve_lost(std::size_t(screen.columns()) * screen.rows() * kBlocks);
-    const std::vector<int> bands = bands_of(view, sizeof(Pair) + sizeof(std::uint64_t));
+    const std::vector<int> bands = bands_of(view, kBytesPerPair);
     for (std::size_t b = 0; b + 1 < bands.size(); ++b) {
       list(view, bands[b], bands[b + 1], threads);
       draw_band(view, image, alpha, threads);
@@ -120,9 +115,11 @@ class Frame {
   }
 
  private:
+  // Gaussian, place, blocks.
+  static constexpr std::int64_t kBytesPerPair = 2 * sizeof(std::uint32_t) + sizeof(std::uint64_t);
+
   struct View {
     Target<T> target;
-    Buffer<BinRange> ranges;
     std::vector<std::int64_t> pairs_in_row;
     std::vector<std::uint64_t> wanted;  // blocks asked for, bin by bin; empty: all
     Buffer<BlockEnd<T>> ends;           // [bins, 64]
@@ -161,7 +158,7 @@ class Frame {
   [[noreturn]] void refuse(const View& view, int row, std::int64_t bytes) const {
     std::int64_t largest = 0;
     for (std::int64_t i = 0; i < n_; ++i)
-      if (view.ranges[i].count() > view.ranges[largest].count()) largest = i;
+      if (view.target.ranges[i].count() > view.target.ranges[largest].count()) largest = i;
     const Ellipse<T>& e = view.target.ellipses[largest];
     throw OverBudget("one row of bins (32 px) holds " + std::to_string(view.pairs_in_row[row]) +
                      " pairs of Gaussian and bin, " + std::to_string(bytes >> 20) + " MiB of the " +
@@ -171,7 +168,7 @@ class Frame {
   }
 
   void list(View& view, int first_row, int end_row, int threads) {
-    list_pairs(view.target.screen.columns(), first_row, end_row, order_, view.ranges, n_,
+    list_pairs(view.target.screen.columns(), first_row, end_row, order_, view.target.ranges, n_,
                view.wanted.empty() ? nullptr : view.wanted.data(), view.bins, threads);
   }
 
@@ -194,8 +191,10 @@ class Frame {
       const std::uint64_t inside = blocks_in_image(bin_x, bin_y, screen.width, screen.height);
       const std::uint64_t wanted = blocks(view, bin_x, bin_y);
       BlockEnd<T>* ends = view.ends.data() + (std::size_t(bin_y) * bins.columns + bin_x) * kBlocks;
-      static thread_local BlockColour<T> colours[kBlocks];
-      for (int b = 0; b < kBlocks; ++b) {
+      static thread_local BlockColour<T> scratch[kBlocks];
+      BlockColour<T>* colours = scratch;
+      for (std::uint64_t m = inside; m; m &= m - 1) {
+        const int b = __builtin_ctzll(m);
         std::fill_n(ends[b].transmittance, kLanes, T(1));
         std::fill_n(ends[b].ended, kLanes, INT_MAX);
         colours[b] = {};
@@ -224,25 +223,17 @@ class Frame {
 
   void show(const Screen<T>& screen, int X, int Y, const BlockColour<T>& colour, const BlockEnd<T>& end, T* image,
             T* alpha) const {
-    const T* background = settings_.background;
-    const int columns = std::min(kBlock, screen.width - X), rows = std::min(kBlock, screen.height - Y);
-    for (int y = 0; y < rows; ++y) {
-      T* pixel = image + (std::int64_t(Y + y) * screen.width + X) * 3;
-      T* cover = alpha + std::int64_t(Y + y) * screen.width + X;
-      for (int x = 0; x < columns; ++x) {
-        const int i = y * kBlock + x;
-        const T through = end.transmittance[i];
-        pixel[3 * x] = colour.r[i] + through * background[0];
-        pixel[3 * x + 1] = colour.g[i] + through * background[1];
-        pixel[3 * x + 2] = colour.b[i] + through * background[2];
-        cover[x] = T(1) - through;
-      }
-    }
+    using L = Lanes<T>;
+    const L through = L::load(end.transmittance), channels[3] = {L::load(colour.r), L::load(colour.g), L::load(colour.b)};
+    L pixel[3], cover[1] = {L(T(1)) - through};
+    for (int c = 0; c < 3; ++c) pixel[c] = channels[c] + through * L(settings_.background[c]);
+    store_block<3>(image, screen.width, screen.height, X, Y, pixel);
+    store_block<1>(alpha, screen.width, screen.height, X, Y, cover);
   }
 
   template <int K>
   void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
-    const std::vector<int> bands = bands_of(view, sizeof(Pair) + sizeof(std::uint64_t) + K * sizeof(Pulled<T>));
+    const std::vector<int> bands = bands_of(view, kBytesPerPair + K * sizeof(Pulled<T>));
     const std::int64_t groups = groups_of(n_), per_task = 32;
     const bool whole = bands.size() == 2;
     if (!whole) {
@@ -264,7 +255,7 @@ class Frame {
         Lanes<T> rows[K][kLanes];
         for (int k = 0; k < K; ++k)
           for (int i = 0; i < count; ++i) rows[k][i] = Lanes<T>::load(&sums_[(g * kLanes + i) * K + k].q);
-        add_slots<T, K>(view.bins.slots.data() + g * kLanes, count, sent_, rows);
+        add_sent<T, K>(view.bins, g * kLanes, count, n_, sent_, rows);
         for (int k = 0; k < K; ++k)
           for (int i = 0; i < count; ++i) rows[k][i].store(&sums_[(g * kLanes + i) * K + k].q);
       });
@@ -277,9 +268,9 @@ class Frame {
         for (Lanes<T>& row : rows[k]) row = T(0);
       std::uint32_t touched = 0;
       if (whole) {
-        const std::uint32_t* slots = view.bins.slots.data() + first;
-        for (int i = 0; i < count; ++i) touched |= std::uint32_t(slots[i + 1] > slots[i]) << i;
-        add_slots<T, K>(slots, count, sent_, rows);
+        const std::uint32_t* mine = view.bins.first.data() + first;
+        for (int i = 0; i < count; ++i) touched |= std::uint32_t(mine[i + 1] > mine[i]) << i;
+        add_sent<T, K>(view.bins, first, count, n_, sent_, rows);
       } else {
         for (int i = 0; i < count; ++i) {
           touched |= std::uint32_t(view.target.visible[first + i]) << i;
@@ -290,79 +281,87 @@ class Frame {
     });
   }
 
-  // The bins of the band, back to front; every slot of the band is written.
+  // The bins of the band, back to front; every pair of the band is written.
   template <int K>
   void send_band(View& view, const T* cotangents, int threads) {
     Bins& bins = view.bins;
     const Screen<T>& screen = view.target.screen;
+    const std::int64_t image = std::int64_t(screen.width) * screen.height * 3;
     Pool::instance().run(threads, bins.bins(), [&](std::int64_t bin) {
       const std::int64_t n = bins.starts[bin + 1] - bins.starts[bin];
       if (!n) return;
       const int bin_x = int(bin) % bins.columns, bin_y = bins.first_row + int(bin) / bins.columns;
       const std::uint64_t wanted = blocks(view, bin_x, bin_y);
       const BlockEnd<T>* ends = view.ends.data() + (std::size_t(bin_y) * bins.columns + bin_x) * kBlocks;
-      static thread_local Buffer<Pulled<T>> sums;
-      static thread_local BlockBack<T, K> backs[kBlocks];
-      alignas(64) static thread_local T seen[kBlocks][K][3][kLanes];
-      sums.reserve_lost(std::size_t(kSegment) * K);
+      static thread_local Passage<K> scratch;
+      Passage<K>& mine = scratch;
 
       std::int64_t end = 0;  // nothing behind it has been drawn
-      for (std::uint64_t m = wanted; m; m &= m - 1) {
-        const int b = __builtin_ctzll(m);
-        load_cotangent<K>(screen, cotangents, bin_x * kBin + b % kBlocksAcross * kBlock,
-                          bin_y * kBin + b / kBlocksAcross * kBlock, seen[b]);
-        std::copy_n(ends[b].transmittance, kLanes, backs[b].transmittance);
-        for (int k = 0; k < K; ++k)
-          for (int i = 0; i < kLanes; ++i) {
-            T light = 0;
-            for (int c = 0; c < 3; ++c) light += settings_.background[c] * seen[b][k][c][i];
-            backs[b].behind[k][i] = ends[b].transmittance[i] * light;
-          }
-        for (std::int32_t e : ends[b].ended) end = std::max<std::int64_t>(end, std::min<std::int64_t>(e, n));
-      }
+      for (std::uint64_t m = wanted; m; m &= m - 1)
+        for (std::int32_t e : ends[__builtin_ctzll(m)].ended) end = std::max<std::int64_t>(end, std::min<std::int64_t>(e, n));
+      for (int k = 0; k < K; ++k)  // on its way while the Gaussians are gathered
+        for (int y = bin_y * kBin; y < std::min(screen.height, (bin_y + 1) * kBin); ++y)
+          for (int x = 0; x < 3 * kBin; x += kLanes)
+            __builtin_prefetch(cotangents + k * image + (std::int64_t(y) * screen.width + bin_x * kBin) * 3 + x);
+      bool entered = false;
       for (std::int64_t first = (n - 1) / kSegment * kSegment; first >= 0; first -= kSegment) {
         const std::int64_t count = std::min<std::int64_t>(kSegment, n - first);
-        std::memset(static_cast<void*>(sums.data()), 0, sizeof(Pulled<T>) * count * K);
+        Pulled<T>* sums = sent_.data() + (bins.starts[bin] + first) * K;
+        std::memset(static_cast<void*>(sums), 0, sizeof(Pulled<T>) * count * K);
         if (first < end) {
           Segment<T>& part = segment();
           gather(view.target.ellipses, bins, int(bin), first, wanted, part);
+          if (!std::exchange(entered, true)) enter<K>(view, cotangents, bin_x, bin_y, wanted, ends, mine);
           for (std::uint64_t m = wanted; m; m &= m - 1) {
             const int b = __builtin_ctzll(m);
             if (part.lengths[b])
               blend_block_vjp<T, K>(part, b, bin_x * kBin + b % kBlocksAcross * kBlock,
-                                    bin_y * kBin + b / kBlocksAcross * kBlock, settings_, ends[b], seen[b], backs[b],
-                                    sums.data());
+                                    bin_y * kBin + b / kBlocksAcross * kBlock, settings_, ends[b], mine.cotangent[b], mine.back[b],
+                                    sums);
           }
         }
-        const Pair* pairs = bins.pairs.data() + bins.starts[bin] + first;
-        for (std::int64_t i = 0; i < count; ++i)
-          for (int k = 0; k < K; ++k)
-            Lanes<T>::load(&sums[i * K + k].q).store(&sent_[std::size_t(pairs[i].slot) * K + k].q);
       }
     });
     bins.has_masks = true;
   }
 
+  // What a bin's blocks start the way back with.
   template <int K>
-  static void load_cotangent(const Screen<T>& screen, const T* cotangents, int X, int Y, T (&seen)[K][3][kLanes]) {
-    const std::int64_t size = std::int64_t(screen.width) * screen.height * 3;
-    const int columns = std::min(kBlock, screen.width - X), rows = std::min(kBlock, screen.height - Y);
-    if (columns < kBlock || rows < kBlock) std::memset(seen, 0, sizeof seen);
-    for (int k = 0; k < K; ++k)
-      for (int y = 0; y < rows; ++y) {
-        const T* pixel = cotangents + k * size + (std::int64_t(Y + y) * screen.width + X) * 3;
-        for (int x = 0; x < columns; ++x)
-          for (int c = 0; c < 3; ++c) seen[k][c][y * kBlock + x] = pixel[3 * x + c];
+  struct Passage {
+    BlockBack<T, K> back[kBlocks];
+    T cotangent[kBlocks][K][3][kLanes];
+  };
+
+  template <int K>
+  void enter(const View& view, const T* cotangents, int bin_x, int bin_y, std::uint64_t wanted, const BlockEnd<T>* ends,
+             Passage<K>& out) const {
+    using L = Lanes<T>;
+    const Screen<T>& s = view.target.screen;
+    for (std::uint64_t m = wanted; m; m &= m - 1) {
+      const int b = __builtin_ctzll(m);
+      const int X = bin_x * kBin + b % kBlocksAcross * kBlock, Y = bin_y * kBin + b / kBlocksAcross * kBlock;
+      const L through = L::load(ends[b].transmittance);
+      through.store(out.back[b].transmittance);
+      for (int k = 0; k < K; ++k) {
+        L v[3], light = T(0);
+        load_block<3>(cotangents + std::int64_t(k) * s.width * s.height * 3, s.width, s.height, X, Y, v);
+        for (int c = 0; c < 3; ++c) {
+          light += v[c] * L(settings_.background[c]);
+          v[c].store(out.cotangent[b][k][c]);
+        }
+        (through * light).store(out.back[b].behind[k]);
       }
+    }
   }
 
   Settings<T> settings_;
   Pose<T> pose_;
   std::int64_t budget_, n_ = 0;
   Palette<T> palette_;
+  Buffer<T> depths_;
   Buffer<std::uint32_t> order_;
   std::vector<View> views_;
-  Buffer<Pulled<T>> sent_, sums_;  // by slot; by Gaussian, when there are several bands
+  Buffer<Pulled<T>> sent_, sums_;  // by pair; by Gaussian, when there are several bands
 };
 
 }  // namespace clear

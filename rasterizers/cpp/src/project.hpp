@@ -1,6 +1,7 @@
 // Project, in memory: every group of sixteen Gaussians onto every screen of a pose, and the colours of those that show.
 #pragma once
 
+#include "bins.hpp"
 #include "colour.hpp"
 #include "columns.hpp"
 #include "pool.hpp"
@@ -28,8 +29,26 @@ struct Target {
   T* means2d;           // out [n, 2]
   bool* visible;        // out [n]
   Buffer<Ellipse<T>> ellipses;
+  Buffer<BinRange> ranges;    // [n]
   Buffer<std::uint16_t> lit;  // [groups, 3]: the lanes whose channel was not below 0, and so has a gradient
 };
+
+// The bins whose pixel centres the ellipses' boxes cover.
+template <class T>
+CLEAR_INLINE void bins_of(const Screen<T>& screen, const Lanes<T> (&e)[kLanes], std::uint32_t shown, int count,
+                          BinRange* out) {
+  using L = Lanes<T>;
+  auto bin = [](const L& pixel, int size, T (&store)[kLanes]) CLEAR_LAMBDA {
+    floor(clamp(pixel, L(T(0)), L(T(size - 1))) * L(T(1) / kBin)).store(store);
+  };
+  const L half = T(0.5);
+  T x0[kLanes], x1[kLanes], y0[kLanes], y1[kLanes];
+  bin(e[0] - e[7] - half, screen.width, x0), bin(e[0] + e[7] - half, screen.width, x1);
+  bin(e[1] - e[8] - half, screen.height, y0), bin(e[1] + e[8] - half, screen.height, y1);
+  for (int i = 0; i < count; ++i)
+    out[i] = (shown >> i) & 1 ? BinRange{std::int16_t(x0[i]), std::int16_t(x1[i]), std::int16_t(y0[i]), std::int16_t(y1[i])}
+                              : BinRange{};
+}
 
 inline std::int64_t groups_of(std::int64_t n) { return (n + kLanes - 1) / kLanes; }
 
@@ -77,7 +96,7 @@ CLEAR_INLINE void note(const Lanes<T>* columns, int count, Lanes<T>& poison) {
 // Returns whether every number that was read is finite.
 template <class T>
 bool project_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
-                   Palette<T>& palette, std::int64_t group) {
+                   Palette<T>& palette, Buffer<T>& depths, std::int64_t group) {
   using L = Lanes<T>;
   const std::int64_t first = group * kLanes;
   const int count = int(std::min<std::int64_t>(kLanes, splats.n - first));
@@ -90,6 +109,7 @@ bool project_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& s
   note(mean, 3, poison), note(quat, 4, poison), note(scale, 3, poison);
   Geometry<T> g(pose, targets[0].screen, mean, quat, scale);
 
+  g.z.store(depths.data() + first);
   Mask<T> in_front = g.z > L(s.near);
   L ellipse[4][kLanes];
   std::uint32_t shown[4], any = 0;
@@ -105,6 +125,7 @@ bool project_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& s
     L centre[2] = {where(in_front, ellipse[i][0]), where(in_front, ellipse[i][1])};
     store_rows<2>(target.means2d, first, count, centre);
     store_bits(target.visible + first, count, shown[i]);
+    bins_of(target.screen, ellipse[i], shown[i], count, target.ranges.data() + first);
   }
 
   Colour<T> colour;
@@ -146,17 +167,19 @@ bool project_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& s
 // Room for whole groups; the rows beyond n repeat the last Gaussian and are never listed.
 template <class T>
 bool project(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
-             Palette<T>& palette, int threads) {
+             Palette<T>& palette, Buffer<T>& depths, int threads) {
   const std::int64_t groups = groups_of(splats.n), per_task = 64;
   palette.reserve(groups, splats.bands > 0);
+  depths.reserve_lost(groups * kLanes);
   for (Target<T>& target : targets) {
+    target.ranges.reserve_lost(splats.n);
     target.ellipses.reserve_lost(groups * kLanes);
     target.lit.reserve_lost(groups * 3);
   }
   std::atomic<bool> finite{true};
   Pool::instance().run(threads, (groups + per_task - 1) / per_task, [&](std::int64_t task) {
     for (std::int64_t g = task * per_task; g < std::min(groups, (task + 1) * per_task); ++g)
-      if (!project_group(pose, s, splats, targets, palette, g)) finite = false;
+      if (!project_group(pose, s, splats, targets, palette, depths, g)) finite = false;
   });
   return finite;
 }

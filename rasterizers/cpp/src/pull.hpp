@@ -1,4 +1,4 @@
-// Back: what the bins sent, summed Gaussian by Gaussian in the order of its slots, and pulled through the projection.
+// Back: what the bins sent, summed Gaussian by Gaussian in the order of its bins, and pulled through the projection.
 #pragma once
 
 #include "blend.hpp"
@@ -12,13 +12,18 @@ struct Gradients {
   T *means, *quats, *scales, *opacities, *screen, *rgb;
 };
 
-// The K rows of a group's Gaussians: sums over slots, or what an earlier band left in `sums` and this one's on top.
+// To the K rows of each of a group's Gaussians, add what this band's bins sent. The rows lie anywhere, so those of the
+// groups to come are fetched ahead.
 template <class T, int K>
-CLEAR_INLINE void add_slots(const std::uint32_t* slots, int count, const Buffer<Pulled<T>>& sent,
-                            Lanes<T> (&rows)[K][kLanes]) {
+CLEAR_INLINE void add_sent(const Bins& bins, std::int64_t first, int count, std::int64_t n,
+                           const Buffer<Pulled<T>>& sent, Lanes<T> (&rows)[K][kLanes]) {
+  constexpr std::int64_t ahead = 6 * kLanes;
+  const std::uint32_t* mine = bins.first.data();
+  for (std::uint32_t p = mine[std::min(n, first + ahead)]; p < mine[std::min(n, first + ahead + kLanes)]; ++p)
+    for (int k = 0; k < K; ++k) __builtin_prefetch(&sent[std::size_t(bins.where[p]) * K + k], 0, 1);
   for (int i = 0; i < count; ++i)
-    for (std::uint32_t slot = slots[i]; slot < slots[i + 1]; ++slot)
-      for (int k = 0; k < K; ++k) rows[k][i] += Lanes<T>::load(&sent[std::size_t(slot) * K + k].q);
+    for (std::uint32_t p = mine[first + i]; p < mine[first + i + 1]; ++p)
+      for (int k = 0; k < K; ++k) rows[k][i] += Lanes<T>::load(&sent[std::size_t(bins.where[p]) * K + k].q);
 }
 
 template <class T, int K>

@@ -1,13 +1,10 @@
 // What the stages hand to each other. `T` is float, or double for checking.
 #pragma once
 
-#include <cstddef>
 #include <cstdint>
-#include <cstdlib>
-#include <new>
-#include <utility>
 #include <vector>
 
+#include "memory.hpp"
 #include "simd.hpp"
 
 namespace clear {
@@ -80,46 +77,6 @@ template <class T>
 struct alignas(kLanes * sizeof(T)) Pulled {
   T q, qx, qy, qxx, qxy, qyy, r, g, b;
   T padding[7];
-};
-
-// Memory that nobody clears before it is written.
-template <class T>
-class Buffer {
- public:
-  Buffer() = default;
-  Buffer(const Buffer&) = delete;
-  Buffer& operator=(const Buffer&) = delete;
-  Buffer(Buffer&& other) noexcept { *this = std::move(other); }
-  Buffer& operator=(Buffer&& other) noexcept {
-    std::swap(data_, other.data_);
-    std::swap(size_, other.size_);
-    std::swap(capacity_, other.capacity_);
-    return *this;
-  }
-  ~Buffer() { std::free(data_); }
-
-  // Makes room for n; what was there is lost when it has to grow.
-  void reserve_lost(std::size_t n) {
-    if (n > capacity_) {
-      std::free(data_);
-      data_ = nullptr;
-      capacity_ = 0;
-      std::size_t bytes = (n * sizeof(T) + 127) / 128 * 128;
-      data_ = static_cast<T*>(std::aligned_alloc(128, bytes));
-      if (!data_) throw std::bad_alloc();
-      capacity_ = n;
-    }
-    size_ = n;
-  }
-  T* data() { return data_; }
-  const T* data() const { return data_; }
-  T& operator[](std::size_t i) { return data_[i]; }
-  const T& operator[](std::size_t i) const { return data_[i]; }
-  std::size_t size() const { return size_; }
-
- private:
-  T* data_ = nullptr;
-  std::size_t size_ = 0, capacity_ = 0;
 };
 
 }  // namespace clear
