@@ -17,6 +17,8 @@ _log = logging.getLogger(__name__)
 
 _QUESTIONS: Final = {
     "rasterizers": "time, memory and error of every backend at every preset",
+    "kernels": "image losses with their gradients, ours and everyone's",
+    "iteration": "one iteration of training, stage by stage",
 }
 
 
@@ -54,9 +56,17 @@ def _measure(options: argparse.Namespace) -> Findings:
 
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    from clear_strategies.bench import rasterizers
+    from clear_strategies.bench import iteration, kernels, rasterizers
     from clear_strategies.bench.plot import time_against_error
 
+    if options.question == "kernels":
+        return kernels.measure(options.size, options.repeats, _log.info)
+    if options.question == "iteration":
+        one = iteration.Request(
+            options.scene, options.strategy, options.backend, options.preset, options.repeats,
+            options.data, options.prototype,
+        )  # fmt: skip
+        return iteration.measure(one, _log.info)
     request = rasterizers.Request(
         options.scene, options.backend, options.preset, options.repeats, options.limit,
         options.data, options.prototype, options.memory,
@@ -68,6 +78,8 @@ def _measure(options: argparse.Namespace) -> Findings:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from clear_strategies.bench.iteration import STRATEGIES
+    from clear_strategies.bench.kernels import SIZES
     from clear_strategies.bench.rasterizers import SCENES
     from clear_strategies.bench.scenes import NAMES
 
@@ -96,6 +108,15 @@ def _parser() -> argparse.ArgumentParser:
     ask.add_argument("--limit", type=_seconds, default=180.0, metavar="S", help="skip what would take longer (180 s)")
     ask.add_argument("--no-memory", dest="memory", action="store_false", help="do not measure peak memory")
     ask.add_argument("--picture", type=Path, metavar="FILE", help="PNG: time against error")
+
+    ask = questions.add_parser("kernels", parents=[common], help=_QUESTIONS["kernels"])
+    ask.add_argument("--size", nargs="+", default=list(SIZES), metavar="WxH", help=f"default: {' '.join(SIZES)}")
+
+    ask = questions.add_parser("iteration", parents=[common, splats], help=_QUESTIONS["iteration"])
+    ask.add_argument("--scene", default="s100k", metavar="SCENE", help="as above; HR is its image (default: s100k)")
+    ask.add_argument("--strategy", default="clear", choices=list(STRATEGIES), help="default: clear")
+    ask.add_argument("--backend", metavar="NAME", help="default: the fastest that runs here")
+    ask.add_argument("--preset", default="fast", choices=list(PRESETS), help="default: fast")
     return parser
 
 

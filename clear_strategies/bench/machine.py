@@ -33,9 +33,9 @@ def machine(threads: int) -> dict[str, Any]:
 
 def sentence(facts: dict[str, Any]) -> str:
     """One line below the tables."""
-    versions = facts["versions"]
+    versions, threads = facts["versions"], facts["threads"]
     parts = [
-        f"{facts['cpu']}, {facts['cores']} cores, {facts['threads']} threads",
+        f"{facts['cpu']}, {facts['cores']} cores, {threads} thread{'s' if threads > 1 else ''}",
         f"torch {versions['torch']}, numpy {versions.get('numpy', 'unknown')}, Python {facts['python']}",
         facts["compiler"],
         f"commit {str(facts['commit'])[:10]}{'+dirty' if str(facts['commit']).endswith('+dirty') else ''}",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -42,5 +43,6 @@ def bar(total: int, label: str) -> Iterator[Callable[[], object]]:
     """Progress on stderr, gone when done."""
     from tqdm import tqdm
 
-    with tqdm(total=total, desc=label, unit="turn", leave=False, dynamic_ncols=True) as shown:
+    every = 0.5 if sys.stderr.isatty() else 15  # seconds; a log file needs no animation
+    with tqdm(total=total, desc=label, unit="turn", leave=False, dynamic_ncols=True, mininterval=every) as shown:
         yield lambda: shown.update(1)

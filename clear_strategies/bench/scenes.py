@@ -26,6 +26,8 @@ SETTINGS: Final = {"kernel": 0.3, "near": 0.01, "alpha_max": 0.999, "antialiased
 GARDEN_FILE: Final = "test_garden.npz"
 _BANDS: Final = 15  # SH degree 3
 _FOCAL: Final = 0.8  # of the image's width
+_SEEN: Final = 0.65  # of the image's size, from its middle
+_PIXELS_A_GAUSSIAN: Final = 64  # projecting and sorting one costs about as much as blending it there
 
 Array = np.ndarray
 Surface = tuple[Float[Array, "n 3"], Float[Array, "n 3"]]  # points, and normals of length 1
@@ -46,15 +48,17 @@ class Workload:
         return next((factor for factor in (4, 3, 2) if not any(size % factor for size in sizes)), None)
 
     def work(self) -> float:
-        """Pixels under the 3-sigma discs of all Gaussians: what rendering costs, to the accuracy of a skip."""
-        pose = self.camera.world_to_camera.to(self.splats.means)
-        depth = self.splats.means @ pose[2, :3] + pose[2, 3]
-        px = self.camera.fx / depth.clamp_min(SETTINGS["near"])
+        """Pixels under the 3-sigma discs of what is seen, and a share per Gaussian: what rendering costs, roughly."""
+        camera = self.camera
+        pose = camera.world_to_camera.to(self.splats.means)
+        x, y, z = (self.splats.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+        depth = z.clamp_min(SETTINGS["near"])
+        u, v = camera.fx * x / depth / camera.width, camera.fy * y / depth / camera.height
+        seen = (z > SETTINGS["near"]) & (u.abs() < _SEEN) & (v.abs() < _SEEN)
         large, medium = self.splats.scales.topk(2, dim=-1).values.unbind(-1)
-        variances = [(sigma * px).square() + SETTINGS["kernel"] for sigma in (large, medium)]
-        area = 9 * math.pi * (variances[0] * variances[1]).sqrt()
-        area = torch.where(depth > SETTINGS["near"], area, 0).clamp_max(self.camera.width * self.camera.height)
-        return float(area.double().sum())
+        variances = [(sigma * camera.fx / depth).square() + SETTINGS["kernel"] for sigma in (large, medium)]
+        area = (9 * math.pi * (variances[0] * variances[1]).sqrt()).clamp_max(camera.width * camera.height)
+        return float(area[seen].double().sum()) + _PIXELS_A_GAUSSIAN * len(self.splats)
 
     def says(self) -> str:
         return f"{self.name}: {len(self.splats):,} Gaussians, {self.camera.width}x{self.camera.height}"
