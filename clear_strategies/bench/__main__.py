@@ -1,9 +1,12 @@
-"""The benchmark's command line. Exit codes: 0, 2 for arguments or input that cannot be used, 130 on Ctrl-C."""
+"""The benchmark's command line. Exit codes: 0, 2 for arguments or input that cannot be used, 130 and 143
+when stopped by a signal.
+"""
 
 from __future__ import annotations
 
 import argparse
 import logging
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -69,7 +72,7 @@ def _measure(options: argparse.Namespace) -> Findings:
         return iteration.measure(one, _log.info)
     request = rasterizers.Request(
         options.scene, options.backend, options.preset, options.repeats, options.limit,
-        options.data, options.prototype, options.memory,
+        options.device, options.data, options.prototype, options.memory,
     )  # fmt: skip
     findings, rows = rasterizers.measure(request, _log.info)
     if options.picture is not None:
@@ -106,6 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     ask.add_argument("--backend", nargs="+", metavar="NAME", help="default: all that run here")
     ask.add_argument("--preset", nargs="+", default=list(PRESETS), choices=list(PRESETS), help="default: all")
     ask.add_argument("--limit", type=_seconds, default=180.0, metavar="S", help="skip what would take longer (180 s)")
+    ask.add_argument("--device", default="cpu", choices=["cpu", "cuda"], help="default: cpu")
     ask.add_argument("--no-memory", dest="memory", action="store_false", help="do not measure peak memory")
     ask.add_argument("--picture", type=Path, metavar="FILE", help="PNG: time against error")
 
@@ -146,4 +150,6 @@ def _seconds(text: str) -> float:
 
 
 if __name__ == "__main__":
+    # Asked to stop, it still ends its worker and removes what it built.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     sys.exit(main())

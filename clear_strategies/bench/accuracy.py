@@ -25,7 +25,7 @@ NO_CUT_OFFS: Final = {"alpha_min": 1e-9, "transmittance_min": 0.0}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A rendering and its gradient for one cotangent, by attribute."""
+    """A rendering and its gradient for one cotangent, by attribute; in main memory."""
 
     image: Float[Tensor, "H W 3"]
     gradients: Mapping[str, Tensor]
@@ -49,7 +49,7 @@ class Errors:
 def draw(rasterizer: Rasterizer, splats: Splats, camera: Camera, cotangent: Float[Tensor, "H W 3"]) -> Picture:
     rendering = rasterizer(splats, camera)
     g = rendering.vjp(cotangent.to(rendering.image)[None])
-    return Picture(rendering.image, {name: getattr(g, name)[0] for name in ATTRIBUTES})
+    return Picture(rendering.image.cpu(), {name: getattr(g, name)[0].cpu() for name in ATTRIBUTES})
 
 
 def compare(found: Picture, truth: Picture) -> Errors:
@@ -72,11 +72,13 @@ def compare(found: Picture, truth: Picture) -> Errors:
     return Errors(image, relative, median)
 
 
-def oracle_backend() -> str | None:
+def oracle_backend(device: str) -> str | None:
     """The fastest backend here that computes in float64."""
     for name, why_not in rasterizers.available().items():
-        if why_not is None and torch.float64 in rasterizers.load(name).traits.dtypes:
-            return name
+        if why_not is None:
+            traits = rasterizers.load(name).traits
+            if torch.float64 in traits.dtypes and device in traits.devices:
+                return name
     return None
 
 

@@ -123,7 +123,7 @@ def measure(request: Request, say: Callable[[str], None]) -> Findings:
     workload = scenes.load(request.scene, request.data)
     if isinstance(workload, str):
         raise DataError("--scene", request.scene, workload, "or take another scene")
-    (backend,) = usable([request.backend or "auto"], skip)
+    (backend,) = usable([request.backend or "auto"], "cpu", skip)
     rasterizer = rasterizers.load(backend, preset=request.preset, **SETTINGS)
     view = view_of(workload, rasterizer)
     without_hr = Objective(lambda_hr=WarmupDecay(peak=0.0, final=0.0))

@@ -22,6 +22,7 @@ def machine(threads: int) -> dict[str, Any]:
         "system": f"{platform.system()} {platform.machine()}",
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "threads": threads,
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
         "simd": torch.backends.cpu.get_cpu_capability(),
         "load_average": [round(load, 2) for load in os.getloadavg()] if hasattr(os, "getloadavg") else "unknown",
         "python": facts["python"],
@@ -36,12 +37,13 @@ def sentence(facts: dict[str, Any]) -> str:
     versions, threads = facts["versions"], facts["threads"]
     parts = [
         f"{facts['cpu']}, {facts['cores']} cores, {threads} thread{'s' if threads > 1 else ''}",
+        facts["gpu"],
         f"torch {versions['torch']}, numpy {versions.get('numpy', 'unknown')}, Python {facts['python']}",
         facts["compiler"],
         f"commit {str(facts['commit'])[:10]}{'+dirty' if str(facts['commit']).endswith('+dirty') else ''}",
         facts["date"][:10],
     ]
-    return f"Measured on {'; '.join(part for part in parts if part != 'unknown')}."
+    return f"Measured on {'; '.join(part for part in parts if part not in ('unknown', 'none'))}."
 
 
 def _compiler() -> str:

@@ -7,7 +7,6 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import resource
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -15,16 +14,20 @@ from pathlib import Path
 from typing import Any, Final
 
 _ROOT: Final = Path(__file__).resolve().parents[2]
+_MIB: Final = 2**20
 _RESET_PEAK: Final = "5"  # proc(5), clear_refs: VmHWM starts again from what is resident
 
 
 def peaks(
-    scene: str, data: Path | None, backend: str, presets: Sequence[str], threads: int, *, seconds: float
+    scene: str, data: Path | None, backend: str, presets: Sequence[str], threads: int, *, device: str, seconds: float
 ) -> dict[str, float] | str:
-    """MiB that forward and backward (K = 2) add at their peak, by preset; the reason where it cannot be measured."""
+    """MiB that forward and backward (K = 2) add at their peak, by preset; the reason where it cannot be measured.
+
+    On CUDA it is what torch's allocator handed out.
+    """
     task = {
         "scene": scene, "data": str(data) if data is not None else None, "backend": backend, "presets": list(presets),
-        "threads": threads,
+        "threads": threads, "device": device,
     }  # fmt: skip
     paths = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     command = [sys.executable, "-m", __name__, json.dumps(task)]
@@ -59,24 +62,29 @@ def measure(task: Mapping[str, Any]) -> dict[str, float]:
     warm = scenes.load("tiny")
     if isinstance(workload, str) or isinstance(warm, str):
         raise TypeError(workload)
+    workload, warm = workload.to(task["device"]), warm.to(task["device"])
+    on_cuda = task["device"] == "cuda"
     found = {}
     for i, preset in enumerate(task["presets"]):
         rasterizer = rasterizers.load(task["backend"], preset=preset, **scenes.SETTINGS)
         if i == 0:  # libraries, thread pools
             _draw(rasterizer, warm)
-            before = _resident("VmRSS")
+            before = torch.cuda.memory_allocated() / _MIB if on_cuda else _resident("VmRSS")
         _release()
         _reset_peak()
+        if on_cuda:
+            torch.cuda.reset_peak_memory_stats()
         _draw(rasterizer, workload)
-        found[preset] = max(0.0, _resident("VmHWM") - before)
+        after = torch.cuda.max_memory_allocated() / _MIB if on_cuda else _resident("VmHWM")
+        found[preset] = max(0.0, after - before)
     return found
 
 
 def _draw(rasterizer: Any, workload: Any) -> None:
     import torch
 
-    camera = workload.camera
-    rasterizer(workload.splats, camera).vjp(torch.ones(2, camera.height, camera.width, 3))
+    camera, device = workload.camera, workload.splats.means.device
+    rasterizer(workload.splats, camera).vjp(torch.ones(2, camera.height, camera.width, 3, device=device))
 
 
 def _resident(field: str) -> float:
@@ -85,6 +93,8 @@ def _resident(field: str) -> float:
         lines = Path("/proc/self/status").read_text().splitlines()
         return next(int(line.split()[1]) for line in lines if line.startswith(field)) / 1024
     except (OSError, StopIteration):
+        import resource
+
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
@@ -97,7 +107,7 @@ def _reset_peak() -> None:
 
 def _release() -> None:
     """Give back what the allocator keeps, so that one preset does not pay for another."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if os.name == "posix" else None
     if trim is not None:
         trim(0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Final
@@ -25,7 +26,7 @@ from clear_strategies.bench.accuracy import (
 )
 from clear_strategies.bench.output import UNKNOWN, Findings, Section, number, small, times
 from clear_strategies.bench.prototype import Prototype, started
-from clear_strategies.bench.rounds import Contender, Milliseconds, bar, interleaved, medians, milliseconds
+from clear_strategies.bench.rounds import Contender, Milliseconds, bar, interleaved, medians, milliseconds, timed
 from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.errors import DataError
 from clear_strategies.ledger import Ledger
@@ -75,6 +76,7 @@ class Request:
     presets: Sequence[str]
     repeats: int
     limit: float
+    device: str = "cpu"
     data: Path | None = None
     prototype: Path | None = None
     memory: bool = True
@@ -95,16 +97,18 @@ def measure(request: Request, say: Say) -> tuple[Findings, list[Row]]:
         say(line)
         findings.skipped.append(line)
 
-    backends = usable(request.backends, skip)
+    if request.device == "cuda" and not torch.cuda.is_available():
+        raise DataError("--device", "cuda", "torch sees no such device here", "use --device cpu")
+    backends = usable(request.backends, request.device, skip)
     for preset in request.presets:
         if preset not in PRESETS:
             raise DataError("--preset", preset, "is no preset", f"choose of {', '.join(PRESETS)}")
     rows: list[Row] = []
-    truth = oracle_backend()
+    truth = oracle_backend(request.device)
     if truth is None:
         skip("errors: no backend here computes in float64.")
     workloads = [(name, scenes.load(name, request.data)) for name in request.scenes]
-    with started(request.prototype, findings.threads) as peer:
+    with _peer(request, findings.threads) as peer:
         if isinstance(peer, str):
             skip(f"prototype: {peer}.")
         calibration = Calibration()
@@ -113,19 +117,26 @@ def measure(request: Request, say: Say) -> tuple[Findings, list[Row]]:
                 skip(f"{name}: {workload}.")
                 continue
             say(workload.says())
-            one = OnScene(name, workload, request, None if isinstance(peer, str) else peer, calibration, skip)
+            one = OnScene(
+                name, workload.to(request.device), request, None if isinstance(peer, str) else peer, calibration, skip
+            )
             rows += one.measure(backends, truth)
-    findings.sections += [s for scene in dict.fromkeys(r.scene for r in rows) for s in _sections(rows, scene)]
-    findings.raw = {
-        "settings": SETTINGS, "presets": {name: dict(PRESETS[name]) for name in request.presets}, "oracle": truth,
-        "rows": [asdict(row) for row in rows],
-    }  # fmt: skip
+    findings.sections += [s for scene in dict.fromkeys(r.scene for r in rows) for s in _sections(rows, scene, truth)]
+    cuts = {name: dict(PRESETS[name]) for name in request.presets}
+    findings.raw = {"settings": SETTINGS, "presets": cuts, "oracle": truth, "device": request.device}
+    findings.raw["rows"] = [asdict(row) for row in rows]
     if not rows:
         raise DataError("bench", "rasterizers", "nothing could be measured", "see the lines above")
     return findings, rows
 
 
-def usable(asked: Sequence[str] | None, skip: Say) -> list[str]:
+def _peer(request: Request, threads: int) -> AbstractContextManager[Prototype | str]:
+    if request.device == "cpu":
+        return started(request.prototype, threads)
+    return nullcontext(f"it knows no {request.device}")
+
+
+def usable(asked: Sequence[str] | None, device: str, skip: Say) -> list[str]:
     """The backends that run here, of those asked for.
 
     Raises:
@@ -139,7 +150,10 @@ def usable(asked: Sequence[str] | None, skip: Say) -> list[str]:
             raise DataError("--backend", name, "is no backend", f"choose of auto, {', '.join(reasons)}")
     found = []
     for name in dict.fromkeys(asked or reasons):
-        if (why_not := reasons[name]) is None:
+        why_not = reasons[name]
+        if why_not is None and device not in rasterizers.load(name).traits.devices:
+            why_not = f"it does not run on {device}; see --device"
+        if why_not is None:
             found.append(name)
         else:
             skip(f"{name}: {why_not}")
@@ -158,18 +172,19 @@ class Turn:
 
     def __call__(self) -> Milliseconds:
         draw_it, splats, camera, ledger = self.rasterizer, self.workload.splats, self.workload.camera, Ledger()
-        with ledger.stage(FORWARD):
+        device = splats.means.device.type
+        with timed(ledger, FORWARD, device):
             rendering = draw_it(splats, camera)
         for k, stage in enumerate(BACKWARD, 1):
-            with ledger.stage(stage):
+            with timed(ledger, stage, device):
                 rendering.vjp(self.cotangents[:k])
         del rendering
-        with ledger.stage(TILES):
+        with timed(ledger, TILES, device):
             draw_it(splats, camera, tiles=self.mask).vjp(self.cotangents[:1])
         if self.lr is not None:
-            with ledger.stage(SHARED):
+            with timed(ledger, SHARED, device):
                 draw_it.render_scales([(splats, self.lr), (splats, camera)])
-            with ledger.stage(SEPARATE):
+            with timed(ledger, SEPARATE, device):
                 draw_it(splats, self.lr)
                 draw_it(splats, camera)
         return milliseconds(ledger)
@@ -197,19 +212,19 @@ class Calibration:
 
     def predict(self, key: tuple[str, str], turn_on: Callable[[Workload], Contender], workload: Workload) -> float:
         """Seconds of one turn on `workload`; `turn_on` makes it for a scene."""
-        small_scene = self._workload()
+        small_scene = self._workload(workload.splats.means.device.type)
         if key not in self._seconds:
             turn = turn_on(small_scene)
             turn()  # libraries are loaded and caches filled by the first
-            self._seconds[key] = sum(turn().values()) / 1e3
+            self._seconds[key] = min(sum(turn().values()) for _ in range(2)) / 1e3
         return self._seconds[key] * workload.work() / small_scene.work()
 
-    def _workload(self) -> Workload:
+    def _workload(self, device: str) -> Workload:
         if self._small is None:
             found = scenes.load("small")
             if isinstance(found, str):
                 raise DataError("bench", "small", found, "report this")
-            self._small = found
+            self._small = found.to(device)
         return self._small
 
 
@@ -278,7 +293,7 @@ class OnScene:
             def turn_on(scene: Workload) -> Contender:
                 def turn() -> Milliseconds:
                     ledger = Ledger()
-                    with ledger.stage("oracle"):
+                    with timed(ledger, "oracle", self.request.device):
                         answer(NO_CUT_OFFS, scene, noise(scene)[0])
                     return milliseconds(ledger)
 
@@ -312,7 +327,7 @@ class OnScene:
             mine = [row for row in rows if row.backend == backend]
             found = memory.peaks(
                 self.name, self.request.data, backend, [row.preset for row in mine], torch.get_num_threads(),
-                seconds=60 + self.request.limit,
+                device=self.request.device, seconds=60 + self.request.limit,
             )  # fmt: skip
             if isinstance(found, str):
                 self.skip(f"memory of {backend} on {self.workload.name}: {found}")
@@ -324,7 +339,8 @@ class OnScene:
 def noise(workload: Workload) -> Float[Tensor, "K H W 3"]:
     """Cotangents: the standard normal distribution, the same for all."""
     camera, generator = workload.camera, torch.Generator().manual_seed(0)
-    return torch.randn(COTANGENTS, camera.height, camera.width, 3, generator=generator)
+    drawn = torch.randn(COTANGENTS, camera.height, camera.width, 3, generator=generator)
+    return drawn.to(workload.splats.means.device)
 
 
 def demand(rasterizer: Rasterizer, workload: Workload) -> Bool[Tensor, "th tw"]:
@@ -332,7 +348,7 @@ def demand(rasterizer: Rasterizer, workload: Workload) -> Bool[Tensor, "th tw"]:
     tile = int(getattr(rasterizer, "tile", RasterSettings().tile))
     rows, columns = -(-workload.camera.height // tile), -(-workload.camera.width // tile)
     order = torch.randperm(rows * columns, generator=torch.Generator().manual_seed(0))
-    return (order < round(DEMAND * rows * columns)).view(rows, columns)
+    return (order < round(DEMAND * rows * columns)).view(rows, columns).to(workload.splats.means.device)
 
 
 def _split(turn: str) -> tuple[str, str]:
@@ -351,7 +367,7 @@ def _add_ratios(rows: Sequence[Row]) -> None:
         } | {FORWARD: theirs[FORWARD] / ours[FORWARD]}
 
 
-def _sections(rows: Sequence[Row], scene: str) -> list[Section]:
+def _sections(rows: Sequence[Row], scene: str, truth: str | None) -> list[Section]:
     rows = [row for row in rows if row.scene == scene]
     head = {"backend": [row.backend for row in rows], "cut-offs": [row.preset for row in rows]}
     median = [row.median for row in rows]
@@ -381,11 +397,11 @@ def _sections(rows: Sequence[Row], scene: str) -> list[Section]:
     if measured:
         lines = [(row, "the same", same) for row, same, _ in measured]
         lines += [(row, "none", none) for row, _, none in measured]
-        sections.append(_error_section(scene, lines))
+        sections.append(_error_section(scene, lines, truth))
     return sections
 
 
-def _error_section(scene: str, lines: Sequence[tuple[Row, str, Errors]]) -> Section:
+def _error_section(scene: str, lines: Sequence[tuple[Row, str, Errors]], truth: str | None) -> Section:
     columns = {
         "backend": [row.backend for row, _, _ in lines],
         "cut-offs": [row.preset for row, _, _ in lines],
@@ -393,7 +409,7 @@ def _error_section(scene: str, lines: Sequence[tuple[Row, str, Errors]]) -> Sect
         **{f"image {key}": [small(e.image[key]) for _, _, e in lines] for key in ("max", "p99.99", "mean")},
         **{name: [f"{small(e.relative[name])} / {small(e.median[name])}" for _, _, e in lines] for name in ATTRIBUTES},
     }
-    note = "Gradients: relative L2 over all Gaussians / median per Gaussian, against float64."
+    note = f"Gradients: relative L2 over all Gaussians / median per Gaussian. The truth is float64 of {truth}."
     return Section(f"{scene}: error", columns, (note,))
 
 

@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
+import torch
+
 from clear_strategies.ledger import Ledger
 
 Milliseconds = Mapping[str, float]  # by stage
@@ -16,6 +18,15 @@ Contender = Callable[[], Milliseconds]  # each call is one turn: all its stages 
 def milliseconds(ledger: Ledger) -> Milliseconds:
     """What one turn took, by stage."""
     return {name: 1e3 * entry.seconds for name, entry in ledger.entries.items()}
+
+
+@contextmanager
+def timed(ledger: Ledger, stage: str, device: str) -> Iterator[None]:
+    """A stage until its work is done: CUDA only queues it."""
+    with ledger.stage(stage):
+        yield
+        if device == "cuda":
+            torch.cuda.synchronize()
 
 
 def interleaved(

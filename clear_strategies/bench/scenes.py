@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Final
 
@@ -59,6 +59,12 @@ class Workload:
         variances = [(sigma * camera.fx / depth).square() + SETTINGS["kernel"] for sigma in (large, medium)]
         area = (9 * math.pi * (variances[0] * variances[1]).sqrt()).clamp_max(camera.width * camera.height)
         return float(area[seen].double().sum()) + _PIXELS_A_GAUSSIAN * len(self.splats)
+
+    def to(self, device: str) -> Workload:
+        """The Gaussians on another device; cameras stay where they are."""
+        tensors = {f.name: getattr(self.splats, f.name) for f in fields(self.splats)}
+        moved = {name: t.to(device) for name, t in tensors.items() if t is not None}
+        return replace(self, splats=replace(self.splats, **moved))
 
     def says(self) -> str:
         return f"{self.name}: {len(self.splats):,} Gaussians, {self.camera.width}x{self.camera.height}"
@@ -133,7 +139,7 @@ class _Frustum:
         u, v = self.random.uniform(-0.1, 1.1, (2, n))
         return u * self.width, v * self.height
 
-    def _at(self, u: Array, v: Array, z: Array) -> Float[Array, "n 3"]:
+    def _at(self, u: Array, v: Array, z: Array) -> Float[Array, "*n 3"]:
         return np.stack(((u - self.width / 2) / self.focal * z, (v - self.height / 2) / self.focal * z, z), -1)
 
     def _directions(self, n: int) -> Float[Array, "n 3"]:
