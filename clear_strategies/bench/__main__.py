@@ -12,8 +12,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NoReturn
 
+import torch
+
+from clear_strategies.bench import iteration, kernels, rasterizers
+from clear_strategies.bench.iteration import STRATEGIES
+from clear_strategies.bench.kernels import SIZES
 from clear_strategies.bench.output import Findings, between_markers, leave
-from clear_strategies.errors import ClearError
+from clear_strategies.bench.plot import time_against_error
+from clear_strategies.bench.rasterizers import SCENES, Row
+from clear_strategies.bench.scenes import NAMES
+from clear_strategies.errors import ClearError, DataError
 from rasterizers.interface import PRESETS, BackendUnavailable
 
 _log = logging.getLogger(__name__)
@@ -38,8 +46,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
         _require_writable(options)
-        findings = _measure(options)
+        findings, rows = _measure(options)
         text = leave(findings, json=options.json, markdown_file=options.markdown, docs=options.docs)
+        encoding = sys.stdout.encoding or "utf-8"
+        sys.stdout.write(text.encode(encoding, "replace").decode(encoding))  # a terminal may not know every sign
+        if picture := getattr(options, "picture", None):
+            time_against_error(picture, rows)
     except (ClearError, BackendUnavailable) as error:
         _log.error("%s", error)
         return 2
@@ -49,43 +61,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         _log.error("stopped; nothing was written.")
         return 130
-    encoding = sys.stdout.encoding or "utf-8"
-    sys.stdout.write(text.encode(encoding, "replace").decode(encoding))
     return 0
 
 
-def _measure(options: argparse.Namespace) -> Findings:
-    import torch
-
+def _measure(options: argparse.Namespace) -> tuple[Findings, Sequence[Row]]:
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    from clear_strategies.bench import iteration, kernels, rasterizers
-    from clear_strategies.bench.plot import time_against_error
-
     if options.question == "kernels":
-        return kernels.measure(options.size, options.repeats, _log.info)
+        return kernels.measure(options.size, options.repeats, _log.info), ()
     if options.question == "iteration":
         one = iteration.Request(
             options.scene, options.strategy, options.backend, options.preset, options.repeats,
             options.data, options.prototype,
         )  # fmt: skip
-        return iteration.measure(one, _log.info)
+        return iteration.measure(one, _log.info), ()
     request = rasterizers.Request(
         options.scene, options.backend, options.preset, options.repeats, options.limit,
         options.device, options.data, options.prototype, options.memory,
     )  # fmt: skip
-    findings, rows = rasterizers.measure(request, _log.info)
-    if options.picture is not None:
-        time_against_error(options.picture, rows)
-    return findings
+    return rasterizers.measure(request, _log.info)
 
 
 def _parser() -> argparse.ArgumentParser:
-    from clear_strategies.bench.iteration import STRATEGIES
-    from clear_strategies.bench.kernels import SIZES
-    from clear_strategies.bench.rasterizers import SCENES
-    from clear_strategies.bench.scenes import NAMES
-
     common = _Parser(add_help=False)
     common.add_argument("--repeats", type=_positive, default=9, metavar="N", help="turns of each (default 9)")
     common.add_argument(
@@ -130,6 +127,8 @@ def _require_writable(options: argparse.Namespace) -> None:
         between_markers(options.docs.read_text(encoding="utf-8"), options.question, "", source=options.docs)
     for path in (options.json, options.markdown, getattr(options, "picture", None)):
         if path is not None:
+            if path.is_dir():
+                raise DataError(path, "file", "is a folder", "name the file in it")
             path.parent.mkdir(parents=True, exist_ok=True)
 
 

@@ -100,7 +100,11 @@ def grouped_convolution(x: Float[Tensor, "1 C H W"], y: Float[Tensor, "1 C H W"]
 
 
 def _ours(loss: str) -> list[Competitor]:
-    """Every implementation that the trainer has; float64 of the specification is the truth."""
+    """Every implementation that the trainer has; float64 of the specification is the truth.
+
+    `kernels.implementations()` gives them by name, modules or anything with `ssim`, `l1` and `haar_l1`; one that has
+    `photometric(x, y, lambda_ssim)` too, L1 and SSIM in one pass, is timed with it.
+    """
     implementations: Mapping[str, Any]
     if hasattr(kernels, "implementations"):
         implementations = kernels.implementations()

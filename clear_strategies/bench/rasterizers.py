@@ -121,7 +121,8 @@ def measure(request: Request, say: Say) -> tuple[Findings, list[Row]]:
                 name, workload.to(request.device), request, None if isinstance(peer, str) else peer, calibration, skip
             )
             rows += one.measure(backends, truth)
-    findings.sections += [s for scene in dict.fromkeys(r.scene for r in rows) for s in _sections(rows, scene, truth)]
+    for scene in dict.fromkeys(row.scene for row in rows):
+        findings.sections += _sections(rows, scene, truth, explained=bool(findings.sections))
     cuts = {name: dict(PRESETS[name]) for name in request.presets}
     findings.raw = {"settings": SETTINGS, "presets": cuts, "oracle": truth, "device": request.device}
     findings.raw["rows"] = [asdict(row) for row in rows]
@@ -367,7 +368,8 @@ def _add_ratios(rows: Sequence[Row]) -> None:
         } | {FORWARD: theirs[FORWARD] / ours[FORWARD]}
 
 
-def _sections(rows: Sequence[Row], scene: str, truth: str | None) -> list[Section]:
+def _sections(rows: Sequence[Row], scene: str, truth: str | None, *, explained: bool) -> list[Section]:
+    """Its tables; what their columns mean is said once, with the first scene's."""
     rows = [row for row in rows if row.scene == scene]
     head = {"backend": [row.backend for row in rows], "cut-offs": [row.preset for row in rows]}
     median = [row.median for row in rows]
@@ -392,12 +394,12 @@ def _sections(rows: Sequence[Row], scene: str, truth: str | None) -> list[Sectio
         "over all, LR and HR together over one by one."
         + (f" {PEER}/this: its forward + backward over ours, above 1 we are faster." if _has_peer(rows) else ""),
     )
-    sections = [Section(f"{scene}: time", time_columns, notes)]
+    sections = [Section(f"{scene}: time", time_columns, () if explained else notes)]
     measured = [(row, row.same, row.none) for row in rows if row.same is not None and row.none is not None]
     if measured:
         lines = [(row, "the same", same) for row, same, _ in measured]
         lines += [(row, "none", none) for row, _, none in measured]
-        sections.append(_error_section(scene, lines, truth))
+        sections.append(_error_section(scene, lines, None if explained else truth))
     return sections
 
 
@@ -410,7 +412,7 @@ def _error_section(scene: str, lines: Sequence[tuple[Row, str, Errors]], truth: 
         **{name: [f"{small(e.relative[name])} / {small(e.median[name])}" for _, _, e in lines] for name in ATTRIBUTES},
     }
     note = f"Gradients: relative L2 over all Gaussians / median per Gaussian. The truth is float64 of {truth}."
-    return Section(f"{scene}: error", columns, (note,))
+    return Section(f"{scene}: error", columns, () if truth is None else (note,))
 
 
 def _has_peer(rows: Sequence[Row]) -> bool:
