@@ -141,7 +141,9 @@ def _ellipse_reaches(
     u, v = projection.means2d.detach()[row].unbind(-1)
     A, B, C = projection.conics.detach()[row].unbind(-1)
     left, top = tile_x * grid.tile + 0.5 - u, tile_y * grid.tile + 0.5 - v
-    right, bottom = left + grid.tile - 1, top + grid.tile - 1
+    # The last column's and row's tiles hang over the image; what lies there is nobody's pixel.
+    right = torch.minimum(left + grid.tile - 1, grid.width - 0.5 - u)
+    bottom = torch.minimum(top + grid.tile - 1, grid.height - 0.5 - v)
     near_x, near_y = _nearest_to_zero(left, right), _nearest_to_zero(top, bottom)
     on_side_x = torch.clamp(-B * near_x / C, top, bottom)
     on_side_y = torch.clamp(-B * near_y / A, left, right)

@@ -64,7 +64,9 @@ void bind_frame(nb::module_& m, const char* name) {
              std::vector<double> background, bool antialiased, std::vector<double> world_to_camera,
              std::vector<double> center, std::int64_t budget) {
             require(background.size() == 3 && world_to_camera.size() == 16 && center.size() == 3, "3, 16 and 3 numbers");
-            Settings<T> s{T(kernel), T(near), T(alpha_min), T(alpha_max), T(transmittance_min),
+            // However low the limit, a pixel ends before T leaves the normal numbers: it could not be rebuilt on the way back.
+            const T through_min = std::max(T(transmittance_min), T(sizeof(T) == 4 ? 1e-30 : 1e-250));
+            Settings<T> s{T(kernel), T(near), T(alpha_min), T(alpha_max), through_min,
                           {T(background[0]), T(background[1]), T(background[2])}, antialiased};
             Pose<T> pose;
             for (int i = 0; i < 3; ++i) {

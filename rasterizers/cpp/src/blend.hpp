@@ -101,7 +101,8 @@ void blend_block(const Segment<T>& segment, int block, int X, int Y, const Setti
     const L alpha = minimum(exp2(exponent(e, dx, dy)), alpha_max);
     const Mask<T> counts = (alpha >= alpha_min) & alive;
     if (!counts.any()) continue;
-    const L weight = through * alpha, after = through - weight;
+    // T (1 - α) in one rounding: from T - weight an α near 1 would leave few digits, and the way back divides by 1 - α.
+    const L weight = through * alpha, after = subtract_product(through, through, alpha);
     const Mask<T> kept = counts & (after >= transmittance_min);
     const std::uint32_t stops = counts.bits() ^ kept.bits();
     if (__builtin_expect(stops != 0, 0)) {

@@ -119,7 +119,7 @@ struct Pull {
 };
 
 // Back through the projection. q and its moments come from the blocks; M = [[qxx, qxy], [qxy, qyy]]:
-//   ∂L/∂u = Σ'⁻¹ (qx, qy)      ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T  (+ the compensation's q · (∂ log area - Σ'⁻¹ T))
+//   ∂L/∂u = Σ'⁻¹ (qx, qy)      ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T, ρ the compensation
 template <class T>
 CLEAR_INLINE void project_vjp(const Pose<T>& pose, const Screen<T>& screen, const Settings<T>& s, const Geometry<T>& g,
                               const Footprint<T>& f, const Vec3<T>& scale, const Lanes<T>& opacity, const Lanes<T>& q,
@@ -138,16 +138,19 @@ CLEAR_INLINE void project_vjp(const Pose<T>& pose, const Screen<T>& screen, cons
     L mx = qxx * px + qxy * py, my = qxy * px + qyy * py;                      // M P
     dX[k] = f.xx * mx + f.xy * my;
     dY[k] = f.xy * mx + f.yy * my;
-    if (s.antialiased) dX[k] -= q * px, dY[k] -= q * py;
   }
   if (s.antialiased) {
-    // log area pulls along the rows' in-plane normals: (Y x n)/|n|², (n x X)/|n|², in the units of `size`.
+    // log ρ = ½ log area² - ½ log(area² + κ tr + κ²). Written so that what cancels for a large Gaussian is never formed:
+    //   ∂ log ρ/∂x = κ/det ((tr + κ)/area² (y x n) - x),   and for y with n x x.
     L x[3], y[3], along_x[3], along_y[3], shrink = L(T(1)) / f.size;
     for (int k = 0; k < 3; ++k) x[k] = f.X[k] * shrink, y[k] = f.Y[k] * shrink;
     cross<T>(y, f.normal, along_x);
     cross<T>(f.normal, x, along_y);
-    L weight = q * shrink / (f.area * f.area);
-    for (int k = 0; k < 3; ++k) dX[k] += weight * along_x[k], dY[k] += weight * along_y[k];
+    L weight = q * shrink * f.kernel / f.det, turn = (f.a + f.c + f.kernel) / (f.area * f.area);
+    for (int k = 0; k < 3; ++k) {
+      dX[k] += weight * (turn * along_x[k] - x[k]);
+      dY[k] += weight * (turn * along_y[k] - y[k]);
+    }
   }
 
   // T = J axes: to the axes, to 1/z, and to the tangents where they are not clamped.

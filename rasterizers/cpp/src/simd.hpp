@@ -84,6 +84,11 @@ struct Native {
     if constexpr (sizeof(T) == 4) return (Register)_mm512_scalef_ps((__m512)a, (__m512)n);
     else return (Register)_mm512_scalef_pd((__m512d)a, (__m512d)n);
   }
+  // c - a b, rounded once.
+  static CLEAR_INLINE Register subtract_product(Register c, Register a, Register b) {
+    if constexpr (sizeof(T) == 4) return (Register)_mm512_fnmadd_ps((__m512)a, (__m512)b, (__m512)c);
+    else return (Register)_mm512_fnmadd_pd((__m512d)a, (__m512d)b, (__m512d)c);
+  }
   // 1/a to about the precision of T.
   static CLEAR_INLINE Register reciprocal(Register a) {
     if constexpr (sizeof(T) == 4) {
@@ -155,6 +160,14 @@ struct Native {
     Integer e = __builtin_convertvector(maximum(n, limit - Register{}), Integer);
     Integer one = (Integer)(T(1) - Register{});
     return a * (Register)(one + (e << mantissa));
+  }
+  static CLEAR_INLINE Register subtract_product(Register c, Register a, Register b) {
+#if defined(__AVX2__)
+    if constexpr (sizeof(T) == 4) return (Register)_mm256_fnmadd_ps((__m256)a, (__m256)b, (__m256)c);
+    else return (Register)_mm256_fnmadd_pd((__m256d)a, (__m256d)b, (__m256d)c);
+#else
+    return c - a * b;
+#endif
   }
   static CLEAR_INLINE Register reciprocal(Register a) { return T(1) / a; }
 #endif
@@ -263,6 +276,10 @@ CLEAR_INLINE Lanes<T> scale_by_power(const Lanes<T>& a, const Lanes<T>& n) {
 template <class T>
 CLEAR_INLINE Lanes<T> reciprocal(const Lanes<T>& a) {
   CLEAR_EACH(reciprocal, a.r[i])
+}
+template <class T>
+CLEAR_INLINE Lanes<T> subtract_product(const Lanes<T>& c_, const Lanes<T>& a, const Lanes<T>& b) {
+  CLEAR_EACH(subtract_product, c_.r[i], a.r[i], b.r[i])
 }
 template <class T>
 CLEAR_INLINE Lanes<T> select(const Mask<T>& m, const Lanes<T>& a, const Lanes<T>& b) {
