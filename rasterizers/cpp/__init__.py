@@ -85,7 +85,7 @@ class _Frame:
         self.threads = settings.threads if settings.threads is not None else torch.get_num_threads()
         self.cameras = [camera for _, camera in jobs]
         shared = (splats.means, splats.quats, splats.scales, splats.sh0)
-        self.shared = tuple(x.detach().contiguous() for x in shared) + (_rows(splats.shN.detach()),)
+        self.shared = (*(x.detach().contiguous() for x in shared), _rows(splats.shN.detach()))
         # Kept here because the native frame only borrows them.
         self.opacities = [job.opacities.detach().contiguous() for job, _ in jobs]
         self.offsets = [None if job.rgb_offset is None else job.rgb_offset.detach().contiguous() for job, _ in jobs]

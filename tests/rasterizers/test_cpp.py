@@ -131,7 +131,8 @@ def test_gradients_agree_where_no_threshold_flips(name):
 
 def test_transmittance_survives_four_hundred_layers():
     n = 400
-    for alpha in (1 / 200, 0.05, 0.5, 0.98):
+    # Near α = 1 the last digit of α itself is worth 1/(1 - α) of them in T.
+    for alpha, tolerance in ((1 / 200, 1e-5), (0.05, 1e-5), (0.5, 1e-5), (0.98, 1e-4)):
         splats = Splats(
             means=torch.tensor([[0.0, 0.0, 2.0]]).repeat(n, 1) + torch.arange(n)[:, None] * torch.tensor([0, 0, 1e-3]),
             quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
@@ -147,7 +148,7 @@ def test_transmittance_survives_four_hundred_layers():
         ours, truth = found.vjp(v), exact.vjp(v.double())
         for name in ("opacities", "sh0"):
             a, b = gradient_of(ours, name).double(), gradient_of(truth, name)
-            assert float((a - b).norm() / b.norm()) < 1e-5
+            assert float((a - b).norm() / b.norm()) < tolerance
 
 
 @pytest.mark.parametrize("aspect", [1.0, 1e2, 1e4])

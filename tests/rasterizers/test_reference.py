@@ -167,7 +167,7 @@ def test_settings_outside_their_range_are_refused(settings, message):
 
 
 def test_an_unknown_backend_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match="choose one of auto, .*torch"):
+    with pytest.raises(ValueError, match=r"choose one of auto, .*torch"):
         rasterizers.load("cuda")
     assert rasterizers.available()["torch"] is None
 
