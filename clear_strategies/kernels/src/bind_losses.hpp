@@ -8,6 +8,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include "haar.hpp"
 #include "ssim.hpp"
 
 namespace clear {
@@ -15,7 +16,7 @@ namespace clear {
 using ImageIn = nanobind::ndarray<const float, nanobind::shape<-1, -1, kChannels>, nanobind::c_contig, nanobind::device::cpu>;
 using ImageOut = nanobind::ndarray<float, nanobind::shape<-1, -1, kChannels>, nanobind::c_contig, nanobind::device::cpu>;
 
-inline ssim::Images same_size(const ImageIn& x, const ImageIn& y, const ImageOut& gradient) {
+inline ImagePair same_size(const ImageIn& x, const ImageIn& y, const ImageOut& gradient) {
   for (std::size_t axis : {0, 1})
     if (x.shape(axis) != y.shape(axis) || x.shape(axis) != gradient.shape(axis) || x.shape(axis) == 0)
       throw std::invalid_argument("the images and the gradient must have one size, and pixels.");
@@ -28,13 +29,22 @@ inline void bind_losses(nanobind::module_& m) {
   m.def(
       "photometric",
       [](const ImageIn& x, const ImageIn& y, const ImageOut& gradient, float l1, float dssim, int threads) {
-        ssim::Images images = same_size(x, y, gradient);
+        ImagePair images = same_size(x, y, gradient);
         nb::gil_scoped_release free;
         PhotometricMeans means = photometric(images, {l1, dssim}, threads);
         return std::pair(means.l1, means.dssim);
       },
       "x"_a.noconvert(), "y"_a.noconvert(), "gradient"_a.noconvert(), "l1"_a, "dssim"_a, "threads"_a,
       "Writes the gradient of l1 * mean|x - y| + dssim * (1 - SSIM); returns (mean|x - y|, 1 - SSIM).");
+  m.def(
+      "haar_l1",
+      [](const ImageIn& x, const ImageIn& y, const ImageOut& gradient, int levels, int threads) {
+        ImagePair images = same_size(x, y, gradient);
+        nb::gil_scoped_release free;
+        return haar_l1(images, levels, threads);
+      },
+      "x"_a.noconvert(), "y"_a.noconvert(), "gradient"_a.noconvert(), "levels"_a, "threads"_a,
+      "Writes the gradient of the mean absolute Haar detail of x - y; returns its value.");
 }
 
 }  // namespace clear

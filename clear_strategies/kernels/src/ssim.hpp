@@ -25,12 +25,11 @@
 #include <cstring>
 #include <vector>
 
+#include "images.hpp"
 #include "pool.hpp"
 #include "simd.hpp"
 
 namespace clear {
-
-inline constexpr int kChannels = 3;
 
 // What is minimised: l1 · mean |x - y| + dssim · (1 - SSIM).
 struct PhotometricWeights {
@@ -62,12 +61,6 @@ inline constexpr int kTileHeight = 128;
 
 // How many of the group's rows the registers have room for at once.
 inline constexpr int kTogether = kRegisterBytes == 64 ? 4 : 1;
-
-struct Images {
-  const float *x, *y;
-  float* gradient;
-  int height, row;  // row: numbers in a row, W · 3
-};
 
 // Rows of numbers, the newest kRing of them.
 struct Ring {
@@ -226,7 +219,7 @@ inline float* scratch(std::size_t n) {
 }
 
 // One tile's share of the means, summed; its part of the gradient is written.
-inline PhotometricMeans run_tile(const Images& im, const Tile& t, PhotometricWeights weights) {
+inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, PhotometricWeights weights) {
   const int width = t.width(), map_width = width + 2 * kHalo, in_width = map_width + 2 * kHalo;
   const int in_left = t.left - 2 * kHalo, map_left = t.left - kHalo;
   const float share = 1.0f / (float(im.height) * float(im.row));
@@ -334,7 +327,7 @@ inline PhotometricMeans run_tile(const Images& im, const Tile& t, PhotometricWei
 }  // namespace ssim
 
 // L1 alone, without a look at neighbours.
-inline double l1_with_gradient(const ssim::Images& im, float weight, int threads) {
+inline double l1_with_gradient(const ImagePair& im, float weight, int threads) {
   using ssim::Floats;
   constexpr std::int64_t chunk = 1 << 14;
   std::int64_t n = std::int64_t(im.height) * im.row, chunks = (n + chunk - 1) / chunk;
@@ -365,7 +358,7 @@ inline double l1_with_gradient(const ssim::Images& im, float weight, int threads
 
 // Writes the gradient of l1 · mean |x - y| + dssim · (1 - SSIM) with respect to x; returns both means. Without weight on
 // SSIM none is computed, and its mean is 0.
-inline PhotometricMeans photometric(const ssim::Images& im, PhotometricWeights weights, int threads) {
+inline PhotometricMeans photometric(const ImagePair& im, PhotometricWeights weights, int threads) {
   if (weights.dssim == 0) return {l1_with_gradient(im, weights.l1, threads), 0};
   auto parts = [](int size, int aim, int whole) {  // equal parts of about `aim`, in multiples of `whole`
     int count = (size + aim - 1) / aim, part = (size + count - 1) / count;
