@@ -13,8 +13,10 @@
 
 namespace clear {
 
-using ImageIn = nanobind::ndarray<const float, nanobind::shape<-1, -1, kChannels>, nanobind::c_contig, nanobind::device::cpu>;
-using ImageOut = nanobind::ndarray<float, nanobind::shape<-1, -1, kChannels>, nanobind::c_contig, nanobind::device::cpu>;
+template <class T>
+using Image = nanobind::ndarray<T, nanobind::shape<-1, -1, kChannels>, nanobind::c_contig, nanobind::device::cpu>;
+using ImageIn = Image<const float>;
+using ImageOut = Image<float>;
 
 inline ImagePair same_size(const ImageIn& x, const ImageIn& y, const ImageOut& gradient) {
   for (std::size_t axis : {0, 1})

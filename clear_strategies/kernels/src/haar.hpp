@@ -100,8 +100,10 @@ inline double blocks_of_row(Workspace& work, float scale, bool has_above) {
   for (int i = 0; i < work.width(); i += kLanes) {
     Floats side = Floats::load(work.side() + i), up = Floats::load(upper + i), down = Floats::load(lower + i);
     auto left = side > zero;
-    Floats a = select(left, up, Floats::load(upper + i - kChannels)), b = select(left, Floats::load(upper + i + kChannels), up);
-    Floats c = select(left, down, Floats::load(lower + i - kChannels)), d = select(left, Floats::load(lower + i + kChannels), down);
+    Floats a = select(left, up, Floats::load(upper + i - kChannels));
+    Floats b = select(left, Floats::load(upper + i + kChannels), up);
+    Floats c = select(left, down, Floats::load(lower + i - kChannels));
+    Floats d = select(left, Floats::load(lower + i + kChannels), down);
     Floats horizontal = a - b + c - d, vertical = a + b - c - d, diagonal = a - b - c + d;
     sum += absolute(horizontal) + absolute(vertical) + absolute(diagonal);
     Floats h = side * signed_scale(horizontal), v = signed_scale(vertical), hv = side * signed_scale(diagonal);

@@ -76,7 +76,15 @@ struct Tile {
   int width() const { return (right - left + kLanes - 1) / kLanes * kLanes; }
 };
 
-// Column sums of one group. `rows` are the kSpan rows from 5 above the group's first to 5 below its last.
+inline double total(const Floats& v) {
+  float lanes[kLanes];
+  v.store(lanes);
+  double all = 0;
+  for (float lane : lanes) all += lane;
+  return all;
+}
+
+// What the column sums of a group are made of: the kSpan rows from 5 above the group's first to 5 below its last.
 struct Columns {
   const float *s[kSpan], *e[kSpan];
   const float *s_origin, *e_origin;
@@ -192,23 +200,47 @@ void down_maps(const Maps& in, int first, int width, float* const* sum_a, float*
   }
 }
 
-inline void store_some(const Floats& v, float* to, int n) {
-  float all[kLanes];
-  v.store(all);
-  std::memcpy(to, all, sizeof(float) * std::size_t(std::min(n, kLanes)));
-}
-
 // Sum of n numbers, the rounding that of one Lanes of a row.
 inline double total(const float* values, int n) {
   Floats sum(0.0f);
   int i = 0;
   for (; i + kLanes <= n; i += kLanes) sum += Floats::load(values + i);
-  float lanes[kLanes];
-  sum.store(lanes);
-  double all = 0;
-  for (float v : lanes) all += v;
+  double all = total(sum);
   for (; i < n; ++i) all += values[i];
   return all;
+}
+
+struct GradientRow {
+  float* to;
+  int length;
+  float l1_scale, ssim_scale;
+};
+
+// The gradient of one row, from the sums down the columns about s_origin and e_origin, which with the column sums begin
+// kHalo numbers before the row; returns Σ |e|.
+inline double along_sums(const float* sum_a, const float* sum_b, const float* sum_c, const float* s_origin,
+                         const float* e_origin, const float* s, const float* e, const GradientRow& out) {
+  Floats zero(0.0f), step(out.l1_scale), absolute_sum(0.0f);
+  for (int i = 0; i < out.length; i += kLanes) {
+    Floats s0 = Floats::load(s + i), e0 = Floats::load(e + i), g(0.0f);
+#pragma GCC unroll 16
+    for (int k = 0; k < kTaps; ++k) {
+      int from = i + kHalo + (k - kReach) * kChannels;
+      g += Floats(kWindow[k]) *
+           (Floats::load(sum_a + from) + Floats::load(sum_b + from) * (s0 - Floats::load(s_origin + from)) +
+            Floats::load(sum_c + from) * (e0 - Floats::load(e_origin + from)));
+    }
+    g = where(e0 < zero, step) - where(e0 > zero, step) + Floats(out.ssim_scale) * g;
+    absolute_sum += absolute(e0);
+    if (i + kLanes <= out.length) {
+      g.store(out.to + i);
+    } else {
+      float lanes[kLanes];
+      g.store(lanes);
+      std::memcpy(out.to + i, lanes, sizeof(float) * std::size_t(out.length - i));
+    }
+  }
+  return total(absolute_sum);
 }
 
 // Buffers of one thread, kept between calls: fresh memory would cost a page fault every 4 KB.
@@ -225,7 +257,8 @@ inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, Photometric
   const float share = 1.0f / (float(im.height) * float(im.row));
   const float l1_scale = weights.l1 * share, ssim_scale = -weights.dssim * share;
 
-  float* free = scratch(std::size_t(in_width) * (2 * kRing + 4 * kGroup) + std::size_t(map_width) * (5 * kRing + 1 + 3 * kGroup));
+  float* free = scratch(std::size_t(in_width) * (2 * kRing + 4 * kGroup) +
+                        std::size_t(map_width) * (5 * kRing + 1 + 3 * kGroup));
   auto take = [&free](std::ptrdiff_t n) {
     float* p = free;
     free += n;
@@ -288,28 +321,9 @@ inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, Photometric
     in.s_origin = mean_s.row(origin), in.e_origin = mean_e.row(origin);
     for (int r = 0; r < kGroup; r += kTogether) down_maps<kTogether>(in, r, map_width, sum[0], sum[1], sum[2]);
     for (int r = 0; r < kGroup && p + r < t.bottom; ++r) {
-      const float *own_s = s.row(p + r) + 2 * kHalo, *own_e = e.row(p + r) + 2 * kHalo;
-      float* out = im.gradient + std::ptrdiff_t(p + r) * im.row + t.left;
-      Floats absolute_sum(0.0f);
-      for (int i = 0; i < width; i += kLanes) {
-        Floats s0 = Floats::load(own_s + i), e0 = Floats::load(own_e + i), g(0.0f);
-#pragma GCC unroll 16
-        for (int k = 0; k < kTaps; ++k) {
-          int from = i + kHalo + (k - kReach) * kChannels;
-          g += Floats(kWindow[k]) * (Floats::load(sum[0][r] + from) +
-                                     Floats::load(sum[1][r] + from) * (s0 - Floats::load(in.s_origin + from)) +
-                                     Floats::load(sum[2][r] + from) * (e0 - Floats::load(in.e_origin + from)));
-        }
-        Floats zero(0.0f), sign = where(e0 < zero, Floats(l1_scale)) - where(e0 > zero, Floats(l1_scale));
-        absolute_sum += absolute(e0);
-        g = sign + Floats(ssim_scale) * g;
-        int left = t.right - t.left - i;
-        if (left >= kLanes) g.store(out + i);
-        else store_some(g, out + i, left);
-      }
-      float lanes[kLanes];
-      absolute_sum.store(lanes);
-      sums.l1 += total(lanes, kLanes);
+      GradientRow out{im.gradient + std::ptrdiff_t(p + r) * im.row + t.left, t.right - t.left, l1_scale, ssim_scale};
+      sums.l1 += along_sums(sum[0][r], sum[1][r], sum[2][r], in.s_origin, in.e_origin, s.row(p + r) + 2 * kHalo,
+                            e.row(p + r) + 2 * kHalo, out);
     }
   };
 
@@ -341,9 +355,7 @@ inline double l1_with_gradient(const ImagePair& im, float weight, int threads) {
       sum += absolute(d);
       (where(d > zero, step) - where(d < zero, step)).store(im.gradient + i);
     }
-    float lanes[kLanes];
-    sum.store(lanes);
-    double all = ssim::total(lanes, kLanes);
+    double all = ssim::total(sum);
     for (; i < end; ++i) {
       float d = im.x[i] - im.y[i];
       all += std::fabs(d);
