@@ -8,12 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies import kernels
-from clear_strategies.kernels import LossAndGradient
+from clear_strategies.kernels import Choice, LossAndGradient
 from clear_strategies.schedules import WarmupDecay
 
 
@@ -34,9 +33,11 @@ class Objective:
         lambda_ssim, lambda_ssim_hr: share of 1 - SSIM in L_LR and L_base, in [0, 1]; the rest is L1.
         haar_levels: levels of the Haar transform; 1 is the top octave, 2 is exactly the band that 4x SR adds.
         clamp_render: compare renders clamped to [0, 1] (DropGaussian); 3DGS clamps for metrics only.
+        kernels: what computes the losses: "cpp", "torch", or "auto", the fastest that runs here.
 
     Raises:
         ValueError: a setting is outside its range.
+        BackendUnavailable: kernels="cpp" was not built.
     """
 
     lambda_hr: WarmupDecay = field(default_factory=WarmupDecay)
@@ -45,8 +46,10 @@ class Objective:
     lambda_ssim_hr: float = 0.2
     haar_levels: int = 1
     clamp_render: bool = False
+    kernels: Choice = "auto"
 
     def __post_init__(self) -> None:
+        kernels.require(self.kernels)
         for name in ("lambda_ssim", "lambda_ssim_hr"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}.")
@@ -57,29 +60,30 @@ class Objective:
 
     def lr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:
         """L_LR, one cotangent."""
-        shown, passes = self._shown(image)
-        loss = photometric(shown, target, self.lambda_ssim)  # Eq. 4
-        return Losses({"lr": float(loss.value)}, (loss.gradient * passes)[None])
+        shown = self._shown(image)
+        cotangents = shown.new_empty(1, *shown.shape)
+        loss = kernels.photometric(shown, target, self.lambda_ssim, kernels=self.kernels, out=cotangents[0])  # Eq. 4
+        return self._losses({"lr": loss}, image, cotangents)
 
     def hr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:
         """L_base and L_HF, two cotangents; L_base alone where λ_HF = 0."""
-        shown, passes = self._shown(image)
-        losses = {"base": photometric(shown, target, self.lambda_ssim_hr)}  # Eq. 5
+        shown, use = self._shown(image), self.kernels
+        cotangents = shown.new_empty(2 if self.lambda_hf > 0 else 1, *shown.shape)
+        base = kernels.photometric(shown, target, self.lambda_ssim_hr, kernels=use, out=cotangents[0])  # Eq. 5
+        losses = {"base": base}
         if self.lambda_hf > 0:
-            losses["hf"] = kernels.haar_l1(shown, target, self.haar_levels)  # Eq. 5
-        values = {name: float(loss.value) for name, loss in losses.items()}
-        return Losses(values, torch.stack([loss.gradient * passes for loss in losses.values()]))
+            losses["hf"] = kernels.haar_l1(shown, target, self.haar_levels, kernels=use, out=cotangents[1])  # Eq. 5
+        return self._losses(losses, image, cotangents)
 
-    def _shown(self, image: Float[Tensor, "H W 3"]) -> tuple[Tensor, Tensor | float]:
-        if not self.clamp_render:
-            return image, 1.0
-        return image.clamp(0, 1), ((image >= 0) & (image <= 1)).to(image.dtype)
+    def _shown(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+        return image.clamp(0, 1) if self.clamp_render else image
 
-
-def photometric(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], lambda_ssim: float) -> LossAndGradient:
-    """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient."""
-    l1, ssim = kernels.l1(x, y), kernels.ssim(x, y)
-    return LossAndGradient(
-        (1 - lambda_ssim) * l1.value + lambda_ssim * (1 - ssim.value),
-        (1 - lambda_ssim) * l1.gradient - lambda_ssim * ssim.gradient,
-    )
+    def _losses(
+        self,
+        losses: Mapping[str, LossAndGradient],
+        image: Float[Tensor, "H W 3"],
+        cotangents: Float[Tensor, "K H W 3"],
+    ) -> Losses:
+        if self.clamp_render:
+            cotangents *= (image >= 0) & (image <= 1)
+        return Losses({name: float(loss.value) for name, loss in losses.items()}, cotangents)

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies import kernels
-from clear_strategies.objective import Objective, photometric
+from clear_strategies.kernels import cpp
+from clear_strategies.kernels import torch as reference
+from clear_strategies.objective import Objective
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, milestones, scaled
+from rasterizers.interface import BackendUnavailable
 
 LOSSES = {
     "l1": kernels.l1,
@@ -54,22 +64,243 @@ def test_ssim_is_the_mean_that_scikit_image_computes_inside():
     assert their_map.shape == (40, 50, 3)
 
 
-@pytest.mark.parametrize("level", [0.0, 1 / 255, 0.5, 0.6, 1.0])
-@pytest.mark.parametrize("difference", [0.0, 1e-7, 1e-3])
-def test_ssim_of_constants_stays_within_its_range(level, difference):
-    x = torch.full((20, 20, 3), level)
-    y = x + difference
-    value, gradient = kernels.ssim(x, y)
+def rough(x, amount, seed=9):
+    """The image and a noisy copy."""
+    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(seed))
+    return x, x + amount * noise
+
+
+def photo(height, width, seed=5):
+    """Blobs of all sizes, edges, fine grain: what a photograph has."""
+    scales = (2, 5, 17, 60)
+    layers = [image(height // s + 1, width // s + 1, seed + s).float() for s in scales]
+    grown = [
+        z.repeat_interleave(s, 0).repeat_interleave(s, 1)[:height, :width] for z, s in zip(layers, scales, strict=True)
+    ]
+    return (0.2 * grown[0] + 0.1 * grown[1] + 0.3 * grown[2] + 0.4 * grown[3]).contiguous()
+
+
+def sky(height=96, width=90):
+    """Above a flat sky, below a wall that is flat at another level, and a textured corner."""
+    x = torch.full((height, width, 3), 0.93)
+    x[height // 2 :] = 0.12
+    x[height // 3 :, : width // 3] = image(height - height // 3, width // 3, 3).float()
+    return x
+
+
+PAIRS = {
+    f"{level:.3g} against {difference:g} more": (
+        torch.full((20, 20, 3), level),
+        torch.full((20, 20, 3), level) + difference,
+    )
+    for level in (0.0, 1 / 255, 0.5, 0.6, 1.0)
+    for difference in (0.0, 1e-7, 1e-3)
+} | {
+    "noise of 1 x 1": (image(1, 1, 1).float(), image(1, 1, 2).float()),
+    "noise of 3 x 30": (image(3, 30, 1).float(), image(3, 30, 2).float()),
+    "noise of 11 x 11": (image(11, 11, 1).float(), image(11, 11, 2).float()),
+    "noise of 40 x 1": (image(40, 1, 1).float(), image(40, 1, 2).float()),
+    "noise over several tiles": (image(141, 353, 1).float(), image(141, 353, 2).float()),
+    "sky and rough copy": rough(sky(), 0.05),
+    "sky and close copy": rough(sky(), 1e-3),
+    "sky and other sky": (sky(), 1.1 * sky()),
+    "photo and rough copy": rough(photo(133, 350), 0.1),
+    "photo and close copy": rough(photo(77, 91), 1e-3),
+    "photo and itself": (photo(50, 60), photo(50, 60)),
+    "photo inverted": (photo(50, 60), 1 - photo(50, 60)),
+    "beyond [0, 1]": (3 * photo(50, 60) - 1, photo(50, 60, 6)),
+}
+IMPLEMENTATIONS = [
+    pytest.param("cpp", marks=pytest.mark.skipif(not cpp.available(), reason="the compiled kernels were not built")),
+    "torch",
+]
+needs_cpp = pytest.mark.skipif(not cpp.available(), reason="the compiled kernels were not built")
+every_implementation = pytest.mark.parametrize("name", IMPLEMENTATIONS)
+
+
+@every_implementation
+@pytest.mark.parametrize(("x", "y"), PAIRS.values(), ids=PAIRS)
+def test_ssim_is_that_of_float64(name, x, y):
+    value, gradient = kernels.ssim(x, y, kernels=name)
+    exact = reference.ssim(x.double(), y.double())
     assert -1 - 1e-6 <= float(value) <= 1 + 1e-6
-    exact = kernels.ssim(x.double(), y.double())
     assert float(value) == pytest.approx(float(exact.value), abs=1e-6)
-    assert torch.allclose(gradient.double(), exact.gradient, atol=1e-5 * float(exact.gradient.abs().max()) + 1e-12)
+    assert_close(gradient, exact.gradient, 1e-5)
+
+
+@every_implementation
+@pytest.mark.parametrize(("x", "y"), PAIRS.values(), ids=PAIRS)
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+def test_photometric_is_that_of_float64(name, x, y, share):
+    value, gradient = kernels.photometric(x, y, share, kernels=name)
+    exact = reference.photometric(x.double(), y.double(), share)
+    assert float(value) == pytest.approx(float(exact.value), abs=1e-6)
+    assert_close(gradient, exact.gradient, 1e-5)
+
+
+@needs_cpp
+@pytest.mark.parametrize(("x", "y"), PAIRS.values(), ids=PAIRS)
+@pytest.mark.parametrize("levels", [1, 2, 3, 7])
+def test_compiled_haar_is_the_reference(x, y, levels):
+    value, gradient = cpp.haar_l1(x, y, levels)
+    expected = reference.haar_l1(x, y, levels)  # in float32: a detail that rounding makes 0 must be 0 in both
+    assert float(value) == pytest.approx(float(reference.haar_l1(x.double(), y.double(), levels).value), abs=1e-6)
+    assert_close(gradient, expected.gradient, 1e-6)
+
+
+def assert_close(gradient, exact, relative):
+    error = float((gradient.double() - exact.double()).abs().max())
+    assert error <= relative * float(exact.abs().max()) + 1e-12
+
+
+@needs_cpp
+def test_equal_images_have_no_gradient_at_all():
+    x = photo(60, 70)
+    for loss in (cpp.ssim, cpp.haar_l1, lambda x, y: cpp.photometric(x, y, 0.2)):
+        value, gradient = loss(x, x.clone())
+        assert float(value) in {0.0, 1.0}
+        assert not gradient.any()
+
+
+COMPILED = {
+    "photometric": lambda x, y: cpp.photometric(x, y, 0.2),
+    "l1": cpp.l1,
+    "haar": lambda x, y: cpp.haar_l1(x, y, 3),
+}
+
+
+@pytest.fixture
+def threads():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@needs_cpp
+@pytest.mark.parametrize("loss", COMPILED.values(), ids=COMPILED)
+def test_the_bits_do_not_depend_on_threads_or_luck(loss, threads):
+    x, y = rough(photo(261, 350), 0.1)
+    results = []
+    for n in (1, 2, 3, 4, 8, 8, 1):
+        threads(n)
+        results.append(loss(x, y))
+    threads(2)
+    with ThreadPoolExecutor(3) as callers:  # only one of them gets the pool
+        results += callers.map(lambda _: loss(x, y), range(6))
+    for value, gradient in results[1:]:
+        assert torch.equal(value, results[0].value)
+        assert torch.equal(gradient, results[0].gradient)
+
+
+ISA_SCRIPT = """
+import sys, torch
+sys.path.insert(0, {tests!r})
+from test_kernels import COMPILED, cpp, photo, rough
+x, y = rough(photo(141, 353), 0.1)
+torch.save([cpp.native().isa, *(tuple(loss(x, y)) for loss in COMPILED.values())], {out!r})
+"""
+
+
+@needs_cpp
+@pytest.mark.parametrize("isa", ["baseline", "avx2"])
+def test_every_instruction_set_agrees(isa, tmp_path):
+    if isa not in [*cpp.native().instruction_sets(), "baseline"]:
+        pytest.skip(f"this processor has no {isa}")
+    tests, out = Path(__file__).parent, tmp_path / "results.pt"
+    subprocess.run(
+        [sys.executable, "-c", ISA_SCRIPT.format(tests=str(tests), out=str(out))],
+        env={**os.environ, "CLEAR_ISA": isa}, cwd=tests.parent, check=True,
+    )  # fmt: skip
+    found, *theirs = torch.load(out)
+    assert found == isa
+    x, y = rough(photo(141, 353), 0.1)
+    for loss, (value, gradient) in zip(COMPILED.values(), theirs, strict=True):
+        mine = loss(x, y)
+        assert float(value) == pytest.approx(float(mine.value), rel=1e-6)
+        assert_close(gradient, mine.gradient, 2e-6)
+
+
+@needs_cpp
+def test_images_of_any_layout_are_taken():
+    x, y = photo(40, 50), photo(40, 50, 6)
+    expected = cpp.photometric(x, y, 0.2)
+    planar = x.movedim(-1, 0).contiguous().movedim(0, -1).requires_grad_()
+    value, gradient = cpp.photometric(planar, y.flip(0).flip(0), 0.2)
+    assert torch.equal(value, expected.value)
+    assert torch.equal(gradient, expected.gradient)
+    assert gradient.is_contiguous()
+
+
+@every_implementation
+def test_gradients_go_where_they_are_wanted(name):
+    x, y = photo(20, 30), photo(20, 30, 6)
+    out = torch.full((2, 20, 30, 3), torch.nan)
+    ssim = kernels.photometric(x, y, 0.2, kernels=name, out=out[0])
+    haar = kernels.haar_l1(x, y, kernels=name, out=out[1])
+    assert ssim.gradient.data_ptr() == out[0].data_ptr()
+    assert torch.equal(haar.gradient, out[1])
+    assert torch.equal(out[0], kernels.photometric(x, y, 0.2, kernels=name).gradient)
+
+
+@needs_cpp
+@pytest.mark.parametrize(
+    ("x", "y", "error", "message"),
+    [
+        (
+            torch.rand(4, 5, 3).double(),
+            torch.rand(4, 5, 3),
+            TypeError,
+            "x must be float32 on the CPU, got torch.float64",
+        ),
+        (torch.rand(4, 5, 3), torch.rand(4, 5, 3).half(), TypeError, "y must be float32"),
+        (torch.rand(4, 5, 3), torch.rand(4, 5, 3, device="meta"), TypeError, "on meta"),
+        (torch.rand(4, 5, 3), torch.rand(5, 4, 3), ValueError, "as large as x"),
+        (torch.rand(4, 5, 4), torch.rand(4, 5, 4), ValueError, r"\[H, W, 3\]"),
+        (torch.rand(0, 5, 3), torch.rand(0, 5, 3), ValueError, "with pixels"),
+    ],
+)
+def test_what_the_compiled_kernels_refuse(x, y, error, message):
+    with pytest.raises(error, match=message):  # behind the shapes that only the tests' type checker knows
+        cpp._prepared(x, y, None)
+
+
+def test_auto_takes_what_the_compiled_kernels_do_not():
+    x, y = image(6, 7, 1), image(6, 7, 2)
+    assert kernels.ssim(x, y).value.dtype == torch.float64
+    assert torch.equal(kernels.haar_l1(x, y).gradient, reference.haar_l1(x, y).gradient)
+
+
+def test_without_a_compiler_torch_does_it(monkeypatch):
+    def absent():
+        raise BackendUnavailable("the compiled kernels are not installed")
+
+    monkeypatch.setattr(cpp, "native", absent)
+    assert list(kernels.implementations()) == ["torch"]
+    x, y = photo(20, 30), photo(20, 30, 6)
+    assert torch.equal(Objective().lr(x, y).cotangents[0], reference.photometric(x, y, 0.2).gradient)
+    with pytest.raises(BackendUnavailable, match="not installed"):
+        Objective(kernels="cpp")
+
+
+@needs_cpp
+def test_the_objective_is_the_same_by_either_kernels(caplog):
+    x, y = rough(photo(60, 70), 0.1)
+    kernels._say.cache_clear()
+    with caplog.at_level(logging.INFO, "clear_strategies.kernels"):
+        fast = [Objective(kernels="auto", clamp_render=clamp).hr(x, y) for clamp in (False, True)]
+    assert [record.message for record in caplog.records] == [f"image losses: cpp, for {cpp.native().isa}."]
+    for clamp, losses in zip((False, True), fast, strict=True):
+        slow = Objective(kernels="torch", clamp_render=clamp).hr(x, y)
+        assert losses.values == pytest.approx(slow.values, abs=1e-6)
+        # Where x = y after clamping, both have gradient 0; elsewhere they agree.
+        for ours, theirs in zip(losses.cotangents, slow.cotangents, strict=True):
+            assert_close(ours, theirs, 1e-5)
 
 
 def test_identical_images_are_perfect():
     x = image(16, 16)
     assert float(kernels.ssim(x, x).value) == pytest.approx(1.0)
-    assert float(photometric(x, x, 0.2).value) == pytest.approx(0.0, abs=1e-12)
+    assert float(kernels.photometric(x, x, 0.2).value) == pytest.approx(0.0, abs=1e-12)
     for loss in (kernels.l1, kernels.haar_l1):
         value, gradient = loss(x, x)
         assert float(value) == 0

@@ -1,8 +1,114 @@
 """The trainer's own hot loops: image losses with their gradients.
 
-`torch` is the specification, in float64 inside; faster backends agree with it.
+`torch` is the specification, in float64 inside; `cpp` agrees with it, and is what runs where it was built, for images of
+float32 on the CPU. Every function takes `kernels` to choose: "auto" (the fastest that takes these images), "torch" or
+"cpp".
 """
 
-from clear_strategies.kernels.torch import LossAndGradient, haar_l1, l1, ssim
+from __future__ import annotations
 
-__all__ = ["LossAndGradient", "haar_l1", "l1", "ssim"]
+import logging
+from functools import cache
+from typing import Literal, Protocol, get_args, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.kernels import cpp
+from clear_strategies.kernels import torch as reference
+from clear_strategies.kernels.torch import LossAndGradient
+
+__all__ = [
+    "Choice",
+    "Implementation",
+    "LossAndGradient",
+    "haar_l1",
+    "implementations",
+    "l1",
+    "photometric",
+    "require",
+    "ssim",
+]
+
+_log = logging.getLogger(__name__)
+
+Choice = Literal["auto", "torch", "cpp"]
+
+
+@runtime_checkable
+class Implementation(Protocol):
+    """What a module of kernels offers; `torch` says what each function means."""
+
+    def photometric(self, x: Tensor, y: Tensor, lambda_ssim: float, out: Tensor | None = None) -> LossAndGradient: ...
+
+    def l1(self, x: Tensor, y: Tensor) -> LossAndGradient: ...
+
+    def ssim(self, x: Tensor, y: Tensor) -> LossAndGradient: ...
+
+    def haar_l1(self, x: Tensor, y: Tensor, levels: int = 1, out: Tensor | None = None) -> LossAndGradient: ...
+
+
+def implementations() -> dict[str, Implementation]:
+    """Those that run here, by name, the fastest first."""
+    return {"cpp": cpp, "torch": reference} if cpp.available() else {"torch": reference}
+
+
+def require(kernels: Choice) -> None:
+    """Make sure of a choice before it is needed.
+
+    Raises:
+        ValueError: there is no such implementation.
+        BackendUnavailable: "cpp" was not built; the message says what to do.
+    """
+    if kernels not in get_args(Choice):
+        raise ValueError(f"kernels must be one of {', '.join(get_args(Choice))}, got {kernels!r}.")
+    if kernels == "cpp":
+        cpp.native()
+
+
+def photometric(
+    x: Float[Tensor, "H W C"],
+    y: Float[Tensor, "H W C"],
+    lambda_ssim: float,
+    *,
+    kernels: Choice = "auto",
+    out: Float[Tensor, "H W C"] | None = None,
+) -> LossAndGradient:
+    """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient with respect to x, written into `out` if given."""
+    return _choose(kernels, x, y).photometric(x, y, lambda_ssim, out)
+
+
+def haar_l1(
+    x: Float[Tensor, "H W C"],
+    y: Float[Tensor, "H W C"],
+    levels: int = 1,
+    *,
+    kernels: Choice = "auto",
+    out: Float[Tensor, "H W C"] | None = None,
+) -> LossAndGradient:
+    """Mean absolute difference of Haar details, averaged over levels, with its gradient, written into `out` if given."""
+    return _choose(kernels, x, y).haar_l1(x, y, levels, out)
+
+
+def l1(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], *, kernels: Choice = "auto") -> LossAndGradient:
+    """Mean absolute difference, with its gradient."""
+    return _choose(kernels, x, y).l1(x, y)
+
+
+def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], *, kernels: Choice = "auto") -> LossAndGradient:
+    """Mean structural similarity, with its gradient."""
+    return _choose(kernels, x, y).ssim(x, y)
+
+
+def _choose(kernels: Choice, x: Tensor, y: Tensor) -> Implementation:
+    require(kernels)
+    if kernels == "cpp" or (kernels == "auto" and cpp.accepts(x, y) and cpp.available()):
+        _say(f"cpp, for {cpp.native().isa}")
+        return cpp
+    _say("torch")
+    return reference
+
+
+@cache
+def _say(which: str) -> None:
+    _log.info("image losses: %s.", which)

@@ -1,5 +1,7 @@
 """Image losses, each with its gradient with respect to the first image. Gradients are written out, not taped:
 the trainer needs image-space cotangents, and nothing else of a graph.
+
+Where a function takes `out`, the gradient is written there, and is that tensor.
 """
 
 from __future__ import annotations
@@ -22,6 +24,21 @@ class LossAndGradient(NamedTuple):
 
     value: Float[Tensor, ""]
     gradient: Float[Tensor, "H W C"]
+
+
+def photometric(
+    x: Float[Tensor, "H W C"],
+    y: Float[Tensor, "H W C"],
+    lambda_ssim: float,
+    out: Float[Tensor, "H W C"] | None = None,
+) -> LossAndGradient:
+    """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient; without λ no SSIM is computed."""
+    value, gradient = l1(x, y)
+    if lambda_ssim > 0:
+        similarity = ssim(x, y)
+        value = (1 - lambda_ssim) * value + lambda_ssim * (1 - similarity.value)
+        gradient = (1 - lambda_ssim) * gradient - lambda_ssim * similarity.gradient
+    return LossAndGradient(value, gradient if out is None else out.copy_(gradient))
 
 
 def l1(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> LossAndGradient:
@@ -52,7 +69,9 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> LossAndGradien
     return LossAndGradient(S.mean().to(x.dtype), gradient.movedim(0, -1).to(x.dtype))
 
 
-def haar_l1(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], levels: int = 1) -> LossAndGradient:
+def haar_l1(
+    x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], levels: int = 1, out: Float[Tensor, "H W C"] | None = None
+) -> LossAndGradient:
     """Mean absolute difference of the three detail bands of an orthonormal Haar transform, averaged over levels.
 
     Blind to the mean of each 2 × 2 block. An odd last row or column is repeated, so every pixel takes part.
@@ -68,7 +87,7 @@ def haar_l1(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], levels: int = 
     gradient = torch.zeros_like(low)
     for shape, details in zip(reversed(sizes), reversed(signs), strict=True):
         gradient = _fold_padding(_inverse_haar(gradient, details), shape)
-    return LossAndGradient(value, gradient)
+    return LossAndGradient(value, gradient if out is None else out.copy_(gradient))
 
 
 def _haar(image: Float[Tensor, "H W C"]) -> tuple[Float[Tensor, "h w C"], Float[Tensor, "3 h w C"]]:

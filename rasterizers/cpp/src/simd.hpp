@@ -212,11 +212,14 @@ struct Lanes {
     for (int i = 0; i < registers; ++i) r[i] = x - Register{};  // x - 0 is x, for -0 too: the compiler makes it a broadcast
   }
   static CLEAR_INLINE Lanes load(const T* p) {
+    // Register by register: one copy of all would go through the stack where there are several.
     Lanes a;
-    std::memcpy(a.r, p, sizeof a.r);
+    for (int i = 0; i < registers; ++i) std::memcpy(&a.r[i], p + i * Native<T>::width, sizeof(Register));
     return a;
   }
-  CLEAR_INLINE void store(T* p) const { std::memcpy(p, r, sizeof r); }
+  CLEAR_INLINE void store(T* p) const {
+    for (int i = 0; i < registers; ++i) std::memcpy(p + i * Native<T>::width, &r[i], sizeof(Register));
+  }
 
 #define CLEAR_OPERATOR(op)                                                          \
   friend CLEAR_INLINE Lanes operator op(const Lanes& a, const Lanes& b) {           \

@@ -1,0 +1,14 @@
+// The images that a loss compares: pixels of three interleaved numbers, so that a row is W · 3 numbers like any others.
+#pragma once
+
+namespace clear {
+
+inline constexpr int kChannels = 3;
+
+struct ImagePair {
+  const float *x, *y;
+  float* gradient;  // of the loss, with respect to x
+  int height, row;  // row: numbers in a row, W · 3
+};
+
+}  // namespace clear

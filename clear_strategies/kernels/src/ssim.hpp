@@ -1,0 +1,395 @@
+// L1 and mean SSIM (11 x 11 Gaussian window of σ = 1.5, zero padding) with their gradient, in one pass over the images.
+//
+// In the sum s = x + y and the difference e = y - x of the images the formula falls into two factors,
+//
+//   SSIM = (1 - u)(1 - n),   u = μe² / B1,  B1 = (μs² + μe²)/2 + C1,   n = σe² / B2,  B2 = (σs² + σe²)/2 + C2,
+//
+// which needs two means and two variances, no covariance, and keeps its digits where the images are nearly the same
+// (there u and n are small, not differences of nearly equal numbers; equal images give exactly 1, and gradient 0).
+// With a window w around q the gradient at a pixel p is
+//
+//   ∂Σ SSIM / ∂x_p = Σ_q w(p-q) [a(q) + b(q) (s_p - μs(q)) + c(q) (e_p - μe(q))],
+//   a = (1-n) (2μe + u (μs - μe)) / B1,   b = (1-u) n / B2,   c = (1-u) (2-n) / B2.
+//
+// Windows are separable: down the columns first, then along the rows. E[s²] - E[s]² would lose the variance of flat
+// regions, so every sum is taken about a value from within its window: about a pixel of the column when going down,
+// about the column's own mean when going along (the means of columns add their variance to the variances of columns).
+// The gradient's sums go about local means in the same way.
+//
+// Pixels are interleaved, so a neighbour is three numbers away and a row is W · 3 numbers like any others. The image is
+// cut into tiles, by its size alone; a tile goes down its rows four at a time, and keeps the last sixteen rows of what
+// it needs in rings that fit the second-level cache.
+#pragma once
+
+#include <algorithm>
+#include <cstring>
+#include <vector>
+
+#include "images.hpp"
+#include "pool.hpp"
+#include "simd.hpp"
+
+namespace clear {
+
+// What is minimised: l1 · mean |x - y| + dssim · (1 - SSIM).
+struct PhotometricWeights {
+  float l1, dssim;
+};
+
+struct PhotometricMeans {
+  double l1, dssim;  // mean |x - y|, 1 - SSIM
+};
+
+namespace ssim {
+
+using Floats = Lanes<float>;
+
+inline constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
+inline constexpr int kReach = 5, kTaps = 2 * kReach + 1;
+inline constexpr float kWindow[kTaps] = {0.001028380084f, 0.007598758135f, 0.03600077213f, 0.1093606895f,
+                                         0.2130055377f,   0.2660117249f,   0.2130055377f,  0.1093606895f,
+                                         0.03600077213f,  0.007598758135f, 0.001028380084f};
+
+inline constexpr int kGroup = 4;                   // rows that are made together, from
+inline constexpr int kSpan = kGroup + kTaps - 1;   // this many rows,
+inline constexpr int kRing = 16;                   // of a ring of this many.
+inline constexpr int kHalo = 16;                   // numbers beside a tile that its window reaches, in whole Lanes
+static_assert(kRing >= kSpan && kHalo >= kReach * kChannels && kHalo % kLanes == 0);
+
+// Aims, in numbers and rows; the tiles of one image are about equal. Narrow, so that the rows of a group stay in the
+// first-level cache: wider tiles compute fewer numbers twice, and take longer.
+inline constexpr int kTileWidth = 256;
+inline constexpr int kTileHeight = 128;
+
+// How many of the group's rows the registers have room for at once.
+inline constexpr int kTogether = kRegisterBytes == 64 ? 4 : 1;
+
+// Rows of numbers, the newest kRing of them.
+struct Ring {
+  float* data;
+  int width;
+  float* row(int r) const { return data + std::ptrdiff_t(r & (kRing - 1)) * width; }
+};
+
+struct Tile {
+  int top, bottom, left, right;  // rows and numbers of a row, ends excluded
+
+  // Numbers from the left end to the last whole Lanes.
+  int width() const { return (right - left + kLanes - 1) / kLanes * kLanes; }
+};
+
+inline double total(const Floats& v) {
+  float lanes[kLanes];
+  v.store(lanes);
+  double all = 0;
+  for (float lane : lanes) all += lane;
+  return all;
+}
+
+// What the column sums of a group are made of: the kSpan rows from 5 above the group's first to 5 below its last.
+struct Columns {
+  const float *s[kSpan], *e[kSpan];
+  const float *s_origin, *e_origin;
+};
+
+// Means and variances down the columns for rows [first, first + Rows) of the group.
+template <int Rows>
+void down_columns(const Columns& in, int first, int width, float* const* mean_s, float* const* mean_e,
+                  float* const* var_s, float* const* var_e) {
+  for (int i = 0; i < width; i += kLanes) {
+    Floats s0 = Floats::load(in.s_origin + i), e0 = Floats::load(in.e_origin + i);
+    Floats ms[Rows], me[Rows], vs[Rows], ve[Rows];
+#pragma GCC unroll 4
+    for (int r = 0; r < Rows; ++r) ms[r] = me[r] = vs[r] = ve[r] = Floats(0.0f);
+#pragma GCC unroll 16
+    for (int k = 0; k < Rows + kTaps - 1; ++k) {
+      Floats s = Floats::load(in.s[first + k] + i) - s0, e = Floats::load(in.e[first + k] + i) - e0;
+      Floats ss = s * s, ee = e * e;
+#pragma GCC unroll 4
+      for (int r = 0; r < Rows; ++r) {
+        if (k < r || k - r >= kTaps) continue;
+        Floats w = kWindow[k - r];
+        ms[r] += w * s;
+        me[r] += w * e;
+        vs[r] += w * ss;
+        ve[r] += w * ee;
+      }
+    }
+#pragma GCC unroll 4
+    for (int r = 0; r < Rows; ++r) {
+      (s0 + ms[r]).store(mean_s[first + r] + i);
+      (e0 + me[r]).store(mean_e[first + r] + i);
+      (vs[r] - ms[r] * ms[r]).store(var_s[first + r] + i);
+      (ve[r] - me[r] * me[r]).store(var_e[first + r] + i);
+    }
+  }
+}
+
+// The maps of one row: local means, the gradient's coefficients, and 1 - SSIM.
+struct MapRow {
+  float *mean_s, *mean_e, *a, *b, *c, *dissimilarity;
+};
+
+// From the columns' means and variances to those of whole windows, and what follows from them. `mean_s`, … begin kHalo
+// numbers before the maps do.
+inline void along_row(const float* mean_s, const float* mean_e, const float* var_s, const float* var_e, int width,
+                      const MapRow& out) {
+  for (int i = 0; i < width; i += kLanes) {
+    int at = i + kHalo;
+    Floats s0 = Floats::load(mean_s + at), e0 = Floats::load(mean_e + at), w0 = kWindow[kReach];
+    Floats ms(0.0f), me(0.0f), vs = w0 * Floats::load(var_s + at), ve = w0 * Floats::load(var_e + at);
+#pragma GCC unroll 16
+    for (int k = 0; k < kTaps; ++k) {
+      if (k == kReach) continue;
+      int from = at + (k - kReach) * kChannels;
+      Floats w = kWindow[k];
+      Floats s = Floats::load(mean_s + from) - s0, e = Floats::load(mean_e + from) - e0;
+      ms += w * s;
+      me += w * e;
+      vs += w * (Floats::load(var_s + from) + s * s);
+      ve += w * (Floats::load(var_e + from) + e * e);
+    }
+    vs -= ms * ms;
+    ve -= me * me;
+    ms += s0;
+    me += e0;
+    Floats half = 0.5f, one = 1.0f, two = 2.0f, me2 = me * me;
+    Floats over_B1 = reciprocal((ms * ms + me2) * half + kC1), over_B2 = reciprocal((vs + ve) * half + kC2);
+    Floats u = me2 * over_B1, n = ve * over_B2, scale = (one - u) * over_B2;
+    ms.store(out.mean_s + i);
+    me.store(out.mean_e + i);
+    ((one - n) * (two * me + u * (ms - me)) * over_B1).store(out.a + i);
+    (scale * n).store(out.b + i);
+    (scale * (two - n)).store(out.c + i);
+    (u + n - u * n).store(out.dissimilarity + i);
+  }
+}
+
+// The kSpan rows of maps around a group, and a row of local means to take the sums about.
+struct Maps {
+  const float *mean_s[kSpan], *mean_e[kSpan], *a[kSpan], *b[kSpan], *c[kSpan];
+  const float *s_origin, *e_origin;
+};
+
+// The gradient's sums down the columns: Σ w [a + b (s0 - μs) + c (e0 - μe)], Σ w b and Σ w c.
+template <int Rows>
+void down_maps(const Maps& in, int first, int width, float* const* sum_a, float* const* sum_b, float* const* sum_c) {
+  for (int i = 0; i < width; i += kLanes) {
+    Floats s0 = Floats::load(in.s_origin + i), e0 = Floats::load(in.e_origin + i);
+    Floats A[Rows], B[Rows], C[Rows];
+#pragma GCC unroll 4
+    for (int r = 0; r < Rows; ++r) A[r] = B[r] = C[r] = Floats(0.0f);
+#pragma GCC unroll 16
+    for (int k = 0; k < Rows + kTaps - 1; ++k) {
+      Floats b = Floats::load(in.b[first + k] + i), c = Floats::load(in.c[first + k] + i);
+      Floats a = Floats::load(in.a[first + k] + i) + b * (s0 - Floats::load(in.mean_s[first + k] + i)) +
+                 c * (e0 - Floats::load(in.mean_e[first + k] + i));
+#pragma GCC unroll 4
+      for (int r = 0; r < Rows; ++r) {
+        if (k < r || k - r >= kTaps) continue;
+        Floats w = kWindow[k - r];
+        A[r] += w * a;
+        B[r] += w * b;
+        C[r] += w * c;
+      }
+    }
+#pragma GCC unroll 4
+    for (int r = 0; r < Rows; ++r) {
+      A[r].store(sum_a[first + r] + i);
+      B[r].store(sum_b[first + r] + i);
+      C[r].store(sum_c[first + r] + i);
+    }
+  }
+}
+
+// Sum of n numbers, the rounding that of one Lanes of a row.
+inline double total(const float* values, int n) {
+  Floats sum(0.0f);
+  int i = 0;
+  for (; i + kLanes <= n; i += kLanes) sum += Floats::load(values + i);
+  double all = total(sum);
+  for (; i < n; ++i) all += values[i];
+  return all;
+}
+
+struct GradientRow {
+  float* to;
+  int length;
+  float l1_scale, ssim_scale;
+};
+
+// The gradient of one row, from the sums down the columns about s_origin and e_origin, which with the column sums begin
+// kHalo numbers before the row; returns Σ |e|.
+inline double along_sums(const float* sum_a, const float* sum_b, const float* sum_c, const float* s_origin,
+                         const float* e_origin, const float* s, const float* e, const GradientRow& out) {
+  Floats zero(0.0f), step(out.l1_scale), absolute_sum(0.0f);
+  for (int i = 0; i < out.length; i += kLanes) {
+    Floats s0 = Floats::load(s + i), e0 = Floats::load(e + i), g(0.0f);
+#pragma GCC unroll 16
+    for (int k = 0; k < kTaps; ++k) {
+      int from = i + kHalo + (k - kReach) * kChannels;
+      g += Floats(kWindow[k]) *
+           (Floats::load(sum_a + from) + Floats::load(sum_b + from) * (s0 - Floats::load(s_origin + from)) +
+            Floats::load(sum_c + from) * (e0 - Floats::load(e_origin + from)));
+    }
+    g = where(e0 < zero, step) - where(e0 > zero, step) + Floats(out.ssim_scale) * g;
+    absolute_sum += absolute(e0);
+    if (i + kLanes <= out.length) {
+      g.store(out.to + i);
+    } else {
+      float lanes[kLanes];
+      g.store(lanes);
+      std::memcpy(out.to + i, lanes, sizeof(float) * std::size_t(out.length - i));
+    }
+  }
+  return total(absolute_sum);
+}
+
+// Buffers of one thread, kept between calls: fresh memory would cost a page fault every 4 KB.
+inline float* scratch(std::size_t n) {
+  static thread_local std::vector<float> memory;
+  if (memory.size() < n) memory.resize(n);
+  return memory.data();
+}
+
+// One tile's share of the means, summed; its part of the gradient is written.
+inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, PhotometricWeights weights) {
+  const int width = t.width(), map_width = width + 2 * kHalo, in_width = map_width + 2 * kHalo;
+  const int in_left = t.left - 2 * kHalo, map_left = t.left - kHalo;
+  const float share = 1.0f / (float(im.height) * float(im.row));
+  const float l1_scale = weights.l1 * share, ssim_scale = -weights.dssim * share;
+
+  float* free = scratch(std::size_t(in_width) * (2 * kRing + 4 * kGroup) +
+                        std::size_t(map_width) * (5 * kRing + 1 + 3 * kGroup));
+  auto take = [&free](std::ptrdiff_t n) {
+    float* p = free;
+    free += n;
+    return p;
+  };
+  auto ring = [&take](int w) { return Ring{take(std::ptrdiff_t(w) * kRing), w}; };
+  Ring s = ring(in_width), e = ring(in_width);
+  Ring mean_s = ring(map_width), mean_e = ring(map_width), a = ring(map_width), b = ring(map_width), c = ring(map_width);
+  float *column[4][kGroup], *sum[3][kGroup], *dissimilarity = take(map_width);
+  for (auto& quantity : column)
+    for (float*& row : quantity) row = take(in_width);
+  for (auto& quantity : sum)
+    for (float*& row : quantity) row = take(map_width);
+
+  // Rows of s and e with the image's zero padding.
+  auto read = [&](int r) {
+    float *to_s = s.row(r), *to_e = e.row(r);
+    std::fill_n(to_s, in_width, 0.0f);
+    std::fill_n(to_e, in_width, 0.0f);
+    if (r < 0 || r >= im.height) return;
+    int begin = std::max(0, in_left), end = std::min(im.row, in_left + in_width);
+    const float *x = im.x + std::ptrdiff_t(r) * im.row, *y = im.y + std::ptrdiff_t(r) * im.row;
+    for (int i = begin; i < end; ++i) {
+      to_s[i - in_left] = x[i] + y[i];
+      to_e[i - in_left] = y[i] - x[i];
+    }
+  };
+
+  PhotometricMeans sums{0, 0};
+  // Maps of rows [q, q + 4); outside the image there is no SSIM, and nothing to pass on.
+  auto forward = [&](int q) {
+    Columns in;
+    for (int k = 0; k < kSpan; ++k) in.s[k] = s.row(q - kReach + k), in.e[k] = e.row(q - kReach + k);
+    int origin = std::clamp(q + kGroup / 2, 0, im.height - 1);
+    in.s_origin = s.row(origin), in.e_origin = e.row(origin);
+    for (int r = 0; r < kGroup; r += kTogether)
+      down_columns<kTogether>(in, r, in_width, column[0], column[1], column[2], column[3]);
+    for (int r = 0; r < kGroup; ++r) {
+      int y = q + r;
+      MapRow out{mean_s.row(y), mean_e.row(y), a.row(y), b.row(y), c.row(y), dissimilarity};
+      int begin = std::max(0, -map_left), end = std::min(map_width, im.row - map_left);
+      if (y < 0 || y >= im.height) begin = end = 0;
+      else along_row(column[0][r], column[1][r], column[2][r], column[3][r], map_width, out);
+      for (float* row : {out.mean_s, out.mean_e, out.a, out.b, out.c}) {
+        std::fill(row, row + begin, 0.0f);
+        std::fill(row + end, row + map_width, 0.0f);
+      }
+      if (y >= t.top && y < t.bottom) sums.dssim += total(dissimilarity + kHalo, t.right - t.left);
+    }
+  };
+  // Gradient of rows [p, p + 4).
+  auto backward = [&](int p) {
+    Maps in;
+    for (int k = 0; k < kSpan; ++k) {
+      int r = p - kReach + k;
+      in.mean_s[k] = mean_s.row(r), in.mean_e[k] = mean_e.row(r);
+      in.a[k] = a.row(r), in.b[k] = b.row(r), in.c[k] = c.row(r);
+    }
+    int origin = std::min(p + kGroup / 2, im.height - 1);
+    in.s_origin = mean_s.row(origin), in.e_origin = mean_e.row(origin);
+    for (int r = 0; r < kGroup; r += kTogether) down_maps<kTogether>(in, r, map_width, sum[0], sum[1], sum[2]);
+    for (int r = 0; r < kGroup && p + r < t.bottom; ++r) {
+      GradientRow out{im.gradient + std::ptrdiff_t(p + r) * im.row + t.left, t.right - t.left, l1_scale, ssim_scale};
+      sums.l1 += along_sums(sum[0][r], sum[1][r], sum[2][r], in.s_origin, in.e_origin, s.row(p + r) + 2 * kHalo,
+                            e.row(p + r) + 2 * kHalo, out);
+    }
+  };
+
+  // The maps of a group are followed by the gradient of the group five rows above: that one now has all its neighbours.
+  int q = t.top - kReach - 2;  // whole groups: -7 = -12 + 5
+  for (int r = q - kReach; r < q + kReach; ++r) read(r);
+  for (; q - kReach < t.bottom; q += kGroup) {
+    for (int r = 0; r < kGroup; ++r) read(q + kReach + r);
+    forward(q);
+    if (q - kReach >= t.top) backward(q - kReach);
+  }
+  return sums;
+}
+
+}  // namespace ssim
+
+// L1 alone, without a look at neighbours.
+inline double l1_with_gradient(const ImagePair& im, float weight, int threads) {
+  using ssim::Floats;
+  constexpr std::int64_t chunk = 1 << 14;
+  std::int64_t n = std::int64_t(im.height) * im.row, chunks = (n + chunk - 1) / chunk;
+  std::vector<double> sums(chunks);
+  float scale = weight / float(n);
+  Pool::instance().run(threads, chunks, [&](std::int64_t index) {
+    std::int64_t begin = index * chunk, end = std::min(n, begin + chunk), i = begin;
+    Floats zero(0.0f), sum(0.0f), step(scale);
+    for (; i + kLanes <= end; i += kLanes) {
+      Floats d = Floats::load(im.x + i) - Floats::load(im.y + i);
+      sum += absolute(d);
+      (where(d > zero, step) - where(d < zero, step)).store(im.gradient + i);
+    }
+    double all = ssim::total(sum);
+    for (; i < end; ++i) {
+      float d = im.x[i] - im.y[i];
+      all += std::fabs(d);
+      im.gradient[i] = d > 0 ? scale : d < 0 ? -scale : 0.0f;
+    }
+    sums[index] = all;
+  });
+  double all = 0;
+  for (double v : sums) all += v;
+  return all / double(n);
+}
+
+// Writes the gradient of l1 · mean |x - y| + dssim · (1 - SSIM) with respect to x; returns both means. Without weight on
+// SSIM none is computed, and its mean is 0.
+inline PhotometricMeans photometric(const ImagePair& im, PhotometricWeights weights, int threads) {
+  if (weights.dssim == 0) return {l1_with_gradient(im, weights.l1, threads), 0};
+  auto parts = [](int size, int aim, int whole) {  // equal parts of about `aim`, in multiples of `whole`
+    int count = (size + aim - 1) / aim, part = (size + count - 1) / count;
+    return (part + whole - 1) / whole * whole;
+  };
+  int width = parts(im.row, ssim::kTileWidth, kLanes), height = parts(im.height, ssim::kTileHeight, ssim::kGroup);
+  int across = (im.row + width - 1) / width, down = (im.height + height - 1) / height;
+  std::vector<PhotometricMeans> sums(std::size_t(across) * down);
+  Pool::instance().run(threads, std::int64_t(sums.size()), [&](std::int64_t i) {
+    int top = int(i) / across * height, left = int(i) % across * width;
+    ssim::Tile tile{top, std::min(top + height, im.height), left, std::min(left + width, im.row)};
+    sums[i] = ssim::run_tile(im, tile, weights);
+  });
+  PhotometricMeans means{0, 0};
+  for (const PhotometricMeans& part : sums) means.l1 += part.l1, means.dssim += part.dssim;
+  double n = double(im.height) * im.row;
+  return {means.l1 / n, means.dssim / n};
+}
+
+}  // namespace clear
