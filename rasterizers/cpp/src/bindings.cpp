@@ -68,11 +68,11 @@ void bind_frame(nb::module_& m, const char* name) {
             const T through_min = std::max(T(transmittance_min), T(sizeof(T) == 4 ? 1e-30 : 1e-250));
             Settings<T> s{T(kernel), T(near), T(alpha_min), T(alpha_max), through_min,
                           {T(background[0]), T(background[1]), T(background[2])}, antialiased};
-            Pose<T> pose;
+            Pose pose;
             for (int i = 0; i < 3; ++i) {
-              for (int k = 0; k < 3; ++k) pose.R[3 * i + k] = T(world_to_camera[4 * i + k]);
-              pose.t[i] = T(world_to_camera[4 * i + 3]);
-              pose.center[i] = T(center[i]);
+              for (int k = 0; k < 3; ++k) pose.R[3 * i + k] = world_to_camera[4 * i + k];
+              pose.t[i] = world_to_camera[4 * i + 3];
+              pose.center[i] = center[i];
             }
             new (self) F(s, pose, budget);
           },

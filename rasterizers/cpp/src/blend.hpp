@@ -12,11 +12,12 @@
 
 namespace clear {
 
-// A block's sixteen pixels: row by row from its corner.
+// A block's sixteen pixels, row by row from its corner; from the bin's corner, as the Gaussians of a segment.
 template <class T>
 struct PixelCentres {
   Lanes<T> x, y;
-  CLEAR_INLINE PixelCentres(int X, int Y) {
+  explicit CLEAR_INLINE PixelCentres(int block) {
+    const int X = block % kBlocksAcross * kBlock, Y = block / kBlocksAcross * kBlock;
     T px[kLanes], py[kLanes];
     for (int i = 0; i < kLanes; ++i) px[i] = T(X + i % kBlock) + T(0.5), py[i] = T(Y + i / kBlock) + T(0.5);
     x = Lanes<T>::load(px), y = Lanes<T>::load(py);
@@ -77,10 +78,9 @@ CLEAR_INLINE Lanes<T> exponent(const Ellipse<T>& e, const Lanes<T>& dx, const La
 
 // One segment's part of a block; after the first, `colour` and `end` go on from where the segment before left them.
 template <class T>
-void blend_block(const Segment<T>& segment, int block, int X, int Y, const Settings<T>& s, BlockColour<T>& colour,
-                 BlockEnd<T>& end) {
+void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, BlockColour<T>& colour, BlockEnd<T>& end) {
   using L = Lanes<T>;
-  const PixelCentres<T> pixel(X, Y);
+  const PixelCentres<T> pixel(block);
   const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, transmittance_min = s.transmittance_min;
   L through = T(1), r = T(0), g = T(0), b = T(0);
   Mask<T> alive = Mask<T>::from_bits(0xffff);
@@ -193,12 +193,13 @@ struct BlockBack {
 //   ∂I·v/∂α_i = T_i (c_i·v) - behind / (1 - α_i)
 // Where the cap binds the picture does not depend on the ellipse.
 template <class T, int K>
-void blend_block_vjp(const Segment<T>& segment, int block, int X, int Y, const Settings<T>& s, const BlockEnd<T>& end,
+void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s, const BlockEnd<T>& end,
                      const T (&cotangent)[K][3][kLanes], BlockBack<T, K>& back, Pulled<T>* sums) {
   using L = Lanes<T>;
-  const PixelCentres<T> pixel(X, Y);
+  const PixelCentres<T> pixel(block);
   const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, one = T(1);
-  const T centre_x = T(X) + T(kBlock) / 2, centre_y = T(Y) + T(kBlock) / 2;
+  const T centre_x = T(block % kBlocksAcross * kBlock) + T(kBlock) / 2;
+  const T centre_y = T(block / kBlocksAcross * kBlock) + T(kBlock) / 2;
   const std::uint16_t* list = segment.list(block);
 
   // Ends, counted from this segment's first pair: exact in T.

@@ -9,7 +9,7 @@ namespace clear {
 inline constexpr int kSegment = 2048;
 inline constexpr int kListStride = kSegment + 32;  // lists 4 KiB apart would all compete for the same lines of the cache
 
-// A segment of a bin: its Gaussians, copied side by side, and for each block the places of those that reach it, in order.
+// A segment of a bin: its Gaussians, copied side by side with their centres from the bin's corner, and for each block the places of those that reach it, in order.
 template <class T>
 struct Segment {
   Buffer<Ellipse<T>> ellipses;
@@ -25,12 +25,12 @@ struct Segment {
   const std::uint16_t* list(int block) const { return places.data() + std::size_t(block) * kListStride; }
 };
 
-// Sixteen Gaussians against all blocks of the bin whose corner is (X, Y). Row of blocks by row of blocks: where is the
+// Sixteen Gaussians, their centres (u, v) from the bin's corner, against all blocks of the bin. Row of blocks by row of blocks: where is the
 // ellipse within this slab widest to the left, and to the right? Exact up to a thousandth of a pixel, always generous.
 template <class T>
-CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], T X, T Y, std::uint64_t* masks) {
+CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], const Lanes<T>& u, const Lanes<T>& v, std::uint64_t* masks) {
   using L = Lanes<T>;
-  const L u = e[0] - L(X), v = e[1] - L(Y), A = e[2], B = e[3], C = e[4], reach = e[6], half_x = e[7], half_y = e[8];
+  const L A = e[kA], B = e[kB], C = e[kC], reach = e[kReach], half_x = e[kHalfX], half_y = e[kHalfY];
   const L one = T(1), zero = T(0), slack = T(1e-3), eight = T(kBlocksAcross);
   const L inverse = one / maximum(half_y, L(T(1e-20)));
   const L shear = -B / (L(T(2)) * A);                  // where x is extreme along a line of constant y, per dy
@@ -89,12 +89,16 @@ void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_
       const int at = start + std::min(i, count - 1);
       if (at + ahead < n) __builtin_prefetch(&ellipses[pairs[at + ahead]]);
       rows[i] = Lanes<T>::load(&ellipses[pairs[at]].u);
-      if (i < count) rows[i].store(&out.ellipses[at].u);
+      if (i < count) {
+        Ellipse<T>& mine = out.ellipses[at];
+        rows[i].store(&mine.u);
+        mine.u += mine.whole_u - X, mine.v += mine.whole_v - Y;  // from here on, from the bin's corner
+      }
     }
     if (!bins.has_masks) {
       std::uint64_t fresh[kLanes];
       transpose(rows);
-      block_masks(rows, X, Y, fresh);
+      block_masks(rows, rows[kU] + (rows[kWholeU] - Lanes<T>(X)), rows[kV] + (rows[kWholeV] - Lanes<T>(Y)), fresh);
       for (int i = 0; i < count; ++i) masks[start + i] = fresh[i] & wanted;
     }
     for (int i = 0; i < count; ++i)

@@ -42,8 +42,8 @@ CLEAR_INLINE void each_band(int bands, const Vec3<T>& direction, Band&& band) {
 }
 
 template <class T>
-CLEAR_INLINE void direction_of(const Pose<T>& pose, const Vec3<T>& mean, Vec3<T>& direction, Lanes<T>& inverse_length) {
-  for (int k = 0; k < 3; ++k) direction[k] = mean[k] - Lanes<T>(pose.center[k]);
+CLEAR_INLINE void direction_of(const Pose& pose, const Vec3<T>& mean, Vec3<T>& direction, Lanes<T>& inverse_length) {
+  for (int k = 0; k < 3; ++k) direction[k] = mean[k] - Lanes<T>(T(pose.center[k]));
   inverse_length = Lanes<T>(T(1)) / root(dot<T>(direction, direction));
   for (int k = 0; k < 3; ++k) direction[k] *= inverse_length;
 }
@@ -56,7 +56,7 @@ struct Colour {
 
 // coefficients[3k + c]: band k of channel c, as lanes.
 template <class T>
-CLEAR_INLINE void colour_of(const Pose<T>& pose, const Vec3<T>& mean, int bands, const Lanes<T>* coefficients,
+CLEAR_INLINE void colour_of(const Pose& pose, const Vec3<T>& mean, int bands, const Lanes<T>* coefficients,
                             Colour<T>& out) {
   using L = Lanes<T>;
   Vec3<T> direction;

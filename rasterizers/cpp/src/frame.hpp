@@ -27,7 +27,7 @@ struct Demand {
 template <class T>
 class Frame {
  public:
-  Frame(const Settings<T>& settings, const Pose<T>& pose, std::int64_t budget)
+  Frame(const Settings<T>& settings, const Pose& pose, std::int64_t budget)
       : settings_(settings), pose_(pose), budget_(budget) {}
 
   // False if a number that was needed is not finite.
@@ -43,7 +43,7 @@ class Frame {
             if (t.visible[i]) return true;
           return false;
         },
-        [&](std::int64_t i) { return depths_[i]; }, order_, threads);
+        depths_, order_, threads);
     for (Target<T>& target : targets) {
       View view;
       view.target = std::move(target);
@@ -207,8 +207,7 @@ class Frame {
         for (std::uint64_t m = open; m; m &= m - 1) {
           const int b = __builtin_ctzll(m);
           if (!part.lengths[b]) continue;
-          blend_block(part, b, bin_x * kBin + b % kBlocksAcross * kBlock, bin_y * kBin + b / kBlocksAcross * kBlock,
-                      settings_, colours[b], ends[b]);
+          blend_block(part, b, settings_, colours[b], ends[b]);
           if (first + kSegment < n && ends[b].finished()) open &= ~(std::uint64_t(1) << b);
         }
       }
@@ -315,9 +314,7 @@ class Frame {
           for (std::uint64_t m = wanted; m; m &= m - 1) {
             const int b = __builtin_ctzll(m);
             if (part.lengths[b])
-              blend_block_vjp<T, K>(part, b, bin_x * kBin + b % kBlocksAcross * kBlock,
-                                    bin_y * kBin + b / kBlocksAcross * kBlock, settings_, ends[b], mine.cotangent[b], mine.back[b],
-                                    sums);
+              blend_block_vjp<T, K>(part, b, settings_, ends[b], mine.cotangent[b], mine.back[b], sums);
           }
         }
       }
@@ -355,10 +352,10 @@ class Frame {
   }
 
   Settings<T> settings_;
-  Pose<T> pose_;
+  Pose pose_;
   std::int64_t budget_, n_ = 0;
   Palette<T> palette_;
-  Buffer<T> depths_;
+  Buffer<double> depths_;
   Buffer<std::uint32_t> order_;
   std::vector<View> views_;
   Buffer<Pulled<T>> sent_, sums_;  // by pair; by Gaussian, when there are several bands

@@ -8,7 +8,7 @@
 
 namespace clear {
 
-// A depth and whose it is. Positive floats order like their bits; ties keep the order of the indices (stable sorts).
+// A depth and whose it is. Positive numbers order like their bits; ties keep the order of the indices (stable sorts).
 struct DepthKey {
   std::uint32_t depth, index;
 };
@@ -48,36 +48,50 @@ inline void sort_by_depth(Buffer<DepthKey>& keys, Buffer<DepthKey>& spare, int t
   }
 }
 
-// Indices of the Gaussians for which `shows(i)`, by depth(i), then index.
-template <class T, class Shows, class Depth>
-void order_by_depth(std::int64_t n, Shows&& shows, Depth&& depth, Buffer<std::uint32_t>& order, int threads) {
+// Indices of the Gaussians for which `shows(i)`, by depth, then index.
+template <class T, class Shows>
+void order_by_depth(std::int64_t n, Shows&& shows, const Buffer<double>& depths, Buffer<std::uint32_t>& order, int threads) {
   const std::int64_t chunk = 8192, chunks = (n + chunk - 1) / chunk;
-  std::vector<std::int64_t> starts(chunks + 1, 0);
+  struct Extent {
+    std::int64_t count = 0;
+    std::uint64_t low = UINT64_MAX, high = 0;
+  };
+  std::vector<Extent> extents(chunks);
   auto each = [&](std::int64_t c, auto&& visit) {
     for (std::int64_t i = c * chunk; i < std::min(n, (c + 1) * chunk); ++i)
-      if (shows(i)) visit(i);
+      if (shows(i)) visit(i, std::bit_cast<std::uint64_t>(depths[i]));
   };
   Pool::instance().run(threads, chunks, [&](std::int64_t c) {
-    std::int64_t count = 0;
-    each(c, [&](std::int64_t) { ++count; });
-    starts[c + 1] = count;
+    Extent e;
+    each(c, [&](std::int64_t, std::uint64_t depth) {
+      ++e.count, e.low = std::min(e.low, depth), e.high = std::max(e.high, depth);
+    });
+    extents[c] = e;
   });
-  for (std::int64_t c = 0; c < chunks; ++c) starts[c + 1] += starts[c];
-  const std::int64_t m = starts[chunks];
-  order.reserve_lost(m);
+  Extent all;
+  std::vector<std::int64_t> starts(chunks);
+  for (std::int64_t c = 0; c < chunks; ++c) {
+    starts[c] = all.count;
+    all = {all.count + extents[c].count, std::min(all.low, extents[c].low), std::max(all.high, extents[c].high)};
+  }
+  order.reserve_lost(all.count);
   if constexpr (sizeof(T) == 4) {
+    // The 32 bits below the highest in which two depths differ: some 30 binary digits where a float has 24.
+    const int shift = all.count ? std::max(0, int(std::bit_width(all.high - all.low)) - 32) : 0;
     Buffer<DepthKey> keys, spare;
-    keys.reserve_lost(m);
+    keys.reserve_lost(all.count);
     Pool::instance().run(threads, chunks, [&](std::int64_t c) {
       std::int64_t at = starts[c];
-      each(c, [&](std::int64_t i) { keys[at++] = {std::bit_cast<std::uint32_t>(depth(i)), std::uint32_t(i)}; });
+      each(c, [&](std::int64_t i, std::uint64_t depth) {
+        keys[at++] = {std::uint32_t((depth - all.low) >> shift), std::uint32_t(i)};
+      });
     });
     sort_by_depth(keys, spare, threads);
-    for (std::int64_t i = 0; i < m; ++i) order[i] = keys[i].index;
+    for (std::int64_t i = 0; i < all.count; ++i) order[i] = keys[i].index;
   } else {
     std::int64_t at = 0;
-    for (std::int64_t c = 0; c < chunks; ++c) each(c, [&](std::int64_t i) { order[at++] = std::uint32_t(i); });
-    std::stable_sort(order.data(), order.data() + m, [&](auto a, auto b) { return depth(a) < depth(b); });
+    for (std::int64_t c = 0; c < chunks; ++c) each(c, [&](std::int64_t i, std::uint64_t) { order[at++] = std::uint32_t(i); });
+    std::stable_sort(order.data(), order.data() + all.count, [&](auto a, auto b) { return depths[a] < depths[b]; });
   }
 }
 

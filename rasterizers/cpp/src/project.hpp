@@ -43,8 +43,9 @@ CLEAR_INLINE void bins_of(const Screen<T>& screen, const Lanes<T> (&e)[kLanes], 
   };
   const L half = T(0.5);
   T x0[kLanes], x1[kLanes], y0[kLanes], y1[kLanes];
-  bin(e[0] - e[7] - half, screen.width, x0), bin(e[0] + e[7] - half, screen.width, x1);
-  bin(e[1] - e[8] - half, screen.height, y0), bin(e[1] + e[8] - half, screen.height, y1);
+  const L u = e[kWholeU] + e[kU] - half, v = e[kWholeV] + e[kV] - half;
+  bin(u - e[kHalfX], screen.width, x0), bin(u + e[kHalfX], screen.width, x1);
+  bin(v - e[kHalfY], screen.height, y0), bin(v + e[kHalfY], screen.height, y1);
   for (int i = 0; i < count; ++i)
     out[i] = (shown >> i) & 1 ? BinRange{std::int16_t(x0[i]), std::int16_t(x1[i]), std::int16_t(y0[i]), std::int16_t(y1[i])}
                               : BinRange{};
@@ -67,23 +68,28 @@ CLEAR_INLINE Mask<T> reaches_image(const Screen<T>& s, const Lanes<T>& u, const 
 
 // Lanes of one group on one screen; returns which of them show. Conditions to keep, not to cull: NaN fails each.
 template <class T>
-CLEAR_INLINE Mask<T> ellipse_of(const Geometry<T>& g, const Screen<T>& screen, const Settings<T>& s,
-                                const Lanes<T>& opacity, Lanes<T> (&e)[kLanes]) {
+CLEAR_INLINE Mask<T> ellipse_of(const Centre& centre, const Geometry<T>& g, const Screen<T>& screen,
+                                const Settings<T>& s, const Lanes<T>& opacity, Lanes<T> (&e)[kLanes]) {
   using L = Lanes<T>;
   Footprint<T> f(g, screen, s);
   constexpr T log2e = kLog2E<T>;
-  L u = L(screen.fx) * g.tan_x + L(screen.cx), v = L(screen.fy) * g.tan_y + L(screen.cy);
+  using D = Lanes<double>;
+  const D exact_u = D(screen.fx) * centre.tan_x + D(screen.cx), exact_v = D(screen.fy) * centre.tan_y + D(screen.cy);
+  const D whole_u = nearest(exact_u), whole_v = nearest(exact_v);
+  const L u = convert<T>(exact_u), v = convert<T>(exact_v);
   L A = L(log2e / 2) * f.xx, B = L(log2e) * f.xy, C = L(log2e / 2) * f.yy;
   L peak = log2(maximum(opacity * f.compensation, L(T(1e-30))));
-  L reach = (peak - L(std::log2(s.alpha_min))) * L(T(1.001)) + L(T(1.5e-3));
+  L reach = (peak - L(std::log2(s.alpha_min))) * L(T(1.001)) + L(T(1e-3) * log2e);
   L extent = root(maximum(reach, L(T(0))) * L(2 / log2e)) * f.size;
   L half_x = extent * root(f.a + f.kernel), half_y = extent * root(f.c + f.kernel);
   constexpr T huge = T(1e30);  // an ellipse of 1e-15 px covers no pixel centre, and its square would overflow
   Mask<T> shows = (g.z > L(s.near)) & (opacity >= L(s.alpha_min)) & (reach > L(T(0))) & (A < L(huge)) & (C < L(huge)) &
                   (absolute(u) < L(huge)) & (absolute(v) < L(huge)) & (half_x >= L(T(0))) & (half_y >= L(T(0))) &
                   reaches_image(screen, u, v, A, B, C, reach);
-  L fields[kLanes] = {u, v, A, B, C, peak, select(shows, reach, L(T(-1))), half_x, half_y};
-  for (int i = 0; i < 9; ++i) e[i] = fields[i];
+  e[kU] = convert<T>(exact_u - whole_u), e[kV] = convert<T>(exact_v - whole_v);
+  e[kWholeU] = convert<T>(whole_u), e[kWholeV] = convert<T>(whole_v);
+  e[kA] = A, e[kB] = B, e[kC] = C, e[kPeak] = peak, e[kReach] = select(shows, reach, L(T(-1)));
+  e[kHalfX] = half_x, e[kHalfY] = half_y;
   return shows;
 }
 
@@ -95,8 +101,8 @@ CLEAR_INLINE void note(const Lanes<T>* columns, int count, Lanes<T>& poison) {
 
 // Returns whether every number that was read is finite.
 template <class T>
-bool project_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
-                   Palette<T>& palette, Buffer<T>& depths, std::int64_t group) {
+bool project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
+                   Palette<T>& palette, Buffer<double>& depths, std::int64_t group) {
   using L = Lanes<T>;
   const std::int64_t first = group * kLanes;
   const int count = int(std::min<std::int64_t>(kLanes, splats.n - first));
@@ -107,9 +113,10 @@ bool project_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& s
   load_rows<3>(splats.scales, first, count, scale);
   L poison = T(0);
   note(mean, 3, poison), note(quat, 4, poison), note(scale, 3, poison);
-  Geometry<T> g(pose, targets[0].screen, mean, quat, scale);
+  const Centre centre(pose, mean);
+  const Geometry<T> g(pose, targets[0].screen, centre, quat, scale);
 
-  g.z.store(depths.data() + first);
+  centre.z.store(depths.data() + first);
   Mask<T> in_front = g.z > L(s.near);
   L ellipse[4][kLanes];
   std::uint32_t shown[4], any = 0;
@@ -119,11 +126,13 @@ bool project_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& s
     note(&opacity, 1, poison);
     // Screens of one pose are nearly always scaled copies of each other, and share the geometry too.
     Mask<T> shows = same_view(target.screen, targets[0].screen)
-                        ? ellipse_of(g, target.screen, s, opacity, ellipse[i])
-                        : ellipse_of(Geometry<T>(pose, target.screen, mean, quat, scale), target.screen, s, opacity, ellipse[i]);
+                        ? ellipse_of(centre, g, target.screen, s, opacity, ellipse[i])
+                        : ellipse_of(centre, Geometry<T>(pose, target.screen, centre, quat, scale), target.screen, s,
+                                     opacity, ellipse[i]);
     any |= shown[i] = shows.bits() & real;
-    L centre[2] = {where(in_front, ellipse[i][0]), where(in_front, ellipse[i][1])};
-    store_rows<2>(target.means2d, first, count, centre);
+    const L uv[2] = {where(in_front, ellipse[i][kWholeU] + ellipse[i][kU]),
+                     where(in_front, ellipse[i][kWholeV] + ellipse[i][kV])};
+    store_rows<2>(target.means2d, first, count, uv);
     store_bits(target.visible + first, count, shown[i]);
     bins_of(target.screen, ellipse[i], shown[i], count, target.ranges.data() + first);
   }
@@ -153,10 +162,10 @@ bool project_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& s
     note(offset, 3, poison);
     for (int c = 0; c < 3; ++c) {
       L rgb = any ? colour.rgb[c] + offset[c] : L(T(0));
-      e[9 + c] = maximum(rgb, L(T(0)));
+      e[kRed + c] = maximum(rgb, L(T(0)));
       targets[i].lit[3 * group + c] = std::uint16_t((rgb >= L(T(0))).bits());
     }
-    for (int c = 12; c < kLanes; ++c) e[c] = T(0);
+    e[14] = e[15] = T(0);
     transpose(e);
     T* rows = reinterpret_cast<T*>(targets[i].ellipses.data() + first);
     for (int k = 0; k < kLanes; ++k) e[k].store(rows + k * kLanes);
@@ -166,8 +175,8 @@ bool project_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& s
 
 // Room for whole groups; the rows beyond n repeat the last Gaussian and are never listed.
 template <class T>
-bool project(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
-             Palette<T>& palette, Buffer<T>& depths, int threads) {
+bool project(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
+             Palette<T>& palette, Buffer<double>& depths, int threads) {
   const std::int64_t groups = groups_of(splats.n), per_task = 64;
   palette.reserve(groups, splats.bands > 0);
   depths.reserve_lost(groups * kLanes);

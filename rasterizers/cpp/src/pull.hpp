@@ -27,7 +27,7 @@ CLEAR_INLINE void add_sent(const Bins& bins, std::int64_t first, int count, std:
 }
 
 template <class T, int K>
-void pull_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& splats, const Target<T>& target,
+void pull_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, const Target<T>& target,
                 const Palette<T>& palette, std::int64_t group, Lanes<T> (&rows)[K][kLanes], std::uint32_t touched,
                 const Gradients<T>& out) {
   using L = Lanes<T>;
@@ -47,7 +47,7 @@ void pull_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& spla
   load_rows<4>(splats.quats, first, count, quat);
   load_rows<3>(splats.scales, first, count, scale);
   const L opacity = load_row(target.opacities, first, count);
-  const Geometry<T> g(pose, target.screen, mean, quat, scale);
+  const Geometry<T> g(pose, target.screen, Centre(pose, mean), quat, scale);
   const Footprint<T> f(g, target.screen, s);
   for (int k = 0; k < K; ++k) {
     L(&sum)[kLanes] = rows[k];

@@ -290,6 +290,20 @@ CLEAR_INLINE Lanes<T> select(const Mask<T>& m, const Lanes<T>& a, const Lanes<T>
 }
 #undef CLEAR_EACH
 
+// The same sixteen numbers in another precision.
+template <class To, class From>
+CLEAR_INLINE Lanes<To> convert(const Lanes<From>& a) {
+  if constexpr (sizeof(To) == sizeof(From)) {
+    return a;
+  } else {
+    From from[kLanes];
+    To to[kLanes];
+    a.store(from);
+    for (int i = 0; i < kLanes; ++i) to[i] = To(from[i]);
+    return Lanes<To>::load(to);
+  }
+}
+
 template <class T>
 CLEAR_INLINE Lanes<T> absolute(const Lanes<T>& a) {
   return maximum(a, -a);

@@ -25,9 +25,9 @@ struct Settings {
   bool antialiased;
 };
 
-template <class T>
+// In double: where a Gaussian's centre falls is computed in double whatever T, see `Centre`.
 struct Pose {
-  T R[9], t[3], center[3];
+  double R[9], t[3], center[3];
 };
 
 // One pixel grid of a pose, and how far off-axis the Jacobian follows (as tangents).
@@ -62,15 +62,19 @@ struct Splats {
 // A Gaussian on a screen: alpha = 2^(peak - A dx² - B dx dy - C dy²). Sixteen numbers: one cache line, one register.
 template <class T>
 struct alignas(kLanes * sizeof(T)) Ellipse {
-  T u, v;            // centre, px
+  T u, v;            // centre, px, less …
   T A, B, C;         // conic times log2(e)/2, log2(e), log2(e)/2
   T peak;            // log2 of the opacity after the Mip compensation
   T reach;           // alpha >= alpha_min within A dx² + B dx dy + C dy² <= reach (a little generous); <= 0: not drawn
   T half_x, half_y;  // half the box around that region, px
   T r, g, b;         // colour, clamped at 0
-  T padding[4];
+  T whole_u, whole_v;  // … its nearest whole pixel: at 1,000 px a float alone resolves 6e-5
+  T padding[2];
 };
 static_assert(sizeof(Ellipse<float>) == 64);
+
+// The places of an Ellipse's fields among its sixteen numbers.
+enum Field { kU, kV, kA, kB, kC, kPeak, kReach, kHalfX, kHalfY, kRed, kGreen, kBlue, kWholeU, kWholeV };
 
 // What the blocks send back to a Gaussian: q = ∂L/∂(log alpha) summed over pixels, q's moments about the centre, and ∂L/∂rgb.
 template <class T>
