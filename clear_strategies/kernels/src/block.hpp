@@ -1,0 +1,90 @@
+// Sixteen Gaussians at a time: from rows in memory to lanes and back.
+#pragma once
+
+#include <cstdint>
+
+#include "simd.hpp"
+
+namespace clear {
+
+using Floats = Lanes<float>;
+using Doubles = Lanes<double>;
+
+// columns[d] lane i = rows[i · stride + d] for the first `count` rows; lanes beyond are 0.
+template <int D>
+CLEAR_INLINE void load_columns(const float* rows, int count, Floats (&columns)[D], int stride = D) {
+  float a[D][kLanes] = {};
+  if (count == kLanes && stride == D) {
+    for (int i = 0; i < kLanes; ++i)
+      for (int d = 0; d < D; ++d) a[d][i] = rows[i * D + d];
+  } else {
+    for (int i = 0; i < count; ++i)
+      for (int d = 0; d < D; ++d) a[d][i] = rows[std::int64_t(i) * stride + d];
+  }
+  for (int d = 0; d < D; ++d) columns[d] = Floats::load(a[d]);
+}
+
+template <int D>
+CLEAR_INLINE void store_columns(float* rows, const Floats (&columns)[D]) {
+  float a[D][kLanes];
+  for (int d = 0; d < D; ++d) columns[d].store(a[d]);
+  for (int i = 0; i < kLanes; ++i)
+    for (int d = 0; d < D; ++d) rows[i * D + d] = a[d][i];
+}
+
+CLEAR_INLINE Floats load_some(const float* values, int count) {
+  if (count == kLanes) return Floats::load(values);
+  float a[kLanes] = {};
+  for (int i = 0; i < count; ++i) a[i] = values[i];
+  return Floats::load(a);
+}
+
+CLEAR_INLINE Doubles widen(const Floats& a) {
+  typedef float Sixteen __attribute__((vector_size(4 * kLanes)));
+  typedef double Wide __attribute__((vector_size(8 * kLanes)));
+  Sixteen f;
+  std::memcpy(&f, a.r, sizeof f);
+  Wide d = __builtin_convertvector(f, Wide);
+  Doubles out;
+  std::memcpy(out.r, &d, sizeof d);
+  return out;
+}
+
+CLEAR_INLINE double sum(const Doubles& a) {
+  double values[kLanes], total = 0;
+  a.store(values);
+  for (double value : values) total += value;
+  return total;
+}
+
+// a · b + c, rounded once where the processor can: torch's add_(alpha) and addcmul_ do the same.
+CLEAR_INLINE Floats multiply_add(const Floats& a, const Floats& b, const Floats& c) {
+#if defined(__AVX512F__)
+  Floats out;
+  out.r[0] = (Floats::Register)_mm512_fmadd_ps((__m512)a.r[0], (__m512)b.r[0], (__m512)c.r[0]);
+  return out;
+#elif defined(__FMA__)
+  Floats out;
+  for (int i = 0; i < Floats::registers; ++i)
+    out.r[i] = (Floats::Register)_mm256_fmadd_ps((__m256)a.r[i], (__m256)b.r[i], (__m256)c.r[i]);
+  return out;
+#else
+  return a * b + c;
+#endif
+}
+
+// Lane i = table[indices[i]], indices in 0 … 15.
+CLEAR_INLINE Floats pick(const Floats& table, const std::int32_t* indices) {
+#if defined(__AVX512F__)
+  Floats out;
+  out.r[0] = (Floats::Register)_mm512_permutexvar_ps(_mm512_loadu_si512(indices), (__m512)table.r[0]);
+  return out;
+#else
+  float a[kLanes], b[kLanes];
+  table.store(a);
+  for (int i = 0; i < kLanes; ++i) b[i] = a[indices[i]];
+  return Floats::load(b);
+#endif
+}
+
+}  // namespace clear
