@@ -185,7 +185,7 @@ class Conductor:
         e: Evidence | None,
         t: int,
     ) -> tuple[Grads, Mapping[str, float]]:
-        """g = g_LR + λ_HR ĝ_HR + λ∇L_stab, and the conflict ratio before correction."""
+        """The gradient g_LR + λ_HR ĝ_HR + λ∇L_stab, and the conflict ratio before correction."""
         if g_base is None:
             return g_lr + self._regularize(params, t), {}
         λ, λ_hf = self.objective.lambda_hr(t), self.objective.lambda_hf
@@ -259,9 +259,7 @@ class Conductor:
                 total = total + g
         return total
 
-    def _screens(
-        self, λ: float, g_lr: Any, lr: Shot, g_base: Any | None, g_hf: Any | None, hr: Shot | None
-    ) -> Screens:
+    def _screens(self, λ: float, g_lr: Any, lr: Shot, g_base: Any | None, g_hf: Any | None, hr: Shot | None) -> Screens:
         screen_lr = to_ndc(_screen(g_lr), lr.image)
         base = to_ndc(_screen(g_base), hr.image) if g_base is not None and hr is not None else None
         hf = to_ndc(_screen(g_hf), hr.image) if g_hf is not None and hr is not None else None

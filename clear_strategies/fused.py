@@ -248,7 +248,7 @@ class FusedStep:
             return {}, {}
         return self._svs.state, self._svs.stiffness(n)
 
-    def _above_is_quiet(self, shN: Tensor, active: int, anchor: Tensor | None) -> bool:  # noqa: N803 - gsplat's name
+    def _above_is_quiet(self, shN: Tensor, active: int, anchor: Tensor | None) -> bool:
         """Whether bands above the active degree have no momentum and no pull. Looked at again when a tensor is another
         one (densification, resuming, the anchor); while it is the same, a pass that left them alone left them quiet.
         """
