@@ -69,7 +69,9 @@ class FitSettings:
         if self.keep < 1:
             raise ValueError(f"keep must be at least 1 checkpoint, got {self.keep}.")
         if self.fused not in get_args(Fused):
-            raise ValueError(f"fused must be one of {', '.join(get_args(Fused))}, got {self.fused!r}.")
+            raise ValueError(
+                f"fused must be one of {', '.join(get_args(Fused))}, got {self.fused!r}. In a YAML file, off is quoted."
+            )
 
     @property
     def stretch(self) -> float:

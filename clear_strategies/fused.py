@@ -180,7 +180,7 @@ class FusedStep:
             )
             for name, p in params.items()
         }  # fmt: skip
-        skips = self.skips and merged is None
+        skips = self.skips and merged is None and self.optimizer.rates.eps > 0  # 0 / (√0 + 0) moves everything
         shN, active = params["shN"], g_lr.gradients.basis.shape[1] - 1
         bands = active if skips and self._above_is_quiet(shN, active, anchor.get("shN")) else shN.shape[1]
         stepped = gaussians.step(

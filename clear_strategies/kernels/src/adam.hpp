@@ -1,4 +1,5 @@
-// Adam on sixteen numbers, and on rows of any length; operation by operation optim.Adam.
+// Adam on sixteen numbers, and on rows of any length; operation by operation optim.Adam, but for a division by the bias
+// of the second moment, which is a multiplication here.
 #pragma once
 
 #include <cstddef>
@@ -10,7 +11,7 @@ namespace clear {
 
 struct AdamStep {
   float beta1, beta2, gain1, gain2;  // gain = 1 - beta
-  float bias2, eps;
+  float per_bias2, eps;  // 1 / bias of the second moment
 };
 
 // One parameter tensor with its moments [N, width], the anchor that holds it, and its limits.
@@ -36,7 +37,7 @@ struct Adam {
   CLEAR_INLINE void step(const AdamStep& s, const Attribute& a, const Floats& g) {
     m = multiply_add(g, s.gain1, m * Floats(s.beta1));
     v = multiply_add(g * Floats(s.gain2), g, v * Floats(s.beta2));
-    Floats denominator = root(v / Floats(s.bias2)) + Floats(s.eps);
+    Floats denominator = root(v * Floats(s.per_bias2)) + Floats(s.eps);
     p = at_rest(a) + m * Floats(a.rate) / denominator;
   }
   CLEAR_INLINE Floats at_rest(const Attribute& a) const { return p * Floats(a.keep); }
@@ -99,11 +100,23 @@ inline void rest_row(const Attribute& a, std::int64_t row) {
   }
 }
 
+CLEAR_INLINE bool all_zero(const float* values, int count) {
+  std::uint32_t any = 0;  // of the bits, all but the sign
+  for (int k = 0; k < count; ++k) {
+    std::uint32_t bits;
+    std::memcpy(&bits, values + k, sizeof bits);
+    any |= bits << 1;
+  }
+  return any == 0;
+}
+
 // Whether nothing would move a row whose gradient is 0: no momentum, no pull of the anchor.
 inline bool is_still(const Attribute& a, std::int64_t row, int width) {
   std::int64_t at = row * a.width;
-  for (int d = 0; d < width; ++d)
-    if (!(a.m[at + d] == 0 && a.v[at + d] == 0) || (a.anchor && !(a.p[at + d] == a.anchor[at + d]))) return false;
+  if (!all_zero(a.m + at, width) || !all_zero(a.v + at, width)) return false;
+  if (a.anchor)
+    for (int d = 0; d < width; ++d)
+      if (!(a.p[at + d] == a.anchor[at + d])) return false;
   return true;
 }
 

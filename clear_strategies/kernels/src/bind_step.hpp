@@ -91,7 +91,7 @@ class GaussianPass {
       if (attribute->width != width) throw nb::value_error("an attribute has another width than its gradient");
     auto number = [&](const char* name) { return nb::cast<double>(settings[name]); };
     double beta1 = number("beta1"), beta2 = number("beta2");
-    s.adam = {float(beta1), float(beta2), float(1 - beta1), float(1 - beta2), float(number("bias2")), float(number("eps"))};
+    s.adam = {float(beta1), float(beta2), float(1 - beta1), float(1 - beta2), float(1 / number("bias2")), float(number("eps"))};
     s.lambda_hr = float(number("lambda_hr"));
     s.visible = reinterpret_cast<const bool*>(tensors.rows<const std::uint8_t>(settings, "visible", g_.n, 1, true));
     s.skips = nb::cast<bool>(settings["skips"]);

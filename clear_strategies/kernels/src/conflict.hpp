@@ -75,49 +75,51 @@ struct Corrected {
   }
 };
 
-// Which of the sixteen are corrected in this group, and by which multiple of g_LR.
-CLEAR_INLINE std::uint32_t correction_steps(const Correction& c, Group group, const Products& p, std::uint32_t candidates,
-                                            std::int64_t i, double (&step)[kLanes], Corrected& done) {
-  Doubles n_lr = root(p.l2), n_hr = root(p.h2), n = n_lr * n_hr, zero = 0.0;
-  Doubles n_eps = maximum(n + Doubles(c.eps_cos[group]), Doubles(std::numeric_limits<double>::min()));
-  Doubles cosine = p.dot / n_eps;  // Eq. 6
-  std::uint32_t conflict = ((n > zero) & (cosine < Doubles(-c.tolerance))).bits() & candidates;
-  if (!conflict) return 0;
-  double C[kLanes], N[kLanes], L[kLanes], dot[kLanes];
-  cosine.store(C), n.store(N), n_lr.store(L), p.dot.store(dot);
-  for (std::uint32_t rest = conflict; rest; rest &= rest - 1) {
-    int k = __builtin_ctz(rest);
-    double q = c.reliability ? double(c.reliability[i + k]) : 0.0;
-    double s = std::clamp((-C[k] - c.tolerance) / (1 - c.tolerance), 0.0, 1.0);
-    double omega = s * (1 - q);  // Eq. 11
-    double coefficient = (dot[k] + c.tolerance * N[k]) / (L[k] * L[k] + c.eps_corr[group]);
-    if (c.bounds_hold_omega) {
-      omega = std::clamp(omega, c.weight_min, c.weight_max);
-      step[k] = omega * coefficient;
-    } else {
-      step[k] = -std::clamp(std::abs(omega * coefficient), c.weight_min, c.weight_max);
-    }
-    done.rows[group] += 1;
-    done.omega[group] += omega;
-    done.at_lower_bound[group] += omega <= c.weight_min;
+// What a stretch has corrected so far, lane by lane.
+struct Tally {
+  Doubles omega[kGroups];
+  std::int64_t rows[kGroups] = {}, at_lower_bound[kGroups] = {};
+
+  Tally() {
+    for (Doubles& o : omega) o = 0.0;
   }
-  return conflict;
+  Corrected total() const {
+    Corrected c;
+    for (int k = 0; k < kGroups; ++k) c.rows[k] = rows[k], c.at_lower_bound[k] = at_lower_bound[k], c.omega[k] = sum(omega[k]);
+    return c;
+  }
+};
+
+// By which multiple of g_LR each of the sixteen is corrected in this group; 0 where it is not.
+CLEAR_INLINE bool correction_steps(const Correction& c, Group group, const Products& p, const Mask<double>& candidates,
+                                   const Doubles& q, Doubles& step, Tally& done) {
+  Doubles zero = 0.0, one = 1.0, tau = c.tolerance;
+  auto apart = (p.dot < zero) & candidates;
+  if (!apart.any()) return false;
+  Doubles n = root(p.l2 * p.h2);  // ‖l‖‖h‖; squares of floats leave room for a product
+  Doubles low = c.weight_min, high = c.weight_max;
+  Doubles cosine = p.dot / maximum(n + Doubles(c.eps_cos[group]), Doubles(std::numeric_limits<double>::min()));  // Eq. 6
+  auto conflict = (n > zero) & (cosine < -tau) & apart;
+  if (!conflict.any()) return false;
+  Doubles s = clamp((-cosine - tau) / (one - tau), zero, one);
+  Doubles omega = s * (one - q);  // Eq. 11
+  Doubles coefficient = (p.dot + tau * n) / (p.l2 + Doubles(c.eps_corr[group]));
+  if (c.bounds_hold_omega) {
+    omega = clamp(omega, low, high);
+    step = where(conflict, omega * coefficient);
+  } else {
+    step = where(conflict, -clamp(absolute(omega * coefficient), low, high));
+  }
+  done.omega[group] += where(conflict, omega);
+  done.rows[group] += __builtin_popcount(conflict.bits());
+  done.at_lower_bound[group] += __builtin_popcount((conflict & (omega <= low)).bits());
+  return true;
 }
 
-CLEAR_INLINE float corrected(float h, float l, double step) { return float(double(h) - double(l) * step); }  // Eq. 7
-
-template <int D>
-CLEAR_INLINE void correct_columns(Floats (&h)[D], const Floats (&l)[D], std::uint32_t rows, const double (&step)[kLanes]) {
-  if (!rows) return;
-  for (int d = 0; d < D; ++d) {
-    float a[kLanes], b[kLanes];
-    l[d].store(a), h[d].store(b);
-    for (std::uint32_t rest = rows; rest; rest &= rest - 1) {
-      int k = __builtin_ctz(rest);
-      b[k] = corrected(b[k], a[k], step[k]);
-    }
-    h[d] = Floats::load(b);
-  }
+// h - step · l; rows with step 0 are handed back bit for bit.
+CLEAR_INLINE Floats corrected(const Floats& h, const Floats& l, const Doubles& step) {
+  auto touched = narrow(where(absolute(step) > Doubles(0.0), Doubles(1.0))) > Floats(0.0f);
+  return select(touched, narrow(widen(h) - widen(l) * step), h);  // Eq. 7
 }
 
 }  // namespace clear

@@ -31,46 +31,73 @@ struct Pulled {
   Floats means[3], quats[4], scales[3], opacities[1], sh0[3], rgb[3];
 };
 
+// What the chain rule needs of sixteen Gaussians, whichever the loss.
+struct Activated {
+  Floats squares[3], filtered[3], shares[3], sigmoid, factor, opacity, slope;
+};
+
+CLEAR_INLINE void load(const Activation& a, std::int64_t i, int count, Activated& out) {
+  Floats s[3], filter = load_some(a.filter + i, count);
+  load_columns(a.scales + 3 * i, count, s);
+  load_columns(a.filtered + 3 * i, count, out.filtered);
+  out.sigmoid = load_some(a.sigmoid + i, count);
+  out.factor = load_some(a.factor + i, count);
+  out.opacity = out.factor * out.sigmoid;
+  out.slope = 1.0f - out.sigmoid;
+  for (int k = 0; k < 3; ++k) {
+    Floats share = filter / out.filtered[k];  // log(coefficient) grows with log(s) by f² / (s² + f²)
+    out.shares[k] = share * share;
+    out.squares[k] = s[k] * s[k];
+  }
+}
+
 // Chain rule through the 3D filter, exp and sigmoid; operation by operation field.Activation.pull.
-CLEAR_INLINE void pull(const SplatGradient& g, const Activation& a, int bases, std::int64_t i, int count, Pulled& out) {
+CLEAR_INLINE void pull(const SplatGradient& g, const Activated& a, const Floats& Y0, std::int64_t i, int count, Pulled& out) {
   load_columns(g.means + 3 * i, count, out.means);
   load_columns(g.quats + 4 * i, count, out.quats);
   load_columns(g.scales + 3 * i, count, out.scales);
   load_columns(g.rgb + 3 * i, count, out.rgb);
   Floats d_opacity = load_some(g.opacities + i, count);
-  Floats filter = load_some(a.filter + i, count), sigmoid = load_some(a.sigmoid + i, count);
-  Floats factor = load_some(a.factor + i, count);
-  Floats s[3], filtered[3], Y0[1];
-  load_columns(a.scales + 3 * i, count, s);
-  load_columns(a.filtered + 3 * i, count, filtered);
-  load_columns(g.basis + bases * i, count, Y0, bases);
-  Floats pulls = d_opacity * (factor * sigmoid);  // log(coefficient) grows with log(s) by f² / (s² + f²)
   for (int k = 0; k < 3; ++k) {
-    Floats share = filter / filtered[k];
-    out.scales[k] = out.scales[k] * (s[k] * s[k]) / filtered[k] + pulls * (share * share);
-    out.sh0[k] = Y0[0] * out.rgb[k];
+    out.scales[k] = out.scales[k] * a.squares[k] / a.filtered[k] + d_opacity * a.opacity * a.shares[k];
+    out.sh0[k] = Y0 * out.rgb[k];
   }
-  out.opacities[0] = d_opacity * factor * sigmoid * (1.0f - sigmoid);
+  out.opacities[0] = d_opacity * a.factor * a.sigmoid * a.slope;
 }
 
-// The factors ⟨Y_a, Y_b⟩ over the higher bands, for ⟨Y_a ⊗ a, Y_b ⊗ b⟩ = ⟨Y_a, Y_b⟩ ⟨a, b⟩.
+CLEAR_INLINE Floats first_band(const SplatGradient& g, int bases, std::int64_t i, int count) {
+  Floats Y0[1];
+  load_columns(g.basis + bases * i, count, Y0, bases);
+  return Y0[0];
+}
+
+// The higher bands of sixteen bases, a lane each.
+CLEAR_INLINE void load_bands(const float* basis, int bases, std::int64_t i, int count, Floats (&bands)[kLanes]) {
+  for (int row = 0; row < kLanes; ++row) bands[row] = row < count ? load_some(basis + bases * (i + row), bases) : Floats(0.0f);
+  transpose(bands);
+}
+
+// ⟨Y_a, Y_b⟩ over the higher bands, for ⟨Y_a ⊗ a, Y_b ⊗ b⟩ = ⟨Y_a, Y_b⟩ ⟨a, b⟩.
 struct BasisProducts {
-  Doubles lr2, hr2, cross;
+  Doubles lr2 = 0.0, hr2 = 0.0, cross = 0.0;
 };
 
 CLEAR_INLINE BasisProducts basis_products(const float* lr, const float* hr, int bases, std::int64_t i, int count) {
-  double l2[kLanes] = {}, h2[kLanes] = {}, cross[kLanes] = {};
-  for (int row = 0; row < count; ++row) {
-    const float *a = lr + bases * (i + row), *b = hr + bases * (i + row);
-    double aa = 0, bb = 0, ab = 0;
-    for (int k = 1; k < bases; ++k) {
-      aa += double(a[k]) * a[k];
-      bb += double(b[k]) * b[k];
-      ab += double(a[k]) * b[k];
-    }
-    l2[row] = aa, h2[row] = bb, cross[row] = ab;
+  BasisProducts out;
+  if (bases == 1) return out;
+  Floats l[kLanes], h[kLanes];
+  load_bands(lr, bases, i, count, l);
+  if (hr == lr) {
+    for (int k = 1; k < bases; ++k) out.lr2 += widen(l[k]) * widen(l[k]);
+    out.hr2 = out.cross = out.lr2;
+    return out;
   }
-  return {Doubles::load(l2), Doubles::load(h2), Doubles::load(cross)};
+  load_bands(hr, bases, i, count, h);
+  for (int k = 1; k < bases; ++k) {
+    Doubles a = widen(l[k]), b = widen(h[k]);
+    out.lr2 += a * a, out.hr2 += b * b, out.cross += a * b;
+  }
+  return out;
 }
 
 // g^HR = g_base + λ_HF m g_HF, in the order in which the conductor multiplies.
@@ -86,11 +113,15 @@ struct Block {
 };
 
 CLEAR_INLINE void load(const Gradients& g, std::int64_t i, int count, Block& b) {
-  pull(g.lr, g.activation, g.bases, i, count, b.lr);
+  Activated a;
+  load(g.activation, i, count, a);
+  Floats Y0 = first_band(g.lr, g.bases, i, count);
+  pull(g.lr, a, Y0, i, count, b.lr);
   if (!g.base) return;
-  pull(g.base, g.activation, g.bases, i, count, b.hr);
+  if (g.base.basis != g.lr.basis) Y0 = first_band(g.base, g.bases, i, count);
+  pull(g.base, a, Y0, i, count, b.hr);
   if (!g.hf) return;
-  pull(g.hf, g.activation, g.bases, i, count, b.hf);
+  pull(g.hf, a, Y0, i, count, b.hf);
   b.m = g.route ? load_some(g.route + i, count) : Floats(1.0f);
   route(b.hr.means, b.hf.means, b.m, g.lambda_hf);
   route(b.hr.quats, b.hf.quats, b.m, g.lambda_hf);

@@ -2,6 +2,7 @@
 // bit for bit where it matters (equal decisions), and fused multiply-add appears only where torch has it.
 #include "step.hpp"
 
+#include <iterator>
 #include <vector>
 
 #include "pool.hpp"
@@ -80,12 +81,7 @@ CLEAR_INLINE Floats expand(const Gradients& g, const Step& s, const RowTables& t
   Floats Y = g.lr.basis == g.base.basis ? pick(t.Y_lr, band) : pick(t.Y_hr, band);
   Floats h = Y * pick(t.base, channel);
   if (g.hf) h += Y * pick(t.hf, channel) * Floats(m) * Floats(g.lambda_hf);  // Eq. 13
-  if (correction != 0) {
-    float a[kLanes], b[kLanes];
-    l.store(a), h.store(b);
-    for (int j = 0; j < kLanes; ++j) b[j] = corrected(b[j], a[j], correction);
-    h = Floats::load(b);
-  }
+  if (correction != 0) h = corrected(h, l, correction);
   return l + h * Floats(s.lambda_hr);  // Eq. 8
 }
 
@@ -100,7 +96,9 @@ class Sweep {
 
   Stepped stretch(std::int64_t number) const {
     Stepped done;
-    each_sixteen(g.n, number, [&](std::int64_t i, int count) { sixteen(i, count, done); });
+    Tally tally;
+    each_sixteen(g.n, number, [&](std::int64_t i, int count) { sixteen(i, count, done, tally); });
+    done.corrected = tally.total();
     return done;
   }
 
@@ -110,7 +108,7 @@ class Sweep {
   const Step& s;
   const RowPlan plan;
 
-  void sixteen(std::int64_t i, int count, Stepped& done) const {
+  void sixteen(std::int64_t i, int count, Stepped& done, Tally& tally) const {
     Block b;
     load(g, i, count, b);
     std::uint32_t rows = first_bits(count);
@@ -123,14 +121,15 @@ class Sweep {
     std::uint32_t moving = rows & ~(still | unseen);
 
     double shN_step[kLanes] = {};
-    if (correction) correct(b, i, count, rows, shN_step, done.corrected);
+    if (correction) correct(b, i, count, shN_step, tally);
     if (moving) {
-      step_columns(s.means, b.lr.means, b.hr.means, i, count, moving);
-      step_columns(s.quats, b.lr.quats, b.hr.quats, i, count, moving);
-      step_columns(s.scales, b.lr.scales, b.hr.scales, i, count, moving);
-      step_columns(s.opacities, b.lr.opacities, b.hr.opacities, i, count, moving);
-      step_columns(s.sh0, b.lr.sh0, b.hr.sh0, i, count, moving);
-      step_detail(b, i, count, moving);
+      std::uint32_t seen = rows & ~unseen;  // a still row among others may take its step: it stays as it is
+      step_columns(s.means, b.lr.means, b.hr.means, i, count, seen);
+      step_columns(s.quats, b.lr.quats, b.hr.quats, i, count, seen);
+      step_columns(s.scales, b.lr.scales, b.hr.scales, i, count, seen);
+      step_columns(s.opacities, b.lr.opacities, b.hr.opacities, i, count, seen);
+      step_columns(s.sh0, b.lr.sh0, b.hr.sh0, i, count, seen);
+      step_detail(b, i, count, seen);
       step_rows(b, i, count, moving, shN_step);
     }
     for (std::uint32_t resting = moving ? 0 : rows; resting; resting &= resting - 1) {
@@ -139,29 +138,31 @@ class Sweep {
     }
   }
 
-  // Eq. 6, 7, 11
-  void correct(Block& b, std::int64_t i, int count, std::uint32_t rows, double (&shN_step)[kLanes], Corrected& done) const {
+  // Eq. 6, 7, 11. Lanes beyond the last Gaussian hold zeros, which are in no conflict.
+  CLEAR_INLINE void correct(Block& b, std::int64_t i, int count, double (&shN_step)[kLanes], Tally& done) const {
     const Correction& c = *correction;
     Products p[kGroups];
     group_products(g, b, i, count, p);
-    std::uint32_t turning = rows & ~turns_nothing(p);
-    double step[kLanes];
-    auto columns = [&](Group group, auto& h, const auto& l, std::uint32_t candidates) {
-      if (c.corrects[group])
-        correct_columns(h, l, correction_steps(c, group, p[group], candidates, i, step, done), step);
+    Doubles q = c.reliability ? widen(load_some(c.reliability + i, count)) : Doubles(0.0);
+    auto every = Doubles(0.0) <= Doubles(0.0);
+    auto columns = [&](Group group, auto& h, const auto& l, const Mask<double>& candidates) {
+      Doubles step;
+      if (c.corrects[group] && correction_steps(c, group, p[group], candidates, q, step, done))
+        for (std::size_t d = 0; d < std::size(h); ++d) h[d] = corrected(h[d], l[d], step);
     };
-    columns(kMeans, b.hr.means, b.lr.means, rows);
-    columns(kSh0, b.hr.sh0, b.lr.sh0, rows);
-    columns(kOpacities, b.hr.opacities, b.lr.opacities, rows);
-    columns(kScales, b.hr.scales, b.lr.scales, rows);
-    columns(kQuats, b.hr.quats, b.lr.quats, turning);
-    if (c.corrects[kShN]) correction_steps(c, kShN, p[kShN], rows, i, shN_step, done);
+    columns(kMeans, b.hr.means, b.lr.means, every);
+    columns(kSh0, b.hr.sh0, b.lr.sh0, every);
+    columns(kOpacities, b.hr.opacities, b.lr.opacities, every);
+    columns(kScales, b.hr.scales, b.lr.scales, every);
+    columns(kQuats, b.hr.quats, b.lr.quats, turns_something(p));
+    Doubles step;
+    if (c.corrects[kShN] && correction_steps(c, kShN, p[kShN], every, q, step, done)) step.store(shN_step);
   }
 
   // A Gaussian with equal axes does not change when it is turned: its rotation gradient is noise.
-  std::uint32_t turns_nothing(const Products (&p)[kGroups]) const {
-    Doubles noise = correction->rotation_noise;
-    return (root(p[kQuats].l2) <= noise * root(p[kScales].l2)).bits() | (root(p[kQuats].h2) <= noise * root(p[kScales].h2)).bits();
+  CLEAR_INLINE Mask<double> turns_something(const Products (&p)[kGroups]) const {
+    Doubles noise2 = correction->rotation_noise * correction->rotation_noise;
+    return (p[kQuats].l2 > noise2 * p[kScales].l2) & (p[kQuats].h2 > noise2 * p[kScales].h2);
   }
 
   template <int D>
