@@ -220,7 +220,7 @@ def markdown(rows: Sequence[Row]) -> str:
     for scene in dict.fromkeys(row.scene for row in rows):
         if shared := _shared([run for row in rows if row.scene == scene for run in row.runs]):
             notes.append(f"All runs of {scene}: `{' '.join(shared)}`.")
-    return "\n".join((*_aligned(columns), "", *notes, ""))
+    return "\n".join((*aligned(columns), "", *notes, ""))
 
 
 def _baseline_rows(baseline: str, runs: Sequence[Run]) -> list[Row]:
@@ -363,7 +363,7 @@ def _spread(values: Sequence[float], form: str) -> str:
     return mean if len(values) == 1 else f"{mean} ± {statistics.stdev(values):{form.lstrip('+')}}"
 
 
-def _aligned(columns: Mapping[str, Sequence[str]]) -> list[str]:
+def aligned(columns: Mapping[str, Sequence[str]]) -> list[str]:
     """A Markdown table that is also one in a terminal."""
     escaped = [[cell.replace("|", "\\|") for cell in (name, *cells)] for name, cells in columns.items()]
     widths = [max(map(len, cells)) for cells in escaped]

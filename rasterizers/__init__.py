@@ -6,6 +6,7 @@ import importlib
 from typing import Any
 
 from rasterizers.interface import (
+    PRESETS,
     BackendUnavailable,
     Camera,
     Rasterizer,
@@ -17,6 +18,7 @@ from rasterizers.interface import (
 )
 
 __all__ = [
+    "PRESETS",
     "BackendUnavailable",
     "Camera",
     "RasterSettings",
@@ -32,18 +34,23 @@ __all__ = [
 
 # name -> module that defines `create(**settings)`, fastest first: "auto" takes the first that is available.
 # A backend imports its library only when it is created, so listing one here costs nothing.
-_BACKENDS: dict[str, str] = {"torch": "rasterizers.reference"}
+_BACKENDS: dict[str, str] = {"cpp": "rasterizers.cpp", "torch": "rasterizers.reference"}
 
 
-def load(name: str = "auto", **settings: Any) -> Rasterizer:
+def load(name: str = "auto", *, preset: str | None = None, **settings: Any) -> Rasterizer:
     """The rasterizer called `name` ("auto": the fastest that runs here).
 
-    `settings` are the fields of `RasterSettings`, plus whatever a backend documents of its own.
+    `settings` are the fields of `RasterSettings`, plus whatever a backend documents of its own; they win over those of
+    the `preset`, see `PRESETS`.
 
     Raises:
         BackendUnavailable: it cannot run here; the message says why and what to do.
-        ValueError: no backend has that name.
+        ValueError: no backend, or no preset, has that name.
     """
+    if preset is not None:
+        if preset not in PRESETS:
+            raise ValueError(f"unknown preset {preset!r}; choose one of {', '.join(PRESETS)}.")
+        settings = {**PRESETS[preset], **settings}
     if name == "auto":
         name = fastest()
     if name not in _BACKENDS:

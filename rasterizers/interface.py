@@ -7,9 +7,10 @@ Everything else in this package implements it; nothing here knows an implementat
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from types import MappingProxyType
+from typing import Final, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -236,3 +237,17 @@ class RasterSettings:
             raise ValueError(f"tile must be at least 1 pixel, got {self.tile}.")
         if len(self.background) != 3 or not all(0 <= c <= 1 for c in self.background):
             raise ValueError(f"background must be three numbers in [0, 1], got {self.background}.")
+
+
+PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
+    {
+        "fast": MappingProxyType({"alpha_min": 1 / 255, "transmittance_min": 1e-4}),
+        "accurate": MappingProxyType({"alpha_min": 1 / 4096, "transmittance_min": 1e-5}),
+        "exact": MappingProxyType({"alpha_min": 1e-7, "transmittance_min": 1e-9}),
+    }
+)
+"""Cut-offs by name, coarsest first. They, not the arithmetic, decide how far gradients are from those without cut-offs.
+
+"fast" is everyone's default: gradients are off by some 3 %. "accurate" is ten times closer for a fifth more time. At
+"exact" float32 itself is what remains, for numeric tests.
+"""

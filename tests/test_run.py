@@ -205,6 +205,7 @@ BAD_SETTINGS = {
     "data.cloud.init=ply data.cloud.path=nowhere.ply": "nowhere.ply",
     "fit.resume=nowhere": "no checkpoint is here",
     "rasterizer.name=cuda": "unknown rasterizer",
+    "rasterizer.preset=best": "unknown preset",
 }
 
 

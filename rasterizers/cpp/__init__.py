@@ -1,1 +1,175 @@
-"""C++."""
+"""The fastest rasterizer without a GPU: compiled kernels behind the interface, in float32, and in float64 for checking.
+
+The stages are those of `rasterizers.reference`, and so are their names: project, bin, blend, and back. The sources in
+`src/` know no Python; `bindings.cpp` knows both. Which of the modules here runs is decided by `rasterizers.native`.
+
+Deterministic: the same bits for any number of threads, and for any memory budget.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from rasterizers.checks import build, require_cotangents, require_finite, require_tiles
+from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
+from rasterizers.native import load_kernels
+
+_TRAITS: Final = Traits(
+    devices=frozenset({"cpu"}),
+    dtypes=frozenset({torch.float32, torch.float64}),
+    shared_pass=True,
+    shared_scales=True,
+    deterministic=True,
+)
+_BLOCK: Final = 4  # px: what one register blends, so what a tile must be a multiple of
+_FRAMES: Final = {torch.float32: "Frame32", torch.float64: "Frame64"}
+
+
+@dataclass(frozen=True, slots=True)
+class CppRasterizer(RasterSettings):
+    """Compiled kernels for CPUs.
+
+    Args:
+        tile: edge of the demand mask's tiles, px, a multiple of 4; at 32 a tile is a bin, and skipping it is free.
+        memory: MiB that the lists of one picture may take; beyond it the picture is drawn in bands, bit for bit the same.
+        threads: None: as many as torch uses.
+
+    A rendering's `vjp` reads the splats' tensors again: pull before they are changed in place.
+    """
+
+    tile: int = 32
+    memory: int = 4096
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        RasterSettings.__post_init__(self)
+        if self.tile % _BLOCK:
+            raise ValueError(f"tile must be a multiple of {_BLOCK} pixels, got {self.tile}.")
+        if self.memory < 1:
+            raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}.")
+
+    @property
+    def traits(self) -> Traits:
+        return _TRAITS
+
+    def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
+        frame = _Frame(self, [(splats, camera)])
+        return CppRendering(frame, 0, tiles)
+
+    def render_scales(self, jobs: Sequence[tuple[Splats, Camera]]) -> list[Rendering]:
+        """Screens of one pose share projection, colour and depth order where their tensors are the same objects."""
+        if len(jobs) > 1 and all(_shares(jobs[0], job) for job in jobs[1:]):
+            frame = _Frame(self, jobs)
+            return [CppRendering(frame, i, None) for i in range(len(jobs))]
+        return [self(splats, camera) for splats, camera in jobs]
+
+
+class _Frame:
+    """One projection for several screens: the native frame, and the tensors that it reads again on the way back."""
+
+    def __init__(self, settings: CppRasterizer, jobs: Sequence[tuple[Splats, Camera]]) -> None:
+        splats, camera = jobs[0]
+        n, like = len(splats), splats.means
+        dtype = like.dtype
+        if dtype not in _FRAMES or like.device.type != "cpu":
+            raise TypeError(f"the cpp rasterizer draws float32 and float64 on the CPU, got {dtype} on {like.device}.")
+        self.settings = settings
+        self.threads = settings.threads if settings.threads is not None else torch.get_num_threads()
+        self.cameras = [camera for _, camera in jobs]
+        shared = (splats.means, splats.quats, splats.scales, splats.sh0)
+        self.shared = tuple(x.detach().contiguous() for x in shared) + (_rows(splats.shN.detach()),)
+        # Kept here because the native frame only borrows them.
+        self.opacities = [job.opacities.detach().contiguous() for job, _ in jobs]
+        self.offsets = [None if job.rgb_offset is None else job.rgb_offset.detach().contiguous() for job, _ in jobs]
+        self.native = getattr(load_kernels(__name__), _FRAMES[dtype])(
+            kernel=settings.kernel,
+            near=settings.near,
+            alpha_min=settings.alpha_min,
+            alpha_max=settings.alpha_max,
+            transmittance_min=settings.transmittance_min,
+            background=list(settings.background),
+            antialiased=settings.antialiased,
+            world_to_camera=camera.world_to_camera.double().flatten().tolist(),
+            center=camera.center.double().tolist(),
+            budget=settings.memory << 20,
+        )
+        self.means2d = [self.empty(n, 2) for _ in jobs]
+        self.visible = [torch.empty(n, dtype=torch.bool) for _ in jobs]
+        self._basis: Tensor | None = None
+        grids = [[c.fx, c.fy, c.cx, c.cy, float(c.width), float(c.height)] for c in self.cameras]
+        if not self.native.project(
+            *self.shared, grids, self.opacities, self.offsets, self.means2d, self.visible, self.threads
+        ):
+            for job, _ in jobs:
+                require_finite(job)
+
+    def empty(self, *shape: int) -> Tensor:
+        """A tensor to be filled, of memory that a picture before it has used: fresh pages cost more than the filling."""
+        fresh: Tensor = self.native.empty(shape)
+        return fresh
+
+    def basis(self) -> Float[Tensor, "N B1"]:
+        """Y of this pose's directions, the same for all screens; made when first asked for."""
+        if self._basis is None:
+            means, shN = self.shared[0], self.shared[4]
+            self._basis = self.empty(len(means), shN.shape[1] + 1)
+            self.native.basis(*self.shared, self._basis, self.threads)
+        return self._basis
+
+
+class CppRendering:
+    """A picture on one screen of a frame."""
+
+    def __init__(self, frame: _Frame, screen: int, tiles: Bool[Tensor, "th tw"] | None) -> None:
+        self._frame, self._screen = frame, screen
+        camera = frame.cameras[screen]
+        if tiles is not None:
+            require_tiles(tiles, camera.width, camera.height, frame.settings.tile)
+            tiles = tiles.to("cpu", torch.bool).contiguous()
+        self.image: Float[Tensor, "H W 3"] = frame.empty(camera.height, camera.width, 3)
+        self.alpha: Float[Tensor, "H W"] = frame.empty(camera.height, camera.width)
+        self.means2d: Float[Tensor, "N 2"] = frame.means2d[screen]
+        self.visible: Bool[Tensor, " N"] = frame.visible[screen]
+        frame.native.draw(screen, self.image, self.alpha, tiles, frame.settings.tile, frame.threads)
+
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
+        """One traversal for up to three cotangents; see `Rendering.vjp`."""
+        require_cotangents(cotangents, self.image)
+        k, n, frame = len(cotangents), len(self.visible), self._frame
+        means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
+        opacities = frame.empty(k, n)
+        frame.native.vjp(
+            self._screen, cotangents.detach().to(self.image).contiguous(), *frame.shared,
+            means, quats, scales, opacities, screen, rgb, frame.threads,
+        )  # fmt: skip
+        return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis())
+
+
+def create(**settings: Any) -> CppRasterizer:
+    """The backend called "cpp"; `settings` are the fields of `CppRasterizer`.
+
+    Raises:
+        BackendUnavailable: the kernels were not built.
+    """
+    load_kernels(__name__)
+    return build(CppRasterizer, settings)
+
+
+def _shares(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
+    """Whether two jobs see the same Gaussians from the same pose; opacities and offsets may differ."""
+    (a, from_a), (b, from_b) = first, other
+    same = all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
+    return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
+
+
+def _rows(shN: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
+    """Rows may lie apart (a view of the active bands), but each must be contiguous."""
+    return shN if shN.numel() == 0 or shN.stride()[1:] == (3, 1) else shN.contiguous()

@@ -10,13 +10,14 @@ Every other backend is judged against this one. It is also usable: memory is bou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Final
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from rasterizers.checks import build, require_cotangents, require_finite
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.reference.blend import blend, blend_vjp
 from rasterizers.reference.projection import Projection, project
@@ -48,7 +49,7 @@ class ReferenceRasterizer(RasterSettings):
         return _TRAITS
 
     def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
-        _require_usable(splats)
+        require_finite(splats)
         grid = TileGrid(camera.width, camera.height, self.tile)
         projection = project(splats, camera, self)
         lists = list_tiles(projection, grid, tiles)
@@ -72,9 +73,7 @@ class ReferenceRendering:
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         """One traversal for all K; see `Rendering.vjp`."""
-        expected = tuple(self.image.shape)
-        if cotangents.dim() != 4 or tuple(cotangents.shape[1:]) != expected:
-            raise ValueError(f"cotangents must be [K, {', '.join(map(str, expected))}], got {tuple(cotangents.shape)}.")
+        require_cotangents(cotangents, self.image)
         v = torch.stack([self._grid.to_tiles(c.to(self.image)) for c in cotangents])
         table = self._projection.table()
         return self._projection.vjp(blend_vjp(table, self._passes, self._grid, self._settings, v))
@@ -82,22 +81,4 @@ class ReferenceRendering:
 
 def create(**settings: Any) -> ReferenceRasterizer:
     """The backend called "torch"; `settings` are the fields of `ReferenceRasterizer`."""
-    known = [f.name for f in fields(ReferenceRasterizer)]
-    unknown = sorted(set(settings) - set(known))
-    if unknown:
-        raise ValueError(f"unknown rasterizer setting {unknown[0]!r}; known are {', '.join(known)}.")
-    if "background" in settings:
-        settings["background"] = tuple(float(c) for c in settings["background"])
-    return ReferenceRasterizer(**settings)
-
-
-def _require_usable(splats: Splats) -> None:
-    """One fused reduction a tensor: NaN or infinity is named here, not found later as a hole in the picture."""
-    for field in fields(splats):
-        value = getattr(splats, field.name)
-        if value is None or value.numel() == 0:
-            continue
-        if not bool(torch.isfinite(value.sum())) and not bool(torch.isfinite(value).all()):
-            bad = (~torch.isfinite(value)).flatten(1).any(1) if value.dim() > 1 else ~torch.isfinite(value)
-            index = int(bad.nonzero()[0])
-            raise ValueError(f"splats.{field.name} must be finite; Gaussian {index} is not ({int(bad.sum())} in all).")
+    return build(ReferenceRasterizer, settings)

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from rasterizers.checks import require_tiles
 from rasterizers.reference.projection import Projection
 
 
@@ -90,11 +91,8 @@ def list_tiles(projection: Projection, grid: TileGrid, demand: Bool[Tensor, "th 
         ValueError: the demand mask has not one entry per tile.
     """
     n_tiles = grid.rows * grid.columns
-    if demand is not None and tuple(demand.shape) != (grid.rows, grid.columns):
-        raise ValueError(
-            f"the tile mask must be [{grid.rows}, {grid.columns}] for {grid.width}x{grid.height} pixels "
-            f"in tiles of {grid.tile}, got {tuple(demand.shape)}."
-        )
+    if demand is not None:
+        require_tiles(demand, grid.width, grid.height, grid.tile)
     rows = torch.argsort(projection.depths, stable=True)
     means, half = projection.means2d.detach()[rows], projection.half_extents[rows]
     first, last = _tile_range(means - half, grid), _tile_range(means + half, grid)

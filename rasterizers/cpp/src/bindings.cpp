@@ -1,13 +1,150 @@
-// Python's view of the trainer's hot loops. Nothing but borders: types and shapes are checked, the GIL is let go.
+// Python's view: a frame in float32 and one in float64. Nothing but borders: shapes and types are checked, the GIL is let go.
 #include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <memory>
+
+#include "frame.hpp"
 #include "isa.hpp"
 
 namespace nb = nanobind;
 
+namespace clear {
+
+template <class T, std::int64_t... shape>
+using Read = nb::ndarray<const T, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
+template <class T, std::int64_t... shape>
+using Write = nb::ndarray<T, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
+template <class T>
+using Rows = nb::ndarray<const T, nb::shape<-1, -1, 3>, nb::device::cpu>;  // shN: rows may lie apart
+
+inline void require(bool holds, const char* rule) {
+  if (!holds) throw nb::value_error(rule);
+}
+
+template <class T>
+Splats<T> splats_of(const Read<T, -1, 3>& means, const Read<T, -1, 4>& quats, const Read<T, -1, 3>& scales,
+                    const Read<T, -1, 1, 3>& sh0, const Rows<T>& shN) {
+  const std::int64_t n = std::int64_t(means.shape(0)), bands = std::int64_t(shN.shape(1));
+  require(std::int64_t(quats.shape(0)) == n && std::int64_t(scales.shape(0)) == n && std::int64_t(sh0.shape(0)) == n &&
+              std::int64_t(shN.shape(0)) == n,
+          "every tensor of the splats must have one row per Gaussian");
+  require(n < std::int64_t(UINT32_MAX), "at most 2^32 - 2 Gaussians");
+  require(bands == 0 || bands == 3 || bands == 8 || bands == 15, "shN must hold 0, 3, 8 or 15 bands");
+  require(n == 0 || bands == 0 || (shN.stride(2) == 1 && shN.stride(1) == 3), "each row of shN must be contiguous");
+  return {n, means.data(), quats.data(), scales.data(), sh0.data(), shN.data(), n ? shN.stride(0) : 0, int(bands)};
+}
+
+// A torch tensor whose memory goes back to the recycler when it is freed: gradients of one iteration are the next one's.
+template <class T>
+nb::ndarray<nb::pytorch, T> empty(const std::vector<std::size_t>& shape) {
+  std::size_t size = 1;
+  for (std::size_t edge : shape) size *= edge;
+  auto buffer = std::make_unique<Buffer<T>>();
+  buffer->reserve_lost(std::max<std::size_t>(size, 1));
+  T* data = buffer->data();
+  nb::capsule owner(buffer.get(), [](void* p) noexcept { delete static_cast<Buffer<T>*>(p); });
+  buffer.release();
+  return nb::ndarray<nb::pytorch, T>(data, shape.size(), shape.data(), owner);
+}
+
+// (fx, fy, cx, cy, width, height)
+using Grid = std::tuple<double, double, double, double, int, int>;
+
+template <class T>
+void bind_frame(nb::module_& m, const char* name) {
+  using F = Frame<T>;
+  nb::class_<F>(m, name)
+      .def(
+          "__init__",
+          [](F* self, double kernel, double near, double alpha_min, double alpha_max, double transmittance_min,
+             std::vector<double> background, bool antialiased, std::vector<double> world_to_camera,
+             std::vector<double> center, std::int64_t budget) {
+            require(background.size() == 3 && world_to_camera.size() == 16 && center.size() == 3, "3, 16 and 3 numbers");
+            Settings<T> s{T(kernel), T(near), T(alpha_min), T(alpha_max), T(transmittance_min),
+                          {T(background[0]), T(background[1]), T(background[2])}, antialiased};
+            Pose<T> pose;
+            for (int i = 0; i < 3; ++i) {
+              for (int k = 0; k < 3; ++k) pose.R[3 * i + k] = T(world_to_camera[4 * i + k]);
+              pose.t[i] = T(world_to_camera[4 * i + 3]);
+              pose.center[i] = T(center[i]);
+            }
+            new (self) F(s, pose, budget);
+          },
+          nb::kw_only(), nb::arg("kernel"), nb::arg("near"), nb::arg("alpha_min"), nb::arg("alpha_max"),
+          nb::arg("transmittance_min"), nb::arg("background"), nb::arg("antialiased"), nb::arg("world_to_camera"),
+          nb::arg("center"), nb::arg("budget"))
+      .def("project",
+           [](F& self, Read<T, -1, 3> means, Read<T, -1, 4> quats, Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0,
+              Rows<T> shN, std::vector<std::vector<double>> grids, std::vector<Read<T, -1>> opacities,
+              std::vector<std::optional<Read<T, -1, 3>>> offsets, std::vector<Write<T, -1, 2>> means2d,
+              std::vector<Write<bool, -1>> visible, int threads) {
+             Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
+             const std::size_t n = std::size_t(splats.n), count = grids.size();
+             require(count >= 1 && count <= 4 && opacities.size() == count && offsets.size() == count &&
+                         means2d.size() == count && visible.size() == count,
+                     "one to four screens, each with its opacities, offset and outputs");
+             std::vector<Target<T>> targets(count);
+             for (std::size_t i = 0; i < count; ++i) {
+               const std::vector<double>& g = grids[i];
+               require(g.size() == 6, "a screen is (fx, fy, cx, cy, width, height)");
+               require(opacities[i].shape(0) == n && means2d[i].shape(0) == n && visible[i].shape(0) == n &&
+                           (!offsets[i] || offsets[i]->shape(0) == n),
+                       "every tensor of a screen must have one row per Gaussian");
+               targets[i].screen = {T(g[0]), T(g[1]), T(g[2]), T(g[3]), int(g[4]), int(g[5])};
+               targets[i].opacities = opacities[i].data();
+               targets[i].rgb_offset = offsets[i] ? offsets[i]->data() : nullptr;
+               targets[i].means2d = means2d[i].data();
+               targets[i].visible = visible[i].data();
+             }
+             nb::gil_scoped_release release;
+             return self.project(splats, std::move(targets), threads);
+           })
+      .def_static("empty", &empty<T>, nb::rv_policy::reference)
+      .def("pairs", &F::pairs)
+      .def("draw",
+           [](F& self, int i, Write<T, -1, -1, 3> image, Write<T, -1, -1> alpha,
+              std::optional<Read<bool, -1, -1>> tiles, int edge, int threads) {
+             require(edge >= kBlock && edge % kBlock == 0, "tiles must be a multiple of 4 px");
+             std::optional<Demand> demand;
+             if (tiles) demand = Demand{tiles->data(), edge, int(tiles->shape(1))};
+             T *pixels = image.data(), *cover = alpha.data();
+             nb::gil_scoped_release release;
+             self.draw(i, pixels, cover, demand, threads);
+           },
+           nb::arg("screen"), nb::arg("image"), nb::arg("alpha"), nb::arg("tiles").none(), nb::arg("edge"),
+           nb::arg("threads"))
+      .def("vjp",
+           [](F& self, int i, Read<T, -1, -1, -1, 3> cotangents, Read<T, -1, 3> means, Read<T, -1, 4> quats,
+              Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1, 3> d_means,
+              Write<T, -1, -1, 4> d_quats, Write<T, -1, -1, 3> d_scales, Write<T, -1, -1> d_opacities,
+              Write<T, -1, -1, 2> d_screen, Write<T, -1, -1, 3> d_rgb, int threads) {
+             Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
+             Gradients<T> out{d_means.data(),     d_quats.data(),  d_scales.data(),
+                              d_opacities.data(), d_screen.data(), d_rgb.data()};
+             const int K = int(cotangents.shape(0));
+             const T* v = cotangents.data();
+             nb::gil_scoped_release release;
+             self.vjp(i, K, v, splats, out, threads);
+           })
+      .def("basis", [](F& self, Read<T, -1, 3> means, Read<T, -1, 4> quats, Read<T, -1, 3> scales,
+                       Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1> out, int threads) {
+        Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
+        T* y = out.data();
+        nb::gil_scoped_release release;
+        self.basis(splats, y, threads);
+      });
+}
+
+}  // namespace clear
+
 NB_MODULE(CLEAR_MODULE, m) {
   m.attr("isa") = CLEAR_ISA;
   m.def("instruction_sets", &clear::instruction_sets);
+  nb::exception<clear::OverBudget>(m, "OverBudget", PyExc_MemoryError);
+  clear::bind_frame<float>(m, "Frame32");
+  clear::bind_frame<double>(m, "Frame64");
 }

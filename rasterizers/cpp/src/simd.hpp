@@ -16,6 +16,7 @@ namespace clear {
 inline constexpr int kLanes = 16;
 
 #define CLEAR_INLINE inline __attribute__((always_inline))
+#define CLEAR_LAMBDA __attribute__((always_inline))
 
 #if defined(__AVX512F__)
 inline constexpr int kRegisterBytes = 64;
@@ -61,6 +62,7 @@ struct Native {
   static CLEAR_INLINE Mask mask_and(Mask a, Mask b) { return a & b; }
   static CLEAR_INLINE Mask mask_and_not(Mask a, Mask b) { return a & Mask(~b) & all; }
   static CLEAR_INLINE std::uint32_t bits(Mask m) { return m & all; }
+  static CLEAR_INLINE Mask from_bits(std::uint32_t b) { return Mask(b) & all; }
   static CLEAR_INLINE Register minimum(Register a, Register b) {
     if constexpr (sizeof(T) == 4) return (Register)_mm512_min_ps((__m512)a, (__m512)b);
     else return (Register)_mm512_min_pd((__m512d)a, (__m512d)b);
@@ -111,6 +113,11 @@ struct Native {
     return b;
 #endif
   }
+  static CLEAR_INLINE Mask from_bits(std::uint32_t b) {
+    Mask m;
+    for (int i = 0; i < width; ++i) m[i] = -(typename IntegerOf<T>::type)((b >> i) & 1);
+    return m;
+  }
   // NaN as x86 has it: the second operand wins.
   static CLEAR_INLINE Register minimum(Register a, Register b) {
 #if defined(__AVX2__)
@@ -145,8 +152,8 @@ struct Native {
   static CLEAR_INLINE Register scale_by_power(Register a, Register n) {
     constexpr int mantissa = sizeof(T) == 4 ? 23 : 52;
     constexpr T limit = sizeof(T) == 4 ? T(-126) : T(-1022);
-    Integer e = __builtin_convertvector(maximum(n, Register{} + limit), Integer);
-    Integer one = (Integer)(Register{} + T(1));
+    Integer e = __builtin_convertvector(maximum(n, limit - Register{}), Integer);
+    Integer one = (Integer)(T(1) - Register{});
     return a * (Register)(one + (e << mantissa));
   }
   static CLEAR_INLINE Register reciprocal(Register a) { return T(1) / a; }
@@ -174,6 +181,11 @@ struct Mask {
     return b;
   }
   CLEAR_INLINE bool any() const { return bits() != 0; }
+  static CLEAR_INLINE Mask from_bits(std::uint32_t b) {
+    Mask m;
+    for (int i = 0; i < registers; ++i) m.r[i] = Native<T>::from_bits(b >> (i * Native<T>::width));
+    return m;
+  }
 };
 
 template <class T>
@@ -184,7 +196,7 @@ struct Lanes {
 
   Lanes() = default;
   CLEAR_INLINE Lanes(T x) {
-    for (int i = 0; i < registers; ++i) r[i] = Register{} + x;
+    for (int i = 0; i < registers; ++i) r[i] = x - Register{};  // x - 0 is x, for -0 too: the compiler makes it a broadcast
   }
   static CLEAR_INLINE Lanes load(const T* p) {
     Lanes a;
@@ -325,6 +337,60 @@ CLEAR_INLINE Lanes<T> log2(const Lanes<T>& x) {
   }
 }
 
+#if defined(__AVX512F__)
+// Where lane i of channel c comes from among 16 a | 16 b, then 16 (that) | 16 c' — and the other way round.
+struct Shuffles3 {
+  std::int32_t split_low[3][kLanes], split_high[3][kLanes], join_low[3][kLanes], join_high[3][kLanes];
+  constexpr Shuffles3() : split_low(), split_high(), join_low(), join_high() {
+    for (int c = 0; c < 3; ++c)
+      for (int i = 0; i < kLanes; ++i) {
+        const int from = 3 * i + c, to = kLanes * c + i;
+        split_low[c][i] = from < 2 * kLanes ? from : 0;
+        split_high[c][i] = from < 2 * kLanes ? i : from - kLanes;
+        join_low[c][i] = to % 3 == 0 ? to / 3 : to % 3 == 1 ? kLanes + to / 3 : 0;
+        join_high[c][i] = to % 3 == 2 ? kLanes + to / 3 : i;
+      }
+  }
+};
+inline constexpr Shuffles3 kShuffles3{};
+CLEAR_INLINE __m512 shuffle3(__m512 a, __m512 b, __m512 c, const std::int32_t (&low)[kLanes], const std::int32_t (&high)[kLanes]) {
+  return _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, _mm512_loadu_si512(low), b), _mm512_loadu_si512(high), c);
+}
+#endif
+
+// Sixteen triples, one after the other in memory, to three columns of sixteen; and back.
+template <class T>
+CLEAR_INLINE void load_triples(const T* p, Lanes<T> (&columns)[3]) {
+#if defined(__AVX512F__)
+  if constexpr (sizeof(T) == 4) {
+    using Register = typename Lanes<T>::Register;
+    const __m512 a = _mm512_loadu_ps(p), b = _mm512_loadu_ps(p + kLanes), c = _mm512_loadu_ps(p + 2 * kLanes);
+    for (int k = 0; k < 3; ++k)
+      columns[k].r[0] = (Register)shuffle3(a, b, c, kShuffles3.split_low[k], kShuffles3.split_high[k]);
+    return;
+  }
+#endif
+  T split[3][kLanes];
+  for (int i = 0; i < kLanes; ++i)
+    for (int c = 0; c < 3; ++c) split[c][i] = p[3 * i + c];
+  for (int c = 0; c < 3; ++c) columns[c] = Lanes<T>::load(split[c]);
+}
+template <class T>
+CLEAR_INLINE void store_triples(T* p, const Lanes<T> (&columns)[3]) {
+#if defined(__AVX512F__)
+  if constexpr (sizeof(T) == 4) {
+    const __m512 a = (__m512)columns[0].r[0], b = (__m512)columns[1].r[0], c = (__m512)columns[2].r[0];
+    for (int k = 0; k < 3; ++k)
+      _mm512_storeu_ps(p + k * kLanes, shuffle3(a, b, c, kShuffles3.join_low[k], kShuffles3.join_high[k]));
+    return;
+  }
+#endif
+  T split[3][kLanes];
+  for (int c = 0; c < 3; ++c) columns[c].store(split[c]);
+  for (int i = 0; i < kLanes; ++i)
+    for (int c = 0; c < 3; ++c) p[3 * i + c] = split[c][i];
+}
+
 // rows[i] lane j  <->  rows[j] lane i.
 template <class T>
 CLEAR_INLINE void transpose(Lanes<T> (&rows)[kLanes]) {
@@ -336,11 +402,11 @@ CLEAR_INLINE void transpose(Lanes<T> (&rows)[kLanes]) {
       t[2 * i + 1] = _mm512_unpackhi_ps((__m512)rows[2 * i].r[0], (__m512)rows[2 * i + 1].r[0]);
     }
     for (int i = 0; i < 4; ++i) {  // pairs of pairs: columns 4j + i of rows 4i … 4i + 3, in each 128-bit quarter j
-      const __m512d *d = (const __m512d*)&t[4 * i];
-      u[4 * i] = (__m512)_mm512_unpacklo_pd(d[0], d[2]);
-      u[4 * i + 1] = (__m512)_mm512_unpackhi_pd(d[0], d[2]);
-      u[4 * i + 2] = (__m512)_mm512_unpacklo_pd(d[1], d[3]);
-      u[4 * i + 3] = (__m512)_mm512_unpackhi_pd(d[1], d[3]);
+      const __m512d a = (__m512d)t[4 * i], b = (__m512d)t[4 * i + 1], c = (__m512d)t[4 * i + 2], d = (__m512d)t[4 * i + 3];
+      u[4 * i] = (__m512)_mm512_unpacklo_pd(a, c);
+      u[4 * i + 1] = (__m512)_mm512_unpackhi_pd(a, c);
+      u[4 * i + 2] = (__m512)_mm512_unpacklo_pd(b, d);
+      u[4 * i + 3] = (__m512)_mm512_unpackhi_pd(b, d);
     }
     for (int i = 0; i < 4; ++i) {  // then the quarters change places
       __m512 even_low = _mm512_shuffle_f32x4(u[i], u[4 + i], 0x88), odd_low = _mm512_shuffle_f32x4(u[i], u[4 + i], 0xdd);

@@ -1,0 +1,71 @@
+"""What every backend asks of its input, said in the same words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from rasterizers.interface import RasterSettings, Splats
+
+Settings = TypeVar("Settings", bound=RasterSettings)
+
+
+def build(kind: type[Settings], settings: Mapping[str, Any]) -> Settings:
+    """A backend from its settings, the fields of `kind`.
+
+    Raises:
+        ValueError: a setting that it does not have, or that is out of range.
+    """
+    known = [f.name for f in fields(kind)]
+    unknown = sorted(set(settings) - set(known))
+    if unknown:
+        raise ValueError(f"unknown rasterizer setting {unknown[0]!r}; known are {', '.join(known)}.")
+    chosen = dict(settings)
+    if "background" in chosen:
+        chosen["background"] = tuple(float(c) for c in chosen["background"])
+    return kind(**chosen)
+
+
+def require_finite(splats: Splats) -> None:
+    """NaN or infinity is named here, not found later as a hole in the picture. One reduction a tensor.
+
+    Raises:
+        ValueError: names the tensor and the first Gaussian.
+    """
+    for field in fields(splats):
+        value = getattr(splats, field.name)
+        if value is None or value.numel() == 0:
+            continue
+        if not bool(torch.isfinite(value.sum())) and not bool(torch.isfinite(value).all()):
+            bad = (~torch.isfinite(value)).flatten(1).any(1) if value.dim() > 1 else ~torch.isfinite(value)
+            index = int(bad.nonzero()[0])
+            raise ValueError(f"splats.{field.name} must be finite; Gaussian {index} is not ({int(bad.sum())} in all).")
+
+
+def require_cotangents(cotangents: Tensor, image: Tensor) -> None:
+    """Cotangents are [K, H, W, 3] for the image they belong to.
+
+    Raises:
+        ValueError: they are not.
+    """
+    expected = tuple(image.shape)
+    if cotangents.dim() != 4 or tuple(cotangents.shape[1:]) != expected:
+        raise ValueError(f"cotangents must be [K, {', '.join(map(str, expected))}], got {tuple(cotangents.shape)}.")
+
+
+def require_tiles(tiles: Tensor, width: int, height: int, tile: int) -> None:
+    """A demand mask has one entry per tile.
+
+    Raises:
+        ValueError: it has not.
+    """
+    rows, columns = -(-height // tile), -(-width // tile)
+    if tuple(tiles.shape) != (rows, columns):
+        raise ValueError(
+            f"the tile mask must be [{rows}, {columns}] for {width}x{height} pixels "
+            f"in tiles of {tile}, got {tuple(tiles.shape)}."
+        )

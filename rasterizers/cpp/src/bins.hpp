@@ -1,0 +1,143 @@
+// Bin, second half: which Gaussians may touch which 32 x 32 bin, front to back, by a stable counting scatter.
+//
+// What a bin sends back to a Gaussian lies where their pair does, so bins write in one stream. A Gaussian finds its pairs
+// by `where`, in a fixed order: that, not the scheduling of threads, decides the order of the sums.
+#pragma once
+
+#include <algorithm>
+#include <stdexcept>
+#include <string>
+
+#include "pool.hpp"
+#include "types.hpp"
+
+namespace clear {
+
+// A rectangle of bins, both ends included; empty if x1 < x0.
+struct BinRange {
+  std::int16_t x0 = 0, x1 = -1, y0 = 0, y1 = -1;
+  std::int64_t count() const { return x1 < x0 || y1 < y0 ? 0 : std::int64_t(x1 - x0 + 1) * (y1 - y0 + 1); }
+};
+
+// The pairs of some rows of bins ("band"): all rows at once, unless that would not fit the memory budget.
+struct Bins {
+  int columns = 0, first_row = 0, end_row = 0;
+  Buffer<std::uint32_t> pairs;        // the Gaussian of each pair; by bin, then depth, then index
+  std::vector<std::int64_t> starts;   // [bins of the band + 1]
+  Buffer<std::uint64_t> masks;        // of each pair: the blocks of its bin that its ellipse reaches (set by blocks.hpp)
+  Buffer<std::uint32_t> first;        // [n + 1]: Gaussian i's pairs are where[first[i]] … where[first[i + 1] - 1]
+  Buffer<std::uint32_t> where;        // places in `pairs`, Gaussian by Gaussian, each from its top left bin on
+  bool has_masks = false;
+
+  int bins() const { return columns * (end_row - first_row); }
+};
+
+// How many pairs each row of bins has in all: 64-bit, a full screen times a million Gaussians is 10^9.
+inline std::vector<std::int64_t> count_pairs(int rows, const Buffer<BinRange>& ranges, std::int64_t n, int threads) {
+  const std::int64_t chunk = 16384, chunks = (n + chunk - 1) / chunk;
+  std::vector<std::int64_t> steps(std::size_t(chunks) * (rows + 1), 0);  // differences from row to row
+  Pool::instance().run(threads, chunks, [&](std::int64_t c) {
+    std::int64_t* step = steps.data() + c * (rows + 1);
+    for (std::int64_t i = c * chunk; i < std::min(n, (c + 1) * chunk); ++i) {
+      const BinRange r = ranges[i];
+      if (!r.count()) continue;
+      step[r.y0] += r.x1 - r.x0 + 1;
+      step[r.y1 + 1] -= r.x1 - r.x0 + 1;
+    }
+  });
+  std::vector<std::int64_t> pairs(rows);
+  std::int64_t running = 0;
+  for (int row = 0; row < rows; ++row) {
+    for (std::int64_t c = 0; c < chunks; ++c) running += steps[c * (rows + 1) + row];
+    pairs[row] = running;
+  }
+  return pairs;
+}
+
+// List the pairs of rows [first_row, end_row). `wanted[bin]` (or null) leaves out bins that nobody asked for.
+inline void list_pairs(int columns, int first_row, int end_row, const Buffer<std::uint32_t>& order,
+                       const Buffer<BinRange>& ranges, std::int64_t n, const std::uint64_t* wanted, Bins& out, int threads) {
+  out.columns = columns, out.first_row = first_row, out.end_row = end_row, out.has_masks = false;
+  const int bins = out.bins();
+  auto clipped = [&](std::uint32_t i) {
+    BinRange r = ranges[i];
+    r.y0 = std::max<int>(r.y0, first_row), r.y1 = std::min<int>(r.y1, end_row - 1);
+    return r;
+  };
+  auto each_bin = [&](const BinRange& r, auto&& visit) {
+    for (int y = r.y0; y <= r.y1; ++y)
+      for (int x = r.x0; x <= r.x1; ++x)
+        if (!wanted || wanted[y * columns + x]) visit((y - first_row) * columns + x);
+  };
+
+  // How many pairs each Gaussian has.
+  const std::int64_t chunk = 16384, chunks = (n + chunk - 1) / chunk;
+  std::vector<std::int64_t> base(chunks + 1, 0);
+  out.first.reserve_lost(n + 1);
+  Pool::instance().run(threads, chunks, [&](std::int64_t c) {
+    std::int64_t count = 0;
+    for (std::int64_t i = c * chunk; i < std::min(n, (c + 1) * chunk); ++i) {
+      out.first[i] = std::uint32_t(count);
+      BinRange r = clipped(std::uint32_t(i));
+      if (wanted) each_bin(r, [&](int) { ++count; });
+      else count += r.count();
+    }
+    base[c + 1] = count;
+  });
+  for (std::int64_t c = 0; c < chunks; ++c) base[c + 1] += base[c];
+  if (base[chunks] > std::int64_t(UINT32_MAX)) throw std::length_error("more than 2^32 pairs in one band");
+  Pool::instance().run(threads, chunks, [&](std::int64_t c) {
+    for (std::int64_t i = c * chunk; i < std::min(n, (c + 1) * chunk); ++i) out.first[i] += std::uint32_t(base[c]);
+  });
+  out.first[n] = std::uint32_t(base[chunks]);
+
+  // Pairs, front to back within each bin: count by part of the depth order, then scatter part by part. What the first walk
+  // had to look up anywhere, the second reads in a row.
+  struct Ranked {
+    BinRange range;
+    std::uint32_t splat, first;
+  };
+  const std::int64_t m = std::int64_t(order.size());
+  const int parts = m < 4096 ? 1 : std::max(1, threads);
+  std::vector<std::uint32_t> places(std::size_t(parts) * bins, 0);
+  Buffer<Ranked> ranked;
+  ranked.reserve_lost(m);
+  auto part_of = [&](std::int64_t part) { return std::pair(m * part / parts, m * (part + 1) / parts); };
+  Pool::instance().run(threads, parts, [&](std::int64_t part) {
+    constexpr int ahead = 16;
+    std::uint32_t* count = places.data() + part * bins;
+    auto [begin, end] = part_of(part);
+    for (std::int64_t k = begin; k < end; ++k) {
+      if (k + ahead < end) {
+        __builtin_prefetch(&ranges[order[k + ahead]]);
+        __builtin_prefetch(&out.first[order[k + ahead]]);
+      }
+      ranked[k] = {clipped(order[k]), order[k], out.first[order[k]]};
+      each_bin(ranked[k].range, [&](int bin) { ++count[bin]; });
+    }
+  });
+  out.starts.assign(bins + 1, 0);
+  std::uint32_t place = 0;
+  for (int bin = 0; bin < bins; ++bin) {
+    out.starts[bin] = place;
+    for (int part = 0; part < parts; ++part) place += std::exchange(places[std::size_t(part) * bins + bin], place);
+  }
+  out.starts[bins] = place;
+  out.pairs.reserve_lost(place);
+  out.masks.reserve_lost(place);
+  out.where.reserve_lost(place);
+  Pool::instance().run(threads, parts, [&](std::int64_t part) {
+    std::uint32_t* next = places.data() + part * bins;
+    auto [begin, end] = part_of(part);
+    for (std::int64_t k = begin; k < end; ++k) {
+      std::uint32_t nth = ranked[k].first;
+      each_bin(ranked[k].range, [&](int bin) {
+        const std::uint32_t at = next[bin]++;
+        out.pairs[at] = ranked[k].splat;
+        out.where[nth++] = at;
+      });
+    }
+  });
+}
+
+}  // namespace clear

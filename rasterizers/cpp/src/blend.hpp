@@ -1,0 +1,253 @@
+// Blend: a block of 4 x 4 pixels, front to back, and its transpose for K image cotangents, back to front.
+//
+//   α_i = min(α_max, 2^(…)),   T_i = Π_{j<i} (1 - α_j),   I = Σ T_i α_i c_i + T_end · background
+//
+// A Gaussian with α_i < α_min is passed over; a pixel ends before the one that would take its T below transmittance_min.
+#pragma once
+
+#include <climits>
+
+#include "blocks.hpp"
+#include "columns.hpp"
+
+namespace clear {
+
+// A block's sixteen pixels: row by row from its corner.
+template <class T>
+struct PixelCentres {
+  Lanes<T> x, y;
+  CLEAR_INLINE PixelCentres(int X, int Y) {
+    T px[kLanes], py[kLanes];
+    for (int i = 0; i < kLanes; ++i) px[i] = T(X + i % kBlock) + T(0.5), py[i] = T(Y + i / kBlock) + T(0.5);
+    x = Lanes<T>::load(px), y = Lanes<T>::load(py);
+  }
+};
+
+// What of a pixel outlives the forward pass: T at its end, and the first pair of the bin that it no longer took.
+template <class T>
+struct BlockEnd {
+  T transmittance[kLanes];
+  std::int32_t ended[kLanes];  // INT_MAX: went through the whole list
+
+  bool finished() const {
+    bool all = true;
+    for (std::int32_t e : ended) all &= e != INT_MAX;
+    return all;
+  }
+};
+
+template <class T>
+struct BlockColour {
+  T r[kLanes], g[kLanes], b[kLanes];
+};
+
+// A block's pixels in an [height, width, C] image; blocks may hang over its edge.
+template <int C, class T>
+CLEAR_INLINE void load_block(const T* image, int width, int height, int X, int Y, Lanes<T> (&channels)[C]) {
+  T pixels[kLanes * C];
+  const int columns = std::min(kBlock, width - X), rows = std::min(kBlock, height - Y);
+  if (columns < kBlock || rows < kBlock) std::memset(pixels, 0, sizeof pixels);
+  for (int y = 0; y < rows; ++y) {
+    const T* from = image + (std::int64_t(Y + y) * width + X) * C;
+    if (columns == kBlock) std::memcpy(pixels + y * kBlock * C, from, sizeof(T) * kBlock * C);
+    else std::copy(from, from + columns * C, pixels + y * kBlock * C);
+  }
+  load_rows<C>(pixels, 0, kLanes, channels);
+}
+
+template <int C, class T>
+CLEAR_INLINE void store_block(T* image, int width, int height, int X, int Y, const Lanes<T> (&channels)[C]) {
+  T pixels[kLanes * C];
+  store_rows<C>(pixels, 0, kLanes, channels);
+  const int columns = std::min(kBlock, width - X), rows = std::min(kBlock, height - Y);
+  for (int y = 0; y < rows; ++y) {
+    T* to = image + (std::int64_t(Y + y) * width + X) * C;
+    if (columns == kBlock) std::memcpy(to, pixels + y * kBlock * C, sizeof(T) * kBlock * C);
+    else std::copy(pixels + y * kBlock * C, pixels + (y * kBlock + columns) * C, to);
+  }
+}
+
+// log2 of a Gaussian's α before the cap, at the pixels.
+template <class T>
+CLEAR_INLINE Lanes<T> exponent(const Ellipse<T>& e, const Lanes<T>& dx, const Lanes<T>& dy) {
+  using L = Lanes<T>;
+  L along = L(e.A) * dx + L(e.B) * dy;
+  return L(e.peak) - dx * along - L(e.C) * dy * dy;
+}
+
+// One segment's part of a block; after the first, `colour` and `end` go on from where the segment before left them.
+template <class T>
+void blend_block(const Segment<T>& segment, int block, int X, int Y, const Settings<T>& s, BlockColour<T>& colour,
+                 BlockEnd<T>& end) {
+  using L = Lanes<T>;
+  const PixelCentres<T> pixel(X, Y);
+  const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, transmittance_min = s.transmittance_min;
+  L through = T(1), r = T(0), g = T(0), b = T(0);
+  Mask<T> alive = Mask<T>::from_bits(0xffff);
+  if (segment.first == 0) {
+    std::fill_n(end.ended, kLanes, INT_MAX);
+  } else {
+    through = L::load(end.transmittance), r = L::load(colour.r), g = L::load(colour.g), b = L::load(colour.b);
+    std::uint32_t open = 0;
+    for (int i = 0; i < kLanes; ++i) open |= std::uint32_t(end.ended[i] == INT_MAX) << i;
+    alive = Mask<T>::from_bits(open);
+  }
+  const Ellipse<T>* ellipses = segment.ellipses.data();
+  const std::uint16_t* list = segment.list(block);
+  const int n = segment.lengths[block];
+  for (int i = 0; i < n; ++i) {
+    const Ellipse<T>& e = ellipses[list[i]];
+    const L dx = pixel.x - L(e.u), dy = pixel.y - L(e.v);
+    const L alpha = minimum(exp2(exponent(e, dx, dy)), alpha_max);
+    const Mask<T> counts = (alpha >= alpha_min) & alive;
+    if (!counts.any()) continue;
+    const L weight = through * alpha, after = through - weight;
+    const Mask<T> kept = counts & (after >= transmittance_min);
+    const std::uint32_t stops = counts.bits() ^ kept.bits();
+    if (__builtin_expect(stops != 0, 0)) {
+      for (std::uint32_t m = stops; m; m &= m - 1)
+        end.ended[__builtin_ctz(m)] = std::int32_t(segment.first) + list[i];
+      alive = alive.and_not(counts.and_not(kept));
+    }
+    const L w = where(kept, weight);
+    r += w * L(e.r), g += w * L(e.g), b += w * L(e.b);
+    through = select(kept, after, through);
+    if (__builtin_expect(stops != 0, 0) && !alive.any()) break;
+  }
+  through.store(end.transmittance);
+  r.store(colour.r), g.store(colour.g), b.store(colour.b);
+}
+
+// Sums over the pixels of a block, for the bin's Gaussians: one row of `Pulled` per (Gaussian, cotangent).
+template <class T, int K>
+struct BlockPull {
+  static constexpr int kRows = kLanes;  // Gaussians are collected until there is one for every lane
+  T q[K][kRows][kLanes], weight[kRows][kLanes];
+  T offset_x[kRows], offset_y[kRows];  // from the Gaussian's centre to the block's
+  int place[kRows];
+
+  // Lanes become Gaussians: rows are transposed, then a sum over pixels is fifteen additions for sixteen Gaussians.
+  CLEAR_INLINE void flush(int count, const T (&cotangent)[K][3][kLanes], Pulled<T>* sums) {
+    using L = Lanes<T>;
+    if (!count) return;
+    for (int i = count; i < kRows; ++i) {
+      L(T(0)).store(weight[i]);
+      for (int k = 0; k < K; ++k) L(T(0)).store(q[k][i]);
+      offset_x[i] = offset_y[i] = T(0);
+    }
+    L w[kRows];
+    for (int i = 0; i < kRows; ++i) w[i] = L::load(weight[i]);
+    transpose(w);
+    const L ox = L::load(offset_x), oy = L::load(offset_y);
+    for (int k = 0; k < K; ++k) {
+      L v[kRows], out[kRows];
+      for (int i = 0; i < kRows; ++i) v[i] = L::load(q[k][i]);
+      transpose(v);
+      moments(v, ox, oy, out);
+      L red = T(0), green = T(0), blue = T(0);
+      for (int p = 0; p < kLanes; ++p) {
+        red += w[p] * L(cotangent[k][0][p]);
+        green += w[p] * L(cotangent[k][1][p]);
+        blue += w[p] * L(cotangent[k][2][p]);
+      }
+      out[6] = red, out[7] = green, out[8] = blue;
+      for (int i = 9; i < kRows; ++i) out[i] = T(0);
+      transpose(out);
+      for (int i = 0; i < count; ++i) {
+        T* row = &sums[std::int64_t(place[i]) * K + k].q;
+        (L::load(row) + out[i]).store(row);
+      }
+    }
+  }
+
+ private:
+  // Σ v, Σ v·dx, … about the Gaussian's centre, by way of the block's centre, where the offsets are constants.
+  static CLEAR_INLINE void moments(const Lanes<T> (&v)[kLanes], const Lanes<T>& ox, const Lanes<T>& oy,
+                                   Lanes<T> (&out)[kLanes]) {
+    using L = Lanes<T>;
+    L m = T(0), mx = T(0), my = T(0), mxx = T(0), mxy = T(0), myy = T(0);
+    for (int row = 0; row < kBlock; ++row) {
+      const L &a = v[4 * row], &b = v[4 * row + 1], &c = v[4 * row + 2], &d = v[4 * row + 3];
+      const L outer = a + d, inner = b + c, sum = outer + inner;
+      const L first = L(T(1.5)) * (d - a) + L(T(0.5)) * (c - b), second = L(T(2.25)) * outer + L(T(0.25)) * inner;
+      const L y = T(row) - T(1.5);
+      m += sum, mx += first, mxx += second;
+      my += y * sum, mxy += y * first, myy += y * y * sum;
+    }
+    const L qx = mx + ox * m, qy = my + oy * m;
+    out[0] = m, out[1] = qx, out[2] = qy;
+    out[3] = mxx + ox * (mx + qx);
+    out[4] = mxy + ox * my + oy * qx;
+    out[5] = myy + oy * (my + qy);
+  }
+};
+
+// What a block carries from segment to segment on the way back: T in front of what was visited, and for each cotangent the
+// light from behind, Σ_{j>i} T_j α_j (c_j·v) + T_end background·v.
+template <class T, int K>
+struct BlockBack {
+  T transmittance[kLanes], behind[K][kLanes];
+};
+
+//   ∂I·v/∂α_i = T_i (c_i·v) - behind / (1 - α_i)
+// Where the cap binds the picture does not depend on the ellipse.
+template <class T, int K>
+void blend_block_vjp(const Segment<T>& segment, int block, int X, int Y, const Settings<T>& s, const BlockEnd<T>& end,
+                     const T (&cotangent)[K][3][kLanes], BlockBack<T, K>& back, Pulled<T>* sums) {
+  using L = Lanes<T>;
+  const PixelCentres<T> pixel(X, Y);
+  const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, one = T(1);
+  const T centre_x = T(X) + T(kBlock) / 2, centre_y = T(Y) + T(kBlock) / 2;
+  const std::uint16_t* list = segment.list(block);
+
+  // Ends, counted from this segment's first pair: exact in T.
+  T ends[kLanes];
+  const std::int32_t before = std::int32_t(segment.first);
+  int last = 0;
+  for (int i = 0; i < kLanes; ++i) {
+    const int e = std::min(std::max(end.ended[i] - before, 0), kSegment);
+    ends[i] = T(e), last = std::max(last, e);
+  }
+  const L ended = L::load(ends);
+  int n = segment.lengths[block];
+  if (last < segment.count) n = int(std::lower_bound(list, list + n, last) - list);
+  if (!n) return;
+
+  L through = L::load(back.transmittance), v[K][3], behind[K];
+  for (int k = 0; k < K; ++k) {
+    behind[k] = L::load(back.behind[k]);
+    for (int c = 0; c < 3; ++c) v[k][c] = L::load(cotangent[k][c]);
+  }
+  BlockPull<T, K> pull;
+  int count = 0;
+  const Ellipse<T>* ellipses = segment.ellipses.data();
+  for (int i = n - 1; i >= 0; --i) {
+    const int place = list[i];
+    const Ellipse<T>& e = ellipses[place];
+    const L dx = pixel.x - L(e.u), dy = pixel.y - L(e.v);
+    const L free = exp2(exponent(e, dx, dy)), capped = minimum(free, alpha_max);
+    const Mask<T> kept = (capped >= alpha_min) & (ended > L(T(place)));
+    if (!kept.any()) continue;
+    const L alpha = where(kept, capped);
+    const L over = reciprocal(one - alpha);
+    through *= over;
+    const L weight = through * alpha;
+    const Mask<T> moves = kept & (free <= alpha_max);
+    weight.store(pull.weight[count]);
+    for (int k = 0; k < K; ++k) {
+      const L light = v[k][0] * L(e.r) + v[k][1] * L(e.g) + v[k][2] * L(e.b);
+      const L d_alpha = through * light - behind[k] * over;
+      where(moves, alpha * d_alpha).store(pull.q[k][count]);
+      behind[k] += weight * light;
+    }
+    pull.offset_x[count] = centre_x - e.u;
+    pull.offset_y[count] = centre_y - e.v;
+    pull.place[count] = place;
+    if (++count == pull.kRows) pull.flush(count, cotangent, sums), count = 0;
+  }
+  pull.flush(count, cotangent, sums);
+  through.store(back.transmittance);
+  for (int k = 0; k < K; ++k) behind[k].store(back.behind[k]);
+}
+
+}  // namespace clear

@@ -1,0 +1,106 @@
+// Within a bin: which Gaussian may touch which 4 x 4 block. A bin is worked off in segments of bounded length, so that
+// what a thread holds stays in its cache however many Gaussians pile up.
+#pragma once
+
+#include "bins.hpp"
+
+namespace clear {
+
+inline constexpr int kSegment = 2048;
+inline constexpr int kListStride = kSegment + 32;  // lists 4 KiB apart would all compete for the same lines of the cache
+
+// A segment of a bin: its Gaussians, copied side by side, and for each block the places of those that reach it, in order.
+template <class T>
+struct Segment {
+  Buffer<Ellipse<T>> ellipses;
+  Buffer<std::uint16_t> places;  // [block][kListStride]
+  int lengths[kBlocks];
+  std::int64_t first;  // the segment's first pair, counted from the bin's first
+  int count;
+
+  Segment() {
+    ellipses.reserve_lost(kSegment);
+    places.reserve_lost(std::size_t(kBlocks) * kListStride);
+  }
+  const std::uint16_t* list(int block) const { return places.data() + std::size_t(block) * kListStride; }
+};
+
+// Sixteen Gaussians against all blocks of the bin whose corner is (X, Y). Row of blocks by row of blocks: where is the
+// ellipse within this slab widest to the left, and to the right? Exact up to a thousandth of a pixel, always generous.
+template <class T>
+CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], T X, T Y, std::uint64_t* masks) {
+  using L = Lanes<T>;
+  const L u = e[0] - L(X), v = e[1] - L(Y), A = e[2], B = e[3], C = e[4], reach = e[6], half_x = e[7], half_y = e[8];
+  const L one = T(1), zero = T(0), slack = T(1e-3), eight = T(kBlocksAcross);
+  const L inverse = one / maximum(half_y, L(T(1e-20)));
+  const L shear = -B / (L(T(2)) * A);                  // where x is extreme along a line of constant y, per dy
+  const L width = root(reach / A);                     // half the chord through the centre
+  const L widest = -B / (L(T(2)) * C) * half_x;        // dy of the rightmost point; the leftmost lies opposite
+  std::uint32_t low[kLanes] = {}, high[kLanes] = {};
+  for (int row = 0; row < kBlocksAcross; ++row) {
+    L first = L(T(row * kBlock) + T(0.5)) - v, last = first + L(T(kBlock - 1));
+    Mask<T> touches = (first <= half_y + slack) & (last >= -half_y - slack);
+    if (!touches.any()) continue;
+    L from = maximum(first, -half_y), to = minimum(last, half_y);
+    L dy_right = clamp(widest, from, to), dy_left = clamp(-widest, from, to);
+    L t_right = dy_right * inverse, t_left = dy_left * inverse;
+    L right = u + shear * dy_right + width * root(maximum(one - t_right * t_right, zero)) + slack;
+    L left = u + shear * dy_left - width * root(maximum(one - t_left * t_left, zero)) - slack;
+    // Blocks c with a pixel centre 4c + 0.5 … 4c + 3.5 in [left, right]; `end` is one past the last.
+    L begin = clamp(-floor((L(T(3.5)) - left) * L(T(0.25))), zero, eight);
+    L end = clamp(floor((right - L(T(0.5))) * L(T(0.25))) + one, zero, eight);
+    Mask<T> some = touches & (begin < end);
+    L bits = where(some, scale_by_power(one, end) - scale_by_power(one, begin));  // 2^end - 2^begin
+    T values[kLanes];
+    bits.store(values);
+    std::uint32_t* half = row < 4 ? low : high;
+    for (int i = 0; i < kLanes; ++i) half[i] |= std::uint32_t(std::int32_t(values[i])) << (8 * (row & 3));
+  }
+  for (int i = 0; i < kLanes; ++i) masks[i] = std::uint64_t(high[i]) << 32 | low[i];
+}
+
+// The blocks of a bin that lie in the image.
+inline std::uint64_t blocks_in_image(int bin_x, int bin_y, int width, int height) {
+  const int columns = std::min(kBlocksAcross, (width - bin_x * kBin + kBlock - 1) / kBlock);
+  const int rows = std::min(kBlocksAcross, (height - bin_y * kBin + kBlock - 1) / kBlock);
+  std::uint64_t row = (1u << columns) - 1, all = 0;
+  for (int y = 0; y < rows; ++y) all |= row << (kBlocksAcross * y);
+  return all;
+}
+
+// Gather a segment's Gaussians and list its blocks. Masks are computed the first time, and saved for the way back.
+template <class T>
+void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_t first, std::uint64_t wanted,
+            Segment<T>& out) {
+  const std::int64_t begin = bins.starts[bin] + first;
+  const int n = out.count = int(std::min<std::int64_t>(kSegment, bins.starts[bin + 1] - begin));
+  out.first = first;
+  const std::uint32_t* pairs = bins.pairs.data() + begin;
+  std::uint64_t* masks = bins.masks.data() + begin;
+  const T X = T(bin % bins.columns * kBin), Y = T((bins.first_row + bin / bins.columns) * kBin);
+  std::uint16_t* next[kBlocks];
+  for (int b = 0; b < kBlocks; ++b) next[b] = out.places.data() + std::size_t(b) * kListStride;
+  constexpr int ahead = 24;
+  for (int i = 0; i < std::min(n, ahead); ++i) __builtin_prefetch(&ellipses[pairs[i]]);
+  for (int start = 0; start < n; start += kLanes) {
+    const int count = std::min(kLanes, n - start);
+    Lanes<T> rows[kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+      const int at = start + std::min(i, count - 1);
+      if (at + ahead < n) __builtin_prefetch(&ellipses[pairs[at + ahead]]);
+      rows[i] = Lanes<T>::load(&ellipses[pairs[at]].u);
+      if (i < count) rows[i].store(&out.ellipses[at].u);
+    }
+    if (!bins.has_masks) {
+      std::uint64_t fresh[kLanes];
+      transpose(rows);
+      block_masks(rows, X, Y, fresh);
+      for (int i = 0; i < count; ++i) masks[start + i] = fresh[i] & wanted;
+    }
+    for (int i = 0; i < count; ++i)
+      for (std::uint64_t m = masks[start + i]; m; m &= m - 1) *next[__builtin_ctzll(m)]++ = std::uint16_t(start + i);
+  }
+  for (int b = 0; b < kBlocks; ++b) out.lengths[b] = int(next[b] - out.list(b));
+}
+
+}  // namespace clear

@@ -1,0 +1,83 @@
+// Between tensors, one Gaussian a row, and lanes, one Gaussian a lane. Groups are sixteen neighbours in memory.
+#pragma once
+
+#include <algorithm>
+
+#include "types.hpp"
+
+namespace clear {
+
+// Columns of a contiguous [n, C] tensor, for the `count` (1 … 16) rows that start at `row`; the last row fills the rest.
+template <int C, class T>
+CLEAR_INLINE void load_rows(const T* tensor, std::int64_t row, int count, Lanes<T> (&columns)[C]) {
+  const T* p = tensor + row * C;
+  T padded[C * kLanes];
+  [[maybe_unused]] T split[C][kLanes];
+  if (count < kLanes) {
+    for (int i = 0; i < kLanes; ++i)
+      for (int c = 0; c < C; ++c) padded[C * i + c] = p[C * std::min(i, count - 1) + c];
+    p = padded;
+  }
+  if constexpr (C == 3) {
+    load_triples(p, columns);
+  } else if constexpr (C == 1) {
+    columns[0] = Lanes<T>::load(p);
+  } else {
+    for (int i = 0; i < kLanes; ++i)
+      for (int c = 0; c < C; ++c) split[c][i] = p[C * i + c];
+    for (int c = 0; c < C; ++c) columns[c] = Lanes<T>::load(split[c]);
+  }
+}
+
+template <int C, class T>
+CLEAR_INLINE void store_rows(T* tensor, std::int64_t row, int count, const Lanes<T> (&columns)[C]) {
+  [[maybe_unused]] T split[C][kLanes];
+  T joined[C * kLanes];
+  T* p = count == kLanes ? tensor + row * C : joined;
+  if constexpr (C == 3) {
+    store_triples(p, columns);
+  } else if constexpr (C == 1) {
+    columns[0].store(p);
+  } else {
+    for (int c = 0; c < C; ++c) columns[c].store(split[c]);
+    for (int i = 0; i < kLanes; ++i)
+      for (int c = 0; c < C; ++c) p[C * i + c] = split[c][i];
+  }
+  if (count < kLanes) std::memcpy(tensor + row * C, joined, sizeof(T) * C * count);
+}
+
+template <class T>
+CLEAR_INLINE Lanes<T> load_row(const T* tensor, std::int64_t row, int count) {
+  Lanes<T> columns[1];
+  load_rows<1>(tensor, row, count, columns);
+  return columns[0];
+}
+
+// Columns of sixteen rows of `width` numbers that lie anywhere; a null row is zeros. Reads nothing beyond a row.
+template <class T>
+CLEAR_INLINE void gather_rows(const T* const (&rows)[kLanes], int width, Lanes<T>* columns) {
+  for (int start = 0; start < width; start += kLanes) {
+    int first = std::max(0, std::min(start, width - kLanes));  // the last sixteen overlap what came before
+    Lanes<T> block[kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+      if (!rows[i]) {
+        block[i] = T(0);
+      } else if (width >= kLanes) {
+        block[i] = Lanes<T>::load(rows[i] + first);
+      } else {
+        T padded[kLanes] = {};
+        std::copy(rows[i], rows[i] + width, padded);
+        block[i] = Lanes<T>::load(padded);
+      }
+    }
+    transpose(block);
+    for (int c = start - first; c < kLanes && first + c < width; ++c) columns[first + c] = block[c];
+  }
+}
+
+// Sixteen truths to bytes.
+inline void store_bits(bool* out, int count, std::uint32_t bits) {
+  for (int i = 0; i < count; ++i) out[i] = (bits >> i) & 1;
+}
+
+}  // namespace clear

@@ -1,0 +1,109 @@
+// Large arrays that nobody clears before they are written, and that are used again.
+//
+// A frame's arrays live for one iteration and are wanted again in the next, at nearly the same size. Fresh pages from the
+// system cost more than what is computed in them, so what is freed is kept for whoever asks next.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <cstdlib>
+#include <mutex>
+#include <new>
+#include <utility>
+#include <vector>
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
+namespace clear {
+
+class Recycler {
+ public:
+  struct Block {
+    void* data = nullptr;
+    std::size_t bytes = 0;
+  };
+
+  static Recycler& instance() {
+    static Recycler* it = new Recycler;  // never destroyed: buffers may outlive static objects
+    return *it;
+  }
+
+  // At least `bytes`, and not more than half of it wasted.
+  Block take(std::size_t bytes) {
+    {
+      std::lock_guard<std::mutex> lock(mutex_);
+      std::size_t best = kept_.size();
+      for (std::size_t i = 0; i < kept_.size(); ++i)
+        if (kept_[i].bytes >= bytes && kept_[i].bytes <= 2 * bytes + kPage &&
+            (best == kept_.size() || kept_[i].bytes < kept_[best].bytes))
+          best = i;
+      if (best < kept_.size()) {
+        Block found = kept_[best];
+        kept_.erase(kept_.begin() + std::ptrdiff_t(best));
+        held_ -= found.bytes;
+        return found;
+      }
+    }
+    const std::size_t align = bytes >= kHuge ? kHuge : kPage;
+    Block fresh{nullptr, (bytes + bytes / 8 + align) / align * align};  // a little more: the next may be a little larger
+    fresh.data = std::aligned_alloc(align, fresh.bytes);
+    if (!fresh.data) throw std::bad_alloc();
+#if defined(__linux__)
+    if (align == kHuge) madvise(fresh.data, fresh.bytes, MADV_HUGEPAGE);  // scattered reads: fewer pages to look up
+#endif
+    return fresh;
+  }
+
+  void give(Block block) {
+    if (!block.data) return;
+    std::lock_guard<std::mutex> lock(mutex_);
+    if (block.bytes < kPage || held_ + block.bytes > kMost) {
+      std::free(block.data);
+    } else {
+      held_ += block.bytes;
+      kept_.push_back(block);
+    }
+  }
+
+ private:
+  static constexpr std::size_t kPage = 4096, kHuge = std::size_t(2) << 20, kMost = std::size_t(1) << 30;
+  std::mutex mutex_;
+  std::vector<Block> kept_;
+  std::size_t held_ = 0;
+};
+
+template <class T>
+class Buffer {
+ public:
+  Buffer() = default;
+  Buffer(const Buffer&) = delete;
+  Buffer& operator=(const Buffer&) = delete;
+  Buffer(Buffer&& other) noexcept { *this = std::move(other); }
+  Buffer& operator=(Buffer&& other) noexcept {
+    std::swap(block_, other.block_);
+    std::swap(size_, other.size_);
+    return *this;
+  }
+  ~Buffer() { Recycler::instance().give(block_); }
+
+  // Makes room for n; what was there is lost when it has to grow.
+  void reserve_lost(std::size_t n) {
+    if (n * sizeof(T) > block_.bytes) {
+      Recycler::instance().give(std::exchange(block_, {}));
+      block_ = Recycler::instance().take(n * sizeof(T));
+    }
+    size_ = n;
+  }
+  T* data() { return static_cast<T*>(block_.data); }
+  const T* data() const { return static_cast<const T*>(block_.data); }
+  T& operator[](std::size_t i) { return data()[i]; }
+  const T& operator[](std::size_t i) const { return data()[i]; }
+  std::size_t size() const { return size_; }
+
+ private:
+  Recycler::Block block_;
+  std::size_t size_ = 0;
+};
+
+}  // namespace clear

@@ -1,0 +1,187 @@
+// Project, in memory: every group of sixteen Gaussians onto every screen of a pose, and the colours of those that show.
+#pragma once
+
+#include "bins.hpp"
+#include "colour.hpp"
+#include "columns.hpp"
+#include "pool.hpp"
+
+namespace clear {
+
+// Colours of the Gaussians that some screen shows, group by group: before offset and clamp, and ∂rgb/∂mean.
+template <class T>
+struct Palette {
+  static constexpr int kRgb = 3 * kLanes, kSlope = 9 * kLanes;
+  Buffer<T> rgb, slope;  // [groups, 3, 16], [groups, 9, 16]
+
+  void reserve(std::int64_t groups, bool turns) {
+    rgb.reserve_lost(groups * kRgb);
+    slope.reserve_lost(turns ? groups * kSlope : 0);  // without higher bands a colour does not depend on the position
+  }
+};
+
+// What differs between the screens of a pose, and what projecting onto one yields.
+template <class T>
+struct Target {
+  Screen<T> screen;
+  const T* opacities;   // [n]
+  const T* rgb_offset;  // [n, 3] or null
+  T* means2d;           // out [n, 2]
+  bool* visible;        // out [n]
+  Buffer<Ellipse<T>> ellipses;
+  Buffer<BinRange> ranges;    // [n]
+  Buffer<std::uint16_t> lit;  // [groups, 3]: the lanes whose channel was not below 0, and so has a gradient
+};
+
+// The bins whose pixel centres the ellipses' boxes cover.
+template <class T>
+CLEAR_INLINE void bins_of(const Screen<T>& screen, const Lanes<T> (&e)[kLanes], std::uint32_t shown, int count,
+                          BinRange* out) {
+  using L = Lanes<T>;
+  auto bin = [](const L& pixel, int size, T (&store)[kLanes]) CLEAR_LAMBDA {
+    floor(clamp(pixel, L(T(0)), L(T(size - 1))) * L(T(1) / kBin)).store(store);
+  };
+  const L half = T(0.5);
+  T x0[kLanes], x1[kLanes], y0[kLanes], y1[kLanes];
+  bin(e[0] - e[7] - half, screen.width, x0), bin(e[0] + e[7] - half, screen.width, x1);
+  bin(e[1] - e[8] - half, screen.height, y0), bin(e[1] + e[8] - half, screen.height, y1);
+  for (int i = 0; i < count; ++i)
+    out[i] = (shown >> i) & 1 ? BinRange{std::int16_t(x0[i]), std::int16_t(x1[i]), std::int16_t(y0[i]), std::int16_t(y1[i])}
+                              : BinRange{};
+}
+
+inline std::int64_t groups_of(std::int64_t n) { return (n + kLanes - 1) / kLanes; }
+
+// Whether the smallest value of A dx² + B dx dy + C dy² over the image's pixel centres' box is within reach: exact. A convex
+// quadratic over a box is smallest at its centre if that is inside, else on one of the sides that face it.
+template <class T>
+CLEAR_INLINE Mask<T> reaches_image(const Screen<T>& s, const Lanes<T>& u, const Lanes<T>& v, const Lanes<T>& A,
+                                   const Lanes<T>& B, const Lanes<T>& C, const Lanes<T>& reach) {
+  using L = Lanes<T>;
+  L left = L(T(0.5)) - u, right = L(T(s.width) - T(0.5)) - u, top = L(T(0.5)) - v, bottom = L(T(s.height) - T(0.5)) - v;
+  L near_x = clamp(L(T(0)), left, right), near_y = clamp(L(T(0)), top, bottom);
+  L on_x = clamp(-B * near_x / (L(T(2)) * C), top, bottom), on_y = clamp(-B * near_y / (L(T(2)) * A), left, right);
+  auto power = [&](const L& dx, const L& dy) { return A * dx * dx + B * dx * dy + C * dy * dy; };
+  return minimum(power(near_x, on_x), power(on_y, near_y)) <= reach;
+}
+
+// Lanes of one group on one screen; returns which of them show. Conditions to keep, not to cull: NaN fails each.
+template <class T>
+CLEAR_INLINE Mask<T> ellipse_of(const Geometry<T>& g, const Screen<T>& screen, const Settings<T>& s,
+                                const Lanes<T>& opacity, Lanes<T> (&e)[kLanes]) {
+  using L = Lanes<T>;
+  Footprint<T> f(g, screen, s);
+  constexpr T log2e = kLog2E<T>;
+  L u = L(screen.fx) * g.tan_x + L(screen.cx), v = L(screen.fy) * g.tan_y + L(screen.cy);
+  L A = L(log2e / 2) * f.xx, B = L(log2e) * f.xy, C = L(log2e / 2) * f.yy;
+  L peak = log2(maximum(opacity * f.compensation, L(T(1e-30))));
+  L reach = (peak - L(std::log2(s.alpha_min))) * L(T(1.001)) + L(T(1.5e-3));
+  L extent = root(maximum(reach, L(T(0))) * L(2 / log2e)) * f.size;
+  L half_x = extent * root(f.a + f.kernel), half_y = extent * root(f.c + f.kernel);
+  constexpr T huge = T(1e30);  // an ellipse of 1e-15 px covers no pixel centre, and its square would overflow
+  Mask<T> shows = (g.z > L(s.near)) & (opacity >= L(s.alpha_min)) & (reach > L(T(0))) & (A < L(huge)) & (C < L(huge)) &
+                  (absolute(u) < L(huge)) & (absolute(v) < L(huge)) & (half_x >= L(T(0))) & (half_y >= L(T(0))) &
+                  reaches_image(screen, u, v, A, B, C, reach);
+  L fields[kLanes] = {u, v, A, B, C, peak, select(shows, reach, L(T(-1))), half_x, half_y};
+  for (int i = 0; i < 9; ++i) e[i] = fields[i];
+  return shows;
+}
+
+// Finite numbers times 0 are 0; NaN and infinity are NaN, and stay.
+template <class T>
+CLEAR_INLINE void note(const Lanes<T>* columns, int count, Lanes<T>& poison) {
+  for (int i = 0; i < count; ++i) poison += columns[i] * Lanes<T>(T(0));
+}
+
+// Returns whether every number that was read is finite.
+template <class T>
+bool project_group(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
+                   Palette<T>& palette, Buffer<T>& depths, std::int64_t group) {
+  using L = Lanes<T>;
+  const std::int64_t first = group * kLanes;
+  const int count = int(std::min<std::int64_t>(kLanes, splats.n - first));
+  const std::uint32_t real = (1u << count) - 1;
+  L mean[3], quat[4], scale[3];
+  load_rows<3>(splats.means, first, count, mean);
+  load_rows<4>(splats.quats, first, count, quat);
+  load_rows<3>(splats.scales, first, count, scale);
+  L poison = T(0);
+  note(mean, 3, poison), note(quat, 4, poison), note(scale, 3, poison);
+  Geometry<T> g(pose, targets[0].screen, mean, quat, scale);
+
+  g.z.store(depths.data() + first);
+  Mask<T> in_front = g.z > L(s.near);
+  L ellipse[4][kLanes];
+  std::uint32_t shown[4], any = 0;
+  for (std::size_t i = 0; i < targets.size(); ++i) {
+    Target<T>& target = targets[i];
+    const L opacity = load_row(target.opacities, first, count);
+    note(&opacity, 1, poison);
+    // Screens of one pose are nearly always scaled copies of each other, and share the geometry too.
+    Mask<T> shows = same_view(target.screen, targets[0].screen)
+                        ? ellipse_of(g, target.screen, s, opacity, ellipse[i])
+                        : ellipse_of(Geometry<T>(pose, target.screen, mean, quat, scale), target.screen, s, opacity, ellipse[i]);
+    any |= shown[i] = shows.bits() & real;
+    L centre[2] = {where(in_front, ellipse[i][0]), where(in_front, ellipse[i][1])};
+    store_rows<2>(target.means2d, first, count, centre);
+    store_bits(target.visible + first, count, shown[i]);
+    bins_of(target.screen, ellipse[i], shown[i], count, target.ranges.data() + first);
+  }
+
+  Colour<T> colour;
+  if (any) {
+    L coefficients[3 * 16];
+    const T *base[kLanes], *bands[kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+      bool used = (any >> i) & 1;
+      base[i] = used ? splats.sh0 + 3 * (first + i) : nullptr;
+      bands[i] = used && splats.bands ? splats.shN + splats.shN_stride * (first + i) : nullptr;
+    }
+    gather_rows(base, 3, coefficients);
+    if (splats.bands) gather_rows(bands, 3 * splats.bands, coefficients + 3);
+    note(coefficients, 3 + 3 * splats.bands, poison);
+    colour_of(pose, mean, splats.bands, coefficients, colour);
+    for (int c = 0; c < 3; ++c) colour.rgb[c].store(palette.rgb.data() + group * palette.kRgb + c * kLanes);
+    if (splats.bands)
+      for (int c = 0; c < 9; ++c) colour.slope[c].store(palette.slope.data() + group * palette.kSlope + c * kLanes);
+  }
+
+  for (std::size_t i = 0; i < targets.size(); ++i) {
+    L(&e)[kLanes] = ellipse[i];
+    L offset[3] = {T(0), T(0), T(0)};
+    if (targets[i].rgb_offset && shown[i]) load_rows<3>(targets[i].rgb_offset, first, count, offset);
+    note(offset, 3, poison);
+    for (int c = 0; c < 3; ++c) {
+      L rgb = any ? colour.rgb[c] + offset[c] : L(T(0));
+      e[9 + c] = maximum(rgb, L(T(0)));
+      targets[i].lit[3 * group + c] = std::uint16_t((rgb >= L(T(0))).bits());
+    }
+    for (int c = 12; c < kLanes; ++c) e[c] = T(0);
+    transpose(e);
+    T* rows = reinterpret_cast<T*>(targets[i].ellipses.data() + first);
+    for (int k = 0; k < kLanes; ++k) e[k].store(rows + k * kLanes);
+  }
+  return (poison >= L(T(0))).bits() == 0xffff;
+}
+
+// Room for whole groups; the rows beyond n repeat the last Gaussian and are never listed.
+template <class T>
+bool project(const Pose<T>& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
+             Palette<T>& palette, Buffer<T>& depths, int threads) {
+  const std::int64_t groups = groups_of(splats.n), per_task = 64;
+  palette.reserve(groups, splats.bands > 0);
+  depths.reserve_lost(groups * kLanes);
+  for (Target<T>& target : targets) {
+    target.ranges.reserve_lost(splats.n);
+    target.ellipses.reserve_lost(groups * kLanes);
+    target.lit.reserve_lost(groups * 3);
+  }
+  std::atomic<bool> finite{true};
+  Pool::instance().run(threads, (groups + per_task - 1) / per_task, [&](std::int64_t task) {
+    for (std::int64_t g = task * per_task; g < std::min(groups, (task + 1) * per_task); ++g)
+      if (!project_group(pose, s, splats, targets, palette, depths, g)) finite = false;
+  });
+  return finite;
+}
+
+}  // namespace clear
