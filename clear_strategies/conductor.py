@@ -5,9 +5,9 @@ Eq. 8, 13
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -33,7 +33,7 @@ class Update:
     """What one iteration decided.
 
     Args:
-        grads: the merged gradient by attribute, for the optimizer.
+        grads: the merged gradient by attribute, for the optimizer; empty where a merger has stepped already.
         score: S_i, what densification goes by; `ordinary` is what it would go by without strategies.
         conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
         losses: scalars by name. readings: the strategies' own numbers, for logs.
@@ -48,6 +48,33 @@ class Update:
     readings: Mapping[str, float] = field(default_factory=dict)
 
 
+@runtime_checkable
+class Merger(Protocol):
+    """Who pulls a view's gradients and merges them. The conductor itself does, readably; a kernel may do the same."""
+
+    @property
+    def stage(self) -> str:
+        """Under which name the ledger counts it."""
+        ...
+
+    def pull(self, shot: Any, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Any]:
+        """One gradient a cotangent, each with `.screen` [N, 2]; what else it is only `merge` knows."""
+        ...
+
+    def merge(
+        self,
+        params: Mapping[str, Tensor],
+        g_lr: Any,
+        g_base: Any | None,
+        g_hf: Any | None,
+        m: float | Float[Tensor, " N"],
+        e: Evidence | None,
+        t: int,
+    ) -> tuple[Grads, Mapping[str, float]]:
+        """The merged gradient and the conflict ratio by group; see `Conductor.merge`."""
+        ...
+
+
 class Conductor:
     """Strategies in concert.
 
@@ -60,6 +87,8 @@ class Conductor:
     Raises:
         StrategyConflict: two strategies answer a question that only one may.
     """
+
+    stage: Final = "strategies"
 
     def __init__(
         self, *strategies: Strategy, objective: Objective | None = None, statistics_from: int | None = None
@@ -104,52 +133,75 @@ class Conductor:
         collecting = self._statistics_from is not None and t > self._statistics_from
         return "score" in self._one and collecting and self.may_densify(t)
 
-    def update(self, params: Mapping[str, Tensor], lr: Shot, hr: Shot | None, view: View, t: int) -> Update:
+    def update(
+        self, params: Mapping[str, Tensor], lr: Shot, hr: Shot | None, view: View, t: int, merger: Merger | None = None
+    ) -> Update:
         """The merged gradient of one view, in place of `backward()`.
 
         Args:
             params: raw parameters by attribute. lr, hr: this view rendered at both scales; hr None skips it.
+            merger: who pulls and merges the gradients; None: the conductor itself, as written below.
         """
         o, λ, stage = self.objective, self.objective.lambda_hr(t), self.ledger.stage
+        how: Merger = self if merger is None else merger
         with stage("losses LR"):
             l_lr = o.lr(lr.image.detach(), view.lr.image)  # Eq. 4
         with stage("backward LR"):
-            (g_lr,) = lr.pull(l_lr.cotangents)
+            (g_lr,) = how.pull(lr, l_lr.cotangents)
         if hr is None:
             self.ledger.skip("backward HR", "lambda_HR = 0")
-            screens = self._screens(λ, g_lr, lr, None, None, None)
-            with stage("strategies"):
-                g = g_lr + self._regularize(params, t)
+            with stage(how.stage):
+                screens = self._screens(λ, g_lr, lr, None, None, None)
+                g, _ = how.merge(params, g_lr, None, None, 1.0, None, t)
             return Update(g, screens.ordinary, screens.ordinary, None, {}, l_lr.values, self._readings())
 
         with stage("losses HR"):
             l_hr = o.hr(hr.image.detach(), view.hr.image)  # Eq. 5
         with stage("backward HR"):
-            g_base, *rest = hr.pull(l_hr.cotangents)  # one backward pass, K = 2
+            g_base, *rest = how.pull(hr, l_hr.cotangents)  # one backward pass, K = 2
         g_hf = rest[0] if rest else None
 
-        with stage("strategies"):
+        with stage(how.stage):
             screens = self._screens(λ, g_lr, lr, g_base, g_hf, hr)
             e = self._ask("observe", None, view, hr)  # q, a, w        Eq. 9, 10
-            g_hr = g_base
-            if g_hf is not None:
-                m = self._ask("route", 1.0, e)  # m              Eq. 12
-                g_hf = g_hf * m * o.lambda_hf
-                g_hr = g_base + g_hf  # g^HR           Eq. 13
-            base_lr, base_hr = _without_detail(g_lr), _without_detail(g_hr)
-            conflict: Mapping[str, float] = {}
-            if λ > 0:
-                conflict = conflict_ratio(base_lr, base_hr)  # before correction
-                base_hr = self._ask("correct", base_hr, base_lr, base_hr, e)  # corrected      Eq. 6, 7, 11
-            g = base_lr + base_hr * λ  # Eq. 8
-            if g_hf is not None:
-                g["detail"] = g_hf["detail"] * λ  # f_det: never corrected, never from L_base
-            g = g + self._regularize(params, t)  # Eq. 16
+            m = 1.0 if g_hf is None else self._ask("route", 1.0, e)  # m              Eq. 12
+            g, conflict = how.merge(params, g_lr, g_base, g_hf, m, e, t)
             score = self._ask("score", None, e, screens)  # S^dens         Eq. 14
         return Update(
             g, screens.ordinary if score is None else score, screens.ordinary, e, conflict,
             {**l_lr.values, **l_hr.values}, self._readings(),
         )  # fmt: skip
+
+    def pull(self, shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
+        return shot.pull(cotangents)
+
+    def merge(
+        self,
+        params: Mapping[str, Tensor],
+        g_lr: Grads,
+        g_base: Grads | None,
+        g_hf: Grads | None,
+        m: float | Float[Tensor, " N"],
+        e: Evidence | None,
+        t: int,
+    ) -> tuple[Grads, Mapping[str, float]]:
+        """The gradient g_LR + λ_HR ĝ_HR + λ∇L_stab, and the conflict ratio before correction."""
+        if g_base is None:
+            return g_lr + self._regularize(params, t), {}
+        λ, λ_hf = self.objective.lambda_hr(t), self.objective.lambda_hf
+        g_hr = g_base
+        if g_hf is not None:
+            g_hf = g_hf * m * λ_hf
+            g_hr = g_base + g_hf  # g^HR           Eq. 13
+        base_lr, base_hr = _without_detail(g_lr), _without_detail(g_hr)
+        conflict: Mapping[str, float] = {}
+        if λ > 0:
+            conflict = conflict_ratio(base_lr, base_hr)  # before correction
+            base_hr = self._ask("correct", base_hr, base_lr, base_hr, e)  # corrected      Eq. 6, 7, 11
+        g = base_lr + base_hr * λ  # Eq. 8
+        if g_hf is not None:
+            g["detail"] = g_hf["detail"] * λ  # f_det: never corrected, never from L_base
+        return g + self._regularize(params, t), conflict  # Eq. 16
 
     def after_step(self, params: Mapping[str, Tensor], t: int) -> None:
         for s in self.strategies:
@@ -189,6 +241,10 @@ class Conductor:
             named[kind if same == 0 else f"{kind}{same + 1}"] = s
         return named
 
+    def owner(self, hook: str) -> Strategy | None:
+        """The strategy that answers a hook which only one may."""
+        return self._one.get(hook)
+
     def _ask(self, hook: str, unanswered: Any, *arguments: Any) -> Any:
         owner = self._one.get(hook)
         return unanswered if owner is None else getattr(owner, hook)(*arguments)
@@ -203,9 +259,7 @@ class Conductor:
                 total = total + g
         return total
 
-    def _screens(
-        self, λ: float, g_lr: Grads, lr: Shot, g_base: Grads | None, g_hf: Grads | None, hr: Shot | None
-    ) -> Screens:
+    def _screens(self, λ: float, g_lr: Any, lr: Shot, g_base: Any | None, g_hf: Any | None, hr: Shot | None) -> Screens:
         screen_lr = to_ndc(_screen(g_lr), lr.image)
         base = to_ndc(_screen(g_base), hr.image) if g_base is not None and hr is not None else None
         hf = to_ndc(_screen(g_hf), hr.image) if g_hf is not None and hr is not None else None
@@ -224,7 +278,8 @@ def _without_detail(g: Grads) -> Grads:
     return Grads({name: value for name, value in g.items() if name != "detail"})
 
 
-def _screen(g: Grads) -> Tensor:
-    if g.screen is None:
+def _screen(g: Any) -> Tensor:
+    screen: Tensor | None = g.screen
+    if screen is None:
         raise ValueError("a Shot's pull() must set .screen on every Grads it returns.")
-    return g.screen
+    return screen

@@ -23,8 +23,8 @@ _NEIGHBOURS: Final = 3  # 3DGS: a point's first size is the root mean square dis
 _SMALLEST_SQUARED_DISTANCE: Final = 1e-7
 
 # Beyond these a parameter can no longer move: sigmoid(17) is 1 in float32, exp(45)² is infinite (STRESS rows 10, 16).
-_LOGIT_LIMIT: Final = 15.0
-_LOG_SCALE_LIMIT: Final = 20.0
+LOGIT_LIMIT: Final = 15.0
+LOG_SCALE_LIMIT: Final = 20.0
 
 
 class GaussianField(nn.Module):
@@ -119,8 +119,8 @@ class GaussianField(nn.Module):
 
     def constrain(self) -> None:
         """Project parameters back to where they can still move: logits to ±15, log scales to ±20."""
-        self.opacities.data.clamp_(-_LOGIT_LIMIT, _LOGIT_LIMIT)
-        self.scales.data.clamp_(-_LOG_SCALE_LIMIT, _LOG_SCALE_LIMIT)
+        self.opacities.data.clamp_(-LOGIT_LIMIT, LOGIT_LIMIT)
+        self.scales.data.clamp_(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
 
     def filtered_opacities(self) -> Float[Tensor, " N"]:
         """σ(opacity) times the 3D filter's coefficient: what is drawn, and what pruning looks at."""
@@ -195,17 +195,21 @@ class Activation:
 
 
 class FieldShot:
-    """A rendering of the field; see `gradients.Shot`."""
+    """A rendering of the field; see `gradients.Shot`.
+
+    Attributes:
+        gradients: K cotangents to gradients of the drawn splats, before the chain rule of `activation`.
+    """
 
     def __init__(self, rendering: Rendering, activation: Activation, *, detail: bool) -> None:
         self.image, self.means2d, self.visible = rendering.image, rendering.means2d, rendering.visible
-        self._vjp: Callable[[Tensor], SplatGradients] = rendering.vjp
-        self._activation = activation
+        self.gradients: Callable[[Tensor], SplatGradients] = rendering.vjp
+        self.activation = activation
         self._detail = detail
 
     def pull(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        g = self._vjp(cotangents)
-        return [self._activation.pull(g, k, detail=self._detail) for k in range(len(cotangents))]
+        g = self.gradients(cotangents)
+        return [self.activation.pull(g, k, detail=self._detail) for k in range(len(cotangents))]
 
 
 def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:

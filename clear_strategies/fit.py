@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ from clear_strategies.data.view import Scene, View
 from clear_strategies.density import Density, DensitySettings, cameras_extent
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.field import GaussianField
+from clear_strategies.fused import Fused, FusedStep, fused_step
 from clear_strategies.mip import MipFilter
 from clear_strategies.optim import Adam, LearningRates
 from clear_strategies.schedules import REFERENCE_ITERATIONS, milestone
@@ -45,6 +46,8 @@ class FitSettings:
         max_degree: of spherical harmonics; one more is active every `degree_every` iterations.
         probe_every: iterations between looks at the test views; 0: never. probe_views: how many of them.
         checkpoint_every: iterations between checkpoints; 0: only when interrupted. keep: how many stay.
+        fused: "auto" merges, corrects, anchors and steps in one compiled pass where it can, and leaves out rows that would
+            not move; "every_row" leaves out none (the same bits); "off" takes the readable path.
     """
 
     iterations: int = 10_000
@@ -56,6 +59,7 @@ class FitSettings:
     probe_views: int = 3
     checkpoint_every: int = milestone(2_500)
     keep: int = 3
+    fused: Fused = "auto"
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
@@ -64,6 +68,10 @@ class FitSettings:
             raise ValueError(f"max_degree must be 0, 1, 2 or 3, got {self.max_degree}.")
         if self.keep < 1:
             raise ValueError(f"keep must be at least 1 checkpoint, got {self.keep}.")
+        if self.fused not in get_args(Fused):
+            raise ValueError(
+                f"fused must be one of {', '.join(get_args(Fused))}, got {self.fused!r}. In a YAML file, off is quoted."
+            )
 
     @property
     def stretch(self) -> float:
@@ -101,6 +109,7 @@ class TrainState:
     views: tuple[View, ...]
     t: int = 1
     history: list[dict[str, float]] = field(default_factory=list)
+    fused: FusedStep | None = None
 
     @classmethod
     def start(
@@ -120,7 +129,8 @@ class TrainState:
         control = Density(density, len(theta), extent=extent, seed=settings.seed, white_background=white)
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed)
-        state = cls(theta, conductor, optimizer, control, settings, mip, scene.train)
+        fused = fused_step(conductor, optimizer, settings.fused)
+        state = cls(theta, conductor, optimizer, control, settings, mip, scene.train, fused=fused)
         state.refilter()
         return state
 
@@ -186,10 +196,11 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         lr, hr = θ.render_scales(rasterizer, view, gate=z, hr=hr_wanted)  # Î_LR, Î_HR     Eq. 2, 3
     if hr is None:
         ask.ledger.skip("render LR + HR", "lambda_HR = 0")
-    u = ask.update(θ.raw(), lr, hr, view, t)
-    with stage("optimizer"):
-        s.optimizer.step(θ.raw(), u.grads, lr.visible if hr is None else lr.visible | hr.visible)
-        θ.constrain()
+    u = ask.update(θ.raw(), lr, hr, view, t, s.fused)
+    if s.fused is None:  # else the same arithmetic has been done, step included
+        with stage("optimizer"):
+            s.optimizer.step(θ.raw(), u.grads, lr.visible if hr is None else lr.visible | hr.visible)
+            θ.constrain()
     ask.after_step(θ.raw(), t)  # θᵃ at t = t_a  Eq. 16       SVS
     s.density.accumulate(u, lr if hr is None else hr, t)  # S^dens         Eq. 14
     with stage("density and filter"):

@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 # A Gaussian whose axes are equally long does not change when it is turned: in exact arithmetic its rotation gradient
 # is 0, in floating point it is noise that would "conflict" one time in five (STRESS §2.3).
-_ROTATION_NOISE: Final = 2.0**-18
+ROTATION_NOISE: Final = 2.0**-18
 
 # ω at its lower bound in this share of the corrections means that the prior agrees with LR and GCO does nothing.
 _INACTIVE_SHARE: Final = 0.9
@@ -77,13 +77,16 @@ class GCO(Strategy):
             if group in lr and group in hr:
                 corrected[group], correction = self._correct_group(group, lr, hr, evidence)
                 done.append(correction)
-        self._report(done, evidence)
+        self.report(done, evidence)
         return corrected
 
     def _correct_group(self, group: str, lr: Grads, hr: Grads, evidence: Evidence | None) -> tuple[Tensor, Correction]:
         g_lr, g_hr = lr[group], hr[group]
         dot, n_lr, n_hr = row_dot(g_lr, g_hr), row_norm(g_lr), row_norm(g_hr)
-        eps_cos, eps_corr = self._epsilons(n_lr, n_hr)
+        both = (n_lr > 0) & (n_hr > 0)
+        compared = int(both.sum())
+        means = (float(n_lr[both].mean()), float(n_hr[both].mean())) if compared else (0.0, 0.0)
+        eps_cos, eps_corr = self.epsilons(*means)
         n = n_lr * n_hr
         c = torch.where(n > 0, dot / (n + eps_cos).clamp_min(_TINY), 0.0)  # Eq. 6
         conflict = c < -self.tolerance
@@ -104,31 +107,33 @@ class GCO(Strategy):
             step = -(omega * coefficient).abs().clamp(self.weight_min, self.weight_max)
         corrected = g_hr.clone()
         corrected[i] = (g_hr[i].double() - scale_rows(g_lr[i].double(), step)).to(g_hr.dtype)  # Eq. 7
-        compared = int((n > 0).sum())
-        return corrected, Correction(group, compared, len(i), omega, n, eps_cos)
+        at_bound = int((omega <= self.weight_min).sum())
+        return corrected, Correction(group, compared, len(i), float(omega.sum()), at_bound, self.margin(n, eps_cos))
 
-    def _epsilons(self, n_lr: Tensor, n_hr: Tensor) -> tuple[float, float]:
-        """ε of the cosine and of the correction: both carry the unit gradient²."""
+    def epsilons(self, mean_lr: float, mean_hr: float) -> tuple[float, float]:
+        """ε of the cosine and of the correction, both in the unit gradient², from the mean norms of what is compared."""
         kind, value = _parse_eps(self.eps)
         if kind == "absolute":
             return value, value
-        both = (n_lr > 0) & (n_hr > 0)
-        if not bool(both.any()):
-            return 0.0, 0.0
-        mean_lr, mean_hr = float(n_lr[both].mean()), float(n_hr[both].mean())
         return value * mean_lr * mean_hr, value * mean_lr**2
 
-    def _report(self, done: list[Correction], evidence: Evidence | None) -> None:
+    def margin(self, product: Float[Tensor, " N"], eps: float) -> float | None:
+        """The median of ‖g_LR‖‖g_HR‖ over an absolute ε; None where ε is relative, or nothing is compared."""
+        compared = product > 0
+        if _parse_eps(self.eps)[0] != "absolute" or eps == 0 or not bool(compared.any()):
+            return None
+        return float(product[compared].median()) / eps
+
+    def report(self, done: Sequence[Correction], evidence: Evidence | None) -> None:
+        """Put what was done into `readings`, and say what makes GCO idle."""
         compared, corrected = sum(c.compared for c in done), sum(c.corrected for c in done)
-        omegas = torch.cat([c.omega for c in done]) if corrected else None
         self.readings["corrected"] = corrected / compared if compared else float("nan")
-        self.readings["mean_omega"] = float(omegas.mean()) if omegas is not None else float("nan")
+        self.readings["mean_omega"] = sum(c.omega for c in done) / corrected if corrected else float("nan")
         for c in done:
             self.readings[f"corrected_{c.group}"] = c.corrected / c.compared if c.compared else float("nan")
-        if _parse_eps(self.eps)[0] == "absolute":
-            self._warn_of_epsilon(done)
-        if omegas is not None and evidence is not None and self.weight_min > 0:
-            at_bound = float((omegas <= self.weight_min).double().mean())
+        self._warn_of_epsilon(done)
+        if corrected and evidence is not None and self.weight_min > 0:
+            at_bound = sum(c.at_lower_bound for c in done) / corrected
             self.readings["omega_at_lower_bound"] = at_bound
             if at_bound > _INACTIVE_SHARE and self._first("inactive"):
                 _log.info(
@@ -139,18 +144,17 @@ class GCO(Strategy):
     def _warn_of_epsilon(self, done: Iterable[Correction]) -> None:
         """Below 20 ε a conflict loses strength; below τ/(1 - τ) ε none can be seen at all (STRESS §2.1)."""
         for c in done:
-            if not c.compared or c.eps == 0:
+            if c.margin is None:
                 continue
-            ratio = float(c.product[c.product > 0].median()) / c.eps
-            if ratio < self.tolerance / (1 - self.tolerance) and self._first(f"eps cannot {c.group}"):
+            if c.margin < self.tolerance / (1 - self.tolerance) and self._first(f"eps cannot {c.group}"):
                 _log.warning(
                     "GCO cannot fire for %s: the median of |g_LR||g_HR| is %.2g of eps=%s. Use eps=relative:1e-12.",
-                    c.group, ratio, self.eps,
+                    c.group, c.margin, self.eps,
                 )  # fmt: skip
-            elif ratio < 20 and self._first(f"eps weak {c.group}"):
+            elif c.margin < 20 and self._first(f"eps weak {c.group}"):
                 _log.warning(
                     "GCO is weakened for %s: the median of |g_LR||g_HR| is only %.2g times eps=%s.",
-                    c.group, ratio, self.eps,
+                    c.group, c.margin, self.eps,
                 )  # fmt: skip
 
     def _first(self, what: str) -> bool:
@@ -161,14 +165,16 @@ class GCO(Strategy):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correction:
-    """What was done to one group: Gaussians compared and corrected, their ω, and ‖g_LR‖‖g_HR‖ beside ε."""
+    """What was done to one group: Gaussians compared and corrected, the sum of their ω and how many sit at the lower
+    bound, and how far ‖g_LR‖‖g_HR‖ lies above an absolute ε.
+    """
 
     group: str
     compared: int
     corrected: int
-    omega: Float[Tensor, " M"]
-    product: Float[Tensor, " N"]
-    eps: float
+    omega: float
+    at_lower_bound: int
+    margin: float | None
 
 
 _TINY: Final = torch.finfo(torch.float64).tiny
@@ -177,7 +183,7 @@ _TINY: Final = torch.finfo(torch.float64).tiny
 def _turns_nothing(g: Grads) -> Bool[Tensor, " N"]:
     if "scales" not in g:
         return torch.zeros_like(g["quats"][:, 0], dtype=torch.bool)
-    return row_norm(g["quats"]) <= _ROTATION_NOISE * row_norm(g["scales"])
+    return row_norm(g["quats"]) <= ROTATION_NOISE * row_norm(g["scales"])
 
 
 def _parse_eps(eps: str) -> tuple[str, float]:

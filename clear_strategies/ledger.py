@@ -34,10 +34,10 @@ class Ledger:
             entry.runs += 1
             entry.seconds += time.perf_counter() - start
 
-    def skip(self, name: str, reason: str) -> None:
-        """Count a block that was not needed."""
+    def skip(self, name: str, reason: str, count: int = 1) -> None:
+        """Count a block that was not needed, or `count` rows of one."""
         skipped = self.entries.setdefault(name, Entry()).skipped
-        skipped[reason] = skipped.get(reason, 0) + 1
+        skipped[reason] = skipped.get(reason, 0) + count
 
     def rows(self) -> list[dict[str, str | int | float]]:
         """One row a stage: runs, ms each, seconds, and the skips with what they saved at that price."""

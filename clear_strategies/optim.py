@@ -13,8 +13,8 @@ from torch import Tensor
 from clear_strategies.gradients import ATTRIBUTES
 from clear_strategies.schedules import LogLinear
 
-_BETA1: Final = 0.9
-_BETA2: Final = 0.999
+BETA1: Final = 0.9
+BETA2: Final = 0.999
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,9 +72,7 @@ class Adam:
         self, params: Mapping[str, Tensor], grads: Mapping[str, Tensor], visible: Bool[Tensor, " N"] | None = None
     ) -> None:
         """One step in place. An attribute without gradient has gradient 0: its momentum still moves it."""
-        self.steps += 1
-        bias1, bias2 = 1 - _BETA1**self.steps, 1 - _BETA2**self.steps
-        rates = self.rates.at(self.steps, self.extent)
+        rates, bias2 = self.advance()
         rows = visible if self.rates.rows == "visible" else None
         if "detail" in grads and self.rates.detail_decay > 0:
             params["detail"].mul_(1 - self.rates.detail_decay)
@@ -82,15 +80,21 @@ class Adam:
             m, v, g = self.first[name], self.second[name], grads.get(name)
             if rows is not None:
                 before = p[~rows], m[~rows], v[~rows]
-            m.mul_(_BETA1)
-            v.mul_(_BETA2)
+            m.mul_(BETA1)
+            v.mul_(BETA2)
             if g is not None:
-                m.add_(g, alpha=1 - _BETA1)
-                v.addcmul_(g, g, value=1 - _BETA2)
+                m.add_(g, alpha=1 - BETA1)
+                v.addcmul_(g, g, value=1 - BETA2)
             denominator = (v / bias2).sqrt_().add_(self.rates.eps)
-            p.addcdiv_(m, denominator, value=-rates[name] / bias1)
+            p.addcdiv_(m, denominator, value=-rates[name])
             if rows is not None:
                 p[~rows], m[~rows], v[~rows] = before
+
+    def advance(self) -> tuple[dict[str, float], float]:
+        """Count a step: every attribute's rate over the bias of the first moment, and the bias of the second."""
+        self.steps += 1
+        bias1, bias2 = 1 - BETA1**self.steps, 1 - BETA2**self.steps
+        return {name: rate / bias1 for name, rate in self.rates.at(self.steps, self.extent).items()}, bias2
 
     def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
         """Follow a change of structure; fresh rows start without momentum."""

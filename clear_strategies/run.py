@@ -184,6 +184,7 @@ def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> Non
         **scene.notes,
         "strategies": strategies or "none (the paper's baseline)",
         "rasterizer": f"{backend}, kernel {config.rasterizer.kernel} px², {torch.get_num_threads()} threads",
+        "per-Gaussian pass": "readable" if state.fused is None else "compiled",
         "iterations": f"{settings.iterations}, seed {settings.seed}",
         "milestones": ", ".join(f"{name} {t}" for name, t in _marks(state).items()),
     }

@@ -6,6 +6,7 @@ the hooks that give *the* answer (gate, observe, route, correct, score) exactly 
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -45,11 +46,20 @@ class Strategy:
     """
 
     fused: ClassVar[str | None] = None
-    """The name under which `kernels` knows this strategy's arithmetic, or None."""
+    """The name under which the fused per-Gaussian pass knows this class's arithmetic, or None. It is not inherited by a
+    class that overrides any method: whoever changes what a strategy does gets the readable path, not the old kernel."""
 
     state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
     cache: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     readings: dict[str, float] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        declared_by = next(base for base in cls.__mro__ if "fused" in vars(base))
+        if declared_by is not cls and any(
+            getattr(cls, name) is not method for name, method in _methods(declared_by).items()
+        ):
+            cls.fused = None
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         """Once, before the first iteration, and again before a resumed one. Overriders call `super()`."""
@@ -92,6 +102,16 @@ class Strategy:
         """After the structure changed: row i of every per-Gaussian tensor now comes from row parents[i]."""
         for name, rows in self.state.items():
             self.state[name] = rows[parents]
+
+
+def _methods(cls: type) -> dict[str, Any]:
+    """A class's own and inherited functions, but for those that a dataclass decorator writes anew."""
+    return {
+        name: getattr(cls, name)
+        for base in cls.__mro__
+        for name, value in vars(base).items()
+        if inspect.isfunction(value) and not (name.startswith("__") and name != "__post_init__")
+    }
 
 
 def answers(strategy: Strategy, hook: str) -> bool:

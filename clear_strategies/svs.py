@@ -81,13 +81,20 @@ class SVS(Strategy):
         """∇ λ_stab Σ_i ‖θ_i - θ_i^a‖²_W, for every Gaussian, seen or not; None before the anchor."""
         if not self.state:
             return None
-        n = next(iter(params.values())).shape[0]
+        stiffness = self.stiffness(next(iter(params.values())).shape[0])
+        return Grads(
+            {name: (params[name] - self.state[name]) * k for name, k in stiffness.items() if name in params}
+        )  # Eq. 16
+
+    def stiffness(self, n: int) -> dict[str, float]:
+        """2 λ_stab W by anchored attribute: the anchor's pull per unit of distance.
+
+        Raises:
+            AnchorError: `n` is not the number of Gaussians that were anchored.
+        """
         self._require_same_number(n)
         strength = 2 * self.anchor_strength / (1 if self.reduction == "sum" else n)
-        weights = {name: self._weight(name) for name in self.state if name in params}
-        return Grads(
-            {name: (params[name] - self.state[name]) * (strength * w) for name, w in weights.items()}
-        )  # Eq. 16
+        return {name: strength * self._weight(name) for name in self.state}
 
     def may_densify(self, t: int) -> bool:
         return t < self.anchor_start

@@ -275,7 +275,8 @@ def test_an_iteration_stands_still_and_has_everything_on(tiny):
     )
     before = {name: t.clone() for name, t in training.state.field.raw().items()}
     ms = training()
-    assert {"render", "losses LR", "backward HR", "strategies", "optimizer", "total"} <= set(ms)
+    assert {"render", "losses LR", "backward HR", "total"} <= set(ms)
+    assert {"strategies", "optimizer"} <= set(ms) or "per-Gaussian pass" in ms
     assert all(torch.equal(t, before[name]) for name, t in training.state.field.raw().items())
     assert training.state.conductor.state_dict()  # the anchor
     assert float(training.state.density.count.sum()) > 0

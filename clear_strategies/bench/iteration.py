@@ -24,6 +24,7 @@ from clear_strategies.density import Density, DensitySettings
 from clear_strategies.errors import DataError
 from clear_strategies.field import GaussianField
 from clear_strategies.fit import FitSettings, TrainState, iterate
+from clear_strategies.fused import fused_step
 from clear_strategies.gco import GCO
 from clear_strategies.ledger import Ledger
 from clear_strategies.mip import MipFilter
@@ -88,9 +89,10 @@ class Training:
         rates = LearningRates(LogLinear(1e-30, 1e-30), *(0.0,) * 6, detail_decay=0.002)
         settings = FitSettings(degree_every=1)
         conductor.on_fit_start(1, 0)
+        optimizer = Adam(field.raw(), rates, 1.0)
         self.state = TrainState(
-            field, conductor, Adam(field.raw(), rates, 1.0), density, settings, MipFilter(), (view,),
-            t=SVS().anchor_start,
+            field, conductor, optimizer, density, settings, MipFilter(), (view,),
+            t=SVS().anchor_start, fused=fused_step(conductor, optimizer),
         )  # fmt: skip
         self.state.refilter()
         self.rasterizer = rasterizer

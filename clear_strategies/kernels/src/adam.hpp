@@ -1,0 +1,123 @@
+// Adam on sixteen numbers, and on rows of any length; operation by operation optim.Adam, but for a division by the bias
+// of the second moment, which is a multiplication here.
+#pragma once
+
+#include <cstddef>
+#include <limits>
+
+#include "block.hpp"
+
+namespace clear {
+
+struct AdamStep {
+  float beta1, beta2, gain1, gain2;  // gain = 1 - beta
+  float per_bias2, eps;  // 1 / bias of the second moment
+};
+
+// One parameter tensor with its moments [N, width], the anchor that holds it, and its limits.
+struct Attribute {
+  float *p, *m, *v;
+  int width;
+  const float* anchor = nullptr;  // θ^a, or null
+  float stiffness = 0;            // of the anchor: 2 λ_stab W
+  float rate;                     // - learning rate / bias of the first moment
+  float keep = 1;                 // what decay leaves of the parameter (f_det)
+  float limit = std::numeric_limits<float>::infinity();
+  float* merged = nullptr;        // where to write the merged gradient instead of stepping
+};
+
+CLEAR_INLINE Floats clamp_keeping_nan(const Floats& x, const Floats& limit) {
+  return minimum(limit, maximum(-limit, x));  // a NaN in the second place wins
+}
+
+struct Adam {
+  Floats p, m, v;
+
+  // Decay, step and projection. `g` holds everything but the anchor's pull.
+  CLEAR_INLINE void step(const AdamStep& s, const Attribute& a, const Floats& g) {
+    m = multiply_add(g, s.gain1, m * Floats(s.beta1));
+    v = multiply_add(g * Floats(s.gain2), g, v * Floats(s.beta2));
+    Floats denominator = root(v * Floats(s.per_bias2)) + Floats(s.eps);
+    p = at_rest(a) + m * Floats(a.rate) / denominator;
+  }
+  CLEAR_INLINE Floats at_rest(const Attribute& a) const { return p * Floats(a.keep); }
+};
+
+// g + ∇ λ_stab ‖θ - θ^a‖²_W
+CLEAR_INLINE Floats with_anchor(const Attribute& a, const Floats& g, const Floats& p, const Floats& anchor) {
+  return g + (p - anchor) * Floats(a.stiffness);  // Eq. 16
+}
+
+// Sixteen numbers at `at`, of which `moves` (0 or 1 each; null: all) take part. The others only decay and are projected.
+CLEAR_INLINE void step_sixteen(const AdamStep& s, const Attribute& a, float* p, float* m, float* v, const float* anchor,
+                               const float* g_in, const float* moves) {
+  Adam x{Floats::load(p), Floats::load(m), Floats::load(v)};
+  Floats g = Floats::load(g_in);
+  if (anchor) g = with_anchor(a, g, x.p, Floats::load(anchor));
+  Adam y = x;
+  y.step(s, a, g);
+  if (moves) {
+    auto mask = Floats::load(moves) > Floats(0.0f);
+    y = {select(mask, y.p, x.at_rest(a)), select(mask, y.m, x.m), select(mask, y.v, x.v)};
+  }
+  clamp_keeping_nan(y.p, a.limit).store(p);
+  y.m.store(m), y.v.store(v);
+}
+
+// `count` numbers from `offset` on.
+inline void step_numbers(const AdamStep& s, const Attribute& a, std::int64_t offset, int count, const float* g,
+                         const float* moves) {
+  if (a.merged) {
+    for (int j = 0; j < count; ++j) {
+      float pull = a.anchor ? (a.p[offset + j] - a.anchor[offset + j]) * a.stiffness : 0.0f;
+      a.merged[offset + j] = a.anchor ? g[j] + pull : g[j];
+    }
+    return;
+  }
+  float *p = a.p + offset, *m = a.m + offset, *v = a.v + offset;
+  const float* anchor = a.anchor ? a.anchor + offset : nullptr;
+  int j = 0;
+  for (; j + kLanes <= count; j += kLanes)
+    step_sixteen(s, a, p + j, m + j, v + j, anchor ? anchor + j : nullptr, g + j, moves ? moves + j : nullptr);
+  if (j == count) return;
+  float last[5][kLanes] = {}, moving[kLanes] = {};  // the rest of the last rows
+  std::size_t bytes = sizeof(float) * (count - j);
+  std::memcpy(last[0], p + j, bytes), std::memcpy(last[1], m + j, bytes), std::memcpy(last[2], v + j, bytes);
+  std::memcpy(last[4], g + j, bytes);
+  if (anchor) std::memcpy(last[3], anchor + j, bytes);
+  if (moves) std::memcpy(moving, moves + j, bytes);
+  step_sixteen(s, a, last[0], last[1], last[2], anchor ? last[3] : nullptr, last[4], moves ? moving : nullptr);
+  std::memcpy(p + j, last[0], bytes), std::memcpy(m + j, last[1], bytes), std::memcpy(v + j, last[2], bytes);
+}
+
+// What happens to a row that takes no step: decay and projection alone.
+inline void rest_row(const Attribute& a, std::int64_t row) {
+  if (a.merged || (a.keep == 1 && a.limit == std::numeric_limits<float>::infinity())) return;
+  for (int d = 0; d < a.width; ++d) {
+    float& p = a.p[row * a.width + d];
+    p *= a.keep;
+    p = p > a.limit ? a.limit : p < -a.limit ? -a.limit : p;
+  }
+}
+
+CLEAR_INLINE bool all_zero(const float* values, int count) {
+  std::uint32_t any = 0;  // of the bits, all but the sign
+  for (int k = 0; k < count; ++k) {
+    std::uint32_t bits;
+    std::memcpy(&bits, values + k, sizeof bits);
+    any |= bits << 1;
+  }
+  return any == 0;
+}
+
+// Whether nothing would move a row whose gradient is 0: no momentum, no pull of the anchor.
+inline bool is_still(const Attribute& a, std::int64_t row, int width) {
+  std::int64_t at = row * a.width;
+  if (!all_zero(a.m + at, width) || !all_zero(a.v + at, width)) return false;
+  if (a.anchor)
+    for (int d = 0; d < width; ++d)
+      if (!(a.p[at + d] == a.anchor[at + d])) return false;
+  return true;
+}
+
+}  // namespace clear

@@ -1,0 +1,125 @@
+// Where do LR and HR gradients disagree, and what becomes of the HR one? Decisions in double: no product of two floats
+// over- or underflows there.  Eq. 6, 7, 11
+#pragma once
+
+#include <algorithm>
+#include <limits>
+
+#include "pulled.hpp"
+
+namespace clear {
+
+// The paper's six groups in the order of gradients.CONFLICT_GROUPS; as a seventh, the Gaussian as a whole.
+enum Group { kMeans, kSh0, kShN, kOpacities, kScales, kQuats, kGroups, kGaussian = kGroups };
+
+struct Products {
+  Doubles dot = 0.0, l2 = 0.0, h2 = 0.0;  // ⟨l, h⟩, ‖l‖², ‖h‖²
+
+  CLEAR_INLINE Products& operator+=(const Products& o) {
+    dot += o.dot, l2 += o.l2, h2 += o.h2;
+    return *this;
+  }
+};
+
+template <int D>
+CLEAR_INLINE Products products(const Floats (&l)[D], const Floats (&h)[D]) {
+  Products p;
+  for (int d = 0; d < D; ++d) {
+    Doubles a = widen(l[d]), b = widen(h[d]);
+    p.dot += a * b, p.l2 += a * a, p.h2 += b * b;
+  }
+  return p;
+}
+
+CLEAR_INLINE void group_products(const Gradients& g, const Block& b, std::int64_t i, int count, Products* p) {
+  p[kMeans] = products(b.lr.means, b.hr.means);
+  p[kSh0] = products(b.lr.sh0, b.hr.sh0);
+  p[kOpacities] = products(b.lr.opacities, b.hr.opacities);
+  p[kScales] = products(b.lr.scales, b.hr.scales);
+  p[kQuats] = products(b.lr.quats, b.hr.quats);
+  BasisProducts Y = basis_products(g.lr.basis, g.base.basis, g.bases, i, count);
+  Products rgb = products(b.lr.rgb, b.hr.rgb);
+  p[kShN] = {Y.cross * rgb.dot, Y.lr2 * rgb.l2, Y.hr2 * rgb.h2};
+}
+
+// Counts of one stretch of Gaussians, before correction; sums run in the order of the stretches.
+struct Comparison {
+  std::int64_t comparable[kGroups + 1] = {}, opposed[kGroups + 1] = {};
+  double norm_lr[kGroups] = {}, norm_hr[kGroups] = {};  // Σ ‖l‖, Σ ‖h‖ over comparable Gaussians
+
+  void add(const Comparison& o) {
+    for (int k = 0; k <= kGroups; ++k) comparable[k] += o.comparable[k], opposed[k] += o.opposed[k];
+    for (int k = 0; k < kGroups; ++k) norm_lr[k] += o.norm_lr[k], norm_hr[k] += o.norm_hr[k];
+  }
+};
+
+// GCO's settings, with ε as numbers.
+struct Correction {
+  bool corrects[kGroups] = {};
+  double eps_cos[kGroups] = {}, eps_corr[kGroups] = {};
+  double tolerance, weight_min, weight_max;
+  double rotation_noise;           // ‖g_quats‖ at or below this times ‖g_scales‖ is rounding
+  bool bounds_hold_omega;          // else they hold the coefficient
+  const float* reliability;        // q_i, or null for 0
+};
+
+struct Corrected {
+  std::int64_t rows[kGroups] = {}, at_lower_bound[kGroups] = {};
+  double omega[kGroups] = {};  // Σ ω
+
+  void add(const Corrected& o) {
+    for (int k = 0; k < kGroups; ++k) {
+      rows[k] += o.rows[k], at_lower_bound[k] += o.at_lower_bound[k];
+      omega[k] += o.omega[k];
+    }
+  }
+};
+
+// What a stretch has corrected so far, lane by lane.
+struct Tally {
+  Doubles omega[kGroups];
+  std::int64_t rows[kGroups] = {}, at_lower_bound[kGroups] = {};
+
+  Tally() {
+    for (Doubles& o : omega) o = 0.0;
+  }
+  Corrected total() const {
+    Corrected c;
+    for (int k = 0; k < kGroups; ++k) c.rows[k] = rows[k], c.at_lower_bound[k] = at_lower_bound[k], c.omega[k] = sum(omega[k]);
+    return c;
+  }
+};
+
+// By which multiple of g_LR each of the sixteen is corrected in this group; 0 where it is not.
+CLEAR_INLINE bool correction_steps(const Correction& c, Group group, const Products& p, const Mask<double>& candidates,
+                                   const Doubles& q, Doubles& step, Tally& done) {
+  Doubles zero = 0.0, one = 1.0, tau = c.tolerance;
+  auto apart = (p.dot < zero) & candidates;
+  if (!apart.any()) return false;
+  Doubles n = root(p.l2 * p.h2);  // ‖l‖‖h‖; squares of floats leave room for a product
+  Doubles low = c.weight_min, high = c.weight_max;
+  Doubles cosine = p.dot / maximum(n + Doubles(c.eps_cos[group]), Doubles(std::numeric_limits<double>::min()));  // Eq. 6
+  auto conflict = (n > zero) & (cosine < -tau) & apart;
+  if (!conflict.any()) return false;
+  Doubles s = clamp((-cosine - tau) / (one - tau), zero, one);
+  Doubles omega = s * (one - q);  // Eq. 11
+  Doubles coefficient = (p.dot + tau * n) / (p.l2 + Doubles(c.eps_corr[group]));
+  if (c.bounds_hold_omega) {
+    omega = clamp(omega, low, high);
+    step = where(conflict, omega * coefficient);
+  } else {
+    step = where(conflict, -clamp(absolute(omega * coefficient), low, high));
+  }
+  done.omega[group] += where(conflict, omega);
+  done.rows[group] += __builtin_popcount(conflict.bits());
+  done.at_lower_bound[group] += __builtin_popcount((conflict & (omega <= low)).bits());
+  return true;
+}
+
+// h - step · l; rows with step 0 are handed back bit for bit.
+CLEAR_INLINE Floats corrected(const Floats& h, const Floats& l, const Doubles& step) {
+  auto touched = narrow(where(absolute(step) > Doubles(0.0), Doubles(1.0))) > Floats(0.0f);
+  return select(touched, narrow(widen(h) - widen(l) * step), h);  // Eq. 7
+}
+
+}  // namespace clear

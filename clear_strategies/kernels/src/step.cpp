@@ -1,0 +1,294 @@
+// Compiled without contraction: products and sums round as they do in torch, so gradients agree with the readable path
+// bit for bit where it matters (equal decisions), and fused multiply-add appears only where torch has it.
+#include "step.hpp"
+
+#include <iterator>
+#include <vector>
+
+#include "pool.hpp"
+
+namespace clear {
+namespace {
+
+constexpr std::int64_t kStretch = 1024;  // Gaussians a task takes; a multiple of sixteen
+
+std::int64_t stretches(std::int64_t n) { return (n + kStretch - 1) / kStretch; }
+
+CLEAR_INLINE std::uint32_t first_bits(int count) { return count == kLanes ? 0xffffu : (1u << count) - 1; }
+
+// task(i, count) for each sixteen Gaussians of stretch `number`.
+template <class Task>
+CLEAR_INLINE void each_sixteen(std::int64_t n, std::int64_t number, Task&& task) {
+  std::int64_t end = std::min(n, (number + 1) * kStretch);
+  for (std::int64_t i = number * kStretch; i < end; i += kLanes) task(i, int(std::min<std::int64_t>(kLanes, end - i)));
+}
+
+Comparison compare_stretch(const Gradients& g, double* norm_products, std::int64_t number) {
+  Comparison c;
+  Doubles norm_lr[kGroups], norm_hr[kGroups];
+  for (int k = 0; k < kGroups; ++k) norm_lr[k] = norm_hr[k] = 0.0;
+  each_sixteen(g.n, number, [&](std::int64_t i, int count) {
+    Block b;
+    load(g, i, count, b);
+    Products p[kGroups + 1];
+    group_products(g, b, i, count, p);
+    for (int k = 0; k < kGroups; ++k) p[kGaussian] += p[k];
+    for (int k = 0; k <= kGroups; ++k) {
+      Doubles zero = 0.0;
+      auto comparable = (p[k].l2 > zero) & (p[k].h2 > zero);
+      c.comparable[k] += __builtin_popcount(comparable.bits());
+      c.opposed[k] += __builtin_popcount((comparable & (p[k].dot < zero)).bits());
+      if (k == kGaussian) continue;
+      Doubles l = root(p[k].l2), h = root(p[k].h2);
+      norm_lr[k] += where(comparable, l), norm_hr[k] += where(comparable, h);
+      if (norm_products) {
+        double values[kLanes];
+        (l * h).store(values);
+        std::copy(values, values + count, norm_products + k * g.n + i);
+      }
+    }
+  });
+  for (int k = 0; k < kGroups; ++k) c.norm_lr[k] = sum(norm_lr[k]), c.norm_hr[k] = sum(norm_hr[k]);
+  return c;
+}
+
+// Where the numbers of an shN row come from: channel and band of each, in up to three sixteens. The last sixteen ends with
+// the row and overlaps the one before; all are read before any is written, so the overlap is written twice alike.
+struct RowPlan {
+  int sixteens, width, offset[3];
+  std::int32_t channel[3][kLanes], band[3][kLanes];
+
+  explicit RowPlan(int width) : sixteens((width + kLanes - 1) / kLanes), width(width) {
+    for (int k = 0; k < sixteens; ++k) {
+      offset[k] = std::max(0, std::min(kLanes * k, width - kLanes));
+      for (int j = 0; j < kLanes; ++j) {
+        channel[k][j] = (offset[k] + j) % 3;
+        band[k][j] = std::min((offset[k] + j) / 3 + 1, kLanes - 1);  // beyond the active ones the basis reads 0
+      }
+    }
+  }
+};
+
+struct RowTables {
+  Floats Y_lr, Y_hr, lr, base, hf;
+};
+
+// Sixteen numbers of g = g_LR + λ ĝ_HR in an shN row, expanded from its factors.
+CLEAR_INLINE Floats expand(const Gradients& g, const Step& s, const RowTables& t, float m, double correction,
+                           const std::int32_t* band, const std::int32_t* channel) {
+  Floats l = pick(t.Y_lr, band) * pick(t.lr, channel);
+  if (!g.base) return l;
+  Floats Y = g.lr.basis == g.base.basis ? pick(t.Y_lr, band) : pick(t.Y_hr, band);
+  Floats h = Y * pick(t.base, channel);
+  if (g.hf) h += Y * pick(t.hf, channel) * Floats(m) * Floats(g.lambda_hf);  // Eq. 13
+  if (correction != 0) h = corrected(h, l, correction);
+  return l + h * Floats(s.lambda_hr);  // Eq. 8
+}
+
+CLEAR_INLINE Floats basis_row(const SplatGradient& g, int bases, std::int64_t row) {
+  return load_some(g.basis + bases * row, bases);
+}
+
+class Sweep {
+ public:
+  Sweep(const Gradients& g, const Correction* correction, const Step& s)
+      : g(g), correction(correction), s(s), plan(s.width) {}
+
+  Stepped stretch(std::int64_t number) const {
+    Stepped done;
+    Tally tally;
+    each_sixteen(g.n, number, [&](std::int64_t i, int count) { sixteen(i, count, done, tally); });
+    done.corrected = tally.total();
+    return done;
+  }
+
+ private:
+  const Gradients& g;
+  const Correction* correction;
+  const Step& s;
+  const RowPlan plan;
+
+  void sixteen(std::int64_t i, int count, Stepped& done, Tally& tally) const {
+    Block b;
+    load(g, i, count, b);
+    std::uint32_t rows = first_bits(count);
+    std::uint32_t still = s.skips ? still_rows(b, i, rows) : 0;
+    std::uint32_t unseen = 0;
+    if (s.visible)
+      for (int k = 0; k < count; ++k) unseen |= std::uint32_t(!s.visible[i + k]) << k;
+    done.invisible += __builtin_popcount(unseen);
+    done.still += __builtin_popcount(still & ~unseen);
+    std::uint32_t moving = rows & ~(still | unseen);
+
+    double shN_step[kLanes] = {};
+    if (correction) correct(b, i, count, shN_step, tally);
+    if (moving) {
+      std::uint32_t seen = rows & ~unseen;  // a still row among others may take its step: it stays as it is
+      step_columns(s.means, b.lr.means, b.hr.means, i, count, seen);
+      step_columns(s.quats, b.lr.quats, b.hr.quats, i, count, seen);
+      step_columns(s.scales, b.lr.scales, b.hr.scales, i, count, seen);
+      step_columns(s.opacities, b.lr.opacities, b.hr.opacities, i, count, seen);
+      step_columns(s.sh0, b.lr.sh0, b.hr.sh0, i, count, seen);
+      step_detail(b, i, count, seen);
+      step_rows(b, i, count, moving, shN_step);
+    }
+    for (std::uint32_t resting = moving ? 0 : rows; resting; resting &= resting - 1) {
+      std::int64_t row = i + __builtin_ctz(resting);
+      rest_row(s.scales, row), rest_row(s.opacities, row), rest_row(s.detail, row);
+    }
+  }
+
+  // Eq. 6, 7, 11. Lanes beyond the last Gaussian hold zeros, which are in no conflict.
+  CLEAR_INLINE void correct(Block& b, std::int64_t i, int count, double (&shN_step)[kLanes], Tally& done) const {
+    const Correction& c = *correction;
+    Products p[kGroups];
+    group_products(g, b, i, count, p);
+    Doubles q = c.reliability ? widen(load_some(c.reliability + i, count)) : Doubles(0.0);
+    auto every = Doubles(0.0) <= Doubles(0.0);
+    auto columns = [&](Group group, auto& h, const auto& l, const Mask<double>& candidates) {
+      Doubles step;
+      if (c.corrects[group] && correction_steps(c, group, p[group], candidates, q, step, done))
+        for (std::size_t d = 0; d < std::size(h); ++d) h[d] = corrected(h[d], l[d], step);
+    };
+    columns(kMeans, b.hr.means, b.lr.means, every);
+    columns(kSh0, b.hr.sh0, b.lr.sh0, every);
+    columns(kOpacities, b.hr.opacities, b.lr.opacities, every);
+    columns(kScales, b.hr.scales, b.lr.scales, every);
+    columns(kQuats, b.hr.quats, b.lr.quats, turns_something(p));
+    Doubles step;
+    if (c.corrects[kShN] && correction_steps(c, kShN, p[kShN], every, q, step, done)) step.store(shN_step);
+  }
+
+  // A Gaussian with equal axes does not change when it is turned: its rotation gradient is noise.
+  CLEAR_INLINE Mask<double> turns_something(const Products (&p)[kGroups]) const {
+    Doubles noise2 = correction->rotation_noise * correction->rotation_noise;
+    return (p[kQuats].l2 > noise2 * p[kScales].l2) & (p[kQuats].h2 > noise2 * p[kScales].h2);
+  }
+
+  template <int D>
+  CLEAR_INLINE void step_columns(const Attribute& a, const Floats (&l)[D], const Floats (&h)[D], std::int64_t i, int count,
+                                 std::uint32_t moving) const {
+    Floats merged[D];
+    for (int d = 0; d < D; ++d) merged[d] = g.base ? l[d] + h[d] * Floats(s.lambda_hr) : l[d];  // Eq. 8
+    float numbers[D * kLanes], moves[D * kLanes];
+    store_columns(numbers, merged);
+    bool all = moving == first_bits(count);
+    if (!all)
+      for (int k = 0; k < D * kLanes; ++k) moves[k] = float(moving >> (k / D) & 1);
+    step_numbers(s.adam, a, D * i, D * count, numbers, all ? nullptr : moves);
+  }
+
+  // f_det: never corrected, never from L_base.
+  void step_detail(const Block& b, std::int64_t i, int count, std::uint32_t moving) const {
+    Floats none[3] = {0.0f, 0.0f, 0.0f}, routed[3] = {0.0f, 0.0f, 0.0f};
+    if (g.hf)
+      for (int d = 0; d < 3; ++d) routed[d] = b.hf.rgb[d] * b.m * Floats(g.lambda_hf);
+    step_columns(s.detail, none, routed, i, count, moving);
+  }
+
+  void step_rows(const Block& b, std::int64_t i, int count, std::uint32_t moving, const double (&correction)[kLanes]) const {
+    if (!s.width) return;
+    float m[kLanes], lr[4 * kLanes] = {}, base[4 * kLanes] = {}, hf[4 * kLanes] = {};  // tables are read sixteen wide
+    std::copy_n(g.lr.rgb + 3 * i, 3 * count, lr);
+    if (g.base) std::copy_n(g.base.rgb + 3 * i, 3 * count, base);
+    if (g.hf) std::copy_n(g.hf.rgb + 3 * i, 3 * count, hf), b.m.store(m);
+    for (std::uint32_t rest = moving; rest; rest &= rest - 1) {
+      int k = __builtin_ctz(rest);
+      RowTables t{basis_row(g.lr, g.bases, i + k), {}, Floats::load(lr + 3 * k), Floats::load(base + 3 * k), Floats::load(hf + 3 * k)};
+      if (g.base && g.base.basis != g.lr.basis) t.Y_hr = basis_row(g.base, g.bases, i + k);
+      Floats gradient[3] = {0.0f, 0.0f, 0.0f};
+      for (int v = 0; v < plan.sixteens; ++v)
+        gradient[v] = expand(g, s, t, g.hf ? m[k] : 1, correction[k], plan.band[v], plan.channel[v]);
+      step_row(i + k, gradient);
+    }
+  }
+
+  CLEAR_INLINE void step_row(std::int64_t row, const Floats (&gradient)[3]) const {
+    const Attribute& a = s.shN;
+    std::int64_t at = row * a.width;
+    if (a.merged || a.width < kLanes) {
+      float numbers[3 * kLanes];
+      for (int v = 0; v < plan.sixteens; ++v) gradient[v].store(numbers + plan.offset[v]);
+      step_numbers(s.adam, a, at, plan.width, numbers, nullptr);
+    } else if (plan.sixteens == 3) {
+      step_sixteens<3>(at, gradient);
+    } else if (plan.sixteens == 2) {
+      step_sixteens<2>(at, gradient);
+    } else {
+      step_sixteens<1>(at, gradient);
+    }
+  }
+
+  template <int V>
+  CLEAR_INLINE void step_sixteens(std::int64_t at, const Floats (&gradient)[3]) const {
+    const Attribute& a = s.shN;
+    Adam x[V];
+    for (int v = 0; v < V; ++v) {
+      std::int64_t from = at + plan.offset[v];
+      x[v] = {Floats::load(a.p + from), Floats::load(a.m + from), Floats::load(a.v + from)};
+    }
+    for (int v = 0; v < V; ++v) {
+      Floats pulled = gradient[v];
+      if (a.anchor) pulled = with_anchor(a, pulled, x[v].p, Floats::load(a.anchor + at + plan.offset[v]));
+      x[v].step(s.adam, a, pulled);
+    }
+    for (int v = 0; v < V; ++v) {
+      std::int64_t to = at + plan.offset[v];
+      x[v].p.store(a.p + to), x[v].m.store(a.m + to), x[v].v.store(a.v + to);
+    }
+  }
+
+  // Rows whose gradient, moments and anchor's pull are all 0: a step would leave them as they are.
+  std::uint32_t still_rows(const Block& b, std::int64_t i, std::uint32_t rows) const {
+    Floats total = magnitude(b.lr);
+    if (g.base) total += magnitude(b.hr);
+    if (g.hf) total += magnitude(b.hf);
+    std::uint32_t still = 0;
+    for (std::uint32_t rest = (total <= Floats(0.0f)).bits() & rows; rest; rest &= rest - 1) {
+      int k = __builtin_ctz(rest);
+      if (is_still(i + k)) still |= 1u << k;
+    }
+    return still;
+  }
+
+  bool is_still(std::int64_t row) const {
+    for (const Attribute* a : {&s.means, &s.quats, &s.scales, &s.opacities, &s.sh0, &s.detail})
+      if (!clear::is_still(*a, row, a->width)) return false;
+    return clear::is_still(s.shN, row, s.width);
+  }
+
+  template <int D>
+  static CLEAR_INLINE Floats magnitude(const Floats (&columns)[D]) {
+    Floats total = 0.0f;
+    for (const Floats& c : columns) total += absolute(c);
+    return total;
+  }
+  static CLEAR_INLINE Floats magnitude(const Pulled& g) {
+    return magnitude(g.means) + magnitude(g.quats) + magnitude(g.scales) + magnitude(g.opacities) + magnitude(g.rgb);
+  }
+};
+
+}  // namespace
+
+Comparison compare(const Gradients& g, double* norm_products, int threads) {
+  std::vector<Comparison> parts(stretches(g.n));
+  Pool::instance().run(threads, std::int64_t(parts.size()),
+                       [&](std::int64_t k) { parts[k] = compare_stretch(g, norm_products, k); });
+  Comparison total;
+  for (const Comparison& part : parts) total.add(part);
+  return total;
+}
+
+Stepped step(const Gradients& g, const Correction* correction, const Step& s, int threads) {
+  std::vector<Stepped> parts(stretches(g.n));
+  Sweep sweep(g, correction, s);
+  Pool::instance().run(threads, std::int64_t(parts.size()), [&](std::int64_t k) { parts[k] = sweep.stretch(k); });
+  Stepped total;
+  for (const Stepped& part : parts) {
+    total.corrected.add(part.corrected);
+    total.still += part.still, total.invisible += part.invisible;
+  }
+  return total;
+}
+
+}  // namespace clear
