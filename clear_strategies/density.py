@@ -104,10 +104,10 @@ class Density:
         seen = shot.visible
         for total, value in ((self.score, update.score), (self.ordinary, update.ordinary)):
             if self.settings.reduce == "max":
-                total[seen] = torch.maximum(total[seen], value[seen])
+                torch.maximum(total, torch.where(seen, value, total), out=total)
             else:
-                total[seen] += value[seen]
-        self.count[seen] += 1
+                total.add_(torch.where(seen, value, 0.0))
+        self.count += seen
 
     def due(self, t: int) -> bool:
         """Whether a round of densification and pruning falls on t."""

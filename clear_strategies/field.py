@@ -137,7 +137,8 @@ class GaussianField(nn.Module):
     def _activate(self, gate: Tensor | None) -> Activation:
         raw = self.raw()
         scales = raw["scales"].exp()
-        filtered = torch.hypot(scales, self.filter_3d[:, None])
+        # √(s² + f²), and s itself where the squares vanish; torch's hypot takes ten times as long.
+        filtered = torch.maximum(scales, (scales.square() + self.filter_3d[:, None].square()).sqrt_())
         coefficient = (scales / filtered).prod(-1)
         sigmoid = raw["opacities"].sigmoid()
         z = coefficient if gate is None else coefficient * gate.to(coefficient)

@@ -11,7 +11,7 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
@@ -31,6 +31,7 @@ from clear_strategies.fused import Fused, FusedStep, fused_step
 from clear_strategies.mip import MipFilter
 from clear_strategies.optim import Adam, LearningRates
 from clear_strategies.schedules import REFERENCE_ITERATIONS, milestone
+from rasterizers import native
 from rasterizers.interface import Rasterizer
 
 _log = logging.getLogger(__name__)
@@ -218,6 +219,13 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     return u
 
 
+def cores(state: TrainState, rasterizer: Rasterizer) -> AbstractContextManager[None]:
+    """To train inside of: the cores go to the compiled kernels where they do nearly all of the work."""
+    if rasterizer.traits.own_threads and state.fused is not None:
+        return native.own_threads(native.threads())
+    return nullcontext()
+
+
 Progress = Callable[[TrainState], None]
 
 
@@ -248,7 +256,7 @@ def fit(
         return checkpoint.save(checkpoints, state.checkpoint(config or {}), keep=settings.keep)
 
     began = time.perf_counter() - (state.history[-1]["seconds"] if state.history else 0.0)
-    with _deferred_signals() as pending:
+    with _deferred_signals() as pending, cores(state, rasterizer):
         while state.t <= settings.iterations:
             iterate(state, rasterizer)
             done = state.t - 1

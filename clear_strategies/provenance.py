@@ -18,14 +18,14 @@ _PACKAGES: Final = (
 
 def provenance(**facts: Any) -> dict[str, Any]:
     """What to write beside every number; `facts` are the run's own (seed, backend, kernels, notes)."""
-    import torch
+    from rasterizers import native
 
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "versions": {name: version for name in _PACKAGES if (version := _version(name)) is not None},
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}, {_processor()}",
-        "threads": torch.get_num_threads(),
+        "threads": native.threads(),
         "git": _git(),
         "command": sys.argv,
         **facts,

@@ -172,9 +172,8 @@ def _resume(state: Any, source: Path, config: Mapping[str, Any]) -> None:
 
 
 def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> None:
-    import torch
-
     from clear_strategies.schedules import milestones
+    from rasterizers import native
 
     settings, conductor = state.settings, state.conductor
     strategies = ", ".join(
@@ -183,7 +182,7 @@ def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> Non
     lines = {
         **scene.notes,
         "strategies": strategies or "none (the paper's baseline)",
-        "rasterizer": f"{backend}, kernel {config.rasterizer.kernel} px², {torch.get_num_threads()} threads",
+        "rasterizer": f"{backend}, kernel {config.rasterizer.kernel} px², {native.threads()} threads",
         "per-Gaussian pass": "readable" if state.fused is None else "compiled",
         "iterations": f"{settings.iterations}, seed {settings.seed}",
         "milestones": ", ".join(f"{name} {t}" for name, t in _marks(state).items()),

@@ -170,6 +170,7 @@ class Traits:
         shared_pass: K cotangents cost one traversal (else a loop, still correct).
         shared_scales: `render_scales` reuses projection, colours and depth order.
         deterministic: bitwise equal on repetition.
+        own_threads: computes on threads of its own (`rasterizers.native`), not on torch's.
     """
 
     devices: frozenset[str]
@@ -177,6 +178,7 @@ class Traits:
     shared_pass: bool
     shared_scales: bool
     deterministic: bool
+    own_threads: bool = False
 
 
 @runtime_checkable

@@ -1,13 +1,17 @@
-"""Compiled kernels: which instruction set this processor has, and the module that was built for it."""
+"""Compiled kernels: which instruction set this processor has, the module that was built for it, and how many threads."""
 
 from __future__ import annotations
 
 import importlib
 import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from types import ModuleType
 from typing import Final
+
+import torch
 
 from rasterizers.interface import BackendUnavailable
 
@@ -15,6 +19,30 @@ _log = logging.getLogger(__name__)
 
 _ISAS: Final = ("avx512", "avx2", "baseline")  # best first
 _OVERRIDE: Final = "CLEAR_ISA"  # for tests and comparisons
+
+_owned: list[int] = []
+
+
+def threads() -> int:
+    """How many threads kernels use: as many as torch, unless somebody holds `own_threads`."""
+    return _owned[-1] if _owned else torch.get_num_threads()
+
+
+@contextmanager
+def own_threads(n: int) -> Iterator[None]:
+    """The cores belong to the kernels: they use n threads, torch uses one.
+
+    OpenMP's threads, torch's too, wait by spinning: for a while after each of its operations torch would keep every
+    core but one from our own threads. With the kernels doing the work, its small operations are as fast on one.
+    """
+    before = torch.get_num_threads()
+    _owned.append(n)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        _owned.pop()
+        torch.set_num_threads(before)
 
 
 @cache

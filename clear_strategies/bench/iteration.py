@@ -23,7 +23,7 @@ from clear_strategies.data.view import Photo, View
 from clear_strategies.density import Density, DensitySettings
 from clear_strategies.errors import DataError
 from clear_strategies.field import GaussianField
-from clear_strategies.fit import FitSettings, TrainState, iterate
+from clear_strategies.fit import FitSettings, TrainState, cores, iterate
 from clear_strategies.fused import fused_step
 from clear_strategies.gco import GCO
 from clear_strategies.ledger import Ledger
@@ -131,17 +131,19 @@ def measure(request: Request, say: Callable[[str], None]) -> Findings:
     without_hr = Objective(lambda_hr=WarmupDecay(peak=0.0, final=0.0))
     make = STRATEGIES[request.strategy]
     full = f"{request.strategy}, LR + HR"
-    turns: dict[str, Contender] = {
-        full: Training(workload, view, rasterizer, Conductor(*make(), objective=Objective(), statistics_from=500)),
-        _LR_ONLY: Training(workload, view, rasterizer, Conductor(*make(), objective=without_hr)),
-    }
+    trainings = (
+        Training(workload, view, rasterizer, Conductor(*make(), objective=Objective(), statistics_from=500)),
+        Training(workload, view, rasterizer, Conductor(*make(), objective=without_hr)),
+    )
+    turns: dict[str, Contender] = dict(zip((full, _LR_ONLY), trainings, strict=True))
     with started(request.prototype, findings.threads) as peer:
         if isinstance(peer, str):
             skip(f"prototype: {peer}.")
         else:
             peer.scene(workload, noise(workload))
             turns[_PEER] = _plain(peer, PRESETS[request.preset])
-        with bar(len(turns) * (request.repeats + 1), request.strategy) as progress:
+        progress_bar = bar(len(turns) * (request.repeats + 1), request.strategy)
+        with progress_bar as progress, cores(trainings[0].state, rasterizer):
             ms = interleaved(turns, request.repeats, progress=progress)
     size = f"LR {view.lr.camera.width}x{view.lr.camera.height} + HR {view.hr.camera.width}x{view.hr.camera.height}"
     title = (

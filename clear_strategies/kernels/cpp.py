@@ -19,7 +19,7 @@ from torch import Tensor
 
 from clear_strategies.kernels.torch import LossAndGradient
 from rasterizers.interface import BackendUnavailable
-from rasterizers.native import load_kernels
+from rasterizers.native import load_kernels, threads
 
 
 def available() -> bool:
@@ -53,7 +53,7 @@ def photometric(
 ) -> LossAndGradient:
     """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient, in one pass; without λ no SSIM is computed."""
     tensors = _prepared(x, y, out)
-    l1_mean, dissimilarity = native().photometric(*tensors, 1 - lambda_ssim, lambda_ssim, torch.get_num_threads())
+    l1_mean, dissimilarity = native().photometric(*tensors, 1 - lambda_ssim, lambda_ssim, threads())
     return _answer((1 - lambda_ssim) * l1_mean + lambda_ssim * dissimilarity, tensors)
 
 
@@ -65,7 +65,7 @@ def l1(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> LossAndGradient:
 def ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> LossAndGradient:
     """Mean structural similarity as 3DGS trains with it: zero padding, so borders count less."""
     tensors = _prepared(x, y, None)
-    _, dissimilarity = native().photometric(*tensors, 0.0, -1.0, torch.get_num_threads())  # SSIM - 1, and its gradient
+    _, dissimilarity = native().photometric(*tensors, 0.0, -1.0, threads())  # SSIM - 1, and its gradient
     return _answer(1 - dissimilarity, tensors)
 
 
@@ -76,7 +76,7 @@ def haar_l1(
     if levels < 1:
         raise ValueError(f"levels must be at least 1, got {levels}.")
     tensors = _prepared(x, y, out)
-    return _answer(native().haar_l1(*tensors, levels, torch.get_num_threads()), tensors)
+    return _answer(native().haar_l1(*tensors, levels, threads()), tensors)
 
 
 class _Tensors(NamedTuple):

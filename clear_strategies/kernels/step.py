@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from rasterizers.native import load_kernels
+from rasterizers.native import load_kernels, threads
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +118,7 @@ class GaussianPass:
 
     def compare(self, products: Tensor | None = None) -> Comparison:
         """Conflicts before correction. products [6, N], float64: takes ‖g_LR‖‖g_HR‖ by group."""
-        return Comparison(*self._pass.compare({"products": products}, torch.get_num_threads()))
+        return Comparison(*self._pass.compare({"products": products}, threads()))
 
     def step(self, attributes: Mapping[str, Attribute], correction: Correction | None, step: Step) -> Stepped:
         """Merge, correct, anchor and step, in place."""
@@ -129,4 +128,4 @@ class GaussianPass:
         }
         rule = None if correction is None else {slot: getattr(correction, slot) for slot in Correction.__slots__}
         settings = {slot: getattr(step, slot) for slot in Step.__slots__}
-        return Stepped(*self._pass.step(tables, rule, settings, torch.get_num_threads()))
+        return Stepped(*self._pass.step(tables, rule, settings, threads()))

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from rasterizers.checks import build, require_cotangents, require_finite, require_tiles
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
-from rasterizers.native import load_kernels
+from rasterizers.native import load_kernels, threads
 
 _TRAITS: Final = Traits(
     devices=frozenset({"cpu"}),
@@ -26,6 +26,7 @@ _TRAITS: Final = Traits(
     shared_pass=True,
     shared_scales=True,
     deterministic=True,
+    own_threads=True,
 )
 _BLOCK: Final = 4  # px: what one register blends, so what a tile must be a multiple of
 _FRAMES: Final = {torch.float32: "Frame32", torch.float64: "Frame64"}
@@ -38,7 +39,7 @@ class CppRasterizer(RasterSettings):
     Args:
         tile: edge of the demand mask's tiles, px, a multiple of 4; at 32 a tile is a bin, and skipping it is free.
         memory: MiB that the lists of one picture may take; beyond it the picture is drawn in bands, bit for bit the same.
-        threads: None: as many as torch uses.
+        threads: None: as many as torch uses, see `native.threads`.
 
     A rendering's `vjp` reads the splats' tensors again: pull before they are changed in place.
     """
@@ -82,7 +83,7 @@ class _Frame:
         if dtype not in _FRAMES or like.device.type != "cpu":
             raise TypeError(f"the cpp rasterizer draws float32 and float64 on the CPU, got {dtype} on {like.device}.")
         self.settings = settings
-        self.threads = settings.threads if settings.threads is not None else torch.get_num_threads()
+        self.threads = settings.threads if settings.threads is not None else threads()
         self.cameras = [camera for _, camera in jobs]
         shared = (splats.means, splats.quats, splats.scales, splats.sh0)
         self.shared = (*(x.detach().contiguous() for x in shared), _rows(splats.shN.detach()))
