@@ -9,6 +9,7 @@
 #include <optional>
 
 #include "order.hpp"
+#include "passes.hpp"
 #include "pull.hpp"
 
 namespace clear {
@@ -67,7 +68,8 @@ class Frame {
     const std::vector<int> bands = bands_of(view, kBytesPerPair);
     for (std::size_t b = 0; b + 1 < bands.size(); ++b) {
       list(view, bands[b], bands[b + 1], threads);
-      draw_band(view, image, alpha, threads);
+      Pool::instance().run(threads, view.bins.bins(), [&](std::int64_t bin) { draw_bin(job(view, bin), image, alpha); });
+      view.bins.has_masks = true;
     }
   }
 
@@ -172,62 +174,22 @@ class Frame {
                view.wanted.empty() ? nullptr : view.wanted.data(), view.bins, threads);
   }
 
-  std::uint64_t blocks(const View& view, int bin_x, int bin_y) const {
+  // The band's bin, with the blocks that were asked for.
+  BinJob<T> job(View& view, std::int64_t bin) const {
     const Screen<T>& s = view.target.screen;
-    const std::uint64_t inside = blocks_in_image(bin_x, bin_y, s.width, s.height);
-    return view.wanted.empty() ? inside : inside & view.wanted[bin_y * s.columns() + bin_x];
-  }
-
-  static Segment<T>& segment() {
-    static thread_local Segment<T> mine;
-    return mine;
-  }
-
-  void draw_band(View& view, T* image, T* alpha, int threads) {
-    Bins& bins = view.bins;
-    const Screen<T>& screen = view.target.screen;
-    Pool::instance().run(threads, bins.bins(), [&](std::int64_t bin) {
-      const int bin_x = int(bin) % bins.columns, bin_y = bins.first_row + int(bin) / bins.columns;
-      const std::uint64_t inside = blocks_in_image(bin_x, bin_y, screen.width, screen.height);
-      const std::uint64_t wanted = blocks(view, bin_x, bin_y);
-      BlockEnd<T>* ends = view.ends.data() + (std::size_t(bin_y) * bins.columns + bin_x) * kBlocks;
-      static thread_local BlockColour<T> scratch[kBlocks];
-      BlockColour<T>* colours = scratch;
-      for (std::uint64_t m = inside; m; m &= m - 1) {
-        const int b = __builtin_ctzll(m);
-        std::fill_n(ends[b].transmittance, kLanes, T(1));
-        std::fill_n(ends[b].ended, kLanes, INT_MAX);
-        colours[b] = {};
-      }
-      const std::int64_t n = bins.starts[bin + 1] - bins.starts[bin];
-      std::uint64_t open = wanted;
-      for (std::int64_t first = 0; first < n && open; first += kSegment) {
-        Segment<T>& part = segment();
-        gather(view.target.ellipses, bins, int(bin), first, wanted, part);
-        for (std::uint64_t m = open; m; m &= m - 1) {
-          const int b = __builtin_ctzll(m);
-          if (!part.lengths[b]) continue;
-          blend_block(part, b, settings_, colours[b], ends[b]);
-          if (first + kSegment < n && ends[b].finished()) open &= ~(std::uint64_t(1) << b);
-        }
-      }
-      for (std::uint64_t m = inside; m; m &= m - 1) {
-        const int b = __builtin_ctzll(m);
-        show(screen, bin_x * kBin + b % kBlocksAcross * kBlock, bin_y * kBin + b / kBlocksAcross * kBlock, colours[b],
-             ends[b], image, alpha);
-      }
-    });
-    bins.has_masks = true;
-  }
-
-  void show(const Screen<T>& screen, int X, int Y, const BlockColour<T>& colour, const BlockEnd<T>& end, T* image,
-            T* alpha) const {
-    using L = Lanes<T>;
-    const L through = L::load(end.transmittance), channels[3] = {L::load(colour.r), L::load(colour.g), L::load(colour.b)};
-    L pixel[3], cover[1] = {L(T(1)) - through};
-    for (int c = 0; c < 3; ++c) pixel[c] = channels[c] + through * L(settings_.background[c]);
-    store_block<3>(image, screen.width, screen.height, X, Y, pixel);
-    store_block<1>(alpha, screen.width, screen.height, X, Y, cover);
+    const int x = int(bin) % view.bins.columns, y = view.bins.first_row + int(bin) / view.bins.columns;
+    const std::size_t place = std::size_t(y) * s.columns() + x;
+    const std::uint64_t inside = blocks_in_image(x, y, s.width, s.height);
+    return {settings_,
+            s,
+            view.target.ellipses,
+            view.bins,
+            int(bin),
+            x,
+            y,
+            inside,
+            view.wanted.empty() ? inside : inside & view.wanted[place],
+            view.ends.data() + place * kBlocks};
   }
 
   template <int K>
@@ -247,7 +209,9 @@ class Frame {
     for (std::size_t b = 0; b + 1 < bands.size(); ++b) {
       if (view.bins.first_row != bands[b] || view.bins.end_row != bands[b + 1]) list(view, bands[b], bands[b + 1], threads);
       sent_.reserve_lost(view.bins.pairs.size() * K);
-      send_band<K>(view, cotangents, threads);
+      Pool::instance().run(threads, view.bins.bins(),
+                           [&](std::int64_t bin) { send_bin<T, K>(job(view, bin), cotangents, sent_.data()); });
+      view.bins.has_masks = true;
       if (whole) break;
       each_group([&](std::int64_t g) {
         const int count = int(std::min<std::int64_t>(kLanes, n_ - g * kLanes));
@@ -278,77 +242,6 @@ class Frame {
       }
       pull_group<T, K>(pose_, settings_, splats, view.target, palette_, g, rows, touched, out);
     });
-  }
-
-  // The bins of the band, back to front; every pair of the band is written.
-  template <int K>
-  void send_band(View& view, const T* cotangents, int threads) {
-    Bins& bins = view.bins;
-    const Screen<T>& screen = view.target.screen;
-    const std::int64_t image = std::int64_t(screen.width) * screen.height * 3;
-    Pool::instance().run(threads, bins.bins(), [&](std::int64_t bin) {
-      const std::int64_t n = bins.starts[bin + 1] - bins.starts[bin];
-      if (!n) return;
-      const int bin_x = int(bin) % bins.columns, bin_y = bins.first_row + int(bin) / bins.columns;
-      const std::uint64_t wanted = blocks(view, bin_x, bin_y);
-      const BlockEnd<T>* ends = view.ends.data() + (std::size_t(bin_y) * bins.columns + bin_x) * kBlocks;
-      static thread_local Passage<K> scratch;
-      Passage<K>& mine = scratch;
-
-      std::int64_t end = 0;  // nothing behind it has been drawn
-      for (std::uint64_t m = wanted; m; m &= m - 1)
-        for (std::int32_t e : ends[__builtin_ctzll(m)].ended) end = std::max<std::int64_t>(end, std::min<std::int64_t>(e, n));
-      for (int k = 0; k < K; ++k)  // on its way while the Gaussians are gathered
-        for (int y = bin_y * kBin; y < std::min(screen.height, (bin_y + 1) * kBin); ++y)
-          for (int x = 0; x < 3 * kBin; x += kLanes)
-            __builtin_prefetch(cotangents + k * image + (std::int64_t(y) * screen.width + bin_x * kBin) * 3 + x);
-      bool entered = false;
-      for (std::int64_t first = (n - 1) / kSegment * kSegment; first >= 0; first -= kSegment) {
-        const std::int64_t count = std::min<std::int64_t>(kSegment, n - first);
-        Pulled<T>* sums = sent_.data() + (bins.starts[bin] + first) * K;
-        std::memset(static_cast<void*>(sums), 0, sizeof(Pulled<T>) * count * K);
-        if (first < end) {
-          Segment<T>& part = segment();
-          gather(view.target.ellipses, bins, int(bin), first, wanted, part);
-          if (!std::exchange(entered, true)) enter<K>(view, cotangents, bin_x, bin_y, wanted, ends, mine);
-          for (std::uint64_t m = wanted; m; m &= m - 1) {
-            const int b = __builtin_ctzll(m);
-            if (part.lengths[b])
-              blend_block_vjp<T, K>(part, b, settings_, ends[b], mine.cotangent[b], mine.back[b], sums);
-          }
-        }
-      }
-    });
-    bins.has_masks = true;
-  }
-
-  // What a bin's blocks start the way back with.
-  template <int K>
-  struct Passage {
-    BlockBack<T, K> back[kBlocks];
-    T cotangent[kBlocks][K][3][kLanes];
-  };
-
-  template <int K>
-  void enter(const View& view, const T* cotangents, int bin_x, int bin_y, std::uint64_t wanted, const BlockEnd<T>* ends,
-             Passage<K>& out) const {
-    using L = Lanes<T>;
-    const Screen<T>& s = view.target.screen;
-    for (std::uint64_t m = wanted; m; m &= m - 1) {
-      const int b = __builtin_ctzll(m);
-      const int X = bin_x * kBin + b % kBlocksAcross * kBlock, Y = bin_y * kBin + b / kBlocksAcross * kBlock;
-      const L through = L::load(ends[b].transmittance);
-      through.store(out.back[b].transmittance);
-      for (int k = 0; k < K; ++k) {
-        L v[3], light = T(0);
-        load_block<3>(cotangents + std::int64_t(k) * s.width * s.height * 3, s.width, s.height, X, Y, v);
-        for (int c = 0; c < 3; ++c) {
-          light += v[c] * L(settings_.background[c]);
-          v[c].store(out.cotangent[b][k][c]);
-        }
-        (through * light).store(out.back[b].behind[k]);
-      }
-    }
   }
 
   Settings<T> settings_;
