@@ -62,22 +62,29 @@ class CppRasterizer(RasterSettings):
         return _TRAITS
 
     def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
-        frame = _Frame(self, [(splats, camera)])
-        return CppRendering(frame, 0, tiles)
+        return CppRendering(_Frame(self, [(splats, camera)], tiles), 0)
 
     def render_scales(self, jobs: Sequence[tuple[Splats, Camera]]) -> list[Rendering]:
         """Screens of one pose share projection, colour and depth order where their tensors are the same objects."""
         if len(jobs) > 1 and all(_shares(jobs[0], job) for job in jobs[1:]):
             frame = _Frame(self, jobs)
-            return [CppRendering(frame, i, None) for i in range(len(jobs))]
+            return [CppRendering(frame, i) for i in range(len(jobs))]
         return [self(splats, camera) for splats, camera in jobs]
 
 
 class _Frame:
     """One projection for several screens: the native frame, and the tensors that it reads again on the way back."""
 
-    def __init__(self, settings: CppRasterizer, jobs: Sequence[tuple[Splats, Camera]]) -> None:
+    def __init__(
+        self,
+        settings: CppRasterizer,
+        jobs: Sequence[tuple[Splats, Camera]],
+        tiles: Bool[Tensor, "th tw"] | None = None,
+    ) -> None:
         splats, camera = jobs[0]
+        if tiles is not None:
+            require_tiles(tiles, camera.width, camera.height, settings.tile)
+            tiles = tiles.to("cpu", torch.bool).contiguous()
         n, like = len(splats), splats.means
         dtype = like.dtype
         if dtype not in _FRAMES or like.device.type != "cpu":
@@ -107,7 +114,15 @@ class _Frame:
         self._basis: Tensor | None = None
         grids = [[c.fx, c.fy, c.cx, c.cy, float(c.width), float(c.height)] for c in self.cameras]
         if not self.native.project(
-            *self.shared, grids, self.opacities, self.offsets, self.means2d, self.visible, self.threads
+            *self.shared,
+            grids,
+            self.opacities,
+            self.offsets,
+            self.means2d,
+            self.visible,
+            tiles,
+            settings.tile,
+            self.threads,
         ):
             for job, _ in jobs:
                 require_finite(job)
@@ -129,17 +144,14 @@ class _Frame:
 class CppRendering:
     """A picture on one screen of a frame."""
 
-    def __init__(self, frame: _Frame, screen: int, tiles: Bool[Tensor, "th tw"] | None) -> None:
+    def __init__(self, frame: _Frame, screen: int) -> None:
         self._frame, self._screen = frame, screen
         camera = frame.cameras[screen]
-        if tiles is not None:
-            require_tiles(tiles, camera.width, camera.height, frame.settings.tile)
-            tiles = tiles.to("cpu", torch.bool).contiguous()
         self.image: Float[Tensor, "H W 3"] = frame.empty(camera.height, camera.width, 3)
         self.alpha: Float[Tensor, "H W"] = frame.empty(camera.height, camera.width)
         self.means2d: Float[Tensor, "N 2"] = frame.means2d[screen]
         self.visible: Bool[Tensor, " N"] = frame.visible[screen]
-        frame.native.draw(screen, self.image, self.alpha, tiles, frame.settings.tile, frame.threads)
+        frame.native.draw(screen, self.image, self.alpha, frame.threads)
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         """One traversal for up to three cotangents; see `Rendering.vjp`."""

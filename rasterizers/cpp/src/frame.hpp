@@ -6,8 +6,6 @@
 // band by band, and bit for bit the same.
 #pragma once
 
-#include <optional>
-
 #include "order.hpp"
 #include "passes.hpp"
 #include "pull.hpp"
@@ -17,12 +15,6 @@ namespace clear {
 // More memory than allowed, said before it is taken.
 struct OverBudget : std::runtime_error {
   using std::runtime_error::runtime_error;
-};
-
-// Which tiles of `edge` px are asked for; edge is a multiple of 4.
-struct Demand {
-  const bool* tiles;
-  int edge, columns;
 };
 
 template <class T>
@@ -36,12 +28,12 @@ class Frame {
     views_.clear();
     n_ = splats.n;
     if (!clear::project(pose_, settings_, splats, targets, palette_, depths_, threads)) return false;
-    // One order over the union of what any screen shows.
+    // One order over the union of what any screen draws.
     order_by_depth<T>(
         n_,
         [&](std::int64_t i) {
           for (const Target<T>& t : targets)
-            if (t.visible[i]) return true;
+            if (t.ranges[i].count()) return true;
           return false;
         },
         depths_, order_, threads);
@@ -60,10 +52,9 @@ class Frame {
     return total;
   }
 
-  void draw(int i, T* image, T* alpha, const std::optional<Demand>& demand, int threads) {
+  void draw(int i, T* image, T* alpha, int threads) {
     View& view = views_.at(i);
     const Screen<T>& screen = view.target.screen;
-    ask_for(view, demand);
     view.ends.reserve_lost(std::size_t(screen.columns()) * screen.rows() * kBlocks);
     const std::vector<int> bands = bands_of(view, kBytesPerPair);
     for (std::size_t b = 0; b + 1 < bands.size(); ++b) {
@@ -123,23 +114,9 @@ class Frame {
   struct View {
     Target<T> target;
     std::vector<std::int64_t> pairs_in_row;
-    std::vector<std::uint64_t> wanted;  // blocks asked for, bin by bin; empty: all
     Buffer<BlockEnd<T>> ends;           // [bins, 64]
     Bins bins;                          // the band listed last
   };
-
-  void ask_for(View& view, const std::optional<Demand>& demand) {
-    view.wanted.clear();
-    view.bins.end_row = view.bins.first_row = 0;
-    if (!demand) return;
-    const Screen<T>& s = view.target.screen;
-    view.wanted.assign(std::size_t(s.columns()) * s.rows(), 0);
-    for (int by = 0; by * kBlock < s.height; ++by)
-      for (int bx = 0; bx * kBlock < s.width; ++bx)
-        if (demand->tiles[by * kBlock / demand->edge * demand->columns + bx * kBlock / demand->edge])
-          view.wanted[by / kBlocksAcross * s.columns() + bx / kBlocksAcross] |=
-              std::uint64_t(1) << (by % kBlocksAcross * kBlocksAcross + bx % kBlocksAcross);
-  }
 
   // Cut the rows of bins so that each band's pairs fit the budget: [0, …, rows].
   std::vector<int> bands_of(const View& view, std::int64_t bytes_per_pair) const {
@@ -171,7 +148,7 @@ class Frame {
 
   void list(View& view, int first_row, int end_row, int threads) {
     list_pairs(view.target.screen.columns(), first_row, end_row, order_, view.target.ranges, n_,
-               view.wanted.empty() ? nullptr : view.wanted.data(), view.bins, threads);
+               view.target.wanted.empty() ? nullptr : view.target.wanted.data(), view.bins, threads);
   }
 
   // The band's bin, with the blocks that were asked for.
@@ -188,7 +165,7 @@ class Frame {
             x,
             y,
             inside,
-            view.wanted.empty() ? inside : inside & view.wanted[place],
+            view.target.wanted.empty() ? inside : inside & view.target.wanted[place],
             view.ends.data() + place * kBlocks};
   }
 
@@ -236,7 +213,7 @@ class Frame {
         add_sent<T, K>(view.bins, first, count, n_, sent_, rows);
       } else {
         for (int i = 0; i < count; ++i) {
-          touched |= std::uint32_t(view.target.visible[first + i]) << i;
+          touched |= std::uint32_t(view.target.ranges[first + i].count() > 0) << i;
           for (int k = 0; k < K; ++k) rows[k][i] = Lanes<T>::load(&sums_[(first + i) * K + k].q);
         }
       }

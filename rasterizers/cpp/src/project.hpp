@@ -28,6 +28,7 @@ struct Target {
   const T* rgb_offset;  // [n, 3] or null
   T* means2d;           // out [n, 2]
   bool* visible;        // out [n]
+  std::vector<std::uint64_t> wanted;  // blocks asked for, bin by bin; empty: all
   Buffer<Ellipse<T>> ellipses;
   Buffer<BinRange> ranges;    // [n]
   Buffer<std::uint16_t> lit;  // [groups, 3]: the lanes whose channel was not below 0, and so has a gradient
@@ -49,6 +50,22 @@ CLEAR_INLINE void bins_of(const Screen<T>& screen, const Lanes<T> (&e)[kLanes], 
   for (int i = 0; i < count; ++i)
     out[i] = (shown >> i) & 1 ? BinRange{std::int16_t(x0[i]), std::int16_t(x1[i]), std::int16_t(y0[i]), std::int16_t(y1[i])}
                               : BinRange{};
+}
+
+// Of the Gaussians that show, those with a bin that was asked for; the others' ranges become empty.
+template <class T>
+std::uint32_t asked_for(const Target<T>& target, std::uint32_t shown, BinRange* ranges) {
+  if (target.wanted.empty()) return shown;
+  std::uint32_t asked = 0;
+  for (std::uint32_t m = shown; m; m &= m - 1) {
+    const int i = __builtin_ctz(m);
+    bool any = false;
+    for (int y = ranges[i].y0; y <= ranges[i].y1 && !any; ++y)
+      for (int x = ranges[i].x0; x <= ranges[i].x1 && !any; ++x) any = target.wanted[y * target.screen.columns() + x] != 0;
+    if (any) asked |= 1u << i;
+    else ranges[i] = BinRange{};
+  }
+  return asked;
 }
 
 inline std::int64_t groups_of(std::int64_t n) { return (n + kLanes - 1) / kLanes; }
@@ -119,7 +136,7 @@ bool project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& spla
   centre.z.store(depths.data() + first);
   Mask<T> in_front = g.z > L(s.near);
   L ellipse[4][kLanes];
-  std::uint32_t shown[4], any = 0;
+  std::uint32_t shown[4], any = 0;  // to be drawn: visible, and on a bin that was asked for
   for (std::size_t i = 0; i < targets.size(); ++i) {
     Target<T>& target = targets[i];
     const L opacity = load_row(target.opacities, first, count);
@@ -129,12 +146,13 @@ bool project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& spla
                         ? ellipse_of(centre, g, target.screen, s, opacity, ellipse[i])
                         : ellipse_of(centre, Geometry<T>(pose, target.screen, centre, quat, scale), target.screen, s,
                                      opacity, ellipse[i]);
-    any |= shown[i] = shows.bits() & real;
+    const std::uint32_t visible = shows.bits() & real;
     const L uv[2] = {where(in_front, ellipse[i][kWholeU] + ellipse[i][kU]),
                      where(in_front, ellipse[i][kWholeV] + ellipse[i][kV])};
     store_rows<2>(target.means2d, first, count, uv);
-    store_bits(target.visible + first, count, shown[i]);
-    bins_of(target.screen, ellipse[i], shown[i], count, target.ranges.data() + first);
+    store_bits(target.visible + first, count, visible);
+    bins_of(target.screen, ellipse[i], visible, count, target.ranges.data() + first);
+    any |= shown[i] = asked_for(target, visible, target.ranges.data() + first);
   }
 
   Colour<T> colour;
