@@ -155,7 +155,7 @@ def test_needles_keep_their_shape(aspect, pixels):
     for i in range(0, n, 5):
         one = select(splats, torch.tensor([i]))
         found, exact = cpp(**CLEAN)(one, view), ReferenceRasterizer(**CLEAN)(to(one, torch.float64), view)
-        assert float((found.image.double() - exact.image).abs().max()) < 2e-5
+        assert float((found.image.double() - exact.image).abs().max()) < 5e-5
         ours, truth = found.vjp(v), exact.vjp(v.double())
         for name in ("means", "scales", "opacities"):
             a, b = gradient_of(ours, name).double(), gradient_of(truth, name)

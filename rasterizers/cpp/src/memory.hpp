@@ -29,8 +29,14 @@ class Recycler {
     return *it;
   }
 
-  // At least `bytes`, and not more than half of it wasted.
+  // At least `bytes`, and not more than half of it wasted. Under the address sanitizer nothing is kept, and nothing spare.
   Block take(std::size_t bytes) {
+#if defined(__SANITIZE_ADDRESS__)
+    const std::size_t exact = (bytes + 63) / 64 * 64;
+    Block block{std::aligned_alloc(64, exact), exact};
+    if (!block.data) throw std::bad_alloc();
+    return block;
+#endif
     {
       std::lock_guard<std::mutex> lock(mutex_);
       std::size_t best = kept_.size();
@@ -57,6 +63,10 @@ class Recycler {
 
   void give(Block block) {
     if (!block.data) return;
+#if defined(__SANITIZE_ADDRESS__)
+    std::free(block.data);
+    return;
+#endif
     std::lock_guard<std::mutex> lock(mutex_);
     if (block.bytes < kPage || held_ + block.bytes > kMost) {
       std::free(block.data);
