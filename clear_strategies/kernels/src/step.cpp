@@ -171,7 +171,7 @@ class Sweep {
     Floats merged[D];
     for (int d = 0; d < D; ++d) merged[d] = g.base ? l[d] + h[d] * Floats(s.lambda_hr) : l[d];  // Eq. 8
     float numbers[D * kLanes], moves[D * kLanes];
-    store_columns(numbers, merged);
+    join_rows(numbers, merged);
     bool all = moving == first_bits(count);
     if (!all)
       for (int k = 0; k < D * kLanes; ++k) moves[k] = float(moving >> (k / D) & 1);

@@ -12,37 +12,19 @@ template <int C, class T>
 CLEAR_INLINE void load_rows(const T* tensor, std::int64_t row, int count, Lanes<T> (&columns)[C]) {
   const T* p = tensor + row * C;
   T padded[C * kLanes];
-  [[maybe_unused]] T split[C][kLanes];
   if (count < kLanes) {
     for (int i = 0; i < kLanes; ++i)
       for (int c = 0; c < C; ++c) padded[C * i + c] = p[C * std::min(i, count - 1) + c];
     p = padded;
   }
-  if constexpr (C == 3) {
-    load_triples(p, columns);
-  } else if constexpr (C == 1) {
-    columns[0] = Lanes<T>::load(p);
-  } else {
-    for (int i = 0; i < kLanes; ++i)
-      for (int c = 0; c < C; ++c) split[c][i] = p[C * i + c];
-    for (int c = 0; c < C; ++c) columns[c] = Lanes<T>::load(split[c]);
-  }
+  split_rows(p, columns);
 }
 
 template <int C, class T>
 CLEAR_INLINE void store_rows(T* tensor, std::int64_t row, int count, const Lanes<T> (&columns)[C]) {
-  [[maybe_unused]] T split[C][kLanes];
   T joined[C * kLanes];
   T* p = count == kLanes ? tensor + row * C : joined;
-  if constexpr (C == 3) {
-    store_triples(p, columns);
-  } else if constexpr (C == 1) {
-    columns[0].store(p);
-  } else {
-    for (int c = 0; c < C; ++c) columns[c].store(split[c]);
-    for (int i = 0; i < kLanes; ++i)
-      for (int c = 0; c < C; ++c) p[C * i + c] = split[c][i];
-  }
+  join_rows(p, columns);
   if (count < kLanes) std::memcpy(tensor + row * C, joined, sizeof(T) * C * count);
 }
 

@@ -296,11 +296,14 @@ CLEAR_INLINE Lanes<To> convert(const Lanes<From>& a) {
   if constexpr (sizeof(To) == sizeof(From)) {
     return a;
   } else {
-    From from[kLanes];
-    To to[kLanes];
-    a.store(from);
-    for (int i = 0; i < kLanes; ++i) to[i] = To(from[i]);
-    return Lanes<To>::load(to);
+    typedef From Given __attribute__((vector_size(sizeof(From) * kLanes)));
+    typedef To Wanted __attribute__((vector_size(sizeof(To) * kLanes)));
+    Given from;
+    std::memcpy(&from, a.r, sizeof from);
+    const Wanted to = __builtin_convertvector(from, Wanted);
+    Lanes<To> out;
+    std::memcpy(out.r, &to, sizeof to);
+    return out;
   }
 }
 
@@ -372,57 +375,67 @@ CLEAR_INLINE Lanes<T> log2(const Lanes<T>& x) {
 }
 
 #if defined(__AVX512F__)
-// Where lane i of channel c comes from among 16 a | 16 b, then 16 (that) | 16 c' — and the other way round.
-struct Shuffles3 {
-  std::int32_t split_low[3][kLanes], split_high[3][kLanes], join_low[3][kLanes], join_high[3][kLanes];
-  constexpr Shuffles3() : split_low(), split_high(), join_low(), join_high() {
-    for (int c = 0; c < 3; ++c)
+// Indices that pick number D · i + d out of D registers in a row, two registers at a time, and the way back.
+template <int D>
+struct Interleaving {
+  alignas(64) std::int32_t apart[D][D - 1][kLanes], together[D][D - 1][kLanes];
+
+  constexpr Interleaving() : apart{}, together{} {
+    for (int out = 0; out < D; ++out)
       for (int i = 0; i < kLanes; ++i) {
-        const int from = 3 * i + c, to = kLanes * c + i;
-        split_low[c][i] = from < 2 * kLanes ? from : 0;
-        split_high[c][i] = from < 2 * kLanes ? i : from - kLanes;
-        join_low[c][i] = to % 3 == 0 ? to / 3 : to % 3 == 1 ? kLanes + to / 3 : 0;
-        join_high[c][i] = to % 3 == 2 ? kLanes + to / 3 : i;
+        int p = D * i + out, q = kLanes * out + i;  // where column `out` reads, and what register `out` of the rows holds
+        for (int k = 1; k < D; ++k) {
+          apart[out][k - 1][i] = p / kLanes == k ? kLanes + p % kLanes : k == 1 ? p % kLanes : i;
+          together[out][k - 1][i] = q % D == k ? kLanes + q / D : k == 1 ? q / D : i;
+        }
       }
   }
 };
-inline constexpr Shuffles3 kShuffles3{};
-CLEAR_INLINE __m512 shuffle3(__m512 a, __m512 b, __m512 c, const std::int32_t (&low)[kLanes], const std::int32_t (&high)[kLanes]) {
-  return _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, _mm512_loadu_si512(low), b), _mm512_loadu_si512(high), c);
+
+template <int D>
+CLEAR_INLINE void rearrange(const std::int32_t (&indices)[D][D - 1][kLanes], const __m512 (&in)[D], __m512 (&out)[D]) {
+  for (int d = 0; d < D; ++d) {
+    out[d] = in[0];
+    for (int k = 1; k < D; ++k) out[d] = _mm512_permutex2var_ps(out[d], _mm512_load_si512(indices[d][k - 1]), in[k]);
+  }
 }
+
+template <int D>
+inline constexpr Interleaving<D> kInterleaving;
 #endif
 
-// Sixteen triples, one after the other in memory, to three columns of sixteen; and back.
-template <class T>
-CLEAR_INLINE void load_triples(const T* p, Lanes<T> (&columns)[3]) {
+// Sixteen rows of D numbers, one after the other in memory, to D columns of sixteen; and back.
+template <int D, class T>
+CLEAR_INLINE void split_rows(const T* rows, Lanes<T> (&columns)[D]) {
 #if defined(__AVX512F__)
-  if constexpr (sizeof(T) == 4) {
-    using Register = typename Lanes<T>::Register;
-    const __m512 a = _mm512_loadu_ps(p), b = _mm512_loadu_ps(p + kLanes), c = _mm512_loadu_ps(p + 2 * kLanes);
-    for (int k = 0; k < 3; ++k)
-      columns[k].r[0] = (Register)shuffle3(a, b, c, kShuffles3.split_low[k], kShuffles3.split_high[k]);
+  if constexpr (sizeof(T) == 4 && (D == 3 || D == 4)) {
+    __m512 in[D], out[D];
+    for (int d = 0; d < D; ++d) in[d] = _mm512_loadu_ps(rows + kLanes * d);
+    rearrange<D>(kInterleaving<D>.apart, in, out);
+    for (int d = 0; d < D; ++d) columns[d].r[0] = (typename Lanes<T>::Register)out[d];
     return;
   }
 #endif
-  T split[3][kLanes];
+  T split[D][kLanes];
   for (int i = 0; i < kLanes; ++i)
-    for (int c = 0; c < 3; ++c) split[c][i] = p[3 * i + c];
-  for (int c = 0; c < 3; ++c) columns[c] = Lanes<T>::load(split[c]);
+    for (int d = 0; d < D; ++d) split[d][i] = rows[D * i + d];
+  for (int d = 0; d < D; ++d) columns[d] = Lanes<T>::load(split[d]);
 }
-template <class T>
-CLEAR_INLINE void store_triples(T* p, const Lanes<T> (&columns)[3]) {
+template <int D, class T>
+CLEAR_INLINE void join_rows(T* rows, const Lanes<T> (&columns)[D]) {
 #if defined(__AVX512F__)
-  if constexpr (sizeof(T) == 4) {
-    const __m512 a = (__m512)columns[0].r[0], b = (__m512)columns[1].r[0], c = (__m512)columns[2].r[0];
-    for (int k = 0; k < 3; ++k)
-      _mm512_storeu_ps(p + k * kLanes, shuffle3(a, b, c, kShuffles3.join_low[k], kShuffles3.join_high[k]));
+  if constexpr (sizeof(T) == 4 && (D == 3 || D == 4)) {
+    __m512 in[D], out[D];
+    for (int d = 0; d < D; ++d) in[d] = (__m512)columns[d].r[0];
+    rearrange<D>(kInterleaving<D>.together, in, out);
+    for (int d = 0; d < D; ++d) _mm512_storeu_ps(rows + kLanes * d, out[d]);
     return;
   }
 #endif
-  T split[3][kLanes];
-  for (int c = 0; c < 3; ++c) columns[c].store(split[c]);
+  T split[D][kLanes];
+  for (int d = 0; d < D; ++d) columns[d].store(split[d]);
   for (int i = 0; i < kLanes; ++i)
-    for (int c = 0; c < 3; ++c) p[3 * i + c] = split[c][i];
+    for (int d = 0; d < D; ++d) rows[D * i + d] = split[d][i];
 }
 
 // rows[i] lane j  <->  rows[j] lane i.
