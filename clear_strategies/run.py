@@ -113,7 +113,7 @@ def run(config: DictConfig, folder: Path) -> float | None:
 
 def _scene(config: DictConfig, seed: int) -> Any:
     from clear_strategies.data.scene import prepare
-    from clear_strategies.data.upscale import Bicubic, Cached, Network
+    from clear_strategies.data.upscale import Bicubic, Prior, cached
 
     if OmegaConf.is_missing(config.data, "path"):
         raise DataError("config", "data.path", "is needed by this data set and missing", "add data.path=FOLDER")
@@ -121,7 +121,7 @@ def _scene(config: DictConfig, seed: int) -> Any:
     views = _instantiate(config.data.views, "data.views")
     cloud = _instantiate(config.data.cloud, "data.cloud")
     if config.data.save_lr is not None:
-        prior = Bicubic()  # the images that the real prior reads may not exist yet
+        prior: Prior = Bicubic()  # the images that the real prior reads may not exist yet
     elif config.prior.get("_target_") is None:  # prior=auto
         name = "demo" if capture.name == "demo" else "bicubic"
         chosen = OmegaConf.load(CONF / "prior" / f"{name}.yaml")
@@ -129,7 +129,7 @@ def _scene(config: DictConfig, seed: int) -> Any:
         _log.info("prior: auto chose %s.", prior.label)
     else:
         prior = _prior(config.prior, capture)
-    return prepare(capture, views, Cached(prior) if isinstance(prior, Network) else prior, cloud, seed=seed)
+    return prepare(capture, views, cached(prior), cloud, seed=seed)
 
 
 def _prior(config: Any, capture: Any) -> Any:

@@ -7,7 +7,6 @@ reliability means something; every report calls it synthetic.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from torch import Tensor
 
 from clear_strategies import images
 from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.corrupt import corrupted, require_errors
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
 
@@ -71,15 +71,10 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DemoPrior:
-    """Ground-truth detail with seeded errors that differ from view to view.
-
-    In a `share` of the patches the detail is wrong: turned over, or taken from elsewhere in the picture (both nearly agree
-    with LR and fight the other views); or the content is doubled, or sharpened and of another shade (both disagree with
-    LR, which reliability can see).
+    """Ground-truth detail with seeded errors that differ from view to view: see `corrupt.corrupted`.
 
     Args:
-        truth: HR image of each view by name. share: of patches with errors, in [0, 1]. strength: of the errors, >= 0.
-        patch: edge of a patch, HR px; 64 is what P2G's reliability looks at.
+        truth: HR image of each view by name. share, strength, patch: as in `corrupt.Corrupted`.
 
     Raises:
         ValueError: a number is outside its range.
@@ -92,10 +87,7 @@ class DemoPrior:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.share <= 1:
-            raise ValueError(f"share must lie in [0, 1], got {self.share}.")
-        if not self.strength >= 0 or self.patch < 1:
-            raise ValueError(f"strength must be >= 0 and patch >= 1, got {self.strength} and {self.patch}.")
+        require_errors(self.share, self.strength, self.patch)
 
     @property
     def label(self) -> str:
@@ -103,24 +95,7 @@ class DemoPrior:
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         truth = self._truth(name, lr.shape[1] * factor, lr.shape[0] * factor, factor)
-        rng = np.random.default_rng([self.seed, *name.encode()])
-        detail = truth - images.upsample(lr, factor)
-        shift = rng.integers(2, max(factor, 2) + 1, 2) * rng.choice((-1, 1), 2)
-        errors = (
-            -1.4 * detail,
-            detail.flip(0, 1) - detail,
-            0.6 * (truth.roll(shift.tolist(), (0, 1)) - truth),
-            0.8 * detail,  # and a shade of its own in each patch, below
-        )
-        corners = list(itertools.product(*(range(0, size, self.patch) for size in truth.shape[:2])))
-        result = truth.clone()
-        for which in rng.permutation(len(corners))[: round(self.share * len(corners))]:
-            top, left = corners[which]
-            box = (slice(top, top + self.patch), slice(left, left + self.patch))
-            kind, shade = rng.integers(len(errors)), torch.from_numpy(rng.uniform(-0.12, 0.12, 3)).to(truth)
-            error = errors[kind][box] + (shade if kind == len(errors) - 1 else 0)
-            result[box] += self.strength * error
-        return images.quantize(result)
+        return corrupted(truth, lr, factor, name, self.share, self.strength, self.patch, self.seed)
 
     def _truth(self, name: str, width: int, height: int, factor: int) -> Float[Tensor, "H W 3"]:
         """Cropped as the HR photo is, at the right and at the bottom, to a multiple of the factor."""

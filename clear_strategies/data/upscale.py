@@ -281,6 +281,11 @@ class Cached:
         return digest.hexdigest()
 
 
+def cached(prior: Prior) -> Prior:
+    """The prior, remembered where it can be: a network depends on nothing but its input and its files."""
+    return Cached(prior) if isinstance(prior, Network) else prior
+
+
 def cache_folder() -> Path:
     """Where results that can be made again are kept: $CLEAR_CACHE, else ~/.cache/clear-strategies."""
     return Path(os.environ.get("CLEAR_CACHE") or Path.home() / ".cache" / "clear-strategies").expanduser()
