@@ -131,7 +131,10 @@ class Conductor:
         if self.objective.lambda_hr(t) > 0:
             return True
         collecting = self._statistics_from is not None and t > self._statistics_from
-        return "score" in self._one and collecting and self.may_densify(t)
+        if "score" in self._one and collecting and self.may_densify(t):
+            return True
+        self.ledger.skip("render LR + HR", "lambda_HR = 0")
+        return False
 
     def update(
         self, params: Mapping[str, Tensor], lr: Shot, hr: Shot | None, view: View, t: int, merger: Merger | None = None
@@ -149,7 +152,7 @@ class Conductor:
         with stage("backward LR"):
             (g_lr,) = how.pull(lr, l_lr.cotangents)
         if hr is None:
-            self.ledger.skip("backward HR", "lambda_HR = 0")
+            self.ledger.skip("backward HR", "HR was not drawn")
             with stage(how.stage):
                 screens = self._screens(λ, g_lr, lr, None, None, None)
                 g, _ = how.merge(params, g_lr, None, None, 1.0, None, t)

@@ -92,16 +92,33 @@ class GaussianField(nn.Module):
         return {name: getattr(self, name).data for name in ATTRIBUTES}
 
     def render_scales(
-        self, rasterizer: Rasterizer, view: View, *, gate: Float[Tensor, " N"] | None = None, hr: bool = True
+        self,
+        rasterizer: Rasterizer,
+        view: View,
+        *,
+        gate: Float[Tensor, " N"] | None = None,
+        hr: bool = True,
+        tiles: Bool[Tensor, "th tw"] | None = None,
     ) -> tuple[FieldShot, FieldShot | None]:
-        """Î_LR without f_det and Î_HR with it, of the same gated geometry.  Eq. 2, 3"""
+        """Î_LR without f_det and Î_HR with it, of the same gated geometry.  Eq. 2, 3
+
+        Args:
+            tiles: those of Î_HR that are drawn, see `Rasterizer.tile`; the others show I_HR, so that no loss sees them.
+        """
         active = self._activate(gate)
         jobs = [(active.splats(detail=False), view.lr.camera)]
-        if hr:
-            jobs.append((active.splats(detail=True), view.hr.camera))
-        lr_rendering, *rest = rasterizer.render_scales(jobs)
-        lr_shot = FieldShot(lr_rendering, active, detail=False)
-        return lr_shot, FieldShot(rest[0], active, detail=True) if rest else None
+        if not hr:
+            (lr_rendering,) = rasterizer.render_scales(jobs)
+            return FieldShot(lr_rendering, active, detail=False), None
+        jobs.append((active.splats(detail=True), view.hr.camera))
+        if tiles is None:
+            lr_rendering, hr_rendering = rasterizer.render_scales(jobs)
+        else:
+            lr_rendering, hr_rendering = rasterizer.render_scales(jobs, [None, tiles])
+        hr_shot = FieldShot(hr_rendering, active, detail=True)
+        if tiles is not None:
+            hr_shot.image = filled(hr_rendering.image, tiles, view.hr.image, rasterizer.tile)
+        return FieldShot(lr_rendering, active, detail=False), hr_shot
 
     def render(self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True) -> Float[Tensor, "H W 3"]:
         """An image for looking at: no dropout, f = base + det, not clamped."""
@@ -211,6 +228,15 @@ class FieldShot:
     def pull(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         g = self.gradients(cotangents)
         return [self.activation.pull(g, k, detail=self._detail) for k in range(len(cotangents))]
+
+
+def filled(
+    image: Float[Tensor, "H W 3"], tiles: Bool[Tensor, "th tw"], reference: Float[Tensor, "H W 3"], tile: int
+) -> Float[Tensor, "H W 3"]:
+    """`image` where its tiles were drawn, `reference` elsewhere: no residual there, and no edge in an SSIM window."""
+    height, width = image.shape[:2]
+    drawn = tiles.repeat_interleave(tile, 0).repeat_interleave(tile, 1)[:height, :width, None]
+    return torch.where(drawn, image, reference)
 
 
 def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:

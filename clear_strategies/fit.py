@@ -31,6 +31,7 @@ from clear_strategies.fused import Fused, FusedStep, fused_step
 from clear_strategies.mip import MipFilter
 from clear_strategies.optim import Adam, LearningRates
 from clear_strategies.schedules import REFERENCE_ITERATIONS, milestone
+from clear_strategies.skips import Economy, Skips
 from rasterizers import native
 from rasterizers.interface import Rasterizer
 
@@ -111,6 +112,7 @@ class TrainState:
     t: int = 1
     history: list[dict[str, float]] = field(default_factory=list)
     fused: FusedStep | None = None
+    economy: Economy = field(default_factory=Economy)
 
     @classmethod
     def start(
@@ -122,6 +124,7 @@ class TrainState:
         density: DensitySettings,
         rates: LearningRates,
         mip: MipFilter,
+        skips: Skips | None = None,
     ) -> TrainState:
         """The state before the first iteration; milestones in the settings are already those of this run."""
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree)
@@ -131,7 +134,9 @@ class TrainState:
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed)
         fused = fused_step(conductor, optimizer, settings.fused)
-        state = cls(theta, conductor, optimizer, control, settings, mip, scene.train, fused=fused)
+        state = cls(
+            theta, conductor, optimizer, control, settings, mip, scene.train, fused=fused, economy=Economy(skips)
+        )
         state.refilter()
         return state
 
@@ -140,6 +145,11 @@ class TrainState:
         epoch, position = divmod(self.t - 1, len(self.views))
         generator = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + epoch)
         return self.views[int(torch.randperm(len(self.views), generator=generator)[position])]
+
+    @property
+    def ended(self) -> bool:
+        """Whether all iterations are done, or the rest is not needed."""
+        return self.t > self.settings.iterations or self.economy.settled(self.history, self.t - 1)
 
     def refilter(self) -> None:
         """Make the 3D filter anew from where the Gaussians are now."""
@@ -191,12 +201,12 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     """One iteration, in the paper's order."""
     t, θ, ask, stage = s.t, s.field, s.conductor, s.conductor.ledger.stage
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
-    view, hr_wanted = s.view(), ask.wants_hr(t)
+    view = s.economy.view(s.view(), t)
+    hr_wanted = ask.wants_hr(t) and s.economy.hr_due(t, ask.ledger)
+    tiles = s.economy.wanted(view, rasterizer.tile, ask.ledger) if hr_wanted else None
     z = ask.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
     with stage("render LR + HR" if hr_wanted else "render LR"):
-        lr, hr = θ.render_scales(rasterizer, view, gate=z, hr=hr_wanted)  # Î_LR, Î_HR     Eq. 2, 3
-    if hr is None:
-        ask.ledger.skip("render LR + HR", "lambda_HR = 0")
+        lr, hr = θ.render_scales(rasterizer, view, gate=z, hr=hr_wanted, tiles=tiles)  # Î_LR, Î_HR     Eq. 2, 3
     u = ask.update(θ.raw(), lr, hr, view, t, s.fused)
     if s.fused is None:  # else the same arithmetic has been done, step included
         with stage("optimizer"):
@@ -257,11 +267,11 @@ def fit(
 
     began = time.perf_counter() - (state.history[-1]["seconds"] if state.history else 0.0)
     with _deferred_signals() as pending, cores(state, rasterizer):
-        while state.t <= settings.iterations:
+        while not state.ended:
             iterate(state, rasterizer)
             done = state.t - 1
             state.history[-1]["seconds"] = time.perf_counter() - began
-            if settings.probe_every and (done % settings.probe_every == 0 or done == settings.iterations):
+            if settings.probe_every and (done % settings.probe_every == 0 or state.ended):
                 with state.conductor.ledger.stage("probe test views"):
                     psnr = _probe(state, scene, rasterizer)
                 if psnr is not None:
@@ -270,9 +280,15 @@ def fit(
                 progress(state)
             if pending:
                 raise Interrupted(pending[0], save(), state.t)
-            if settings.checkpoint_every and done % settings.checkpoint_every == 0 and done < settings.iterations:
+            if settings.checkpoint_every and done % settings.checkpoint_every == 0 and not state.ended:
                 _require_finite(state)
                 save()
+    if left := settings.iterations + 1 - state.t:
+        state.conductor.ledger.skip("iterations", "the training views stopped improving (skips.stop_gain)", left)
+        _log.info(
+            "training ended at t=%d of %d: the training views' loss fell by less than %.1f %% in %d iterations.",
+            state.t - 1, settings.iterations, 100 * state.economy.skips.stop_gain, state.economy.skips.stop_window,
+        )  # fmt: skip
     _require_finite(state)
     save()
     return state

@@ -73,9 +73,10 @@ class P2G(Strategy):
 
     def observe(self, view: View, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian this view sees."""
-        if view.name not in self.cache:
-            self.cache[view.name] = self._patch_evidence(view)
-        R, A = self.cache[view.name]
+        key = (view.name, view.factor)
+        if key not in self.cache:
+            self.cache[key] = self._patch_evidence(view)
+        R, A = self.cache[key]
         size = (view.lr.camera.width, view.lr.camera.height)
         u = hr.means2d / view.factor  # patches live on the LR grid
         q = lift(R, u, hr.visible, self.patch, size, self.lookup, self.outside)

@@ -88,6 +88,7 @@ def run(config: DictConfig, folder: Path) -> float | None:
     density = scaled(_instantiate(config.density, "density"), settings.stretch)
     rates = scaled(_instantiate(config.optim, "optim"), settings.stretch)
     mip = scaled(_mip(config), settings.stretch)
+    skips = scaled(_instantiate(config.skips, "skips"), settings.stretch)
     conductor = Conductor(
         *strategies, objective=objective, statistics_from=round(config.statistics_from * settings.stretch)
     )
@@ -98,7 +99,13 @@ def run(config: DictConfig, folder: Path) -> float | None:
     rasterizer, backend = _rasterizer(config, scene.background)
 
     state = TrainState.start(
-        scene, conductor, settings=scaled(settings, settings.stretch), density=density, rates=rates, mip=mip
+        scene,
+        conductor,
+        settings=scaled(settings, settings.stretch),
+        density=density,
+        rates=rates,
+        mip=mip,
+        skips=skips,
     )
     compared = _comparable(config)
     if config.fit.resume is not None:
@@ -202,6 +209,7 @@ def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> Non
         skipped.append(f"HR scale until iteration {hr.start} (lambda_HR = 0)")
     if state.mip.variance == 0:
         skipped.append("3D filter (variance 0)")
+    skipped += state.economy.skips.says()
     lines["skipped"] = "; ".join(skipped) or "nothing"
     width = max(map(len, lines))
     _log.info("\n".join(f"  {label:<{width}}  {text}" for label, text in lines.items()))
@@ -265,7 +273,7 @@ def _leave_results(
     for name, image in evaluation.renders.items():
         write_png(folder / "renders" / f"{Path(name).stem}.png", image)
     names = [str(name) for name in config.strategies]
-    length = f"{state.settings.iterations} iterations · seed {state.settings.seed}"
+    length = f"{state.t - 1} iterations · seed {state.settings.seed}"
     title = f"{scene.name} · {' + '.join(names) or 'baseline'} · {length}"
     if scene.synthetic_prior:
         title += " · SYNTHETIC prior"
@@ -293,7 +301,7 @@ def _leave_results(
             scene=scene.name,
             strategies=names,
             seed=state.settings.seed,
-            iterations=state.settings.iterations,
+            iterations=state.t - 1,
             gaussians=len(field),
             seconds=seconds,
             conflict=_mean_conflict(compared),

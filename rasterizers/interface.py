@@ -192,8 +192,15 @@ class Rasterizer(Protocol):
         """Draw; tiles not asked for show the background, and `vjp` honours the mask."""
         ...
 
-    def render_scales(self, jobs: Sequence[tuple[Splats, Camera]]) -> list[Rendering]:
-        """Draw several pixel grids of one camera centre, sharing whatever `is` the same tensor."""
+    @property
+    def tile(self) -> int:
+        """Edge of the demand mask's square tiles, px."""
+        ...
+
+    def render_scales(
+        self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
+    ) -> list[Rendering]:
+        """Draw several pixel grids of one camera centre, sharing whatever `is` the same tensor; a demand mask for each."""
         ...
 
 

@@ -132,6 +132,9 @@ def check_tile_mask(make: Make) -> None:
     found, expected = partial.vjp(v), full.vjp(v * pixels[None, :, :, None])
     for name in _ATTRIBUTES:
         _close(gradient_of(found, name), gradient_of(expected, name), 1e-5, f"the gradient of {name} under a mask")
+    whole, masked = rasterizer.render_scales([(splats, camera.scaled(1 / 3)), (splats, camera)], [None, mask])
+    _close(whole.image, rasterizer(splats, camera.scaled(1 / 3)).image, 1e-6, "a scale drawn whole beside a masked one")
+    _close(masked.image, partial.image, 1e-6, "a scale under a mask of its own")
 
 
 def check_equal_depths_have_an_order(make: Make) -> None:

@@ -62,14 +62,17 @@ class CppRasterizer(RasterSettings):
         return _TRAITS
 
     def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
-        return CppRendering(_Frame(self, [(splats, camera)], tiles), 0)
+        return CppRendering(_Frame(self, [(splats, camera)], [tiles]), 0)
 
-    def render_scales(self, jobs: Sequence[tuple[Splats, Camera]]) -> list[Rendering]:
+    def render_scales(
+        self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
+    ) -> list[Rendering]:
         """Screens of one pose share projection, colour and depth order where their tensors are the same objects."""
+        masks = [None] * len(jobs) if tiles is None else tiles
         if len(jobs) > 1 and all(_shares(jobs[0], job) for job in jobs[1:]):
-            frame = _Frame(self, jobs)
+            frame = _Frame(self, jobs, masks)
             return [CppRendering(frame, i) for i in range(len(jobs))]
-        return [self(splats, camera) for splats, camera in jobs]
+        return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
 
 
 class _Frame:
@@ -79,12 +82,13 @@ class _Frame:
         self,
         settings: CppRasterizer,
         jobs: Sequence[tuple[Splats, Camera]],
-        tiles: Bool[Tensor, "th tw"] | None = None,
+        tiles: Sequence[Bool[Tensor, "_ _"] | None],
     ) -> None:
         splats, camera = jobs[0]
-        if tiles is not None:
-            require_tiles(tiles, camera.width, camera.height, settings.tile)
-            tiles = tiles.to("cpu", torch.bool).contiguous()
+        masks = [None if mask is None else mask.to("cpu", torch.bool).contiguous() for mask in tiles]
+        for mask, (_, screen) in zip(masks, jobs, strict=True):
+            if mask is not None:
+                require_tiles(mask, screen.width, screen.height, settings.tile)
         n, like = len(splats), splats.means
         dtype = like.dtype
         if dtype not in _FRAMES or like.device.type != "cpu":
@@ -120,7 +124,7 @@ class _Frame:
             self.offsets,
             self.means2d,
             self.visible,
-            tiles,
+            masks,
             settings.tile,
             self.threads,
         ):

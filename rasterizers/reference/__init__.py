@@ -55,8 +55,11 @@ class ReferenceRasterizer(RasterSettings):
         lists = list_tiles(projection, grid, tiles)
         return ReferenceRendering(self, grid, projection, lists)
 
-    def render_scales(self, jobs: Sequence[tuple[Splats, Camera]]) -> list[Rendering]:
-        return [self(splats, camera) for splats, camera in jobs]
+    def render_scales(
+        self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
+    ) -> list[Rendering]:
+        masks = [None] * len(jobs) if tiles is None else tiles
+        return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
 
 
 class ReferenceRendering:

@@ -27,13 +27,13 @@ def test_the_contract_can_fail():
         def __init__(self, **settings):
             settings["background"] = (0.0, 0.0, 0.0)
             self.inner = rasterizers.load("torch", **settings)
-            self.traits = self.inner.traits
+            self.traits, self.tile = self.inner.traits, self.inner.tile
 
         def __call__(self, *arguments, **options):
             return self.inner(*arguments, **options)
 
-        def render_scales(self, jobs):
-            return self.inner.render_scales(jobs)
+        def render_scales(self, *arguments, **options):
+            return self.inner.render_scales(*arguments, **options)
 
     with pytest.raises(ContractError, match="background"):
         check_rasterizer(Wrong)

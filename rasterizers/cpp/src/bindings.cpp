@@ -83,14 +83,14 @@ void bind_frame(nb::module_& m, const char* name) {
            [](F& self, Read<T, -1, 3> means, Read<T, -1, 4> quats, Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0,
               Rows<T> shN, std::vector<std::vector<double>> grids, std::vector<Read<T, -1>> opacities,
               std::vector<std::optional<Read<T, -1, 3>>> offsets, std::vector<Write<T, -1, 2>> means2d,
-              std::vector<Write<bool, -1>> visible, std::optional<Read<bool, -1, -1>> tiles, int edge, int threads) {
+              std::vector<Write<bool, -1>> visible, std::vector<std::optional<Read<bool, -1, -1>>> tiles, int edge,
+              int threads) {
              require(edge >= kBlock && edge % kBlock == 0, "tiles must be a multiple of 4 px");
-             require(!tiles || grids.size() == 1, "tiles are asked for on one screen");
              Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
              const std::size_t n = std::size_t(splats.n), count = grids.size();
              require(count >= 1 && count <= 4 && opacities.size() == count && offsets.size() == count &&
-                         means2d.size() == count && visible.size() == count,
-                     "one to four screens, each with its opacities, offset and outputs");
+                         means2d.size() == count && visible.size() == count && tiles.size() == count,
+                     "one to four screens, each with its opacities, offset, tiles and outputs");
              std::vector<Target<T>> targets(count);
              for (std::size_t i = 0; i < count; ++i) {
                const std::vector<double>& g = grids[i];
@@ -103,13 +103,13 @@ void bind_frame(nb::module_& m, const char* name) {
                targets[i].rgb_offset = offsets[i] ? offsets[i]->data() : nullptr;
                targets[i].means2d = means2d[i].data();
                targets[i].visible = visible[i].data();
-               if (tiles) targets[i].wanted = blocks_of_tiles(tiles->data(), edge, int(g[4]), int(g[5]));
+               if (tiles[i]) targets[i].wanted = blocks_of_tiles(tiles[i]->data(), edge, int(g[4]), int(g[5]));
              }
              nb::gil_scoped_release release;
              return self.project(splats, std::move(targets), threads);
            },
            nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("sh0"), nb::arg("shN"), nb::arg("grids"),
-           nb::arg("opacities"), nb::arg("offsets"), nb::arg("means2d"), nb::arg("visible"), nb::arg("tiles").none(),
+           nb::arg("opacities"), nb::arg("offsets"), nb::arg("means2d"), nb::arg("visible"), nb::arg("tiles"),
            nb::arg("edge"), nb::arg("threads"))
       .def_static("empty", &empty<T>, nb::rv_policy::reference)
       .def("pairs", &F::pairs)
