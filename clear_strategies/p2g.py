@@ -6,8 +6,9 @@ Eq. 9, 10, 12, 14
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -31,7 +32,8 @@ class P2G(Strategy):
     """Weigh SR detail by evidence.
 
     Args:
-        reliability_scale: τ_r > 0, the mean |D(I_HR) - I_LR| (images in [0, 1]) at which R falls to 1/e.
+        reliability_scale: τ_r > 0, the mean |D(I_HR) - I_LR| (images in [0, 1]) at which R falls to 1/e; "relative:k" is k
+            times the view's own mean, so that R spreads whatever the prior (a fidelity network is near 1 at 0.05).
         floor: q_min in [0, 1], the share of its high-frequency gradient that every Gaussian keeps.
         patch: edge of a patch in LR pixels; in HR pixels it is that times the SR factor.
         down, up: D and U. D should be the very operator that made the LR images.
@@ -47,7 +49,7 @@ class P2G(Strategy):
 
     fused: ClassVar[str | None] = "p2g"
 
-    reliability_scale: float = 0.05
+    reliability_scale: float | str = 0.05
     floor: float = 0.25
     patch: int = 16
     down: DownKernel = "bicubic"
@@ -58,8 +60,7 @@ class P2G(Strategy):
     score_by: ScoreBy = "evidence"
 
     def __post_init__(self) -> None:
-        if not self.reliability_scale > 0:
-            raise ValueError(f"reliability_scale must be > 0, got {self.reliability_scale}.")
+        _tau_r(self.reliability_scale, 1.0)
         if not 0 <= self.floor <= 1:
             raise ValueError(f"floor must lie in [0, 1], got {self.floor}.")
         if self.patch < 1:
@@ -118,7 +119,7 @@ def patch_evidence(
     hr: Float[Tensor, "H W 3"],
     factor: int,
     patch: int = 16,
-    reliability_scale: float = 0.05,
+    reliability_scale: float | str = 0.05,
     detail_eps: float = 1e-4,
     down: DownKernel = "bicubic",
     up: UpKernel = "bicubic",
@@ -135,7 +136,24 @@ def patch_evidence(
         if not (low >= -1e-3 and high <= 1 + 1e-3):
             raise ValueError(f"{name} must lie in [0, 1], got {low:.3g}..{high:.3g}. Divide 8-bit values by 255.")
     reduced = downsample(hr, factor, down)
-    R = torch.exp(-patch_means((reduced - lr).abs(), patch) / reliability_scale)
+    disagreement = (reduced - lr).abs()
+    R = torch.exp(-patch_means(disagreement, patch) / _tau_r(reliability_scale, float(disagreement.mean())))
     residual = (hr - upsample(reduced, factor, up)).abs()
     A = (patch_means(residual, patch * factor) / (2 * residual.mean() + detail_eps)).clamp(0, 1)
     return R, A
+
+
+# An 8-bit image is off by a quarter of a grey level on average; to be relative to less would be to read rounding.
+_ROUNDING: Final = 0.25 / 255
+
+
+def _tau_r(scale: float | str, mean: float) -> float:
+    """τ_r of a view whose mean disagreement is `mean`."""
+    kind, _, number = str(scale).rpartition(":")
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if kind not in ("", "relative") or not 0 < value < math.inf:
+        raise ValueError(f'reliability_scale must be a number > 0 or "relative:<number > 0>", got {scale!r}.')
+    return value * max(mean, _ROUNDING) if kind else value

@@ -32,6 +32,20 @@ def test_reliability_worked_out_by_hand():
     assert R[0].tolist() == pytest.approx([math.exp(-1), 1.0], rel=1e-5)
 
 
+def test_a_relative_scale_counts_in_the_views_own_disagreement():
+    # 0.05 in the left half, 0 in the right: 0.025 on average; twice that is 0.05 again.
+    lr, hr = torch.full((16, 32, 3), 0.4), torch.full((64, 128, 3), 0.4)
+    hr[:, :64] += 0.05
+    relative, absolute = (patch_evidence(lr, hr, 4, reliability_scale=r, down="area")[0] for r in ("relative:2", 0.05))
+    assert torch.allclose(relative, absolute, rtol=1e-5)
+
+
+def test_a_relative_scale_does_not_read_rounding():
+    hr = images.quantize(torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)))
+    R, _ = patch_evidence(images.downsample(hr, 4), hr, 4, reliability_scale="relative:1")
+    assert torch.allclose(R, torch.ones_like(R))
+
+
 def test_flat_references_demand_nothing_and_one_textured_patch_everything():
     flat = torch.full((128, 128, 3), 0.6)
     _, A = patch_evidence(images.downsample(flat, 4), flat, 4)
@@ -103,7 +117,14 @@ def test_scores():
 
 @pytest.mark.parametrize(
     "setting",
-    [{"reliability_scale": 0}, {"floor": 1.1}, {"patch": 0}, {"detail_eps": 0}],
+    [
+        {"reliability_scale": 0},
+        {"reliability_scale": "relative:0"},
+        {"reliability_scale": "half"},
+        {"floor": 1.1},
+        {"patch": 0},
+        {"detail_eps": 0},
+    ],
 )
 def test_settings_outside_their_range_are_refused(setting):
     (name,) = setting
