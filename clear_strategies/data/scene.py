@@ -9,6 +9,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float
@@ -25,6 +26,8 @@ from clear_strategies.images import DownKernel
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
+
+_NOTHING_ADDED: Final = 0.5  # grey levels: what rounding to 8 bits may do
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +98,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         "test views": _names(test),
         "LR": f"{_size(sample.lr.camera)}, {made}",
         "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), reference: {sample.reference}",
+        "the reference adds": f"{_added_detail(train):.1f} grey levels to bicubic, on average",
         "initial points": f"{len(points):,}: {points.source}",
         "test views had a part in the points": points.saw_test_views,
     }
@@ -195,6 +199,18 @@ def _ready_made(frame: Frame, folder: Path, camera: Camera, capture: Capture) ->
             path = inside(folder, file.name, file=folder)
             return read_image(path, background=capture.background, expect=(camera.width, camera.height))
     raise DataError(folder, stem, "has no LR image of this name", "name the LR images like the photos")
+
+
+def _added_detail(views: Sequence[View]) -> float:
+    """Mean |I_HR - U(I_LR)| in grey levels of 255; where it is next to nothing, the log says what follows from that."""
+    means = [float((v.hr.image - images.upsample(v.lr.image, v.factor)).abs().mean()) for v in views]
+    added = 255 * sum(means) / len(means)
+    if added < _NOTHING_ADDED:
+        _log.warning(
+            "the reference adds %.2f grey levels to bicubic: HR still holds the field in place between LR pixels, but "
+            "there is no detail to route, and no strategy can find any.", added,
+        )  # fmt: skip
+    return added
 
 
 def _names(views: Sequence[View]) -> str:
