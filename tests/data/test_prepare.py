@@ -17,7 +17,7 @@ POINTS = CloudSettings(init="random", random_points=50)
 def added(prior, caplog) -> tuple[float, str]:
     capture = demo.read(width=64, height=48, views=5, train=2)
     with caplog.at_level(logging.WARNING):
-        scene = prepare(capture, ViewSettings(), prior(capture), POINTS)
+        scene = prepare(capture, ViewSettings(train=2), prior(capture), POINTS)
     return float(scene.notes["the reference adds"].split()[0]), caplog.text
 
 
