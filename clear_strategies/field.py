@@ -92,16 +92,20 @@ class GaussianField(nn.Module):
         return {name: getattr(self, name).data for name in ATTRIBUTES}
 
     def render_scales(
-        self, rasterizer: Rasterizer, view: View, *, gate: Float[Tensor, " N"] | None = None, hr: bool = True
-    ) -> tuple[FieldShot, FieldShot | None]:
-        """Î_LR without f_det and Î_HR with it, of the same gated geometry.  Eq. 2, 3"""
+        self,
+        rasterizer: Rasterizer,
+        view: View,
+        *,
+        gate: Float[Tensor, " N"] | None = None,
+        lr: bool = True,
+        hr: bool = True,
+    ) -> tuple[FieldShot | None, FieldShot | None]:
+        """Î_LR without f_det and Î_HR with it, of the same gated geometry; None for one that is not wanted.  Eq. 2, 3"""
         active = self._activate(gate)
-        jobs = [(active.splats(detail=False), view.lr.camera)]
-        if hr:
-            jobs.append((active.splats(detail=True), view.hr.camera))
-        lr_rendering, *rest = rasterizer.render_scales(jobs)
-        lr_shot = FieldShot(lr_rendering, active, detail=False)
-        return lr_shot, FieldShot(rest[0], active, detail=True) if rest else None
+        wanted = [(detail, photo.camera) for detail, photo, on in ((False, view.lr, lr), (True, view.hr, hr)) if on]
+        renderings = rasterizer.render_scales([(active.splats(detail=detail), camera) for detail, camera in wanted])
+        shots = {d: FieldShot(r, active, detail=d) for (d, _), r in zip(wanted, renderings, strict=True)}
+        return shots.get(False), shots.get(True)
 
     def render(self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True) -> Float[Tensor, "H W 3"]:
         """An image for looking at: no dropout, f = base + det, not clamped."""

@@ -41,10 +41,20 @@ def downsample(image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = 
     if factor == 1:
         return image.clone()
     if kernel == "area":
-        return _hwc(F.avg_pool2d(_nchw(image), factor)).clamp(0, 1)
+        return area_mean(image, factor).clamp(0, 1)
     pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     small = Image.fromarray(pixels).resize((width // factor, height // factor), _PIL_FILTERS[kernel])
     return torch.from_numpy(np.array(small)).to(image) / 255
+
+
+def area_mean(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:
+    """The mean of each factor × factor block, whatever the values."""
+    return _hwc(F.avg_pool2d(_nchw(image), factor))
+
+
+def area_mean_transposed(cotangents: Float[Tensor, "K h w C"], factor: int) -> Float[Tensor, "K H W C"]:
+    """What cotangents of `area_mean(image)` are to the image: each spread evenly over its block."""
+    return cotangents.repeat_interleave(factor, 1).repeat_interleave(factor, 2) / factor**2
 
 
 def upsample(image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel = "bicubic") -> Float[Tensor, "H W C"]:

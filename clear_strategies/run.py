@@ -191,6 +191,11 @@ def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> Non
         if found := milestones(s):
             lines[f"milestones of {type(s).__name__}"] = ", ".join(f"{name} {t}" for name, t in found.items())
     skipped = []
+    if not conductor.wants_lr:
+        used = "is the area mean of the HR render" if conductor.objective.lambda_lr > 0 else "plays no part"
+        skipped.append(f"LR render (LR {used})")
+    if conductor.objective.lambda_lr == 0 and (idle := [name for name in config.strategies if name == "gco"]):
+        _log.warning("lambda_LR is 0: nothing can conflict, %s has no effect.", idle[0])
     if conductor.objective.lambda_hf == 0:
         skipped.append("high-frequency loss (lambda_hf = 0)")
     hr = conductor.objective.lambda_hr
@@ -237,7 +242,8 @@ def _progress(state: Any) -> Iterator[Callable[[Any], None]]:
 
         def update(state: Any) -> None:
             row = state.history[-1]
-            shown["loss"] = f"{row['loss_lr'] + row['lambda_hr'] * row.get('loss_base', 0.0):.4f}"
+            λ_lr, λ_hr = state.conductor.objective.lambda_lr, row["lambda_hr"]
+            shown["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
             shown["N"] = f"{int(row['n_gaussians']):,}"
             if not math.isnan(row.get("conflict", math.nan)):
                 shown["conflict"] = f"{row['conflict']:.2f}"
