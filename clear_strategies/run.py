@@ -127,6 +127,10 @@ def _scene(config: DictConfig, seed: int) -> Any:
         chosen = OmegaConf.load(CONF / "prior" / f"{name}.yaml")
         prior = _prior(chosen, capture)
         _log.info("prior: auto chose %s.", prior.label)
+        if name == "bicubic":
+            _log.warning(
+                "A bicubic prior shows nothing that LR does not. For SR pictures: prior=images prior.path=FOLDER."
+            )
     else:
         prior = _prior(config.prior, capture)
     return prepare(capture, views, Cached(prior) if isinstance(prior, Network) else prior, cloud, seed=seed)
@@ -181,7 +185,8 @@ def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> Non
     )
     lines = {
         **scene.notes,
-        "strategies": strategies or "none (the paper's baseline)",
+        **({} if config.method is None else {"method": f"{config.method}; strategies named before it take no part"}),
+        "strategies": strategies or ("none (the paper's baseline)" if config.method is None else "none"),
         "rasterizer": f"{backend}, kernel {config.rasterizer.kernel} px², {native.threads()} threads",
         "per-Gaussian pass": "readable" if state.fused is None else "compiled",
         "iterations": f"{settings.iterations}, seed {settings.seed}",
@@ -272,7 +277,7 @@ def _leave_results(
         write_png(folder / "renders" / f"{Path(name).stem}.png", image)
     names = [str(name) for name in config.strategies]
     length = f"{state.settings.iterations} iterations · seed {state.settings.seed}"
-    title = f"{scene.name} · {' + '.join(names) or 'baseline'} · {length}"
+    title = f"{scene.name} · {config.method or ' + '.join(names) or 'baseline'} · {length}"
     if scene.synthetic_prior:
         title += " · SYNTHETIC prior"
     pictures.contact_sheet(folder / "contact_sheet.png", _sheet(scene, evaluation), title)
@@ -297,6 +302,7 @@ def _leave_results(
         metrics.to_json(
             evaluation,
             scene=scene.name,
+            method=config.method,
             strategies=names,
             seed=state.settings.seed,
             iterations=state.settings.iterations,
