@@ -193,16 +193,20 @@ def _reduced(
 ) -> tuple[Float[Tensor, "h w 3"], Camera]:
     """The photo reduced by `shrink`, its sizes whole multiples of `multiple`; see `ViewSettings.sizes`."""
     if views.sizes == "round":
-        width, height = (multiple * round(n / (views.shrink * multiple)) for n in (camera.width, camera.height))
-        fitted = _resized(camera, width, height)
-        return images.resize(image, (width, height), views.downsample), fitted
+        camera = rounded(camera, views.shrink, multiple)
+        return images.resize(image, (camera.width, camera.height), views.downsample), camera
     image = images.crop_to_multiple(image, views.shrink * multiple)
     camera = replace(camera, width=image.shape[1], height=image.shape[0])
     return images.downsample(image, views.shrink, views.downsample), camera.scaled(1 / views.shrink)
 
 
-def _resized(camera: Camera, width: int, height: int) -> Camera:
-    """The same rays through another pixel grid, each axis by its own ratio."""
+def rounded(camera: Camera, shrink: int, multiple: int) -> Camera:
+    """The same rays through `multiple · round(size / (shrink · multiple))` pixels, each axis by its own ratio.
+
+    Raises:
+        ValueError: no pixel would be left.
+    """
+    width, height = (multiple * round(size / (shrink * multiple)) for size in (camera.width, camera.height))
     x, y = width / camera.width, height / camera.height
     return replace(
         camera, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y, width=width, height=height
