@@ -50,7 +50,7 @@ class ViewSettings:
     """
 
     train: int | None = 3
-    train_names: tuple[str, ...] | None = None
+    train_names: Sequence[str] | None = None
     test_every: int = 8
     test_limit: int | None = None
     sr_scale: int = 4
