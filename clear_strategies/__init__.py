@@ -11,6 +11,7 @@ from clear_strategies.gco import GCO
 from clear_strategies.gradients import ATTRIBUTES, CONFLICT_GROUPS, Grads, Shot
 from clear_strategies.objective import Objective
 from clear_strategies.p2g import P2G
+from clear_strategies.splatsure import SplatSuRe
 from clear_strategies.strategy import Screens, Strategy
 from clear_strategies.svs import SVS
 
@@ -29,6 +30,7 @@ __all__ = [
     "Objective",
     "Screens",
     "Shot",
+    "SplatSuRe",
     "Strategy",
     "StrategyConflict",
     "Update",

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from clear_strategies import images
 from clear_strategies.errors import StrategyConflict
 from clear_strategies.evidence import Evidence
 from clear_strategies.gradients import Grads, Shot, conflict_ratio, to_ndc
@@ -127,8 +128,8 @@ class Conductor:
         return z
 
     def wants_hr(self, t: int) -> bool:
-        """Whether the HR scale has any use at t: λ_HR > 0, or a densification score that needs it."""
-        if self.objective.lambda_hr(t) > 0:
+        """Whether the HR scale has any use at t: λ_HR > 0, Î_LR is made of it, or a densification score needs it."""
+        if self.objective.lambda_hr(t) > 0 or not self.wants_lr:
             return True
         collecting = self._statistics_from is not None and t > self._statistics_from
         if "score" in self._one and collecting and self.may_densify(t):
@@ -136,36 +137,64 @@ class Conductor:
         self.ledger.skip("render LR + HR", "lambda_HR = 0")
         return False
 
+    @property
+    def wants_lr(self) -> bool:
+        """Whether the LR scale has any use; else Î_LR is the area mean of Î_HR."""
+        return self.objective.draws_lr
+
     def update(
-        self, params: Mapping[str, Tensor], lr: Shot, hr: Shot | None, view: View, t: int, merger: Merger | None = None
+        self,
+        params: Mapping[str, Tensor],
+        lr: Shot | None,
+        hr: Shot | None,
+        view: View,
+        t: int,
+        merger: Merger | None = None,
     ) -> Update:
         """The merged gradient of one view, in place of `backward()`.
 
         Args:
-            params: raw parameters by attribute. lr, hr: this view rendered at both scales; hr None skips it.
+            params: raw parameters by attribute. lr, hr: this view rendered at both scales. hr None skips it; lr None
+                stands for the area mean of hr, and is not looked at where `wants_lr` says no.
             merger: who pulls and merges the gradients; None: the conductor itself, as written below.
+
+        Raises:
+            ValueError: a scale that the objective needs was not rendered.
         """
         o, λ, stage = self.objective, self.objective.lambda_hr(t), self.ledger.stage
         how: Merger = self if merger is None else merger
+        reduced = not self.wants_lr
+        through = hr if reduced else lr
+        if through is None:
+            raise ValueError(
+                f"this objective needs the {'HR' if reduced else 'LR'} scale at t={t}, got None. Render what wants_lr "
+                "and wants_hr(t) ask for."
+            )
         with stage("losses LR"):
-            l_lr = o.lr(lr.image.detach(), view.lr.image)  # Eq. 4
-        with stage("backward LR"):
-            (g_lr,) = how.pull(lr, l_lr.cotangents)
+            low = through.image.detach()
+            l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, view.lr.image)  # Eq. 4
+        if not reduced:
+            with stage("backward LR"):
+                (g_lr,) = how.pull(through, l_lr.cotangents)
         if hr is None:
             self.ledger.skip("backward HR", "HR was not drawn")
             with stage(how.stage):
-                screens = self._screens(λ, g_lr, lr, None, None, None)
+                screens = self._screens(λ, g_lr, through, None, None, None)
                 g, _ = how.merge(params, g_lr, None, None, 1.0, None, t)
             return Update(g, screens.ordinary, screens.ordinary, None, {}, l_lr.values, self._readings())
 
         with stage("losses HR"):
             l_hr = o.hr(hr.image.detach(), view.hr.image)  # Eq. 5
-        with stage("backward HR"):
-            g_base, *rest = how.pull(hr, l_hr.cotangents)  # one backward pass, K = 2
+        with stage("backward HR"):  # one pass for all cotangents
+            if reduced:
+                spread = images.area_mean_transposed(l_lr.cotangents, view.factor)
+                g_lr, g_base, *rest = how.pull(hr, torch.cat((spread, l_hr.cotangents)))
+            else:
+                g_base, *rest = how.pull(hr, l_hr.cotangents)
         g_hf = rest[0] if rest else None
 
         with stage(how.stage):
-            screens = self._screens(λ, g_lr, lr, g_base, g_hf, hr)
+            screens = self._screens(λ, g_lr, through, g_base, g_hf, hr)
             e = self._ask("observe", None, view, hr)  # q, a, w        Eq. 9, 10
             m = 1.0 if g_hf is None else self._ask("route", 1.0, e)  # m              Eq. 12
             g, conflict = how.merge(params, g_lr, g_base, g_hf, m, e, t)

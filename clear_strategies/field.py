@@ -97,28 +97,28 @@ class GaussianField(nn.Module):
         view: View,
         *,
         gate: Float[Tensor, " N"] | None = None,
+        lr: bool = True,
         hr: bool = True,
         tiles: Bool[Tensor, "th tw"] | None = None,
-    ) -> tuple[FieldShot, FieldShot | None]:
-        """Î_LR without f_det and Î_HR with it, of the same gated geometry.  Eq. 2, 3
+    ) -> tuple[FieldShot | None, FieldShot | None]:
+        """Î_LR without f_det and Î_HR with it, of the same gated geometry; None for one that is not wanted.  Eq. 2, 3
 
         Args:
             tiles: those of Î_HR that are drawn, see `Rasterizer.tile`; the others show I_HR, so that no loss sees them.
         """
         active = self._activate(gate)
-        jobs = [(active.splats(detail=False), view.lr.camera)]
-        if not hr:
-            (lr_rendering,) = rasterizer.render_scales(jobs)
-            return FieldShot(lr_rendering, active, detail=False), None
-        jobs.append((active.splats(detail=True), view.hr.camera))
-        if tiles is None:
-            lr_rendering, hr_rendering = rasterizer.render_scales(jobs)
-        else:
-            lr_rendering, hr_rendering = rasterizer.render_scales(jobs, [None, tiles])
-        hr_shot = FieldShot(hr_rendering, active, detail=True)
-        if tiles is not None:
-            hr_shot.image = filled(hr_rendering.image, tiles, view.hr.image, rasterizer.tile)
-        return FieldShot(lr_rendering, active, detail=False), hr_shot
+        wanted = [
+            (detail, photo.camera, mask)
+            for detail, photo, on, mask in ((False, view.lr, lr, None), (True, view.hr, hr, tiles))
+            if on
+        ]
+        renderings = rasterizer.render_scales(
+            [(active.splats(detail=detail), camera) for detail, camera, _ in wanted], [mask for *_, mask in wanted]
+        )
+        shots = {d: FieldShot(r, active, detail=d) for (d, *_), r in zip(wanted, renderings, strict=True)}
+        if hr and tiles is not None:
+            shots[True].image = filled(shots[True].image, tiles, view.hr.image, rasterizer.tile)
+        return shots.get(False), shots.get(True)
 
     def render(self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True) -> Float[Tensor, "H W 3"]:
         """An image for looking at: no dropout, f = base + det, not clamped."""

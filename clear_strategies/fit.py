@@ -20,7 +20,7 @@ from typing import Any, Final, get_args
 import torch
 from torch import Tensor
 
-from clear_strategies import checkpoint
+from clear_strategies import checkpoint, images
 from clear_strategies.checkpoint import Checkpoint
 from clear_strategies.conductor import Conductor, Update
 from clear_strategies.data.view import Scene, View
@@ -202,18 +202,19 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     t, θ, ask, stage = s.t, s.field, s.conductor, s.conductor.ledger.stage
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = s.economy.view(s.view(), t)
-    hr_wanted = ask.wants_hr(t) and s.economy.hr_due(t, ask.ledger)
-    tiles = s.economy.wanted(view, rasterizer.tile, ask.ledger) if hr_wanted else None
+    scales = {"lr": ask.wants_lr, "hr": ask.wants_hr(t) and (not ask.wants_lr or s.economy.hr_due(t, ask.ledger))}
+    tiles = s.economy.wanted(view, rasterizer.tile, ask.ledger) if scales["hr"] else None
     z = ask.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
-    with stage("render LR + HR" if hr_wanted else "render LR"):
-        lr, hr = θ.render_scales(rasterizer, view, gate=z, hr=hr_wanted, tiles=tiles)  # Î_LR, Î_HR     Eq. 2, 3
+    with stage(f"render {' + '.join(scale.upper() for scale, wanted in scales.items() if wanted)}"):
+        lr, hr = θ.render_scales(rasterizer, view, gate=z, tiles=tiles, **scales)  # Î_LR, Î_HR     Eq. 2, 3
+    drawn = [shot for shot in (lr, hr) if shot is not None]
     u = ask.update(θ.raw(), lr, hr, view, t, s.fused)
     if s.fused is None:  # else the same arithmetic has been done, step included
         with stage("optimizer"):
-            s.optimizer.step(θ.raw(), u.grads, lr.visible if hr is None else lr.visible | hr.visible)
+            s.optimizer.step(θ.raw(), u.grads, torch.stack([shot.visible for shot in drawn]).any(0))
             θ.constrain()
     ask.after_step(θ.raw(), t)  # θᵃ at t = t_a  Eq. 16       SVS
-    s.density.accumulate(u, lr if hr is None else hr, t)  # S^dens         Eq. 14
+    s.density.accumulate(u, drawn[-1], t)  # S^dens         Eq. 14
     with stage("density and filter"):
         may_change = ask.may_densify(t)
         restructured = may_change and s.density.due(t)
@@ -224,7 +225,8 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
             s.density.reset_opacity(θ, s.optimizer)
         if s.filter_due() and not restructured:  # the means have not moved since
             s.refilter()
-    s.history.append(_row(s, u, lr.image, view))
+    low = images.area_mean(drawn[-1].image, view.factor) if lr is None else lr.image
+    s.history.append(_row(s, u, low, view))
     s.t += 1
     return u
 

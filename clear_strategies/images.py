@@ -29,7 +29,7 @@ def downsample(image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = 
     """D: reduce by a whole factor, antialiased; the result lies in [0, 1].
 
     "bicubic", "bilinear" and "lanczos" are PIL's resize, 8 bits per pass, as the published protocols make
-    their LR images; "area" is the mean of each factor × factor block, not rounded. Not differentiable.
+    their LR images; "area" is the mean of each block, not rounded. Not differentiable.
 
     Raises:
         ValueError: unknown kernel, or a size that is not a multiple of `factor`.
@@ -38,13 +38,38 @@ def downsample(image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = 
     height, width = image.shape[:2]
     if height % factor or width % factor:
         raise ValueError(f"{width}x{height} is not a multiple of {factor}; crop it with images.crop_to_multiple first.")
-    if factor == 1:
+    return resize(image, (width // factor, height // factor), kernel)
+
+
+def resize(
+    image: Float[Tensor, "H W 3"], size: tuple[int, int], kernel: DownKernel = "bicubic"
+) -> Float[Tensor, "h w 3"]:
+    """D to any size (width, height), by the same operators as `downsample`; the result lies in [0, 1].
+
+    Raises:
+        ValueError: unknown kernel, or a size that is not positive.
+    """
+    _require_member("downsampling kernel", kernel, get_args(DownKernel))
+    width, height = size
+    if width < 1 or height < 1:
+        raise ValueError(f"an image needs at least one pixel a side, got {width}x{height}.")
+    if (height, width) == tuple(image.shape[:2]):
         return image.clone()
     if kernel == "area":
-        return _hwc(F.avg_pool2d(_nchw(image), factor)).clamp(0, 1)
+        return _hwc(F.adaptive_avg_pool2d(_nchw(image), (height, width))).clamp(0, 1)
     pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    small = Image.fromarray(pixels).resize((width // factor, height // factor), _PIL_FILTERS[kernel])
+    small = Image.fromarray(pixels).resize((width, height), _PIL_FILTERS[kernel])
     return torch.from_numpy(np.array(small)).to(image) / 255
+
+
+def area_mean(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:
+    """The mean of each factor × factor block, whatever the values."""
+    return _hwc(F.avg_pool2d(_nchw(image), factor))
+
+
+def area_mean_transposed(cotangents: Float[Tensor, "K h w C"], factor: int) -> Float[Tensor, "K H W C"]:
+    """What cotangents of `area_mean(image)` are to the image: each spread evenly over its block."""
+    return cotangents.repeat_interleave(factor, 1).repeat_interleave(factor, 2) / factor**2
 
 
 def upsample(image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel = "bicubic") -> Float[Tensor, "H W C"]:

@@ -11,11 +11,12 @@ On photographs of six real scenes each of the four ranks truth, a ×4 network, b
 GMSD alone of the last two sees a shift by two pixels. Blur has no notion of place: noise on a blurred image brings it
 back to 0 while GMSD rises, so read the two together.
 
-metrics.json: {"scene", "strategies", "seed", "iterations", "gaussians", "seconds", "conflict", "synthetic_prior",
-"note", "test": TABLE, "train": TABLE, "provenance"}, where TABLE is {"against", "views": {view: {method: scores}},
-"mean": {method: scores}}. The methods are "ours", "bicubic" (U of the view's own LR photo) and "prior" (its SR
-reference); `against` says what they were compared with: "HR photos", or "LR photos" after D where HR is unknown, or
-"HR and LR photos" where that differs between views. A number that is not finite is null.
+metrics.json: {"scene", "method", "strategies", "seed", "iterations", "gaussians", "seconds", "conflict",
+"synthetic_prior", "note", "test": TABLE, "train": TABLE, "provenance"}, where TABLE is {"against", "views": {view:
+{image: scores}}, "mean": {image: scores}}. "method" is the baseline's name, null where none was asked for. The images
+are "ours", "bicubic" (U of the view's own LR photo) and "prior" (its SR reference); `against` says what they were
+compared with: "HR photos", or "LR photos" after D where HR is unknown, or "HR and LR photos" where that differs between
+views. A number that is not finite is null.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 from jaxtyping import Float
 from torch import Tensor
@@ -14,6 +14,8 @@ from torch import Tensor
 from clear_strategies import kernels
 from clear_strategies.kernels import Choice, LossAndGradient
 from clear_strategies.schedules import WarmupDecay
+
+LowFrom = Literal["lr", "hr"]
 
 
 class Losses(NamedTuple):
@@ -25,23 +27,27 @@ class Losses(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Objective:
-    """L = L_LR + λ_HR(t) (L_base + λ_HF L_HF).
+    """L = λ_LR L_LR + λ_HR(t) (L_base + λ_HF L_HF); the paper's λ_LR is 1.
 
     Args:
         lambda_hr: λ_HR(t).
         lambda_hf: λ_HF >= 0; 0 skips the high-frequency loss altogether.
+        lambda_lr: λ_LR >= 0; at 0 the LR photos take no part: nothing is drawn at LR, L_LR is for the log alone.
+        lr_from: where Î_LR comes from: drawn at "lr"; or the area mean of Î_HR, "hr", which then is all that is drawn.
         lambda_ssim, lambda_ssim_hr: share of 1 - SSIM in L_LR and L_base, in [0, 1]; the rest is L1.
         haar_levels: levels of the Haar transform; 1 is the top octave, 2 is exactly the band that 4x SR adds.
         clamp_render: compare renders clamped to [0, 1] (DropGaussian); 3DGS clamps for metrics only.
         kernels: what computes the losses: "cpp", "torch", or "auto", the fastest that runs here.
 
     Raises:
-        ValueError: a setting is outside its range.
+        ValueError: a setting is outside its range, or nothing would move the Gaussians at the first iteration.
         BackendUnavailable: kernels="cpp" was not built.
     """
 
     lambda_hr: WarmupDecay = field(default_factory=WarmupDecay)
     lambda_hf: float = 0.2
+    lambda_lr: float = 1.0
+    lr_from: LowFrom = "lr"
     lambda_ssim: float = 0.2
     lambda_ssim_hr: float = 0.2
     haar_levels: int = 1
@@ -53,16 +59,31 @@ class Objective:
         for name in ("lambda_ssim", "lambda_ssim_hr"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}.")
-        if self.lambda_hf < 0:
-            raise ValueError(f"lambda_hf must be >= 0, got {self.lambda_hf}.")
+        for name in ("lambda_lr", "lambda_hf"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}.")
+        if self.lr_from not in get_args(LowFrom):
+            raise ValueError(f"lr_from must be lr or hr, got {self.lr_from!r}.")
+        if self.lambda_lr == 0 and not self.lambda_hr(1) > 0:
+            raise ValueError(
+                "without L_LR (lambda_lr=0) L_base must act from the first iteration, got "
+                f"lambda_hr.peak={self.lambda_hr.peak}, start={self.lambda_hr.start}. Set lambda_hr.start=0 and full=0."
+            )
         if self.haar_levels < 1:
             raise ValueError(f"haar_levels must be at least 1, got {self.haar_levels}.")
 
+    @property
+    def draws_lr(self) -> bool:
+        """Whether Î_LR is drawn; else it is the area mean of Î_HR, which is then needed at every iteration."""
+        return self.lr_from == "lr" and self.lambda_lr > 0
+
     def lr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:
-        """L_LR, one cotangent."""
+        """L_LR by value, and one cotangent: that of λ_LR L_LR."""
         shown = self._shown(image)
         cotangents = shown.new_empty(1, *shown.shape)
         loss = kernels.photometric(shown, target, self.lambda_ssim, kernels=self.kernels, out=cotangents[0])  # Eq. 4
+        if self.lambda_lr != 1:
+            cotangents *= self.lambda_lr
         return self._losses({"lr": loss}, image, cotangents)
 
     def hr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:

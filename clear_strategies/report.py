@@ -43,6 +43,7 @@ _BASELINES: Final = ("bicubic", "prior")
 
 _SEED: Final = "fit.seed="
 _STRATEGY: Final = "+strategy="
+_METHOD: Final = "+method="
 # Overrides that change no result, and those that choose what the baselines see.
 _NEUTRAL: Final = ("hydra", "fit.resume=", "fit.threads=", "fit.keep=", "fit.checkpoint_every=", "fit.probe_")
 _INPUT: Final = ("data", "prior", "experiment")
@@ -54,7 +55,8 @@ class Run:
 
     Args:
         scene: its name, marked where the prior is synthetic or the scores are not those of HR.
-        strategies: as they were asked for ("clear"), else as metrics.json lists them ("gco + p2g").
+        strategies: the method, or the strategies as they were asked for ("clear"), else as metrics.json lists them
+            ("gco + p2g").
         settings: Hydra's overrides but for seed and strategies, without what changes no result.
         scores: method ("ours", "bicubic", "prior") -> measure -> mean over the test views; over the training views
             where there are no test views.
@@ -88,7 +90,9 @@ class Run:
                 folder=folder,
                 scene=str(content["scene"]) + (f" ({', '.join(marks)})" if marks else ""),
                 strategies=_strategies(overrides, content["strategies"]),
-                settings=tuple(o for o in overrides if not o.lstrip("+~").startswith((*_NEUTRAL, _SEED, "strategy="))),
+                settings=tuple(
+                    o for o in overrides if not o.lstrip("+~").startswith((*_NEUTRAL, _SEED, "strategy=", "method="))
+                ),
                 seed=int(content["seed"]),
                 scores={m: {s: _number(part["mean"][m][s]) for s in _SCORES} for m in methods},
                 facts={
@@ -313,7 +317,12 @@ def _overrides(folder: Path) -> tuple[str, ...]:
 
 
 def _strategies(overrides: Sequence[str], names: Sequence[str]) -> str:
-    asked = [o.removeprefix(_STRATEGY).strip("[]").replace(",", " + ") for o in overrides if o.startswith(_STRATEGY)]
+    asked: list[str] = []
+    for o in overrides:
+        if o.startswith(_METHOD):  # takes the place of what was named before it
+            asked = [o.removeprefix(_METHOD)]
+        elif o.startswith(_STRATEGY):
+            asked.append(o.removeprefix(_STRATEGY).strip("[]").replace(",", " + "))
     return " + ".join(asked or names) or "baseline"
 
 

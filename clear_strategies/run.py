@@ -134,6 +134,10 @@ def _scene(config: DictConfig, seed: int) -> Any:
         chosen = OmegaConf.load(CONF / "prior" / f"{name}.yaml")
         prior = _prior(chosen, capture)
         _log.info("prior: auto chose %s.", prior.label)
+        if name == "bicubic":
+            _log.warning(
+                "A bicubic prior shows nothing that LR does not. For SR pictures: prior=images prior.path=FOLDER."
+            )
     else:
         prior = _prior(config.prior, capture)
     return prepare(capture, views, cached(prior), cloud, seed=seed)
@@ -188,7 +192,8 @@ def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> Non
     )
     lines = {
         **scene.notes,
-        "strategies": strategies or "none (the paper's baseline)",
+        **({} if config.method is None else {"method": f"{config.method}; strategies named before it take no part"}),
+        "strategies": strategies or ("none (the paper's baseline)" if config.method is None else "none"),
         "rasterizer": f"{backend}, kernel {config.rasterizer.kernel} px², {native.threads()} threads",
         "per-Gaussian pass": "readable" if state.fused is None else "compiled",
         "iterations": f"{settings.iterations}, seed {settings.seed}",
@@ -198,6 +203,11 @@ def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> Non
         if found := milestones(s):
             lines[f"milestones of {type(s).__name__}"] = ", ".join(f"{name} {t}" for name, t in found.items())
     skipped = []
+    if not conductor.wants_lr:
+        used = "is the area mean of the HR render" if conductor.objective.lambda_lr > 0 else "plays no part"
+        skipped.append(f"LR render (LR {used})")
+    if conductor.objective.lambda_lr == 0 and (idle := [name for name in config.strategies if name == "gco"]):
+        _log.warning("lambda_LR is 0: nothing can conflict, %s has no effect.", idle[0])
     if conductor.objective.lambda_hf == 0:
         skipped.append("high-frequency loss (lambda_hf = 0)")
     hr = conductor.objective.lambda_hr
@@ -245,7 +255,8 @@ def _progress(state: Any) -> Iterator[Callable[[Any], None]]:
 
         def update(state: Any) -> None:
             row = state.history[-1]
-            shown["loss"] = f"{row['loss_lr'] + row['lambda_hr'] * row.get('loss_base', 0.0):.4f}"
+            λ_lr, λ_hr = state.conductor.objective.lambda_lr, row["lambda_hr"]
+            shown["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
             shown["N"] = f"{int(row['n_gaussians']):,}"
             if not math.isnan(row.get("conflict", math.nan)):
                 shown["conflict"] = f"{row['conflict']:.2f}"
@@ -274,7 +285,7 @@ def _leave_results(
         write_png(folder / "renders" / f"{Path(name).stem}.png", image)
     names = [str(name) for name in config.strategies]
     length = f"{state.t - 1} iterations · seed {state.settings.seed}"
-    title = f"{scene.name} · {' + '.join(names) or 'baseline'} · {length}"
+    title = f"{scene.name} · {config.method or ' + '.join(names) or 'baseline'} · {length}"
     if scene.synthetic_prior:
         title += " · SYNTHETIC prior"
     pictures.contact_sheet(folder / "contact_sheet.png", _sheet(scene, evaluation), title)
@@ -299,6 +310,7 @@ def _leave_results(
         metrics.to_json(
             evaluation,
             scene=scene.name,
+            method=config.method,
             strategies=names,
             seed=state.settings.seed,
             iterations=state.t - 1,

@@ -49,7 +49,7 @@ class AutogradShot:
 def joint_loss(
     conductor: Conductor, params: Mapping[str, Tensor], lr: Shot, hr: Shot | None, view: Any, t: int
 ) -> Float[Tensor, ""]:
-    """L_LR + λ_HR (L_base + λ_HF L_HF) by value; its gradient is the conductor's merged one.
+    """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF) by value; its gradient is the conductor's merged one.
 
     Args:
         params: the leaves that the host optimizes, by gsplat's names (and "detail", if it has one).
@@ -66,7 +66,9 @@ def joint_update(
     update = conductor.update(values, lr, hr, view, t)
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
     losses = update.losses
-    value = losses["lr"] + λ * (losses.get("base", 0.0) + objective.lambda_hf * losses.get("hf", 0.0))
+    value = objective.lambda_lr * losses["lr"] + λ * (
+        losses.get("base", 0.0) + objective.lambda_hf * losses.get("hf", 0.0)
+    )
     touched = {name: p for name, p in params.items() if name in update.grads}
     gradients = [update.grads[name].to(p) for name, p in touched.items()]
     loss: Tensor = _GivenGradients.apply(value, gradients, *touched.values())  # type: ignore[no-untyped-call]

@@ -9,7 +9,7 @@ import torch
 import toy
 from torch import Tensor
 
-from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, Strategy, StrategyConflict, kernels
+from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, SplatSuRe, Strategy, StrategyConflict, kernels
 from clear_strategies.field import GaussianField
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.testing import CHECKS, ContractError, check_strategy
@@ -28,7 +28,9 @@ class Halve(Strategy):
 
 
 @pytest.mark.parametrize(
-    "make", [GCO, P2G, SVS, Halve, lambda: SVS(anchor_strength=0.0)], ids=["GCO", "P2G", "SVS", "own", "loose"]
+    "make",
+    [GCO, P2G, SVS, SplatSuRe, Halve, lambda: SVS(anchor_strength=0.0)],
+    ids=["GCO", "P2G", "SVS", "SplatSuRe", "own", "loose"],
 )
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
 def test_contract(make, check):
@@ -117,9 +119,12 @@ def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective
 
     common = (raw["means"], raw["quats"], scales, opacities, raw["sh0"], raw["shN"][:, :bands])
     zero = torch.zeros_like(raw["detail"])
-    lr = Draw.apply(view.lr.camera, *common, zero)
     hr = Draw.apply(view.hr.camera, *common, raw["detail"])
-    loss = photometric(lr, view.lr.image.double()) + λ * (
+    if objective.lr_from == "hr":
+        lr = torch.nn.functional.avg_pool2d(hr.permute(2, 0, 1), view.factor).permute(1, 2, 0)
+    else:
+        lr = Draw.apply(view.lr.camera, *common, zero)
+    loss = objective.lambda_lr * photometric(lr, view.lr.image.double()) + λ * (
         photometric(hr, view.hr.image.double())
         + objective.lambda_hf * Loss.apply(kernels.haar_l1, hr, view.hr.image.double())
     )
@@ -127,18 +132,63 @@ def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective
     return Grads(dict(zip(raw, gradients, strict=True)))
 
 
-@pytest.mark.parametrize("hf", [0.2, 0.0])
-def test_without_strategies_it_is_autograd_of_the_summed_loss(hf):
+@pytest.mark.parametrize("lr_from", ["lr", "hr"])
+@pytest.mark.parametrize(("hf", "lambda_lr"), [(0.2, 1.0), (0.0, 1.0), (0.2, 0.6), (0.0, 0.0)])
+def test_without_strategies_it_is_autograd_of_the_summed_loss(hf, lambda_lr, lr_from):
     field, view = field_and_view()
-    objective = Objective(lambda_hr=ALWAYS, lambda_hf=hf)
+    objective = Objective(lambda_hr=ALWAYS, lambda_hf=hf, lambda_lr=lambda_lr, lr_from=lr_from)
     conductor = Conductor(objective=objective)
-    lr, hr = field.render_scales(toy.RASTERIZER, view)
+    lr, hr = field.render_scales(toy.RASTERIZER, view, lr=conductor.wants_lr, hr=conductor.wants_hr(5))
+    assert (lr is None) == (lr_from == "hr" or lambda_lr == 0)
     view = _double(view)
     found = conductor.update(field.raw(), lr, hr, view, 5).grads
     expected = autograd_of_the_summed_loss(field, view, objective, 1.0)
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         scale = float(expected[name].abs().max())
         assert torch.allclose(found[name], expected[name], atol=1e-9 * scale, rtol=1e-7), name
+
+
+def test_a_reduced_lr_image_counts_for_densification_in_ndc_as_a_drawn_one_does():
+    """∇_u in NDC does not depend on the pixels that it was pulled through: two routes to one blurred picture agree."""
+    field, view = field_and_view()
+    view = _double(view)
+    seen = {}
+    for lr_from in ("lr", "hr"):
+        conductor = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0), lr_from=lr_from))
+        lr, hr = field.render_scales(toy.RASTERIZER, view)
+        seen[lr_from] = conductor.update(field.raw(), lr, hr, view, 5).ordinary
+    ratio = seen["hr"].sum() / seen["lr"].sum()
+    assert 0.5 < float(ratio) < 2  # in pixels of their own image it would be 4 times off
+
+
+def test_without_lr_photos_only_the_reference_moves_gaussians():
+    field, view = field_and_view()
+    view = _double(view)
+    conductor = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0, lambda_lr=0.0))
+    _, hr = field.render_scales(toy.RASTERIZER, view, lr=False)
+    update = conductor.update(field.raw(), None, hr, view, 5)
+    (g_base,) = hr.pull(conductor.objective.hr(hr.image, view.hr.image).cotangents)
+    for name in ("means", "quats", "scales", "opacities", "sh0"):
+        assert torch.allclose(update.grads[name], g_base[name], rtol=1e-12, atol=0)
+    assert update.losses["lr"] > 0  # measured, for the log
+
+
+def test_a_scale_that_the_objective_needs_is_asked_for():
+    field, view = field_and_view()
+    lr, hr = field.render_scales(toy.RASTERIZER, view)
+    with pytest.raises(ValueError, match="needs the HR scale"):
+        Conductor(objective=Objective(lr_from="hr")).update(field.raw(), lr, None, view, 5)
+    with pytest.raises(ValueError, match="needs the LR scale"):
+        Conductor().update(field.raw(), None, hr, view, 5)
+    with pytest.raises(ValueError, match="L_base must act from the first iteration"):
+        Objective(lambda_lr=0.0)
+    with pytest.raises(ValueError, match="lambda_lr must be >= 0"):
+        Objective(lambda_lr=-1.0)
+
+
+def test_a_weight_without_warm_up_is_constant_from_the_first_iteration():
+    constant = WarmupDecay(peak=0.4, final=0.4, start=0, full=0)
+    assert {constant(t) for t in (1, 2, 5_000, 5_001, 9_999, 10_000, 20_000)} == {0.4}
 
 
 def test_the_detail_feature_moves_by_routed_high_frequencies_alone():

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = [
     {"errors", "files", "images", "kernels", "schedules", "gradients", "evidence", "ledger", "provenance"},
     {"strategy"},
-    {"gco", "p2g", "svs"},
+    {"gco", "p2g", "svs", "splatsure"},
     {"objective", "conductor"},
     {
         "data",

@@ -9,7 +9,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -29,6 +29,8 @@ _log = logging.getLogger(__name__)
 
 _NOTHING_ADDED: Final = 0.5  # grey levels: what rounding to 8 bits may do
 
+Sizes = Literal["crop", "round"]
+
 
 @dataclass(frozen=True, slots=True)
 class ViewSettings:
@@ -41,6 +43,8 @@ class ViewSettings:
         test_limit: at most this many test views, evenly spread; None: all.
         sr_scale: HR pixels per LR pixel.
         shrink: the photos are first reduced by this whole factor (LLFF at 1/8 -> 1/2 of its full size: 2).
+        sizes: photos whose sizes are no multiple of shrink · sr_scale lose a few pixels at the right and the bottom
+            ("crop"), or are resized to sr_scale · round(size / (shrink · sr_scale)) and keep their border ("round").
         photos_are: "hr": the photos are the truth at HR and LR is made from them, as in the papers; "lr": they are the
             observations, and nobody knows HR.
         downsample: D, the operator that makes LR.
@@ -48,11 +52,12 @@ class ViewSettings:
     """
 
     train: int | None = 3
-    train_names: tuple[str, ...] | None = None
+    train_names: Sequence[str] | None = None
     test_every: int = 8
     test_limit: int | None = None
     sr_scale: int = 4
     shrink: int = 1
+    sizes: Sizes = "crop"
     photos_are: str = "hr"
     downsample: DownKernel = "bicubic"
     lr_folder: str | None = None
@@ -66,6 +71,8 @@ class ViewSettings:
             raise ValueError(f"sr_scale and shrink must be at least 1, got {self.sr_scale} and {self.shrink}.")
         if self.test_every < 2:
             raise ValueError(f"test_every must be at least 2, got {self.test_every}.")
+        if self.sizes not in get_args(Sizes):
+            raise ValueError(f"sizes must be crop or round, got {self.sizes!r}.")
         if self.photos_are not in ("hr", "lr"):
             raise ValueError(f"photos_are must be hr or lr, got {self.photos_are!r}.")
         if self.photos_are == "lr" and self.lr_folder:
@@ -85,7 +92,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     points = initial_cloud(
         cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, background=capture.background, seed=seed
     )
-    sample = train[0]
+    sample, photo = train[0], train_frames[0].camera
     made = {
         "hr": f"{'PIL ' if views.downsample != 'area' else ''}{views.downsample} of the HR photo"
         if views.lr_folder is None else f"read from {views.lr_folder} (D is taken to be {views.downsample})",
@@ -96,6 +103,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         **capture.notes,
         "train views": _names(train),
         "test views": _names(test),
+        "sizes": f"photos of {_size(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
         "LR": f"{_size(sample.lr.camera)}, {made}",
         "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), reference: {sample.reference}",
         "the reference adds": f"{_added_detail(train):.1f} grey levels to bicubic, on average",
@@ -163,10 +171,10 @@ def _spread(n: int, count: int) -> list[int]:
 def _view(frame: Frame, capture: Capture, views: ViewSettings, prior: Prior, *, required: bool) -> View:
     image, camera = frame.load(), frame.camera
     if views.photos_are == "lr":
-        image, camera = _reduced(image, camera, views.shrink, 1, views.downsample)
+        image, camera = _reduced(image, camera, views, 1)
         lr, hr_camera, truth = Photo(camera, image), camera.scaled(views.sr_scale), None
     else:
-        truth, hr_camera = _reduced(image, camera, views.shrink, views.sr_scale, views.downsample)
+        truth, hr_camera = _reduced(image, camera, views, views.sr_scale)
         lr_camera = hr_camera.scaled(1 / views.sr_scale)
         if views.lr_folder is None:
             lr = Photo(lr_camera, images.downsample(truth, views.sr_scale, views.downsample))
@@ -184,12 +192,28 @@ def _view(frame: Frame, capture: Capture, views: ViewSettings, prior: Prior, *, 
 
 
 def _reduced(
-    image: Float[Tensor, "H W 3"], camera: Camera, shrink: int, multiple: int, kernel: DownKernel
+    image: Float[Tensor, "H W 3"], camera: Camera, views: ViewSettings, multiple: int
 ) -> tuple[Float[Tensor, "h w 3"], Camera]:
-    """Crop at the bottom and right to a multiple of shrink·multiple, then reduce by `shrink`."""
-    image = images.crop_to_multiple(image, shrink * multiple)
+    """The photo reduced by `shrink`, its sizes whole multiples of `multiple`; see `ViewSettings.sizes`."""
+    if views.sizes == "round":
+        camera = rounded(camera, views.shrink, multiple)
+        return images.resize(image, (camera.width, camera.height), views.downsample), camera
+    image = images.crop_to_multiple(image, views.shrink * multiple)
     camera = replace(camera, width=image.shape[1], height=image.shape[0])
-    return images.downsample(image, shrink, kernel), camera.scaled(1 / shrink)
+    return images.downsample(image, views.shrink, views.downsample), camera.scaled(1 / views.shrink)
+
+
+def rounded(camera: Camera, shrink: int, multiple: int) -> Camera:
+    """The same rays through `multiple · round(size / (shrink · multiple))` pixels, each axis by its own ratio.
+
+    Raises:
+        ValueError: no pixel would be left.
+    """
+    width, height = (multiple * round(size / (shrink * multiple)) for size in (camera.width, camera.height))
+    x, y = width / camera.width, height / camera.height
+    return replace(
+        camera, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y, width=width, height=height
+    )
 
 
 def _ready_made(frame: Frame, folder: Path, camera: Camera, capture: Capture) -> Float[Tensor, "h w 3"]:

@@ -1,0 +1,239 @@
+"""The fair table and the papers' protocols: every file composes, every baseline trains, every sweep is what it says."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+import toy
+from hydra import compose, initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.utils import create_config_search_path
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.core.utils import setup_globals
+from hydra.types import RunMode
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from clear_strategies import Conductor
+from clear_strategies.data.scene import ViewSettings
+from clear_strategies.fit import FitSettings, TrainState, fit, iterate
+from clear_strategies.mip import MipFilter
+from clear_strategies.run import CONF
+from clear_strategies.schedules import scaled
+from tests.test_run import TINY, run
+
+
+def names(group: str) -> list[str]:
+    return sorted(p.stem for p in (CONF / group).glob("*.yaml") if not p.stem.startswith("_"))
+
+
+def composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+def jobs(*arguments: str) -> tuple[list[dict[str, str]], Callable[[dict[str, str]], DictConfig]]:
+    """The jobs that Hydra's sweeper makes of a command line, and what composes one."""
+    setup_globals()
+    Plugins.instance()
+    loader = ConfigLoaderImpl(create_config_search_path(str(CONF)))
+    whole = loader.load_configuration("config", list(arguments), run_mode=RunMode.MULTIRUN)
+    assert whole.hydra.mode == RunMode.MULTIRUN
+    swept = [f"{key}={value}" for key, value in whole.hydra.sweeper.params.items()]
+    overrides = OverridesParser.create(loader).parse_overrides([*swept, *arguments])
+    (batch,) = BasicSweeper.split_arguments(overrides, None)
+
+    def composed_job(job: dict[str, str]) -> DictConfig:
+        return loader.load_sweep_config(whole, [f"{key}={value}" for key, value in job.items()])
+
+    return [dict(override.split("=", 1) for override in job) for job in batch], composed_job
+
+
+def pieces(config: DictConfig, stretch: float = 1.0):
+    """What `run` builds of a configuration, without data."""
+    build = [instantiate(config[key], _convert_="object") for key in ("objective", "density", "optim")]
+    strategies = [instantiate(s, _convert_="object") for s in config.strategies.values()]
+    mip = MipFilter(**OmegaConf.to_container(config.mip))
+    return [scaled(s, stretch) for s in strategies], *(scaled(thing, stretch) for thing in (*build, mip))
+
+
+@pytest.mark.parametrize("name", names("method"))
+@pytest.mark.parametrize("fused", ["off", "auto"])
+def test_every_method_trains(name, fused):
+    """Few iterations of a toy, through every phase; the loss that it is about falls."""
+    config = composed(f"+method={name}", "density.reset_every=0")  # after a reset the loss has to fall anew
+    assert config.method == name
+    settings = FitSettings(iterations=24, max_degree=1, probe_every=0, checkpoint_every=0, fused=fused)
+    strategies, objective, density, rates, mip = pieces(config, settings.stretch)
+    scene = toy.scene()
+    conductor = Conductor(*strategies, objective=objective, statistics_from=1)
+    state = TrainState.start(
+        scene, conductor, settings=scaled(settings, settings.stretch), density=density, rates=rates, mip=mip
+    )
+    compiled = state.fused is not None
+    assert not (compiled and (fused == "off" or "splatsure" in name))
+    fit(state, scene, toy.RASTERIZER)
+    drawn = {stage for stage in conductor.ledger.entries if stage.startswith("render")}
+    if (name.endswith("_lr") and name != "srgs_lr") or name == "dropgaussian":
+        assert drawn == {"render LR", "render LR + HR"}  # the second one only as skipped
+        assert conductor.ledger.entries["render LR + HR"].runs == 0
+        told = "loss_lr"
+    else:
+        assert drawn == {"render HR"}
+        told = "loss_base"
+    losses = [row[told] for row in state.history]
+    assert all(math.isfinite(loss) for loss in losses)
+    assert sum(losses[-6:]) < sum(losses[:6])
+    assert float(state.field.detail.data.abs().max()) == 0  # no baseline has the detail feature
+
+
+@pytest.mark.parametrize(("lambda_lr", "lr_from"), [(0.6, "hr"), (0.0, "lr"), (0.6, "lr")])
+def test_the_compiled_pass_sees_the_same_gradients(lambda_lr, lr_from):
+    """Adam's first moments after one step are a tenth of the merged gradient."""
+    moments = []
+    for fused in ("off", "auto"):
+        config = composed("+strategy=clear", f"objective.lambda_lr={lambda_lr}", f"objective.lr_from={lr_from}",
+                          "objective.lambda_hr.start=0", "objective.lambda_hr.full=0")  # fmt: skip
+        settings = FitSettings(iterations=1, max_degree=1, probe_every=0, checkpoint_every=0, fused=fused)
+        strategies, objective, density, rates, mip = pieces(config)
+        conductor = Conductor(*strategies, objective=objective)
+        state = TrainState.start(toy.scene(), conductor, settings=settings, density=density, rates=rates, mip=mip)
+        if fused == "auto" and state.fused is None:
+            pytest.skip("the kernels are not installed")
+        iterate(state, toy.RASTERIZER)
+        moments.append(state.optimizer.first)
+    for name, readable in moments[0].items():
+        assert torch.allclose(readable, moments[1][name], rtol=1e-4, atol=1e-5 * float(readable.abs().max())), name
+    assert float(moments[0]["means"].abs().max()) > 0
+
+
+def test_what_the_methods_are():
+    """Weights, filters and dropout, row by row of docs/strategies.md."""
+    found = {}
+    for name in names("method"):
+        c = composed(f"+method={name}")
+        hr = c.objective.lambda_hr
+        assert hr.peak == hr.final
+        assert hr.peak == 0 or (hr.start, hr.full) == (0, 0)
+        assert c.objective.lambda_hf == 0
+        found[name] = (
+            hr.peak,
+            c.objective.lambda_lr,
+            c.objective.lr_from,
+            c.rasterizer.kernel,
+            c.mip.variance,
+            c.mip.cameras,
+        )
+        assert all(c.strategies[s].anchor_strength == 0 for s in c.strategies if s == "svs")
+        assert ("svs" in c.strategies) == name.startswith("dropgaussian")
+        assert ("splatsure" in c.strategies) == name.endswith("splatsure")
+    mip, on_lr, on_hr = (0.1, 0.2, "lr"), (0.0, 1.0, "lr"), (0.1, 0.2, "hr")
+    assert found == {
+        "3dgs_lr": (*on_lr, 0.3, 0.0, "hr"),
+        "mip_splatting_lr": (*on_lr, *mip),
+        "dropgaussian": (*on_lr, *mip),
+        "srgs": (1.0, 0.0, "lr", *on_hr),
+        "dropgaussian_srgs": (1.0, 0.0, "lr", *on_hr),
+        "srgs_lr": (0.4, 0.6, "hr", *on_hr),
+        "splatsure": (0.4, 0.6, "hr", *on_hr),
+        "dropgaussian_splatsure": (0.4, 0.6, "hr", *on_hr),
+    }
+    assert composed("+method=3dgs_lr").rasterizer.antialiased is False
+
+
+def test_a_method_sets_aside_the_strategies_named_before_it():
+    assert list(composed("+strategy=clear", "+method=srgs").strategies) == []
+    assert list(composed("+strategy=clear", "+method=dropgaussian").strategies) == ["svs"]
+    assert list(composed("+method=srgs", "+strategy=gco").strategies) == ["gco"]
+
+
+SCENES = {
+    "llff_x4": "fern flower fortress horns leaves orchids room trex",
+    "llff_x4_quarter": "fern flower fortress horns leaves orchids room trex",
+    "blender_x4": "chair drums ficus hotdog lego materials mic ship",
+    "mip360_x4": "bicycle bonsai counter garden kitchen room stump",
+}
+CLEAR = ["gco", "p2g", "svs"]
+ROWS = {
+    "ablation": {"baseline": [], "gco": ["gco"], "[gco,p2g]": ["gco", "p2g"], "clear": CLEAR},
+    "leave_one_out": {"clear": CLEAR, "[p2g,svs]": CLEAR[1:], "[gco,svs]": ["gco", "svs"], "[gco,p2g]": CLEAR[:2]},
+}
+
+
+@pytest.mark.parametrize("experiment", [name for name in names("experiment") if name != "smoke"])
+def test_an_experiment_is_its_scenes_times_seeds_times_rows(experiment):
+    found, composed_job = jobs(f"experiment={experiment}", "data.root=here")
+    scenes = SCENES[experiment if experiment in SCENES else "llff_x4"].split()
+    rows = ROWS.get(experiment, {"clear": CLEAR})
+    expected = list(itertools.product(scenes, "012", rows))
+    assert [(job["data.scene"], job["fit.seed"], job["+strategy"]) for job in found] == expected
+    for job in found[: len(rows)]:  # of the first scene and seed
+        c = composed_job(job)
+        assert list(c.strategies) == rows[job["+strategy"]]
+        assert (c.fit.iterations, c.fit.seed, c.data.path) == (10_000, 0, f"here/{scenes[0]}")
+        assert c.hydra.sweep.dir == f"multirun/{experiment}"
+        assert c.hydra.sweep.subdir == f"+strategy={job['+strategy']},data.scene={scenes[0]},fit.seed=0"
+        assert isinstance(instantiate(c.data.views, _convert_="object"), ViewSettings)
+        pieces(c)
+
+
+def test_the_protocols_are_the_papers():
+    firsts = []
+    for experiment in SCENES:
+        (job, *_), composed_job = jobs(f"experiment={experiment}", "data.root=here")
+        firsts.append(composed_job(job).data)
+    llff, quarter, blender, mip360 = firsts
+    assert (llff.views.train, llff.views.test_every, llff.views.shrink, llff.views.sr_scale) == (3, 8, 2, 4)
+    assert (quarter.views.train, quarter.views.shrink) == (3, 4)
+    assert list(blender.views.train_names) == [f"r_{i}" for i in (2, 16, 26, 55, 73, 76, 86, 93)]
+    assert (blender.views.shrink, blender.views.test_limit) == (1, None)
+    assert (blender.cloud.init, blender.cloud.random_points, blender.cloud.box) == ("random", 10_000, 1)
+    assert (mip360.views.train, mip360.views.shrink, mip360.views.sizes) == (24, 2, "round")
+    assert {llff.cloud.init, mip360.cloud.init} == {"auto"}
+
+
+def test_the_command_line_takes_the_place_of_what_an_experiment_sweeps():
+    (one,), composed_job = jobs(
+        "experiment=llff_x4", "data.root=here", "data.scene=horns", "fit.seed=7", "+strategy=[gco,p2g]"
+    )
+    c = composed_job(one)
+    assert (c.data.scene, c.fit.seed, list(c.strategies)) == ("horns", 7, ["gco", "p2g"])
+
+
+def test_methods_take_the_place_of_an_experiments_strategies():
+    asked = ("experiment=llff_x4", "data.root=here", "fit.seed=0", "+method=srgs,dropgaussian", "data.scene=horns")
+    found, composed_job = jobs(*asked)
+    for job, (method, strategies) in zip(found, (("srgs", []), ("dropgaussian", ["svs"])), strict=True):
+        c = composed_job(job)
+        assert (c.method, list(c.strategies)) == (method, strategies)
+        assert c.hydra.sweep.subdir == f"+method={method},data.scene=horns,fit.seed=0"
+
+
+def test_an_ablation_of_other_data():
+    found, composed_job = jobs("experiment=ablation", "protocol=blender_x4", "data.root=here", "fit.seed=0")
+    assert [job["data.scene"] for job in found[::4]] == SCENES["blender_x4"].split()
+    assert composed_job(found[-1]).data.path == "here/ship"
+    own, composed_job = jobs("experiment=ablation", "~protocol", "data=colmap", "data.path=mine", "fit.seed=0")
+    assert [job["+strategy"] for job in own] == list(ROWS["ablation"])
+    assert (composed_job(own[0]).data.path, composed_job(own[0]).data.views.shrink) == ("mine", 1)
+
+
+def test_one_command_runs_all_and_the_report_tells_the_rows_apart(tmp_path: Path):
+    tiny = ["experiment=ablation", "~protocol", "fit.seed=0", *TINY, "fit.iterations=3"]
+    for rows in ("+strategy=baseline,clear", "+method=srgs"):
+        result = run(*tiny, rows, cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+    assert "strategies named before it take no part" in result.stdout + result.stderr
+    done = sorted(p.parent.name.split(",")[0] for p in tmp_path.glob("multirun/ablation/*/metrics.json"))
+    assert done == ["+method=srgs", "+strategy=baseline", "+strategy=clear"]
+    told = run("multirun", "--out", "report", cwd=tmp_path, module="clear_strategies.report")
+    assert told.returncode == 0, told.stderr
+    for row in ("| baseline ", "| clear ", "| srgs "):
+        assert row in told.stdout, told.stdout

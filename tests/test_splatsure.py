@@ -1,0 +1,102 @@
+"""SplatSuRe's weights, worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from clear_strategies import Grads, SplatSuRe
+from clear_strategies.testing import StubShot
+from rasterizers import Camera
+
+
+def camera(distance: float, focal: float = 10.0) -> Camera:
+    """Looks along z at the origin from `distance`."""
+    pose = torch.eye(4)
+    pose[2, 3] = distance
+    return Camera(pose, focal, focal, 4.0, 4.0, 8, 8)
+
+
+def visit(strategy: SplatSuRe, name: str, distance: float, shown: list[bool], means=None) -> torch.Tensor:
+    """One iteration of a view: the weights of its HR gradients."""
+    view = SimpleNamespace(name=name, hr=SimpleNamespace(camera=camera(distance)))
+    visible = torch.tensor(shown)
+    strategy.observe(view, StubShot(torch.zeros(8, 8, 3), torch.zeros(len(shown), 2), visible, []))
+    corrected = strategy.correct(Grads(), Grads({"opacities": torch.ones(len(shown))}), None)["opacities"]
+    strategy.after_step({"means": torch.zeros(len(shown), 3) if means is None else means}, 1)
+    return corrected
+
+
+def started(n_views: int = 3, **settings) -> SplatSuRe:
+    strategy = SplatSuRe(**settings)
+    strategy.on_fit_start(n_views, 0)
+    return strategy
+
+
+def test_far_views_yield_to_the_nearest_once_all_were_visited():
+    s = started(ratio=1.5, softness=0.5)
+    views = {"near": 2.0, "middle": 2.5, "far": 4.0}
+    for name, distance in views.items():
+        assert visit(s, name, distance, [True, True]).tolist() == [1, 1]  # too few views have shown them
+    withheld = 1 / (1 + math.exp(-(2 - 1.5) / 0.5))  # rates 10/2, 10/2.5, 10/4: ratio 2
+    for name, expected in (("near", 1.0), ("middle", 1 - withheld), ("far", 1 - withheld)):
+        assert visit(s, name, views[name], [True, True]).tolist() == pytest.approx([expected] * 2)
+    assert s.readings["mean_hr_weight"] == pytest.approx(1 - withheld)
+
+
+def test_equal_sampling_keeps_nearly_everything_and_a_wide_range_leaves_nearly_nothing():
+    s = started()
+    for name, distance in (("a", 1.0), ("b", 1.0), ("c", 1.0)):
+        visit(s, name, distance, [True])
+    assert s.weight("a").tolist() == [1.0]
+    visit(s, "c", 2.0, [True])
+    assert s.weight("a").tolist() == [1.0]
+    assert float(s.weight("c")) < 1e-6
+
+
+def test_a_gaussian_that_few_views_show_keeps_its_gradient():
+    s = started()
+    for name, distance, shown in (("a", 1.0, [True, True]), ("b", 2.0, [True, False]), ("c", 4.0, [True, True])):
+        visit(s, name, distance, shown)
+    w = visit(s, "c", 4.0, [True, True])
+    assert float(w[0]) < 1e-6
+    assert float(w[1]) == 1.0
+
+
+def test_a_view_that_no_longer_shows_a_gaussian_keeps_what_it_knew():
+    """Dropout hides a Gaussian for an iteration; that is no evidence that the view does not see it."""
+    s = started()
+    visit(s, "a", 2.0, [True])
+    visit(s, "a", 4.0, [False])
+    assert s.state["a"].tolist() == [5.0]
+
+
+def test_gaussians_behind_the_camera_are_not_sampled():
+    s = started()
+    visit(s, "a", 2.0, [True, True], means=torch.tensor([[0.0, 0, -3], [0, 0, 3]]))
+    assert s.state["a"].tolist() == [0.0, 2.0]
+
+
+def test_the_weights_follow_their_gaussians():
+    s = started()
+    for name, distance in (("a", 1.0), ("b", 2.0), ("c", 4.0)):
+        visit(s, name, distance, [True, name != "b"])
+    before = s.weight("c")
+    s.on_resize(torch.tensor([1, 0, 0]))
+    assert torch.equal(s.weight("c"), before[[1, 0, 0]])
+
+
+def test_two_views_are_warned_of(caplog):
+    started(3)
+    assert not caplog.text
+    started(2)
+    assert "SplatSuRe has no effect: 2 training views are fewer than min_views=3" in caplog.text
+
+
+@pytest.mark.parametrize("setting", [{"ratio": 0.9}, {"softness": 0.0}, {"min_views": 0}], ids=str)
+def test_settings_outside_their_range_are_refused(setting):
+    with pytest.raises(ValueError, match=next(iter(setting))):
+        SplatSuRe(**setting)
