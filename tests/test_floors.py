@@ -12,12 +12,12 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = [
-    {"errors", "files", "images", "kernels", "schedules", "gradients", "evidence", "ledger", "provenance"},
+    {"errors", "files", "images", "kernels", "schedules", "gradients", "evidence", "ledger", "lock", "provenance"},
     {"strategy"},
     {"gco", "p2g", "svs"},
     {"objective", "conductor"},
     {"data", "mip", "optim", "field", "fused", "density", "checkpoint", "metrics", "pictures", "fit", "export"},
-    {"run", "report", "bench", "testing"},
+    {"run", "sweep", "report", "bench", "testing"},
 ]
 # Types that floor 2 may name: what a view is, and nothing that trains on it.
 ALLOWED_UP = {("p2g", "data"), ("conductor", "data")}
