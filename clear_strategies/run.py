@@ -170,7 +170,7 @@ def _run(config: DictConfig, folder: Path) -> float | None:
         _resume_newest(state, folder / "checkpoints", compared)
     elif config.fit.resume is not None:
         _resume(state, Path(config.fit.resume), compared)
-    _print_plan(config, scene, state, backend, f"{threads}: {why}")
+    _print_plan(config, scene, state, backend, f"{threads} ({why})")
     if (folder / "metrics.json").exists():
         _log.warning("%s: of an earlier run; removed, for it says that a run is finished.", folder / "metrics.json")
         (folder / "metrics.json").unlink()
@@ -230,7 +230,7 @@ def _threads(config: DictConfig) -> tuple[int, str]:
         return int(config.fit.threads), "fit.threads"
     launcher = HydraConfig.get().launcher if HydraConfig.initialized() else None
     jobs = int(launcher.n_jobs) if launcher is not None and "n_jobs" in launcher else 1
-    here = f"{sweep.cores()} cores here"
+    here = f"of {sweep.cores()} here"
     return sweep.threads(jobs), here if jobs == 1 else f"{here}, hydra.launcher.n_jobs={jobs}"
 
 
