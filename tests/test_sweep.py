@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -61,9 +62,10 @@ def test_a_folder_of_another_configuration_is_refused(whole):
 
 
 def test_metrics_json_is_the_last_file_a_run_writes(whole):
-    last = max((p for p in whole.rglob("*") if p.is_file()), key=lambda p: (p.stat().st_mtime_ns, p.name != "run.log"))
     others = [p for p in whole.rglob("*") if p.is_file() and p.name not in ("metrics.json", "run.log")]
-    assert all(p.stat().st_mtime_ns <= (whole / "metrics.json").stat().st_mtime_ns for p in others), last
+    results = [p.stat().st_mtime_ns for p in others if ".hydra" not in p.parts]
+    assert len(results) > 10
+    assert max(results) <= (whole / "metrics.json").stat().st_mtime_ns
 
 
 def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same(whole, tmp_path):
@@ -84,7 +86,7 @@ def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same
     assert f"resumed from {before}" in said
     assert (tmp_path / "here" / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
     timing = (tmp_path / "here" / "timing.csv").read_text()
-    assert [line.split(",")[1] for line in timing.splitlines() if line.startswith("render LR + HR")] == ["39"], timing
+    assert [line.split(",")[1] for line in timing.splitlines() if line.startswith("losses LR")] == ["40"], timing
     history = [line.split(",") for line in (tmp_path / "here" / "history.csv").read_text().splitlines()]
     seconds = [float(row[history[0].index("seconds")]) for row in history[1:]]
     assert len(seconds) == 40
@@ -137,15 +139,17 @@ def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, monkeypatch):
 
 
 joblib = pytest.mark.skipif(
-    not __import__("importlib.util").util.find_spec("hydra_plugins.hydra_joblib_launcher"),
-    reason="hydra-joblib-launcher is not installed: pip install 'clear-strategies[sweeps]'",
+    find_spec("hydra_plugins") is None or find_spec("hydra_plugins.hydra_joblib_launcher") is None,
+    reason="hydra-joblib-launcher is not installed: pip install -e '.[sweeps]'",
 )
 JOBLIB = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
 
 
 @joblib
 def test_in_other_processes_a_failed_job_stops_no_other_and_is_told(tmp_path):
-    result = run(*SWEEP, *JOBLIB, "+strategy=gco", "strategies.gco.tolerance=7,0.1,0.2", "fit.iterations=3", cwd=tmp_path)
+    result = run(
+        *SWEEP, *JOBLIB, "+strategy=gco", "strategies.gco.tolerance=7,0.1,0.2", "fit.iterations=3", cwd=tmp_path
+    )
     said = result.stdout + result.stderr
     assert result.returncode == 2, said
     assert "1 job(s) failed: job 0: config: strategies.gco: tolerance must lie in [0, 1), got 7" in said
@@ -155,6 +159,7 @@ def test_in_other_processes_a_failed_job_stops_no_other_and_is_told(tmp_path):
 
 
 @joblib
+@pytest.mark.slow
 @pytest.mark.parametrize("whom", ["parent", "group"])
 def test_a_stopped_joblib_sweep_saves_its_jobs_and_goes_on(tmp_path, whom):
     """Ctrl-C reaches the workers too, SIGTERM only the process that was started; both save and begin no other job."""
@@ -179,6 +184,8 @@ def test_a_stopped_joblib_sweep_saves_its_jobs_and_goes_on(tmp_path, whom):
     saved = [checkpoint.saved(tmp_path / "all" / job / "checkpoints") for job in ("0", "1")]
     assert all(saved), text
     assert not (tmp_path / "all" / "2" / "metrics.json").exists()
+    if whom == "parent":
+        return  # going on is the same for both
     again = run(*sweep_of_three, cwd=tmp_path)
     assert again.returncode == 0, again.stdout + again.stderr
     assert "resumed from" in (tmp_path / "all" / "1" / "run.log").read_text()
@@ -211,5 +218,11 @@ def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
     assert process.returncode == 91, said
 
 
-def test_torch_keeps_its_threads_for_the_next_job():
-    assert sweep._threads_of_torch() == torch.get_num_threads()
+def test_the_threads_of_one_job_are_not_those_of_the_next():
+    """A process does several: fit.threads of one must not become the default of the other."""
+    before, default = torch.get_num_threads(), sweep.threads(1)
+    torch.set_num_threads(default + 1)
+    try:
+        assert sweep.threads(1) == default
+    finally:
+        torch.set_num_threads(before)

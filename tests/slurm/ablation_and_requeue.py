@@ -24,6 +24,7 @@ DEMO = ["data.reader.width=64", "data.reader.height=48", "fit.max_degree=1", "da
         "data.cloud.random_points=60", "data.reader.views=5", "data.reader.train=2", "data.views.train=2"]  # fmt: skip
 # What a user writes to go from this machine to a cluster.
 SLURM = ["-m", "hydra/launcher=submitit_slurm", "hydra.launcher.cpus_per_task=1", "fit.resume=auto"]
+ABLATION = [*SLURM, "+strategy=baseline,gco,[gco,p2g],clear", "hydra.sweep.dir=ablation", "fit.iterations=300", *DEMO]
 LONG = ["+strategy=clear", "fit.iterations=6000", *DEMO]
 
 _log = logging.getLogger("slurm")
@@ -71,8 +72,7 @@ class Experiment:
 
     def ablation(self) -> None:
         """Table 4's rows, two jobs at once on two cores."""
-        rows = "+strategy=baseline,gco,[gco,p2g],clear"
-        process = self.start(*SLURM, rows, "hydra.sweep.dir=ablation", "fit.iterations=300", *DEMO, name="ablation")
+        process = self.start(*ABLATION, name="ablation")
         self.wait_for("two jobs to run", lambda: self.ask("squeue", "-h", "-t", "R").count("\n") >= 1)
         self.show("squeue")
         self.finish(process, "ablation")
@@ -84,11 +84,7 @@ class Experiment:
     def rerun(self) -> None:
         """The same command again trains nothing."""
         before = (self.folder / "ablation" / "3" / "metrics.json").stat().st_mtime_ns
-        self.ablation_again = self.start(
-            *SLURM, "+strategy=baseline,gco,[gco,p2g],clear", "hydra.sweep.dir=ablation", "fit.iterations=300", *DEMO,
-            name="again",
-        )  # fmt: skip
-        self.finish(self.ablation_again, "again")
+        self.finish(self.start(*ABLATION, name="again"), "again")
         _tell(self.folder / "ablation" / "3" / "run.log", r"nothing is trained")
         if (self.folder / "ablation" / "3" / "metrics.json").stat().st_mtime_ns != before:
             raise AssertionError("a finished run was written again")
@@ -112,12 +108,16 @@ class Experiment:
         self.compare("requeued", expected)
 
     def timed_out(self, expected: bytes) -> None:
-        """The time limit is shorter than the run; 30 s before it Slurm sends SIGUSR2, as submitit asked it to."""
-        limits = ["hydra.launcher.timeout_min=1", "hydra.launcher.signal_delay_s=15", "hydra.launcher.max_num_timeout=20"]
+        """The time limit is shorter than the run; before it Slurm sends SIGUSR2, as submitit asked it to."""
+        limits = [
+            "hydra.launcher.timeout_min=1",
+            "hydra.launcher.signal_delay_s=15",
+            "hydra.launcher.max_num_timeout=20",
+        ]
         process = self.start(*SLURM, *limits, *LONG, "hydra.sweep.dir=timed_out", name="timed_out")
         self.finish(process, "timed_out")
-        for path in sorted((self.folder / "timed_out" / ".submitit").rglob("*_log.*")):
-            _tell(path, r"submitit (WARNING|INFO).*(signal|timed|checkpoint|Requeued|Exiting|completed)")
+        for path in sorted((self.folder / "timed_out" / ".submitit").rglob("*_log.out")):
+            _tell(path, r"submitit (WARNING|INFO).*(Caught signal|Requeued|completed)")
         self.compare("timed_out", expected)
 
     def compare(self, name: str, expected: bytes) -> None:
@@ -128,7 +128,9 @@ class Experiment:
         if (folder / "point_cloud.ply").read_bytes() != expected:
             raise AssertionError(f"{name}: the point cloud is not that of the undisturbed run")
         seconds = json.loads((folder / "metrics.json").read_text())["seconds"]
-        _log.info("%s/0/point_cloud.ply is, byte for byte, that of the undisturbed run (%.0f s of training).", name, seconds)
+        _log.info(
+            "%s/0/point_cloud.ply is, byte for byte, that of the undisturbed run (%.0f s of training).", name, seconds
+        )
 
 
 def _tell(path: Path, pattern: str) -> None:
@@ -143,6 +145,7 @@ def main(folder: Path) -> None:
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S", handlers=handlers)
     with cluster(folder / "cluster") as environment:
         experiment = Experiment(folder, environment)
+        experiment.show("sbatch", "--version")
         experiment.show("sinfo")
         experiment.ablation()
         experiment.rerun()

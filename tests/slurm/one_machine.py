@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "scontrol", "squeue")
+PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "scontrol", "squeue", "scancel", "sinfo")
 
 CONFIG = """\
 ClusterName=throwaway
@@ -93,6 +93,8 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
 
         _wait_until(idle, 60)
         yield environment
+        subprocess.run(["scancel", f"--user={user}"], env=environment, check=True)  # of a failed experiment
+        _wait_until(idle, 60)  # else the ends of the last job would look for a controller that is gone
     finally:
         for daemon in reversed(daemons):
             daemon.terminate()
@@ -118,5 +120,7 @@ def _wait_until(condition, seconds: float) -> None:
     deadline = time.monotonic() + seconds
     while not condition():
         if time.monotonic() > deadline:
-            raise TimeoutError("the cluster did not come up; see daemons.log, slurmctld.log and slurmd.log in its folder")
+            raise TimeoutError(
+                "the cluster did not come up; see daemons.log, slurmctld.log and slurmd.log in its folder"
+            )
         time.sleep(0.2)
