@@ -23,6 +23,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.experimental.callback import Callback
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -57,8 +58,10 @@ def main(config: DictConfig) -> float | None:
     from clear_strategies.fit import Interrupted
     from rasterizers.interface import BackendUnavailable
 
-    job = HydraConfig.get()
-    ours = Sweep.current()
+    job, ours = HydraConfig.get(), _sweep()
+    if ours is not None and _launcher(job) == "joblib" and not ours.begun_here:
+        # A terminal sends Ctrl-C to joblib's workers too; one stop is enough, and it comes from the sweep.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     if ours is not None and ours.stopped_by is not None:
         _log.warning("job %s is not started: the sweep was stopped.", job.job.num)
         return None
@@ -116,6 +119,11 @@ class SweepCallback(Callback):
             sys.exit(128 + stopped)
         if failed:
             sys.exit(2)
+
+
+def _sweep() -> Sweep | None:
+    """The one that this job is of. A single run is of none, whatever the environment says that it was started in."""
+    return Sweep.current() if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN else None
 
 
 def _launcher(job: Any) -> str:
@@ -384,11 +392,9 @@ def _progress(state: Any) -> Iterator[Callable[[Any], None]]:
 
 
 def _watch() -> Callable[[], None] | None:
-    """For a job that joblib runs in another process: looks whether the sweep was stopped."""
-    ours = Sweep.current()
-    if ours is None or ours.begun_here or _launcher(HydraConfig.get()) != "joblib":
-        return None
-    return sweep.Watch(ours)
+    """For joblib's jobs: looks whether the sweep was stopped, from whichever process."""
+    ours = _sweep()
+    return sweep.Watch(ours) if ours is not None and _launcher(HydraConfig.get()) == "joblib" else None
 
 
 def _leave_results(

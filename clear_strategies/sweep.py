@@ -105,12 +105,10 @@ def stop_on_signals(sweep: Sweep) -> None:
 
 
 class Watch:
-    """In a worker: turns the sweep's stop into the signal that training saves at. Called after each iteration."""
+    """Turns the sweep's stop into the signal that training saves at. Called after each iteration."""
 
     def __init__(self, sweep: Sweep) -> None:
         self.sweep, self.next_look = sweep, 0.0
-        # A terminal sends Ctrl-C to the workers too; one stop is enough, and it comes by the note.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def __call__(self) -> None:
         if time.monotonic() < self.next_look:

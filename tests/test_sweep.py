@@ -226,3 +226,31 @@ def test_the_threads_of_one_job_are_not_those_of_the_next():
         assert sweep.threads(1) == default
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.mark.skipif(find_spec("submitit") is None, reason="submitit is not installed: pip install -e '.[sweeps]'")
+def test_the_slurm_configuration_is_one_that_submitit_takes(tmp_path):
+    """hydra/launcher=slurm, composed and turned into the head of a batch file."""
+    from hydra import compose, initialize_config_dir
+    from omegaconf import OmegaConf
+    from submitit.slurm.slurm import _make_sbatch_string
+
+    from clear_strategies.run import CONF
+
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        launcher = compose("config", ["hydra/launcher=slurm"], return_hydra_config=True).hydra.launcher
+    fields = {k: v for k, v in launcher.items() if k not in ("_target_", "submitit_folder", "max_num_timeout")}
+    names = {"name": "job_name", "timeout_min": "time", "mem_gb": "mem", "tasks_per_node": "ntasks_per_node"}
+    plain = {names.get(k, k): OmegaConf.to_container(v) if OmegaConf.is_config(v) else v for k, v in fields.items()}
+    script = _make_sbatch_string(command="true", folder=tmp_path, **plain)
+    for line in ("--signal=USR2@120", "--time=240", "--cpus-per-task=4", "--requeue\n"):
+        assert f"#SBATCH {line}" in script
+    assert "SlurmLauncher" in launcher._target_
+    assert launcher.max_num_timeout == 100
+
+
+def test_a_single_run_started_from_within_a_sweep_is_no_job_of_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("CLEAR_SWEEP", str(tmp_path / ".sweep_1_x"))
+    result = run("strategies.gco.tolerance=7", "+strategy=gco", *TINY, cwd=tmp_path)
+    assert result.returncode == 2
+    assert not (tmp_path / ".sweep_1_x").exists()

@@ -1,9 +1,10 @@
 """The ablation through a real Slurm, then jobs that are taken away: `python -m tests.slurm.ablation_and_requeue FOLDER`.
 
 Starts a cluster of this one machine in FOLDER, runs the four rows of the ablation on the tiny demo with
-`hydra/launcher=submitit_slurm`, and then one longer run three times: undisturbed and without Slurm; as a job that
-`scontrol requeue` takes away; as a job that runs into its time limit. All three must leave the same point cloud, byte for
-byte. What happens is told on standard output and in FOLDER/log.txt, which docs/cluster.md quotes.
+`hydra/launcher=submitit_slurm`, the same again, and a sweep with a job that fails. Then one longer run four times:
+undisturbed and without Slurm; as a job that `scontrol requeue` takes away; as one that is killed; as one that runs into
+its time limit. All must leave the same point cloud, byte for byte. What happens is told on standard output and in
+FOLDER/log.txt, which docs/cluster.md quotes.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import json
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -49,9 +51,9 @@ class Experiment:
         with (self.folder / f"{name}.txt").open("wb") as output:
             return subprocess.Popen(command, cwd=self.folder, env=self.environment, stdout=output, stderr=output)
 
-    def finish(self, process: subprocess.Popen[bytes], name: str) -> None:
+    def finish(self, process: subprocess.Popen[bytes], name: str, expected: int = 0) -> None:
         code = process.wait(900)
-        if code:
+        if code != expected:
             raise RuntimeError(f"{name} ended with {code}:\n{(self.folder / f'{name}.txt').read_text()[-3000:]}")
 
     def ask(self, *command: str) -> str:
@@ -89,6 +91,15 @@ class Experiment:
         if (self.folder / "ablation" / "3" / "metrics.json").stat().st_mtime_ns != before:
             raise AssertionError("a finished run was written again")
 
+    def failed(self) -> None:
+        """A job with a setting out of range: the other runs, and the exit code tells."""
+        process = self.start(*SLURM, "+strategy=gco", "strategies.gco.tolerance=7,0.1", "hydra.sweep.dir=failed",
+                             "fit.iterations=10", *DEMO, name="failed")  # fmt: skip
+        self.finish(process, "failed", expected=2)
+        _tell(self.folder / "failed.txt", r"job\(s\) failed")
+        if not (self.folder / "failed" / "1" / "metrics.json").exists():
+            raise AssertionError("the other job did not finish")
+
     def undisturbed(self) -> bytes:
         process = self.start("hydra.run.dir=undisturbed", *LONG, "fit.threads=1", name="undisturbed")
         self.finish(process, "undisturbed")
@@ -107,11 +118,27 @@ class Experiment:
         self.finish(process, "requeued")
         self.compare("requeued", expected)
 
+    def killed(self, expected: bytes) -> None:
+        """As a failing node would: the process is gone without a word, its lock stays, and the job is started again."""
+        process = self.start(*SLURM, *LONG, "hydra.sweep.dir=killed", name="killed")
+        folder = self.folder / "killed" / "0"
+        self.wait_for("a checkpoint", lambda: list(folder.glob("checkpoints/step_*/manifest.json")))
+        job = self.ask("squeue", "-h", "-t", "R", "-o", "%i").split()[0]
+        pid = json.loads((folder / "run.lock").read_text())["pid"]
+        os.kill(pid, signal.SIGKILL)
+        self.wait_for("the job to end", lambda: not self.ask("squeue", "-h", "-t", "R"))
+        _log.info("$ kill -9 %d\nrun.lock says\n  %s", pid, (folder / "run.lock").read_text())
+        self.show("scontrol", "requeue", job)
+        self.wait_for("its second try", lambda: '"slurm_restarts": 1' in _text(folder / "run.lock"))
+        _log.info("run.lock says\n  %s", _text(folder / "run.lock"))
+        self.finish(process, "killed")
+        self.compare("killed", expected)
+
     def timed_out(self, expected: bytes) -> None:
         """The time limit is shorter than the run; before it Slurm sends SIGUSR2, as submitit asked it to."""
         limits = [
             "hydra.launcher.timeout_min=1",
-            "hydra.launcher.signal_delay_s=15",
+            "hydra.launcher.signal_delay_s=30",
             "hydra.launcher.max_num_timeout=20",
         ]
         process = self.start(*SLURM, *limits, *LONG, "hydra.sweep.dir=timed_out", name="timed_out")
@@ -133,6 +160,10 @@ class Experiment:
         )
 
 
+def _text(path: Path) -> str:
+    return path.read_text() if path.exists() else ""
+
+
 def _tell(path: Path, pattern: str) -> None:
     lines = [line for line in path.read_text(errors="replace").splitlines() if re.search(pattern, line)]
     _log.info("%s says\n%s", path.name, "\n".join(f"  {line.strip()}" for line in lines))
@@ -149,8 +180,10 @@ def main(folder: Path) -> None:
         experiment.show("sinfo")
         experiment.ablation()
         experiment.rerun()
+        experiment.failed()
         expected = experiment.undisturbed()
         experiment.requeued(expected)
+        experiment.killed(expected)
         experiment.timed_out(expected)
 
 

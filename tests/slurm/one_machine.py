@@ -92,9 +92,11 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
             return answer.stdout.strip() == "idle"
 
         _wait_until(idle, 60)
-        yield environment
-        subprocess.run(["scancel", f"--user={user}"], env=environment, check=True)  # of a failed experiment
-        _wait_until(idle, 60)  # else the ends of the last job would look for a controller that is gone
+        try:
+            yield environment
+        finally:
+            subprocess.run(["scancel", f"--user={user}"], env=environment, check=True)  # what a failure left
+            _wait_until(idle, 60)  # else what ends the last job would look for a controller that is gone
     finally:
         for daemon in reversed(daemons):
             daemon.terminate()
