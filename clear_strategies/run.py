@@ -76,8 +76,12 @@ def main(config: DictConfig) -> float | None:
             signal.raise_signal(stopped.signum)  # all is saved: now whoever launched the job may hand it in again
         sys.exit(stopped.exit_code)
     except OSError as error:  # a full or read-only disk; unusable input is a DataError
-        _log.error("%s: %s. Earlier checkpoints are untouched.", error.filename or "output", error.strerror or error)
-        sys.exit(3)
+        message = f"{error.filename or 'output'}: {error.strerror or error}. Earlier checkpoints are untouched."
+        _log.error("%s", message)
+        if ours is None or _launcher(job) == "basic":
+            sys.exit(3)
+        ours.note_failure(job.job.num, message)  # jobs elsewhere may have another disk
+        return None
     except (ClearError, BackendUnavailable, OmegaConfBaseException, InstantiationException, ValueError) as error:
         if isinstance(error, ValueError) and not isinstance(error, ClearError) and not _is_ours(error):
             raise
