@@ -13,7 +13,7 @@ import logging
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,6 +35,7 @@ class Checkpoint:
     Args:
         t: the next iteration. config: the run's composed configuration, to refuse another one on resume.
         facts: small numbers (Adam's step count, the active SH degree …). history: one row an iteration.
+        ledger: what was computed and skipped until then, `Ledger.state_dict`.
     """
 
     t: int
@@ -42,6 +43,7 @@ class Checkpoint:
     config: Mapping[str, Any]
     facts: Mapping[str, float]
     history: list[dict[str, float]]
+    ledger: Mapping[str, Any] = field(default_factory=dict)
 
 
 def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
@@ -61,6 +63,7 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
         "t": checkpoint.t,
         "config": checkpoint.config,
         "facts": checkpoint.facts,
+        "ledger": checkpoint.ledger,
         "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
     }
     files[_MANIFEST] = json.dumps(manifest, indent=1).encode()
@@ -78,9 +81,17 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
     except OSError:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-    for old in _all(folder)[:-keep]:
+    all_of_them = saved(folder)
+    # What is beyond this one is of another run, or of a try that this one does not go on from.
+    until, beyond = [p for p in all_of_them if p <= target], [p for p in all_of_them if p > target]
+    for old in (*until[:-keep], *beyond):
         shutil.rmtree(old, ignore_errors=True)
     return target
+
+
+def saved(folder: Path) -> list[Path]:
+    """The checkpoints in a folder of checkpoints, newest last."""
+    return sorted(p for p in folder.glob(f"{_PREFIX}*") if (p / _MANIFEST).is_file())
 
 
 def load(path: Path) -> Checkpoint:
@@ -107,6 +118,7 @@ def load(path: Path) -> Checkpoint:
         config=manifest["config"],
         facts=manifest["facts"],
         history=json.loads(files[_HISTORY]),
+        ledger=manifest.get("ledger", {}),
     )
 
 
@@ -135,13 +147,9 @@ def _newest(path: Path) -> Path:
     if (path / _MANIFEST).is_file():
         return path
     for folder in (path, path / "checkpoints"):
-        if found := _all(folder):
+        if found := saved(folder):
             return found[-1]
     raise DataError(path, "checkpoint", "no checkpoint is here", "give a run's folder or one of its checkpoints/step_*")
-
-
-def _all(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.glob(f"{_PREFIX}*") if (p / _MANIFEST).is_file())
 
 
 def _write_durably(path: Path, data: bytes) -> None:

@@ -86,7 +86,7 @@ class DivergedError(ClearError, FloatingPointError):
 
 
 class Interrupted(ClearError):
-    """The run was asked to stop (Ctrl-C, SIGTERM); it finished its step and saved."""
+    """The run was asked to stop (Ctrl-C, SIGTERM, a cluster's own signal); it finished its step and saved."""
 
     def __init__(self, signum: int, saved: Path | None, t: int) -> None:
         self.signum = signum
@@ -170,7 +170,7 @@ class TrainState:
         ):
             tensors |= {f"{prefix}/{name}": value for name, value in table.items()}
         facts = {"optimizer_steps": float(self.optimizer.steps), "degree": float(self.field.degree)}
-        return Checkpoint(self.t, tensors, config, facts, self.history)
+        return Checkpoint(self.t, tensors, config, facts, self.history, self.conductor.ledger.state_dict())
 
     def restore(self, saved: Checkpoint, source: Path) -> None:
         """Go on from a checkpoint.
@@ -189,7 +189,8 @@ class TrainState:
             self.optimizer.load_state_dict(tables["optimizer"], int(saved.facts["optimizer_steps"]))
             self.density.load_state_dict(tables["density"])
             self.conductor.load_state_dict(tables.get("strategies", {}))
-        except (KeyError, ValueError) as error:
+            self.conductor.ledger.load_state_dict(saved.ledger)
+        except (KeyError, ValueError, TypeError) as error:
             raise DataError(
                 source, "tensors", f"do not fit this run ({error})", "resume with the run's own config"
             ) from error
@@ -281,7 +282,7 @@ def fit(
             if progress is not None:
                 progress(state)
             if pending:
-                raise Interrupted(pending[0], save(), state.t)
+                raise Interrupted(_foremost(pending), save(), state.t)
             if settings.checkpoint_every and done % settings.checkpoint_every == 0 and not state.ended:
                 _require_finite(state)
                 save()
@@ -336,21 +337,29 @@ def _require_finite(state: TrainState) -> None:
 
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+# With these a cluster announces the end of a job, if whoever started the job has set a handler.
+_ANNOUNCEMENTS: Final = tuple(getattr(signal, name) for name in ("SIGUSR1", "SIGUSR2") if hasattr(signal, name))
 
 
 @contextmanager
 def _deferred_signals() -> Iterator[list[int]]:
-    """Collect the first SIGINT or SIGTERM instead of dying in the middle of a step; a second one acts at once."""
+    """Collect the first SIGINT or SIGTERM instead of dying in the middle of a step; a second one acts at once.
+
+    A signal that somebody handles to hand the job in again is collected too: that handler would leave before saving. It
+    is in force again when `fit` raises Interrupted, so that whoever catches it can raise the signal anew.
+    """
     pending: list[int] = []
 
     def note(signum: int, _frame: FrameType | None) -> None:
         pending.append(signum)
-        _log.warning("%s: finishing this step, then saving. Once more to leave at once.", signal.Signals(signum).name)
+        again = " Once more to leave at once." if signum in _SIGNALS else ""
+        _log.warning("%s: finishing this step, then saving.%s", signal.Signals(signum).name, again)
         for s in _SIGNALS:
             signal.signal(s, before[s])
 
+    handled = [s for s in _ANNOUNCEMENTS if callable(signal.getsignal(s))]
     try:
-        before = {s: signal.signal(s, note) for s in _SIGNALS}
+        before = {s: signal.signal(s, note) for s in (*_SIGNALS, *handled)}
     except ValueError:  # not the main thread: signals are somebody else's
         yield pending
         return
@@ -359,3 +368,8 @@ def _deferred_signals() -> Iterator[list[int]]:
     finally:
         for s, handler in before.items():
             signal.signal(s, handler)
+
+
+def _foremost(pending: list[int]) -> int:
+    """A cluster may send SIGTERM with its announcement; the announcement says what to do."""
+    return next((s for s in pending if s in _ANNOUNCEMENTS), pending[0])

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 
 @dataclass(slots=True)
@@ -57,3 +58,11 @@ class Ledger:
                 }
             )
         return table
+
+    def state_dict(self) -> dict[str, Any]:
+        """JSON-ready, for a checkpoint."""
+        return {name: asdict(entry) for name, entry in self.entries.items()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Count on from there."""
+        self.entries = {name: Entry(**entry) for name, entry in state.items()}

@@ -1,15 +1,17 @@
 """`python -m clear_strategies.run +strategy=clear`: the door to a whole run, and the only one that knows Hydra.
 
-Composes the configuration, prints the plan, trains, and leaves in Hydra's run folder: metrics.json, history.csv,
-conflict.csv, timing.csv, renders/, contact_sheet.png, curves.png, point_cloud.ply and checkpoints/. Exit codes: 0, 2 for
-input that cannot be used, 3 where
-the disk is full or read-only, 130 and 143 when stopped by a signal (after saving).
+Composes the configuration, prints the plan, trains, and leaves in Hydra's run folder: history.csv, conflict.csv,
+timing.csv, renders/, contact_sheet.png, curves.png, point_cloud.ply, checkpoints/ and, last, so that its presence says
+that the run is finished, metrics.json. Exit codes: 0, 2 for input that cannot be used or a sweep with a failed job, 3
+where the disk is full or read-only, 130 and 143 when stopped by a signal (after saving).
 """
 
 from __future__ import annotations
 
+import json
 import logging
 import math
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -20,11 +22,15 @@ from typing import Any, Final
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
+from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from clear_strategies import sweep
 from clear_strategies.errors import ClearError, DataError
+from clear_strategies.lock import HeldError, hold
+from clear_strategies.sweep import Sweep
 
 _log = logging.getLogger(__name__)
 
@@ -42,7 +48,8 @@ _NOT_COMPARED: Final = {
     "fit.probe_views",
 }
 
-_failed_jobs: list[str] = []
+# What `fit.resume` says besides a path.
+_AUTO: Final = "auto"
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
@@ -51,27 +58,95 @@ def main(config: DictConfig) -> float | None:
     from clear_strategies.fit import Interrupted
     from rasterizers.interface import BackendUnavailable
 
+    job, ours = HydraConfig.get(), _sweep()
+    if ours is not None and _launcher(job) == "joblib" and not ours.begun_here:
+        # A terminal sends Ctrl-C to joblib's workers too; one stop is enough, and it comes from the sweep.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if ours is not None and ours.stopped_by is not None:
+        _log.warning("job %s is not started: the sweep was stopped.", job.job.num)
+        return None
     try:
-        return run(config, Path(HydraConfig.get().runtime.output_dir))
+        return run(config, Path(job.runtime.output_dir))
     except Interrupted as stopped:
         _log.error("%s", stopped)
+        if ours is not None and _launcher(job) == "joblib":
+            ours.stop(stopped.signum)  # ending a worker would have joblib kill the others before they have saved
+            return None
+        if stopped.signum not in (signal.SIGINT, signal.SIGTERM):
+            signal.raise_signal(stopped.signum)  # all is saved: now whoever launched the job may hand it in again
         sys.exit(stopped.exit_code)
     except OSError as error:  # a full or read-only disk; unusable input is a DataError
-        _log.error("%s: %s. Earlier checkpoints are untouched.", error.filename or "output", error.strerror or error)
-        sys.exit(3)
+        message = f"{error.filename or 'output'}: {error.strerror or error}. Earlier checkpoints are untouched."
+        _log.error("%s", message)
+        if ours is None or _launcher(job) == "basic":
+            sys.exit(3)
+        ours.note_failure(job.job.num, message)  # jobs elsewhere may have another disk
+        return None
     except (ClearError, BackendUnavailable, OmegaConfBaseException, InstantiationException, ValueError) as error:
         if isinstance(error, ValueError) and not isinstance(error, ClearError) and not _is_ours(error):
             raise
         message = _one_line(error)
-        _log.error("%s", message)
-        if HydraConfig.get().mode == RunMode.MULTIRUN:
-            _failed_jobs.append(message)  # the other jobs go on
-            return None
-        sys.exit(2)
+        if ours is None:
+            _log.error("%s", message)
+            sys.exit(2)
+        if isinstance(error, HeldError) and config.fit.resume == _AUTO:
+            _log.warning("left to the other process: %s", message)
+            ours.note_left(job.job.num, message)
+        else:
+            _log.error("%s", message)
+            ours.note_failure(job.job.num, message)  # the other jobs go on
+        return None
+
+
+class SweepCallback(Callback):
+    """A sweep's beginning and end, in the process that was started; `main` is called in between, maybe in others.
+
+    Hydra pickles it for them, so it remembers nothing.
+    """
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        ours = Sweep.begin(Path(config.hydra.sweep.dir))
+        if _launcher(config.hydra) == "joblib":
+            sweep.stop_on_signals(ours)
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        ours = Sweep.current()
+        if ours is None:
+            return
+        stopped, failed, left = ours.stopped_by, ours.failures, ours.left
+        if left:
+            _log.warning("%d job(s) were left to other processes: %s", len(left), " | ".join(left))
+        if failed:
+            _log.error("%d job(s) failed: %s", len(failed), " | ".join(failed))
+        if stopped is not None:
+            _log.error("stopped by %s. With fit.resume=auto the same command goes on.", signal.Signals(stopped).name)
+            sys.exit(128 + stopped)
+        if failed:
+            sys.exit(2)
+
+
+def _sweep() -> Sweep | None:
+    """The one that this job is of. A single run is of none, whatever the environment says that it was started in."""
+    return Sweep.current() if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN else None
+
+
+def _launcher(job: Any) -> str:
+    """basic, joblib or submitit: the module of the launcher in Hydra's own configuration."""
+    target = str(job.launcher._target_)
+    return next((name for name in ("joblib", "submitit") if name in target), "basic")
 
 
 def run(config: DictConfig, folder: Path) -> float | None:
-    """Everything a job does, into `folder`."""
+    """Everything a job does, into `folder`, which is its own while it does.
+
+    Raises:
+        DataError: unusable input; or another job is at work in the folder, or left another configuration there.
+    """
+    with hold(folder):
+        return _run(config, folder)
+
+
+def _run(config: DictConfig, folder: Path) -> float | None:
     import torch
 
     from clear_strategies.conductor import Conductor
@@ -79,8 +154,11 @@ def run(config: DictConfig, folder: Path) -> float | None:
     from clear_strategies.fit import FitSettings, TrainState, fit
     from clear_strategies.schedules import scaled
 
-    if config.fit.threads is not None:
-        torch.set_num_threads(int(config.fit.threads))
+    compared = _comparable(config)
+    if config.fit.resume == _AUTO and (finished := _finished(folder, compared)) is not None:
+        return finished[0]
+    threads, why = _threads(config)
+    torch.set_num_threads(threads)
     known = FitSettings.__dataclass_fields__
     settings = FitSettings(**{k: v for k, v in _plain(config.fit).items() if k in known})
     strategies = [scaled(s, settings.stretch) for s in _instantiate_strategies(config)]
@@ -107,11 +185,16 @@ def run(config: DictConfig, folder: Path) -> float | None:
         mip=mip,
         skips=skips,
     )
-    compared = _comparable(config)
-    if config.fit.resume is not None:
+    if config.fit.resume == _AUTO:
+        _resume_newest(state, folder / "checkpoints", compared)
+    elif config.fit.resume is not None:
         _resume(state, Path(config.fit.resume), compared)
-    _print_plan(config, scene, state, backend)
-    began = time.perf_counter()
+    _print_plan(config, scene, state, backend, f"{threads} ({why})")
+    if (folder / "metrics.json").exists():
+        _log.warning("%s: of an earlier run; removed, for it says that a run is finished.", folder / "metrics.json")
+        (folder / "metrics.json").unlink()
+    # What a run that is resumed took before counts too.
+    began = time.perf_counter() - (state.history[-1]["seconds"] if state.history else 0.0)
     with _progress(state) as progress:
         fit(state, scene, rasterizer, checkpoints=folder / "checkpoints", config=compared, progress=progress)
     seconds = time.perf_counter() - began
@@ -164,27 +247,86 @@ def _rasterizer(config: DictConfig, background: tuple[float, float, float]) -> t
     return rasterizers.load(name, **settings), name
 
 
+def _threads(config: DictConfig) -> tuple[int, str]:
+    """How many a job has, and why."""
+    if config.fit.threads is not None:
+        return int(config.fit.threads), "fit.threads"
+    launcher = HydraConfig.get().launcher if HydraConfig.initialized() else None
+    jobs = int(launcher.n_jobs) if launcher is not None and "n_jobs" in launcher else 1
+    here = f"of {sweep.cores()} here"
+    return sweep.threads(jobs), here if jobs == 1 else f"{here}, hydra.launcher.n_jobs={jobs}"
+
+
+def _finished(folder: Path, config: Mapping[str, Any]) -> tuple[float | None] | None:
+    """What the finished run in this folder returned; None where there is none.
+
+    Raises:
+        DataError: it was another configuration's, or its metrics.json is damaged.
+    """
+    from clear_strategies.data.strict_json import read_object
+
+    path = folder / "metrics.json"
+    if not path.exists():
+        return None
+    metrics = read_object(path)
+    try:
+        _require_same(path, metrics["config"], config)
+        means = metrics["test"]["mean"] or metrics["train"]["mean"]
+        psnr = means["ours"]["psnr"] if means else None
+        date = metrics["provenance"]["date"]
+    except (KeyError, TypeError) as error:
+        raise DataError(path, str(error), "is missing", "remove the file: the run is then trained again") from error
+    said = "no PSNR" if psnr is None else f"PSNR {psnr:.2f} dB"
+    _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, date, said)
+    return (psnr,)
+
+
+def _resume_newest(state: Any, folder: Path, config: Mapping[str, Any]) -> None:
+    """Go on from the newest checkpoint that is whole; start anew where there is none."""
+    from clear_strategies import checkpoint
+
+    found = checkpoint.saved(folder)
+    for source in reversed(found):
+        try:
+            saved = checkpoint.load(source)
+        except DataError as error:
+            _log.warning("%s; trying an earlier one.", error)
+            continue
+        _require_same(source, saved.config, config)
+        _restore(state, saved, source)
+        return
+    if found:
+        _log.warning("%s: no checkpoint is whole; starting anew.", folder)
+
+
 def _resume(state: Any, source: Path, config: Mapping[str, Any]) -> None:
     from clear_strategies import checkpoint
 
     saved = checkpoint.load(source)
+    _require_same(source, saved.config, config)
+    _restore(state, saved, source)
+
+
+def _restore(state: Any, saved: Any, source: Path) -> None:
+    state.restore(saved, source)
+    _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
+
+
+def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     differences = [
-        f"{key}: {saved.config.get(key)!r} then, {config.get(key)!r} now"
-        for key in sorted({*saved.config, *config})
-        if saved.config.get(key) != config.get(key)
+        f"{key}: {then.get(key)!r} then, {now.get(key)!r} now"
+        for key in sorted({*then, *now})
+        if then.get(key) != now.get(key)
     ]
     if differences:
         raise DataError(
             source, "config", "this is not the configuration that wrote it: " + "; ".join(differences[:5]),
             "resume with the same overrides, or start anew",
         )  # fmt: skip
-    state.restore(saved, source)
-    _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
 
 
-def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> None:
+def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str, threads: str) -> None:
     from clear_strategies.schedules import milestones
-    from rasterizers import native
 
     settings, conductor = state.settings, state.conductor
     strategies = ", ".join(
@@ -194,7 +336,8 @@ def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str) -> Non
         **scene.notes,
         **({} if config.method is None else {"method": f"{config.method}; strategies named before it take no part"}),
         "strategies": strategies or ("none (the paper's baseline)" if config.method is None else "none"),
-        "rasterizer": f"{backend}, kernel {config.rasterizer.kernel} px², {native.threads()} threads",
+        "rasterizer": f"{backend}, kernel {config.rasterizer.kernel} px²",
+        "threads": threads,
         "per-Gaussian pass": "readable" if state.fused is None else "compiled",
         "iterations": f"{settings.iterations}, seed {settings.seed}",
         "milestones": ", ".join(f"{name} {t}" for name, t in _marks(state).items()),
@@ -248,6 +391,7 @@ def _progress(state: Any) -> Iterator[Callable[[Any], None]]:
     shown: dict[str, str] = {}
     every = 0.5 if sys.stderr.isatty() else 15  # seconds; a log file needs no animation
     total, done = state.settings.iterations, state.t - 1
+    watch = _watch()
     with (
         logging_redirect_tqdm(),
         tqdm(total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=every) as bar,
@@ -264,8 +408,16 @@ def _progress(state: Any) -> Iterator[Callable[[Any], None]]:
                 shown["psnr"] = f"{row['psnr_test']:.2f} dB"
             bar.set_postfix(shown, refresh=False)
             bar.update(1)
+            if watch is not None:
+                watch()
 
         yield update
+
+
+def _watch() -> Callable[[], None] | None:
+    """For joblib's jobs: looks whether the sweep was stopped, from whichever process."""
+    ours = _sweep()
+    return sweep.Watch(ours) if ours is not None and _launcher(HydraConfig.get()) == "joblib" else None
 
 
 def _leave_results(
@@ -318,6 +470,7 @@ def _leave_results(
             seconds=seconds,
             conflict=_mean_conflict(compared),
             synthetic_prior=scene.synthetic_prior,
+            config=_comparable(config),
             provenance=provenance(seed=state.settings.seed, backend=backend, plan=scene.notes),
         ),
     )
@@ -406,7 +559,8 @@ def _comparable(config: DictConfig) -> dict[str, Any]:
         else:
             yield prefix, value
 
-    return {key: value for key, value in flatten("", _plain(config)) if key not in _NOT_COMPARED}
+    flat = {key: value for key, value in flatten("", _plain(config)) if key not in _NOT_COMPARED}
+    return dict(json.loads(json.dumps(flat)))  # as it comes back from a file
 
 
 def _is_ours(error: BaseException) -> bool:
@@ -423,7 +577,6 @@ def _one_line(error: BaseException) -> str:
 
 
 if __name__ == "__main__":
-    main()
-    if _failed_jobs:
-        _log.error("%d job(s) failed: %s", len(_failed_jobs), " | ".join(_failed_jobs))
-        sys.exit(2)
+    from clear_strategies.run import main as main_of_the_package
+
+    main_of_the_package()  # not that of `__main__`, which another process could not import

@@ -12,25 +12,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = [
-    {"errors", "files", "images", "kernels", "schedules", "gradients", "evidence", "ledger", "provenance"},
+    {"errors", "files", "images", "kernels", "schedules", "gradients", "evidence", "ledger", "lock", "provenance"},
     {"strategy"},
     {"gco", "p2g", "svs", "splatsure"},
     {"objective", "conductor"},
-    {
-        "data",
-        "mip",
-        "optim",
-        "field",
-        "fused",
-        "density",
-        "checkpoint",
-        "metrics",
-        "pictures",
-        "fit",
-        "export",
-        "skips",
-    },
-    {"run", "report", "bench", "testing"},
+    {"data", "mip", "optim", "field", "fused", "density", "skips"}
+    | {"checkpoint", "metrics", "pictures", "fit", "export"},
+    {"run", "sweep", "report", "bench", "testing"},
 ]
 # Types that floor 2 may name: what a view is, and nothing that trains on it.
 ALLOWED_UP = {("p2g", "data"), ("conductor", "data")}

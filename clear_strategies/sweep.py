@@ -1,0 +1,149 @@
+"""Floor 5: what the jobs of one sweep share, in however many processes they run: cores, failures, and when to stop.
+
+The process that was started leaves the path of a folder in the environment, which its jobs inherit, on this machine and
+on a cluster; each job that fails leaves a note there. Nothing else passes between them.
+"""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import os
+import shutil
+import signal
+import tempfile
+import time
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from clear_strategies import files
+
+_log = logging.getLogger(__name__)
+
+_ENVIRONMENT: Final = "CLEAR_SWEEP"
+_STOP, _FAILED, _LEFT = "stop", "failed_", "left_"
+_SECONDS_BETWEEN_LOOKS: Final = 0.5  # for the stop; a look is one question to the file system
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """The notes of one sweep. `folder` is that of the notes, `pid` the process that was started."""
+
+    folder: Path
+    pid: int
+
+    @classmethod
+    def begin(cls, folder: Path) -> Sweep:
+        """In the process that was started, before its first job; `folder` is the sweep's."""
+        folder.mkdir(parents=True, exist_ok=True)
+        notes = tempfile.mkdtemp(prefix=f".sweep_{os.getpid()}_", dir=folder)
+        atexit.register(shutil.rmtree, notes, ignore_errors=True)
+        os.environ[_ENVIRONMENT] = str(Path(notes).resolve())
+        return cls(Path(notes).resolve(), os.getpid())
+
+    @classmethod
+    def current(cls) -> Sweep | None:
+        """The sweep that this process, or the one that started it, is at; None outside of any."""
+        folder = Path(os.environ.get(_ENVIRONMENT, ""))
+        if not folder.name.startswith(".sweep_"):
+            return None
+        return cls(folder, int(folder.name.split("_")[1]))
+
+    @property
+    def begun_here(self) -> bool:
+        return self.pid == os.getpid()
+
+    def note_failure(self, job: int, message: str) -> None:
+        files.write_text(self.folder / f"{_FAILED}{job:05d}", message)
+
+    def note_left(self, job: int, message: str) -> None:
+        """The job is in the hands of another process."""
+        files.write_text(self.folder / f"{_LEFT}{job:05d}", message)
+
+    def stop(self, signum: int) -> None:
+        """Ask the jobs of this sweep to save and end, and no further one to begin."""
+        files.write_text(self.folder / _STOP, str(int(signum)))
+
+    @property
+    def stopped_by(self) -> int | None:
+        """The signal, if the sweep was stopped."""
+        try:
+            return int((self.folder / _STOP).read_text())
+        except FileNotFoundError:
+            return None
+
+    @property
+    def failures(self) -> list[str]:
+        return self._notes(_FAILED)
+
+    @property
+    def left(self) -> list[str]:
+        return self._notes(_LEFT)
+
+    def _notes(self, kind: str) -> list[str]:
+        notes = sorted(self.folder.glob(f"{kind}*"))
+        return [f"job {int(note.name.removeprefix(kind))}: {note.read_text()}" for note in notes]
+
+
+def stop_on_signals(sweep: Sweep) -> None:
+    """From now on Ctrl-C and SIGTERM are the sweep's stop, once; a second one acts at once.
+
+    Joblib answers Ctrl-C by killing its workers, in the middle of whatever they write.
+    """
+
+    def note(signum: int, _frame: FrameType | None) -> None:
+        for s, handler in before.items():
+            signal.signal(s, handler)
+        sweep.stop(signum)
+        name = signal.Signals(signum).name
+        _log.warning("%s: the jobs finish their step and save, no other begins. Once more to leave at once.", name)
+
+    before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+
+
+class Watch:
+    """Turns the sweep's stop into the signal that training saves at. Called after each iteration."""
+
+    def __init__(self, sweep: Sweep) -> None:
+        self.sweep, self.next_look = sweep, 0.0
+
+    def __call__(self) -> None:
+        if time.monotonic() < self.next_look:
+            return
+        self.next_look = time.monotonic() + _SECONDS_BETWEEN_LOOKS
+        if self.sweep.stopped_by is not None:
+            signal.raise_signal(signal.SIGTERM)
+
+
+def cores() -> int:
+    """How many this process may use: its affinity, and within a Slurm job what the job asked for."""
+    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    for name in ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
+        if (given := os.environ.get(name, "")).isdecimal():
+            return max(1, min(here, int(given)))
+    return here
+
+
+def threads(jobs: int) -> int:
+    """Of each of so many jobs at once on this machine. At most what torch takes by itself, so OMP_NUM_THREADS counts.
+
+    Jobs that share cores must not share them: OpenMP's threads wait by spinning, and two jobs of two threads on two cores
+    run tens of times slower than two of one.
+
+    Args:
+        jobs: at once; negative as joblib counts: -1 is one a core, -2 one less.
+    """
+    here = cores()
+    at_once = jobs if jobs > 0 else max(1, here + 1 + jobs)
+    return max(1, min(_threads_of_torch(), here // at_once))
+
+
+@cache
+def _threads_of_torch() -> int:
+    """Before anybody changed it: a process may do several jobs."""
+    import torch
+
+    return torch.get_num_threads()

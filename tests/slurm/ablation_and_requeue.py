@@ -1,0 +1,191 @@
+"""The ablation through a real Slurm, then jobs that are taken away: `python -m tests.slurm.ablation_and_requeue FOLDER`.
+
+Starts a cluster of this one machine in FOLDER, runs the four rows of the ablation on the tiny demo with
+`hydra/launcher=submitit_slurm`, the same again, and a sweep with a job that fails. Then one longer run four times:
+undisturbed and without Slurm; as a job that `scontrol requeue` takes away; as one that is killed; as one that runs into
+its time limit. All must leave the same point cloud, byte for byte. What happens is told on standard output and in
+FOLDER/log.txt, which docs/cluster.md quotes.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from tests.slurm.one_machine import cluster
+
+ROOT = Path(__file__).resolve().parents[2]
+DEMO = ["data.reader.width=64", "data.reader.height=48", "fit.max_degree=1", "data.cloud.init=random",
+        "data.cloud.random_points=60", "data.reader.views=5", "data.reader.train=2", "data.views.train=2"]  # fmt: skip
+# What a user writes to go from this machine to a cluster.
+SLURM = ["-m", "hydra/launcher=submitit_slurm", "hydra.launcher.cpus_per_task=1", "fit.resume=auto"]
+ABLATION = [*SLURM, "+strategy=baseline,gco,[gco,p2g],clear", "hydra.sweep.dir=ablation", "fit.iterations=300", *DEMO]
+LONG = ["+strategy=clear", "fit.iterations=6000", *DEMO]
+
+_log = logging.getLogger("slurm")
+
+
+class Experiment:
+    """The commands, in one folder and one environment."""
+
+    def __init__(self, folder: Path, environment: dict[str, str]) -> None:
+        self.folder = folder
+        self.environment = {
+            **environment,
+            "PYTHONPATH": os.pathsep.join((str(ROOT), environment.get("PYTHONPATH", ""))).rstrip(os.pathsep),
+            "CLEAR_CACHE": str(folder / "cache"),
+        }
+
+    def start(self, *overrides: str, name: str) -> subprocess.Popen[bytes]:
+        """`python -m clear_strategies.run` with the overrides; what it says goes to `name`.txt."""
+        command = [sys.executable, "-m", "clear_strategies.run", *overrides]
+        said = " ".join(o for o in overrides if o not in DEMO)
+        _log.info("$ python -m clear_strategies.run %s   (the tiny demo)", said)
+        with (self.folder / f"{name}.txt").open("wb") as output:
+            return subprocess.Popen(command, cwd=self.folder, env=self.environment, stdout=output, stderr=output)
+
+    def finish(self, process: subprocess.Popen[bytes], name: str, expected: int = 0) -> None:
+        code = process.wait(900)
+        if code != expected:
+            raise RuntimeError(f"{name} ended with {code}:\n{(self.folder / f'{name}.txt').read_text()[-3000:]}")
+
+    def ask(self, *command: str) -> str:
+        result = subprocess.run(
+            command, cwd=self.folder, env=self.environment, capture_output=True, text=True, check=False
+        )
+        return (result.stdout + result.stderr).strip()
+
+    def show(self, *command: str) -> None:
+        _log.info("$ %s\n%s", " ".join(command), self.ask(*command))
+
+    def wait_for(self, what: str, condition, seconds: float = 300) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"waited {seconds} s for {what}")
+            time.sleep(0.2)
+
+    def ablation(self) -> None:
+        """Table 4's rows, two jobs at once on two cores."""
+        process = self.start(*ABLATION, name="ablation")
+        self.wait_for("two jobs to run", lambda: self.ask("squeue", "-h", "-t", "R").count("\n") >= 1)
+        self.show("squeue")
+        self.finish(process, "ablation")
+        threads = re.findall(r"threads +(.*)", (self.folder / "ablation" / "0" / "run.log").read_text())
+        _log.info("the plan of job 0, threads: %s", threads[-1])
+        report = [sys.executable, "-m", "clear_strategies.report", "ablation"]
+        _log.info("$ python -m clear_strategies.report ablation\n%s", self.ask(*report).split("\n\n")[0])
+
+    def rerun(self) -> None:
+        """The same command again trains nothing."""
+        before = (self.folder / "ablation" / "3" / "metrics.json").stat().st_mtime_ns
+        self.finish(self.start(*ABLATION, name="again"), "again")
+        _tell(self.folder / "ablation" / "3" / "run.log", r"nothing is trained")
+        if (self.folder / "ablation" / "3" / "metrics.json").stat().st_mtime_ns != before:
+            raise AssertionError("a finished run was written again")
+
+    def failed(self) -> None:
+        """A job with a setting out of range: the other runs, and the exit code tells."""
+        process = self.start(*SLURM, "+strategy=gco", "strategies.gco.tolerance=7,0.1", "hydra.sweep.dir=failed",
+                             "fit.iterations=10", *DEMO, name="failed")  # fmt: skip
+        self.finish(process, "failed", expected=2)
+        _tell(self.folder / "failed.txt", r"job\(s\) failed")
+        if not (self.folder / "failed" / "1" / "metrics.json").exists():
+            raise AssertionError("the other job did not finish")
+
+    def undisturbed(self) -> bytes:
+        process = self.start("hydra.run.dir=undisturbed", *LONG, "fit.threads=1", name="undisturbed")
+        self.finish(process, "undisturbed")
+        return (self.folder / "undisturbed" / "point_cloud.ply").read_bytes()
+
+    def requeued(self, expected: bytes) -> None:
+        """An operator, or a job of higher priority, takes the job away in the middle."""
+        process = self.start(*SLURM, *LONG, "hydra.sweep.dir=requeued", name="requeued")
+        log = self.folder / "requeued" / "0" / "run.log"
+        self.wait_for("training", lambda: log.exists() and "GCO is" in log.read_text())
+        time.sleep(3)
+        job = self.ask("squeue", "-h", "-t", "R", "-o", "%i").split()[0]
+        self.show("scontrol", "requeue", job)
+        time.sleep(2)
+        self.show("squeue")
+        self.finish(process, "requeued")
+        self.compare("requeued", expected)
+
+    def killed(self, expected: bytes) -> None:
+        """As a failing node would: the process is gone without a word, its lock stays, and the job is started again."""
+        process = self.start(*SLURM, *LONG, "hydra.sweep.dir=killed", name="killed")
+        folder = self.folder / "killed" / "0"
+        self.wait_for("a checkpoint", lambda: list(folder.glob("checkpoints/step_*/manifest.json")))
+        job = self.ask("squeue", "-h", "-t", "R", "-o", "%i").split()[0]
+        pid = json.loads((folder / "run.lock").read_text())["pid"]
+        os.kill(pid, signal.SIGKILL)
+        self.wait_for("the job to end", lambda: not self.ask("squeue", "-h", "-t", "R"))
+        _log.info("$ kill -9 %d\nrun.lock says\n  %s", pid, (folder / "run.lock").read_text())
+        self.show("scontrol", "requeue", job)
+        self.wait_for("its second try", lambda: '"slurm_restarts": 1' in _text(folder / "run.lock"))
+        _log.info("run.lock says\n  %s", _text(folder / "run.lock"))
+        self.finish(process, "killed")
+        self.compare("killed", expected)
+
+    def timed_out(self, expected: bytes) -> None:
+        """The time limit is shorter than the run; before it Slurm sends SIGUSR2, as submitit asked it to."""
+        limits = [
+            "hydra.launcher.timeout_min=1",
+            "hydra.launcher.signal_delay_s=30",
+            "hydra.launcher.max_num_timeout=20",
+        ]
+        process = self.start(*SLURM, *limits, *LONG, "hydra.sweep.dir=timed_out", name="timed_out")
+        self.finish(process, "timed_out")
+        for path in sorted((self.folder / "timed_out" / ".submitit").rglob("*_log.out")):
+            _tell(path, r"submitit (WARNING|INFO).*(Caught signal|Requeued|completed)")
+        self.compare("timed_out", expected)
+
+    def compare(self, name: str, expected: bytes) -> None:
+        folder = self.folder / name / "0"
+        _tell(folder / "run.log", r"finishing this step|stopped by|resumed from|taken over|done in")
+        if "resumed from" not in (folder / "run.log").read_text():
+            raise AssertionError(f"{name}: the run was never resumed, so nothing was shown")
+        if (folder / "point_cloud.ply").read_bytes() != expected:
+            raise AssertionError(f"{name}: the point cloud is not that of the undisturbed run")
+        seconds = json.loads((folder / "metrics.json").read_text())["seconds"]
+        _log.info(
+            "%s/0/point_cloud.ply is, byte for byte, that of the undisturbed run (%.0f s of training).", name, seconds
+        )
+
+
+def _text(path: Path) -> str:
+    return path.read_text() if path.exists() else ""
+
+
+def _tell(path: Path, pattern: str) -> None:
+    lines = [line for line in path.read_text(errors="replace").splitlines() if re.search(pattern, line)]
+    _log.info("%s says\n%s", path.name, "\n".join(f"  {line.strip()}" for line in lines))
+
+
+def main(folder: Path) -> None:
+    """Everything, into the folder; raises where something is not as it should be."""
+    folder.mkdir(parents=True, exist_ok=True)
+    handlers = [logging.StreamHandler(sys.stdout), logging.FileHandler(folder / "log.txt", "w")]
+    logging.basicConfig(level=logging.INFO, format="[%(asctime)s] %(message)s", datefmt="%H:%M:%S", handlers=handlers)
+    with cluster(folder / "cluster") as environment:
+        experiment = Experiment(folder, environment)
+        experiment.show("sbatch", "--version")
+        experiment.show("sinfo")
+        experiment.ablation()
+        experiment.rerun()
+        experiment.failed()
+        expected = experiment.undisturbed()
+        experiment.requeued(expected)
+        experiment.killed(expected)
+        experiment.timed_out(expected)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]).resolve())

@@ -1,0 +1,112 @@
+"""One writer a folder: who holds it is respected while alive, and only then."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from clear_strategies import DataError
+from clear_strategies.lock import NAME, HeldError, hold
+
+
+def leave(folder, **facts):
+    """A lock as a process would have left it."""
+    mine = {"host": socket.gethostname(), "pid": os.getpid(), "started": "1", "since": "2026-01-01T00:00:00+00:00"}
+    (folder / NAME).write_text(json.dumps(mine | facts))
+
+
+def a_dead_process() -> int:
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        process.wait()
+        return process.pid
+
+
+def test_a_held_folder_is_refused_and_a_released_one_is_not(tmp_path):
+    with hold(tmp_path / "run"):
+        assert (tmp_path / "run" / NAME).exists()
+        with pytest.raises(HeldError, match=f"process {os.getpid()} on .* is at work"), hold(tmp_path / "run"):
+            pass
+    assert not (tmp_path / "run" / NAME).exists()
+    with hold(tmp_path / "run"):
+        pass
+
+
+def test_it_is_released_when_the_job_fails(tmp_path):
+    with pytest.raises(KeyError), hold(tmp_path):
+        raise KeyError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_dead_process_left_is_taken_over(tmp_path, caplog):
+    leave(tmp_path, pid=a_dead_process())
+    with hold(tmp_path):
+        assert json.loads((tmp_path / NAME).read_text())["pid"] == os.getpid()
+    assert "ended without releasing it" in caplog.text
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="tells processes apart by /proc")  # noqa: PTH110
+def test_a_process_that_has_the_number_of_a_dead_one_is_another(tmp_path):
+    leave(tmp_path, pid=os.getpid(), started="1")  # we were not started one tick after boot
+    with hold(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"host": 3}', "damaged"])
+def test_a_lock_that_says_nothing_is_respected(tmp_path, text):
+    (tmp_path / NAME).write_text(text)
+    with pytest.raises(DataError, match="remove this file"), hold(tmp_path):
+        pass
+    assert (tmp_path / NAME).read_text() == text
+
+
+def test_of_another_host_nothing_is_known(tmp_path):
+    leave(tmp_path, host="elsewhere")
+    with pytest.raises(DataError, match="cannot be known from") as caught, hold(tmp_path):
+        pass
+    assert not isinstance(caught.value, HeldError)
+
+
+@pytest.mark.parametrize(("job", "restarts", "taken"), [("7", "1", True), ("7", "0", False), ("8", "1", False)])
+def test_a_job_that_slurm_starts_again_elsewhere_takes_over_from_itself(tmp_path, monkeypatch, job, restarts, taken):
+    leave(tmp_path, host="elsewhere", slurm_job="7", slurm_restarts=0)
+    monkeypatch.setenv("SLURM_JOB_ID", job)
+    monkeypatch.setenv("SLURM_RESTART_COUNT", restarts)
+    if taken:
+        with hold(tmp_path):
+            pass
+    else:
+        with pytest.raises(DataError, match="elsewhere"), hold(tmp_path):
+            pass
+
+
+def test_of_many_at_once_exactly_one_gets_it(tmp_path):
+    """All find the same stale lock."""
+    leave(tmp_path, pid=a_dead_process())
+    code = (
+        "import sys, time\n"
+        "from pathlib import Path\n"
+        "from clear_strategies.lock import HeldError, hold\n"
+        "sys.stdin.readline()\n"
+        "try:\n"
+        "    with hold(Path(sys.argv[1])):\n"
+        "        sys.stdout.write('got it')\n"
+        "        sys.stdout.flush()\n"
+        "        sys.stdin.readline()\n"
+        "except HeldError:\n"
+        "    sys.stdout.write('refused')\n"
+    )
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    several = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(4)]
+    for process in several:
+        process.stdin.write("go\n")
+        process.stdin.flush()
+    said = [process.stdout.read(6) for process in several]
+    for process in several:
+        process.communicate("\n")
+    assert sorted(said) == ["got it", "refuse", "refuse", "refuse"]

@@ -1,0 +1,256 @@
+"""Jobs that can be started again, and sweeps of several processes: what is done stays, what failed is told, all stop."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import torch
+
+from clear_strategies import checkpoint, sweep
+from tests.test_run import ROOT, TINY, run
+
+AUTO = ["fit.resume=auto", *TINY]
+SWEEP = ["-m", "hydra.sweep.dir=all", *AUTO]
+
+
+def start(*overrides: str, cwd: Path) -> subprocess.Popen[str]:
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "clear_strategies.run", *overrides]
+    return subprocess.Popen(command, cwd=cwd, env=env, stderr=subprocess.STDOUT, stdout=subprocess.PIPE, text=True)
+
+
+def wait_for(condition, seconds: float = 120) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """A run that nothing disturbed, of 40 iterations."""
+    folder = tmp_path_factory.mktemp("whole")
+    result = run("+strategy=clear", "hydra.run.dir=here", *AUTO, "fit.iterations=40", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    return folder / "here"
+
+
+def test_a_finished_run_is_not_trained_again(whole):
+    def state() -> dict[Path, int]:
+        return {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.is_file() and ".hydra" not in p.parts}
+
+    before = {p: t for p, t in state().items() if p.name != "run.log"}
+    again = run("+strategy=clear", "hydra.run.dir=here", *AUTO, "fit.iterations=40", "fit.keep=1", cwd=whole.parent)
+    assert again.returncode == 0, again.stderr
+    assert "this run finished on" in again.stdout + again.stderr
+    assert "nothing is trained" in again.stdout + again.stderr
+    assert {p: t for p, t in state().items() if p.name != "run.log"} == before
+
+
+def test_a_folder_of_another_configuration_is_refused(whole):
+    other = run("+strategy=gco", "hydra.run.dir=here", *AUTO, "fit.iterations=40", cwd=whole.parent)
+    assert other.returncode == 2
+    assert "this is not the configuration that wrote it" in other.stdout + other.stderr
+
+
+def test_metrics_json_is_the_last_file_a_run_writes(whole):
+    others = [p for p in whole.rglob("*") if p.is_file() and p.name not in ("metrics.json", "run.log")]
+    results = [p.stat().st_mtime_ns for p in others if ".hydra" not in p.parts]
+    assert len(results) > 10
+    assert max(results) <= (whole / "metrics.json").stat().st_mtime_ns
+
+
+def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same(whole, tmp_path):
+    """SIGKILL, then a damaged newest checkpoint: the one before it is taken; seconds and counts go on."""
+    every = [*AUTO, "fit.iterations=40", "fit.checkpoint_every=2500", "+strategy=clear", "hydra.run.dir=here"]
+    process = start(*every, cwd=tmp_path)
+    saved = tmp_path / "here" / "checkpoints"
+    wait_for(lambda: len(checkpoint.saved(saved)) >= 2)
+    process.kill()
+    process.communicate()
+    (tmp_path / "here" / "metrics.json").unlink(missing_ok=True)  # on a fast machine it had ended before
+    newest, before = checkpoint.saved(saved)[-1], checkpoint.saved(saved)[-2]
+    (newest / "tensors.safetensors").write_bytes(b"torn")
+    result = run(*every, cwd=tmp_path)
+    said = result.stdout + result.stderr
+    assert result.returncode == 0, said
+    assert "the file was altered" in said
+    assert f"resumed from {before}" in said
+    assert (tmp_path / "here" / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
+    timing = (tmp_path / "here" / "timing.csv").read_text()
+    assert [line.split(",")[1] for line in timing.splitlines() if line.startswith("losses LR")] == ["40"], timing
+    history = [line.split(",") for line in (tmp_path / "here" / "history.csv").read_text().splitlines()]
+    seconds = [float(row[history[0].index("seconds")]) for row in history[1:]]
+    assert len(seconds) == 40
+    assert seconds == sorted(seconds)
+    assert json.loads((tmp_path / "here" / "metrics.json").read_text())["seconds"] >= seconds[-1]
+
+
+def test_a_stopped_run_goes_on_by_itself_and_ends_the_same(whole, tmp_path):
+    every = [*AUTO, "fit.iterations=40", "+strategy=clear", "hydra.run.dir=here"]
+    process = start(*every, cwd=tmp_path)
+    while "it/s" not in process.stdout.readline():
+        pass
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=120)
+    assert process.returncode == 143
+    assert not (tmp_path / "here" / "metrics.json").exists()
+    result = run(*every, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "resumed from" in result.stdout + result.stderr
+    assert (tmp_path / "here" / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
+
+
+def test_torch_and_kernels_divide_the_cores_among_the_jobs(monkeypatch):
+    monkeypatch.setattr(sweep, "_threads_of_torch", lambda: 16)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: set(range(12)), raising=False)
+    for name in ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
+        monkeypatch.delenv(name, raising=False)
+    assert [sweep.threads(jobs) for jobs in (1, 2, 5, 12, 40, -1, -2)] == [12, 6, 2, 1, 1, 1, 1]
+    monkeypatch.setenv("SLURM_CPUS_ON_NODE", "8")
+    assert sweep.threads(1) == 8
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "3")
+    assert sweep.threads(1) == 3
+    monkeypatch.setattr(sweep, "_threads_of_torch", lambda: 2)  # OMP_NUM_THREADS=2
+    assert sweep.threads(1) == 2
+
+
+def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, monkeypatch):
+    """So the same command, started several times, shares the work."""
+    from clear_strategies.lock import hold
+
+    with hold(tmp_path / "all" / "1"):
+        result = run(*SWEEP, "+strategy=baseline,gco", "fit.iterations=3", cwd=tmp_path)
+    said = result.stdout + result.stderr
+    assert result.returncode == 0, said
+    assert "left to the other process" in said
+    assert "1 job(s) were left to other processes: job 1" in said
+    assert (tmp_path / "all" / "0" / "metrics.json").exists()
+    assert not (tmp_path / "all" / "1" / "metrics.json").exists()
+    assert not list((tmp_path / "all").glob(".sweep_*"))
+
+
+joblib = pytest.mark.skipif(
+    find_spec("hydra_plugins") is None or find_spec("hydra_plugins.hydra_joblib_launcher") is None,
+    reason="hydra-joblib-launcher is not installed: pip install -e '.[sweeps]'",
+)
+JOBLIB = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+
+
+@joblib
+def test_in_other_processes_a_failed_job_stops_no_other_and_is_told(tmp_path):
+    result = run(
+        *SWEEP, *JOBLIB, "+strategy=gco", "strategies.gco.tolerance=7,0.1,0.2", "fit.iterations=3", cwd=tmp_path
+    )
+    said = result.stdout + result.stderr
+    assert result.returncode == 2, said
+    assert "1 job(s) failed: job 0: config: strategies.gco: tolerance must lie in [0, 1), got 7" in said
+    assert "Traceback" not in said
+    assert sorted(p.parent.name for p in tmp_path.glob("all/*/metrics.json")) == ["1", "2"]
+    assert "hydra.launcher.n_jobs=2" in (tmp_path / "all" / "1" / "run.log").read_text()
+
+
+@joblib
+@pytest.mark.slow
+@pytest.mark.parametrize("whom", ["parent", "group"])
+def test_a_stopped_joblib_sweep_saves_its_jobs_and_goes_on(tmp_path, whom):
+    """Ctrl-C reaches the workers too, SIGTERM only the process that was started; both save and begin no other job."""
+    sweep_of_three = [*SWEEP, *JOBLIB, "+strategy=baseline,gco,svs", "fit.iterations=400"]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
+    with (tmp_path / "said").open("w") as said:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "clear_strategies.run", *sweep_of_three], cwd=tmp_path, env=env, stdout=said,
+            stderr=said, start_new_session=True,
+        )  # fmt: skip
+        logs = [tmp_path / "all" / str(job) / "run.log" for job in (0, 1)]
+        wait_for(lambda: all(log.exists() and "cloned" in log.read_text() for log in logs))
+        if whom == "group":
+            os.killpg(process.pid, signal.SIGINT)
+        else:
+            process.terminate()
+        code = process.wait(120)
+    text = (tmp_path / "said").read_text()
+    assert code == (130 if whom == "group" else 143), text
+    assert "the same command goes on" in text
+    assert "Traceback" not in text
+    saved = [checkpoint.saved(tmp_path / "all" / job / "checkpoints") for job in ("0", "1")]
+    assert all(saved), text
+    assert not (tmp_path / "all" / "2" / "metrics.json").exists()
+    if whom == "parent":
+        return  # going on is the same for both
+    again = run(*sweep_of_three, cwd=tmp_path)
+    assert again.returncode == 0, again.stdout + again.stderr
+    assert "resumed from" in (tmp_path / "all" / "1" / "run.log").read_text()
+    assert len(list(tmp_path.glob("all/*/metrics.json"))) == 3
+
+
+def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
+    """SIGUSR2, as submitit handles it: what it would do at once is done after the checkpoint."""
+    code = (
+        "import signal, sys\n"
+        "def hand_in_again(signum, frame):\n"
+        "    from clear_strategies import checkpoint\n"
+        "    from pathlib import Path\n"
+        "    sys.exit(90 + len(checkpoint.saved(Path('here/checkpoints'))))\n"
+        "signal.signal(signal.SIGUSR2, hand_in_again)\n"
+        "from clear_strategies.run import main\n"
+        "main()\n"
+    )
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", code, "+strategy=clear", "hydra.run.dir=here", *AUTO, "fit.iterations=400"]
+    command.append("fit.checkpoint_every=0")
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        while "it/s" not in process.stdout.readline():
+            pass
+        process.send_signal(signal.SIGTERM)  # some clusters send it first
+        process.send_signal(signal.SIGUSR2)
+        said, _ = process.communicate(timeout=120)
+    assert process.returncode == 91, said
+
+
+def test_the_threads_of_one_job_are_not_those_of_the_next():
+    """A process does several: fit.threads of one must not become the default of the other."""
+    before, default = torch.get_num_threads(), sweep.threads(1)
+    torch.set_num_threads(default + 1)
+    try:
+        assert sweep.threads(1) == default
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.skipif(find_spec("submitit") is None, reason="submitit is not installed: pip install -e '.[sweeps]'")
+def test_the_slurm_configuration_is_one_that_submitit_takes(tmp_path):
+    """hydra/launcher=slurm, composed and turned into the head of a batch file."""
+    from hydra import compose, initialize_config_dir
+    from omegaconf import OmegaConf
+    from submitit.slurm.slurm import _make_sbatch_string
+
+    from clear_strategies.run import CONF
+
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        launcher = compose("config", ["hydra/launcher=slurm"], return_hydra_config=True).hydra.launcher
+    fields = {k: v for k, v in launcher.items() if k not in ("_target_", "submitit_folder", "max_num_timeout")}
+    names = {"name": "job_name", "timeout_min": "time", "mem_gb": "mem", "tasks_per_node": "ntasks_per_node"}
+    plain = {names.get(k, k): OmegaConf.to_container(v) if OmegaConf.is_config(v) else v for k, v in fields.items()}
+    script = _make_sbatch_string(command="true", folder=tmp_path, **plain)
+    for line in ("--signal=USR2@120", "--time=240", "--cpus-per-task=4", "--requeue\n"):
+        assert f"#SBATCH {line}" in script
+    assert "SlurmLauncher" in launcher._target_
+    assert launcher.max_num_timeout == 100
+
+
+def test_a_single_run_started_from_within_a_sweep_is_no_job_of_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("CLEAR_SWEEP", str(tmp_path / ".sweep_1_x"))
+    result = run("strategies.gco.tolerance=7", "+strategy=gco", *TINY, cwd=tmp_path)
+    assert result.returncode == 2
+    assert not (tmp_path / ".sweep_1_x").exists()
