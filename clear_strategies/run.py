@@ -1,9 +1,9 @@
 """`python -m clear_strategies.run +strategy=clear`: the door to a whole run, and the only one that knows Hydra.
 
 Composes the configuration, prints the plan, trains, and leaves in Hydra's run folder: metrics.json, history.csv,
-conflict.csv, timing.csv, renders/, contact_sheet.png, curves.png, point_cloud.ply and checkpoints/. Exit codes: 0, 2 for
-input that cannot be used, 3 where
-the disk is full or read-only, 130 and 143 when stopped by a signal (after saving).
+conflict.csv, timing.csv, renders/, views/, maps/, contact_sheet.png, curves.png, point_cloud.ply and checkpoints/. Exit
+codes: 0, 2 for input that cannot be used, 3 where the disk is full or read-only, 130 and 143 when stopped by a signal
+(after saving).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import logging
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -40,7 +40,10 @@ _NOT_COMPARED: Final = {
     "fit.checkpoint_every",
     "fit.probe_every",
     "fit.probe_views",
+    "fit.map_views",
 }
+
+_SHEET_VIEWS: Final = 4  # test views on the contact sheet, and left as pictures
 
 _failed_jobs: list[str] = []
 
@@ -81,6 +84,8 @@ def run(config: DictConfig, folder: Path) -> float | None:
 
     if config.fit.threads is not None:
         torch.set_num_threads(int(config.fit.threads))
+    if config.fit.map_views < 0:
+        raise ValueError(f"fit.map_views must be at least 0, got {config.fit.map_views}.")
     known = FitSettings.__dataclass_fields__
     settings = FitSettings(**{k: v for k, v in _plain(config.fit).items() if k in known})
     strategies = [scaled(s, settings.stretch) for s in _instantiate_strategies(config)]
@@ -252,7 +257,7 @@ def _progress(state: Any) -> Iterator[Callable[[Any], None]]:
 def _leave_results(
     config: DictConfig, folder: Path, scene: Any, state: Any, rasterizer: Any, backend: str, seconds: float
 ) -> float | None:
-    from clear_strategies import files, metrics, pictures
+    from clear_strategies import diagnosis, files, metrics, pictures
     from clear_strategies.data.photo_files import write_png
     from clear_strategies.export import export_ply
     from clear_strategies.provenance import provenance
@@ -261,9 +266,17 @@ def _leave_results(
     with ledger.stage("evaluate"):
         down = config.data.views.downsample
         evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera), down=down)
+    with ledger.stage("maps"):
+        mapped = _spread(scene.train, int(config.fit.map_views))
+        if mapped:
+            diagnosis.leave(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
     export_ply(folder / "point_cloud.ply", field)
     for name, image in evaluation.renders.items():
         write_png(folder / "renders" / f"{Path(name).stem}.png", image)
+    for view in _spread(scene.test, _SHEET_VIEWS):
+        for kind, image in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
+            if image is not None:
+                write_png(folder / "views" / f"{Path(view.name).stem}_{kind}.png", image)
     names = [str(name) for name in config.strategies]
     length = f"{state.settings.iterations} iterations · seed {state.settings.seed}"
     title = f"{scene.name} · {' + '.join(names) or 'baseline'} · {length}"
@@ -309,7 +322,7 @@ def _sheet(scene: Any, evaluation: Any) -> list[Any]:
     from clear_strategies import images, pictures
 
     rows = []
-    for view in scene.test[:: max(1, math.ceil(len(scene.test) / 4))]:
+    for view in _spread(scene.test, _SHEET_VIEWS):
         scores = evaluation.test[view.name]["ours"]
         shown = {
             "LR, enlarged": images.upsample(view.lr.image, view.factor, "nearest"),
@@ -318,6 +331,11 @@ def _sheet(scene: Any, evaluation: Any) -> list[Any]:
         }
         rows.append(pictures.SheetRow(view.name, shown, view.truth, f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}"))
     return rows
+
+
+def _spread(views: Sequence[Any], count: int) -> Sequence[Any]:
+    """At most so many of the views, evenly."""
+    return views[:: max(1, math.ceil(len(views) / count))] if count else ()
 
 
 def _mean_conflict(rows: list[dict[str, float]]) -> dict[str, float]:

@@ -16,7 +16,20 @@ FLOORS = [
     {"strategy"},
     {"gco", "p2g", "svs"},
     {"objective", "conductor"},
-    {"data", "mip", "optim", "field", "fused", "density", "checkpoint", "metrics", "pictures", "fit", "export"},
+    {
+        "data",
+        "mip",
+        "optim",
+        "field",
+        "fused",
+        "density",
+        "checkpoint",
+        "metrics",
+        "pictures",
+        "fit",
+        "export",
+        "diagnosis",
+    },
     {"run", "report", "bench", "testing"},
 ]
 # Types that floor 2 may name: what a view is, and nothing that trains on it.

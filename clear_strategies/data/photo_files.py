@@ -129,8 +129,8 @@ def frame_number(name: str) -> int | None:
     return int(digits[-1]) if digits else None
 
 
-def write_png(path: Path, image: Float[Tensor, "H W 3"]) -> None:
-    """8-bit PNG, atomically; values outside [0, 1] are clamped."""
+def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> None:
+    """8-bit PNG, atomically, grey of one number a pixel; values outside [0, 1] are clamped."""
     pixels = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="PNG")
