@@ -137,6 +137,14 @@ def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) 
     write_bytes(path, buffer.getvalue())
 
 
+def jpeg(image: Float[Tensor, "H W 3"], quality: int = 90) -> bytes:
+    """A small file of an image in [0, 1], for looking at and not for measuring."""
+    pixels = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="JPEG", quality=quality, subsampling=0)
+    return buffer.getvalue()
+
+
 def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) -> Path:
     """`root / name`, if that is inside `root` after symbolic links are followed.
 
