@@ -108,7 +108,7 @@ def _ticks(low: float, high: float) -> list[float]:
     power = 10 ** math.floor(math.log10(rough))
     step = next(m * power for m in (1, 2, 5, 10) if m * power >= rough * 0.999)
     first, last = math.floor(low / step + 1e-9), math.ceil(high / step - 1e-9)
-    return [k * step for k in range(first, max(last, first + 1) + 1)]
+    return [float(k * step) for k in range(first, max(last, first + 1) + 1)]
 
 
 def _number(value: float, ticks: Sequence[float]) -> str:

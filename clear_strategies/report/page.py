@@ -182,13 +182,14 @@ def _page(sections: Sequence[Section], scenes: Sequence[Mapping[str, Any]], pict
     content = json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
     style, script = ((_FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js"))
     links = "".join(f'<a href="#scene-{i}">{html.escape(s.title)}</a>' for i, s in enumerate(sections))
+    links = f"<nav>{links}</nav>" if len(sections) > 1 else ""
     body = "".join(_section(i, s, scene) for i, (s, scene) in enumerate(zip(sections, scenes, strict=True)))
     said = f"<p>{html.escape(said)}</p>" if said else ""
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{html.escape(_title(sections))}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
-        f"<header><h1>{html.escape(_title(sections))}</h1><nav>{links}</nav></header>\n<main>\n{body}</main>\n"
+        f"<header><h1>{html.escape(_title(sections))}</h1>{links}</header>\n<main>\n{body}</main>\n"
         f'<footer>{said}</footer>\n<script type="application/json" id="data">{content}</script>\n'
         f"<script>\n{script}</script>\n</body>\n</html>\n"
     )
@@ -224,9 +225,11 @@ def _table(columns: Columns) -> str:
 
 
 def _cell(text: str) -> str:
-    """Numbers stand in a column, right-aligned."""
-    number = re.match(r"[+\-]?[\d–]", text) is not None
-    return f'<td class="number">{html.escape(text)}</td>' if number else f"<td>{html.escape(text)}</td>"
+    """Of a number, what it varies by recedes."""
+    if re.match(r"[+\-]?\d", text) is None:
+        return f"<td>{html.escape(text)}</td>"
+    number, _, spread = text.partition(" ± ")
+    return f'<td class="number">{number}' + (f" <small>± {spread}</small></td>" if spread else "</td>")
 
 
 def _charts(histories: Mapping[str, charts.History]) -> str:

@@ -148,13 +148,15 @@ class Beside:
     runs: Sequence[Run]
     names: frozenset[str]
 
-    def columns(self, rows: Sequence[Row]) -> Columns:
+    def columns(self, rows: Sequence[Row]) -> dict[str, Columns]:
+        """The paper's numbers, each right of ours; LPIPS, which we do not measure, right of SSIM."""
         found = [self._numbers(row) for row in rows]
         cells = {
-            f"{name}, paper": [format(of[measure], form) if measure in of else "" for of in found]
+            measure: {f"{name}, paper": [format(of[measure], form) if measure in of else "" for of in found]}
             for measure, (name, form) in _MEASURES.items()
         }
-        return {"LPIPS": ["–" if row.runs or not row.baseline else "" for row in rows], **cells}
+        cells["ssim"] |= {"LPIPS": ["–" for _ in rows], **cells.pop("lpips")}
+        return cells
 
     def records(self, rows: Sequence[Row]) -> list[dict[str, float]]:
         """Plain numbers for report.csv."""
@@ -187,17 +189,19 @@ class Beside:
         def each(label: str) -> list[str]:
             return list(dict.fromkeys(run.plan[label] for run in self.runs if label in run.plan))
 
+        facts = self.table
         found = []
-        if other := sorted({run.iterations for run in self.runs} - {self.table.iterations}):
-            found.append(f"{', '.join(f'{n:,}' for n in other)} iterations")
-        if other := sorted({text.split(":")[0] for text in each("train views")} - {str(self.table.views)}):
-            found.append(f"{', '.join(other)} training views")
-        sizes = dict.fromkeys(text.partition(",")[0] for text in each("HR"))
-        if other := [size for size in sizes if size.split()[0] not in self.table.pixels]:
-            found.append(f"HR {', '.join(other)} (protocol: {' or '.join(self.table.pixels)})")
-        priors = dict.fromkeys(text.partition("reference: ")[2] for text in each("HR"))
-        if other := [prior for prior in priors if prior and "resshift" not in prior.lower()]:
-            found.append(f"prior {', '.join(other)} (paper: ResShift)")
+        if iterations := sorted({run.iterations for run in self.runs} - {facts.iterations}):
+            found.append(f"{', '.join(f'{n:,}' for n in iterations)} iterations")
+        if counts := sorted({text.split(":")[0] for text in each("train views")} - {str(facts.views)}):
+            found.append(f"{', '.join(counts)} training views")
+        inputs = [text.partition(", reference: ") for text in each("HR")]
+        sizes = dict.fromkeys(size for size, _, _ in inputs if size.split()[0] not in facts.pixels)
+        if sizes:
+            found.append(f"HR {', '.join(sizes)} (protocol: {' or '.join(facts.pixels)})")
+        priors = dict.fromkeys(prior for _, _, prior in inputs if prior and "resshift" not in prior.lower())
+        if priors:
+            found.append(f"prior {', '.join(priors)} (paper: ResShift)")
         if clouds := each("initial points"):
             found.append(f"initial points {' | '.join(clouds)} (the paper does not say where its own come from)")
         return found

@@ -10,7 +10,7 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, runtime_checkable
 
 from clear_strategies.metrics import NOTE
 from clear_strategies.report.runs import BASELINES, SCORES, Run
@@ -81,11 +81,12 @@ class Row:
         return "" if self.baseline else ", ".join(map(str, sorted({run.seed for run in self.runs})))
 
 
+@runtime_checkable
 class Beside(Protocol):
     """Other people's numbers for the same rows."""
 
-    def columns(self, rows: Sequence[Row]) -> Columns:
-        """Cells by header, one for each row."""
+    def columns(self, rows: Sequence[Row]) -> Mapping[str, Columns]:
+        """What stands right of each quantity: cells by header, one for each row."""
         ...
 
     def notes(self) -> Sequence[str]:
@@ -110,8 +111,10 @@ def columns(rows: Sequence[Row], beside: Beside | None = None) -> tuple[Columns,
         "scene": [row.scene for row in rows],
         "method": [row.method for row in rows],
     }
+    others = {} if beside is None else beside.columns(rows)
     for quantity, (header, form) in QUANTITIES.items():
         cells[header] = [_spread(row, quantity, form) for row in rows]
+        cells |= others.get(quantity, {})
         if quantity == "psnr":
             several = any(row.delta is not None and abs(row.delta.mean) > 0 for row in rows)
             cells["Δ"] = [str(row.delta) if several and row.delta is not None else "" for row in rows]
@@ -135,7 +138,6 @@ def columns(rows: Sequence[Row], beside: Beside | None = None) -> tuple[Columns,
         if shared := _shared([run for row in rows if row.scene == scene for run in row.runs]):
             notes.append(f"All runs of {scene}: `{' '.join(shared)}`.")
     if beside is not None:
-        cells |= beside.columns(rows)
         notes += beside.notes()
     return {name: column for name, column in cells.items() if any(column)}, notes
 
