@@ -211,6 +211,15 @@ def test_the_average_over_scenes_is_of_their_means_and_its_differences_are_paire
     assert (line["PSNR (dB) ↑"], line["Δ"]) == ("25.50", "+2.00 ± 1.00")
 
 
+def test_scenes_are_averaged_over_what_their_own_data_settings_say(tmp_path: Path) -> None:
+    for scene, shrink in (("fern", 2), ("horns", 4)):
+        for job, strategy in enumerate(("baseline", "gco")):
+            make_run(tmp_path / f"{scene}{job}", f"+strategy={strategy}", f"data.views.shrink={shrink}", scene=scene)
+    make_run(tmp_path / "only_here", "+strategy=gco", "density.threshold=1", "data.views.shrink=2", scene="fern")
+    averages = [row.method for row in report.table(report.collect([tmp_path])) if not row.runs]
+    assert averages == ["bicubic", "prior", "baseline", "gco"]
+
+
 def test_a_method_names_its_runs_and_where_a_scene_lies_separates_none(tmp_path: Path) -> None:
     make_run(tmp_path / "0", "+method=srgs", "+scene=fern", strategies=["hr_only"])
     make_run(tmp_path / "1", "+method=srgs", "data.path=elsewhere/fern", "data.reader.path=x", seed=1)

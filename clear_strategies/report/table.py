@@ -127,11 +127,11 @@ def columns(rows: Sequence[Row], beside: Beside | None = None) -> tuple[Columns,
     cells["seeds"] = [row.seeds for row in rows]
     notes = [f"{NOTE[0].upper()}{NOTE[1:]}."]
     if any(cells["Δ"]):
-        paired = any(row.delta is not None and not math.isnan(row.delta.error) for row in rows)
-        how = "; ±: standard error of the differences seed by seed" * paired
+        with_error = any(row.delta is not None and not math.isnan(row.delta.error) for row in rows)
+        how = "; its ±: standard error of the differences seed by seed" * with_error
         notes.append(f"Δ: PSNR over the scene's first method, dB{how}.")
     if any(cells["best"]):
-        notes.append("Other ±: standard deviation over seeds; best: PSNR of the best seed.")
+        notes.append("±: standard deviation over seeds; best: PSNR of the best seed.")
     if any(not row.runs for row in rows):
         notes.append("Averages are means of the scenes' means; their Δ is paired over scenes and seeds.")
     for scene in dict.fromkeys(row.scene for row in rows if row.runs):
@@ -193,7 +193,7 @@ def _baseline_rows(runs: Sequence[Run]) -> list[Row]:
     for baseline in BASELINES:
         by_input: dict[str, list[Run]] = {}
         for run in (run for run in runs if baseline in run.scores):
-            inputs = [s for s in run.settings if s.lstrip("+~").startswith(_INPUT)]
+            inputs = [s for s in run.settings if _is_input(s)]
             by_input.setdefault(_label(baseline, inputs, shared), []).append(run)
         for label, same in by_input.items():
             # Runs with one input have one baseline; a prior that depends on the seed has several.
@@ -225,14 +225,17 @@ def _averages(scenes: Sequence[Sequence[Row]], marks: str) -> list[Row]:
     if len(scenes) < 2:
         return []
     title = f"average of {len(scenes)} scenes" + (f" ({marks})" if marks else "")
-    by_method = [{row.method: row for row in of_scene} for of_scene in scenes]
-    common = [method for method in by_method[0] if all(method in rows for rows in by_method)]
-    if left_out := sorted({method for rows in by_method for method in rows} - set(common)):
-        _log.info("%s: left out, for not every scene has it: %s.", title, "; ".join(left_out))
+    tables = [_by_identity(of_scene) for of_scene in scenes]
+    common = [identity for identity in tables[0] if all(identity in rows for rows in tables)]
+    left_out = [row.method for rows in tables for identity, row in rows.items() if identity not in common]
+    if left_out:
+        _log.info("%s: left out, for not every scene has it: %s.", title, "; ".join(dict.fromkeys(left_out)))
+    methods = [settings for name, settings in common if name not in BASELINES]
+    shared = [s for s in methods[0] if all(s in settings for settings in methods)] if methods else []
     averages: list[Row] = []
     first: list[Row] = []  # one a scene
-    for method in common:
-        rows = [of_scene[method] for of_scene in by_method]
+    for identity in common:
+        rows = [of_scene[identity] for of_scene in tables]
         values = {q: [mean(row.values[q]) for row in rows if row.values.get(q)] for q in QUANTITIES}
         values = {q: means for q, means in values.items() if len(means) == len(rows)}
         delta = None
@@ -241,8 +244,24 @@ def _averages(scenes: Sequence[Sequence[Row]], marks: str) -> list[Row]:
             pairs = [d for row, start in zip(rows, first, strict=True) for d in _pairs(row.runs, start.runs)]
             psnr = [mean(row.values["psnr"]) for row in first]
             delta = Difference(0.0) if rows is first else paired(values.get("psnr", ()), psnr, pairs)
-        averages.append(Row(title, method, rows[0].name, (), values, delta))
+        averages.append(Row(title, _label(*identity, shared), rows[0].name, (), values, delta))
     return averages
+
+
+def _by_identity(rows: Sequence[Row]) -> dict[tuple[str, tuple[str, ...]], Row]:
+    """Of one scene: name and settings -> row. What all its runs say about their data belongs to the scene."""
+    shared = _shared([run for row in rows for run in row.runs])
+    found = {}
+    for row in rows:
+        settings = [s for s in row.runs[0].settings if not (s in shared and _is_input(s, ("data",)))]
+        if row.baseline:
+            settings = [s for s in settings if _is_input(s)]
+        found[row.name, tuple(sorted(settings))] = row
+    return found
+
+
+def _is_input(setting: str, groups: tuple[str, ...] = _INPUT) -> bool:
+    return setting.lstrip("+~").startswith(groups)
 
 
 def _pairs(runs: Sequence[Run], first: Sequence[Run]) -> list[float]:
