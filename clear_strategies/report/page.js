@@ -201,7 +201,7 @@ function viewer(holder, number) {
   const zoom = segments("zoom", ["−", "fit", "+"], (i) => (i === 1 ? stage.fit() : stage.zoomBy(i ? 2 : 0.5)));
   holder.append(
     element("div", { class: "controls" }, controls.view.node, controls.left.node, controls.right.node, controls.mode.node,
-      zoom.node, element("label", {}, error, "error map"), scale.node),
+      zoom.node, element("label", {}, error, "error map")),
     stage.canvas, captions,
     element("p", { class: "hint" }, "Drag the line; wheel zooms, drag pans. Keys on the picture: ",
       ...["←", "→"].map((k) => element("kbd", {}, k)), " line, ", element("kbd", {}, "space"), " flip, ",
@@ -221,7 +221,7 @@ function viewer(holder, number) {
     const [left, right] = [state.left, state.right].map((i) => layers()[i]);
     const said = (layer) => [element("b", {}, layer.label), layer.note ? ` ${layer.note}` : ""];
     const both = [element("span", {}, ...said(left)), element("span", {}, ...said(right))];
-    captions.replaceChildren(...(state.mode === 1 ? [both[state.flipped]] : both));
+    captions.replaceChildren(both[state.mode === 1 ? state.flipped : 0], scale.node, state.mode === 1 ? "" : both[1]);
     const view = scene.views[state.view];
     stage.show(view, state.mode === 2 ? 2 : 1);
   }
@@ -311,12 +311,13 @@ function maps(holder, number) {
   const scale = colourScale(), caption = element("div", { class: "captions", "aria-live": "polite" });
   holder.append(
     element("div", { class: "controls" }, ...Object.values(controls).map((c) => c.node),
-      element("label", {}, "opacity", opacity), scale.node),
+      element("label", {}, "opacity", opacity)),
     stage.canvas, caption,
   );
   const asked = new URLSearchParams(location.hash.slice(1));
   if (Number(asked.get("scene") ?? -1) === number && kinds.includes(asked.get("map"))) state.map = kinds.indexOf(asked.get("map"));
-  state.method = methods.length - 1;
+  state.method = scene.maps[0].methods.findLastIndex((method) => "corrected" in method.maps);
+  if (state.method < 0) state.method = methods.length - 1;
   set({});
 
   function set(change) {
@@ -326,7 +327,7 @@ function maps(holder, number) {
     const mean = method && method.means[kind];
     scale.show(true, String(view.tops[kind]));
     const there = method && kind in method.maps;
-    caption.replaceChildren(element("span", {}, element("b", {}, MAPS[kind])),
+    caption.replaceChildren(element("span", {}, element("b", {}, MAPS[kind])), scale.node,
       element("span", {}, there ? (mean == null ? "" : `mean ${mean.toFixed(3)}`) : "this method corrects nothing"));
     stage.show(view, 1);
   }
