@@ -19,7 +19,7 @@ from clear_strategies import files, pictures
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.report import page
-from clear_strategies.report.published import PAPER, beside
+from clear_strategies.report.published import PAPER, Beside, beside
 from clear_strategies.report.runs import Run, collect, history
 from clear_strategies.report.table import Row, aligned, columns, markdown, record, table
 
@@ -61,7 +61,11 @@ def write(runs: Sequence[Run], out: Path, *, paper: str | None = None, page_mb: 
         page_mb: what report.html may weigh, 10⁶ bytes; where it does not fit it shows fewer views, and says so.
     """
     rows = table(runs)
-    published = beside(rows, runs, PAPER[paper]) if paper is not None else None
+
+    def papers(some: Sequence[Row], of: Sequence[Run]) -> Beside | None:
+        return None if paper is None else beside(some, of, PAPER[paper])
+
+    published = papers(rows, runs)
     text = markdown(rows, published)
     files.write_text(out / "report.md", text)
     records = [record(row) for row in rows]
@@ -78,7 +82,8 @@ def write(runs: Sequence[Run], out: Path, *, paper: str | None = None, page_mb: 
         pictures.overlay(out / f"curves_{name}.png", histories, scene)
         pictures.over_seconds(out / f"psnr_over_seconds_{name}.png", histories, scene)
         of_scene = [row for row in rows if row.scene == scene]
-        sections.append(page.Section(scene, *columns(of_scene, published), shown, histories))
+        own = papers(of_scene, [run for run in runs if run.scene == scene])
+        sections.append(page.Section(scene, *columns(of_scene, own), shown, histories))
     if averages := [row for row in rows if not row.runs]:
         sections.insert(0, page.Section("average over scenes", *columns(averages, published), {}, {}))
     size = page.write(out / "report.html", sections, budget_mb=page_mb)

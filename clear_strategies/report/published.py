@@ -163,11 +163,11 @@ class Beside:
         return [{f"paper_{m}": self._numbers(row).get(m, math.nan) for m in _MEASURES} for row in rows]
 
     def notes(self) -> list[str]:
-        scenes = {run.scene for run in self.runs}
+        scenes = len({run.scene for run in self.runs})
         facts = self.table
         lines = [
             f"In the paper: CLEAR, {facts.source}; the mean of {facts.scenes} scenes after {facts.iterations:,} iterations, "
-            f"here beside each of our {len(scenes)} scene(s). LPIPS is not measured here."
+            f"here beside {f'each of our {scenes} scenes' if scenes > 1 else 'our one scene'}. LPIPS is not measured here."
         ]
         if differences := self._differences():
             lines.append(f"Ours differs: {'; '.join(differences)}.")
@@ -196,7 +196,7 @@ class Beside:
         if counts := sorted({text.split(":")[0] for text in each("train views")} - {str(facts.views)}):
             found.append(f"{', '.join(counts)} training views")
         inputs = [text.partition(", reference: ") for text in each("HR")]
-        sizes = dict.fromkeys(size for size, _, _ in inputs if size.split()[0] not in facts.pixels)
+        sizes = dict.fromkeys(size for size, _, _ in inputs if size.partition(" ")[0] not in facts.pixels)
         if sizes:
             found.append(f"HR {', '.join(sizes)} (protocol: {' or '.join(facts.pixels)})")
         priors = dict.fromkeys(prior for _, _, prior in inputs if prior and "resshift" not in prior.lower())
