@@ -85,7 +85,9 @@ def run(config: DictConfig, folder: Path) -> float | None:
     if config.fit.threads is not None:
         torch.set_num_threads(int(config.fit.threads))
     if config.fit.map_views < 0:
-        raise ValueError(f"fit.map_views must be at least 0, got {config.fit.map_views}.")
+        raise DataError(
+            "config", "fit.map_views", f"must be at least 0, got {config.fit.map_views}", "0 leaves no maps"
+        )
     known = FitSettings.__dataclass_fields__
     settings = FitSettings(**{k: v for k, v in _plain(config.fit).items() if k in known})
     strategies = [scaled(s, settings.stretch) for s in _instantiate_strategies(config)]

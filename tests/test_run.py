@@ -201,7 +201,7 @@ BAD_SETTINGS = {
     "objective.lambda_hr.start=4000": "start <= full",
     "density.mode=median": "mode must be quantile or fixed",
     "rasterizer.kernel=-1": "kernel must be",
-    "fit.map_views=-1": "fit.map_views must be at least 0",
+    "fit.map_views=-1": "must be at least 0, got -1",
     "fit.iterations=0": "iterations must be at least 1",
     "data.views.train=99": "99 training views are asked for",
     "data=llff": "data.path",
