@@ -41,7 +41,7 @@ _BLUE, _RED, _GREEN, _YELLOW, _CYAN, _PURPLE, _GREY = (
 _GROUP_COLORS: Final = {
     "means": _BLUE, "sh0": _RED, "shN": _GREEN, "opacities": _YELLOW, "scales": _CYAN, "quats": _PURPLE,
 }  # fmt: skip
-_RUN_COLORS: Final = (_BLUE, _RED, _GREEN, _YELLOW, _CYAN, _PURPLE)
+RUN_COLORS: Final = (_BLUE, _RED, _GREEN, _YELLOW, _CYAN, _PURPLE)
 _RUN_STYLES: Final = ("-", "--", ":")
 
 
@@ -195,11 +195,31 @@ def overlay(path: Path, runs: Mapping[str, Sequence[Mapping[str, float]]], title
     conflict.set_title("conflict ratio, before correction (running mean)")
     structure.set_title("number of Gaussians")
     for i, (name, history) in enumerate(runs.items()):
-        color = _RUN_COLORS[i % len(_RUN_COLORS)]
-        style = _RUN_STYLES[i // len(_RUN_COLORS) % len(_RUN_STYLES)]
+        color = RUN_COLORS[i % len(RUN_COLORS)]
+        style = _RUN_STYLES[i // len(RUN_COLORS) % len(_RUN_STYLES)]
         _draw(quality, history, "psnr_test", name, color, marker="o", linestyle=style)
         _draw(conflict, history, "conflict", name, color, smooth=True, linestyle=style)
         _draw(structure, history, "n_gaussians", name, color, linestyle=style)
+    _share_legend(figure, axes)
+    _head(figure, title)
+    _save(figure, path)
+
+
+def over_seconds(path: Path, runs: Mapping[str, Sequence[Mapping[str, float]]], title: str) -> None:
+    """PSNR of several runs over the seconds that they trained, by name of the run."""
+    figure, axes = _figure(1, 1, 9, 5)
+    axes[0, 0].set_title("PSNR of test views, dB, over seconds of training")
+    for i, (name, history) in enumerate(runs.items()):
+        color = RUN_COLORS[i % len(RUN_COLORS)]
+        style = _RUN_STYLES[i // len(RUN_COLORS) % len(_RUN_STYLES)]
+        _draw(axes[0, 0], history, "psnr_test", name, color, marker="o", linestyle=style, over="seconds")
+    _share_legend(figure, axes)
+    _head(figure, title)
+    _save(figure, path)
+
+
+def _share_legend(figure: Figure, axes: Any) -> None:
+    """One legend below all of the axes."""
     known = {
         text: line for axis in axes.flatten() for line, text in zip(*axis.get_legend_handles_labels(), strict=True)
     }
@@ -210,8 +230,6 @@ def overlay(path: Path, runs: Mapping[str, Sequence[Mapping[str, float]]], title
         figure.legend(
             known.values(), wrapped, fontsize=9, frameon=False, loc="outside lower center", ncols=min(3, len(known))
         )
-    _head(figure, title)
-    _save(figure, path)
 
 
 class _Page:
@@ -297,9 +315,9 @@ def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Figur
 
 def _draw(
     axis: Axes, history: Sequence[Mapping[str, float]], column: str, label: str, color: str, *,
-    smooth: bool = False, marker: str | None = None, width: float = 1.4, linestyle: str = "-",
+    smooth: bool = False, marker: str | None = None, width: float = 1.4, linestyle: str = "-", over: str = "t",
 ) -> None:  # fmt: skip
-    points = [(row["t"], row[column]) for row in history if math.isfinite(row.get(column, math.nan))]
+    points = [(row[over], row[column]) for row in history if over in row and math.isfinite(row.get(column, math.nan))]
     if not points:
         return
     t, values = np.array(points).T

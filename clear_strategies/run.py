@@ -1,9 +1,9 @@
 """`python -m clear_strategies.run +strategy=clear`: the door to a whole run, and the only one that knows Hydra.
 
 Composes the configuration, prints the plan, trains, and leaves in Hydra's run folder: history.csv, conflict.csv,
-timing.csv, renders/, contact_sheet.png, curves.png, point_cloud.ply, checkpoints/ and, last, so that its presence says
-that the run is finished, metrics.json. Exit codes: 0, 2 for input that cannot be used or a sweep with a failed job, 3
-where the disk is full or read-only, 130 and 143 when stopped by a signal (after saving).
+timing.csv, renders/, views/, maps/, contact_sheet.png, curves.png, point_cloud.ply, checkpoints/ and, last, so that its
+presence says that the run is finished, metrics.json. Exit codes: 0, 2 for input that cannot be used or a sweep with a
+failed job, 3 where the disk is full or read-only, 130 and 143 when stopped by a signal (after saving).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -46,10 +46,12 @@ _NOT_COMPARED: Final = {
     "fit.checkpoint_every",
     "fit.probe_every",
     "fit.probe_views",
+    "fit.map_views",
 }
 
 # What `fit.resume` says besides a path.
 _AUTO: Final = "auto"
+_SHEET_VIEWS: Final = 4  # test views on the contact sheet, and left as pictures
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
@@ -159,6 +161,10 @@ def _run(config: DictConfig, folder: Path) -> float | None:
         return finished[0]
     threads, why = _threads(config)
     torch.set_num_threads(threads)
+    if config.fit.map_views < 0:
+        raise DataError(
+            "config", "fit.map_views", f"must be at least 0, got {config.fit.map_views}", "0 leaves no maps"
+        )
     known = FitSettings.__dataclass_fields__
     settings = FitSettings(**{k: v for k, v in _plain(config.fit).items() if k in known})
     strategies = [scaled(s, settings.stretch) for s in _instantiate_strategies(config)]
@@ -423,7 +429,7 @@ def _watch() -> Callable[[], None] | None:
 def _leave_results(
     config: DictConfig, folder: Path, scene: Any, state: Any, rasterizer: Any, backend: str, seconds: float
 ) -> float | None:
-    from clear_strategies import files, metrics, pictures
+    from clear_strategies import diagnosis, files, metrics, pictures
     from clear_strategies.data.photo_files import write_png
     from clear_strategies.export import export_ply
     from clear_strategies.provenance import provenance
@@ -432,9 +438,17 @@ def _leave_results(
     with ledger.stage("evaluate"):
         down = config.data.views.downsample
         evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera), down=down)
+    with ledger.stage("maps"):
+        mapped = _spread(scene.train, int(config.fit.map_views))
+        if mapped:
+            diagnosis.leave(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
     export_ply(folder / "point_cloud.ply", field)
     for name, image in evaluation.renders.items():
         write_png(folder / "renders" / f"{Path(name).stem}.png", image)
+    for view in _spread(scene.test, _SHEET_VIEWS):
+        for kind, image in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
+            if image is not None:
+                write_png(folder / "views" / f"{Path(view.name).stem}_{kind}.png", image)
     names = [str(name) for name in config.strategies]
     length = f"{state.t - 1} iterations · seed {state.settings.seed}"
     title = f"{scene.name} · {config.method or ' + '.join(names) or 'baseline'} · {length}"
@@ -482,7 +496,7 @@ def _sheet(scene: Any, evaluation: Any) -> list[Any]:
     from clear_strategies import images, pictures
 
     rows = []
-    for view in scene.test[:: max(1, math.ceil(len(scene.test) / 4))]:
+    for view in _spread(scene.test, _SHEET_VIEWS):
         scores = evaluation.test[view.name]["ours"]
         shown = {
             "LR, enlarged": images.upsample(view.lr.image, view.factor, "nearest"),
@@ -491,6 +505,11 @@ def _sheet(scene: Any, evaluation: Any) -> list[Any]:
         }
         rows.append(pictures.SheetRow(view.name, shown, view.truth, f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}"))
     return rows
+
+
+def _spread(views: Sequence[Any], count: int) -> Sequence[Any]:
+    """At most so many of the views, evenly."""
+    return views[:: max(1, math.ceil(len(views) / count))] if count else ()
 
 
 def _mean_conflict(rows: list[dict[str, float]]) -> dict[str, float]:

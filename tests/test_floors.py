@@ -17,7 +17,7 @@ FLOORS = [
     {"gco", "p2g", "svs", "splatsure"},
     {"objective", "conductor"},
     {"data", "mip", "optim", "field", "fused", "density", "skips"}
-    | {"checkpoint", "metrics", "pictures", "fit", "export"},
+    | {"checkpoint", "metrics", "pictures", "fit", "export", "diagnosis"},
     {"run", "sweep", "report", "bench", "testing"},
 ]
 # Types that floor 2 may name: what a view is, and nothing that trains on it.

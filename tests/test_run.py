@@ -64,7 +64,11 @@ def test_a_run_leaves_everything_it_promises(finished):
     assert (out / "checkpoints" / "step_0000013" / "manifest.json").is_file()
     header = (out / "conflict.csv").read_text().splitlines()[0]
     assert header.startswith("t,conflict,conflict_means")
-    assert "skipped" in (out / "timing.csv").read_text()
+    timing = (out / "timing.csv").read_text()
+    assert "skipped" in timing
+    assert "\nmaps,1," in timing
+    assert len(list((out / "views").glob("*_truth.png"))) == 3
+    assert len(list((out / "maps").glob("*/corrected.png"))) == 2
 
 
 def test_the_plan_is_printed_before_training(finished):
@@ -108,6 +112,7 @@ def test_report_of_a_run(finished):
     assert result.returncode == 0, result.stderr
     assert "| bicubic" in result.stdout
     assert (finished / "report" / "report.csv").is_file()
+    assert "data:image/png" in (finished / "report" / "report.html").read_text(encoding="utf-8")
     nothing = run("cache", cwd=finished, module="clear_strategies.report")
     assert nothing.returncode == 2
     assert "Traceback" not in nothing.stderr
@@ -199,6 +204,7 @@ BAD_SETTINGS = {
     "data.views.sizes=pad": "sizes must be crop or round",
     "density.mode=median": "mode must be quantile or fixed",
     "rasterizer.kernel=-1": "kernel must be",
+    "fit.map_views=-1": "must be at least 0, got -1",
     "fit.iterations=0": "iterations must be at least 1",
     "data.views.train=99": "99 training views are asked for",
     "data=llff": "data.path",

@@ -129,12 +129,20 @@ def frame_number(name: str) -> int | None:
     return int(digits[-1]) if digits else None
 
 
-def write_png(path: Path, image: Float[Tensor, "H W 3"]) -> None:
-    """8-bit PNG, atomically; values outside [0, 1] are clamped."""
+def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> None:
+    """8-bit PNG, atomically, grey of one number a pixel; values outside [0, 1] are clamped."""
     pixels = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="PNG")
     write_bytes(path, buffer.getvalue())
+
+
+def jpeg(image: Float[Tensor, "H W 3"], quality: int = 90) -> bytes:
+    """A small file of an image in [0, 1], for looking at and not for measuring."""
+    pixels = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="JPEG", quality=quality, subsampling=0)
+    return buffer.getvalue()
 
 
 def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) -> Path:

@@ -1,0 +1,7 @@
+"""`python -m clear_strategies.report`."""
+
+import sys
+
+from clear_strategies.report import main
+
+sys.exit(main())

@@ -1,0 +1,355 @@
+"use strict";
+// The two viewers of report.html: pictures of test views (slide, flip, side by side), and maps over training views.
+// Both draw on a canvas, pixel for pixel once enlarged, with one zoom for everything that they show. What the viewer of a
+// scene shows is kept in the address after "#", so that a link leads back to it.
+
+const data = JSON.parse(document.getElementById("data").textContent);
+const magma = data.magma.map((hex) => [0, 2, 4].map((i) => parseInt(hex.slice(i, i + 2), 16)));
+const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
+
+// Pictures are decoded when they are first looked at; `then` draws anew once they are there.
+const decoded = new Map();
+function picture(key, then) {
+  if (!decoded.has(key)) {
+    const image = new Image();
+    decoded.set(key, null);
+    image.onload = () => { decoded.set(key, image); then(); };
+    image.src = data.images[key];
+  }
+  return decoded.get(key);
+}
+
+function pixels(image, width, height) {
+  const canvas = document.createElement("canvas");
+  canvas.width = width;
+  canvas.height = height;
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.imageSmoothingEnabled = image.width > width;
+  context.drawImage(image, 0, 0, width, height);
+  return { canvas, context, content: context.getImageData(0, 0, width, height) };
+}
+
+// A picture whose every pixel is the colour of a number in [0, 1].
+function coloured(target, number) {
+  const { canvas, context, content } = target;
+  for (let i = 0; i < content.data.length; i += 4) {
+    const rgb = magma[Math.round(255 * clamp(number(content.data, i), 0, 1))];
+    [content.data[i], content.data[i + 1], content.data[i + 2]] = rgb;
+  }
+  context.putImageData(content, 0, 0);
+  return canvas;
+}
+
+const made = new Map();
+function once(name, make) {
+  if (!made.has(name)) made.set(name, make());
+  return made.get(name);
+}
+
+// Mean over RGB of |picture - truth|, its colours ending at errorMax.
+function errorMap(image, truth, view, name) {
+  return once(name, () => {
+    const reference = pixels(truth, view.width, view.height).content.data;
+    const difference = (a, i) =>
+      (Math.abs(a[i] - reference[i]) + Math.abs(a[i + 1] - reference[i + 1]) + Math.abs(a[i + 2] - reference[i + 2])) / 765;
+    return coloured(pixels(image, view.width, view.height), (a, i) => difference(a, i) / data.errorMax);
+  });
+}
+
+function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else made.setAttribute(name, value);
+  }
+  made.append(...children);
+  return made;
+}
+
+function choice(label, options, chosen, onChoice) {
+  const select = element("select", { onchange: () => onChoice(select.selectedIndex) });
+  options.forEach((option) => select.append(element("option", {}, option)));
+  select.selectedIndex = chosen;
+  return { node: element("label", {}, label, select), show: (i) => { select.selectedIndex = i; } };
+}
+
+function segments(label, options, onChoice) {
+  const buttons = options.map((option, i) => element("button", { type: "button", onclick: () => onChoice(i) }, option));
+  const node = element("span", { class: "segments", role: "group", "aria-label": label }, ...buttons);
+  return { node, show: (i) => buttons.forEach((b, k) => b.setAttribute("aria-pressed", String(k === i))) };
+}
+
+function colourScale() {
+  const stops = [0, 64, 128, 192, 255].map((i) => `#${data.magma[i]}`).join(",");
+  const high = element("span");
+  const node = element("span", { class: "scale" }, "0", element("i", { style: `background:linear-gradient(90deg,${stops})` }), high);
+  return { node, show: (visible, text) => { node.hidden = !visible; high.textContent = text; } };
+}
+
+// A canvas to look through: wheel or +/- zooms, drag or Shift+arrows pans.
+class Stage {
+  constructor(name, paint, onDrag, onKey) {
+    this.zoom = 1;
+    this.centre = [0.5, 0.5];
+    this.paint = paint;
+    this.canvas = element("canvas", { tabindex: "0", role: "img", "aria-label": name });
+    this.canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoomBy(Math.exp(-event.deltaY / 300));
+    }, { passive: false });
+    this.canvas.addEventListener("pointerdown", (down) => {
+      this.canvas.setPointerCapture(down.pointerId);
+      let last = [down.offsetX, down.offsetY];
+      const divider = onDrag(down.offsetX / this.canvas.clientWidth, true);
+      const move = (event) => {
+        if (divider) onDrag(event.offsetX / this.canvas.clientWidth, false);
+        else this.pan(last[0] - event.offsetX, last[1] - event.offsetY);
+        last = [event.offsetX, event.offsetY];
+      };
+      this.canvas.onpointermove = move;
+      this.canvas.onpointerup = this.canvas.onpointercancel = () => { this.canvas.onpointermove = null; };
+    });
+    this.canvas.addEventListener("keydown", (event) => {
+      const arrow = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      if (arrow && event.shiftKey) this.pan(arrow[0] * 40, arrow[1] * 40);
+      else if (event.key === "+" || event.key === "=") this.zoomBy(2);
+      else if (event.key === "-") this.zoomBy(0.5);
+      else if (event.key === "0") this.fit();
+      else if (!onKey(event, arrow)) return;
+      event.preventDefault();
+    });
+    new ResizeObserver(() => this.draw()).observe(this.canvas);
+  }
+
+  zoomBy(factor) { this.zoom = clamp(this.zoom * factor, 1, 64); this.draw(); }
+  fit() { this.zoom = 1; this.centre = [0.5, 0.5]; this.draw(); }
+  pan(x, y) {
+    this.centre[0] += x / (this.scale * this.size.width);
+    this.centre[1] += y / (this.scale * this.size.height);
+    this.draw();
+  }
+
+  // `abreast` panels of one picture's size beside each other.
+  show(size, abreast) { this.size = size; this.abreast = abreast; this.draw(); }
+
+  draw() {
+    if (!this.size || !this.canvas.clientWidth) return;
+    const ratio = window.devicePixelRatio || 1, width = this.canvas.clientWidth / this.abreast;
+    const height = Math.min(width * this.size.height / this.size.width, window.innerHeight * 0.8);
+    this.canvas.style.height = `${height}px`;
+    this.canvas.width = Math.round(this.canvas.clientWidth * ratio);
+    this.canvas.height = Math.round(height * ratio);
+    this.fitted = Math.min(width / this.size.width, height / this.size.height);
+    this.scale = this.fitted * this.zoom;  // CSS pixels a picture's pixel
+    for (const [k, extent] of [[0, width / this.size.width], [1, height / this.size.height]]) {
+      const half = Math.min(0.5, extent / this.scale / 2);
+      this.centre[k] = clamp(this.centre[k], half, 1 - half);
+    }
+    this.context = this.canvas.getContext("2d");
+    this.context.scale(ratio, ratio);
+    this.panel = { width, height };
+    this.paint(this);
+  }
+
+  // Draw one picture into panel `k`, only between the shares `from` and `to` of its width.
+  put(image, k = 0, from = 0, to = 1, alpha = 1) {
+    if (!image) return;
+    const c = this.context, { width, height } = this.panel, left = k * width;
+    const w = this.size.width * this.scale, h = this.size.height * this.scale;
+    c.save();
+    c.beginPath();
+    c.rect(left + from * width, 0, (to - from) * width, height);
+    c.clip();
+    c.globalAlpha = alpha;
+    c.imageSmoothingEnabled = w < image.width;
+    c.drawImage(image, left + width / 2 - this.centre[0] * w, height / 2 - this.centre[1] * h, w, h);
+    c.restore();
+  }
+
+  divider(share) {
+    const c = this.context, x = share * this.panel.width;
+    c.fillStyle = "rgba(0,0,0,.45)";
+    c.fillRect(x - 1.5, 0, 3, this.panel.height);
+    c.fillStyle = "#fff";
+    c.fillRect(x - 0.5, 0, 1, this.panel.height);
+    c.beginPath();
+    c.arc(x, this.panel.height / 2, 9, 0, 7);
+    c.fill();
+  }
+}
+
+const MODES = ["slide", "flip", "side by side"];
+
+function viewer(holder, number) {
+  const scene = data.scenes[number], layers = () => scene.views[state.view].layers;
+  const last = scene.views[0].layers.length - 1;
+  const truth = scene.views[0].layers.findIndex((layer) => layer.kind === "truth");
+  const state = { view: 0, left: truth > 0 ? truth : 0, right: last, mode: 0, split: 0.5, flipped: 0, error: 0 };
+  const stage = new Stage(`test views of ${scene.name}`, paint, drag, key);
+
+  const names = layers().map((layer) => layer.label);
+  const controls = {
+    view: segments("view", scene.views.map((view) => view.name), (i) => set({ view: i })),
+    left: choice("left", names, state.left, (i) => set({ left: i })),
+    right: choice("right", names, state.right, (i) => set({ right: i })),
+    mode: segments("mode", MODES, (i) => set({ mode: i })),
+  };
+  const error = element("input", { type: "checkbox", onchange: () => set({ error: Number(error.checked) }) });
+  const scale = colourScale();
+  const captions = element("div", { class: "captions", "aria-live": "polite" });
+  const zoom = segments("zoom", ["−", "fit", "+"], (i) => (i === 1 ? stage.fit() : stage.zoomBy(i ? 2 : 0.5)));
+  holder.append(
+    element("div", { class: "controls" }, controls.view.node, controls.left.node, controls.right.node, controls.mode.node,
+      zoom.node, element("label", {}, error, "error map")),
+    stage.canvas, captions,
+    element("p", { class: "hint" }, "Drag the line; wheel zooms, drag pans. Keys on the picture: ",
+      ...["←", "→"].map((k) => element("kbd", {}, k)), " line, ", element("kbd", {}, "space"), " flip, ",
+      element("kbd", {}, "1"), "–", element("kbd", {}, "9"), " right, ", element("kbd", {}, "Shift"), " + digit left, ",
+      element("kbd", {}, "v"), " next view, ", element("kbd", {}, "m"), " mode, ", element("kbd", {}, "e"), " error, ",
+      element("kbd", {}, "+"), " ", element("kbd", {}, "−"), " ", element("kbd", {}, "0"), " zoom."),
+  );
+  if (truth < 0) error.disabled = true;
+  restore();
+  set({});
+
+  function set(change) {
+    Object.assign(state, change);
+    for (const name of Object.keys(controls)) controls[name].show(state[name]);
+    error.checked = Boolean(state.error);
+    scale.show(Boolean(state.error), `${data.errorMax} mean |difference| over RGB`);
+    const [left, right] = [state.left, state.right].map((i) => layers()[i]);
+    const said = (layer) => [element("b", {}, layer.label), layer.note ? ` ${layer.note}` : ""];
+    const both = [element("span", {}, ...said(left)), element("span", {}, ...said(right))];
+    captions.replaceChildren(both[state.mode === 1 ? state.flipped : 0], scale.node, state.mode === 1 ? "" : both[1]);
+    const view = scene.views[state.view];
+    stage.show(view, state.mode === 2 ? 2 : 1);
+  }
+
+  function shown(i) {
+    const view = scene.views[state.view], layer = layers()[i];
+    const image = picture(layer.image, () => stage.draw());
+    if (!state.error || layer.kind === "truth") return image;
+    const reference = picture(layers()[truth].image, () => stage.draw());
+    return image && reference && errorMap(image, reference, view, `error ${layer.image} ${layers()[truth].image}`);
+  }
+
+  function paint() {
+    if (state.mode === 2) {
+      stage.put(shown(state.left), 0);
+      stage.put(shown(state.right), 1);
+    } else if (state.mode === 1) {
+      stage.put(shown(state.flipped ? state.right : state.left));
+    } else {
+      stage.put(shown(state.left), 0, 0, state.split);
+      stage.put(shown(state.right), 0, state.split, 1);
+      stage.divider(state.split);
+    }
+    remember();
+  }
+
+  function drag(share, starts) {
+    const near = Math.abs(share - state.split) * stage.panel.width < 24;
+    if (state.mode !== 0 || (starts && stage.zoom > 1 && !near)) return false;
+    set({ split: clamp(share, 0, 1) });
+    return true;
+  }
+
+  function key(event, arrow) {
+    const digit = /^Digit([1-9])$/.exec(event.code);
+    if (arrow && arrow[0] && state.mode === 0) set({ split: clamp(state.split + 0.02 * arrow[0], 0, 1) });
+    else if (event.key === " ") set(state.mode === 1 ? { flipped: 1 - state.flipped } : { left: state.right, right: state.left });
+    else if (digit && Number(digit[1]) <= last + 1) set({ [event.shiftKey ? "left" : "right"]: Number(digit[1]) - 1 });
+    else if (event.key === "v") set({ view: (state.view + 1) % scene.views.length });
+    else if (event.key === "m") set({ mode: (state.mode + 1) % MODES.length });
+    else if (event.key === "e" && truth >= 0) set({ error: 1 - state.error });
+    else return false;
+    return true;
+  }
+
+  function restore() {
+    const asked = new URLSearchParams(location.hash.slice(1));
+    if (Number(asked.get("scene") ?? -1) !== number) return;
+    const limits = { view: scene.views.length - 1, left: last, right: last, mode: 2, split: 1, flipped: 1, error: truth < 0 ? 0 : 1 };
+    for (const [name, high] of Object.entries(limits)) {
+      const value = Number(asked.get(name) ?? NaN);
+      if (Number.isFinite(value)) state[name] = name === "split" ? clamp(value, 0, 1) : Math.round(clamp(value, 0, high));
+    }
+    const [zoom, x, y] = ["zoom", "x", "y"].map((name) => Number(asked.get(name) ?? NaN));
+    if (zoom >= 1) [stage.zoom, stage.centre] = [Math.min(zoom, 64), [x || 0.5, y || 0.5]];
+  }
+
+  function remember() {
+    if (document.activeElement !== stage.canvas && !holder.contains(document.activeElement)) return;
+    const words = { scene: number, ...state, split: state.split.toFixed(3), zoom: stage.zoom.toFixed(2),
+      x: stage.centre[0].toFixed(3), y: stage.centre[1].toFixed(3) };
+    history.replaceState(null, "", `#${new URLSearchParams(words)}`);
+  }
+}
+
+const MAPS = {
+  reliability: "R, reliability of the prior: does it agree with the LR photo?",
+  demand: "A, demand: how much detail does the prior add here?",
+  weight: "w = R·A, what high-frequency gradients are routed by",
+  corrected: "corrected: share of the HR gradient taken away, drawn on the Gaussians",
+  conflict: "conflict: Gaussians whose LR and HR gradients point apart",
+};
+
+function maps(holder, number) {
+  const scene = data.scenes[number], state = { view: 0, method: 0, map: 0, under: 0, opacity: 0.7 };
+  const kinds = Object.keys(MAPS).filter((kind) => scene.maps.some((view) => view.methods.some((m) => kind in m.maps)));
+  const stage = new Stage(`maps of ${scene.name}`, paint, () => false, key);
+  const methods = scene.maps[0].methods.map((method) => method.label);
+  const controls = {
+    view: segments("view", scene.maps.map((view) => view.name), (i) => set({ view: i })),
+    map: segments("map", kinds, (i) => set({ map: i })),
+    method: choice("of", methods, 0, (i) => set({ method: i })),
+    under: choice("over", scene.maps[0].under.map((u) => u.label), 0, (i) => set({ under: i })),
+  };
+  const opacity = element("input", { type: "range", min: "0", max: "1", step: "0.05", value: String(state.opacity),
+    oninput: () => set({ opacity: Number(opacity.value) }) });
+  const scale = colourScale(), caption = element("div", { class: "captions", "aria-live": "polite" });
+  holder.append(
+    element("div", { class: "controls" }, ...Object.values(controls).map((c) => c.node),
+      element("label", {}, "opacity", opacity)),
+    stage.canvas, caption,
+  );
+  const asked = new URLSearchParams(location.hash.slice(1));
+  if (Number(asked.get("scene") ?? -1) === number && kinds.includes(asked.get("map"))) state.map = kinds.indexOf(asked.get("map"));
+  state.method = scene.maps[0].methods.findLastIndex((method) => "corrected" in method.maps);
+  if (state.method < 0) state.method = methods.length - 1;
+  set({});
+
+  function set(change) {
+    Object.assign(state, change);
+    for (const name of Object.keys(controls)) controls[name].show(state[name]);
+    const view = scene.maps[state.view], method = view.methods[state.method], kind = kinds[state.map];
+    const mean = method && method.means[kind];
+    scale.show(true, String(view.tops[kind]));
+    const there = method && kind in method.maps;
+    caption.replaceChildren(element("span", {}, element("b", {}, MAPS[kind])), scale.node,
+      element("span", {}, there ? (mean == null ? "" : `mean ${mean.toFixed(3)}`) : "this method corrects nothing"));
+    stage.show(view, 1);
+  }
+
+  function paint() {
+    const view = scene.maps[state.view], kind = kinds[state.map], top = view.tops[kind];
+    stage.put(picture(view.under[state.under].image, () => stage.draw()));
+    const key = view.methods[state.method]?.maps[kind];
+    const grey = key && picture(key, () => stage.draw());
+    if (!grey) return;
+    const overlay = once(`map ${key} ${top}`, () =>
+      coloured(pixels(grey, grey.width, grey.height), (a, i) => a[i] / 255 / top));
+    stage.put(overlay, 0, 0, 1, state.opacity);
+  }
+
+  function key(event) {
+    if (event.key === "v") set({ view: (state.view + 1) % scene.maps.length });
+    else if (event.key === "m") set({ map: (state.map + 1) % kinds.length });
+    else return false;
+    return true;
+  }
+}
+
+document.querySelectorAll(".viewer").forEach((holder) => viewer(holder, Number(holder.dataset.scene)));
+document.querySelectorAll(".maps").forEach((holder) => maps(holder, Number(holder.dataset.scene)));

@@ -1,0 +1,150 @@
+"""Maps of a run show what its strategies decide, and asking for them decides nothing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import toy
+from torch import Tensor
+
+from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies.data.photo_files import read_image
+from clear_strategies.density import DensitySettings
+from clear_strategies.diagnosis import MAPS, diagnose, leave
+from clear_strategies.fit import FitSettings, TrainState, iterate
+from clear_strategies.gradients import Grads, conflict_ratio
+from clear_strategies.mip import MipFilter
+from clear_strategies.objective import Objective
+from clear_strategies.optim import LearningRates
+from clear_strategies.p2g import patch_evidence
+from clear_strategies.schedules import WarmupDecay
+from clear_strategies.strategy import Strategy
+
+OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
+
+
+def trained(*strategies: Strategy, iterations: int = 3) -> TrainState:
+    """A few iterations with a prior whose left half is a negative, so that there is something to find."""
+    scene = toy.scene()
+    left = (torch.arange(96) < 48)[:, None]
+    train = tuple(
+        replace(v, hr=replace(v.hr, image=torch.where(left, 1 - v.hr.image, v.hr.image))) for v in scene.train
+    )
+    settings = FitSettings(iterations=iterations, probe_every=0, max_degree=1, fused="off")
+    conductor = Conductor(*strategies, objective=OBJECTIVE)
+    state = TrainState.start(
+        replace(scene, train=train), conductor, settings=settings, density=DensitySettings(), rates=LearningRates(),
+        mip=MipFilter(),
+    )  # fmt: skip
+    for _ in range(iterations):
+        iterate(state, toy.RASTERIZER)
+    return state
+
+
+def everything(state: TrainState) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in state.checkpoint({}).tensors.items()}
+
+
+def test_asking_changes_nothing() -> None:
+    strategies = (GCO(), P2G(), SVS(anchor_start=2))
+    state = trained(*strategies)
+    before, readings = everything(state), [dict(s.readings) for s in strategies]
+    caches, entries = [set(s.cache) for s in strategies], dict(state.conductor.ledger.entries)
+    for view in state.views:
+        diagnose(state.field, state.conductor, toy.RASTERIZER, view)
+    after = everything(state)
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert [dict(s.readings) for s in strategies] == readings
+    assert [set(s.cache) for s in strategies] == caches
+    assert state.conductor.ledger.entries == entries
+
+
+def test_patch_maps_are_those_that_p2g_routes_by_enlarged_to_hr() -> None:
+    p2g = P2G(patch=8, reliability_scale=0.02)
+    state = trained(p2g)
+    view = state.views[0]
+    maps = diagnose(state.field, state.conductor, toy.RASTERIZER, view).maps
+    R, A = patch_evidence(view.lr.image, view.hr.image, 4, patch=8, reliability_scale=0.02)
+    assert maps["reliability"].shape == (64, 96)
+    assert maps["reliability"][31, 32] == R[0, 1]  # patches of 32 HR pixels
+    assert maps["demand"][32, 95] == A[1, 2]
+    assert torch.equal(maps["weight"], maps["reliability"] * maps["demand"])
+
+
+def test_without_p2g_the_evidence_is_its_default() -> None:
+    state = trained()
+    view = state.views[0]
+    R, _ = patch_evidence(view.lr.image, view.hr.image, 4)
+    assert diagnose(state.field, state.conductor, toy.RASTERIZER, view).means["reliability"] == pytest.approx(
+        float(R[0].repeat_interleave(64)[:96].mean()), rel=1e-6
+    )
+
+
+def test_conflict_is_the_share_that_training_reports() -> None:
+    state = trained()
+    view = state.views[0]
+    found = diagnose(state.field, state.conductor, toy.RASTERIZER, view)
+    lr, hr = state.field.render_scales(toy.RASTERIZER, view)
+    assert hr is not None
+    (g_lr,) = lr.pull(OBJECTIVE.lr(lr.image, view.lr.image).cotangents)
+    g_base, g_hf = hr.pull(OBJECTIVE.hr(hr.image, view.hr.image).cotangents)
+    assert found.means["conflict"] == pytest.approx(conflict_ratio(g_lr, g_base + g_hf * 0.2)["gaussian"])
+    assert 0 < found.means["conflict"] < 1
+    assert "corrected" not in found.maps
+
+
+class Halve(Strategy):
+    """Every Gaussian loses half of its HR gradient."""
+
+    def correct(self, lr: Grads, hr: Grads, evidence: object) -> Grads:
+        return hr * 0.5
+
+
+def test_correction_is_the_share_of_the_hr_gradient_that_was_taken_away() -> None:
+    state = trained(Halve())
+    found = diagnose(state.field, state.conductor, toy.RASTERIZER, state.views[0])
+    assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
+    # Drawn over black: nowhere more than the number itself, and nearly that where Gaussians cover the pixel.
+    assert float(found.maps["corrected"].max()) == pytest.approx(0.5, abs=0.1)
+    assert float(found.maps["corrected"].max()) <= 0.5 + 1e-5
+
+
+def test_maps_lie_over_black_whatever_the_background_is() -> None:
+    import rasterizers
+
+    state = trained(Halve())
+    white = rasterizers.load("torch", tile=8, background=(1.0, 1.0, 1.0))
+    state.field.opacities.data[:] = -4.0  # little is drawn
+    found = diagnose(state.field, state.conductor, white, state.views[0])
+    assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
+    assert 0 < float(found.maps["corrected"].max()) < 0.4
+
+
+def test_a_folder_of_maps_is_complete_and_says_what_it_holds(tmp_path: Path) -> None:
+    state = trained(GCO(), P2G())
+    leave(tmp_path, state.views[:2], state.field, state.conductor, toy.RASTERIZER)
+    content = json.loads((tmp_path / "maps.json").read_text())
+    assert (content["corrector"], content["evidence"]) == ("GCO", "this run's P2G")
+    assert set(content["views"]) == {view.name for view in state.views[:2]}
+    for view in state.views[:2]:
+        own = tmp_path / view.name
+        assert {path.name for path in own.iterdir()} == {f"{name}.png" for name in (*MAPS, "lr", "prior")}
+        assert set(content["views"][view.name]) == set(MAPS)
+        found = diagnose(state.field, state.conductor, toy.RASTERIZER, view).maps
+        for name in MAPS:
+            assert float((read_image(own / f"{name}.png")[..., 0] - found[name]).abs().max()) <= 0.5 / 255 + 1e-6
+
+
+def test_without_a_corrector_no_correction_is_claimed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    state = trained()
+    leave(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER)
+    content = json.loads((tmp_path / "maps.json").read_text())
+    assert (content["corrector"], content["evidence"]) == (None, "P2G's defaults")
+    assert not (tmp_path / state.views[0].name / "corrected.png").exists()
+    assert "no strategy corrects" in caplog.text
