@@ -115,6 +115,7 @@ class SweepCallback(Callback):
         ours = Sweep.current()
         if ours is None:
             return
+        _report(Path(config.hydra.sweep.dir))
         stopped, failed, left = ours.stopped_by, ours.failures, ours.left
         if left:
             _log.warning("%d job(s) were left to other processes: %s", len(left), " | ".join(left))
@@ -125,6 +126,16 @@ class SweepCallback(Callback):
             sys.exit(128 + stopped)
         if failed:
             sys.exit(2)
+
+
+def _report(folder: Path) -> None:
+    """The table and the page of what a sweep has finished so far."""
+    from clear_strategies import report
+
+    try:
+        _log.info("%s", report.write(report.collect([folder]), folder))
+    except ClearError as error:  # nothing is finished yet, or a run's files are damaged; the jobs themselves are not
+        _log.warning("there is no report: %s", error)
 
 
 def _sweep() -> Sweep | None:
