@@ -167,7 +167,7 @@ ROWS = {
 }
 
 
-@pytest.mark.parametrize("experiment", [name for name in names("experiment") if name != "smoke"])
+@pytest.mark.parametrize("experiment", [*SCENES, *ROWS])
 def test_an_experiment_is_its_scenes_times_seeds_times_rows(experiment):
     found, composed_job = jobs(f"experiment={experiment}", "data.root=here")
     scenes = SCENES[experiment if experiment in SCENES else "llff_x4"].split()
@@ -182,6 +182,33 @@ def test_an_experiment_is_its_scenes_times_seeds_times_rows(experiment):
         assert c.hydra.sweep.subdir == f"+strategy={job['+strategy']},data.scene={scenes[0]},fit.seed=0"
         assert isinstance(instantiate(c.data.views, _convert_="object"), ViewSettings)
         pieces(c)
+
+
+EVIDENCE = {
+    "evidence": (5 * 3 * 6, {"iterations": 1000, "prior": "Onnx"}),
+    "evidence_corrupted": (5 * 3 * 4, {"iterations": 1000, "prior": "Corrupted"}),
+    "evidence_baselines": (5 * 8, {"iterations": 1000, "prior": "Onnx"}),
+    "evidence_skips": (4 * 3 * 2, {"iterations": 2000, "prior": "Onnx"}),
+}
+
+
+@pytest.mark.parametrize("experiment", EVIDENCE)
+def test_the_evidence_differs_in_what_it_sweeps_alone(experiment):
+    count, expected = EVIDENCE[experiment]
+    found, composed_job = jobs(f"experiment={experiment}", "data.root=here")
+    assert len(found) == count
+    for job in (found[0], found[-1]):
+        c = composed_job(job)
+        assert c.fit.iterations == expected["iterations"]
+        assert c.prior._target_.endswith(expected["prior"])
+        assert c.data.path == f"here/{job['+scene']}"
+        assert c.fit.resume == "auto"
+        assert (c.skips.coarse_until == 0) == (job.get("skips", "none") == "none")
+        pieces(c)
+
+
+def test_every_experiment_has_a_test():
+    assert {*SCENES, *ROWS, *EVIDENCE, "smoke"} == set(names("experiment"))
 
 
 def test_the_protocols_are_the_papers():
@@ -233,6 +260,9 @@ def test_one_command_runs_all_and_the_report_tells_the_rows_apart(tmp_path: Path
     assert "strategies named before it take no part" in result.stdout + result.stderr
     done = sorted(p.parent.name.split(",")[0] for p in tmp_path.glob("multirun/ablation/*/metrics.json"))
     assert done == ["+method=srgs", "+strategy=baseline", "+strategy=clear"]
+    swept = tmp_path / "multirun" / "ablation"  # a sweep ends with its report
+    assert "| srgs " in (swept / "report.md").read_text()
+    assert (swept / "report.html").is_file()
     told = run("multirun", "--out", "report", cwd=tmp_path, module="clear_strategies.report")
     assert told.returncode == 0, told.stderr
     for row in ("| baseline ", "| clear ", "| srgs "):
