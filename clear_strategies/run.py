@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,7 +49,6 @@ _NOT_COMPARED: Final = {
 
 # What `fit.resume` says besides a path.
 _AUTO: Final = "auto"
-_SHEET_VIEWS: Final = 4  # test views on the contact sheet, and left as pictures
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
@@ -162,6 +159,7 @@ def run(config: DictConfig, folder: Path) -> float | None:
 def _run(config: DictConfig, folder: Path) -> float | None:
     import torch
 
+    from clear_strategies import plan, results
     from clear_strategies.conductor import Conductor
     from clear_strategies.data.scene import save_lr
     from clear_strategies.fit import FitSettings, TrainState, fit
@@ -206,16 +204,29 @@ def _run(config: DictConfig, folder: Path) -> float | None:
         _resume_newest(state, folder / "checkpoints", compared)
     elif config.fit.resume is not None:
         _resume(state, Path(config.fit.resume), compared)
-    _print_plan(config, scene, state, backend, f"{threads} ({why})")
+    chosen = plan.Chosen(config.method, [str(name) for name in config.strategies])
+    drawn = f"{backend}, kernel {config.rasterizer.kernel} px²"
+    _log.info("%s", plan.describe(scene, state, chosen, rasterizer=drawn, threads=f"{threads} ({why})"))
     if (folder / "metrics.json").exists():
         _log.warning("%s: of an earlier run; removed, for it says that a run is finished.", folder / "metrics.json")
         (folder / "metrics.json").unlink()
     # What a run that is resumed took before counts too.
     began = time.perf_counter() - (state.history[-1]["seconds"] if state.history else 0.0)
-    with _progress(state) as progress:
+    with plan.progress(state, _watch()) as progress:
         fit(state, scene, rasterizer, checkpoints=folder / "checkpoints", config=compared, progress=progress)
     seconds = time.perf_counter() - began
-    return _leave_results(config, folder, scene, state, rasterizer, backend, seconds)
+    return results.leave(
+        folder,
+        scene,
+        state,
+        rasterizer,
+        chosen,
+        backend=backend,
+        down=config.data.views.downsample,
+        map_views=int(config.fit.map_views),
+        seconds=seconds,
+        config=compared,
+    )
 
 
 def _scene(config: DictConfig, seed: int) -> Any:
@@ -342,206 +353,10 @@ def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any])
         )  # fmt: skip
 
 
-def _print_plan(config: DictConfig, scene: Any, state: Any, backend: str, threads: str) -> None:
-    from clear_strategies.schedules import milestones
-
-    settings, conductor = state.settings, state.conductor
-    strategies = ", ".join(
-        f"{name} ({type(s).__name__})" for name, s in zip(config.strategies, conductor.strategies, strict=True)
-    )
-    lines = {
-        **scene.notes,
-        **({} if config.method is None else {"method": f"{config.method}; strategies named before it take no part"}),
-        "strategies": strategies or ("none (the paper's baseline)" if config.method is None else "none"),
-        "rasterizer": f"{backend}, kernel {config.rasterizer.kernel} px²",
-        "threads": threads,
-        "per-Gaussian pass": "readable" if state.fused is None else "compiled",
-        "iterations": f"{settings.iterations}, seed {settings.seed}",
-        "milestones": ", ".join(f"{name} {t}" for name, t in _marks(state).items()),
-    }
-    for s in conductor.strategies:
-        if found := milestones(s):
-            lines[f"milestones of {type(s).__name__}"] = ", ".join(f"{name} {t}" for name, t in found.items())
-    skipped = []
-    if not conductor.wants_lr:
-        used = "is the area mean of the HR render" if conductor.objective.lambda_lr > 0 else "plays no part"
-        skipped.append(f"LR render (LR {used})")
-    if conductor.objective.lambda_lr == 0 and (idle := [name for name in config.strategies if name == "gco"]):
-        _log.warning("lambda_LR is 0: nothing can conflict, %s has no effect.", idle[0])
-    if conductor.objective.lambda_hf == 0:
-        skipped.append("high-frequency loss (lambda_hf = 0)")
-    hr = conductor.objective.lambda_hr
-    if hr.peak == hr.final == 0:
-        skipped.append("HR scale throughout (lambda_HR = 0)")
-        if idle := [name for name in config.strategies if name in ("gco", "p2g")]:
-            _log.warning("lambda_HR is 0 throughout: %s has no effect.", " and ".join(idle))
-    elif hr.start > 0:
-        skipped.append(f"HR scale until iteration {hr.start} (lambda_HR = 0)")
-    if state.mip.variance == 0:
-        skipped.append("3D filter (variance 0)")
-    skipped += state.economy.skips.says()
-    lines["skipped"] = "; ".join(skipped) or "nothing"
-    width = max(map(len, lines))
-    _log.info("\n".join(f"  {label:<{width}}  {text}" for label, text in lines.items()))
-
-
-def _marks(state: Any) -> dict[str, int]:
-    """The milestones worth a mark on a curve."""
-    hr, density = state.conductor.objective.lambda_hr, state.density.settings
-    marks = {"HR from": hr.start, "HR full": hr.full, "densify until": density.stop}
-    if hr.final != hr.peak:
-        marks["HR decays"] = hr.decay_from
-    if 0 < density.reset_every < density.stop:
-        marks["opacity reset"] = density.reset_every
-    for s in state.conductor.strategies:
-        if hasattr(s, "anchor_start"):
-            marks["anchor"] = s.anchor_start
-    return marks
-
-
-@contextmanager
-def _progress(state: Any) -> Iterator[Callable[[Any], None]]:
-    """A bar with loss, PSNR, Gaussians, conflict ratio and the time that is left."""
-    from tqdm import tqdm
-    from tqdm.contrib.logging import logging_redirect_tqdm
-
-    shown: dict[str, str] = {}
-    every = 0.5 if sys.stderr.isatty() else 15  # seconds; a log file needs no animation
-    total, done = state.settings.iterations, state.t - 1
-    watch = _watch()
-    with (
-        logging_redirect_tqdm(),
-        tqdm(total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=every) as bar,
-    ):
-
-        def update(state: Any) -> None:
-            row = state.history[-1]
-            λ_lr, λ_hr = state.conductor.objective.lambda_lr, row["lambda_hr"]
-            shown["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
-            shown["N"] = f"{int(row['n_gaussians']):,}"
-            if not math.isnan(row.get("conflict", math.nan)):
-                shown["conflict"] = f"{row['conflict']:.2f}"
-            if "psnr_test" in row:
-                shown["psnr"] = f"{row['psnr_test']:.2f} dB"
-            bar.set_postfix(shown, refresh=False)
-            bar.update(1)
-            if watch is not None:
-                watch()
-
-        yield update
-
-
 def _watch() -> Callable[[], None] | None:
     """For joblib's jobs: looks whether the sweep was stopped, from whichever process."""
     ours = _sweep()
     return sweep.Watch(ours) if ours is not None and _launcher(HydraConfig.get()) == "joblib" else None
-
-
-def _leave_results(
-    config: DictConfig, folder: Path, scene: Any, state: Any, rasterizer: Any, backend: str, seconds: float
-) -> float | None:
-    from clear_strategies import diagnosis, files, metrics, pictures
-    from clear_strategies.data.photo_files import write_png
-    from clear_strategies.export import export_ply
-    from clear_strategies.provenance import provenance
-
-    field, ledger = state.field, state.conductor.ledger
-    with ledger.stage("evaluate"):
-        down = config.data.views.downsample
-        evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera), down=down)
-    with ledger.stage("maps"):
-        mapped = _spread(scene.train, int(config.fit.map_views))
-        if mapped:
-            diagnosis.leave(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
-    export_ply(folder / "point_cloud.ply", field)
-    for name, image in evaluation.renders.items():
-        write_png(folder / "renders" / f"{Path(name).stem}.png", image)
-    for view in _spread(scene.test, _SHEET_VIEWS):
-        for kind, image in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
-            if image is not None:
-                write_png(folder / "views" / f"{Path(view.name).stem}_{kind}.png", image)
-    names = [str(name) for name in config.strategies]
-    length = f"{state.t - 1} iterations · seed {state.settings.seed}"
-    title = f"{scene.name} · {config.method or ' + '.join(names) or 'baseline'} · {length}"
-    if scene.synthetic_prior:
-        title += " · SYNTHETIC prior"
-    pictures.contact_sheet(folder / "contact_sheet.png", _sheet(scene, evaluation), title)
-    pictures.curves(folder / "curves.png", state.history, _marks(state), title)
-
-    columns = list(dict.fromkeys(key for row in state.history for key in row))
-    files.write_csv(folder / "history.csv", state.history, columns)
-    shares = [
-        "conflict",
-        *(c for c in columns if c.startswith("conflict_")),
-        *(c for c in columns if c.startswith("corrected")),
-    ]
-    readings = [c for c in ("mean_q", "mean_w", "mean_omega") if c in columns]
-    compared = [row for row in state.history if "conflict" in row]
-    files.write_csv(folder / "conflict.csv", compared, ["t", *dict.fromkeys(shares), *readings])
-    files.write_csv(
-        folder / "timing.csv", ledger.rows(), ["stage", "runs", "ms_each", "seconds", "skipped", "seconds_saved", "why"]
-    )
-    mean = evaluation.mean("test") or evaluation.mean("train")
-    files.write_json(
-        folder / "metrics.json",
-        metrics.to_json(
-            evaluation,
-            scene=scene.name,
-            method=config.method,
-            strategies=names,
-            seed=state.settings.seed,
-            iterations=state.t - 1,
-            gaussians=len(field),
-            seconds=seconds,
-            conflict=_mean_conflict(compared),
-            synthetic_prior=scene.synthetic_prior,
-            config=_comparable(config),
-            provenance=provenance(seed=state.settings.seed, backend=backend, plan=scene.notes),
-        ),
-    )
-    _say_results(folder, evaluation, seconds)
-    return None if mean is None else mean.psnr
-
-
-def _sheet(scene: Any, evaluation: Any) -> list[Any]:
-    from clear_strategies import images, pictures
-
-    rows = []
-    for view in _spread(scene.test, _SHEET_VIEWS):
-        scores = evaluation.test[view.name]["ours"]
-        shown = {
-            "LR, enlarged": images.upsample(view.lr.image, view.factor, "nearest"),
-            "SR prior": view.hr.image,
-            "ours": evaluation.renders[view.name],
-        }
-        rows.append(pictures.SheetRow(view.name, shown, view.truth, f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}"))
-    return rows
-
-
-def _spread(views: Sequence[Any], count: int) -> Sequence[Any]:
-    """At most so many of the views, evenly."""
-    return views[:: max(1, math.ceil(len(views) / count))] if count else ()
-
-
-def _mean_conflict(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Mean over the iterations with λ_HR > 0, by group and for the Gaussian as a whole."""
-    means = {}
-    for key in dict.fromkeys(k for row in rows for k in row if k == "conflict" or k.startswith("conflict_")):
-        values = [row[key] for row in rows if key in row and not math.isnan(row[key])]
-        if values:
-            means[key.removeprefix("conflict_").replace("conflict", "gaussian")] = sum(values) / len(values)
-    return means
-
-
-def _say_results(folder: Path, evaluation: Any, seconds: float) -> None:
-    lines = [f"done in {seconds:.0f} s: {folder}"]
-    for part in ("test", "train"):
-        for method in ("ours", "bicubic", "prior"):
-            if (m := evaluation.mean(part, method)) is not None:
-                lines.append(
-                    f"  {part:<5} {method:<8} PSNR {m.psnr:6.2f} dB   SSIM {m.ssim:.4f}   GMSD {m.gmsd:.4f}   blur {m.blur:+.4f}"
-                )
-    _log.info("\n".join(lines))
 
 
 def _instantiate(config: Any, key: str, **extra: Any) -> Any:

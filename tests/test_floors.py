@@ -18,7 +18,7 @@ FLOORS = [
     {"objective", "conductor"},
     {"data", "mip", "optim", "field", "fused", "density", "skips"}
     | {"checkpoint", "metrics", "pictures", "fit", "export", "diagnosis"},
-    {"run", "sweep", "report", "bench", "testing"},
+    {"run", "plan", "results", "sweep", "report", "bench", "testing"},
 ]
 # Types that floor 2 may name: what a view is, and nothing that trains on it.
 ALLOWED_UP = {("p2g", "data"), ("conductor", "data")}
