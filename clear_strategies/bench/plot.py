@@ -92,7 +92,7 @@ def time_against_quality(path: Path, rows: Sequence[pareto.Row], title: str) -> 
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, MaxNLocator
+    from matplotlib.ticker import LogLocator
 
     rows = [row for row in rows if math.isfinite(row.mean("psnr"))]
     if not rows:
@@ -121,9 +121,9 @@ def time_against_quality(path: Path, rows: Sequence[pareto.Row], title: str) -> 
     slowest, fastest = max(seconds), min(seconds)
     if slowest > _LOG_FROM * fastest:
         axis.set_xscale("log")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axis.xaxis.set_minor_formatter(lambda *_: "")
-    axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    axis.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+    axis.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
     # The markers fill the picture; where the curves began lies below it.
     axis.set_xlim(_FROM * fastest, slowest * (1.12 if slowest <= _LOG_FROM * fastest else 1.35))
     room = 0.18 * max(max(psnr) - min(psnr), 0.1)
