@@ -231,7 +231,7 @@ def test_the_command_trains_and_leaves_table_json_and_picture(tmp_path, capsys, 
     monkeypatch.setenv("CLEAR_CACHE", str(tmp_path / "cache"))
     page = tmp_path / "page.md"
     page.write_text("<!-- bench:pareto -->\n<!-- /bench:pareto -->\n")
-    asked = ["pareto", *SCENE, "--seeds", "0", "--iterations", "12", "--variants", "clear", "1/2 as long"]
+    asked = ["pareto", *SCENE, "--seeds", "0", "--iterations", "24", "--variants", "clear", "1/2 as long"]
     asked += ["--out", str(tmp_path / "it's [a=b]"), "--threads", "1", "--docs", str(page)]
     files = {name: tmp_path / f"out.{name}" for name in ("json", "picture")}
     caplog.set_level("INFO")
@@ -239,7 +239,7 @@ def test_the_command_trains_and_leaves_table_json_and_picture(tmp_path, capsys, 
         caplog.text
     )
     rows = {r["name"]: r for r in json.loads(files["json"].read_text())["rows"]}
-    assert {name: r["trainings"][0]["iterations"] for name, r in rows.items()} == {"clear": 12, "1/2 as long": 6}
+    assert {name: r["trainings"][0]["iterations"] for name, r in rows.items()} == {"clear": 24, "1/2 as long": 12}
     for found in rows.values():
         (training,) = found["trainings"]
         assert training["curve"][-1] == [pytest.approx(training["seconds"]), pytest.approx(training["psnr"], abs=1e-3)]
