@@ -8,18 +8,18 @@ import argparse
 import logging
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, NoReturn
 
 import torch
 
-from clear_strategies.bench import iteration, kernels, rasterizers
+from clear_strategies.bench import iteration, kernels, pareto, rasterizers
 from clear_strategies.bench.iteration import STRATEGIES
 from clear_strategies.bench.kernels import SIZES
 from clear_strategies.bench.output import Findings, between_markers, leave
-from clear_strategies.bench.plot import time_against_error
-from clear_strategies.bench.rasterizers import SCENES, Row
+from clear_strategies.bench.plot import time_against_error, time_against_quality
+from clear_strategies.bench.rasterizers import SCENES
 from clear_strategies.bench.scenes import NAMES
 from clear_strategies.errors import ClearError, DataError
 from rasterizers.interface import PRESETS, BackendUnavailable
@@ -30,7 +30,10 @@ _QUESTIONS: Final = {
     "rasterizers": "time, memory and error of every backend at every preset",
     "kernels": "image losses with their gradients, ours and everyone's",
     "iteration": "one iteration of training, stage by stage",
+    "pareto": "seconds against PSNR and SSIM of whole trainings",
 }
+
+Draw = Callable[[Path], None]
 
 
 class _Parser(argparse.ArgumentParser):
@@ -46,12 +49,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
         _require_writable(options)
-        findings, rows = _measure(options)
+        findings, draw = _measure(options)
         text = leave(findings, json=options.json, markdown_file=options.markdown, docs=options.docs)
         encoding = sys.stdout.encoding or "utf-8"
         sys.stdout.write(text.encode(encoding, "replace").decode(encoding))  # a terminal may not know every sign
-        if picture := getattr(options, "picture", None):
-            time_against_error(picture, rows)
+        if draw is not None and options.picture is not None:
+            draw(options.picture)
     except (ClearError, BackendUnavailable) as error:
         _log.error("%s", error)
         return 2
@@ -59,32 +62,40 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _log.error("%s: %s", error.filename or "output", error.strerror or error)
         return 2
     except KeyboardInterrupt:
-        _log.error("stopped; nothing was written.")
+        _log.error("stopped; no table was written.")
         return 130
     return 0
 
 
-def _measure(options: argparse.Namespace) -> tuple[Findings, Sequence[Row]]:
+def _measure(options: argparse.Namespace) -> tuple[Findings, Draw | None]:
+    """What was found, and how to draw it where there is a picture."""
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     if options.question == "kernels":
-        return kernels.measure(options.size, options.repeats, _log.info), ()
+        return kernels.measure(options.size, options.repeats, _log.info), None
     if options.question == "iteration":
         one = iteration.Request(
             options.scene, options.strategy, options.backend, options.preset, options.repeats,
             options.data, options.prototype,
         )  # fmt: skip
-        return iteration.measure(one, _log.info), ()
+        return iteration.measure(one, _log.info), None
+    if options.question == "pareto":
+        whole = pareto.Request(
+            tuple(options.overrides), options.seeds, options.iterations, options.out, tuple(options.backends),
+            tuple(options.variants),
+        )  # fmt: skip
+        findings, trained = pareto.measure(whole, _log.info)
+        return findings, lambda path: time_against_quality(path, trained, findings.sections[0].title)
     request = rasterizers.Request(
         options.scene, options.backend, options.preset, options.repeats, options.limit,
         options.device, options.data, options.prototype, options.memory,
     )  # fmt: skip
-    return rasterizers.measure(request, _log.info)
+    findings, drawn = rasterizers.measure(request, _log.info)
+    return findings, lambda path: time_against_error(path, drawn)
 
 
 def _parser() -> argparse.ArgumentParser:
     common = _Parser(add_help=False)
-    common.add_argument("--repeats", type=_positive, default=9, metavar="N", help="turns of each (default 9)")
     common.add_argument(
         "--threads", type=_positive, metavar="N", help="of torch and of the backends (default: torch's)"
     )
@@ -92,13 +103,16 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--markdown", type=Path, metavar="FILE", help="the tables")
     common.add_argument("--docs", type=Path, metavar="FILE", help="replace the tables between this page's markers")
 
+    turns = _Parser(add_help=False)
+    turns.add_argument("--repeats", type=_positive, default=9, metavar="N", help="turns of each (default 9)")
+
     splats = _Parser(add_help=False)
     splats.add_argument("--data", type=Path, metavar="PATH", help="the garden's .npz, or its folder")
     splats.add_argument("--prototype", type=Path, metavar="DIR", help="sources of the CPU prototype, a peer")
 
     parser = _Parser(prog="python -m clear_strategies.bench", description="Run time against error, on this machine.")
     questions = parser.add_subparsers(dest="question", required=True, metavar="QUESTION", parser_class=_Parser)
-    ask = questions.add_parser("rasterizers", parents=[common, splats], help=_QUESTIONS["rasterizers"])
+    ask = questions.add_parser("rasterizers", parents=[common, turns, splats], help=_QUESTIONS["rasterizers"])
     ask.add_argument(
         "--scene", nargs="+", default=list(SCENES), metavar="SCENE",
         help=f"{', '.join(NAMES)}, a .ply or a checkpoint (default: {' '.join(SCENES)})",
@@ -110,14 +124,32 @@ def _parser() -> argparse.ArgumentParser:
     ask.add_argument("--no-memory", dest="memory", action="store_false", help="do not measure peak memory")
     ask.add_argument("--picture", type=Path, metavar="FILE", help="PNG: time against error")
 
-    ask = questions.add_parser("kernels", parents=[common], help=_QUESTIONS["kernels"])
+    ask = questions.add_parser("kernels", parents=[common, turns], help=_QUESTIONS["kernels"])
     ask.add_argument("--size", nargs="+", default=list(SIZES), metavar="WxH", help=f"default: {' '.join(SIZES)}")
 
-    ask = questions.add_parser("iteration", parents=[common, splats], help=_QUESTIONS["iteration"])
+    ask = questions.add_parser("iteration", parents=[common, turns, splats], help=_QUESTIONS["iteration"])
     ask.add_argument("--scene", default="s100k", metavar="SCENE", help="as above; HR is its image (default: s100k)")
     ask.add_argument("--strategy", default="clear", choices=list(STRATEGIES), help="default: clear")
     ask.add_argument("--backend", metavar="NAME", help="default: the fastest that runs here")
     ask.add_argument("--preset", default="fast", choices=list(PRESETS), help="default: fast")
+
+    ask = questions.add_parser("pareto", parents=[common], help=_QUESTIONS["pareto"])
+    ask.add_argument(
+        "overrides", nargs="*", metavar="OVERRIDE", help="of all trainings, as for a run (default: the demo)"
+    )
+    ask.add_argument("--seeds", type=_seeds, default=(0, 1), metavar="S,S", help="default: 0,1")
+    ask.add_argument("--iterations", type=_positive, default=1500, metavar="N", help="default: 1500")
+    ask.add_argument(
+        "--out", type=Path, default=Path("outputs/pareto"), metavar="FOLDER",
+        help="of the trainings; those that are there are kept (default: %(default)s)",
+    )  # fmt: skip
+    ask.add_argument(
+        "--backends", nargs="+", default=["auto"], metavar="NAME",
+        help="the first trains all variants, each further one clear alone (default: the fastest)",
+    )  # fmt: skip
+    names = [variant.name for variant in pareto.VARIANTS]
+    ask.add_argument("--variants", nargs="+", default=names, metavar="NAME", help=f"default: {', '.join(names)}")
+    ask.add_argument("--picture", type=Path, metavar="FILE", help="PNG: time against quality")
     return parser
 
 
@@ -136,6 +168,12 @@ def _positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text!r}")
     return int(text)
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    if not all(part.isdecimal() for part in text.split(",")):
+        raise argparse.ArgumentTypeError(f"must be whole numbers with commas between them, got {text!r}")
+    return tuple(dict.fromkeys(int(part) for part in text.split(",")))
 
 
 def _seconds(text: str) -> float:

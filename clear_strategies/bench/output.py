@@ -32,7 +32,7 @@ class Findings:
     """Everything one question found.
 
     Args:
-        question: "rasterizers", "kernels" or "iteration"; names the markers in the documentation.
+        question: "rasterizers", "kernels", "iteration" or "pareto"; names the markers in the documentation.
         skipped: one line each: what was not measured, and why.
         raw: for the JSON file: settings, and rows with every repeat.
     """
