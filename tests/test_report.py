@@ -446,3 +446,15 @@ def test_the_command_says_in_one_line_what_is_wrong_and_exits_with_2(
     assert report.main([str(tmp_path)]) == 2
     assert len(caplog.records) == 1
     assert capsys.readouterr().out == ""
+
+
+def test_rows_stand_in_the_order_in_which_a_sweep_was_asked_for(tmp_path: Path) -> None:
+    for number, name in ((2, "a_clear"), (10, "b_more"), (0, "z_baseline")):
+        folder = make_run(tmp_path / name, f"+strategy={name[2:]}")
+        files.write_text(folder / ".hydra" / "hydra.yaml", f"hydra:\n  job:\n    num: {number}\n")
+    assert [run.name for run in report.collect([tmp_path])] == ["baseline", "clear", "more"]
+
+
+def test_a_method_takes_the_place_of_the_strategies_before_it(tmp_path: Path) -> None:
+    run = report.Run.read(make_run(tmp_path / "run", "+strategy=clear", "+method=srgs"))
+    assert run.name == "srgs"

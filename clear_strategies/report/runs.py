@@ -20,11 +20,12 @@ SCORES: Final = ("psnr", "ssim", "gmsd", "blur")
 BASELINES: Final = ("bicubic", "prior")
 
 _SEED: Final = "fit.seed="
-# What names a run, in the order of the name; the rest of the overrides are its settings.
-_NAMES: Final = ("method", "strategy")
+# What names a run; the rest of the overrides are its settings.
+_METHOD, _STRATEGY = "method=", "strategy="
 # Overrides that change no result, and paths: what a scene is, its name says.
 _NEUTRAL: Final = (
     "hydra", "fit.resume=", "fit.threads=", "fit.keep=", "fit.checkpoint_every=", "fit.probe_", "fit.map_views=", "scene=",
+    "data.root=",
 )  # fmt: skip
 _PATH: Final = re.compile(r"data\.[\w.]*path=")
 
@@ -96,13 +97,19 @@ class Run:
 
 
 def collect(folders: Iterable[Path]) -> list[Run]:
-    """Every finished run at or below the folders, by path; what is unfinished or damaged is named and left out.
+    """Every finished run at or below the folders, a sweep's in the order in which it was asked for, others by path; what is
+    unfinished or damaged is named and left out.
 
     Raises:
         DataError: there is none.
     """
     folders = list(folders)
-    found = {path.parent.resolve(): None for folder in folders for path in _sorted(folder.rglob("metrics.json"))}
+    found: dict[Path, None] = {}
+    for folder in folders:
+        runs_here = _sorted(path.parent for path in folder.rglob("metrics.json"))
+        sweeps = list(dict.fromkeys(run.parent for run in runs_here))
+        for run in sorted(runs_here, key=lambda run: (sweeps.index(run.parent), _job(run))):
+            found[run.resolve()] = None
     for unfinished in _sorted(path.parent for folder in folders for path in folder.rglob(".hydra")):
         if unfinished.resolve() not in found:
             _log.warning("%s: left out, it has no metrics.json: the run did not finish.", unfinished)
@@ -153,16 +160,17 @@ def _overrides(folder: Path) -> tuple[str, ...]:
 
 def _is_setting(override: str) -> bool:
     key = override.lstrip("+~")
-    return not (key.startswith((*_NEUTRAL, _SEED, *(f"{group}=" for group in _NAMES))) or _PATH.match(key))
+    return not (key.startswith((*_NEUTRAL, _SEED, _METHOD, _STRATEGY)) or _PATH.match(key))
 
 
 def _name(overrides: Sequence[str], strategies: Sequence[str]) -> str:
-    asked = [
-        override.partition("=")[2].strip("[]").replace(",", " + ")
-        for group in _NAMES
-        for override in overrides
-        if override.lstrip("+").startswith(f"{group}=")
-    ]
+    asked: list[str] = []
+    for override in overrides:
+        key, value = override.lstrip("+"), override.partition("=")[2].strip("[]").replace(",", " + ")
+        if key.startswith(_METHOD):  # takes the place of what was named before it
+            asked = [value]
+        elif key.startswith(_STRATEGY):
+            asked.append(value)
     return " + ".join(asked or strategies) or "baseline"
 
 
@@ -174,6 +182,16 @@ def _sorted(paths: Iterable[Path]) -> list[Path]:
         return [(1, int(word), "") if word.isdecimal() else (0, 0, word) for word in words]
 
     return sorted(set(paths), key=key)
+
+
+def _job(folder: Path) -> int:
+    """Its number in the sweep that it was a job of; 0 where it was of none, which leaves its place to its name."""
+    try:
+        content = (folder / ".hydra" / "hydra.yaml").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return 0
+    number = re.search(r"^    num: (\d+)$", content, re.MULTILINE)
+    return int(number[1]) if number else 0
 
 
 def _number(value: Any) -> float:
