@@ -64,6 +64,8 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, *, rasterizer: str
         skipped.append(f"HR scale until iteration {hr.start} (lambda_HR = 0)")
     if state.mip.variance == 0:
         skipped.append("3D filter (variance 0)")
+    if any(getattr(s, "anchor_strength", None) == 0 for s in conductor.strategies):
+        skipped.append("anchor (anchor_strength = 0)")
     skipped += state.economy.skips.says()
     lines["skipped"] = "; ".join(skipped) or "nothing"
     width = max(map(len, lines))
@@ -79,7 +81,7 @@ def marks(state: TrainState) -> dict[str, int]:
     if 0 < density.reset_every < density.stop:
         at["opacity reset"] = density.reset_every
     for s in state.conductor.strategies:
-        if hasattr(s, "anchor_start"):
+        if getattr(s, "anchor_strength", 0.0) > 0:
             at["anchor"] = s.anchor_start
     return at
 
