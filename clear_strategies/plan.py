@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from clear_strategies.data.view import Scene
 from clear_strategies.fit import Progress, TrainState
 from clear_strategies.schedules import milestones
+from clear_strategies.svs import SVS
 
 _log = logging.getLogger(__name__)
 
@@ -64,7 +65,7 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, *, rasterizer: str
         skipped.append(f"HR scale until iteration {hr.start} (lambda_HR = 0)")
     if state.mip.variance == 0:
         skipped.append("3D filter (variance 0)")
-    if any(getattr(s, "anchor_strength", None) == 0 for s in conductor.strategies):
+    if any(isinstance(s, SVS) and s.anchor_strength == 0 for s in conductor.strategies):
         skipped.append("anchor (anchor_strength = 0)")
     skipped += state.economy.skips.says()
     lines["skipped"] = "; ".join(skipped) or "nothing"
@@ -81,7 +82,7 @@ def marks(state: TrainState) -> dict[str, int]:
     if 0 < density.reset_every < density.stop:
         at["opacity reset"] = density.reset_every
     for s in state.conductor.strategies:
-        if getattr(s, "anchor_strength", 0.0) > 0:
+        if isinstance(s, SVS) and s.anchor_strength > 0:
             at["anchor"] = s.anchor_start
     return at
 
