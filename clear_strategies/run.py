@@ -165,6 +165,8 @@ def _run(config: DictConfig, folder: Path) -> float | None:
     from clear_strategies.fit import FitSettings, TrainState, fit
     from clear_strategies.schedules import scaled
 
+    if missing := [f"data.{key}" for key in config.data if OmegaConf.is_missing(config.data, key)]:
+        raise DataError("config", missing[0], "is needed by this data set and missing", f"add {missing[0]}=…")
     compared = _comparable(config)
     if config.fit.resume == _AUTO and (finished := _finished(folder, compared)) is not None:
         return finished[0]
@@ -233,8 +235,6 @@ def _scene(config: DictConfig, seed: int) -> Any:
     from clear_strategies.data.scene import prepare
     from clear_strategies.data.upscale import Bicubic, Prior, cached
 
-    if OmegaConf.is_missing(config.data, "path"):
-        raise DataError("config", "data.path", "is needed by this data set and missing", "add data.path=FOLDER")
     capture = _instantiate(config.data.reader, "data.reader")
     views = _instantiate(config.data.views, "data.views")
     cloud = _instantiate(config.data.cloud, "data.cloud")

@@ -21,7 +21,8 @@ from tests.data.malformed import CASES
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = ["data.reader.width=64", "data.reader.height=48", "fit.iterations=12", "fit.max_degree=1", "data.cloud.init=random",
-        "data.cloud.random_points=60", "data.reader.views=5", "data.reader.train=2", "data.views.train=2"]  # fmt: skip
+        "data.cloud.random_points=60", "data.reader.views=5", "data.reader.train=2", "data.views.train=2",
+        "skips=none"]  # fmt: skip
 
 
 def run(
@@ -208,6 +209,7 @@ BAD_SETTINGS = {
     "fit.iterations=0": "iterations must be at least 1",
     "data.views.train=99": "99 training views are asked for",
     "data=llff": "data.path",
+    "+scene=fern data=llff": "data.root",
     "prior=onnx": "prior.path",
     "prior=onnx prior.path=nowhere.onnx": "nowhere.onnx",
     "prior=images prior.path=nowhere": "nowhere",
