@@ -1,7 +1,10 @@
-"""The ablation and two requeues on a real Slurm, where one is installed; a few minutes."""
+"""The ablation and two requeues on a real Slurm. It starts daemons and takes minutes, so it has to be asked for:
+CLEAR_TEST_SLURM=1 python -m pytest tests/slurm
+"""
 
 from __future__ import annotations
 
+import os
 from importlib.util import find_spec
 
 import pytest
@@ -10,6 +13,7 @@ from tests.slurm import ablation_and_requeue, one_machine
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(not os.environ.get("CLEAR_TEST_SLURM"), reason="not asked for: CLEAR_TEST_SLURM=1")
 @pytest.mark.skipif(
     bool(one_machine.missing()),
     reason=f"Slurm is not installed (Debian: apt install slurm-wlm munge): {', '.join(one_machine.missing())}",
