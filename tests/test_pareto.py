@@ -19,7 +19,7 @@ from tests.test_run import TINY
 
 BY_NAME = {variant.name: variant for variant in VARIANTS}
 REQUEST = pareto.Request((), (0, 1), 100, Path("out"), ("torch",), tuple(BY_NAME))
-SCENE = [override for override in TINY if not override.startswith("fit.iterations")]
+SCENE = [override for override in TINY if not override.startswith(("fit.iterations", "skips"))]
 
 
 def leave(folder: Path, *, psnr: float = 20.0, seed: int = 0, seconds: float = 10.0, look_ms: float = 500.0) -> None:
