@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies import files
+from clear_strategies import files, images
 from clear_strategies.conductor import Conductor
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.view import View
@@ -114,7 +114,7 @@ def _evidence_maps(conductor: Conductor, view: View, down: DownKernel) -> dict[s
     edge, camera = p2g.patch * view.factor, view.hr.camera
 
     def enlarged(patches: Tensor) -> Tensor:
-        return patches.repeat_interleave(edge, 0).repeat_interleave(edge, 1)[: camera.height, : camera.width]
+        return images.upsample(patches[..., None], edge, "nearest")[: camera.height, : camera.width, 0]
 
     return {"reliability": enlarged(R), "demand": enlarged(A), "weight": enlarged(R * A)}
 

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from clear_strategies import images
 from clear_strategies.data.view import PointCloud, View
 from clear_strategies.gradients import ATTRIBUTES, Grads
 from clear_strategies.mip import filter_std
@@ -235,8 +236,8 @@ def filled(
 ) -> Float[Tensor, "H W 3"]:
     """`image` where its tiles were drawn, `reference` elsewhere: no residual there, and no edge in an SSIM window."""
     height, width = image.shape[:2]
-    drawn = tiles.repeat_interleave(tile, 0).repeat_interleave(tile, 1)[:height, :width, None]
-    return torch.where(drawn, image, reference)
+    drawn = images.upsample(tiles[..., None].to(image), tile, "nearest")[:height, :width]
+    return torch.where(drawn > 0, image, reference)
 
 
 def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:

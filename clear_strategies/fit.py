@@ -270,11 +270,12 @@ def fit(
 
     began = time.perf_counter() - (state.history[-1]["seconds"] if state.history else 0.0)
     with _deferred_signals() as pending, cores(state, rasterizer):
-        while not state.ended:
+        ended = state.ended
+        while not ended:
             iterate(state, rasterizer)
-            done = state.t - 1
+            done, ended = state.t - 1, state.ended
             state.history[-1]["seconds"] = time.perf_counter() - began
-            if settings.probe_every and (done % settings.probe_every == 0 or state.ended):
+            if settings.probe_every and (done % settings.probe_every == 0 or ended):
                 with state.conductor.ledger.stage("probe test views"):
                     psnr = _probe(state, scene, rasterizer)
                 if psnr is not None:
@@ -283,7 +284,7 @@ def fit(
                 progress(state)
             if pending:
                 raise Interrupted(_foremost(pending), save(), state.t)
-            if settings.checkpoint_every and done % settings.checkpoint_every == 0 and not state.ended:
+            if settings.checkpoint_every and done % settings.checkpoint_every == 0 and not ended:
                 _require_finite(state)
                 save()
     if left := settings.iterations + 1 - state.t:

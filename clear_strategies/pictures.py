@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -43,6 +43,8 @@ _GROUP_COLORS: Final = {
 }  # fmt: skip
 RUN_COLORS: Final = (_BLUE, _RED, _GREEN, _YELLOW, _CYAN, _PURPLE)
 _RUN_STYLES: Final = ("-", "--", ":")
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,6 +93,11 @@ def contact_sheet(path: Path, rows: Sequence[SheetRow], title: str) -> None:
     if error is not None:
         page.scale(right, top, cell_h, error, "mean |difference| over RGB")
     page.save(path)
+
+
+def evenly(items: Sequence[Item], count: int) -> Sequence[Item]:
+    """At most so many, spread over all of them: a few views that stand for many."""
+    return items[:: max(1, math.ceil(len(items) / count))] if count else ()
 
 
 def error_map(image: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:

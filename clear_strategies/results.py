@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 from clear_strategies import diagnosis, files, images, metrics, pictures
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.data.view import Scene, View
+from clear_strategies.data.view import Scene
 from clear_strategies.export import export_ply
 from clear_strategies.fit import TrainState
 from clear_strategies.images import DownKernel
@@ -47,13 +47,13 @@ def leave(
     with ledger.stage("evaluate"):
         evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera), down=down)
     with ledger.stage("maps"):
-        mapped = _spread(scene.train, map_views)
+        mapped = pictures.evenly(scene.train, map_views)
         if mapped:
             diagnosis.leave(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
     export_ply(folder / "point_cloud.ply", field)
     for name, image in evaluation.renders.items():
         write_png(folder / "renders" / f"{Path(name).stem}.png", image)
-    for view in _spread(scene.test, _SHEET_VIEWS):
+    for view in pictures.evenly(scene.test, _SHEET_VIEWS):
         for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:
                 write_png(folder / "views" / f"{Path(view.name).stem}_{kind}.png", shown)
@@ -101,7 +101,7 @@ def leave(
 
 def _sheet(scene: Scene, evaluation: Evaluation) -> list[pictures.SheetRow]:
     rows = []
-    for view in _spread(scene.test, _SHEET_VIEWS):
+    for view in pictures.evenly(scene.test, _SHEET_VIEWS):
         scores = evaluation.test[view.name]["ours"]
         shown = {
             "LR, enlarged": images.upsample(view.lr.image, view.factor, "nearest"),
@@ -110,11 +110,6 @@ def _sheet(scene: Scene, evaluation: Evaluation) -> list[pictures.SheetRow]:
         }
         rows.append(pictures.SheetRow(view.name, shown, view.truth, f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}"))
     return rows
-
-
-def _spread(views: Sequence[View], count: int) -> Sequence[View]:
-    """At most so many of the views, evenly."""
-    return views[:: max(1, math.ceil(len(views) / count))] if count else ()
 
 
 def _mean_conflict(rows: list[dict[str, float]]) -> dict[str, float]:

@@ -320,8 +320,7 @@ def _resume_newest(state: Any, folder: Path, config: Mapping[str, Any]) -> None:
         except DataError as error:
             _log.warning("%s; trying an earlier one.", error)
             continue
-        _require_same(source, saved.config, config)
-        _restore(state, saved, source)
+        _restore(state, saved, source, config)
         return
     if found:
         _log.warning("%s: no checkpoint is whole; starting anew.", folder)
@@ -330,12 +329,11 @@ def _resume_newest(state: Any, folder: Path, config: Mapping[str, Any]) -> None:
 def _resume(state: Any, source: Path, config: Mapping[str, Any]) -> None:
     from clear_strategies import checkpoint
 
-    saved = checkpoint.load(source)
+    _restore(state, checkpoint.load(source), source, config)
+
+
+def _restore(state: Any, saved: Any, source: Path, config: Mapping[str, Any]) -> None:
     _require_same(source, saved.config, config)
-    _restore(state, saved, source)
-
-
-def _restore(state: Any, saved: Any, source: Path) -> None:
     state.restore(saved, source)
     _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
 

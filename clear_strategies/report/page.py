@@ -22,6 +22,7 @@ from clear_strategies.data.photo_files import image_size, jpeg, read_image
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.diagnosis import MAPS
 from clear_strategies.errors import DataError
+from clear_strategies.pictures import evenly
 from clear_strategies.report import charts
 from clear_strategies.report.runs import Run, skips
 from clear_strategies.report.table import Columns
@@ -103,7 +104,7 @@ def _said(scenes: Sequence[Mapping[str, Any]], *, lossy: bool, views: int) -> st
 def _scene(section: Section, pictures: Pictures, views: int) -> dict[str, Any]:
     """What page.js needs to know about a scene."""
     offered = _test_views(section)
-    chosen = _spread(offered, min(views, _VIEWS))
+    chosen = evenly(offered, min(views, _VIEWS))
     shown = [view for name in chosen if (view := _view(section, name, pictures)) is not None]
     return {"name": section.title, "offered": len(offered), "views": shown, "maps": _maps(section, pictures, views)}
 
@@ -150,7 +151,7 @@ def _maps(section: Section, pictures: Pictures, views: int) -> list[dict[str, An
         folder = run.folder / "maps"
         try:
             of_views = read_object(folder / "maps.json")["views"] if folder.is_dir() else {}
-            for name in _spread(list(of_views), views):
+            for name in evenly(list(of_views), views):
                 own = folder / Path(name).stem
                 width, height = image_size(own / "prior.png")
                 view = found.setdefault(
@@ -267,10 +268,6 @@ def _saved(text: str) -> str:
 def _inline(note: str) -> str:
     """A note's Markdown: code, and nothing else."""
     return re.sub(r"`([^`]*)`", r"<code>\1</code>", html.escape(note))
-
-
-def _spread(names: Sequence[str], count: int) -> list[str]:
-    return list(names[:: max(1, -(-len(names) // count))])
 
 
 def _magma() -> list[str]:
