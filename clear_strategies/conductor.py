@@ -49,6 +49,27 @@ class Update:
     readings: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Heard:
+    """What the HR scale said of one view: its gradients, the evidence, and how much of g_HF each Gaussian gets.
+
+    `Heard()` is silence: HR was not drawn.
+
+    Args:
+        base, hf: ∇L_base and ∇L_HF, each with `.screen` in 1/pixel of an image of `size` (width, height); hf None where
+            λ_HF = 0. lr: ∇(λ_LR L_LR), where Î_LR is made of Î_HR.
+        m: what `route` answered.
+    """
+
+    base: Any | None = None
+    hf: Any | None = None
+    lr: Any | None = None
+    size: tuple[int, int] = (1, 1)
+    evidence: Evidence | None = None
+    m: float | Float[Tensor, " N"] = 1.0
+    losses: Mapping[str, float] = field(default_factory=dict)
+
+
 @runtime_checkable
 class Merger(Protocol):
     """Who pulls a view's gradients and merges them. The conductor itself does, readably; a kernel may do the same."""
@@ -161,7 +182,7 @@ class Conductor:
         Raises:
             ValueError: a scale that the objective needs was not rendered.
         """
-        o, λ, stage = self.objective, self.objective.lambda_hr(t), self.ledger.stage
+        o, stage = self.objective, self.ledger.stage
         how: Merger = self if merger is None else merger
         reduced = not self.wants_lr
         through = hr if reduced else lr
@@ -177,32 +198,57 @@ class Conductor:
             with stage("backward LR"):
                 (g_lr,) = how.pull(through, l_lr.cotangents)
         if hr is None:
+            heard = Heard()
             self.ledger.skip("backward HR", "HR was not drawn")
-            with stage(how.stage):
-                screens = self._screens(λ, g_lr, through, None, None, None)
-                g, _ = how.merge(params, g_lr, None, None, 1.0, None, t)
-            return Update(g, screens.ordinary, screens.ordinary, None, {}, l_lr.values, self._readings())
-
-        with stage("losses HR"):
-            l_hr = o.hr(hr.image.detach(), view.hr.image)  # Eq. 5
-        with stage("backward HR"):  # one pass for all cotangents
-            if reduced:
-                spread = images.area_mean_transposed(l_lr.cotangents, view.factor)
-                g_lr, g_base, *rest = how.pull(hr, torch.cat((spread, l_hr.cotangents)))
-            else:
-                g_base, *rest = how.pull(hr, l_hr.cotangents)
-        g_hf = rest[0] if rest else None
-
+        else:
+            spread = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
+            heard = self.hear(hr, view, how, spread)
+        if reduced:
+            g_lr = heard.lr
         with stage(how.stage):
-            screens = self._screens(λ, g_lr, through, g_base, g_hf, hr)
+            score, ordinary = self.scores(to_ndc(_screen(g_lr), _size(through.image)), heard, t)  # S^dens    Eq. 14
+            g, conflict = how.merge(params, g_lr, heard.base, heard.hf, heard.m, heard.evidence, t)
+        return Update(g, score, ordinary, heard.evidence, conflict, {**l_lr.values, **heard.losses}, self.readings())
+
+    def hear(
+        self, hr: Shot, view: View, how: Merger | None = None, spread: Float[Tensor, "1 H W 3"] | None = None
+    ) -> Heard:
+        """Compare Î_HR with its reference, pull the gradients in one pass, and ask what they are worth.
+
+        Args:
+            spread: a cotangent of Î_HR more, that of L_LR where Î_LR is made of Î_HR.
+        """
+        puller, stage = self if how is None else how, self.ledger.stage
+        with stage("losses HR"):
+            losses = self.objective.hr(hr.image.detach(), view.hr.image)  # Eq. 5
+        with stage("backward HR"):  # one pass for all cotangents
+            cotangents = losses.cotangents if spread is None else torch.cat((spread, losses.cotangents))
+            pulled = list(puller.pull(hr, cotangents))
+        lr = pulled.pop(0) if spread is not None else None
+        base, hf = pulled if len(pulled) > 1 else (pulled[0], None)
+        with stage("evidence"):
             e = self._ask("observe", None, view, hr)  # q, a, w        Eq. 9, 10
-            m = 1.0 if g_hf is None else self._ask("route", 1.0, e)  # m              Eq. 12
-            g, conflict = how.merge(params, g_lr, g_base, g_hf, m, e, t)
-            score = self._ask("score", None, e, screens)  # S^dens         Eq. 14
-        return Update(
-            g, screens.ordinary if score is None else score, screens.ordinary, e, conflict,
-            {**l_lr.values, **l_hr.values}, self._readings(),
-        )  # fmt: skip
+            m = 1.0 if hf is None else self._ask("route", 1.0, e)  # m              Eq. 12
+        return Heard(base, hf, lr, _size(hr.image), e, m, losses.values)
+
+    def scores(
+        self, screen_lr: Float[Tensor, "N 2"], heard: Heard, t: int
+    ) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
+        """Where to densify: as the strategies say, and ‖∇_u L‖, as it would be without them.
+
+        Args:
+            screen_lr: ∇_u(λ_LR L_LR) in NDC units.
+        """
+        λ, total, base, hf = self.objective.lambda_hr(t), screen_lr, None, None
+        if heard.base is not None:
+            base = to_ndc(_screen(heard.base), heard.size)
+            total = total + λ * base
+        if heard.hf is not None:
+            hf = to_ndc(_screen(heard.hf), heard.size)
+            total = total + λ * self.objective.lambda_hf * hf
+        screens = Screens(screen_lr, base, hf, torch.linalg.vector_norm(total, dim=-1))
+        score = None if base is None else self._ask("score", None, heard.evidence, screens)
+        return screens.ordinary if score is None else score, screens.ordinary
 
     def pull(self, shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         return shot.pull(cotangents)
@@ -291,18 +337,8 @@ class Conductor:
                 total = total + g
         return total
 
-    def _screens(self, λ: float, g_lr: Any, lr: Shot, g_base: Any | None, g_hf: Any | None, hr: Shot | None) -> Screens:
-        screen_lr = to_ndc(_screen(g_lr), lr.image)
-        base = to_ndc(_screen(g_base), hr.image) if g_base is not None and hr is not None else None
-        hf = to_ndc(_screen(g_hf), hr.image) if g_hf is not None and hr is not None else None
-        total = screen_lr
-        if base is not None:
-            total = total + λ * base
-        if hf is not None:
-            total = total + λ * self.objective.lambda_hf * hf
-        return Screens(screen_lr, base, hf, torch.linalg.vector_norm(total, dim=-1))
-
-    def _readings(self) -> dict[str, float]:
+    def readings(self) -> dict[str, float]:
+        """The strategies' own numbers of the last iteration."""
         return {name: value for s in self.strategies for name, value in s.readings.items()}
 
 
@@ -315,3 +351,7 @@ def _screen(g: Any) -> Tensor:
     if screen is None:
         raise ValueError("a Shot's pull() must set .screen on every Grads it returns.")
     return screen
+
+
+def _size(image: Float[Tensor, "H W 3"]) -> tuple[int, int]:
+    return image.shape[1], image.shape[0]

@@ -104,7 +104,7 @@ def _share_below_zero(dot: Tensor, l2: Tensor, h2: Tensor) -> float:
     return int(((dot < 0) & comparable).sum()) / count if count else float("nan")
 
 
-def to_ndc(screen: Float[Tensor, "N 2"], image: Float[Tensor, "H W 3"]) -> Float[Tensor, "N 2"]:
-    """∇_u in NDC from ∇_u in pixels of `image`."""
-    height, width = image.shape[:2]
+def to_ndc(screen: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor, "N 2"]:
+    """∇_u in NDC from ∇_u in pixels of an image of `size` (width, height)."""
+    width, height = size
     return screen * screen.new_tensor((width / 2, height / 2))
