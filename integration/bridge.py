@@ -1,13 +1,12 @@
-"""Two small pieces that turn any autograd-based renderer into a host.
+"""The loop that can be edited: a host's rendering as a `Shot`, and a scalar whose gradient is the merged gradient.
 
-`AutogradShot` pulls gradients through the host's own graph; `joint_loss` is a scalar whose value is the honest loss and
-whose `backward()` hands every parameter its merged gradient, so that the host keeps its optimizer, its gradient scaler
-and its accumulation.
+Three added lines, see README.md. The host keeps `loss.backward()` and everything after it: its optimizer, its gradient
+scaler, its accumulation, its densifier. A loop that must stay as it is: `attach.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from clear_strategies.conductor import Conductor, Update
 from clear_strategies.gradients import Grads, Shot
+from integration.densify import Scale, Screen, magnitude
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,44 +24,66 @@ class AutogradShot:
     """A rendering made by a host.
 
     Args:
-        image: in the graph of `params` and of `means2d`.
-        means2d: projected centres, pixels; a tensor that `image` was computed from.
+        image: in the graph of `params` and of the tensor that holds ∇_u.
+        means2d: projected centres, pixels.
         params: raw parameters by gsplat's names; one that the image does not depend on has gradient 0.
+        screen: where the host keeps ∇_u; None: `means2d` itself is in the graph.
     """
 
     image: Float[Tensor, "H W 3"]
     means2d: Float[Tensor, "N 2"]
     visible: Bool[Tensor, " N"]
     params: Mapping[str, Tensor]
+    screen: Screen | None = None
+
+    @property
+    def kept(self) -> Screen:
+        """Where ∇_u is kept."""
+        return self.screen or Screen(self.means2d, (self.image.shape[1], self.image.shape[0]))
 
     def pull(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         """One pass through the host's graph for each cotangent; the graph is kept."""
-        inputs = [*self.params.values(), self.means2d]
+        inputs = [*self.params.values(), self.kept.tensor]
         pulled = []
         for cotangent in cotangents:
-            gradients = torch.autograd.grad(
+            *gradients, screen = torch.autograd.grad(
                 self.image, inputs, cotangent, retain_graph=True, allow_unused=True, materialize_grads=True
             )
-            pulled.append(Grads(dict(zip(self.params, gradients, strict=False)), screen=gradients[-1]))
+            values = dict(zip(self.params, gradients, strict=True))
+            pulled.append(Grads(values, screen=self.kept.gradient(screen, len(self.visible))))
         return pulled
 
 
 def joint_loss(
-    conductor: Conductor, params: Mapping[str, Tensor], lr: Shot, hr: Shot | None, view: Any, t: int
+    conductor: Conductor,
+    params: Mapping[str, Tensor],
+    lr: Shot,
+    hr: Shot | None,
+    view: Any,
+    t: int,
+    scale: Scale | None = None,
 ) -> Float[Tensor, ""]:
     """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF) by value; its gradient is the conductor's merged one.
 
     Args:
         params: the leaves that the host optimizes, by gsplat's names (and "detail", if it has one).
         lr, hr: this view rendered at both scales, e.g. as `AutogradShot`. view: see `clear_strategies.data.view.View`.
+        scale: given the host's densification threshold, `backward()` also leaves the score where the host's densifier
+            reads ∇_u of the LR rendering.
     """
-    return joint_update(conductor, params, lr, hr, view, t)[0]
+    return joint_update(conductor, params, lr, hr, view, t, scale)[0]
 
 
 def joint_update(
-    conductor: Conductor, params: Mapping[str, Tensor], lr: Shot, hr: Shot | None, view: Any, t: int
+    conductor: Conductor,
+    params: Mapping[str, Tensor],
+    lr: Shot,
+    hr: Shot | None,
+    view: Any,
+    t: int,
+    scale: Scale | None = None,
 ) -> tuple[Float[Tensor, ""], Update]:
-    """`joint_loss`, with the `Update` behind it: scores for the host's densifier, conflict ratios for its log."""
+    """`joint_loss`, with the `Update` behind it: scores for a densifier of one's own, conflict ratios for the log."""
     values = {name: p.detach() for name, p in params.items()}
     update = conductor.update(values, lr, hr, view, t)
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
@@ -71,7 +93,12 @@ def joint_update(
     )
     touched = {name: p for name, p in params.items() if name in update.grads}
     gradients = [update.grads[name].to(p) for name, p in touched.items()]
-    loss: Tensor = _GivenGradients.apply(value, gradients, *touched.values())  # type: ignore[no-untyped-call]
+
+    def densify(times: float) -> None:
+        if scale is not None and isinstance(lr, AutogradShot):
+            lr.kept.hand_over(times * magnitude(update.score, update.ordinary, lr.visible, scale))
+
+    loss: Tensor = _GivenGradients.apply(value, gradients, densify, *touched.values())  # type: ignore[no-untyped-call]
     return loss, update
 
 
@@ -79,10 +106,13 @@ class _GivenGradients(torch.autograd.Function):
     """A scalar with gradients that were computed elsewhere; scaling the loss scales them."""
 
     @staticmethod
-    def forward(ctx: Any, value: float, gradients: list[Tensor], *params: Tensor) -> Tensor:
-        ctx.gradients = gradients
+    def forward(
+        ctx: Any, value: float, gradients: list[Tensor], densify: Callable[[float], None], *params: Tensor
+    ) -> Tensor:
+        ctx.gradients, ctx.densify = gradients, densify
         return params[0].new_tensor(value)
 
     @staticmethod
-    def backward(ctx: Any, *scale: Tensor) -> Any:
-        return None, None, *(g * scale[0] for g in ctx.gradients)
+    def backward(ctx: Any, *times: Tensor) -> Any:
+        ctx.densify(float(times[0]))
+        return None, None, None, *(g * times[0] for g in ctx.gradients)

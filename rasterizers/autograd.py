@@ -1,0 +1,135 @@
+"""Rasterizers as torch functions: for trainers that speak autograd, and for gsplat's, whose own kernels need CUDA.
+
+`draw` is a rendering in the graph of its splats; `rasterization` is that behind gsplat's signature, so that a loop
+written for gsplat runs on a CPU. One cotangent a backward pass: whoever wants several at once calls `Rendering.vjp`.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+import rasterizers
+from rasterizers.geometry import SH_C0
+from rasterizers.interface import Camera, Rasterizer, Splats
+
+
+class Drawn(NamedTuple):
+    """A picture in the graph of its splats.
+
+    Args:
+        means2d: projected centres, pixels. Beside the way that gradients take: after `backward()` its `.grad` is ∇_u in
+            1/pixel, and nothing flows on from it (the positions' gradient is whole without it).
+    """
+
+    image: Float[Tensor, "H W 3"]
+    alpha: Float[Tensor, "H W"]
+    means2d: Float[Tensor, "N 2"]
+    visible: Bool[Tensor, " N"]
+
+
+def draw(rasterizer: Rasterizer, splats: Splats, camera: Camera, means2d: Tensor | None = None) -> Drawn:
+    """Draw the splats; the gradient of the image, not that of alpha, reaches their tensors.
+
+    Args:
+        means2d: where to put the projected centres and to collect their gradient; None makes a leaf for it.
+    """
+    if means2d is None:
+        means2d = splats.means.new_zeros(len(splats), 2).requires_grad_()
+    tensors = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN)
+    image, alpha, visible = _Draw.apply(rasterizer, camera, means2d, splats.rgb_offset, *tensors)  # type: ignore[no-untyped-call]
+    return Drawn(image, alpha, means2d, visible)
+
+
+class _Draw(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, rasterizer: Rasterizer, camera: Camera, means2d: Tensor, offset: Tensor | None, *tensors: Tensor
+    ) -> Any:
+        means, quats, scales, opacities, sh0, shN = (x.detach() for x in tensors)
+        ctx.offset = offset is not None
+        offset = None if offset is None else offset.detach()
+        ctx.rendering = rasterizer(Splats(means, quats, scales, opacities, sh0, shN, offset), camera)
+        means2d.data.copy_(ctx.rendering.means2d)
+        ctx.mark_non_differentiable(ctx.rendering.alpha, ctx.rendering.visible)
+        return ctx.rendering.image, ctx.rendering.alpha, ctx.rendering.visible
+
+    @staticmethod
+    def backward(ctx: Any, *cotangents: Tensor) -> Any:
+        g = ctx.rendering.vjp(cotangents[0][None])
+        pulled = (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN)
+        return None, None, g.screen[0], g.rgb[0] if ctx.offset else None, *(x[0] for x in pulled)
+
+
+def rasterization(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, " N"],
+    colors: Float[Tensor, "N ..."],
+    viewmats: Float[Tensor, "C 4 4"],
+    Ks: Float[Tensor, "C 3 3"],
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = False,
+    backgrounds: Float[Tensor, "C 3"] | None = None,
+    render_mode: str = "RGB",
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    backend: str = "auto",
+    **ignored: Any,
+) -> tuple[Float[Tensor, "C H W 3"], Float[Tensor, "C H W 1"], dict[str, Any]]:
+    """The `rasterization` of gsplat, drawn by ours: pinhole cameras, RGB, on the CPU.
+
+    Args:
+        colors: [N, K, 3] spherical harmonics of which `sh_degree` says how many are active, or [N, 3] RGB where it is None.
+        packed: no effect, `info` is always the unpacked one (a strategy is told `packed=False`). ignored: whatever else
+            gsplat takes (sparse_grad, tile_size, far_plane …), without effect.
+        backend: a name that `rasterizers.load` knows.
+
+    Returns:
+        images, alphas (not differentiable), and what gsplat's strategies read: `means2d` [C, N, 2] (`retain_grad` works,
+        as there), `radii` [C, N, 2] (1 for the visible, 0 for the others), `width`, `height`, `n_cameras`, `gaussian_ids`.
+
+    Raises:
+        ValueError: a mode that only gsplat has.
+    """
+    if render_mode != "RGB" or rasterize_mode not in ("classic", "antialiased") or absgrad:
+        raise ValueError(
+            "this stand-in for gsplat's rasterization draws render_mode='RGB', rasterize_mode='classic' or 'antialiased', "
+            f"absgrad=False; got {render_mode!r}, {rasterize_mode!r}, {absgrad}. gsplat's own needs CUDA."
+        )
+    n = len(means)
+    if sh_degree is None:
+        base, bands = (colors[:, None] - 0.5) / SH_C0, colors.new_zeros(n, 0, 3)
+    else:
+        base, bands = colors[:, :1], colors[:, 1 : (sh_degree + 1) ** 2]
+    splats = Splats(means, quats, scales, opacities, base, bands)
+    means2d = means.new_zeros(len(viewmats), n, 2).requires_grad_()
+    shots = []
+    for i, (pose, K) in enumerate(zip(viewmats, Ks, strict=True)):
+        background = tuple(backgrounds[i].tolist()) if backgrounds is not None else (0.0, 0.0, 0.0)
+        antialiased = rasterize_mode == "antialiased"
+        rasterizer = _loaded(backend, near_plane, eps2d, antialiased, background)
+        (fx, _, cx), (_, fy, cy), _ = K.tolist()
+        shots.append(draw(rasterizer, splats, Camera(pose.detach(), fx, fy, cx, cy, width, height), means2d[i]))
+    visible = torch.stack([shot.visible for shot in shots])
+    info = {
+        "means2d": means2d, "radii": visible[..., None].expand(-1, -1, 2).int(), "gaussian_ids": None,
+        "width": width, "height": height, "n_cameras": len(shots),
+    }  # fmt: skip
+    return torch.stack([s.image for s in shots]), torch.stack([s.alpha for s in shots])[..., None], info
+
+
+@lru_cache(maxsize=8)
+def _loaded(
+    name: str, near: float, kernel: float, antialiased: bool, background: tuple[float, float, float]
+) -> Rasterizer:
+    return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased, background=background)

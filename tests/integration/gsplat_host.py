@@ -1,0 +1,78 @@
+"""A gsplat-style trainer, as its documentation has it, on a CPU: gsplat's strategies and our rasterizer. Knows no CLEAR."""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+
+from clear_strategies import kernels
+from clear_strategies.field import GaussianField
+from clear_strategies.optim import LearningRates
+from rasterizers import autograd
+
+
+class Photometric(torch.autograd.Function):
+    """0.8 L1 + 0.2 (1 - SSIM), the host's own loss."""
+
+    @staticmethod
+    def forward(ctx, image, target):
+        loss = kernels.photometric(image.detach().contiguous(), target, 0.2, kernels="torch")
+        ctx.gradient = loss.gradient
+        return image.new_tensor(float(loss.value))
+
+    @staticmethod
+    def backward(ctx, scale):
+        return ctx.gradient * scale, None
+
+
+rasterization = functools.partial(autograd.rasterization, backend="torch")
+
+
+def intrinsics(camera):
+    return torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])[None]
+
+
+class Host:
+    """`photos`: what the host itself would load: name -> (camera, image) at LR."""
+
+    def __init__(self, scene, extent=1.0, strategy=None, fused=False, scaler=None, accumulation=1, eps=1e-15):
+        self.photos = {v.name: v.lr for v in scene.train}
+        raw = GaussianField.from_cloud(scene.cloud).raw()
+        self.splats = {k: torch.nn.Parameter(p.clone()) for k, p in raw.items() if k != "detail"}
+        rates = LearningRates().at(0, extent)
+        self.optimizers = {k: torch.optim.Adam([p], lr=rates[k], eps=eps, fused=fused) for k, p in self.splats.items()}
+        self.strategy, self.state = strategy, None
+        if strategy is not None:
+            strategy.check_sanity(self.splats, self.optimizers)
+            self.state = strategy.initialize_state(scene_scale=extent)
+        self.scaler, self.accumulation = scaler, accumulation
+        self.grads = {}
+
+    def render(self, camera, step):
+        p = self.splats
+        return rasterization(
+            p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), torch.cat([p["sh0"], p["shN"]], 1),
+            camera.world_to_camera[None], intrinsics(camera), camera.width, camera.height,
+            sh_degree=min(3, step), packed=False,
+        )  # fmt: skip
+
+    def train(self, names, between=lambda: None):
+        """The loop of gsplat's simple_trainer: backward, step, densify."""
+        for step, name in enumerate(names):
+            camera, target = self.photos[name].camera, self.photos[name].image
+            renders, _, info = self.render(camera, step)
+            if self.strategy is not None:
+                self.strategy.step_pre_backward(self.splats, self.optimizers, self.state, step, info)
+            loss = Photometric.apply(renders[0], target) / self.accumulation
+            (self.scaler.scale(loss) if self.scaler else loss).backward()
+            if (step + 1) % self.accumulation == 0:
+                self.grads = {k: p.grad.clone() for k, p in self.splats.items() if p.grad is not None}
+                for optimizer in self.optimizers.values():
+                    self.scaler.step(optimizer) if self.scaler else optimizer.step()
+                    optimizer.zero_grad(set_to_none=True)
+                if self.scaler:
+                    self.scaler.update()
+            if self.strategy is not None:
+                self.strategy.step_post_backward(self.splats, self.optimizers, self.state, step, info, packed=False)
+            between()
