@@ -1,4 +1,4 @@
-"""`python -m clear_strategies.run +strategy=clear`: the door to a whole run, and the only one that knows Hydra.
+"""`python -m clear_strategies.run +strategy=clear`: the door to a whole run.
 
 Composes the configuration, prints the plan, trains, and leaves in Hydra's run folder: history.csv, conflict.csv,
 timing.csv, renders/, views/, maps/, contact_sheet.png, curves.png, point_cloud.ply, checkpoints/ and, last, so that its
@@ -26,15 +26,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies import sweep
+from clear_strategies.compose import CONF, conducted, instantiate, one_line, plain
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.lock import HeldError, hold
 from clear_strategies.sweep import Sweep
 
 _log = logging.getLogger(__name__)
-
-_PACKAGE: Final = Path(__file__).resolve().parent
-# In a wheel conf/ lies inside the package, in a checkout beside it.
-CONF: Final = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
 
 # What may differ between a run and the one it resumes.
 _NOT_COMPARED: Final = {
@@ -84,7 +81,7 @@ def main(config: DictConfig) -> float | None:
     except (ClearError, BackendUnavailable, OmegaConfBaseException, InstantiationException, ValueError) as error:
         if isinstance(error, ValueError) and not isinstance(error, ClearError) and not _is_ours(error):
             raise
-        message = _one_line(error)
+        message = one_line(error)
         if ours is None:
             _log.error("%s", message)
             sys.exit(2)
@@ -160,7 +157,6 @@ def _run(config: DictConfig, folder: Path) -> float | None:
     import torch
 
     from clear_strategies import plan, results
-    from clear_strategies.conductor import Conductor
     from clear_strategies.data.scene import save_lr
     from clear_strategies.fit import FitSettings, TrainState, fit
     from clear_strategies.schedules import scaled
@@ -177,16 +173,12 @@ def _run(config: DictConfig, folder: Path) -> float | None:
             "config", "fit.map_views", f"must be at least 0, got {config.fit.map_views}", "0 leaves no maps"
         )
     known = FitSettings.__dataclass_fields__
-    settings = FitSettings(**{k: v for k, v in _plain(config.fit).items() if k in known})
-    strategies = [scaled(s, settings.stretch) for s in _instantiate_strategies(config)]
-    objective = scaled(_instantiate(config.objective, "objective"), settings.stretch)
-    density = scaled(_instantiate(config.density, "density"), settings.stretch)
-    rates = scaled(_instantiate(config.optim, "optim"), settings.stretch)
+    settings = FitSettings(**{k: v for k, v in plain(config.fit).items() if k in known})
+    density = scaled(instantiate(config.density, "density"), settings.stretch)
+    rates = scaled(instantiate(config.optim, "optim"), settings.stretch)
     mip = scaled(_mip(config), settings.stretch)
-    skips = scaled(_instantiate(config.skips, "skips"), settings.stretch)
-    conductor = Conductor(
-        *strategies, objective=objective, statistics_from=round(config.statistics_from * settings.stretch)
-    )
+    skips = scaled(instantiate(config.skips, "skips"), settings.stretch)
+    conductor = conducted(config, settings.stretch)
     scene = _scene(config, settings.seed)
     if config.data.save_lr is not None:
         save_lr(scene, Path(config.data.save_lr))
@@ -235,9 +227,9 @@ def _scene(config: DictConfig, seed: int) -> Any:
     from clear_strategies.data.scene import prepare
     from clear_strategies.data.upscale import Bicubic, Prior, cached
 
-    capture = _instantiate(config.data.reader, "data.reader")
-    views = _instantiate(config.data.views, "data.views")
-    cloud = _instantiate(config.data.cloud, "data.cloud")
+    capture = instantiate(config.data.reader, "data.reader")
+    views = instantiate(config.data.views, "data.views")
+    cloud = instantiate(config.data.cloud, "data.cloud")
     if config.data.save_lr is not None:
         prior: Prior = Bicubic()  # the images that the real prior reads may not exist yet
     elif config.prior.get("_target_") is None:  # prior=auto
@@ -256,14 +248,14 @@ def _scene(config: DictConfig, seed: int) -> Any:
 
 def _prior(config: Any, capture: Any) -> Any:
     if str(config._target_).endswith("DemoPrior"):
-        return _instantiate(config, "prior", truth={f.name: f.load for f in capture.frames})
-    return _instantiate(config, "prior")
+        return instantiate(config, "prior", truth={f.name: f.load for f in capture.frames})
+    return instantiate(config, "prior")
 
 
 def _rasterizer(config: DictConfig, background: tuple[float, float, float]) -> tuple[Any, str]:
     import rasterizers
 
-    settings = {k: v for k, v in _plain(config.rasterizer).items() if v is not None and k != "name"}
+    settings = {k: v for k, v in plain(config.rasterizer).items() if v is not None and k != "name"}
     settings.setdefault("background", background)
     settings["background"] = tuple(settings["background"])
     name = str(config.rasterizer.name)
@@ -357,39 +349,10 @@ def _watch() -> Callable[[], None] | None:
     return sweep.Watch(ours) if ours is not None and _launcher(HydraConfig.get()) == "joblib" else None
 
 
-def _instantiate(config: Any, key: str, **extra: Any) -> Any:
-    """Build what a config node names, with errors that name the node."""
-    try:
-        return hydra.utils.instantiate(config, _convert_="object", **extra)
-    except InstantiationException as error:
-        cause = error.__cause__
-        if isinstance(cause, ClearError):
-            raise cause from None
-        raise DataError("config", key, _one_line(cause or error), "see the field's comment in conf/") from cause
-
-
-def _instantiate_strategies(config: DictConfig) -> Iterator[Any]:
-    from clear_strategies.strategy import Strategy
-
-    for name, node in config.strategies.items():
-        strategy = _instantiate(node, f"strategies.{name}")
-        if not isinstance(strategy, Strategy):
-            raise DataError(
-                "config", f"strategies.{name}", f"is a {type(strategy).__name__}, not a Strategy",
-                "derive the class from clear_strategies.Strategy",
-            )  # fmt: skip
-        yield strategy
-
-
 def _mip(config: DictConfig) -> Any:
     from clear_strategies.mip import MipFilter
 
-    return MipFilter(**_plain(config.mip))
-
-
-def _plain(node: Any) -> dict[str, Any]:
-    plain = OmegaConf.to_container(node, resolve=True)
-    return {str(k): v for k, v in plain.items()} if isinstance(plain, dict) else {}
+    return MipFilter(**plain(config.mip))
 
 
 def _comparable(config: DictConfig) -> dict[str, Any]:
@@ -402,7 +365,7 @@ def _comparable(config: DictConfig) -> dict[str, Any]:
         else:
             yield prefix, value
 
-    flat = {key: value for key, value in flatten("", _plain(config)) if key not in _NOT_COMPARED}
+    flat = {key: value for key, value in flatten("", plain(config)) if key not in _NOT_COMPARED}
     return dict(json.loads(json.dumps(flat)))  # as it comes back from a file
 
 
@@ -413,10 +376,6 @@ def _is_ours(error: BaseException) -> bool:
         traceback = traceback.tb_next
     module = traceback.tb_frame.f_globals.get("__name__", "") if traceback is not None else ""
     return module.startswith(("clear_strategies", "rasterizers"))
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
 
 
 if __name__ == "__main__":

@@ -16,13 +16,14 @@ FLOORS = [
     {"strategy"},
     {"gco", "p2g", "svs", "splatsure"},
     {"objective", "conductor"},
+    {"compose"},
     {"data", "mip", "optim", "field", "fused", "density", "skips"}
     | {"checkpoint", "metrics", "pictures", "fit", "export", "diagnosis"},
     {"run", "plan", "results", "sweep", "report", "bench", "testing"},
 ]
 # Types that floor 2 may name: what a view is, and nothing that trains on it.
 ALLOWED_UP = {("p2g", "data"), ("conductor", "data")}
-HYDRA = {"run"}
+HYDRA = {"run", "compose"}
 HEAVY = {
     "cv2": {"data"},
     "kornia": {"data"},
