@@ -42,8 +42,8 @@ Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
 
 def attach(
-    params: MutableMapping[str, Tensor],
-    optimizers: MutableMapping[str, torch.optim.Optimizer],
+    params: MutableMapping[str, Any] | torch.nn.ParameterDict,
+    optimizers: MutableMapping[str, Any],
     views: Sequence[View],
     conductor: Conductor,
     *,
@@ -81,8 +81,8 @@ class Attached:
 
     def __init__(
         self,
-        params: MutableMapping[str, Tensor],
-        optimizers: MutableMapping[str, torch.optim.Optimizer],
+        params: MutableMapping[str, Any] | torch.nn.ParameterDict,
+        optimizers: MutableMapping[str, Any],
         views: Sequence[View],
         conductor: Conductor,
         *,
