@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 import toy
+import yaml
 
 import rasterizers
 from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, Objective
@@ -388,6 +389,7 @@ class TestWithGsplat:
             rasterization=gsplat_host.rasterization,
         )  # fmt: skip
         assert isinstance(clear, DefaultStrategy)
+        assert len(yaml.dump({"strategy": clear})) < 3_000  # as simple_trainer writes its cfg.yml: no photographs
         try:
             host = Host(scene, extent=4.0, strategy=clear)
             host.train([scene.train[i % 3].name for i in range(30)])
