@@ -7,10 +7,10 @@ Which row became which is not guessed: the row numbers travel as one more parame
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import logging
 import math
-import pkgutil
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -77,15 +77,13 @@ class GsplatSettings:
     mode: Literal["quantile", "fixed"] = "quantile"
     start: int = milestone(500)
     stop: int = milestone(5_000)
-    every: int = milestone(100)
+    every: int = milestone(100, least=1)
     reset_every: int = milestone(3_000)
     statistics_from: int = milestone(500)
     max_gaussians: int = 1_000_000
     min_gaussians: int = 10
 
     def __post_init__(self) -> None:
-        if "_target_" not in self.strategy:
-            raise ValueError("strategy must name its class: strategy._target_=gsplat.strategy.DefaultStrategy.")
         for theirs, ours in _OURS.items():
             if theirs in self.strategy:
                 raise ValueError(f"strategy.{theirs} must stand beside the strategy, not in it: density.{ours}.")
@@ -93,8 +91,8 @@ class GsplatSettings:
             raise ValueError(f"threshold must be > 0, got {self.threshold}.")
         if self.mode not in ("quantile", "fixed"):
             raise ValueError(f"mode must be quantile or fixed, got {self.mode!r}.")
-        if self.max_gaussians < 1 or self.min_gaussians < 1 or self.reset_every < 0:
-            raise ValueError("max_gaussians and min_gaussians must be at least 1, reset_every at least 0.")
+        if self.every < 1 or self.max_gaussians < 1 or self.min_gaussians < 1 or self.reset_every < 0:
+            raise ValueError("every, max_gaussians and min_gaussians must be at least 1, reset_every at least 0.")
 
     def densifier(self, n: int, *, extent: float, seed: int, white_background: bool) -> GsplatDensifier:
         """Import and build the strategy.
@@ -105,12 +103,17 @@ class GsplatSettings:
         return GsplatDensifier(self, self._build(), n, extent=extent, seed=seed)
 
     def _build(self) -> Any:
-        target = str(self.strategy["_target_"])
+        target = self.strategy.get("_target_")
+        if target is None:
+            example = "density.strategy._target_=your_package.YourStrategy"
+            raise _unusable("_target_", "no strategy is named", f"{example}, or density=gsplat_default")
         given = {name: value for name, value in self.strategy.items() if name != "_target_"}
+        module, _, name = str(target).rpartition(".")
         try:
-            kind = pkgutil.resolve_name(target)
+            kind = getattr(importlib.import_module(module), name)
         except ImportError as error:
-            remedy = "pip install 'clear-strategies[gsplat]'" if "gsplat" in target else "correct its dotted name"
+            gsplat = "gsplat" in f"{target} {error}"
+            remedy = "pip install 'clear-strategies[gsplat]'" if gsplat else "correct its dotted name"
             raise _unusable("_target_", f"{target} cannot be imported ({error})", remedy) from error
         except (AttributeError, ValueError) as error:
             raise _unusable("_target_", f"{target} is not there ({error})", "correct its dotted name") from error
@@ -123,7 +126,7 @@ class GsplatSettings:
             if given.get(name, silent) != silent:
                 raise _unusable(name, f"asks for {what}, which our rasterizers do not report", f"leave it at {silent}")
         ours = {theirs: getattr(self, name) for theirs, name in _OURS.items()}
-        ours |= {"refine_every": max(1, self.every), "reset_every": self.reset_every or sys.maxsize}
+        ours["reset_every"] = self.reset_every or sys.maxsize
         accepted = inspect.signature(kind).parameters
         taken = {name: value for name, value in ours.items() if name in accepted and value is not None}
         for theirs, name in _OURS.items():
@@ -138,10 +141,10 @@ class GsplatSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """What one view says: the score to densify by, whether a strategy of ours gave it, and who was seen."""
+    """What one view says; `score` is `ordinary` itself where no strategy of ours gave another."""
 
     score: Float[Tensor, " N"]
-    ours: bool
+    ordinary: Float[Tensor, " N"]
     visible: Bool[Tensor, " N"]
     means2d: Float[Tensor, "N 2"]
     width: int
@@ -178,14 +181,10 @@ class GsplatDensifier:
         return {"densify until": s.stop, **reset}
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
-        """Hold this view's score ready for `step`, and add it up as the strategy will."""
+        """Hold this view's score ready for `step`."""
         height, width = shot.image.shape[:2]
         visible = shot.visible if t > self.settings.statistics_from else torch.zeros_like(shot.visible)
-        ours = update.score is not update.ordinary
-        self._seen = _Seen(update.score, ours, visible, shot.means2d.detach(), width, height)
-        self.score += torch.where(visible, update.score, 0.0)
-        self.ordinary += torch.where(visible, update.ordinary, 0.0)
-        self.count += visible
+        self._seen = _Seen(update.score, update.ordinary, visible, shot.means2d.detach(), width, height)
 
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         """Let the strategy do what falls on t.
@@ -196,6 +195,10 @@ class GsplatDensifier:
         seen, self._seen = self._seen, None
         if seen is None:
             raise ValueError(f"t={t}: step() must follow accumulate() of the same iteration.")
+        n = len(field)
+        self.score += torch.where(seen.visible, seen.score, 0.0)
+        self.ordinary += torch.where(seen.visible, seen.ordinary, 0.0)
+        self.count += seen.visible
         rates = optimizer.rates.at(optimizer.steps, optimizer.extent)
         params, optimizers = lend(field, optimizer, rates)
         if not self._checked:
@@ -206,7 +209,6 @@ class GsplatDensifier:
         with torch.no_grad(), _seeded(self.seed * 1_000_003 + t), self._threshold(t):
             self.strategy.step_pre_backward(params, optimizers, self.state, t, info)
             self.strategy.step_post_backward(params, optimizers, self.state, t, info, **rest)
-        n = len(field)
         parents = take_back(field, optimizer, params, optimizers, self.kind)
         self._remark(t, seen, info, optimizer)
         changed = not torch.equal(parents, torch.arange(n))
@@ -225,9 +227,10 @@ class GsplatDensifier:
                 own[f"state.{name}"] = torch.tensor(value, dtype=torch.float64 if isinstance(value, float) else None)
             elif value is not None:
                 self._warn_once(
+                    name,
                     f"checkpoints cannot hold {self.kind}'s {name!r}, a {type(value).__name__}: a resumed run starts it "
-                    "anew."
-                )  # fmt: skip
+                    "anew.",
+                )
         return own
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
@@ -272,8 +275,9 @@ class GsplatDensifier:
         room = max(0, s.max_gaussians - len(score))
         if wanted > room:
             self._warn_once(
+                "cap",
                 f"the cap of {s.max_gaussians} Gaussians binds: {wanted} want to densify, {room} may. Raise "
-                "density.max_gaussians, or density.threshold."
+                "density.max_gaussians, or density.threshold.",
             )
         allowed = min(wanted, room)
         return threshold if allowed == int((score > threshold).sum()) else passed_by(score, allowed)
@@ -298,19 +302,21 @@ class GsplatDensifier:
 
     def _remark(self, t: int, seen: _Seen, info: _Info, optimizer: Adam) -> None:
         """Say once what was set and had no effect."""
-        if seen.ours and "means2d" not in info.read:
-            self._warn_once(f"{self.kind} reads no screen gradient: P2G's score has no effect on the structure.")
-        every = getattr(self.strategy, "reset_every", None)
-        if every is not None and t % every == 0 and bool(optimizer.second["opacities"].any()):
+        if seen.score is not seen.ordinary and "means2d" not in info.read:
             self._warn_once(
+                "score", f"{self.kind} reads no screen gradient: P2G's score has no effect on the structure."
+            )
+        due = t < self.settings.stop and t % getattr(self.strategy, "reset_every", sys.maxsize) == 0
+        if due and bool(optimizer.second["opacities"].any()):  # a reset leaves no momentum
+            self._warn_once(
+                "reset",
                 f"t={t}: density.reset_every falls here, and {self.name} reset no opacity. gsplat 1.5's DefaultStrategy "
-                "never does."
-            )  # fmt: skip
+                "never does.",
+            )
 
-    def _warn_once(self, message: str) -> None:
-        key = message.split(":", maxsplit=1)[-1][:40]
-        if key not in self._said:
-            self._said.add(key)
+    def _warn_once(self, about: str, message: str) -> None:
+        if about not in self._said:
+            self._said.add(about)
             _log.warning("%s", message)
 
 
