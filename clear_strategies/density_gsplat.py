@@ -120,7 +120,7 @@ class GsplatSettings:
         if f"{kind.__module__}.{kind.__qualname__}" == _NEEDS_CUDA:
             raise _unusable(
                 "_target_", "gsplat's MCMCStrategy moves Gaussians by CUDA kernels, and these are on the CPU",
-                "take density=gsplat_mcmc, the same strategy with those two computations in torch",
+                "take density=gsplat_mcmc, the same strategy with those computations in torch",
             )  # fmt: skip
         for name, (silent, what) in _NOT_REPORTED.items():
             if given.get(name, silent) != silent:
@@ -212,10 +212,11 @@ class GsplatDensifier:
         parents = take_back(field, optimizer, params, optimizers, self.kind)
         self._remark(t, seen, info, optimizer)
         changed = not torch.equal(parents, torch.arange(n))
-        self._follow(parents)
         if changed:
+            self.score, self.ordinary, self.count = (x[parents] for x in (self.score, self.ordinary, self.count))
             self._report(parents, n, t)
             resized(parents)
+        self._begin_anew()
         return changed
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -282,9 +283,8 @@ class GsplatDensifier:
         allowed = min(wanted, room)
         return threshold if allowed == int((score > threshold).sum()) else passed_by(score, allowed)
 
-    def _follow(self, parents: Int[Tensor, " M"]) -> None:
-        """Our sums follow the rows, and begin anew when the strategy's own do."""
-        self.score, self.ordinary, self.count = (x[parents] for x in (self.score, self.ordinary, self.count))
+    def _begin_anew(self) -> None:
+        """Our sums are set to 0 when the strategy's own are."""
         count = self.state.get("count")
         if isinstance(count, Tensor) and not bool(count.any()):
             for total in (self.score, self.ordinary, self.count):
@@ -437,7 +437,7 @@ def _radii_by_axis() -> bool:
 def _seeded(seed: int) -> Iterator[None]:
     """What torch draws globally, as gsplat does, is here a function of (seed, t), and as before afterwards."""
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.default_generator.manual_seed(seed)  # torch.manual_seed would look for other devices, every time
         yield
 
 

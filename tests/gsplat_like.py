@@ -39,7 +39,7 @@ class Tiny:
         if step >= self.refine_stop_iter:
             return
         ndc = info["means2d"].grad[0] * torch.tensor([info["width"] / 2, info["height"] / 2])
-        seen = info["radii"][0].flatten(1).amax(1) > 0
+        seen = info["radii"][0].reshape(len(ndc), -1).amax(1) > 0
         if state["count"] is None:
             state["grad2d"], state["count"] = torch.zeros(len(seen)), torch.zeros(len(seen))
         state["grad2d"] += torch.where(seen, ndc.norm(dim=1), 0.0)
