@@ -103,25 +103,8 @@ class GsplatSettings:
         return GsplatDensifier(self, self._build(), n, extent=extent, seed=seed)
 
     def _build(self) -> Any:
-        target = self.strategy.get("_target_")
-        if target is None:
-            example = "density.strategy._target_=your_package.YourStrategy"
-            raise _unusable("_target_", "no strategy is named", f"{example}, or density=gsplat_default")
-        given = {name: value for name, value in self.strategy.items() if name != "_target_"}
-        module, _, name = str(target).rpartition(".")
-        try:
-            kind = getattr(importlib.import_module(module), name)
-        except ImportError as error:
-            gsplat = "gsplat" in f"{target} {error}"
-            remedy = "pip install 'clear-strategies[gsplat]'" if gsplat else "correct its dotted name"
-            raise _unusable("_target_", f"{target} cannot be imported ({error})", remedy) from error
-        except (AttributeError, ValueError) as error:
-            raise _unusable("_target_", f"{target} is not there ({error})", "correct its dotted name") from error
-        if f"{kind.__module__}.{kind.__qualname__}" == _NEEDS_CUDA:
-            raise _unusable(
-                "_target_", "gsplat's MCMCStrategy moves Gaussians by CUDA kernels, and these are on the CPU",
-                "take density=gsplat_mcmc, the same strategy with those computations in torch",
-            )  # fmt: skip
+        given = dict(self.strategy)
+        kind = _imported(given.pop("_target_", None))
         for name, (silent, what) in _NOT_REPORTED.items():
             if given.get(name, silent) != silent:
                 raise _unusable(name, f"asks for {what}, which our rasterizers do not report", f"leave it at {silent}")
@@ -136,7 +119,7 @@ class GsplatSettings:
         try:
             return kind(**given, **taken)
         except (TypeError, ValueError) as error:
-            raise _unusable("", f"{target} cannot be built: {error}", "see its own documentation") from error
+            raise _unusable("", f"{kind.__name__} cannot be built: {error}", "see its own documentation") from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -439,6 +422,28 @@ def _seeded(seed: int) -> Iterator[None]:
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)  # torch.manual_seed would look for other devices, every time
         yield
+
+
+def _imported(target: str | None) -> Any:
+    """The class of that dotted name."""
+    if target is None:
+        example = "density.strategy._target_=your_package.YourStrategy"
+        raise _unusable("_target_", "no strategy is named", f"{example}, or density=gsplat_default")
+    module, _, name = target.rpartition(".")
+    try:
+        kind = getattr(importlib.import_module(module), name)
+    except ImportError as error:
+        gsplat = "gsplat" in f"{target} {error}"
+        remedy = "pip install 'clear-strategies[gsplat]'" if gsplat else "correct its dotted name"
+        raise _unusable("_target_", f"{target} cannot be imported ({error})", remedy) from error
+    except (AttributeError, ValueError) as error:
+        raise _unusable("_target_", f"{target} is not there ({error})", "correct its dotted name") from error
+    if f"{kind.__module__}.{kind.__qualname__}" == _NEEDS_CUDA:
+        raise _unusable(
+            "_target_", "gsplat's MCMCStrategy moves Gaussians by CUDA kernels, and these are on the CPU",
+            "take density=gsplat_mcmc, the same strategy with those computations in torch",
+        )  # fmt: skip
+    return kind
 
 
 def _unusable(field: str, problem: str, remedy: str) -> DataError:
