@@ -1,0 +1,80 @@
+"""What only Warp has to show: where it runs, why it does not, and that a warp a tile finds what one thread finds."""
+
+from __future__ import annotations
+
+import builtins
+
+import pytest
+import torch
+from rasterizers_backends import CLEAN, camera, cotangents, dense_scene, why_not
+
+import rasterizers
+from rasterizers import BackendUnavailable
+from rasterizers.testing import gradient_of
+
+installed = pytest.mark.skipif(bool(why_not("warp")), reason=str(why_not("warp")))
+no_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA")
+
+
+@installed
+@no_cuda
+def test_without_cuda_the_remedy_is_named():
+    with pytest.raises(BackendUnavailable, match=r"no CUDA device\. Install .* device=cpu runs here"):
+        rasterizers.load("warp", device="cuda")
+    assert rasterizers.load("warp").device == "cpu"
+
+
+def test_without_warp_the_remedy_is_named(monkeypatch):
+    real = builtins.__import__
+
+    def missing(name, *arguments, **options):
+        if name == "warp":
+            raise ModuleNotFoundError("No module named 'warp'", name="warp")
+        return real(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    with pytest.raises(BackendUnavailable, match=r"not installed .*pip install 'clear-strategies\[warp\]'"):
+        rasterizers.load("warp")
+
+
+@pytest.mark.parametrize(("cuda", "order"), [(True, ["warp", "cpp", "torch"]), (False, ["cpp", "torch", "warp"])])
+def test_warp_is_the_fastest_on_cuda_and_the_last_choice_without(monkeypatch, cuda, order):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    monkeypatch.setattr(rasterizers, "load", lambda name: None)
+    assert list(rasterizers.available()) == order
+    assert rasterizers.fastest() == order[0]
+
+
+@installed
+def test_an_unknown_device_is_refused():
+    with pytest.raises(ValueError, match="cpu or cuda, got 'tpu'"):
+        rasterizers.load("warp", device="tpu")
+
+
+@installed
+@pytest.mark.parametrize("k", [1, 3])
+def test_a_warp_a_tile_sends_what_one_thread_sends(monkeypatch, k):
+    """The way back as CUDA runs it, 32 lanes that add up together: on a CPU, where Warp can imitate them."""
+    import warp as wp
+
+    from rasterizers.warp_backend import frame
+
+    if not hasattr(wp.config, "enable_cpu_blocks"):
+        pytest.skip("this Warp has no blocks of several threads on a CPU")
+    splats, view = dense_scene(600)
+    v = cotangents(k, view.height, view.width)
+    rasterizer = rasterizers.load("warp", device="cpu", **CLEAN)
+    alone = rasterizer(splats, view).vjp(v)
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    monkeypatch.setitem(frame._LANES, "cpu", 32)
+    together, again = (rasterizer(splats, view).vjp(v) for _ in range(2))
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "screen"):
+        found, expected = gradient_of(together, name), gradient_of(alone, name)
+        assert float((found - expected).norm()) <= 2e-6 * float(expected.norm()), name
+        assert torch.equal(found, gradient_of(again, name))
+
+
+@installed
+def test_nothing_is_said_on_stdout(capfd):
+    rasterizers.load("warp", device="cpu")(dense_scene(10)[0], camera())
+    assert capfd.readouterr().out == ""
