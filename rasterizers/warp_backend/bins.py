@@ -114,7 +114,7 @@ def list_pairs(
     tiles: wp.array[wp.int32],
     pairs: wp.array[wp.int32],
     splats: wp.array[wp.int32],
-):
+) -> None:
     """A thread per Gaussian, front to back: its tiles, from the top left on, at the places before `ends`.
 
     `counts` was found by the same function in another kernel, which a compiler may round otherwise. Should they differ,
@@ -152,7 +152,7 @@ def find_tiles(
     listed: wp.array[wp.int32],
     starts: wp.array[wp.int32],
     ends: wp.array[wp.int32],
-):
+) -> None:
     """A thread per pair, sorted by tile: where each tile's list begins and ends, and the Gaussians in it."""
     at = wp.tid()
     tile = tiles[at]

@@ -56,7 +56,7 @@ def blend(
     transmittance: wp.array2d[wp.float32],
     ended: wp.array2d[wp.int32],
     reached: wp.array[wp.int32],
-):
+) -> None:
     """A thread per pixel. `ended`: the first pair it did not take; `reached`: the last such of the tile's pixels."""
     thread = wp.tid()
     tile = thread / PIXELS
@@ -112,7 +112,7 @@ def blend_vjp(K: int, lanes: int) -> Any:
         reached: wp.array[wp.int32],
         cotangents: wp.array3d[wp.vec3],
         sent: wp.array[Sent],
-    ):
+    ) -> None:
         tile, lane = wp.tid()
         begin, last = starts[tile], wp.max(starts[tile], reached[tile])
         through, stop, behind, v = Pixels(), Ends(), Behind(), Cotangents()

@@ -74,7 +74,7 @@ def colour_of(
 
 
 @wp.kernel
-def basis(pose: Pose, means: wp.array[wp.vec3], visible: wp.array[wp.bool], Y: wp.array2d[wp.float32]):
+def basis(pose: Pose, means: wp.array[wp.vec3], visible: wp.array[wp.bool], Y: wp.array2d[wp.float32]) -> None:
     """Y of every Gaussian that some screen shows; the others' rows stay as they are."""
     i = wp.tid()
     if visible[i]:

@@ -318,8 +318,7 @@ def _read_later(numbers: Tensor) -> Any:
         return numbers.tolist
     host = torch.empty(numbers.shape, dtype=numbers.dtype, pin_memory=True)
     host.copy_(numbers, non_blocking=True)
-    copied = torch.cuda.Event()
-    copied.record()
+    copied = torch.cuda.current_stream(numbers.device).record_event()
 
     def wait() -> list[int]:
         copied.synchronize()

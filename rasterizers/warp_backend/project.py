@@ -79,7 +79,7 @@ def project(
     visible: wp.array[wp.bool],
     counts: wp.array[wp.int32],
     poison: wp.array[wp.int64],
-):
+) -> None:
     """A thread per Gaussian. What the screens of a pose share (depth key, colour, slope) is made by the first that draws it.
 
     `poison` becomes 1 if a number that was needed is not finite.
@@ -148,7 +148,7 @@ def pull(K: int) -> Any:
         d_opacities: wp.array2d[wp.float32],
         d_screen: wp.array2d[wp.vec2],
         d_rgb: wp.array2d[wp.vec3],
-    ):
+    ) -> None:
         """A thread per Gaussian: adds what its tiles sent, in their order, and takes it through the projection."""
         i = wp.tid()
         if counts[i] == 0:
