@@ -24,22 +24,23 @@ def depth_key(z: wp.float64, cuts: Cuts) -> wp.int32:
 
 
 @wp.func
-def reaches_image(e: Ellipse, screen: Screen) -> wp.bool:
+def reaches_image(ellipse: Ellipse, screen: Screen) -> wp.bool:
     """Whether the exponent is within reach somewhere in the box of the image's pixel centres: exact.
 
     A convex quadratic over a box is smallest at its centre if that is inside, else on one of the sides that face it.
     """
-    low = wp.vec2(0.5, 0.5) - e.whole - e.rest
-    high = wp.vec2(wp.float32(screen.size[0]), wp.float32(screen.size[1])) - wp.vec2(0.5, 0.5) - e.whole - e.rest
+    corner = wp.vec2(0.5, 0.5)
+    low = corner - ellipse.whole - ellipse.rest
+    high = wp.vec2(wp.float32(screen.size[0]), wp.float32(screen.size[1])) - corner - ellipse.whole - ellipse.rest
     near_x, near_y = wp.clamp(0.0, low[0], high[0]), wp.clamp(0.0, low[1], high[1])
-    on_x = wp.clamp(-e.B * near_x / (2.0 * e.C), low[1], high[1])
-    on_y = wp.clamp(-e.B * near_y / (2.0 * e.A), low[0], high[0])
-    return wp.min(exponent(e, near_x, on_x), exponent(e, on_y, near_y)) <= e.reach
+    on_x = wp.clamp(-ellipse.B * near_x / (2.0 * ellipse.C), low[1], high[1])
+    on_y = wp.clamp(-ellipse.B * near_y / (2.0 * ellipse.A), low[0], high[0])
+    return wp.min(exponent(ellipse, near_x, on_x), exponent(ellipse, on_y, near_y)) <= ellipse.reach
 
 
 @wp.func
-def exponent(e: Ellipse, dx: wp.float32, dy: wp.float32) -> wp.float32:
-    return dx * (e.A * dx + e.B * dy) + e.C * dy * dy
+def exponent(ellipse: Ellipse, dx: wp.float32, dy: wp.float32) -> wp.float32:
+    return dx * (ellipse.A * dx + ellipse.B * dy) + ellipse.C * dy * dy
 
 
 @wp.func
@@ -49,27 +50,27 @@ def row_of_tiles(y: wp.float32, screen: Screen) -> wp.int32:
 
 
 @wp.func
-def rows_of(e: Ellipse, screen: Screen) -> tuple[wp.int32, wp.int32]:
+def rows_of(ellipse: Ellipse, screen: Screen) -> tuple[wp.int32, wp.int32]:
     """First and last row of tiles that the ellipse may reach."""
-    v = e.whole[1] + e.rest[1]
-    return row_of_tiles(v - e.half[1] - SLACK, screen), row_of_tiles(v + e.half[1] + SLACK, screen)
+    v = ellipse.whole[1] + ellipse.rest[1]
+    return row_of_tiles(v - ellipse.half[1] - SLACK, screen), row_of_tiles(v + ellipse.half[1] + SLACK, screen)
 
 
 @wp.func
-def columns_of(e: Ellipse, row: wp.int32, screen: Screen) -> tuple[wp.int32, wp.int32]:
+def columns_of(ellipse: Ellipse, row: wp.int32, screen: Screen) -> tuple[wp.int32, wp.int32]:
     """Of a row of tiles, those that the ellipse reaches: [begin, end). Exact up to `SLACK`, always generous.
 
     Within the slab of the row's pixel centres the ellipse is widest at its rightmost point, or on the slab's side
     nearest to that.
     """
-    first = wp.float32(row * TILE) + 0.5 - e.whole[1] - e.rest[1]
+    first = wp.float32(row * TILE) + 0.5 - ellipse.whole[1] - ellipse.rest[1]
     last = first + wp.float32(TILE - 1)
-    if not (first <= e.half[1] + SLACK and last >= -e.half[1] - SLACK):
+    if not (first <= ellipse.half[1] + SLACK and last >= -ellipse.half[1] - SLACK):
         return wp.int32(0), wp.int32(0)
-    low, high = wp.max(first, -e.half[1]), wp.min(last, e.half[1])
-    rightmost = -e.B / (2.0 * e.C) * e.half[0]
-    right = chord(e, wp.clamp(rightmost, low, high), 1.0)
-    left = chord(e, wp.clamp(-rightmost, low, high), -1.0)
+    low, high = wp.max(first, -ellipse.half[1]), wp.min(last, ellipse.half[1])
+    rightmost = -ellipse.B / (2.0 * ellipse.C) * ellipse.half[0]
+    right = chord(ellipse, wp.clamp(rightmost, low, high), 1.0)
+    left = chord(ellipse, wp.clamp(-rightmost, low, high), -1.0)
     edge = wp.float32(TILE)
     limit = wp.float32(screen.tiles[0])
     begin = wp.clamp(wp.ceil((left - SLACK + 0.5) / edge) - 1.0, 0.0, limit)
@@ -78,20 +79,20 @@ def columns_of(e: Ellipse, row: wp.int32, screen: Screen) -> tuple[wp.int32, wp.
 
 
 @wp.func
-def chord(e: Ellipse, dy: wp.float32, side: wp.float32) -> wp.float32:
+def chord(ellipse: Ellipse, dy: wp.float32, side: wp.float32) -> wp.float32:
     """Where the ellipse ends to the left (-1) or right (1) on the line dy px below its centre, px of the image."""
-    t = dy / wp.max(e.half[1], 1e-20)
-    width = wp.sqrt(e.reach / e.A) * wp.sqrt(wp.max(1.0 - t * t, 0.0))
-    return e.whole[0] + e.rest[0] - e.B / (2.0 * e.A) * dy + side * width
+    t = dy / wp.max(ellipse.half[1], 1e-20)
+    width = wp.sqrt(ellipse.reach / ellipse.A) * wp.sqrt(wp.max(1.0 - t * t, 0.0))
+    return ellipse.whole[0] + ellipse.rest[0] - ellipse.B / (2.0 * ellipse.A) * dy + side * width
 
 
 @wp.func
-def count_tiles(e: Ellipse, screen: Screen, masked: wp.bool, wanted: wp.array2d[wp.bool]) -> wp.int32:
+def count_tiles(ellipse: Ellipse, screen: Screen, masked: wp.bool, wanted: wp.array2d[wp.bool]) -> wp.int32:
     """How many tiles the ellipse may reach, of those that are wanted."""
     count = wp.int32(0)
-    top, bottom = rows_of(e, screen)
+    top, bottom = rows_of(ellipse, screen)
     for row in range(top, bottom + 1):
-        begin, end = columns_of(e, row, screen)
+        begin, end = columns_of(ellipse, row, screen)
         if masked:
             for column in range(begin, end):
                 if wanted[row, column]:
@@ -127,11 +128,11 @@ def list_pairs(
         return
     first = ends[rank] - count
     firsts[i] = first
-    e = ellipse_of(rows[i])
+    ellipse = ellipse_of(rows[i])
     place = wp.int32(0)
-    top, bottom = rows_of(e, screen)
+    top, bottom = rows_of(ellipse, screen)
     for row in range(top, bottom + 1):
-        begin, end = columns_of(e, row, screen)
+        begin, end = columns_of(ellipse, row, screen)
         for column in range(begin, end):
             if place < count and (not masked or wanted[row, column]):
                 tiles[first + place] = row * screen.tiles[0] + column

@@ -33,14 +33,14 @@ def inside(pixel: wp.vec2i, screen: Screen) -> wp.bool:
 
 
 @wp.func
-def offset_of(pixel: wp.vec2i, e: Ellipse) -> wp.vec2:
+def offset_of(pixel: wp.vec2i, ellipse: Ellipse) -> wp.vec2:
     """From the ellipse's centre to the pixel's."""
-    return wp.vec2(wp.float32(pixel[0]), wp.float32(pixel[1])) - e.whole + (wp.vec2(0.5, 0.5) - e.rest)
+    return wp.vec2(wp.float32(pixel[0]), wp.float32(pixel[1])) - ellipse.whole + (wp.vec2(0.5, 0.5) - ellipse.rest)
 
 
 @wp.func
-def colour(e: Ellipse) -> wp.vec3:
-    return wp.max(e.rgb, wp.vec3(0.0, 0.0, 0.0))
+def colour(ellipse: Ellipse) -> wp.vec3:
+    return wp.max(ellipse.rgb, wp.vec3(0.0, 0.0, 0.0))
 
 
 @wp.kernel
@@ -66,15 +66,15 @@ def blend(
     through, rgb = wp.float32(1.0), wp.vec3(0.0, 0.0, 0.0)
     at = wp.int32(starts[tile])
     while at < ends[tile]:
-        e = ellipse_of(rows[listed[at]])
-        d = offset_of(pixel, e)
-        free = e.opacity * wp.exp(-exponent(e, d[0], d[1]))
+        ellipse = ellipse_of(rows[listed[at]])
+        d = offset_of(pixel, ellipse)
+        free = ellipse.opacity * wp.exp(-exponent(ellipse, d[0], d[1]))
         if free >= cuts.alpha_min:
             share = wp.min(free, cuts.alpha_max)
             after = through * (1.0 - share)
             if after < cuts.transmittance_min:
                 break
-            rgb += through * share * colour(e)
+            rgb += through * share * colour(ellipse)
             through = after
         at += 1
     image[pixel[1], pixel[0]] = rgb + through * cuts.background
@@ -129,12 +129,12 @@ def blend_vjp(K: int, lanes: int) -> Any:
 
         for back in range(last - begin):
             at = last - 1 - back
-            e = ellipse_of(rows[listed[at]])
-            rgb = colour(e)
+            ellipse = ellipse_of(rows[listed[at]])
+            rgb = colour(ellipse)
             part = Sent()
             for j in range(own):
-                d = offset_of(pixel_of(tile, j * lanes + lane, screen), e)
-                free = e.opacity * wp.exp(-exponent(e, d[0], d[1]))
+                d = offset_of(pixel_of(tile, j * lanes + lane, screen), ellipse)
+                free = ellipse.opacity * wp.exp(-exponent(ellipse, d[0], d[1]))
                 if at < stop[j] and free >= cuts.alpha_min:
                     share = wp.min(free, cuts.alpha_max)
                     over = 1.0 / (1.0 - share)

@@ -19,7 +19,7 @@ def band(k: wp.int32, d: wp.vec3) -> wp.vec4:  # noqa: PLR0911, PLR0912 - a tabl
     x, y, z = d[0], d[1], d[2]
     xx, yy, zz = x * x, y * y, z * z
     c1, a, b, c = 0.4886025119029199, 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
-    e, f, g, h, i = -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, 1.445305721320277
+    p, q, r, s, t = -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154, 1.445305721320277
     if k == 0:
         return wp.vec4(0.28209479177387814, 0.0, 0.0, 0.0)
     if k == 1:
@@ -39,20 +39,20 @@ def band(k: wp.int32, d: wp.vec3) -> wp.vec4:  # noqa: PLR0911, PLR0912 - a tabl
     if k == 8:
         return wp.vec4(c * (xx - yy), 2.0 * c * x, -2.0 * c * y, 0.0)
     if k == 9:
-        return wp.vec4(e * y * (3.0 * xx - yy), 6.0 * e * x * y, 3.0 * e * (xx - yy), 0.0)
+        return wp.vec4(p * y * (3.0 * xx - yy), 6.0 * p * x * y, 3.0 * p * (xx - yy), 0.0)
     if k == 10:
-        return wp.vec4(f * x * y * z, f * y * z, f * x * z, f * x * y)
+        return wp.vec4(q * x * y * z, q * y * z, q * x * z, q * x * y)
     if k == 11:
-        return wp.vec4(g * y * (4.0 * zz - xx - yy), -2.0 * g * x * y, g * (4.0 * zz - xx - 3.0 * yy), 8.0 * g * y * z)
+        return wp.vec4(r * y * (4.0 * zz - xx - yy), -2.0 * r * x * y, r * (4.0 * zz - xx - 3.0 * yy), 8.0 * r * y * z)
     if k == 12:
         return wp.vec4(
-            h * z * (2.0 * zz - 3.0 * xx - 3.0 * yy), -6.0 * h * x * z, -6.0 * h * y * z, 3.0 * h * (2.0 * zz - xx - yy)
+            s * z * (2.0 * zz - 3.0 * xx - 3.0 * yy), -6.0 * s * x * z, -6.0 * s * y * z, 3.0 * s * (2.0 * zz - xx - yy)
         )
     if k == 13:
-        return wp.vec4(g * x * (4.0 * zz - xx - yy), g * (4.0 * zz - 3.0 * xx - yy), -2.0 * g * x * y, 8.0 * g * x * z)
+        return wp.vec4(r * x * (4.0 * zz - xx - yy), r * (4.0 * zz - 3.0 * xx - yy), -2.0 * r * x * y, 8.0 * r * x * z)
     if k == 14:
-        return wp.vec4(i * z * (xx - yy), 2.0 * i * x * z, -2.0 * i * y * z, i * (xx - yy))
-    return wp.vec4(e * x * (xx - 3.0 * yy), 3.0 * e * (xx - yy), -6.0 * e * x * y, 0.0)
+        return wp.vec4(t * z * (xx - yy), 2.0 * t * x * z, -2.0 * t * y * z, t * (xx - yy))
+    return wp.vec4(p * x * (xx - 3.0 * yy), 3.0 * p * (xx - yy), -6.0 * p * x * y, 0.0)
 
 
 @wp.func

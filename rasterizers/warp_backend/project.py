@@ -27,27 +27,28 @@ HUGE = wp.constant(1e30)  # an ellipse of 1e-15 px covers no pixel centre, and i
 @wp.func
 def ellipse_at(u: wp.float64, v: wp.float64, f: Footprint, opacity: wp.float32, cuts: Cuts) -> Ellipse:
     whole_u, whole_v = wp.round(u), wp.round(v)
-    e = Ellipse()
-    e.whole = wp.vec2(wp.float32(whole_u), wp.float32(whole_v))
-    e.rest = wp.vec2(wp.float32(u - whole_u), wp.float32(v - whole_v))
-    e.A = 0.5 * f.xx
-    e.B = f.xy
-    e.C = 0.5 * f.yy
-    e.opacity = opacity * f.compensation
-    e.reach = wp.log(wp.max(e.opacity, 1e-30) / cuts.alpha_min) * 1.001 + 1e-3
-    extent = wp.sqrt(2.0 * wp.max(e.reach, 0.0)) * f.size
-    e.half = extent * wp.vec2(wp.sqrt(f.a + f.kernel), wp.sqrt(f.c + f.kernel))
-    return e
+    ellipse = Ellipse()
+    ellipse.whole = wp.vec2(wp.float32(whole_u), wp.float32(whole_v))
+    ellipse.rest = wp.vec2(wp.float32(u - whole_u), wp.float32(v - whole_v))
+    ellipse.A = 0.5 * f.xx
+    ellipse.B = f.xy
+    ellipse.C = 0.5 * f.yy
+    ellipse.opacity = opacity * f.compensation
+    ellipse.reach = wp.log(wp.max(ellipse.opacity, 1e-30) / cuts.alpha_min) * 1.001 + 1e-3
+    extent = wp.sqrt(2.0 * wp.max(ellipse.reach, 0.0)) * f.size
+    ellipse.half = extent * wp.vec2(wp.sqrt(f.a + f.kernel), wp.sqrt(f.c + f.kernel))
+    return ellipse
 
 
 @wp.func
-def shows(e: Ellipse, screen: Screen) -> wp.bool:
+def shows(ellipse: Ellipse, screen: Screen) -> wp.bool:
     """Conditions to keep, not to cull: NaN fails each."""
-    if not (e.reach > 0.0 and e.A < HUGE and e.C < HUGE):
+    seen = ellipse.reach > 0.0 and ellipse.A < HUGE and ellipse.C < HUGE
+    seen = seen and wp.abs(ellipse.whole[0]) < HUGE and wp.abs(ellipse.whole[1]) < HUGE
+    seen = seen and ellipse.half[0] >= 0.0 and ellipse.half[1] >= 0.0
+    if not seen:
         return False
-    if not (wp.abs(e.whole[0]) < HUGE and wp.abs(e.whole[1]) < HUGE and e.half[0] >= 0.0 and e.half[1] >= 0.0):
-        return False
-    return reaches_image(e, screen)
+    return reaches_image(ellipse, screen)
 
 
 @wp.func
@@ -101,10 +102,10 @@ def project(
         means2d[i] = wp.vec2(wp.float32(u), wp.float32(v))
         if opacity >= cuts.alpha_min:
             footprint = footprint_of(geometry_of(pose, screen, centre, quat, scales[i]), screen, cuts)
-            e = ellipse_at(u, v, footprint, opacity, cuts)
-            if shows(e, screen):
+            ellipse = ellipse_at(u, v, footprint, opacity, cuts)
+            if shows(ellipse, screen):
                 visible[i] = True
-                count = count_tiles(e, screen, masked, wanted)
+                count = count_tiles(ellipse, screen, masked, wanted)
                 if count > 0:
                     counts[i] = count
                     if keys[i] == FAR:
@@ -113,11 +114,11 @@ def project(
                         colours[i] = rgb
                         if shN.shape[1] > 0:
                             slopes[i] = slope
-                    e.rgb = colours[i]
+                    ellipse.rgb = colours[i]
                     if moved:
-                        e.rgb += offsets[i]
-                    rows[i] = row_of(e)
-                    sound = sound and finite(e.rgb)
+                        ellipse.rgb += offsets[i]
+                    rows[i] = row_of(ellipse)
+                    sound = sound and finite(ellipse.rgb)
     if not sound:
         poison[0] = wp.int64(1)
 
@@ -165,7 +166,7 @@ def pull(K: int) -> Any:
             total += sent[firsts[i] + nth]
         g = geometry_of(pose, screen, centre_of(pose, means[i]), quats[i], scales[i])
         f = footprint_of(g, screen, cuts)
-        e = ellipse_of(rows[i])
+        ellipse = ellipse_of(rows[i])
         for k in range(K):
             sums = Sums()
             sums.q = total[9 * k]
@@ -176,7 +177,7 @@ def pull(K: int) -> Any:
             out = geometry_vjp(pose, screen, cuts, g, f, scales[i], sums)
             rgb = wp.vec3(0.0, 0.0, 0.0)
             for c in range(3):
-                if e.rgb[c] >= 0.0:  # where the clamp binds the picture does not depend on the colour
+                if ellipse.rgb[c] >= 0.0:  # where the clamp binds the picture does not depend on the colour
                     rgb[c] = total[9 * k + 6 + c]
             if turns:
                 out.mean += wp.transpose(slopes[i]) * rgb

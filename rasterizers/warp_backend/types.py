@@ -73,23 +73,26 @@ Row: Final[Any] = wp.types.vector(length=14, dtype=wp.float32)
 
 
 @wp.func
-def row_of(e: Ellipse) -> Row:
+def row_of(ellipse: Ellipse) -> Row:
+    whole, rest, half, rgb = ellipse.whole, ellipse.rest, ellipse.half, ellipse.rgb
     return Row(
-        e.whole[0], e.whole[1], e.rest[0], e.rest[1], e.A, e.B, e.C, e.opacity, e.reach, e.half[0], e.half[1],
-        e.rgb[0], e.rgb[1], e.rgb[2],
+        whole[0], whole[1], rest[0], rest[1],
+        ellipse.A, ellipse.B, ellipse.C, ellipse.opacity,
+        ellipse.reach, half[0], half[1],
+        rgb[0], rgb[1], rgb[2],
     )  # fmt: skip
 
 
 @wp.func
 def ellipse_of(row: Row) -> Ellipse:
-    e = Ellipse()
-    e.whole = wp.vec2(row[0], row[1])
-    e.rest = wp.vec2(row[2], row[3])
-    e.A = row[4]
-    e.B = row[5]
-    e.C = row[6]
-    e.opacity = row[7]
-    e.reach = row[8]
-    e.half = wp.vec2(row[9], row[10])
-    e.rgb = wp.vec3(row[11], row[12], row[13])
-    return e
+    ellipse = Ellipse()
+    ellipse.whole = wp.vec2(row[0], row[1])
+    ellipse.rest = wp.vec2(row[2], row[3])
+    ellipse.A = row[4]
+    ellipse.B = row[5]
+    ellipse.C = row[6]
+    ellipse.opacity = row[7]
+    ellipse.reach = row[8]
+    ellipse.half = wp.vec2(row[9], row[10])
+    ellipse.rgb = wp.vec3(row[11], row[12], row[13])
+    return ellipse

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import builtins
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -78,3 +81,35 @@ def test_a_warp_a_tile_sends_what_one_thread_sends(monkeypatch, k):
 def test_nothing_is_said_on_stdout(capfd):
     rasterizers.load("warp", device="cpu")(dense_scene(10)[0], camera())
     assert capfd.readouterr().out == ""
+
+
+@installed
+def test_no_local_name_hides_a_constant_of_warp():
+    # Warp's hash of a kernel would take `e.A` for a property of Euler's number until it has compiled `e`: no cache hit.
+    import warp as wp
+
+    from rasterizers import warp_backend
+
+    constants = {name for name in dir(wp) if isinstance(getattr(wp, name), (int, float))}
+    assert {"e", "pi", "inf"} <= {name.lower() for name in constants}
+    for path in Path(warp_backend.__file__).parent.glob("*.py"):
+        names = {
+            n.id
+            for n in ast.walk(ast.parse(path.read_text()))
+            if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
+        }
+        assert not names & constants, path.name
+
+
+@installed
+@pytest.mark.skipif(sys.platform == "darwin", reason="Warp for macOS brings no compiler for CUDA")
+def test_the_kernels_compile_for_cuda_without_one(monkeypatch, tmp_path):
+    import warp as wp
+
+    from rasterizers.warp_backend import bins, blend, colour, project
+
+    back = blend.blend_vjp(1, 32)
+    monkeypatch.setitem(back.module.options, "block_dim", 32)
+    for kernel in (bins.list_pairs, blend.blend, colour.basis, project.project, back, project.pull(1)):
+        (compiled,) = wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path / kernel.key, use_ptx=True)
+        assert ".target sm_90" in compiled.read_text()
