@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
@@ -11,7 +10,7 @@ import pytest
 import torch
 
 import rasterizers
-from rasterizers import Camera, Rasterizer, Rendering, Splats
+from rasterizers import BackendUnavailable, Camera, Rasterizer, Rendering, SplatGradients, Splats
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import gradient_of, scene, to
 
@@ -26,40 +25,91 @@ class Backend:
     Args:
         edges: the tiles it can be asked for, px.
         cases: how many pictures of one Gaussian a test may ask for.
+        device: where it draws; the tests' tensors are brought there, and what it finds is brought back.
     """
 
     name: str
     edges: tuple[int, ...]
     cases: int
-    settings: Mapping[str, Any] = field(default_factory=dict)
+    device: str = "cpu"
 
     def __call__(self, **settings: Any) -> Rasterizer:
-        return rasterizers.load(self.name, **self.settings, **settings)
+        if self.name != "warp":
+            return rasterizers.load(self.name, **settings)
+        rasterizer = rasterizers.load(self.name, device=self.device, **settings)
+        return rasterizer if self.device == "cpu" else Elsewhere(rasterizer, self.device)
 
     @property
     def widest(self) -> torch.dtype:
         return torch.float64 if torch.float64 in self().traits.dtypes else torch.float32
 
+    @property
+    def why_not(self) -> str | None:
+        """Why it does not run here."""
+        try:
+            self()
+        except BackendUnavailable as reason:
+            return str(reason)
+        return None
 
-BACKENDS = (
-    Backend("cpp", (4, 8, 16, 32, 64), 400),
-    Backend("warp", (8, 16, 32, 64), 100, {"device": "cpu"}),
-)
+
+class Elsewhere:
+    """A rasterizer on another device, for tests that stay on the CPU."""
+
+    def __init__(self, rasterizer: Rasterizer, device: str) -> None:
+        self.rasterizer, self.device = rasterizer, device
+        self.traits, self.tile = rasterizer.traits, rasterizer.tile
+
+    def __call__(self, splats: Splats, camera: Camera, tiles: torch.Tensor | None = None) -> Rendering:
+        return Home(self.rasterizer(moved(splats, self.device), camera, tiles))
+
+    def render_scales(self, jobs, tiles=None) -> list[Rendering]:
+        there: dict[int, torch.Tensor] = {}  # the same tensor stays the same tensor
+        jobs = [(moved(splats, self.device, there), camera) for splats, camera in jobs]
+        return [Home(rendering) for rendering in self.rasterizer.render_scales(jobs, tiles)]
+
+
+class Home:
+    """A rendering of another device, brought to the CPU."""
+
+    def __init__(self, rendering: Rendering) -> None:
+        self.rendering = rendering
+        self.image, self.alpha = rendering.image.cpu(), rendering.alpha.cpu()
+        self.means2d, self.visible = rendering.means2d.cpu(), rendering.visible.cpu()
+
+    def vjp(self, cotangents: torch.Tensor) -> SplatGradients:
+        return moved(self.rendering.vjp(cotangents), "cpu")
+
+
+def moved(tensors, device: str, there: dict[int, torch.Tensor] | None = None):
+    """Splats or gradients on another device; `there` knows what has been brought."""
+    there = {} if there is None else there
+    found = {f.name: getattr(tensors, f.name) for f in fields(tensors)}
+    return replace(
+        tensors,
+        **{name: there.setdefault(id(x), x.to(device)) if x is not None else None for name, x in found.items()},
+    )
+
+
+BACKENDS = {
+    "cpp": Backend("cpp", (4, 8, 16, 32, 64), 400),
+    "warp": Backend("warp", (8, 16, 32, 64), 100),
+    "warp-cuda": Backend("warp", (8, 16, 32, 64), 400, "cuda"),
+}
 
 
 @cache
 def why_not(name: str) -> str | None:
     """Why a backend does not run here."""
-    return rasterizers.available()[name]
+    return BACKENDS[name].why_not
 
 
 def backends(*, dtype: torch.dtype | None = None) -> pytest.MarkDecorator:
     """Run a test for every backend, skipped with the reason where it does not run."""
     params = [
-        pytest.param(backend, id=backend.name, marks=pytest.mark.skipif(bool(reason), reason=str(reason)))
-        for backend in BACKENDS
-        for reason in [why_not(backend.name)]
-        if dtype is None or reason is not None or dtype in backend().traits.dtypes
+        pytest.param(backend, id=name, marks=pytest.mark.skipif(bool(why_not(name)), reason=str(why_not(name))))
+        for name, backend in BACKENDS.items()
+        if dtype is None or why_not(name) or dtype in backend().traits.dtypes
     ]
     return pytest.mark.parametrize("backend", params)
 

@@ -2,8 +2,8 @@
 
     project (each screen) -> order by depth -> (each screen: list pairs -> blend)          and back: blend_vjp -> pull
 
-All memory is torch's, and all work goes to torch's current stream: nothing here waits for the device but for one number,
-how many pairs of Gaussian and tile there are, and that while the depths are being sorted.
+Memory is torch's (but the sort's scratch), and all work goes to torch's current stream. Nothing here waits for the device
+but for how many pairs of Gaussian and tile there are, and that while the depths are being sorted.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import struct
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final
 
 import torch
@@ -127,7 +128,8 @@ class _Frame:
         like = splats.means
         if like.dtype != torch.float32 or like.device.type != settings.device:
             raise TypeError(
-                f"this warp rasterizer draws float32 on {settings.device}, got {like.dtype} on {like.device}."
+                f"this warp rasterizer draws float32 on {settings.device}, got {like.dtype} on {like.device}. "
+                "Move the splats there, or load it with another device."
             )
         self.settings, self.jobs, self.n, self.like = settings, jobs, len(splats), like.detach()
         self.pose, self.cuts = _pose_struct(camera), _cuts_struct(settings)
@@ -165,8 +167,10 @@ class _Frame:
         """Warp's work goes where torch's goes."""
         if self.like.device.type == "cpu":
             return nullcontext()
-        stream: AbstractContextManager[Any] = wp.ScopedStream(wp.stream_from_torch(self.like.device), sync_enter=False)
-        return stream
+        scope: AbstractContextManager[Any] = wp.ScopedStream(
+            _stream(torch.cuda.current_stream(self.like.device)), sync_enter=False
+        )
+        return scope
 
     def launch(self, kernel: Any, threads: int, *arguments: Any) -> None:
         """A thread per Gaussian, pair or pixel; the arguments are the kernel's."""
@@ -203,7 +207,7 @@ class _Frame:
 
     def _require_memory(self, screen: _Screen, count: int) -> None:
         """Counts are 64-bit until here, where they are found to fit."""
-        mebibytes = count * (_PAIR_BYTES + _SENT_BYTES) >> 20
+        mebibytes = _room(count) * (_PAIR_BYTES + _SENT_BYTES) >> 20
         if mebibytes <= self.settings.memory and count < 2**31:
             return
         largest = int(screen.counts.argmax())
@@ -261,8 +265,8 @@ class WarpRendering:
         v = cotangents.detach().to(self.image).contiguous()
         means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
         opacities = frame.empty(k, n)
-        budget = (frame.settings.memory << 20) - self._screen.lists.count * _PAIR_BYTES
-        together = max(1, min(3, budget // max(1, self._screen.lists.count * _SENT_BYTES)))
+        room = _room(self._screen.lists.count)
+        together = max(1, min(3, ((frame.settings.memory << 20) - room * _PAIR_BYTES) // (room * _SENT_BYTES)))
         with frame.on_stream():
             for part in range(0, k, together):
                 some = slice(part, part + together)
@@ -277,7 +281,7 @@ class WarpRendering:
         sent_row = wp.types.vector(length=9 * k, dtype=wp.float32)
         lanes = _LANES[frame.settings.device]
         wp.launch_tiled(
-            blend_vjp(k, lanes), dim=[screen.columns * screen.rows_of_tiles], block_dim=lanes,
+            blend_vjp(k, lanes), dim=[len(lists.starts)], block_dim=lanes,  # also for what is left over, see list_pairs
             device=wp.device_from_torch(frame.like.device),
             inputs=[
                 screen.struct, frame.cuts, _array(screen.ellipses, types.Row), _array(lists.gaussians),
@@ -293,6 +297,12 @@ class WarpRendering:
             _array(screen.ellipses, types.Row), _array(screen.counts), _array(screen.firsts), _array(sent, sent_row),
             *(_array(x, width) for x, width in zip(out, widths, strict=True)),
         )  # fmt: skip
+
+
+@cache
+def _stream(stream: torch.cuda.Stream) -> Any:
+    """Torch's stream as Warp knows it; kept, for Warp keeps the scratch of its sort with it."""
+    return wp.stream_from_torch(stream)
 
 
 def _array(tensor: Tensor | None, dtype: Any = None) -> Any:
