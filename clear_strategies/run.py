@@ -260,7 +260,7 @@ def _rasterizer(config: DictConfig, background: tuple[float, float, float]) -> t
     settings["background"] = tuple(settings["background"])
     name = str(config.rasterizer.name)
     if name == "auto":
-        name = rasterizers.fastest()
+        name = rasterizers.fastest("cpu")  # where the trainer keeps its field
         for other, why_not in rasterizers.available().items():
             if why_not is not None:
                 _log.info("rasterizer %s is not available: %s", other, why_not)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+import torch
+
 from rasterizers.interface import (
     PRESETS,
     BackendUnavailable,
@@ -32,9 +34,13 @@ __all__ = [
     "load",
 ]
 
-# name -> module that defines `create(**settings)`, fastest first: "auto" takes the first that is available.
-# A backend imports its library only when it is created, so listing one here costs nothing.
-_BACKENDS: dict[str, str] = {"cpp": "rasterizers.cpp", "torch": "rasterizers.reference"}
+# name -> module that defines `create(**settings)`. A backend imports its library only when it is created, so listing one
+# here costs nothing.
+_BACKENDS: dict[str, str] = {
+    "cpp": "rasterizers.cpp",
+    "torch": "rasterizers.reference",
+    "warp": "rasterizers.warp_backend",
+}
 
 
 def load(name: str = "auto", *, preset: str | None = None, **settings: Any) -> Rasterizer:
@@ -59,18 +65,31 @@ def load(name: str = "auto", *, preset: str | None = None, **settings: Any) -> R
     return rasterizer
 
 
-def fastest() -> str:
-    """The name that "auto" stands for here."""
-    return next(name for name, why_not in available().items() if why_not is None)
+def fastest(device: str | None = None) -> str:
+    """The name that "auto" stands for here.
+
+    Args:
+        device: "cpu" or "cuda", where the splats lie; None: wherever drawing is fastest.
+    """
+    return next(
+        name
+        for name, why_not in available().items()
+        if why_not is None and (device is None or device in load(name).traits.devices)
+    )
 
 
 def available() -> dict[str, str | None]:
     """Every backend by name, fastest first; the value is None, or the reason why it cannot run here."""
     reasons: dict[str, str | None] = {}
-    for name in _BACKENDS:
+    for name in _fastest_first():
         try:
             load(name)
             reasons[name] = None
         except BackendUnavailable as reason:
             reasons[name] = str(reason)
     return reasons
+
+
+def _fastest_first() -> list[str]:
+    """Warp draws on CUDA and then wins; without CUDA it is there to be checked, and comes last."""
+    return sorted(_BACKENDS, key=lambda name: name != "warp" if torch.cuda.is_available() else name == "warp")

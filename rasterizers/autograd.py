@@ -117,7 +117,7 @@ def rasterization(
     for i, (pose, K) in enumerate(zip(viewmats, Ks, strict=True)):
         background = tuple(backgrounds[i].tolist()) if backgrounds is not None else (0.0, 0.0, 0.0)
         antialiased = rasterize_mode == "antialiased"
-        rasterizer = _loaded(backend, near_plane, eps2d, antialiased, background)
+        rasterizer = _loaded(backend, means.device.type, near_plane, eps2d, antialiased, background)
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
         shots.append(draw(rasterizer, splats, Camera(pose.detach(), fx, fy, cx, cy, width, height), means2d[i]))
     visible = torch.stack([shot.visible for shot in shots])
@@ -130,6 +130,7 @@ def rasterization(
 
 @lru_cache(maxsize=8)
 def _loaded(
-    name: str, near: float, kernel: float, antialiased: bool, background: tuple[float, float, float]
+    name: str, device: str, near: float, kernel: float, antialiased: bool, background: tuple[float, float, float]
 ) -> Rasterizer:
+    name = rasterizers.fastest(device) if name == "auto" else name
     return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased, background=background)

@@ -1,0 +1,98 @@
+"""What the kernels hand to each other: structures passed by value, and the rows of the tables between the stages."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+TILE: Final = wp.constant(8)
+"""Edge of the tiles that Gaussians are listed for, px."""
+PIXELS: Final = wp.constant(64)
+"""Of a tile."""
+FAR: Final = wp.constant(2**31 - 1)
+"""The depth key of a Gaussian that no screen draws."""
+
+
+@wp.struct
+class Pose:
+    """World to camera, in float64 where a Gaussian's centre falls is decided, and the camera's position."""
+
+    rotation: wp.mat33
+    exact_rotation: wp.mat33d
+    exact_translation: wp.vec3d
+    center: wp.vec3
+
+
+@wp.struct
+class Screen:
+    """A pixel grid of a pose, and how far off-axis the Jacobian follows, as tangents."""
+
+    exact_focal: wp.vec2d
+    exact_principal: wp.vec2d
+    focal: wp.vec2
+    size: wp.vec2i
+    tiles: wp.vec2i  # columns and rows of tiles
+    low: wp.vec2
+    high: wp.vec2
+
+
+@wp.struct
+class Cuts:
+    """The numbers of `rasterizers.interface.RasterSettings`."""
+
+    kernel: wp.float32
+    near: wp.float64
+    near_bits: wp.int64  # of `near`: depth keys count from here
+    alpha_min: wp.float32
+    alpha_max: wp.float32
+    transmittance_min: wp.float32
+    background: wp.vec3
+    antialiased: wp.bool
+
+
+@wp.struct
+class Ellipse:
+    """A Gaussian on a screen: alpha = opacity · exp(-(A dx² + B dx dy + C dy²)) at (dx, dy) px from its centre."""
+
+    whole: wp.vec2  # the pixel corner nearest to the centre, px: at 1,000 px a float32 alone resolves 6e-5 …
+    rest: wp.vec2  # … and the centre from there
+    A: wp.float32
+    B: wp.float32
+    C: wp.float32
+    opacity: wp.float32  # after the Mip compensation
+    reach: wp.float32  # alpha >= alpha_min within A dx² + B dx dy + C dy² <= reach, a little generous
+    half: wp.vec2  # half the box around that region, px
+    rgb: wp.vec3  # before its clamp at 0
+
+
+Row: Final[Any] = wp.types.vector(length=14, dtype=wp.float32)
+"""An `Ellipse` in memory that torch has allocated."""
+
+
+@wp.func
+def row_of(ellipse: Ellipse) -> Row:
+    whole, rest, half, rgb = ellipse.whole, ellipse.rest, ellipse.half, ellipse.rgb
+    return Row(
+        whole[0], whole[1], rest[0], rest[1],
+        ellipse.A, ellipse.B, ellipse.C, ellipse.opacity,
+        ellipse.reach, half[0], half[1],
+        rgb[0], rgb[1], rgb[2],
+    )  # fmt: skip
+
+
+@wp.func
+def ellipse_of(row: Row) -> Ellipse:
+    ellipse = Ellipse()
+    ellipse.whole = wp.vec2(row[0], row[1])
+    ellipse.rest = wp.vec2(row[2], row[3])
+    ellipse.A = row[4]
+    ellipse.B = row[5]
+    ellipse.C = row[6]
+    ellipse.opacity = row[7]
+    ellipse.reach = row[8]
+    ellipse.half = wp.vec2(row[9], row[10])
+    ellipse.rgb = wp.vec3(row[11], row[12], row[13])
+    return ellipse

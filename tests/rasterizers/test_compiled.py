@@ -1,0 +1,309 @@
+"""The compiled backends: the public contract, agreement with float64, the same bits however they are run, hard inputs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+from itertools import product
+
+import pytest
+import torch
+from rasterizers_agreement import require_gradient, require_image, require_same_bits
+from rasterizers_backends import (
+    ATTRIBUTES,
+    CLEAN,
+    Backend,
+    backends,
+    camera,
+    cotangents,
+    dense_scene,
+    everything,
+    exact,
+)
+
+from rasterizers import SplatGradients, Splats
+from rasterizers.reference import ReferenceRasterizer
+from rasterizers.testing import CHECKS, gradient_of, scene, select, to
+
+
+def require_reference(backend, splats, view, v, **settings):
+    """At its widest precision a backend is the reference, to rounding; in float32 without cut-offs, which would flip."""
+    narrow = backend.widest == torch.float32
+    settings = {**settings, **(CLEAN if narrow else {})}
+    of_image, of_gradient = (5e-6, 5e-5) if narrow else (1e-12, 1e-10)
+    found = backend(**settings)(to(splats, backend.widest), view)
+    truth = ReferenceRasterizer(**settings)(to(splats, torch.float64), view)
+    assert float((found.image.double() - truth.image).abs().max()) < of_image
+    assert float((found.alpha.double() - truth.alpha).abs().max()) < of_image
+    ours, theirs = found.vjp(v), truth.vjp(v.double())
+    for name in ATTRIBUTES:
+        a, b = gradient_of(ours, name), gradient_of(theirs, name)
+        assert a.shape == b.shape
+        assert float((a - b).norm()) <= of_gradient * float(b.norm()) + 1e-14, name
+    return found, truth
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
+@backends()
+def test_contract(backend, check):
+    check(backend)
+
+
+# ---- agreement ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("settings", [{}, CLEAN], ids=["default", "clean"])
+@pytest.mark.parametrize("bands", [0, 15])
+@backends()
+def test_the_widest_precision_is_the_reference(backend, settings, bands):
+    settings = {**settings, "background": (0.2, 0.4, 0.6)}
+    require_reference(backend, scene(400, bands=bands), camera(97, 66), cotangents(2, 66, 97), **settings)
+
+
+@backends(dtype=torch.float32)
+def test_float32_agrees_with_float64_at_the_same_cut_offs(backend):
+    splats, view = dense_scene()
+    require_image(backend()(splats, view).image, exact(splats, view).image)
+
+
+@cache
+def dense_gradients(backend: Backend) -> tuple[SplatGradients, SplatGradients]:
+    """Found and exact, where no threshold flips."""
+    splats, view = dense_scene()
+    v = cotangents(1, 97, 130)
+    return backend(**CLEAN)(splats, view).vjp(v), exact(splats, view, **CLEAN).vjp(v.double())
+
+
+@pytest.mark.parametrize("name", ATTRIBUTES)
+@backends(dtype=torch.float32)
+def test_gradients_agree_where_no_threshold_flips(backend, name):
+    found, truth = dense_gradients(backend)
+    require_gradient(name, gradient_of(found, name)[0], gradient_of(truth, name)[0])
+
+
+@backends(dtype=torch.float32)
+def test_transmittance_survives_four_hundred_layers(backend):
+    n = 400
+    # Near α = 1 the last digit of α itself is worth 1/(1 - α) of them in T.
+    for alpha, tolerance in ((1 / 200, 1e-5), (0.05, 1e-5), (0.5, 1e-5), (0.98, 1e-4)):
+        splats = Splats(
+            means=torch.tensor([[0.0, 0.0, 2.0]]).repeat(n, 1) + torch.arange(n)[:, None] * torch.tensor([0, 0, 1e-3]),
+            quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+            scales=torch.full((n, 3), 2.0),
+            opacities=torch.full((n,), alpha),
+            sh0=torch.randn(n, 1, 3, generator=torch.Generator().manual_seed(5)),  # equal colours would cancel
+            shN=torch.zeros(n, 0, 3),
+        )
+        view, v = camera(8, 8), cotangents(1, 8, 8)
+        settings = {"alpha_min": 1e-6, "transmittance_min": 1e-9}
+        found, right = backend(**settings)(splats, view), exact(splats, view, **settings)
+        assert float((found.image.double() - right.image).abs().max()) < 5e-6
+        ours, truth = found.vjp(v), right.vjp(v.double())
+        for name in ("opacities", "sh0"):
+            a, b = gradient_of(ours, name).double(), gradient_of(truth, name)
+            assert float((a - b).norm() / b.norm()) < tolerance
+
+
+@pytest.mark.parametrize("aspect", [1.0, 1e2, 1e4])
+@pytest.mark.parametrize("pixels", [1e-2, 1.0, 1e3, 1e5])
+@backends(dtype=torch.float32)
+def test_needles_keep_their_shape(backend, aspect, pixels):
+    n, view = 24, camera(64, 64)
+    angle = torch.arange(n) * math.pi / n
+    size = pixels * 4.0 / view.fx
+    splats = Splats(
+        means=torch.tensor([[0.05, -0.02, 4.0]]).repeat(n, 1),
+        quats=torch.stack((torch.cos(angle / 2), 0 * angle, 0 * angle, torch.sin(angle / 2)), dim=1),
+        scales=torch.tensor([[size, size / aspect, size / aspect]]).repeat(n, 1),
+        opacities=torch.full((n,), 0.4),
+        sh0=torch.full((n, 1, 3), 0.5),
+        shN=torch.zeros(n, 0, 3),
+    )
+    v = cotangents(1, 64, 64)
+    for i in range(0, n, 5):
+        one = select(splats, torch.tensor([i]))
+        found, right = backend(**CLEAN)(one, view), ReferenceRasterizer(**CLEAN)(to(one, torch.float64), view)
+        assert float((found.image.double() - right.image).abs().max()) < 5e-5
+        ours, truth = found.vjp(v), right.vjp(v.double())
+        for name in ("means", "scales", "opacities"):
+            a, b = gradient_of(ours, name).double(), gradient_of(truth, name)
+            assert bool(a.isfinite().all())
+            assert float((a - b).norm()) <= 2e-3 * float(b.norm()) + 1e-6, (name, i)
+
+
+def sweep(cases, seed=0):
+    """Sizes, depths, opacities and quaternion norms over many orders of magnitude: a sample of their product."""
+    scales, depths = [10.0**k for k in range(-8, 9)], [10.0**k for k in range(-6, 7)]
+    logits, norms = (-100.0, -15.0, -3.0, 0.0, 3.0, 15.0, 100.0), [10.0**k for k in range(-20, 21, 5)]
+    table = list(product(scales, depths, logits, norms))
+    chosen = torch.randperm(len(table), generator=torch.Generator().manual_seed(seed))[:cases]
+    return [table[int(i)] for i in chosen]
+
+
+@backends(dtype=torch.float32)
+def test_extreme_gaussians_are_right_or_absent(backend):
+    # Finite and as in float64, or culled as the near plane and alpha_min say.
+    view, settings = camera(24, 20), {"near": 1e-4, "background": (0.1, 0.2, 0.3)}
+    v, drawn = cotangents(1, 20, 24), 0
+    for scale, depth, logit, norm in sweep(cases=backend.cases):
+        splats = Splats(
+            means=torch.tensor([[0.03 * depth, -0.02 * depth, depth]]),
+            quats=torch.tensor([[0.5, -0.5, 0.1, 0.7]]) * norm,
+            scales=torch.tensor([[scale, scale * 0.5, scale * 0.1]]),
+            opacities=torch.sigmoid(torch.tensor([logit])),
+            sh0=torch.tensor([[[0.5, -0.2, 0.9]]]),
+            shN=torch.zeros(1, 0, 3),
+        )
+        found, right = backend(**settings)(splats, view), exact(splats, view, **settings)
+        case = f"scale {scale:g} depth {depth:g} logit {logit:g} norm {norm:g}"
+        error = float((found.image.double() - right.image).abs().max())
+        assert error < 1e-4 or (error < FLIP_OF_ONE and bool(found.visible) == bool(right.visible)), (case, error)
+        pulled = found.vjp(v)
+        assert all(bool(gradient_of(pulled, name).isfinite().all()) for name in ATTRIBUTES), case
+        drawn += bool(right.visible)
+    assert drawn > backend.cases / 8
+
+
+FLIP_OF_ONE = 1 / 255 + 1e-3  # a single Gaussian at alpha_min: drawn by one precision, passed over by the other
+
+
+# ---- the same bits -----------------------------------------------------------------------------------------------
+
+
+@backends()
+def test_bits_do_not_depend_on_the_run(backend):
+    splats, view = dense_scene()
+    v = cotangents(3, 97, 130)
+    expected = everything(backend()(splats, view), v)
+    for _ in range(3):
+        require_same_bits(everything(backend()(splats, view), v), expected)
+
+
+@backends()
+def test_more_than_the_budget_is_refused_with_figures(backend):
+    splats = scene(4000, bands=0)
+    huge = replace(splats, scales=splats.scales * 1e3)
+    with pytest.raises(MemoryError, match=r"pairs of Gaussian and .*MiB.*largest Gaussian is number \d+"):
+        backend(memory=1)(huge, camera(2000, 64))
+
+
+@backends()
+def test_scales_together_are_scales_alone(backend):
+    splats, hr = scene(500, bands=15), camera(128, 96)
+    lr = hr.scaled(1 / 4)
+    plain = replace(splats, rgb_offset=None, opacities=splats.opacities * 0.9)
+    shared = backend().render_scales([(plain, lr), (splats, hr)])
+    for rendering, (job, view) in zip(shared, [(plain, lr), (splats, hr)], strict=True):
+        v = cotangents(2, view.height, view.width)
+        alone = backend()(job, view)
+        *found, _ = everything(rendering, v)  # Y is of the union: not 0 for a Gaussian that only the other screen shows
+        *expected, _ = everything(alone, v)
+        require_same_bits(found, expected)
+
+
+@backends()
+def test_scales_that_share_nothing_are_drawn_alone(backend):
+    a, b, view = scene(50, seed=1), scene(50, seed=2), camera()
+    for rendering, job in zip(backend().render_scales([(a, view), (b, view)]), (a, b), strict=True):
+        assert torch.equal(rendering.image, backend()(job, view).image)
+
+
+@backends()
+def test_order_is_by_depth_then_index_in_every_storage(backend):
+    # Gaussians of one depth but different index: the picture follows the index, whoever else is there.
+    splats, view = scene(64), camera(32, 32)
+    flat = replace(splats, means=torch.cat((splats.means[:, :2], torch.full((64, 1), 5.0)), dim=1))
+    require_image(backend()(flat, view).image, ReferenceRasterizer()(to(flat, torch.float64), view).image)
+    reverse = torch.arange(63, -1, -1)
+    assert not torch.equal(backend()(select(flat, reverse), view).image, backend()(flat, view).image)
+
+
+@backends()
+def test_long_lists_are_worked_off_to_the_end(backend):
+    # More Gaussians over one tile than any buffer holds (cpp: 2048), most of them faint: every pixel sees them all.
+    splats, view = scene(5000, bands=0, seed=3), camera(33, 31)
+    faint = replace(splats, opacities=splats.opacities * 0.02)
+    require_reference(backend, faint, view, cotangents(2, 31, 33))
+
+
+# ---- shapes and borders ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 15, 16, 17, 255, 257])
+@backends()
+def test_any_number_of_gaussians(backend, n):
+    require_reference(backend, select(scene(300), torch.arange(n)), camera(40, 30), cotangents(1, 30, 40))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (15, 16), (16, 17), (31, 33), (32, 32), (64, 65)])
+@backends()
+def test_any_image_size(backend, size):
+    found, truth = require_reference(backend, scene(80), camera(*size), cotangents(1, size[1], size[0]))
+    assert torch.equal(found.visible, truth.visible)
+
+
+@pytest.mark.parametrize("tile", [4, 8, 16, 32, 64])
+@backends()
+def test_tiles_not_asked_for_cost_nothing_and_change_nothing(backend, tile):
+    if tile not in backend.edges:
+        pytest.skip(f"{backend.name} has no tiles of {tile} px")
+    splats, view = scene(200), camera(100, 70)
+    rasterizer = backend(tile=tile)
+    rows, columns = -(-70 // tile), -(-100 // tile)
+    mask = torch.rand(rows, columns, generator=torch.Generator().manual_seed(1)) < 0.4
+    pixels = mask.repeat_interleave(tile, 0).repeat_interleave(tile, 1)[:70, :100]
+    full, part = rasterizer(splats, view), rasterizer(splats, view, tiles=mask)
+    assert torch.equal(part.image[pixels], full.image[pixels])
+    assert not part.image[~pixels].any()
+    v = cotangents(1, 70, 100)
+    a, b = part.vjp(v), full.vjp(v * pixels[None, :, :, None])
+    for name in ATTRIBUTES:
+        expected = gradient_of(b, name)
+        assert float((gradient_of(a, name) - expected).norm()) <= 2e-6 * float(expected.norm())
+    assert torch.equal(part.visible, full.visible)
+
+
+@backends()
+def test_inactive_bands_are_stepped_over(backend):
+    splats, view = scene(60, bands=15), camera()
+    active = replace(splats, shN=splats.shN[:, :3])  # a view: rows lie 45 numbers apart
+    assert not active.shN.is_contiguous()
+    packed = replace(splats, shN=splats.shN[:, :3].contiguous())
+    v = cotangents(1, view.height, view.width)
+    require_same_bits(everything(backend()(active, view), v), everything(backend()(packed, view), v))
+
+
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN", "rgb_offset"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@backends()
+def test_numbers_that_are_not_finite_are_named(backend, name, bad):
+    splats = scene(20)
+    visible = int(backend()(splats, camera()).visible.nonzero()[3])
+    value = getattr(splats, name).clone()
+    value[visible].view(-1)[-1] = bad
+    with pytest.raises(ValueError, match=f"splats.{name} must be finite; Gaussian {visible}"):
+        backend()(replace(splats, **{name: value}), camera())
+
+
+@backends()
+def test_half_precision_is_refused(backend):
+    with pytest.raises(TypeError, match="draws float32"):
+        backend()(to(scene(3), torch.float16), camera())
+
+
+@pytest.mark.parametrize(("setting", "rule"), [({"tile": 6}, "multiple of [48]"), ({"memory": 0}, "at least 1 MiB")])
+@backends()
+def test_settings_out_of_range_are_named(backend, setting, rule):
+    with pytest.raises(ValueError, match=rule):
+        backend(**setting)
+
+
+@backends()
+def test_a_picture_outlives_its_rasterizer_and_its_memory_is_used_again(backend):
+    splats, view = scene(3000), camera(200, 150)
+    kept = backend()(splats, view).image
+    before = kept.clone()
+    for _ in range(5):
+        backend()(splats, view).vjp(cotangents(1, 150, 200))
+    assert torch.equal(kept, before)

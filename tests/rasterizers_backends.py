@@ -1,0 +1,140 @@
+"""The backends that are judged against float64, each at the widest precision that it has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cache
+from typing import Any
+
+import pytest
+import torch
+
+import rasterizers
+from rasterizers import BackendUnavailable, Camera, Rasterizer, Rendering, SplatGradients, Splats
+from rasterizers.reference import ReferenceRasterizer
+from rasterizers.testing import gradient_of, scene, to
+
+ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN", "rgb_offset", "screen")
+CLEAN = {"alpha_min": 1e-7, "transmittance_min": 1e-9}  # cut-offs far below what float32 resolves: no flips
+
+
+@dataclass(frozen=True, eq=False)
+class Backend:
+    """A rasterizer by name.
+
+    Args:
+        edges: the tiles it can be asked for, px.
+        cases: how many pictures of one Gaussian a test may ask for.
+        device: where it draws; the tests' tensors are brought there, and what it finds is brought back.
+    """
+
+    name: str
+    edges: tuple[int, ...]
+    cases: int
+    device: str = "cpu"
+
+    def __call__(self, **settings: Any) -> Rasterizer:
+        if self.name != "warp":
+            return rasterizers.load(self.name, **settings)
+        rasterizer = rasterizers.load(self.name, device=self.device, **settings)
+        return rasterizer if self.device == "cpu" else Elsewhere(rasterizer, self.device)
+
+    @property
+    def widest(self) -> torch.dtype:
+        return torch.float64 if torch.float64 in self().traits.dtypes else torch.float32
+
+    @property
+    def why_not(self) -> str | None:
+        """Why it does not run here."""
+        try:
+            self()
+        except BackendUnavailable as reason:
+            return str(reason)
+        return None
+
+
+class Elsewhere:
+    """A rasterizer on another device, for tests that stay on the CPU."""
+
+    def __init__(self, rasterizer: Rasterizer, device: str) -> None:
+        self.rasterizer, self.device = rasterizer, device
+        self.traits, self.tile = rasterizer.traits, rasterizer.tile
+
+    def __call__(self, splats: Splats, camera: Camera, tiles: torch.Tensor | None = None) -> Rendering:
+        return Home(self.rasterizer(moved(splats, self.device), camera, tiles))
+
+    def render_scales(self, jobs, tiles=None) -> list[Rendering]:
+        there: dict[int, torch.Tensor] = {}  # the same tensor stays the same tensor
+        jobs = [(moved(splats, self.device, there), camera) for splats, camera in jobs]
+        return [Home(rendering) for rendering in self.rasterizer.render_scales(jobs, tiles)]
+
+
+class Home:
+    """A rendering of another device, brought to the CPU."""
+
+    def __init__(self, rendering: Rendering) -> None:
+        self.rendering = rendering
+        self.image, self.alpha = rendering.image.cpu(), rendering.alpha.cpu()
+        self.means2d, self.visible = rendering.means2d.cpu(), rendering.visible.cpu()
+
+    def vjp(self, cotangents: torch.Tensor) -> SplatGradients:
+        return moved(self.rendering.vjp(cotangents), "cpu")
+
+
+def moved(tensors, device: str, there: dict[int, torch.Tensor] | None = None):
+    """Splats or gradients on another device; `there` knows what has been brought."""
+    there = {} if there is None else there
+    found = {f.name: getattr(tensors, f.name) for f in fields(tensors)}
+    return replace(
+        tensors,
+        **{name: there.setdefault(id(x), x.to(device)) if x is not None else None for name, x in found.items()},
+    )
+
+
+BACKENDS = {
+    "cpp": Backend("cpp", (4, 8, 16, 32, 64), 400),
+    "warp": Backend("warp", (8, 16, 32, 64), 100),
+    "warp-cuda": Backend("warp", (8, 16, 32, 64), 400, "cuda"),
+}
+
+
+@cache
+def why_not(name: str) -> str | None:
+    """Why a backend does not run here."""
+    return BACKENDS[name].why_not
+
+
+def backends(*, dtype: torch.dtype | None = None) -> pytest.MarkDecorator:
+    """Run a test for every backend, skipped with the reason where it does not run."""
+    params = [
+        pytest.param(backend, id=name, marks=pytest.mark.skipif(bool(why_not(name)), reason=str(why_not(name))))
+        for name, backend in BACKENDS.items()
+        if dtype is None or why_not(name) or dtype in backend().traits.dtypes
+    ]
+    return pytest.mark.parametrize("backend", params)
+
+
+def exact(splats: Splats, camera: Camera, **settings: Any) -> Rendering:
+    """The truth: float64, compiled where that can be."""
+    oracle = ReferenceRasterizer(**settings) if why_not("cpp") else rasterizers.load("cpp", **settings)
+    return oracle(to(splats, torch.float64), camera)
+
+
+def camera(width=65, height=47) -> Camera:
+    return Camera(torch.eye(4), 0.9 * width, 0.9 * width, 0.52 * width, 0.47 * height, width, height)
+
+
+def cotangents(k, height, width, seed=0) -> torch.Tensor:
+    return torch.randn(k, height, width, 3, generator=torch.Generator().manual_seed(seed))
+
+
+def everything(rendering, v):
+    g = rendering.vjp(v)
+    picture = (rendering.image, rendering.alpha, rendering.means2d, rendering.visible)
+    return (*picture, *(gradient_of(g, name) for name in ATTRIBUTES), g.basis)
+
+
+def dense_scene(n=3000):
+    """Deep enough that pixels end: some hundred Gaussians over each."""
+    splats = scene(n, bands=15, seed=4)
+    return replace(splats, scales=splats.scales * 0.35), camera(130, 97)
