@@ -149,8 +149,22 @@ class TrainState:
 
     @property
     def ended(self) -> bool:
-        """Whether all iterations are done, or the rest is not needed."""
-        return self.t > self.settings.iterations or self.economy.settled(self.history, self.t - 1)
+        """Whether all iterations are done."""
+        return self.t > self.settings.iterations
+
+    def advance(self) -> None:
+        """On to the next iteration; from a plateau of the training views straight to its end."""
+        done, self.t = self.t, self.t + 1
+        if not self.economy.settled(self.history, done):
+            return
+        to, skips = min(self.economy.skips.plateau_to, self.settings.iterations), self.economy.skips
+        left_out, self.t = to + 1 - self.t, to + 1
+        self.optimizer.steps += left_out  # the learning rates follow the iteration
+        self.conductor.ledger.skip("iterations", "the training views stopped improving (skips.plateau_gain)", left_out)
+        _log.info(
+            "t=%d: the training views' loss fell by less than %.1f %% in %d iterations; training goes on at t=%d.",
+            done, 100 * skips.plateau_gain, skips.plateau_window, self.t,
+        )  # fmt: skip
 
     def refilter(self) -> None:
         """Make the 3D filter anew from where the Gaussians are now."""
@@ -229,7 +243,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
             s.refilter()
     low = images.area_mean(drawn[-1].image, view.factor) if lr is None else lr.image
     s.history.append(_row(s, u, low, view))
-    s.t += 1
+    s.advance()
     return u
 
 
@@ -274,7 +288,7 @@ def fit(
         ended = state.ended
         while not ended:
             iterate(state, rasterizer)
-            done, ended = state.t - 1, state.ended
+            done, ended = int(state.history[-1]["t"]), state.ended
             state.history[-1]["seconds"] = time.perf_counter() - began
             if settings.probe_every and (done % settings.probe_every == 0 or ended):
                 with state.conductor.ledger.stage("probe test views"):
@@ -288,12 +302,6 @@ def fit(
             if settings.checkpoint_every and done % settings.checkpoint_every == 0 and not ended:
                 _require_finite(state)
                 save()
-    if left := settings.iterations + 1 - state.t:
-        state.conductor.ledger.skip("iterations", "the training views stopped improving (skips.stop_gain)", left)
-        _log.info(
-            "training ended at t=%d of %d: the training views' loss fell by less than %.1f %% in %d iterations.",
-            state.t - 1, settings.iterations, 100 * state.economy.skips.stop_gain, state.economy.skips.stop_window,
-        )  # fmt: skip
     _require_finite(state)
     save()
     return state

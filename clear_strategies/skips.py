@@ -35,8 +35,10 @@ class Skips:
         hr_every: from `hr_every_from` on, HR takes part in every n-th iteration only.
         flat: HR tiles are not drawn where the reference adds less than this to U(I_LR), mean over the tile, image units;
             LR looks after them. 0: all tiles are drawn.
-        stop_gain: training ends once the training views' loss, mean over `stop_window` iterations, is not at least this
-            share below that of the window before; 0: never. Not before `stop_from`, when the structure has settled.
+        plateau_gain: once the training views' loss, mean over `plateau_window` iterations, is not at least this share below
+            that of the window before, the rest of the plateau is left out: training goes on at `plateau_to`, where the
+            learning rates have nearly fallen and test views still gain; 0: never. Not before `plateau_from`, when the
+            structure has settled.
 
     Raises:
         ValueError: a setting is outside its range.
@@ -46,17 +48,18 @@ class Skips:
     hr_every: int = 1
     hr_every_from: int = milestone(5_000)
     flat: float = 0.0
-    stop_gain: float = 0.0
-    stop_window: int = milestone(500)
-    stop_from: int = milestone(5_000)
+    plateau_gain: float = 0.0
+    plateau_window: int = milestone(500)
+    plateau_from: int = milestone(5_000)
+    plateau_to: int = milestone(8_000)
 
     def __post_init__(self) -> None:
         if self.hr_every < 1:
             raise ValueError(f"hr_every must be at least 1 iteration, got {self.hr_every}.")
         if not 0 <= self.flat < 1:
             raise ValueError(f"flat must lie in [0, 1) image units, got {self.flat}.")
-        if not 0 <= self.stop_gain < 1:
-            raise ValueError(f"stop_gain must lie in [0, 1), got {self.stop_gain}.")
+        if not 0 <= self.plateau_gain < 1:
+            raise ValueError(f"plateau_gain must lie in [0, 1), got {self.plateau_gain}.")
         if self.coarse_until < 0:
             raise ValueError(f"coarse_until must be at least 0 iterations, got {self.coarse_until}.")
 
@@ -69,8 +72,11 @@ class Skips:
             phrases.append(f"HR but every {self.hr_every} iterations from {self.hr_every_from}")
         if self.flat > 0:
             phrases.append(f"HR tiles to which the reference adds less than {self.flat:.4f}")
-        if self.stop_gain > 0:
-            phrases.append(f"the rest once {self.stop_window} iterations gain less than {self.stop_gain:.1%}")
+        if self.plateau_gain > 0:
+            phrases.append(
+                f"what is left until {self.plateau_to} once {self.plateau_window} iterations gain less than "
+                f"{self.plateau_gain:.1%}"
+            )
         return phrases
 
 
@@ -112,16 +118,16 @@ class Economy:
         return wanted
 
     def settled(self, history: Sequence[Mapping[str, float]], t: int) -> bool:
-        """Whether training may end after iteration t: the training views have stopped improving."""
-        s, window = self.skips, self.skips.stop_window
-        if s.stop_gain == 0 or window < 1 or t < s.stop_from + 2 * window or t % window:
+        """Whether the training views have stopped improving by iteration t, which then is followed by `plateau_to`."""
+        s, window = self.skips, self.skips.plateau_window
+        if s.plateau_gain == 0 or window < 1 or t % window or not s.plateau_from + 2 * window <= t < s.plateau_to:
             return False
         rows = history[t - 2 * window : t]
         column = "loss_base" if any("loss_base" in row for row in rows[window:]) else "loss_lr"
         before, now = ([row[column] for row in part if column in row] for part in (rows[:window], rows[window:]))
         if not before or not now:
             return False
-        return math.fsum(now) / len(now) > (1 - s.stop_gain) * math.fsum(before) / len(before)
+        return math.fsum(now) / len(now) > (1 - s.plateau_gain) * math.fsum(before) / len(before)
 
     def _with_detail(self, view: View, tile: int) -> Bool[Tensor, "th tw"] | None:
         added = (view.hr.image - images.upsample(view.lr.image, view.factor)).abs()

@@ -103,7 +103,7 @@ def test_every_variant_composes():
             on = (
                 config.skips.coarse_until > 0
                 or config.skips.hr_every > 1
-                or config.skips.flat + config.skips.stop_gain > 0
+                or config.skips.flat + config.skips.plateau_gain > 0
             )
             assert on == (variant.kind == pareto.SKIPS), variant.name
             assert config.rasterizer.preset == ("accurate" if variant.name == "accurate" else "fast")
@@ -120,14 +120,14 @@ def test_a_folder_is_that_of_its_overrides():
 
 @pytest.fixture
 def trainings(monkeypatch) -> list[tuple[str, str]]:
-    """Trainings take no time and are noted; "early stop" fails."""
+    """Trainings take no time and are noted; "no plateau" fails."""
     noted: list[tuple[str, str]] = []
 
     def train(folder: Path, overrides: list[str]) -> str | None:
         seed = next(int(o.partition("=")[2]) for o in overrides if o.startswith("fit.seed="))
-        stops, coarse = ("skips.stop_gain=0.01" in overrides, "skips.coarse_until=3000" in overrides)
-        noted.append(("early stop" if stops else "coarse first" if coarse else "clear", str(seed)))
-        if stops:
+        leaps, coarse = ("skips.plateau_gain=0.01" in overrides, "skips.coarse_until=3000" in overrides)
+        noted.append(("no plateau" if leaps else "coarse first" if coarse else "clear", str(seed)))
+        if leaps:
             return f"{folder}: no such scene"
         leave(folder, psnr=20.0 + seed, seed=seed, seconds=6.0 if coarse else 11.0)
         return None
@@ -138,14 +138,14 @@ def trainings(monkeypatch) -> list[tuple[str, str]]:
 
 def test_seeds_are_outermost_and_what_failed_is_not_tried_again(tmp_path, trainings):
     said: list[str] = []
-    request = replace(REQUEST, out=tmp_path, variants=("clear", "early stop", "coarse first"))
+    request = replace(REQUEST, out=tmp_path, variants=("clear", "no plateau", "coarse first"))
     findings, rows = pareto.measure(request, said.append)
     assert trainings == [
-        ("clear", "0"), ("early stop", "0"), ("coarse first", "0"), ("clear", "1"), ("coarse first", "1"),
+        ("clear", "0"), ("no plateau", "0"), ("coarse first", "0"), ("clear", "1"), ("coarse first", "1"),
     ]  # fmt: skip
     assert [r.variant.name for r in rows] == ["coarse first", "clear"]
     assert len(findings.skipped) == 1
-    assert findings.skipped[0].startswith("early stop, seed 0 and later: early_stop_seed0_")
+    assert findings.skipped[0].startswith("no plateau, seed 0 and later: no_plateau_seed0_")
     assert str(tmp_path) not in findings.skipped[0]
     columns = findings.sections[0].columns
     assert columns["of clear"] == ["0.500x", "1.00x"]

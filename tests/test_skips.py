@@ -90,19 +90,19 @@ def test_undrawn_tiles_show_the_reference_and_send_no_gradient():
 
 
 @pytest.mark.parametrize(("now", "ends"), [(0.99, True), (0.97, False), (1.10, True)])
-def test_training_ends_when_a_window_gains_less_than_asked(now, ends):
-    economy = Economy(Skips(stop_gain=0.02, stop_window=4, stop_from=0))
+def test_a_plateau_is_a_window_that_gains_less_than_asked(now, ends):
+    economy = Economy(Skips(plateau_gain=0.02, plateau_window=4, plateau_from=0))
     assert economy.settled(loss_rows(*[1.0] * 4, *[now] * 4), 8) is ends
 
 
-def test_training_does_not_end_early_nor_between_windows():
-    skips = Skips(stop_gain=0.5, stop_window=4, stop_from=4)
-    rows = loss_rows(*[1.0] * 16)
-    assert [t for t in range(1, 17) if Economy(skips).settled(rows, t)] == [12, 16]
+def test_a_plateau_begins_neither_early_nor_between_windows_nor_late():
+    skips = Skips(plateau_gain=0.5, plateau_window=4, plateau_from=4, plateau_to=20)
+    rows = loss_rows(*[1.0] * 24)
+    assert [t for t in range(1, 25) if Economy(skips).settled(rows, t)] == [12, 16]
 
 
 def test_without_hr_the_lr_loss_decides_and_rows_without_hr_are_left_out():
-    skips = Skips(stop_gain=0.02, stop_window=2, stop_from=0)
+    skips = Skips(plateau_gain=0.02, plateau_window=2, plateau_from=0)
     assert Economy(skips).settled(loss_rows(1, 1, 1, 1, column="loss_other"), 4)
     mixed = [{"loss_lr": 9.0}, {"loss_lr": 1.0, "loss_base": 1.0}, {"loss_lr": 1.0}, {"loss_lr": 1.0, "loss_base": 0.5}]
     assert not Economy(skips).settled(mixed, 4)
@@ -110,17 +110,18 @@ def test_without_hr_the_lr_loss_decides_and_rows_without_hr_are_left_out():
 
 def test_every_milestone_stretches_with_the_run():
     short = scaled(Skips(coarse_until=3_000), 0.1)
-    assert (short.coarse_until, short.hr_every_from, short.stop_window, short.stop_from) == (300, 500, 50, 500)
+    assert (short.coarse_until, short.hr_every_from, short.plateau_window, short.plateau_to) == (300, 500, 50, 800)
 
 
-def test_a_run_ends_by_itself_and_says_so(caplog):
+def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
     state = start(("gco",))
-    state.economy = Economy(Skips(stop_gain=0.99, stop_window=4, stop_from=8))
+    state.economy = Economy(Skips(plateau_gain=0.99, plateau_window=2, plateau_from=6, plateau_to=17))
     with caplog.at_level("INFO"):
         fit(state, toy.scene(), toy.RASTERIZER)
-    assert state.t - 1 == 16 < ITERATIONS
-    assert "training ended at t=16 of 20" in caplog.text
-    assert sum(state.conductor.ledger.entries["iterations"].skipped.values()) == 4
+    assert [int(row["t"]) for row in state.history] == [*range(1, 11), 18, 19, 20]
+    assert state.optimizer.steps == ITERATIONS  # so the learning rates are those of the end
+    assert "training goes on at t=18" in caplog.text
+    assert sum(state.conductor.ledger.entries["iterations"].skipped.values()) == 7
 
 
 @pytest.mark.parametrize("skips", [Skips(coarse_until=12), Skips(hr_every=2, hr_every_from=3), Skips(flat=0.02)])
@@ -133,7 +134,7 @@ def test_every_skip_trains(skips):
 
 
 @pytest.mark.parametrize(
-    "bad", [{"hr_every": 0}, {"flat": -0.1}, {"flat": 1.0}, {"stop_gain": 1.0}, {"coarse_until": -1}]
+    "bad", [{"hr_every": 0}, {"flat": -0.1}, {"flat": 1.0}, {"plateau_gain": 1.0}, {"coarse_until": -1}]
 )
 def test_settings_out_of_range_are_refused(bad):
     with pytest.raises(ValueError, match="must"):
