@@ -40,8 +40,13 @@ class Screen:
         return g if self.rows is None else g.new_zeros(n, 2).index_add_(0, self.rows, g)
 
     def hand_over(self, magnitude: Float[Tensor, " N"]) -> None:
-        """Make the tensor's `.grad` (and gsplat's `.absgrad`) one whose norm in NDC units is `magnitude`."""
+        """Make the tensor's `.grad` (and gsplat's `.absgrad`) one whose norm in NDC units is `magnitude`.
+
+        Columns beyond the second are the host's: some keep absolute gradients there.
+        """
         given = torch.zeros_like(self.tensor)
+        if self.tensor.grad is not None:
+            given[..., 2:] = self.tensor.grad[..., 2:]
         rows = magnitude if self.rows is None else magnitude[self.rows]
         given.view(-1, given.shape[-1])[:, 0] = rows.to(given) * (2 / self.size[0] / self.unit[0])
         self.tensor.grad = given

@@ -1,0 +1,144 @@
+"""A host's model, camera and picture as an adapter needs them, where `render` takes the model whole (Inria's 3DGS and what
+descends from it): the model with gated opacities and f_det in its colours, the camera at HR, the result as a `Drawing`.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from integration.attach import Drawing, HostError
+from integration.bridge import AutogradShot
+from integration.densify import Screen
+from rasterizers.geometry import SH_C0
+from rasterizers.interface import Camera
+
+Role = Literal["gate", "detail"]
+
+
+@dataclass(slots=True, eq=False)
+class Shown:
+    """What a model is seen with.
+
+    Args:
+        gate: z, a factor of every opacity. detail: f_det, an offset of every colour. None: as they are.
+        read: which of them the host has looked at. busy: inside a getter that other getters may call.
+    """
+
+    gate: Float[Tensor, " N"] | None = None
+    detail: Float[Tensor, "N 3"] | None = None
+    read: set[Role] = field(default_factory=set)
+    busy: set[Role] = field(default_factory=set)
+
+
+def seen(model: Any, shown: Shown, roles: tuple[tuple[str, Role], ...]) -> Any:
+    """The same model, sharing all it has, but for what is `shown`.
+
+    Args:
+        roles: which of its getters, methods and attributes give opacities (or a pair that ends with them), and which the
+            constant band of its colours; those that it does not have are passed over.
+    """
+    view: Any = object.__new__(_kind(type(model), roles))  # type: ignore[arg-type]
+    object.__setattr__(view, "__dict__", vars(model))
+    object.__setattr__(view, "_clear_shown", shown)
+    return view
+
+
+@cache
+def _kind(cls: type, roles: tuple[tuple[str, Role], ...]) -> type:
+    members: dict[str, Any] = {"__slots__": ("_clear_shown",), "__module__": cls.__module__}
+    for name, role in roles:
+        members |= {name: _member(inspect.getattr_static(cls, name, None), name, role)}
+    return type(cls.__name__, (cls,), members)
+
+
+def _member(original: Any, name: str, role: Role) -> Any:
+    """A getter, method or plain attribute that gives what `original` gives, changed once."""
+
+    def changed(self: Any, get: Callable[[], Any]) -> Any:
+        shown: Shown = self._clear_shown
+        if role in shown.busy:
+            return get()
+        shown.busy.add(role)
+        try:
+            return _changed(get(), shown, role)
+        finally:
+            shown.busy.discard(role)
+
+    if callable(original):
+        return lambda self, *args, **kwargs: changed(self, lambda: original(self, *args, **kwargs))
+    if isinstance(original, property):
+        return property(lambda self: changed(self, lambda: original.__get__(self)))
+    return property(lambda self: changed(self, lambda: _attribute(self, name)))
+
+
+def _attribute(model: Any, name: str) -> Any:
+    try:
+        return vars(model)[name]
+    except KeyError:
+        raise AttributeError(f"{type(model).__name__} has no {name}") from None
+
+
+def _changed(value: Any, shown: Shown, role: Role) -> Any:
+    shown.read.add(role)
+    if isinstance(value, tuple):  # Mip-Splatting's (scales, opacities)
+        return (*value[:-1], _changed(value[-1], shown, role))
+    if role == "gate" and shown.gate is not None:
+        return value * shown.gate.to(value).view(-1, *[1] * (value.dim() - 1))
+    if role == "detail" and shown.detail is not None:
+        return value + (shown.detail / SH_C0).view_as(value)
+    return value
+
+
+def drawing(
+    result: Any, camera: Camera, params: Mapping[str, Tensor], shown: Shown, unit: tuple[float, float] | None = None
+) -> Drawing:
+    """The result of a host's `render`: a dict with "render" [3, H, W], "viewspace_points" [N, 2 or more], "radii" and
+    "visibility_filter" [N]. Who is left out has not been seen, and the dict says so.
+
+    Args:
+        camera: that of the photograph.
+        unit: from a gradient of "viewspace_points" to 1/pixel; None: they are in NDC.
+
+    Raises:
+        HostError: something else was returned, or of another size.
+    """
+    names = ("render", "viewspace_points", "radii", "visibility_filter")
+    if not isinstance(result, Mapping) or any(name not in result for name in names):
+        found = ", ".join(map(str, result)) if isinstance(result, Mapping) else type(result).__name__
+        raise HostError(f"render must return a dict with {', '.join(names)}, got {found}. Wrap a function that does.")
+    image, screen, radii = (result[name] for name in names[:3])
+    if tuple(image.shape) != (3, camera.height, camera.width):
+        raise HostError(
+            f"a picture of {camera.width}x{camera.height} pixels was expected, render gave {tuple(image.shape)}. Train at "
+            "one resolution, that of the photographs."
+        )
+    visible = radii > 0 if radii.dim() == 1 else (radii > 0).all(-1)
+    if shown.gate is not None:
+        kept = shown.gate > 0
+        visible = visible & kept
+        passed = result["visibility_filter"]
+        result = {
+            **result,
+            "radii": radii * kept.view(-1, *[1] * (radii.dim() - 1)).to(radii),
+            "visibility_filter": passed & kept if passed.dtype == torch.bool else passed[kept[passed.reshape(-1)]],
+        }
+    size = camera.width, camera.height
+    kept_screen = Screen(screen, size, unit if unit is not None else (2 / size[0], 2 / size[1]))
+    u = centres(params["means"].detach(), camera)
+    return Drawing(AutogradShot(image.permute(1, 2, 0), u, visible, params, kept_screen), image, result)
+
+
+def centres(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 2"]:
+    """u_i = π(μ_i), pixels; of Gaussians behind the camera some finite number."""
+    pose = camera.world_to_camera.to(means)
+    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+    z = z.clamp_min(torch.finfo(z.dtype).eps)
+    return torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), -1)
