@@ -28,13 +28,12 @@ from torch import Tensor
 
 from clear_strategies.conductor import Conductor
 from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.data.upscale import Images
 from clear_strategies.data.view import View
 from integration.attach import Attachment, Drawing, HostError, Which
+from integration.densify import warn_of_early_end
 from integration.lineage import Detail
-from integration.seen import Role, Shown, drawing, seen
-from integration.views import SuperResolve, view
-from rasterizers.geometry import SH_C0
+from integration.seen import Eye, Role
+from integration.views import SuperResolve, super_resolve, view
 
 _log = logging.getLogger(__name__)
 
@@ -81,7 +80,7 @@ def attach(
         detail: train the detail feature f_det, beside the host's parameters.
 
     Raises:
-        ValueError: HR is wanted, but there is no `sr`; or there is no camera, or one twice.
+        ValueError: HR is wanted, but there is no `sr`; or there is no camera, or two have one name.
         DataError: an SR picture is missing, or not `factor` times its photograph.
         HostError: `gaussians` is not what 3DGS calls a GaussianModel.
     """
@@ -112,23 +111,23 @@ class Attached:
                 f"{type(gaussians).__name__} has no {missing[0]}, as 3DGS's GaussianModel has. Attach after "
                 "gaussians.training_setup(opt)."
             )
-        self._model, self._trains_detail = gaussians, detail
+        self._model = gaussians
         resolve, factor = super_resolve(sr, conductor, factor)
         self._views = self._read(cameras, resolve, factor)
         self._detail = Detail(self._leaves)
-        self._optimizer, self._save_ply = gaussians.optimizer, gaussians.save_ply
-        self._stepped = gaussians.optimizer.register_step_post_hook(lambda *_: self._detail.step())
-        gaussians.save_ply = self._saving_detail
-        self._said: set[str] = set()
-        _warn_of_density(conductor, densify_until)
+        self._eye = Eye(gaussians, _ROLES, self._leaves, self._detail if detail else None, conductor)
+        warn_of_early_end(conductor, densify_until, "densify_until_iter")
         self.attachment = Attachment(
             conductor, self.params, n_views=len(self._views), seed=seed, threshold=threshold,
             rows=lambda: self._detail.rows(conductor.state_dict),
         )  # fmt: skip
+        self._optimizer, self._save_ply = gaussians.optimizer, gaussians.save_ply
+        self._stepped = gaussians.optimizer.register_step_post_hook(lambda *_: self._detail.step())
+        gaussians.save_ply = self._saving_detail
 
     def params(self) -> dict[str, Tensor]:
         """The leaves of this moment, by gsplat's names."""
-        return self._leaves() | ({"detail": self._detail.value} if self._trains_detail else {})
+        return self._eye.params()
 
     def wrap(self, render: Render) -> Render:
         """The same function; training cameras are drawn at both scales, and whatever is drawn without gradients shows f_det."""
@@ -138,8 +137,7 @@ class Attached:
             if self.attachment.removed or pc is not self._model:
                 return render(viewpoint_camera, pc, *args, **kwargs)
             if not torch.is_grad_enabled():
-                model = seen(pc, Shown(detail=self._detail.value), _ROLES)
-                return render(viewpoint_camera, model, *args, **kwargs)
+                return render(viewpoint_camera, self._eye.whole(), *args, **kwargs)
             photographed = self._recognise(viewpoint_camera)
             if photographed is None:
                 return render(viewpoint_camera, pc, *args, **kwargs)
@@ -152,7 +150,7 @@ class Attached:
 
             def draw(which: Which, gate: Tensor | None) -> Drawing:
                 camera = enlarged(viewpoint_camera, photographed.factor) if which == "hr" else viewpoint_camera
-                return self._draw(lambda model: render(camera, model, *args, **kwargs), photographed, which, gate)
+                return self._eye.draw(lambda model: render(camera, model, *args, **kwargs), photographed, which, gate)
 
             return self.attachment.draw(photographed, draw)
 
@@ -161,14 +159,14 @@ class Attached:
     @torch.no_grad()
     def fold_detail(self) -> None:
         """Add f_det to the constant band of the colours and make it 0."""
-        self._model._features_dc += self._offset()
+        self._model._features_dc += self._detail.offset(self._model._features_dc)
         self._detail.value.zero_()
 
     def remove(self) -> None:
         """Leave the loop as it was; f_det is no longer shown, see `fold_detail`."""
         self.attachment.remove()
         self._stepped.remove()
-        del self._model.save_ply  # the instance's: its class has its own
+        vars(self._model).pop("save_ply", None)  # the instance's: its class has its own
 
     def __enter__(self) -> Attached:
         return self
@@ -197,43 +195,15 @@ class Attached:
     def _recognise(self, camera: Any) -> View | None:
         name = getattr(camera, "image_name", None)
         if name not in self._views:
-            self._say(
-                "camera",
-                "a camera (%s) is none of the %d views; what it draws is left as it is.",
-                name,
-                len(self._views),
+            self._eye.say(
+                "a camera (%s) is none of the %d views; what it draws is left as it is.", name, len(self._views)
             )
         return self._views.get(name)  # type: ignore[arg-type]
-
-    def _draw(self, render: Render, of: View, which: Which, gate: Tensor | None) -> Drawing:
-        shown = Shown(gate, self._detail.value if which == "hr" and self._trains_detail else None)
-        result = render(seen(self._model, shown, _ROLES))
-        if shown.gate is not None and "gate" not in shown.read:
-            self._say("gate", "render reads none of the model's opacity getters: dropout has no effect.")
-        if shown.detail is not None and "detail" not in shown.read:
-            self._say("detail", "render does not read the model's _features_dc: the detail feature has no effect.")
-        params = self.params() if which == "hr" else self._leaves()
-        drawn = drawing(result, (of.hr if which == "hr" else of.lr).camera, _trained(params), shown)
-        if drawn.shot.kept.tensor.shape[-1] == 4 and self.attachment.conductor.owner("score") is not None:
-            self._say(
-                "absolute",
-                "viewspace_points have 4 columns: absolute gradients stay those of the LR image, the densification score of "
-                "%s goes to the first two columns alone.", type(self.attachment.conductor.owner("score")).__name__,
-            )  # fmt: skip
-        return drawn
-
-    def _say(self, what: str, message: str, *values: Any) -> None:
-        if what not in self._said:
-            _log.warning(message, *values)
-            self._said.add(what)
-
-    def _offset(self) -> Float[Tensor, "N 1 3"]:
-        return (self._detail.value.detach() / SH_C0).view_as(self._model._features_dc)
 
     def _saving_detail(self, *args: Any, **kwargs: Any) -> Any:
         """`save_ply`, with f_det in the colours of the file."""
         trained = self._model._features_dc
-        self._model._features_dc = torch.nn.Parameter(trained.detach() + self._offset())
+        self._model._features_dc = torch.nn.Parameter(trained.detach() + self._detail.offset(trained))
         try:
             return self._save_ply(*args, **kwargs)
         finally:
@@ -258,34 +228,9 @@ def intrinsics(camera: Any) -> Float[Tensor, "3 3"]:
     return torch.tensor([[fx * w, 0, (cx + 1) * w], [0, fy * h, (cy + 1) * h], [0, 0, 1]], dtype=torch.float64)
 
 
-def super_resolve(sr: SuperResolve | str | Path | None, conductor: Conductor, factor: int) -> tuple[SuperResolve, int]:
-    """The function that gives SR pictures, and their factor; where there are none, HR is LR and must not be asked for."""
-    if sr is not None:
-        return Images(str(sr)) if isinstance(sr, str | Path) else sr, factor
-    λ = conductor.objective.lambda_hr
-    if λ.peak > 0 or λ.final > 0 or conductor.owner("observe") is not None:
-        raise ValueError(
-            "sr must say where the SR pictures are, got None, but HR takes part. Pass their folder; or set "
-            "objective.lambda_hr.peak=0 and objective.lambda_hr.final=0, and leave P2G out."
-        )
-    return lambda name, image, factor: image, 1
-
-
 def _file_name(image_name: str) -> str:
     """Some hosts drop the suffix, and what follows the last dot of the rest is none."""
     return image_name if Path(image_name).suffix.lower() in SUFFIXES else f"{image_name}.png"
-
-
-def _trained(params: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: p for name, p in params.items() if p.requires_grad}
-
-
-def _warn_of_density(conductor: Conductor, until: int | None) -> None:
-    if until is not None and conductor.may_densify(0) and not conductor.may_densify(until - 1):
-        _log.warning(
-            "the host densifies until densify_until_iter=%d, but a strategy ends densification before (SVS: anchor_start). "
-            "Set densify_until_iter to that.", until,
-        )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -22,7 +22,8 @@ import torch
 from clear_strategies.conductor import Conductor
 from clear_strategies.data.upscale import Images
 from clear_strategies.errors import ClearError, DataError
-from integration.inria import THRESHOLD, Attached, Render, attach, super_resolve
+from integration.inria import THRESHOLD, Attached, Render, attach
+from integration.views import super_resolve
 
 _log = logging.getLogger(__name__)
 

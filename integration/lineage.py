@@ -17,6 +17,7 @@ from torch import Tensor
 
 from clear_strategies.optim import LearningRates
 from integration.attach import HostError
+from rasterizers.geometry import SH_C0
 
 # Split children keep these rows as they are. Opacity is none of them: some hosts correct that of clones.
 _INHERITED: Final = ("quats", "sh0")
@@ -81,6 +82,10 @@ class Detail:
         """A row for each Gaussian that the host has now."""
         self._follow()
         return self._value
+
+    def offset(self, sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
+        """f_det in the constant band of the colours."""
+        return (self.value.detach() / SH_C0).view_as(sh0)
 
     def rows(self, remembered: Callable[[], Mapping[str, Tensor]]) -> Int[Tensor, " M"] | None:
         """parents[M] of what happened since it was last asked; None: nothing.

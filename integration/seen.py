@@ -5,6 +5,7 @@ descends from it): the model with gated opacities and f_det in its colours, the 
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -14,11 +15,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from integration.attach import Drawing, HostError
+from clear_strategies.conductor import Conductor
+from clear_strategies.data.view import View
+from integration.attach import Drawing, HostError, Which
 from integration.bridge import AutogradShot
 from integration.densify import Screen
+from integration.lineage import Detail
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
+
+_log = logging.getLogger(__name__)
 
 Role = Literal["gate", "detail"]
 
@@ -97,15 +103,85 @@ def _changed(value: Any, shown: Shown, role: Role) -> Any:
     return value
 
 
+class Eye:
+    """Looks at a model through a host's render function, at either scale; says once what the host does not look at.
+
+    Args:
+        leaves: the host's parameters of this moment, by gsplat's names.
+        detail: f_det, shown at HR and where nothing is trained; None: there is none.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        roles: tuple[tuple[str, Role], ...],
+        leaves: Callable[[], Mapping[str, Tensor]],
+        detail: Detail | None,
+        conductor: Conductor,
+    ) -> None:
+        self._model, self._roles, self._leaves, self._detail = model, roles, leaves, detail
+        scoring = conductor.owner("score")
+        self._scoring = None if scoring is None else type(scoring).__name__
+        self._said: set[str] = set()
+
+    def params(self) -> dict[str, Tensor]:
+        """The leaves of this moment, f_det among them."""
+        detail = {} if self._detail is None else {"detail": self._detail.value}
+        return {**self._leaves(), **detail}
+
+    def whole(self) -> Any:
+        """The model as one looks at it: f = base + det, nobody left out."""
+        return seen(self._model, Shown(detail=None if self._detail is None else self._detail.value), self._roles)
+
+    def draw(
+        self,
+        render: Callable[[Any], Any],
+        of: View,
+        which: Which,
+        gate: Float[Tensor, " N"] | None,
+        unit: Callable[[Mapping[str, Any]], tuple[float, float] | None] = lambda result: None,
+    ) -> Drawing:
+        """Draw the view at LR without f_det, or at HR with it.
+
+        Args:
+            render: the host's, of a model alone. unit: see `drawing`, by the result.
+        """
+        shown = Shown(gate, self._detail.value if which == "hr" and self._detail is not None else None)
+        result = render(seen(self._model, shown, self._roles))
+        if shown.gate is not None and "gate" not in shown.read:
+            self.say("render reads none of the model's opacity getters: dropout has no effect.")
+        if shown.detail is not None and "detail" not in shown.read:
+            self.say("render reads no constant colours of the model: the detail feature has no effect.")
+        params = self.params() if which == "hr" else self._leaves()
+        trained = {name: p for name, p in params.items() if p.requires_grad}
+        drawn = drawing(result, (of.hr if which == "hr" else of.lr).camera, trained, shown, unit)
+        if drawn.shot.kept.tensor.shape[-1] == 4 and self._scoring is not None:
+            self.say(
+                "viewspace_points have 4 columns: absolute gradients stay those of the LR image, the densification score of "
+                "%s goes to the first two columns alone.", self._scoring,
+            )  # fmt: skip
+        return drawn
+
+    def say(self, message: str, *values: Any) -> None:
+        """Warn, once."""
+        if message not in self._said:
+            _log.warning(message, *values)
+            self._said.add(message)
+
+
 def drawing(
-    result: Any, camera: Camera, params: Mapping[str, Tensor], shown: Shown, unit: tuple[float, float] | None = None
+    result: Any,
+    camera: Camera,
+    params: Mapping[str, Tensor],
+    shown: Shown,
+    unit: Callable[[Mapping[str, Any]], tuple[float, float] | None],
 ) -> Drawing:
     """The result of a host's `render`: a dict with "render" [3, H, W], "viewspace_points" [N, 2 or more], "radii" and
     "visibility_filter" [N]. Who is left out has not been seen, and the dict says so.
 
     Args:
         camera: that of the photograph.
-        unit: from a gradient of "viewspace_points" to 1/pixel; None: they are in NDC.
+        unit: of a result, what makes a gradient of its "viewspace_points" one in 1/pixel; None: they are in NDC.
 
     Raises:
         HostError: something else was returned, or of another size.
@@ -131,7 +207,7 @@ def drawing(
             "visibility_filter": passed & kept if passed.dtype == torch.bool else passed[kept[passed.reshape(-1)]],
         }
     size = camera.width, camera.height
-    kept_screen = Screen(screen, size, unit if unit is not None else (2 / size[0], 2 / size[1]))
+    kept_screen = Screen(screen, size, unit(result) or (2 / size[0], 2 / size[1]))
     u = centres(params["means"].detach(), camera)
     return Drawing(AutogradShot(image.permute(1, 2, 0), u, visible, params, kept_screen), image, result)
 
