@@ -54,16 +54,16 @@ def conducted(config: DictConfig, stretch: float) -> Conductor:
 
 
 def _compose(overrides: list[str]) -> DictConfig:
-    # Who calls may be a Hydra application: its own state is put back.
-    state = GlobalHydra.get_state()
-    GlobalHydra.instance().clear()
+    # Who calls may be a Hydra application: its own is put back.
+    shared = GlobalHydra.instance()
+    theirs, shared.hydra = shared.hydra, None
     try:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             return hydra.compose("config", overrides)
     except (HydraException, OmegaConfBaseException) as error:
         raise DataError("config", " ".join(overrides), one_line(error), "see conf/ for what there is") from error
     finally:
-        GlobalHydra.set_state(state)
+        GlobalHydra.instance().hydra = theirs
 
 
 def instantiate(config: Any, key: str, **extra: Any) -> Any:

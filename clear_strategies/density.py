@@ -1,11 +1,14 @@
-"""Floor 4: adaptive density control (METHOD, A): clone, split and prune as one gather map, driven by a score."""
+"""Floor 4: who decides the structure, and our own answer: adaptive density control (METHOD, A), where clone, split and
+prune are one gather map, driven by a score. `density_gsplat` lets another library's strategy answer instead.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -29,6 +32,52 @@ _FEWEST_ROUNDS: Final = 10
 
 class DensityError(ClearError, RuntimeError):
     """Pruning would leave too few Gaussians to go on."""
+
+
+@runtime_checkable
+class Densifier(Protocol):
+    """Who changes the structure while the trainer trains."""
+
+    @property
+    def name(self) -> str:
+        """For the printed plan."""
+        ...
+
+    @property
+    def settings(self) -> Any:
+        """A dataclass; its milestones are printed."""
+        ...
+
+    @property
+    def marks(self) -> Mapping[str, int]:
+        """The iterations worth a mark on a curve."""
+        ...
+
+    def accumulate(self, update: Update, shot: Shot, t: int) -> None:
+        """Note what iteration t says about each Gaussian; `shot` is the rendering that its scores are of."""
+        ...
+
+    def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
+        """Whatever falls on t, after the optimizer's step; whether the structure changed.
+
+        Args:
+            resized: told parents[M] once field and optimizer have followed; row i of everything else per Gaussian now
+                comes from row parents[i].
+        """
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]: ...
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None: ...
+
+
+@runtime_checkable
+class DensifierSettings(Protocol):
+    """What a configuration's `density` is: a frozen dataclass that makes its densifier once the scene is known."""
+
+    def densifier(self, n: int, *, extent: float, seed: int, white_background: bool) -> Densifier:
+        """For a field of n Gaussians; `extent` is 3DGS's cameras_extent, world units."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +131,9 @@ class DensitySettings:
         """`every`, or less where the window would not hold 10 rounds."""
         return max(1, min(self.every, (self.stop - self.start) // _FEWEST_ROUNDS))
 
+    def densifier(self, n: int, *, extent: float, seed: int, white_background: bool) -> Density:
+        return Density(self, n, extent=extent, seed=seed, white_background=white_background)
+
 
 class Density:
     """Statistics per Gaussian, and the change of structure that follows from them.
@@ -90,12 +142,20 @@ class Density:
         extent: 3DGS's cameras_extent, world units. white_background: adds the early opacity reset.
     """
 
+    name: Final = "density control"
+
     def __init__(
         self, settings: DensitySettings, n: int, *, extent: float, seed: int, white_background: bool = False
     ) -> None:
         self.settings, self.extent, self.seed, self.white_background = settings, extent, seed, white_background
         self.score, self.ordinary, self.count = torch.zeros(n), torch.zeros(n), torch.zeros(n)
         self._said_cap = False
+
+    @property
+    def marks(self) -> Mapping[str, int]:
+        s = self.settings
+        reset = {"opacity reset": s.reset_every} if 0 < s.reset_every < s.stop else {}
+        return {"densify until": s.stop, **reset}
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
         """Add this view's scores for the Gaussians it saw (dropped ones are not seen)."""
@@ -119,6 +179,13 @@ class Density:
         s = self.settings
         early = self.white_background and t == s.start
         return early or (s.start < t < s.stop and s.reset_every > 0 and t % s.reset_every == 0)
+
+    def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
+        if due := self.due(t):
+            resized(self.restructure(field, optimizer, t))
+        if self.reset_due(t):
+            self.reset_opacity(field, optimizer)
+        return due
 
     def restructure(self, field: GaussianField, optimizer: Adam, t: int) -> Int[Tensor, " M"]:
         """Clone, split, prune: returns parents[M], row i of everything per Gaussian now comes from row parents[i].

@@ -18,13 +18,14 @@ from types import FrameType
 from typing import Any, Final, get_args
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies import checkpoint, images
 from clear_strategies.checkpoint import Checkpoint
 from clear_strategies.conductor import Conductor, Update
 from clear_strategies.data.view import Scene, View
-from clear_strategies.density import Density, DensitySettings, cameras_extent
+from clear_strategies.density import Densifier, DensifierSettings, cameras_extent
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.field import GaussianField
 from clear_strategies.fused import Fused, FusedStep, fused_step
@@ -105,7 +106,7 @@ class TrainState:
     field: GaussianField
     conductor: Conductor
     optimizer: Adam
-    density: Density
+    density: Densifier
     settings: FitSettings
     mip: MipFilter
     views: tuple[View, ...]
@@ -121,7 +122,7 @@ class TrainState:
         conductor: Conductor,
         *,
         settings: FitSettings,
-        density: DensitySettings,
+        density: DensifierSettings,
         rates: LearningRates,
         mip: MipFilter,
         skips: Skips | None = None,
@@ -130,7 +131,7 @@ class TrainState:
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree)
         extent = cameras_extent(torch.stack([view.hr.camera.center.float() for view in scene.train]))
         white = all(c == 1.0 for c in scene.background)
-        control = Density(density, len(theta), extent=extent, seed=settings.seed, white_background=white)
+        control = density.densifier(len(theta), extent=extent, seed=settings.seed, white_background=white)
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed)
         fused = fused_step(conductor, optimizer, settings.fused)
@@ -155,6 +156,11 @@ class TrainState:
         """Make the 3D filter anew from where the Gaussians are now."""
         cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]
         self.field.update_filter(cameras, self.mip.variance)
+
+    def resized(self, parents: Int[Tensor, " M"]) -> None:
+        """Row i of everything per Gaussian now comes from row parents[i]; field and optimizer have followed already."""
+        self.conductor.on_resize(parents)
+        self.refilter()
 
     def filter_due(self) -> bool:
         """Structure changes refresh the filter themselves; between and after them it follows the moving means."""
@@ -217,13 +223,8 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     ask.after_step(θ.raw(), t)  # θᵃ at t = t_a  Eq. 16       SVS
     s.density.accumulate(u, drawn[-1], t)  # S^dens         Eq. 14
     with stage("density and filter"):
-        may_change = ask.may_densify(t)
-        restructured = may_change and s.density.due(t)
-        if restructured:
-            ask.on_resize(s.density.restructure(θ, s.optimizer, t))  # clone · split · prune = parents[M]
-            s.refilter()
-        if may_change and s.density.reset_due(t):
-            s.density.reset_opacity(θ, s.optimizer)
+        # clone · split · prune = parents[M]
+        restructured = ask.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
         if s.filter_due() and not restructured:  # the means have not moved since
             s.refilter()
     low = images.area_mean(drawn[-1].image, view.factor) if lr is None else lr.image

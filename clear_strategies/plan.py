@@ -48,6 +48,8 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, *, rasterizer: str
     for s in conductor.strategies:
         if found := milestones(s):
             lines[f"milestones of {type(s).__name__}"] = ", ".join(f"{name} {t}" for name, t in found.items())
+    if found := milestones(state.density.settings):
+        lines[f"milestones of {state.density.name}"] = ", ".join(f"{name} {t}" for name, t in found.items())
     skipped = []
     if not conductor.wants_lr:
         used = "is the area mean of the HR render" if conductor.objective.lambda_lr > 0 else "plays no part"
@@ -75,12 +77,10 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, *, rasterizer: str
 
 def marks(state: TrainState) -> dict[str, int]:
     """The milestones worth a mark on a curve."""
-    hr, density = state.conductor.objective.lambda_hr, state.density.settings
-    at = {"HR from": hr.start, "HR full": hr.full, "densify until": density.stop}
+    hr = state.conductor.objective.lambda_hr
+    at = {"HR from": hr.start, "HR full": hr.full, **state.density.marks}
     if hr.final != hr.peak:
         at["HR decays"] = hr.decay_from
-    if 0 < density.reset_every < density.stop:
-        at["opacity reset"] = density.reset_every
     for s in state.conductor.strategies:
         if isinstance(s, SVS) and s.anchor_strength > 0:
             at["anchor"] = s.anchor_start

@@ -16,9 +16,11 @@ _MILESTONE: Final = "milestone"
 Settings = TypeVar("Settings")
 
 
-def milestone(default: int) -> Any:
-    """A dataclass field that holds an iteration number of a 10,000-iteration run; `scaled` stretches it."""
-    return field(default=default, metadata={_MILESTONE: True})
+def milestone(default: int, *, least: int = 0) -> Any:
+    """A dataclass field that holds an iteration number of a 10,000-iteration run; `scaled` stretches it, to no less than
+    `least`.
+    """
+    return field(default=default, metadata={_MILESTONE: least})
 
 
 def scaled(settings: Settings, factor: float) -> Settings:
@@ -28,8 +30,8 @@ def scaled(settings: Settings, factor: float) -> Settings:
         if not f.init:
             continue
         value = getattr(settings, f.name)
-        if f.metadata.get(_MILESTONE):
-            changes[f.name] = round(value * factor)
+        if _MILESTONE in f.metadata:
+            changes[f.name] = max(f.metadata[_MILESTONE], round(value * factor))
         elif is_dataclass(value) and not isinstance(value, type):
             changes[f.name] = scaled(value, factor)
     return replace(settings, **changes)  # type: ignore[type-var]
@@ -40,7 +42,7 @@ def milestones(settings: Any) -> dict[str, int]:
     found: dict[str, int] = {}
     for f in fields(settings):
         value = getattr(settings, f.name)
-        if f.metadata.get(_MILESTONE):
+        if _MILESTONE in f.metadata:
             found[f.name] = value
         elif f.init and is_dataclass(value) and not isinstance(value, type):
             found |= {f"{f.name}.{name}": t for name, t in milestones(value).items()}

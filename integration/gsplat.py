@@ -9,6 +9,7 @@ shapes and orders are all that is needed, of 1.4 ([C, N] radii) as of 1.5 and la
 
 from __future__ import annotations
 
+import functools
 import inspect
 import logging
 import sys
@@ -34,14 +35,15 @@ ROWS: Final = "clear_rows"
 every tensor of the state together with the parameters, so this one becomes the map of the change."""
 
 DETAIL_RATE: Final = 2.5e-3
+_ATTACHED: Final = "clear_attached"  # on a wrapped function: by whom
 _SAME_POSE: Final = 1e-3  # largest difference between entries of two poses that are one camera's
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
 
 def attach(
-    params: MutableMapping[str, Tensor],
-    optimizers: MutableMapping[str, torch.optim.Optimizer],
+    params: MutableMapping[str, Any] | torch.nn.ParameterDict,
+    optimizers: MutableMapping[str, Any],
     views: Sequence[View],
     conductor: Conductor,
     *,
@@ -79,8 +81,8 @@ class Attached:
 
     def __init__(
         self,
-        params: MutableMapping[str, Tensor],
-        optimizers: MutableMapping[str, torch.optim.Optimizer],
+        params: MutableMapping[str, Any] | torch.nn.ParameterDict,
+        optimizers: MutableMapping[str, Any],
         views: Sequence[View],
         conductor: Conductor,
         *,
@@ -121,6 +123,8 @@ class Attached:
 
     def wrap(self, rasterization: Rasterization) -> Rasterization:
         """The same function; training views are drawn at both scales, and whatever is drawn without gradients shows f_det."""
+        if hasattr(rasterization, _ATTACHED):
+            raise HostError("this rasterization is wrapped already; remove() the attachment that did it first.")
         signature = inspect.signature(rasterization)
         rest = [name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD]
         if missing := {"means", "opacities", "colors", "viewmats", "Ks", "width", "height"} - {*signature.parameters}:
@@ -129,6 +133,7 @@ class Attached:
                 "that takes them by name."
             )
 
+        @functools.wraps(rasterization)
         def wrapped(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
             given = signature.bind(*args, **kwargs).arguments
             for name in rest:
@@ -146,6 +151,7 @@ class Attached:
 
             return self.attachment.draw(view, draw)  # type: ignore[no-any-return]
 
+        setattr(wrapped, _ATTACHED, self)
         return wrapped
 
     def replace_everywhere(self, rasterization: Rasterization) -> Rasterization:

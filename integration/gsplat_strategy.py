@@ -6,7 +6,7 @@ cfg.strategy = ClearStrategy(views=views, conductor=conductor("clear", iteration
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import gsplat.rendering
@@ -52,6 +52,12 @@ class ClearStrategy(DefaultStrategy):  # type: ignore[misc]
         )  # fmt: skip
         self.attached.replace_everywhere(self.rasterization)
         return state
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Settings and names: trainers write their strategy into a configuration file, and photographs do not belong there."""
+        settings = {field.name: getattr(self, field.name) for field in fields(DefaultStrategy)}
+        strategies = self.conductor.strategies if self.conductor is not None else ()
+        return {**settings, "views": [view.name for view in self.views], "strategies": [repr(s) for s in strategies]}
 
     def step_post_backward(
         self, params: Any, optimizers: Any, state: dict[str, Any], step: int, info: dict[str, Any], **keywords: Any

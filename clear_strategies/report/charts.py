@@ -15,7 +15,7 @@ from jaxtyping import Float
 from clear_strategies.pictures import RUN_COLORS
 
 _WIDTH, _HEIGHT = 460, 250  # px, before the page scales them
-_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 30, 40
+_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 24, 30, 40  # the right one holds half a label
 _POINTS: Final = 240  # of a curve; more are not seen
 _DASHES: Final = ("", "6 3", "2 3")
 

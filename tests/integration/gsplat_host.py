@@ -30,7 +30,7 @@ rasterization = functools.partial(autograd.rasterization, backend="torch")
 
 
 def intrinsics(camera):
-    return torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])[None]
+    return torch.tensor([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], dtype=torch.float64)
 
 
 class Host:
@@ -48,13 +48,14 @@ class Host:
             self.state = strategy.initialize_state(scene_scale=extent)
         self.scaler, self.accumulation = scaler, accumulation
         self.grads = {}
+        self.degree = lambda step: min(3, step)
 
     def render(self, camera, step):
         p = self.splats
         return rasterization(
             p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), torch.cat([p["sh0"], p["shN"]], 1),
             camera.world_to_camera[None], intrinsics(camera), camera.width, camera.height,
-            sh_degree=min(3, step), packed=False,
+            sh_degree=self.degree(step), packed=False,
         )  # fmt: skip
 
     def train(self, names, between=lambda: None):

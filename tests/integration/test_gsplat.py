@@ -1,0 +1,401 @@
+"""CLEAR beside an unmodified gsplat loop: equal to our own trainer, and each strategy touches what it should."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import pytest
+import torch
+import toy
+import yaml
+
+import rasterizers
+from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, Objective
+from clear_strategies.compose import conductor as composed
+from clear_strategies.data.view import Photo, View
+from clear_strategies.density import DensitySettings
+from clear_strategies.fit import FitSettings, TrainState, iterate
+from clear_strategies.mip import MipFilter
+from clear_strategies.optim import LearningRates
+from clear_strategies.schedules import LogLinear, WarmupDecay, scaled
+from integration.attach import HostError
+from integration.gsplat import ROWS, attach
+from rasterizers import Splats, autograd
+from tests.integration import gsplat_host
+from tests.integration.gsplat_host import Host
+
+STEPS = 50
+EPS = 1e-10
+SUBSETS = ("baseline", "gco", "p2g", "svs", "clear")
+AT_ONCE = WarmupDecay(start=0, full=1, decay_from=100, end=100)
+
+
+def subset(name):
+    """New objects each time: a strategy remembers."""
+    anchored = SVS(anchor_weights={"means": 1e-4, "scales": 1e-4, "detail": 1e-6})
+    made = {"gco": GCO(), "p2g": P2G(patch=4), "svs": scaled(anchored, STEPS / 10_000)}
+    return tuple(s for key, s in made.items() if name in (key, "clear"))
+
+
+def conductor(name):
+    stretched = scaled(Objective(), STEPS / 10_000)
+    return Conductor(*subset(name), objective=stretched, statistics_from=round(500 * STEPS / 10_000))
+
+
+def double(view):
+    def photo(p):
+        return Photo(replace(p.camera, world_to_camera=p.camera.world_to_camera.double()), p.image.double())
+
+    return View(view.name, photo(view.lr), photo(view.hr))
+
+
+@pytest.fixture
+def attached():
+    """Attach to a host, and leave the module as it was."""
+    handles = []
+
+    def attach_to(host, scene, *args, **kwargs):
+        handle = attach(host.splats, host.optimizers, scene.train, *args, **kwargs)
+        handle.replace_everywhere(gsplat_host.rasterization)
+        handles.append(handle)
+        return handle
+
+    yield attach_to
+    for handle in handles:
+        handle.remove()
+
+
+@pytest.mark.parametrize("name", SUBSETS)
+def test_fifty_steps_are_those_of_our_own_trainer(name, attached):
+    """In float64 and with Adam's ε above rounding: else it follows the sign of gradients that are nothing but rounding."""
+    scene = toy.scene(40)
+    scene = replace(scene, train=tuple(map(double, scene.train)))
+    own = TrainState.start(
+        scene, conductor(name), settings=FitSettings(iterations=STEPS, degree_every=1, fused="off", scale_schedule=False),
+        density=DensitySettings(start=1_000, stop=1_001), rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1), eps=EPS),
+        mip=MipFilter(variance=0),
+    )  # fmt: skip
+    own.field.double()
+    adam = own.optimizer
+    adam.first, adam.second = ({k: v.double() for k, v in moments.items()} for moments in (adam.first, adam.second))
+    rasterizer = rasterizers.load("torch", near=0.01, kernel=0.3, antialiased=False)
+
+    host = Host(scene, extent=adam.extent, eps=EPS)
+    for p in host.splats.values():
+        p.data = p.data.double()
+    clear = attached(host, scene, conductor(name))
+    host.optimizers["detail"].param_groups[0]["eps"] = EPS
+    views = []
+    for _ in range(STEPS):
+        views.append(own.view().name)
+        iterate(own, rasterizer)
+    host.train(views)
+
+    for attribute, p in own.field.raw().items():
+        difference = float((p - host.splats[attribute].detach()).norm() / p.norm().clamp_min(1e-12))
+        assert difference < 1e-4, attribute
+    assert clear.attachment.t == STEPS
+    assert clear.attachment.counts["merged"] == STEPS
+    assert clear.attachment.counts["HR renders"] == STEPS - 2  # lambda_HR is 0 until t = 2
+
+
+def first_gradient(scene, strategies, attached, steps=1, **host_settings):
+    host = Host(scene, **host_settings)
+    clear = attached(host, scene, Conductor(*strategies, objective=Objective(lambda_hr=AT_ONCE)))
+    host.train([scene.train[0].name] * steps)
+    clear.remove()
+    return host.grads, clear
+
+
+def test_each_strategy_changes_what_it_should_and_nothing_else(attached):
+    scene = toy.scene(40)
+    lying = [replace(v, hr=replace(v.hr, image=v.hr.image.flip(1))) for v in scene.train]  # so that there are conflicts
+    scene = replace(scene, train=tuple(lying))
+    plain, _ = first_gradient(scene, (), attached)
+    gco, with_gco = first_gradient(scene, (GCO(),), attached)
+    p2g, with_p2g = first_gradient(scene, (P2G(patch=4),), attached)
+    svs, with_svs = first_gradient(
+        scene, (SVS(dropout=replace(SVS().dropout, maximum=0.5, shape="constant")),), attached
+    )
+    # GCO: rows in conflict alone, and never f_det.
+    assert 0 < with_gco.attachment.log["corrected"] < 1
+    for name in ("means", "scales", "opacities", "sh0"):
+        changed = (gco[name] != plain[name]).reshape(40, -1).any(1)
+        assert 0 < int(changed.sum()) < 40, name
+    assert torch.equal(gco["detail"], plain["detail"])
+    # P2G: the HF share of every Gaussian, f_det's as well.
+    assert not torch.equal(p2g["detail"], plain["detail"])
+    assert with_p2g.attachment.log["mean_q"] > 0
+    # SVS: the dropped have no gradient at all.
+    dropped = svs["means"].abs().sum(1) == 0
+    assert 8 <= int((dropped & (plain["means"].abs().sum(1) > 0)).sum()) <= 30
+    assert with_svs.attachment.counts["scores handed over"] == 0
+
+
+def test_without_a_strategy_the_gradient_is_that_of_the_summed_losses(attached):
+    scene = toy.scene(30)
+    view = scene.train[0]
+    merged, _ = first_gradient(scene, (), attached)
+    host = Host(scene)
+    renders, _, _ = host.render(view.lr.camera, 0)
+    gsplat_host.Photometric.apply(renders[0], view.lr.image).backward()
+    alone = {k: p.grad.clone() for k, p in host.splats.items()}
+    o = Objective(lambda_hr=AT_ONCE)
+    renders, _, _ = host.render(view.hr.camera, 0)
+    cotangents = o.hr(renders[0].detach(), view.hr.image).cotangents
+    (renders[0] * (cotangents[0] + o.lambda_hf * cotangents[1])).sum().backward()
+    for name, p in host.splats.items():
+        if name == "quats":  # of balls: nothing but rounding
+            continue
+        rounding = 1e-6 * float(p.grad.abs().max()) + 1e-9
+        assert torch.allclose(merged[name], p.grad, rtol=1e-4, atol=rounding), name
+    assert not torch.equal(merged["means"], alone["means"])
+
+
+@pytest.mark.parametrize("accumulation", [1, 2])
+def test_gradient_scaling_and_accumulation_leave_the_merge_as_it_is(accumulation, attached):
+    scene = toy.scene(30)
+    plain, _ = first_gradient(scene, subset("gco"), attached)
+
+    class Scaler:
+        """What a gradient scaler of torch.amp does, where it does it."""
+
+        def scale(self, loss):
+            return loss * 1024.0
+
+        def step(self, optimizer):
+            for group in optimizer.param_groups:
+                for p in group["params"]:
+                    p.grad /= 1024.0
+            optimizer.step()
+
+        def update(self):
+            pass
+
+    host = Host(scene, scaler=Scaler(), accumulation=accumulation)
+    host.degree = lambda step: 0
+    clear = attached(
+        host, scene, Conductor(GCO(), objective=Objective(lambda_hr=AT_ONCE)),
+        loss_scale=lambda: 1024.0, accumulation=accumulation,
+    )  # fmt: skip
+    host.train([scene.train[0].name] * accumulation)
+    assert clear.attachment.counts["merged"] == accumulation
+    for name, g in plain.items():
+        assert torch.allclose(host.grads[name] / 1024, g, rtol=1e-4, atol=1e-6 * float(g.abs().max())), name
+
+
+def test_a_fused_adam_steps_by_the_merged_gradient(attached):
+    scene = toy.scene(30)
+    slow, _ = first_gradient(scene, subset("clear"), attached, steps=3)
+    fused, _ = first_gradient(scene, subset("clear"), attached, steps=3, fused=True)
+    for name, g in slow.items():
+        assert torch.allclose(fused[name], g, rtol=1e-3, atol=1e-4 * float(g.abs().max())), name
+
+
+def test_renders_without_gradients_show_the_detail_and_train_nothing(attached):
+    scene = toy.scene(20)
+    host = Host(scene)
+    clear = attached(host, scene, Conductor())
+    with torch.no_grad():
+        before, _, _ = host.render(scene.train[0].hr.camera, 3)
+        host.splats["detail"] += 0.2
+        shown, _, _ = host.render(scene.train[0].hr.camera, 3)
+        clear.fold_detail()
+        folded, _, _ = host.render(scene.train[0].hr.camera, 3)
+    assert float((shown - before).max()) > 0.05
+    assert torch.allclose(shown, folded, atol=1e-6)
+    assert float(host.splats["detail"].abs().max()) == 0
+    assert clear.attachment.counts["LR renders"] == 0
+
+
+def test_removed_it_leaves_the_loop_as_it_was(attached):
+    scene = toy.scene(20)
+    alone = Host(scene)
+    alone.train([v.name for v in scene.train])
+    host = Host(scene)
+    attached(host, scene, Conductor(GCO()), detail=False).remove()
+    host.train([v.name for v in scene.train])
+    for name, p in alone.splats.items():
+        assert torch.equal(p, host.splats[name])
+
+
+def test_unknown_cameras_pass_and_wrong_sizes_are_refused(attached, caplog):
+    scene = toy.scene(20)
+    host = Host(scene)
+    clear = attached(host, scene, Conductor())
+    elsewhere = toy.camera(1.2).scaled(0.25)
+    with caplog.at_level(logging.WARNING):
+        host.render(elsewhere, 0)
+        host.render(elsewhere, 0)
+    assert caplog.text.count("none of the") == 1
+    assert clear.attachment.counts["LR renders"] == 0
+    with pytest.raises(HostError, match=r"drawn at 96x64, but its photograph has 24x16"):
+        host.render(scene.train[0].hr.camera, 0)
+
+
+def test_a_function_that_is_not_gsplats_is_refused():
+    host = Host(toy.scene(20))
+    clear = attach(host.splats, host.optimizers, toy.scene(20).train, Conductor())
+    with pytest.raises(HostError, match="names no Ks"):
+        clear.wrap(lambda means, opacities, colors, viewmats, width, height: None)
+
+
+def test_a_wrapped_function_is_not_wrapped_again(attached):
+    scene = toy.scene(20)
+    attached(Host(scene), scene, Conductor())
+    with pytest.raises(HostError, match="wrapped already"):
+        attached(Host(scene), scene, Conductor())
+
+
+def test_missing_parameters_and_views_are_named():
+    scene = toy.scene(20)
+    host = Host(scene)
+    with pytest.raises(ValueError, match="at least one view"):
+        attach(host.splats, host.optimizers, (), Conductor())
+    del host.splats["sh0"]
+    with pytest.raises(ValueError, match="sh0 is missing"):
+        attach(host.splats, host.optimizers, scene.train, Conductor())
+
+
+def test_the_stand_in_for_gsplats_rasterization_has_our_gradients():
+    splats, camera = toy.splats(20, dtype=torch.float64), toy.camera(0.1, 48, 32)
+    camera = replace(camera, world_to_camera=camera.world_to_camera.double())
+    leaves = {
+        k: getattr(splats, k).clone().requires_grad_() for k in ("means", "quats", "scales", "opacities", "sh0", "shN")
+    }
+    colors = torch.cat((leaves["sh0"], leaves["shN"]), 1)
+    pose, K = camera.world_to_camera[None], gsplat_host.intrinsics(camera).double()
+    geometry = (leaves["means"], leaves["quats"], leaves["scales"], leaves["opacities"], colors)
+    image, _, info = gsplat_host.rasterization(*geometry, pose, K, 48, 32, sh_degree=1)
+    cotangent = torch.randn(image.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    (image * cotangent).sum().backward()
+    drawn = rasterizers.load("torch", near=0.01, kernel=0.3, antialiased=False)(Splats(**leaves_of(splats)), camera)
+    expected = drawn.vjp(cotangent)
+    assert torch.equal(image[0], drawn.image)
+    for name, leaf in leaves.items():
+        assert torch.allclose(leaf.grad, getattr(expected, name)[0]), name
+    assert torch.allclose(info["means2d"].grad[0], expected.screen[0])
+    with pytest.raises(ValueError, match="needs CUDA"):
+        autograd.rasterization(*geometry, pose, K, 48, 32, sh_degree=1, render_mode="RGB+ED")
+
+
+def leaves_of(splats):
+    return {k: getattr(splats, k) for k in ("means", "quats", "scales", "opacities", "sh0", "shN")}
+
+
+class TestWithGsplat:
+    """The real package's strategies."""
+
+    @pytest.fixture(autouse=True)
+    def installed(self):
+        pytest.importorskip("gsplat", reason="pip install gsplat")
+
+    def strategy(self, **settings):
+        from gsplat.strategy import DefaultStrategy
+
+        return DefaultStrategy(**{
+            "refine_start_iter": 4, "refine_stop_iter": 24, "refine_every": 5, "grow_grad2d": 2e-4, "prune_opa": 0.02,
+            **settings,
+        })  # fmt: skip
+
+    def run(self, attached, strategies, steps=30, **settings):
+        torch.manual_seed(0)
+        scene = toy.scene(40)
+        strategy = self.strategy(**settings)
+        host = Host(scene, extent=4.0, strategy=strategy)
+        objective = Objective(lambda_hr=AT_ONCE)
+        clear = attached(host, scene, Conductor(*strategies, objective=objective), strategy=strategy, state=host.state)
+        host.train([scene.train[i % 3].name for i in range(steps)])
+        return host, clear
+
+    def test_its_densifier_grows_and_everything_follows(self, attached):
+        host, clear = self.run(attached, subset("clear"))
+        n = len(host.splats["means"])
+        assert n > 40
+        assert {len(p) for p in host.splats.values()} == {n}
+        assert len(host.state[ROWS]) == n
+        assert clear.attachment.counts["structure changes"] >= 3
+        assert clear.attachment.counts["scores handed over"] == 30
+        assert clear.attachment.counts["merged"] == 30
+        assert float(host.splats["detail"].abs().max()) > 0
+
+    def test_rows_tell_where_every_gaussian_came_from(self, attached):
+        torch.manual_seed(0)
+        scene, strategy = toy.scene(40), self.strategy()
+        host = Host(scene, extent=4.0, strategy=strategy)
+        clear = attached(host, scene, Conductor(), strategy=strategy, state=host.state)
+        seen = []
+        inner = clear._changed
+        clear.attachment._rows = lambda: seen.append(inner()) or seen[-1]
+        colors = host.splats["sh0"].detach().clone()
+        host.optimizers["sh0"].param_groups[0]["lr"] = 0.0  # so that colours stay and can be compared
+        host.train([scene.train[i % 3].name for i in range(30)], between=lambda: None)
+        for parents in seen:
+            if parents is not None:
+                colors = colors[parents]
+        assert torch.equal(colors, host.splats["sh0"].detach())
+
+    def test_as_many_densify_by_the_score_as_by_the_ordinary_statistic(self, attached):
+        counts = {}
+        for name in ("baseline", "p2g"):
+            host, clear = self.run(attached, (P2G(patch=4, score_by="evidence"),) if name == "p2g" else (), 6)
+            counts[name] = len(host.splats["means"]) - 40
+            clear.remove()
+        assert counts["baseline"] > 3
+        assert abs(counts["p2g"] - counts["baseline"]) <= max(3, 0.3 * counts["baseline"])
+
+    def test_the_older_layout_of_radii_is_understood(self, attached, monkeypatch):
+        def older(*args, **kwargs):
+            renders, alphas, info = autograd.rasterization(*args, backend="torch", **kwargs)
+            return renders, alphas, {**info, "radii": info["radii"][..., 0]}
+
+        older.__signature__ = __import__("inspect").signature(autograd.rasterization)
+        monkeypatch.setattr(gsplat_host, "rasterization", older)
+        scene = toy.scene(30)
+        new, _ = first_gradient(scene, subset("clear"), attached)
+        host = Host(scene)
+        clear = attach(
+            host.splats,
+            host.optimizers,
+            scene.train,
+            Conductor(*subset("clear"), objective=Objective(lambda_hr=AT_ONCE)),
+        )
+        clear.replace_everywhere(older)
+        host.train([scene.train[0].name])
+        clear.remove()
+        for name, g in new.items():
+            assert torch.equal(host.grads[name], g), name
+
+    def test_an_anchor_that_meets_a_changed_number_says_what_to_do(self, attached):
+        early = SVS(anchor_start=5, anchor_strength=0.01)
+        with pytest.raises(AnchorError, match=r"anchor was taken at t=5 for .*gsplat: refine_stop_iter"):
+            self.run(attached, (early,))
+
+    def test_too_long_a_densification_is_said_beforehand(self, attached, caplog):
+        with caplog.at_level(logging.WARNING):
+            self.run(attached, (SVS(anchor_start=10),), steps=1)
+        assert "densifies until refine_stop_iter=24" in caplog.text
+
+    def test_clear_strategy_is_a_default_strategy_that_attaches_itself(self):
+        from gsplat.strategy import DefaultStrategy
+
+        from integration.gsplat_strategy import ClearStrategy
+
+        scene = toy.scene(40)
+        clear = ClearStrategy(
+            refine_start_iter=4, refine_every=5, grow_grad2d=2e-4, views=scene.train,
+            conductor=composed("clear", "strategies.p2g.patch=4", "strategies.svs.anchor_strength=0.01", iterations=30),
+            rasterization=gsplat_host.rasterization,
+        )  # fmt: skip
+        assert isinstance(clear, DefaultStrategy)
+        assert len(yaml.dump({"strategy": clear})) < 3_000  # as simple_trainer writes its cfg.yml: no photographs
+        try:
+            host = Host(scene, extent=4.0, strategy=clear)
+            host.train([scene.train[i % 3].name for i in range(30)])
+        finally:
+            clear.attached.remove()
+        sizes = len(host.splats["means"])
+        assert sizes > 40
+        assert clear.attached.attachment.t == 30
+        assert clear.attached.attachment.conductor.state_dict()["SVS.means"].shape == (sizes, 3)  # anchored at t = 15
