@@ -111,6 +111,8 @@ class Attached:
                 f"{type(gaussians).__name__} has no {missing[0]}, as 3DGS's GaussianModel has. Attach after "
                 "gaussians.training_setup(opt)."
             )
+        if isinstance(getattr(gaussians.save_ply, "__self__", None), Attached):
+            raise HostError("these gaussians are attached already; remove() the attachment that did it first.")
         self._model = gaussians
         resolve, factor = super_resolve(sr, conductor, factor)
         self._views = self._read(cameras, resolve, factor)

@@ -60,7 +60,7 @@ def super_resolve(sr: SuperResolve | str | Path | None, conductor: Conductor, fa
     λ = conductor.objective.lambda_hr
     if λ.peak > 0 or λ.final > 0 or conductor.owner("observe") is not None:
         raise ValueError(
-            "sr must say where the SR pictures are, got None, but HR takes part. Pass their folder; or set "
-            "objective.lambda_hr.peak=0 and objective.lambda_hr.final=0, and leave P2G out."
+            "sr must say where the SR pictures are, got None, but HR takes part. Pass their folder, or set objective=lr_only "
+            "and leave P2G out."
         )
     return lambda name, image, factor: image, 1
