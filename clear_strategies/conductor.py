@@ -277,7 +277,7 @@ class Conductor:
             conflict = conflict_ratio(base_lr, base_hr)  # before correction
             base_hr = self._ask("correct", base_hr, base_lr, base_hr, e)  # corrected      Eq. 6, 7, 11
         g = base_lr + base_hr * λ  # Eq. 8
-        if g_hf is not None:
+        if g_hf is not None and "detail" in g_hf:
             g["detail"] = g_hf["detail"] * λ  # f_det: never corrected, never from L_base
         return g + self._regularize(params, t), conflict  # Eq. 16
 

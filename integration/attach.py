@@ -222,7 +222,8 @@ class Attachment:
     def _densify(self, shot: AutogradShot, gradient: Tensor, heard: Heard, times: float) -> None:
         """Leave the score where the host's densifier reads ∇_u, if it does."""
         kept = shot.kept
-        if heard.base is None or kept.tensor.grad is None:
+        held = kept.tensor.is_leaf or kept.tensor.retains_grad
+        if heard.base is None or not held or kept.tensor.grad is None:
             return
         score, ordinary = self.conductor.scores(to_ndc(kept.gradient(gradient, self._n), kept.size), heard, self.t)
         kept.hand_over(times * magnitude(score, ordinary, shot.visible, self._scale))

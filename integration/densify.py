@@ -4,12 +4,17 @@ threshold understands.  Eq. 14
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Final
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from clear_strategies.conductor import Conductor
+
+_log = logging.getLogger(__name__)
 
 _LOOK_EVERY: Final = (
     10  # views between two looks at the scale; sorting N scores for each view would cost more than it tells
@@ -40,8 +45,13 @@ class Screen:
         return g if self.rows is None else g.new_zeros(n, 2).index_add_(0, self.rows, g)
 
     def hand_over(self, magnitude: Float[Tensor, " N"]) -> None:
-        """Make the tensor's `.grad` (and gsplat's `.absgrad`) one whose norm in NDC units is `magnitude`."""
+        """Make the tensor's `.grad` (and gsplat's `.absgrad`) one whose norm in NDC units is `magnitude`.
+
+        Columns beyond the second are the host's: some keep absolute gradients there.
+        """
         given = torch.zeros_like(self.tensor)
+        if self.tensor.grad is not None:
+            given[..., 2:] = self.tensor.grad[..., 2:]
         rows = magnitude if self.rows is None else magnitude[self.rows]
         given.view(-1, given.shape[-1])[:, 0] = rows.to(given) * (2 / self.size[0] / self.unit[0])
         self.tensor.grad = given
@@ -97,3 +107,12 @@ def magnitude(
 ) -> Float[Tensor, " N"]:
     """What a host's densifier should read; the ordinary statistic is left as it is."""
     return score if score is ordinary or scale is None else scale(score, ordinary, seen)
+
+
+def warn_of_early_end(conductor: Conductor, until: int | None, setting: str) -> None:
+    """Say beforehand where a strategy wants densification to end and the host's `setting` lets it go on."""
+    if until is not None and conductor.may_densify(0) and not conductor.may_densify(until - 1):
+        _log.warning(
+            "the host densifies until %s=%d, but a strategy ends densification before (SVS: anchor_start). Set %s to that.",
+            setting, until, setting,
+        )  # fmt: skip

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.conductor import Conductor
+from clear_strategies.data.upscale import Images
 from clear_strategies.data.view import Photo, View
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
@@ -48,3 +51,16 @@ def view(
             f"{w * factor}x{h * factor}", "super-resolve the very images that the host trains on",
         )  # fmt: skip
     return View(name, Photo(low, image), Photo(low.scaled(factor), enlarged), reference=getattr(sr, "label", "unknown"))
+
+
+def super_resolve(sr: SuperResolve | str | Path | None, conductor: Conductor, factor: int) -> tuple[SuperResolve, int]:
+    """The function that gives SR pictures, and their factor; where there are none, HR is LR and must not be asked for."""
+    if sr is not None:
+        return Images(str(sr)) if isinstance(sr, str | Path) else sr, factor
+    λ = conductor.objective.lambda_hr
+    if λ.peak > 0 or λ.final > 0 or conductor.owner("observe") is not None:
+        raise ValueError(
+            "sr must say where the SR pictures are, got None, but HR takes part. Pass their folder, or set objective=lr_only "
+            "and leave P2G out."
+        )
+    return lambda name, image, factor: image, 1

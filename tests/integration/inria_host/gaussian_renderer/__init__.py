@@ -1,0 +1,46 @@
+"""The public shape of an Inria-style renderer, drawn on a CPU."""
+
+import torch
+
+from rasterizers import Camera, Splats, autograd, load
+
+RASTERIZER = load("torch", near=0.01, kernel=0.3, antialiased=False)
+
+
+class _InNdc(torch.autograd.Function):
+    """Projected centres whose gradient arrives, in NDC, at a dummy of zeros."""
+
+    @staticmethod
+    def forward(ctx, dummy, width, height):
+        ctx.size, ctx.columns = (width, height), dummy.shape[1]
+        return dummy.new_zeros(len(dummy), 2)
+
+    @staticmethod
+    def backward(ctx, g):
+        ndc = torch.zeros(len(g), ctx.columns, dtype=g.dtype)
+        ndc[:, :2] = g * g.new_tensor(ctx.size) / 2
+        if ctx.columns == 4:  # forks that keep absolute gradients
+            ndc[:, 2:] = 3 * ndc[:, :2].abs()
+        return ndc, None, None
+
+
+def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3, indices=False):
+    w, h = viewpoint_camera.image_width, viewpoint_camera.image_height
+    focal = [size / 2 / torch.tan(torch.tensor(fov, dtype=torch.float64) / 2)
+             for size, fov in ((w, viewpoint_camera.FoVx), (h, viewpoint_camera.FoVy))]  # fmt: skip
+    camera = Camera(viewpoint_camera.world_view_transform.T, *map(float, focal), w / 2, h / 2, w, h)
+    xyz = pc.get_xyz
+    dummy = torch.zeros(len(xyz), columns, dtype=xyz.dtype, requires_grad=True) + 0
+    if dummy.requires_grad:
+        dummy.retain_grad()
+    features = pc.get_features
+    bands = (pc.active_sh_degree + 1) ** 2
+    scales = pc.get_scaling * scaling_modifier
+    splats = Splats(xyz, pc.get_rotation, scales, pc.get_opacity[:, 0], features[:, :1], features[:, 1:bands])
+    drawn = autograd.draw(RASTERIZER, splats, camera, _InNdc.apply(dummy, w, h))
+    return {
+        "render": drawn.image.permute(2, 0, 1),
+        "viewspace_points": dummy,
+        "visibility_filter": drawn.visible.nonzero() if indices else drawn.visible,
+        "radii": drawn.visible.int() * 3,
+    }

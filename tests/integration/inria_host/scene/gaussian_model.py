@@ -1,0 +1,122 @@
+"""The public shape of an Inria-style GaussianModel: one Adam with named groups, parameters replaced when rows change."""
+
+import torch
+from safetensors.torch import save_file
+
+from clear_strategies.data.view import PointCloud
+from clear_strategies.field import GaussianField
+from rasterizers.geometry import rotation_matrix
+
+GROUPS = {
+    "xyz": "_xyz", "f_dc": "_features_dc", "f_rest": "_features_rest", "opacity": "_opacity", "scaling": "_scaling",
+    "rotation": "_rotation",
+}  # fmt: skip
+
+
+class GaussianModel:
+    def __init__(self):
+        self.active_sh_degree, self.max_sh_degree, self.optimizer = 0, 3, None
+
+    def create(self, points, colors):
+        raw = GaussianField.from_cloud(PointCloud(points, colors, source="points")).raw()
+        tensors = (raw["means"], raw["sh0"], raw["shN"], raw["opacities"][:, None], raw["scales"], raw["quats"])
+        for attribute, tensor in zip(GROUPS.values(), tensors, strict=True):
+            setattr(self, attribute, torch.nn.Parameter(tensor.clone()))
+        self._forget()
+
+    def training_setup(self, opt):
+        rates = {
+            "xyz": opt.position_lr,
+            "f_dc": 2.5e-3,
+            "f_rest": 1.25e-4,
+            "opacity": 0.05,
+            "scaling": 5e-3,
+            "rotation": 1e-3,
+        }
+        groups = [{"params": [getattr(self, a)], "lr": rates[name], "name": name} for name, a in GROUPS.items()]
+        self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
+
+    @property
+    def get_xyz(self):
+        return self._xyz
+
+    @property
+    def get_scaling(self):
+        return self._scaling.exp()
+
+    @property
+    def get_rotation(self):
+        return torch.nn.functional.normalize(self._rotation)
+
+    @property
+    def get_features(self):
+        return torch.cat((self._features_dc, self._features_rest), dim=1)
+
+    @property
+    def get_opacity(self):
+        return self._opacity.sigmoid()
+
+    def oneupSHdegree(self):
+        self.active_sh_degree = min(self.active_sh_degree + 1, self.max_sh_degree)
+
+    def add_densification_stats(self, viewspace_point_tensor, update_filter):
+        norm = viewspace_point_tensor.grad[update_filter, :2].norm(dim=-1, keepdim=True)
+        self.xyz_gradient_accum[update_filter] += norm.view_as(self.xyz_gradient_accum[update_filter])
+        self.denom[update_filter] += 1
+
+    def densify_and_prune(self, max_grad, min_opacity, extent, max_screen_size):
+        grads = (self.xyz_gradient_accum / self.denom).nan_to_num(0)[:, 0]
+        large = self.get_scaling.amax(1) > 0.01 * extent
+        small, split = (grads >= max_grad) & ~large, (grads >= max_grad) & large
+        self.densification_postfix(*(getattr(self, a)[small].detach() for a in GROUPS.values()))
+        split = torch.cat((split, torch.zeros(int(small.sum()), dtype=torch.bool)))
+        two = {
+            a: getattr(self, a)[split].detach().repeat(2, *[1] * (getattr(self, a).dim() - 1)) for a in GROUPS.values()
+        }
+        offsets = torch.randn_like(two["_xyz"]) * two["_scaling"].exp()
+        two["_xyz"] += (rotation_matrix(two["_rotation"]) @ offsets[..., None])[..., 0]
+        two["_scaling"] -= torch.tensor(1.6).log()
+        self.densification_postfix(*two.values())
+        self.prune_points(torch.cat((split, torch.zeros(2 * int(split.sum()), dtype=torch.bool))))
+        self.prune_points((self.get_opacity < min_opacity)[:, 0])
+
+    def densification_postfix(self, xyz, features_dc, features_rest, opacities, scaling, rotation):
+        self.cat_tensors_to_optimizer(
+            dict(zip(GROUPS, (xyz, features_dc, features_rest, opacities, scaling, rotation), strict=True))
+        )
+        self._forget()
+
+    def cat_tensors_to_optimizer(self, new):
+        self._replace(lambda name, rows, fresh: torch.cat((rows, torch.zeros_like(new[name]) if fresh else new[name])))
+
+    def prune_points(self, mask):
+        self._prune_optimizer(~mask)
+        self.xyz_gradient_accum, self.denom = self.xyz_gradient_accum[~mask], self.denom[~mask]
+
+    def _prune_optimizer(self, keep):
+        self._replace(lambda name, rows, fresh: rows[keep])
+
+    def _replace(self, made):
+        for group in self.optimizer.param_groups:
+            old, name = group["params"][0], group["name"]
+            state = self.optimizer.state.pop(old, {})
+            parameter = torch.nn.Parameter(made(name, old.detach(), False))
+            group["params"][0] = parameter
+            if state:
+                moments = {k: made(name, m, True) if m.dim() else m for k, m in state.items()}
+                self.optimizer.state[parameter] = moments
+            setattr(self, GROUPS[name], parameter)
+
+    def reset_opacity(self):
+        (group,) = (g for g in self.optimizer.param_groups if g["name"] == "opacity")
+        self.optimizer.state.pop(group["params"][0], None)
+        limit = torch.logit(torch.tensor(0.01))
+        self._opacity = group["params"][0] = torch.nn.Parameter(self._opacity.detach().clamp_max(limit))
+
+    def save_ply(self, path):
+        """In this stand-in: the raw tensors, by name."""
+        save_file({name: getattr(self, a).detach().contiguous() for name, a in GROUPS.items()}, path)
+
+    def _forget(self):
+        self.xyz_gradient_accum = torch.zeros(len(self._xyz), 1)
+        self.denom = torch.zeros(len(self._xyz), 1)

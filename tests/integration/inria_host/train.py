@@ -1,0 +1,94 @@
+"""The loop of an Inria-style trainer, in its own order: backward, densify, step. Knows no CLEAR."""
+
+import argparse
+
+import torch
+from gaussian_renderer import render
+from scene import GaussianModel, Scene
+
+from clear_strategies import kernels
+
+
+class Photometric(torch.autograd.Function):
+    """0.8 L1 + 0.2 (1 - SSIM)."""
+
+    @staticmethod
+    def forward(ctx, image, target):
+        x, y = (i.detach().permute(1, 2, 0).contiguous() for i in (image, target))
+        loss = kernels.photometric(x, y, 0.2, kernels="torch")
+        ctx.gradient = loss.gradient.permute(2, 0, 1)
+        return image.new_tensor(float(loss.value))
+
+    @staticmethod
+    def backward(ctx, scale):
+        return ctx.gradient * scale, None
+
+
+def densify(gaussians, opt, iteration, package):
+    if iteration >= opt.densify_until_iter:
+        return
+    gaussians.add_densification_stats(package["viewspace_points"], package["visibility_filter"].squeeze(-1))
+    if iteration > opt.densify_from_iter and iteration % opt.densification_interval == 0:
+        gaussians.densify_and_prune(opt.densify_grad_threshold, 0.005, opt.extent, None)
+    if iteration % opt.opacity_reset_interval == 0:
+        gaussians.reset_opacity()
+
+
+def training(opt, gaussians, scene, render, names=None, between=lambda iteration: None):
+    background, pipe = torch.zeros(3), None
+    for iteration in range(1, opt.iterations + 1):
+        if iteration % opt.sh_interval == 0:
+            gaussians.oneupSHdegree()
+        cameras = scene.getTrainCameras()
+        if names is None:
+            camera = cameras[iteration % len(cameras)]
+        else:
+            (camera,) = (c for c in cameras if c.image_name == names[iteration - 1])
+        package = render(camera, gaussians, pipe, background)
+        loss = Photometric.apply(package["render"], camera.original_image)
+        loss.backward()
+        between(iteration)
+        if not opt.step_first:
+            with torch.no_grad():
+                densify(gaussians, opt, iteration, package)
+        gaussians.optimizer.step()
+        gaussians.optimizer.zero_grad(set_to_none=True)
+        if opt.step_first:
+            with torch.no_grad():
+                densify(gaussians, opt, iteration, package)
+
+
+def parser():
+    p = argparse.ArgumentParser()
+    p.add_argument("-s", "--source_path")
+    p.add_argument("--save")
+    p.add_argument("--iterations", type=int, default=30)
+    p.add_argument("--position_lr", type=float, default=1.6e-4)
+    p.add_argument("--extent", type=float, default=4.0)
+    p.add_argument("--densify_grad_threshold", type=float, default=2e-4)
+    p.add_argument("--densify_from_iter", type=int, default=4)
+    p.add_argument("--densify_until_iter", type=int, default=24)
+    p.add_argument("--densification_interval", type=int, default=5)
+    p.add_argument("--opacity_reset_interval", type=int, default=1000)
+    p.add_argument("--sh_interval", type=int, default=10)
+    p.add_argument("--step_first", action="store_true")
+    return p
+
+
+def setup(opt):
+    torch.manual_seed(0)
+    gaussians = GaussianModel()
+    scene = Scene(opt.source_path, gaussians)
+    gaussians.training_setup(opt)
+    return gaussians, scene
+
+
+def main():
+    opt = parser().parse_args()
+    gaussians, scene = setup(opt)
+    training(opt, gaussians, scene, render)
+    gaussians.save_ply(opt.save)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""Clones what moves on the screen and prunes what is transparent, by replacing the parameters of all optimizers."""
+
+from dataclasses import dataclass
+
+import torch
+
+from .density_controller import DensityController, DensityControllerImpl
+
+
+@dataclass
+class VanillaDensityController(DensityController):
+    densify_from_iter: int = 4
+    densify_until_iter: int = 24
+    densification_interval: int = 5
+    densify_grad_threshold: float = 2e-4
+
+    def instantiate(self, *args, **kwargs):
+        return VanillaDensityControllerImpl(self)
+
+
+class VanillaDensityControllerImpl(DensityControllerImpl):
+    def setup(self, stage, pl_module):
+        self.forget(pl_module.gaussian_model.n_gaussians)
+
+    def forget(self, n):
+        self.register_buffer("xyz_gradient_accum", torch.zeros(n), persistent=True)
+        self.register_buffer("denom", torch.zeros(n), persistent=True)
+
+    def before_backward(self, outputs, batch, gaussian_model, optimizers, global_step, pl_module):
+        outputs["viewspace_points"].retain_grad()
+
+    @torch.no_grad()
+    def after_backward(self, outputs, batch, gaussian_model, optimizers, global_step, pl_module):
+        if global_step >= self.config.densify_until_iter:
+            return
+        seen = outputs["visibility_filter"]
+        gradient = outputs["viewspace_points"].grad[:, :2] * outputs.get("viewspace_points_grad_scale", 1)
+        self.xyz_gradient_accum[seen] += gradient[seen].norm(dim=-1)
+        self.denom[seen] += 1
+        if global_step > self.config.densify_from_iter and global_step % self.config.densification_interval == 0:
+            mean = (self.xyz_gradient_accum / self.denom).nan_to_num(0)
+            kept = gaussian_model.get_opacities()[:, 0] > 0.005
+            rows = torch.cat((kept.nonzero()[:, 0], (mean >= self.config.densify_grad_threshold).nonzero()[:, 0]))
+            old = kept.sum()
+            for optimizer in optimizers:
+                for group in optimizer.param_groups:
+                    before = group["params"][0]
+                    state = optimizer.state.pop(before, {})
+                    after = group["params"][0] = torch.nn.Parameter(before.detach()[rows])
+                    for name, moment in state.items():
+                        if moment.dim():
+                            state[name] = moment[rows]
+                            state[name][old:] = 0
+                    optimizer.state[after] = state
+                    gaussian_model.gaussians[group["name"]] = after
+            self.forget(len(rows))

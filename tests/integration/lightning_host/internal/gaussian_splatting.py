@@ -1,0 +1,134 @@
+"""The module with its model, renderer and cameras; and the little of a lightning Trainer that calls it."""
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import torch
+
+from clear_strategies import kernels
+from clear_strategies.field import GaussianField
+from rasterizers import Camera as Pinhole
+from rasterizers import Splats, autograd, load
+
+RASTERIZER = load("torch", near=0.01, kernel=0.3, antialiased=False)
+
+
+@dataclass
+class Camera:
+    """Every field a tensor; world_to_camera for row vectors."""
+
+    fx: torch.Tensor
+    fy: torch.Tensor
+    cx: torch.Tensor
+    cy: torch.Tensor
+    width: torch.Tensor
+    height: torch.Tensor
+    world_to_camera: torch.Tensor
+
+
+class VanillaGaussianModel(torch.nn.Module):
+    def __init__(self, cloud):
+        super().__init__()
+        raw = GaussianField.from_cloud(cloud).raw()
+        names = {"means": "means", "shs_dc": "sh0", "shs_rest": "shN", "scales": "scales", "rotations": "quats"}
+        self.gaussians = torch.nn.ParameterDict({k: torch.nn.Parameter(raw[v].clone()) for k, v in names.items()})
+        self.gaussians["opacities"] = torch.nn.Parameter(raw["opacities"][:, None].clone())
+        self.active_sh_degree = 3
+
+    @property
+    def n_gaussians(self):
+        return len(self.gaussians["means"])
+
+    @property
+    def shs_dc(self):
+        return self.gaussians["shs_dc"]
+
+    def get_shs(self):
+        return torch.cat((self.shs_dc, self.gaussians["shs_rest"]), 1)
+
+    def get_opacities(self):
+        return self.gaussians["opacities"].sigmoid()
+
+    def training_setup(self):
+        rates = {"shs_dc": 2.5e-3, "shs_rest": 1.25e-4, "opacities": 0.05, "scales": 5e-3, "rotations": 1e-3}
+        means = torch.optim.Adam([{"params": [self.gaussians["means"]], "name": "means"}], lr=1.6e-4)
+        groups = [{"params": [self.gaussians[k]], "lr": lr, "name": k} for k, lr in rates.items()]
+        return [means, torch.optim.Adam(groups, lr=0.0, eps=1e-15)]
+
+
+class Renderer(torch.nn.Module):
+    """Centres in pixels, as gsplat's, or in NDC behind a dummy of zeros."""
+
+    def __init__(self, pixels=True):
+        super().__init__()
+        self.pixels = pixels
+
+    def forward(self, viewpoint_camera, pc, bg_color, scaling_modifier=1.0, **kwargs):
+        c, g = viewpoint_camera, pc.gaussians
+        intrinsics = (float(x) for x in (c.fx, c.fy, c.cx, c.cy))
+        size = int(c.width), int(c.height)
+        camera = Pinhole(c.world_to_camera.T, *intrinsics, *size)
+        shs, half = pc.get_shs(), torch.tensor([size]) / 2
+        splats = Splats(g["means"], g["rotations"], g["scales"].exp(), pc.get_opacities()[:, 0], shs[:, :1], shs[:, 1:])
+        points = torch.zeros(len(shs), 2, requires_grad=True) + 0
+        drawn = autograd.draw(RASTERIZER, splats, camera, points * 1 if self.pixels else points * half)
+        scale = {"viewspace_points_grad_scale": half} if self.pixels else {}
+        return {
+            "render": drawn.image.permute(2, 0, 1), "viewspace_points": points, "visibility_filter": drawn.visible,
+            "radii": drawn.visible.int(), **scale,
+        }  # fmt: skip
+
+    def training_forward(self, step, module, viewpoint_camera, pc, bg_color, scaling_modifier=1.0, **kwargs):
+        return self(viewpoint_camera=viewpoint_camera, pc=pc, bg_color=bg_color, scaling_modifier=scaling_modifier)
+
+
+class GaussianSplatting(torch.nn.Module):
+    def __init__(self, cloud, density, renderer):
+        super().__init__()
+        self.gaussian_model, self.renderer = VanillaGaussianModel(cloud), renderer
+        self.density_controller = density.instantiate()
+        self.on_train_batch_end_hooks = []
+        self.saved = []
+        self.grads = {}
+
+    def forward(self, camera):
+        if self.training:
+            step = self.trainer.global_step
+            return self.renderer.training_forward(step, self, camera, self.gaussian_model, bg_color=torch.zeros(3))
+        return self.renderer(camera, self.gaussian_model, bg_color=torch.zeros(3))
+
+    def training_step(self, batch, batch_idx):
+        camera, (_, gt_image, _), _ = batch
+        global_step = self.trainer.global_step + 1
+        for optimizer in self.gaussian_optimizers:
+            optimizer.zero_grad(set_to_none=True)
+        outputs = self(camera)
+        told = (outputs, batch, self.gaussian_model, self.gaussian_optimizers, global_step, self)
+        self.density_controller.before_backward(*told)
+        image = outputs["render"].permute(1, 2, 0)
+        loss = kernels.photometric(image.detach(), gt_image.permute(1, 2, 0), 0.2, kernels="torch")
+        (image * loss.gradient).sum().backward()
+        self.grads = {k: p.grad for k, p in self.gaussian_model.gaussians.items()}
+        self.points = outputs["viewspace_points"]
+        self.density_controller.after_backward(*told)
+        for optimizer in self.gaussian_optimizers:
+            optimizer.step()
+
+    def save_gaussians(self):
+        self.saved.append(self.gaussian_model.gaussians["shs_dc"].detach().clone())
+
+
+def fit(module, photos, steps):
+    """What a Trainer does: setup, optimizers, and a batch after the other; photos: (name, camera, image) each."""
+    outputs = SimpleNamespace(train_set=SimpleNamespace(image_names=[name for name, _, _ in photos]))
+    datamodule = SimpleNamespace(dataparser_outputs=outputs)
+    module.trainer = SimpleNamespace(global_step=0, max_steps=steps, datamodule=datamodule)
+    module.density_controller.setup("fit", module)
+    module.gaussian_optimizers = module.gaussian_model.training_setup()
+    while module.trainer.global_step < steps:
+        name, camera, image = photos[module.trainer.global_step % len(photos)]
+        module.training_step((camera, (name, image, None), None), 0)
+        module.trainer.global_step += 1
+        for hook in module.on_train_batch_end_hooks:
+            hook(None, None, module.gaussian_model, module.trainer.global_step, module)
+    module.save_gaussians()
