@@ -226,9 +226,8 @@ class Attachment:
             return
         score, ordinary = self.conductor.scores(to_ndc(kept.gradient(gradient, self._n), kept.size), heard, self.t)
         absolute = kept.absolute(self._n)
-        if (
-            absolute is not None
-        ):  # the host's threshold is one for Σ|∂L/∂u|: the score must let as many pass as that does
+        if absolute is not None:
+            # The host's threshold is one for Σ|∂L/∂u|: the score shall let as many pass as that does.
             if score is ordinary:
                 return
             ordinary = torch.linalg.vector_norm(to_ndc(absolute / times, kept.size), dim=-1)
