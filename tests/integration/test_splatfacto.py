@@ -3,11 +3,8 @@
 nerfstudio brings 3.5 GB, so that this file is skipped where it is absent, as in CI; docs/hosts.md says how it is run.
 
 What is not nerfstudio's own here: gsplat's CUDA kernels are replaced by our rasterizer (with gsplat 1.4's shapes, and |∇_u|
-for `absgrad`, which it does not compute), `Tensor.cuda()` returns the tensor, the LPIPS network, a download, is a constant,
-and torchvision's compiled operators, which nerfstudio never calls, are names only where its build does not fit torch's.
+for `absgrad`, which it does not compute), `Tensor.cuda()` returns the tensor, and the LPIPS network, a download, is a constant.
 """
-
-# ruff: noqa: E402 - torchvision's names must be there before nerfstudio is imported
 
 from __future__ import annotations
 
@@ -27,18 +24,8 @@ if importlib.util.find_spec("nerfstudio") is None:
     pytest.skip("nerfstudio is not installed: docs/hosts.md", allow_module_level=True)
 
 os.environ["TORCHDYNAMO_DISABLE"] = "1"
-torchvision = torch.library.Library("torchvision", "FRAGMENT")
-try:
-    import torchvision.extension
-except RuntimeError:
-    for signature in (
-        "nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor",
-        "roi_align(Tensor input, Tensor rois, float spatial_scale, int pooled_height, int pooled_width, int sampling_ratio, "
-        "bool aligned) -> Tensor",
-    ):
-        torchvision.define(signature)
-
 import yaml
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.models import splatfacto
 from nerfstudio.plugins.registry import discover_methods
 
@@ -110,14 +97,8 @@ def configured(capture, out, model=None, **fields):
     config.machine.device_type = "cpu"
     config.vis, config.logging.local_writer.enable = "tensorboard", False
     config.output_dir, config.max_num_iterations, config.steps_per_eval_image = out, STEPS, 15
-    small = {
-        "sr": capture / "sr",
-        "warmup_length": 4,
-        "refine_every": 5,
-        "reset_alpha_every": 100,
-        "sh_degree_interval": 10,
-    }
-    for name, value in (small | fields).items():
+    small = {"warmup_length": 4, "refine_every": 5, "reset_alpha_every": 100, "sh_degree_interval": 10}
+    for name, value in ({"sr": capture / "sr"} | small | fields).items():
         if hasattr(config.pipeline.model, name):
             setattr(config.pipeline.model, name, value)
     config.set_timestamp()
@@ -222,27 +203,44 @@ def test_without_sr_weight_it_is_splatfacto_bit_for_bit(capture, tmp_path):
     assert not a["detail"].any()
 
 
+def before_iteration(host, step):
+    for callback in host.callbacks:
+        callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+
+
 def test_what_is_looked_at_and_exported_shows_the_detail(capture, tmp_path):
-    model = trainer(configured(capture, tmp_path)).pipeline.model
-    camera = model.attached._views[0]
-    model.gauss_params["detail"].data += 0.1
+    host = trainer(configured(capture, tmp_path))
+    model, camera = host.pipeline.model, host.pipeline.datamanager.train_dataset.cameras[:1]
     base = model.gauss_params["features_dc"]
-    assert torch.equal(model.features_dc, base)
+    assert model.features_dc is base
     model.eval()
+    without = model.get_outputs_for_camera(camera)
+    model.gauss_params["detail"].data += 0.1
+    brighter = model.get_outputs_for_camera(camera)["rgb"] - without["rgb"]
+    covered = without["accumulation"][..., 0] > 0.5
+    assert bool(covered.any())
+    assert float(brighter[covered].mean()) == pytest.approx(
+        0.1 * float(without["accumulation"][covered].mean()), rel=0.3
+    )
     assert torch.equal(model.shs_0, base + model.gauss_params["detail"] / SH_C0)
-    assert camera is not None
 
 
 def test_numbers_of_the_iteration_are_among_the_metrics(capture, tmp_path):
     host = trainer(configured(capture, tmp_path, clear="gco"))
-    for step in range(4):
-        for callback in host.callbacks:
-            callback.run_callback_at_location(step, callback.where_to_run[0]) if "BEFORE" in str(
-                callback.where_to_run
-            ) else None
+    for step in range(5):
+        before_iteration(host, step)
         _, _, metrics = host.train_iteration(step)
-    assert metrics["clear_t"] == 3
+    assert metrics["clear_t"] == 4  # the numbers of the iteration before, whose backward pass has ended
     assert 0 <= metrics["clear_corrected"] <= 1
+
+
+def test_a_resumed_training_counts_on(capture, tmp_path):
+    host = trainer(configured(capture, tmp_path, clear="gco"))
+    before_iteration(host, 7)
+    host.train_iteration(7)
+    before_iteration(host, 8)
+    host.train_iteration(8)
+    assert host.pipeline.model.attached.attachment.t == 9
 
 
 def test_accumulated_gradients_are_refused(capture, tmp_path):
