@@ -226,6 +226,12 @@ class Attachment:
         if heard.base is None or not held or kept.tensor.grad is None:
             return
         score, ordinary = self.conductor.scores(to_ndc(kept.gradient(gradient, self._n), kept.size), heard, self.t)
+        absolute = kept.absolute(self._n)
+        if absolute is not None:
+            # The host's threshold is one for Σ|∂L/∂u|: the score shall let as many pass as that does.
+            if score is ordinary:
+                return
+            ordinary = torch.linalg.vector_norm(to_ndc(absolute / times, kept.size), dim=-1)
         kept.hand_over(times * magnitude(score, ordinary, shot.visible, self._scale))
         self.counts["scores handed over"] += score is not ordinary
 

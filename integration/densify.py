@@ -44,6 +44,11 @@ class Screen:
         g = of_tensor.reshape(-1, of_tensor.shape[-1])[:, :2] * of_tensor.new_tensor(self.unit)
         return g if self.rows is None else g.new_zeros(n, 2).index_add_(0, self.rows, g)
 
+    def absolute(self, n: int) -> Float[Tensor, "N 2"] | None:
+        """Σ|∂L/∂u| over pixels of every Gaussian in 1/pixel, where the host densifies by that (gsplat's `absgrad`)."""
+        kept = getattr(self.tensor, "absgrad", None)
+        return None if kept is None else self.gradient(kept, n)
+
     def hand_over(self, magnitude: Float[Tensor, " N"]) -> None:
         """Make the tensor's `.grad` (and gsplat's `.absgrad`) one whose norm in NDC units is `magnitude`.
 
