@@ -40,6 +40,7 @@ _BACKENDS: dict[str, str] = {
     "cpp": "rasterizers.cpp",
     "torch": "rasterizers.reference",
     "warp": "rasterizers.warp_backend",
+    "gsplat": "rasterizers.gsplat_backend",
 }
 
 

@@ -1,0 +1,76 @@
+"""gsplat's kernels behind the interface: the adapter, with our own rasterizer in place of what needs CUDA."""
+
+from __future__ import annotations
+
+import functools
+
+import pytest
+import torch
+import toy
+
+import rasterizers
+from rasterizers import BackendUnavailable, autograd
+from rasterizers.gsplat_backend import GsplatRasterizer
+
+STAND_IN = functools.partial(autograd.rasterization, backend="torch")
+
+
+def both(**settings):
+    mine = GsplatRasterizer(rasterization=STAND_IN, device="cpu", **settings)
+    return mine, rasterizers.load("torch", **settings)
+
+
+@pytest.mark.parametrize("offset", [False, True])
+def test_picture_and_transpose_are_those_of_what_draws(offset):
+    mine, reference = both(background=(0.2, 0.5, 0.9), kernel=0.3)
+    splats = toy.splats(20)
+    if offset:
+        splats = rasterizers.Splats(
+            **{k: getattr(splats, k) for k in ("means", "quats", "scales", "opacities", "sh0", "shN")},
+            rgb_offset=torch.randn(20, 3, generator=torch.Generator().manual_seed(3)) * 0.2,
+        )
+    camera = toy.camera(0.2, 48, 32)
+    cotangents = torch.randn(2, 32, 48, 3, generator=torch.Generator().manual_seed(0))
+    found, expected = mine(splats, camera), reference(splats, camera)
+    assert torch.allclose(found.image, expected.image, atol=1e-5)
+    assert torch.equal(found.visible, expected.visible)
+    assert torch.allclose(found.means2d, expected.means2d, atol=1e-4)
+    mine_g, reference_g = found.vjp(cotangents), expected.vjp(cotangents)
+    for name in ("means", "quats", "scales", "opacities", "screen", "rgb", "basis", "sh0", "shN"):
+        a, b = getattr(mine_g, name), getattr(reference_g, name)
+        assert torch.allclose(a, b, rtol=1e-3, atol=1e-4 * float(b.abs().max())), name
+
+
+def test_tiles_that_nobody_asked_for_show_the_background_and_send_nothing_back():
+    mine, _ = both(background=(0.25, 0.5, 0.75), tile=16)
+    tiles = torch.zeros(2, 3, dtype=torch.bool)
+    tiles[0, 0] = True
+    splats, camera = toy.splats(20), toy.camera(0.0, 48, 32)
+    part, whole = mine(splats, camera, tiles), mine(splats, camera)
+    assert torch.equal(part.image[:16, :16], whole.image[:16, :16])
+    assert torch.equal(part.image[16:], torch.tensor([0.25, 0.5, 0.75]).expand(16, 48, 3))
+    cotangent = torch.zeros(1, 32, 48, 3)
+    cotangent[:, 16:] = 1
+    assert float(part.vjp(cotangent).means.abs().max()) == 0
+
+
+def test_scales_are_drawn_one_after_the_other():
+    mine, _ = both()
+    splats, camera = toy.splats(10), toy.camera(0.0, 48, 32)
+    low, high = mine.render_scales([(splats, camera.scaled(0.5)), (splats, camera)])
+    assert torch.equal(high.image, mine(splats, camera).image)
+    assert low.image.shape == (16, 24, 3)
+
+
+def test_cut_offs_and_devices_that_it_does_not_have_are_refused():
+    with pytest.raises(ValueError, match="alpha_min must stay"):
+        both(alpha_min=1 / 4096)
+    with pytest.raises(ValueError, match="on cuda, got"):
+        GsplatRasterizer(rasterization=STAND_IN)(toy.splats(5), toy.camera(0.0))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="says what to do without CUDA")
+def test_without_cuda_it_says_so_in_one_sentence():
+    with pytest.raises(BackendUnavailable, match=r"needs gsplat|draws on CUDA only"):
+        rasterizers.load("gsplat")
+    assert rasterizers.available()["gsplat"] is not None
