@@ -29,7 +29,7 @@ from clear_strategies.data.view import View
 from clear_strategies.errors import ClearError
 from clear_strategies.gradients import Grads, to_ndc
 from integration.bridge import AutogradShot
-from integration.densify import Scale, magnitude
+from integration.densify import Scale, to_read
 
 _log = logging.getLogger(__name__)
 
@@ -226,13 +226,9 @@ class Attachment:
         if heard.base is None or not held or kept.tensor.grad is None:
             return
         score, ordinary = self.conductor.scores(to_ndc(kept.gradient(gradient, self._n), kept.size), heard, self.t)
-        absolute = kept.absolute(self._n)
-        if absolute is not None:
-            # The host's threshold is one for Σ|∂L/∂u|: the score shall let as many pass as that does.
-            if score is ordinary:
-                return
-            ordinary = torch.linalg.vector_norm(to_ndc(absolute / times, kept.size), dim=-1)
-        kept.hand_over(times * magnitude(score, ordinary, shot.visible, self._scale))
+        read = to_read(kept, score, ordinary, shot.visible, self._scale, times)
+        if read is not None:
+            kept.hand_over(times * read)
         self.counts["scores handed over"] += score is not ordinary
 
 

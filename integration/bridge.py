@@ -16,7 +16,7 @@ from torch import Tensor
 
 from clear_strategies.conductor import Conductor, Update
 from clear_strategies.gradients import Grads, Shot
-from integration.densify import Scale, Screen, magnitude
+from integration.densify import Scale, Screen, to_read
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,9 +94,12 @@ def joint_update(
     touched = {name: p for name, p in params.items() if name in update.grads}
     gradients = [update.grads[name].to(p) for name, p in touched.items()]
 
+    kept = lr.kept if scale is not None and isinstance(lr, AutogradShot) else None
+    read = None if kept is None else to_read(kept, update.score, update.ordinary, lr.visible, scale)
+
     def densify(times: float) -> None:
-        if scale is not None and isinstance(lr, AutogradShot):
-            lr.kept.hand_over(times * magnitude(update.score, update.ordinary, lr.visible, scale))
+        if kept is not None and read is not None:
+            kept.hand_over(times * read)
 
     loss: Tensor = _GivenGradients.apply(value, gradients, densify, *touched.values())  # type: ignore[no-untyped-call]
     return loss, update

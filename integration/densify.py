@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.conductor import Conductor
+from clear_strategies.gradients import to_ndc
 
 _log = logging.getLogger(__name__)
 
@@ -107,10 +108,26 @@ class Scale:
         return self.threshold / middle if middle > 0 else 1.0
 
 
-def magnitude(
-    score: Float[Tensor, " N"], ordinary: Float[Tensor, " N"], seen: Bool[Tensor, " N"], scale: Scale | None
-) -> Float[Tensor, " N"]:
-    """What a host's densifier should read; the ordinary statistic is left as it is."""
+def to_read(
+    screen: Screen,
+    score: Float[Tensor, " N"],
+    ordinary: Float[Tensor, " N"],
+    seen: Bool[Tensor, " N"],
+    scale: Scale | None,
+    times: float = 1.0,
+) -> Float[Tensor, " N"] | None:
+    """What a host's densifier should read, in NDC units; None: what it has already.
+
+    Args:
+        score, ordinary: what the conductor said; the same tensor where no strategy answered.
+        times: by what the screen's own gradients are scaled (the host's loss scale).
+    """
+    absolute = screen.absolute(len(score))
+    if absolute is not None:
+        # The host's threshold is one for Σ|∂L/∂u|: a score shall let as many pass as that does.
+        if score is ordinary:
+            return None
+        ordinary = torch.linalg.vector_norm(to_ndc(absolute / times, screen.size), dim=-1)
     return score if score is ordinary or scale is None else scale(score, ordinary, seen)
 
 

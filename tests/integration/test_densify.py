@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from integration.densify import Scale, Screen, magnitude
+from integration.densify import Scale, Screen, to_read
 
 
 def test_a_gradient_in_ndc_is_read_in_pixels():
@@ -75,8 +75,18 @@ def test_a_score_of_nothing_stays_nothing():
 
 
 def test_the_ordinary_statistic_is_left_as_it_is():
-    ordinary = torch.rand(5)
-    assert magnitude(ordinary, ordinary, torch.ones(5, dtype=torch.bool), Scale(1.0)) is ordinary
+    ordinary, screen = torch.rand(5), Screen(torch.zeros(1, 5, 2), (2, 2))
+    assert to_read(screen, ordinary, ordinary, torch.ones(5, dtype=torch.bool), Scale(1.0)) is ordinary
+
+
+def test_a_host_of_absolute_gradients_keeps_its_own_and_a_score_is_measured_by_them():
+    tensor = torch.zeros(1, 4, 2)
+    tensor.absgrad = torch.tensor([[[8.0, 0.0], [6.0, 0.0], [1.0, 0.0], [0.0, 0.0]]])  # NDC: the same, of 2x2 pixels
+    screen, seen = Screen(tensor, (2, 2)), torch.ones(4, dtype=torch.bool)
+    ordinary, score = torch.full((4,), 0.1), torch.tensor([0.4, 0.1, 0.3, 0.2])
+    assert to_read(screen, ordinary, ordinary, seen, Scale(5.0)) is None
+    read = to_read(screen, score, ordinary, seen, Scale(5.0))
+    assert (read >= 5).tolist() == [True, False, True, False]  # two, as by 8 and 6
 
 
 @pytest.mark.parametrize("wrong", [{"threshold": 0.0}, {"threshold": 1.0, "memory": 0}])
