@@ -42,6 +42,7 @@ _BACKENDS: dict[str, str] = {
     "warp": "rasterizers.warp_backend",
     "gsplat": "rasterizers.gsplat_backend",
 }
+_ON_CUDA = ("warp", "gsplat")
 
 
 def load(name: str = "auto", *, preset: str | None = None, **settings: Any) -> Rasterizer:
@@ -92,5 +93,5 @@ def available() -> dict[str, str | None]:
 
 
 def _fastest_first() -> list[str]:
-    """Warp draws on CUDA and then wins; without CUDA it is there to be checked, and comes last."""
-    return sorted(_BACKENDS, key=lambda name: name != "warp" if torch.cuda.is_available() else name == "warp")
+    """Those that draw on CUDA win where there is CUDA; without it they can at most be checked, and come last."""
+    return sorted(_BACKENDS, key=lambda name: (name in _ON_CUDA) != torch.cuda.is_available())

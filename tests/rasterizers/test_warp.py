@@ -41,8 +41,10 @@ def test_without_warp_the_remedy_is_named(monkeypatch):
         rasterizers.load("warp")
 
 
-@pytest.mark.parametrize(("cuda", "order"), [(True, ["warp", "cpp", "torch"]), (False, ["cpp", "torch", "warp"])])
-def test_warp_is_the_fastest_on_cuda_and_the_last_choice_without(monkeypatch, cuda, order):
+@pytest.mark.parametrize(
+    ("cuda", "order"), [(True, ["warp", "gsplat", "cpp", "torch"]), (False, ["cpp", "torch", "warp", "gsplat"])]
+)
+def test_warp_is_the_fastest_on_cuda_and_no_choice_without(monkeypatch, cuda, order):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
     monkeypatch.setattr(rasterizers, "load", lambda name: None)
     assert list(rasterizers.available()) == order
