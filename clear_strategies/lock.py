@@ -7,14 +7,15 @@ it has ended it. Of another host nothing is known, so its lock is respected.
 from __future__ import annotations
 
 import datetime
+import fcntl
 import json
 import logging
 import os
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 from clear_strategies.errors import DataError
 
@@ -37,31 +38,51 @@ def hold(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / NAME
     mine = json.dumps(_me())
-    while not _create(path, mine):
-        _take_away_if_stale(path)
+    with _alone_with(path) as file:
+        left = file.read()
+        if left:  # or this opening made it
+            _require_stale(path, left)
+        try:
+            _write(file, mine)
+        except OSError:  # a full disk: half a lock would be nobody's
+            path.unlink(missing_ok=True)
+            raise
     try:
         yield
     finally:
-        if _read(path) == mine:
-            path.unlink(missing_ok=True)
+        with suppress(FileNotFoundError), _alone_with(path) as file:  # the whole folder may be gone
+            if file.read() in (mine, ""):  # empty: it had been taken away, and this opening made it anew
+                path.unlink(missing_ok=True)
 
 
-def _create(path: Path, text: str) -> bool:
+@contextmanager
+def _alone_with(path: Path) -> Iterator[TextIO]:
+    """The file, made if need be, while no other process reads or writes it: who starts at the same moment waits here."""
+    while True:
+        with path.open("a+") as file:
+            with suppress(OSError):  # a file system that has no such locks: only starts at the same moment go unnoticed
+                fcntl.flock(file, fcntl.LOCK_EX)
+            if not _is_at(path, file):  # whoever had it removed it
+                continue
+            file.seek(0)
+            yield file
+            return
+
+
+def _is_at(path: Path, file: TextIO) -> bool:
     try:
-        with path.open("x") as file:
-            file.write(text)
-    except FileExistsError:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
         return False
-    except OSError:
-        path.unlink(missing_ok=True)  # a full disk: an empty lock would be nobody's
-        raise
-    return True
 
 
-def _take_away_if_stale(path: Path) -> None:
-    text = _read(path)
-    if text is None:
-        return  # released in the meantime
+def _write(file: TextIO, text: str) -> None:
+    file.truncate(0)
+    file.write(text)
+    file.flush()
+
+
+def _require_stale(path: Path, text: str) -> None:
     holder = _parsed(text)
     name = f"process {holder.get('pid', '?')} on {holder.get('host', 'an unknown host')}"
     since = f"since {holder.get('since', 'an unknown time')}"
@@ -73,16 +94,7 @@ def _take_away_if_stale(path: Path) -> None:
     if alive is None:
         problem = f"{name} took this folder {since}; whether it still runs cannot be known from {socket.gethostname()}"
         raise DataError(path, "lock", problem, "if it does not run any more, remove this file")
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.rename(aside)  # of several who find it stale, one moves it
-    except FileNotFoundError:
-        return
-    if _read(aside) == text:
-        _log.warning("%s: %s ended without releasing it; taken over.", path, name)
-    else:  # it was taken over by another in the meantime: back with it
-        os.link(aside, path)
-    aside.unlink()
+    _log.warning("%s: %s ended without releasing it; taken over.", path, name)
 
 
 def _me() -> dict[str, Any]:
@@ -127,13 +139,6 @@ def _started(pid: int) -> str | None:
     except PermissionError:
         pass
     return "unknown"
-
-
-def _read(path: Path) -> str | None:
-    try:
-        return path.read_text()
-    except FileNotFoundError:
-        return None
 
 
 def _parsed(text: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -57,7 +58,7 @@ def test_a_process_that_has_the_number_of_a_dead_one_is_another(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"host": 3}', "damaged"])
+@pytest.mark.parametrize("text", ["[]", '{"host": 3}', "damaged"])
 def test_a_lock_that_says_nothing_is_respected(tmp_path, text):
     (tmp_path / NAME).write_text(text)
     with pytest.raises(DataError, match="remove this file"), hold(tmp_path):
@@ -85,28 +86,56 @@ def test_a_job_that_slurm_starts_again_elsewhere_takes_over_from_itself(tmp_path
             pass
 
 
-def test_of_many_at_once_exactly_one_gets_it(tmp_path):
-    """All find the same stale lock."""
-    leave(tmp_path, pid=a_dead_process())
+@pytest.mark.parametrize("stale", [True, False])
+def test_of_many_at_once_exactly_one_gets_it(tmp_path, stale):
+    """In each of many rounds all come to a folder at the same moment, where a dead process may have left its lock."""
     code = (
-        "import sys, time\n"
+        "import sys\n"
         "from pathlib import Path\n"
         "from clear_strategies.lock import HeldError, hold\n"
-        "sys.stdin.readline()\n"
-        "try:\n"
-        "    with hold(Path(sys.argv[1])):\n"
-        "        sys.stdout.write('got it')\n"
-        "        sys.stdout.flush()\n"
-        "        sys.stdin.readline()\n"
-        "except HeldError:\n"
-        "    sys.stdout.write('refused')\n"
+        "def say(word):\n"
+        "    print(word, flush=True)\n"
+        "    sys.stdin.readline()\n"
+        "say('ready')\n"
+        "for folder in sorted(Path(sys.argv[1]).iterdir()):\n"
+        "    try:\n"
+        "        with hold(folder):\n"
+        "            say('got it')\n"
+        "    except HeldError:\n"
+        "        say('refused')\n"
     )
+    rounds, dead = 25, a_dead_process()
+    for i in range(rounds):
+        (tmp_path / f"{i:02d}").mkdir()
+        if stale:
+            leave(tmp_path / f"{i:02d}", pid=dead)
     command = [sys.executable, "-c", code, str(tmp_path)]
     several = [subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) for _ in range(4)]
+
+    def all_say():
+        said = sorted(process.stdout.readline().strip() for process in several)
+        for process in several:
+            process.stdin.write("go on\n")
+            process.stdin.flush()
+        return said
+
+    assert all_say() == ["ready"] * 4
+    assert [all_say() for _ in range(rounds)] == [["got it", "refused", "refused", "refused"]] * rounds
     for process in several:
-        process.stdin.write("go\n")
-        process.stdin.flush()
-    said = [process.stdout.read(6) for process in several]
-    for process in several:
-        process.communicate("\n")
-    assert sorted(said) == ["got it", "refuse", "refuse", "refuse"]
+        process.communicate()
+        assert process.returncode == 0
+    assert list(tmp_path.rglob("*lock*")) == []
+
+
+def test_a_lock_taken_away_by_hand_is_not_missed(tmp_path):
+    with hold(tmp_path):
+        (tmp_path / NAME).unlink()
+    assert list(tmp_path.iterdir()) == []
+    with hold(tmp_path / "run"):
+        shutil.rmtree(tmp_path / "run")
+
+
+def test_another_s_lock_is_left_to_it(tmp_path):
+    with hold(tmp_path):
+        leave(tmp_path, pid=1)
+    assert (tmp_path / NAME).exists()
