@@ -117,12 +117,9 @@ class DensitySettings:
     def __post_init__(self) -> None:
         if not self.threshold > 0:
             raise ValueError(f"threshold must be > 0, got {self.threshold}.")
-        if self.mode not in ("quantile", "fixed"):
-            raise ValueError(f"mode must be quantile or fixed, got {self.mode!r}.")
+        require_in_range(self)
         if self.reduce not in ("mean", "max"):
             raise ValueError(f"reduce must be mean or max, got {self.reduce!r}.")
-        if self.every < 1 or self.max_gaussians < 1 or self.min_gaussians < 1 or self.reset_every < 0:
-            raise ValueError("every, max_gaussians and min_gaussians must be at least 1, reset_every at least 0.")
         if not 0 <= self.prune_opacity < 1:
             raise ValueError(f"prune_opacity must lie in [0, 1), got {self.prune_opacity}.")
 
@@ -266,3 +263,15 @@ def cameras_extent(centers: Float[Tensor, "V 3"]) -> float:
     """3DGS's scene size: 1.1 times the largest distance of a training camera from their mean, at least a little."""
     radius = torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()
     return max(1.1 * float(radius), 1e-6)
+
+
+def require_in_range(settings: Any) -> None:
+    """What every densifier's settings have in common.
+
+    Raises:
+        ValueError: one is outside its range.
+    """
+    if settings.mode not in ("quantile", "fixed"):
+        raise ValueError(f"mode must be quantile or fixed, got {settings.mode!r}.")
+    if min(settings.every, settings.max_gaussians, settings.min_gaussians) < 1 or settings.reset_every < 0:
+        raise ValueError("every, max_gaussians and min_gaussians must be at least 1, reset_every at least 0.")

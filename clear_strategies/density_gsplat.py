@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from clear_strategies.conductor import Update
-from clear_strategies.density import DensityError
+from clear_strategies.density import DensityError, require_in_range
 from clear_strategies.errors import DataError
 from clear_strategies.field import GaussianField
 from clear_strategies.gradients import ATTRIBUTES, Shot
@@ -89,10 +89,7 @@ class GsplatSettings:
                 raise ValueError(f"strategy.{theirs} must stand beside the strategy, not in it: density.{ours}.")
         if self.threshold is not None and not self.threshold > 0:
             raise ValueError(f"threshold must be > 0, got {self.threshold}.")
-        if self.mode not in ("quantile", "fixed"):
-            raise ValueError(f"mode must be quantile or fixed, got {self.mode!r}.")
-        if self.every < 1 or self.max_gaussians < 1 or self.min_gaussians < 1 or self.reset_every < 0:
-            raise ValueError("every, max_gaussians and min_gaussians must be at least 1, reset_every at least 0.")
+        require_in_range(self)
 
     def densifier(self, n: int, *, extent: float, seed: int, white_background: bool) -> GsplatDensifier:
         """Import and build the strategy.

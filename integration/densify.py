@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -137,4 +137,14 @@ def warn_of_early_end(conductor: Conductor, until: int | None, setting: str) -> 
         _log.warning(
             "the host densifies until %s=%d, but a strategy ends densification before (SVS: anchor_start). Set %s to that.",
             setting, until, setting,
+        )  # fmt: skip
+
+
+def warn_of_unread_score(conductor: Conductor, densifier: Any, threshold: float | None) -> None:
+    """Say where a strategy scores and the host's densifier, which has no threshold, reads no screen gradient."""
+    scoring = conductor.owner("score")
+    if scoring is not None and densifier is not None and threshold is None:
+        _log.warning(
+            "%s reads no screen gradient: the densification score of %s has no effect.",
+            type(densifier).__name__, type(scoring).__name__,
         )  # fmt: skip

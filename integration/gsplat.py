@@ -23,9 +23,10 @@ from torch import Tensor
 
 from clear_strategies.conductor import Conductor
 from clear_strategies.data.view import View
+from clear_strategies.optim import LearningRates
 from integration.attach import Attachment, Drawing, HostError, Which
 from integration.bridge import AutogradShot
-from integration.densify import Screen
+from integration.densify import Screen, warn_of_early_end, warn_of_unread_score
 from rasterizers.geometry import SH_C0
 
 _log = logging.getLogger(__name__)
@@ -34,7 +35,6 @@ ROWS: Final = "clear_rows"
 """In a gsplat strategy's `state`: which row each Gaussian had when the structure last changed. gsplat's operations gather
 every tensor of the state together with the parameters, so this one becomes the map of the change."""
 
-DETAIL_RATE: Final = 2.5e-3
 _ATTACHED: Final = "clear_attached"  # on a wrapped function: by whom
 _SAME_POSE: Final = 1e-3  # largest difference between entries of two poses that are one camera's
 
@@ -104,7 +104,8 @@ class Attached:
         means = params[self._own("means")]
         if detail and "detail" not in params:
             params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
-            optimizers["detail"] = torch.optim.Adam([params["detail"]], lr=DETAIL_RATE, eps=1e-15)
+            rates = LearningRates()
+            optimizers["detail"] = torch.optim.Adam([params["detail"]], lr=rates.detail, eps=rates.eps)
         self._state = state
         self._told: Tensor | None = None
         self._number()
@@ -280,20 +281,10 @@ _GSPLAT: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 def _threshold(strategy: Any, conductor: Conductor) -> float | None:
-    """What the host's densifier holds ‖∇_u‖ against; says what of P2G has no effect."""
+    """What the host's densifier holds ‖∇_u‖ against; says what of the strategies it does not heed."""
     threshold = getattr(strategy, "grow_grad2d", None)
-    scoring = conductor.owner("score")
-    if scoring is not None and strategy is not None and threshold is None:
-        _log.warning(
-            "%s reads no screen gradient: the densification score of %s has no effect.",
-            type(strategy).__name__, type(scoring).__name__,
-        )  # fmt: skip
-    last = getattr(strategy, "refine_stop_iter", None)
-    if last is not None and conductor.may_densify(0) and not conductor.may_densify(last - 1):
-        _log.warning(
-            "%s densifies until refine_stop_iter=%d, but a strategy ends densification before (SVS: anchor_start). Set "
-            "refine_stop_iter to that, or pass ClearStrategy, which asks.", type(strategy).__name__, last,
-        )  # fmt: skip
+    warn_of_unread_score(conductor, strategy, threshold)
+    warn_of_early_end(conductor, getattr(strategy, "refine_stop_iter", None), "refine_stop_iter")
     return None if threshold is None else float(threshold)
 
 

@@ -13,7 +13,6 @@ Nothing of those repositories is imported but by their own train.py, and nothing
 
 from __future__ import annotations
 
-import copy
 import functools
 import logging
 import sys
@@ -32,7 +31,7 @@ from clear_strategies.data.view import View
 from integration.attach import Attachment, Drawing, HostError, Which
 from integration.densify import warn_of_early_end
 from integration.lineage import Detail
-from integration.seen import Eye, Role
+from integration.seen import Eye, Role, enlarged
 from integration.views import SuperResolve, super_resolve, view
 
 _log = logging.getLogger(__name__)
@@ -49,7 +48,6 @@ _ROLES: Final[tuple[tuple[str, Role], ...]] = (
     ("get_scaling_n_opacity_with_3D_filter", "gate"),
     ("_features_dc", "detail"),
 )
-_IN_PIXELS: Final = ("image_width", "image_height", "focal_x", "focal_y", "fx", "fy", "cx", "cy")
 
 THRESHOLD: Final = 2e-4
 """3DGS's densify_grad_threshold."""
@@ -210,15 +208,6 @@ class Attached:
             return self._save_ply(*args, **kwargs)
         finally:
             self._model._features_dc = trained
-
-
-def enlarged(camera: Any, factor: int) -> Any:
-    """The same camera on a pixel grid `factor` times as fine; fields of view stay."""
-    larger = copy.copy(camera)
-    for name in _IN_PIXELS:
-        if hasattr(camera, name):
-            setattr(larger, name, getattr(camera, name) * factor)
-    return larger
 
 
 def intrinsics(camera: Any) -> Float[Tensor, "3 3"]:

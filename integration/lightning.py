@@ -11,7 +11,6 @@ are the same. Imported by that host only, for it derives from its `DensityContro
 
 from __future__ import annotations
 
-import copy
 import functools
 import logging
 from collections.abc import Callable, Mapping
@@ -27,9 +26,9 @@ from clear_strategies.conductor import Conductor
 from clear_strategies.data.upscale import Images
 from clear_strategies.data.view import View
 from integration.attach import Attachment, Drawing, HostError, Which
-from integration.densify import warn_of_early_end
+from integration.densify import warn_of_early_end, warn_of_unread_score
 from integration.lineage import Detail
-from integration.seen import Eye, Role
+from integration.seen import Eye, Role, enlarged
 from integration.views import super_resolve, view
 
 _log = logging.getLogger(__name__)
@@ -43,7 +42,6 @@ _ROLES: Final[tuple[tuple[str, Role], ...]] = (
     ("shs_dc", "detail"),
     ("get_shs_dc", "detail"),
 )
-_IN_PIXELS: Final = ("fx", "fy", "cx", "cy", "width", "height")
 
 
 @dataclass
@@ -115,12 +113,7 @@ class Attached:
     def _begin(self) -> Attachment:
         done, settings = self._module.trainer.global_step, self._settings
         threshold = getattr(self._density, "densify_grad_threshold", None)
-        scoring = self._conductor.owner("score")
-        if scoring is not None and threshold is None:
-            _log.warning(
-                "%s reads no screen gradient: the densification score of %s has no effect.",
-                type(self._density).__name__, type(scoring).__name__,
-            )  # fmt: skip
+        warn_of_unread_score(self._conductor, self._density, threshold)
         warn_of_early_end(self._conductor, getattr(self._density, "densify_until_iter", None), "densify_until_iter")
         model = self._module.gaussian_model
         self._detail = Detail(self._leaves)
@@ -196,14 +189,6 @@ class Attached:
             pixels = image.permute(1, 2, 0)
             self._views[name] = view(name, pixels, camera.world_to_camera.T, K, self._sr, self._factor)
         return self._views[name]
-
-
-def enlarged(camera: Any, factor: int) -> Any:
-    """The same camera on a pixel grid `factor` times as fine; fields of view and projections stay."""
-    larger = copy.copy(camera)
-    for name in _IN_PIXELS:
-        setattr(larger, name, getattr(camera, name) * factor)
-    return larger
 
 
 def _unit(result: Mapping[str, Any]) -> tuple[float, float] | None:

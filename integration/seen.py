@@ -4,12 +4,13 @@ descends from it): the model with gated opacities and f_det in its colours, the 
 
 from __future__ import annotations
 
+import copy
 import inspect
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import torch
 from jaxtyping import Float
@@ -27,6 +28,11 @@ from rasterizers.interface import Camera
 _log = logging.getLogger(__name__)
 
 Role = Literal["gate", "detail"]
+
+# What cameras call what they measure in pixels; one host has some of them, another others.
+_IN_PIXELS: Final = (
+    "image_width", "image_height", "width", "height", "focal_x", "focal_y", "fx", "fy", "cx", "cy",
+)  # fmt: skip
 
 
 @dataclass(slots=True, eq=False)
@@ -218,3 +224,12 @@ def centres(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 2"]
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     z = z.clamp_min(torch.finfo(z.dtype).eps)
     return torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), -1)
+
+
+def enlarged(camera: Any, factor: int) -> Any:
+    """The same camera on a pixel grid `factor` times as fine; fields of view and projections stay."""
+    larger = copy.copy(camera)
+    for name in _IN_PIXELS:
+        if hasattr(camera, name):
+            setattr(larger, name, getattr(camera, name) * factor)
+    return larger

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -73,11 +74,16 @@ def fastest(device: str | None = None) -> str:
     Args:
         device: "cpu" or "cuda", where the splats lie; None: wherever drawing is fastest.
     """
-    return next(
-        name
-        for name, why_not in available().items()
-        if why_not is None and (device is None or device in load(name).traits.devices)
-    )
+    return next(name for name, drawing in _running() if device is None or device in drawing.traits.devices)
+
+
+def _running() -> Iterator[tuple[str, Rasterizer]]:
+    """Those that run here, fastest first; none is loaded before it is asked for."""
+    for name in _fastest_first():
+        try:
+            yield name, load(name)
+        except BackendUnavailable:
+            continue
 
 
 def available() -> dict[str, str | None]:

@@ -1,4 +1,4 @@
-"""What every backend asks of its input, said in the same words."""
+"""What every backend asks of its input, said in the same words, and what several do with it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import fields
 from typing import Any, TypeVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from rasterizers.interface import RasterSettings, Splats
+from rasterizers.interface import Camera, RasterSettings, Splats
 
 Settings = TypeVar("Settings", bound=RasterSettings)
 
@@ -69,3 +70,15 @@ def require_tiles(tiles: Tensor, width: int, height: int, tile: int) -> None:
             f"the tile mask must be [{rows}, {columns}] for {width}x{height} pixels "
             f"in tiles of {tile}, got {tuple(tiles.shape)}."
         )
+
+
+def shares(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
+    """Whether two jobs see the same Gaussians from the same pose; opacities and offsets may differ."""
+    (a, from_a), (b, from_b) = first, other
+    same = all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
+    return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
+
+
+def packed_rows(shN: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
+    """Rows may lie apart (a view of the active bands), but each must be contiguous."""
+    return shN if shN.numel() == 0 or shN.stride()[1:] == (3, 1) else shN.contiguous()

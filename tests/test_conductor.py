@@ -13,6 +13,7 @@ from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, SplatSu
 from clear_strategies.field import GaussianField
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.testing import CHECKS, ContractError, check_strategy
+from rasterizers import Splats, autograd
 
 ALWAYS = WarmupDecay(start=0, full=1, decay_from=10, end=10)
 
@@ -90,19 +91,8 @@ def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective
     opacities = raw["opacities"].sigmoid() * (raw["scales"].exp() / scales).prod(-1)
     bands = (field.degree + 1) ** 2 - 1
 
-    class Draw(torch.autograd.Function):
-        @staticmethod
-        def forward(ctx, camera, *inputs):
-            from rasterizers import Splats
-
-            ctx.rendering = toy.RASTERIZER(Splats(*inputs), camera)
-            return ctx.rendering.image
-
-        @staticmethod
-        def backward(ctx, cotangent):
-            g = ctx.rendering.vjp(cotangent[None])
-            values = (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN, g.rgb)
-            return None, *(v[0] for v in values)
+    def draw(camera, *inputs):
+        return autograd.draw(toy.RASTERIZER, Splats(*inputs), camera).image
 
     class Loss(torch.autograd.Function):
         @staticmethod
@@ -119,11 +109,11 @@ def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective
 
     common = (raw["means"], raw["quats"], scales, opacities, raw["sh0"], raw["shN"][:, :bands])
     zero = torch.zeros_like(raw["detail"])
-    hr = Draw.apply(view.hr.camera, *common, raw["detail"])
+    hr = draw(view.hr.camera, *common, raw["detail"])
     if objective.lr_from == "hr":
         lr = torch.nn.functional.avg_pool2d(hr.permute(2, 0, 1), view.factor).permute(1, 2, 0)
     else:
-        lr = Draw.apply(view.lr.camera, *common, zero)
+        lr = draw(view.lr.camera, *common, zero)
     loss = objective.lambda_lr * photometric(lr, view.lr.image.double()) + λ * (
         photometric(hr, view.hr.image.double())
         + objective.lambda_hf * Loss.apply(kernels.haar_l1, hr, view.hr.image.double())

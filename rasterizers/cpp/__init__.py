@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import build, require_cotangents, require_finite, require_tiles
+from rasterizers.checks import build, packed_rows, require_cotangents, require_finite, require_tiles, shares
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.native import load_kernels, threads
 
@@ -69,7 +69,7 @@ class CppRasterizer(RasterSettings):
     ) -> list[Rendering]:
         """Screens of one pose share projection, colour and depth order where their tensors are the same objects."""
         masks = [None] * len(jobs) if tiles is None else tiles
-        if len(jobs) > 1 and all(_shares(jobs[0], job) for job in jobs[1:]):
+        if len(jobs) > 1 and all(shares(jobs[0], job) for job in jobs[1:]):
             frame = _Frame(self, jobs, masks)
             return [CppRendering(frame, i) for i in range(len(jobs))]
         return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
@@ -97,7 +97,7 @@ class _Frame:
         self.threads = settings.threads if settings.threads is not None else threads()
         self.cameras = [camera for _, camera in jobs]
         shared = (splats.means, splats.quats, splats.scales, splats.sh0)
-        self.shared = (*(x.detach().contiguous() for x in shared), _rows(splats.shN.detach()))
+        self.shared = (*(x.detach().contiguous() for x in shared), packed_rows(splats.shN.detach()))
         # Kept here because the native frame only borrows them.
         self.opacities = [job.opacities.detach().contiguous() for job, _ in jobs]
         self.offsets = [None if job.rgb_offset is None else job.rgb_offset.detach().contiguous() for job, _ in jobs]
@@ -178,15 +178,3 @@ def create(**settings: Any) -> CppRasterizer:
     """
     load_kernels(__name__)
     return build(CppRasterizer, settings)
-
-
-def _shares(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
-    """Whether two jobs see the same Gaussians from the same pose; opacities and offsets may differ."""
-    (a, from_a), (b, from_b) = first, other
-    same = all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
-    return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
-
-
-def _rows(shN: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
-    """Rows may lie apart (a view of the active bands), but each must be contiguous."""
-    return shN if shN.numel() == 0 or shN.stride()[1:] == (3, 1) else shN.contiguous()

@@ -20,7 +20,7 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import require_cotangents, require_finite, require_tiles
+from rasterizers.checks import packed_rows, require_cotangents, require_finite, require_tiles, shares
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
@@ -77,7 +77,7 @@ class WarpRasterizer(RasterSettings):
     ) -> list[Rendering]:
         """Screens of one pose share colour and depth order where their tensors are the same objects."""
         masks = [None] * len(jobs) if tiles is None else tiles
-        if len(jobs) > 1 and all(_shares(jobs[0], job) for job in jobs[1:]):
+        if len(jobs) > 1 and all(shares(jobs[0], job) for job in jobs[1:]):
             return _Frame(self, jobs, masks).draw()
         return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
 
@@ -136,7 +136,7 @@ class _Frame:
         self.means, self.quats, self.scales = (
             x.detach().contiguous() for x in (splats.means, splats.quats, splats.scales)
         )
-        self.sh0, self.shN = splats.sh0.detach()[:, 0], _rows(splats.shN.detach())
+        self.sh0, self.shN = splats.sh0.detach()[:, 0], packed_rows(splats.shN.detach())
         self.bands = self.shN.shape[1]
         self.colours = self.empty(self.n, 3)
         self.slopes = self.empty(self.n if self.bands else 0, 3, 3)
@@ -373,15 +373,3 @@ def _cuts_struct(settings: WarpRasterizer) -> Any:
     cuts.alpha_min, cuts.alpha_max = settings.alpha_min, settings.alpha_max
     cuts.transmittance_min, cuts.background = settings.transmittance_min, wp.vec3(*settings.background)
     return cuts
-
-
-def _shares(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
-    """Whether two jobs see the same Gaussians from the same pose; opacities and offsets may differ."""
-    (a, from_a), (b, from_b) = first, other
-    same = all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
-    return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
-
-
-def _rows(shN: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
-    """Rows may lie apart (a view of the active bands), but each must be contiguous."""
-    return shN if shN.numel() == 0 or shN.stride()[1:] == (3, 1) else shN.contiguous()

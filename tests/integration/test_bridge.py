@@ -10,24 +10,9 @@ from clear_strategies import GCO, P2G, SVS, Conductor, Objective
 from clear_strategies.field import GaussianField
 from clear_strategies.schedules import WarmupDecay
 from integration.bridge import AutogradShot, joint_loss, joint_update
-from rasterizers import Splats
+from rasterizers import Splats, autograd
 
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
-
-
-class Draw(torch.autograd.Function):
-    """A host's differentiable renderer: splats in, image and projected centres out."""
-
-    @staticmethod
-    def forward(ctx, camera, probe, *splats):
-        ctx.rendering = toy.RASTERIZER(Splats(*splats), camera)
-        ctx.mark_non_differentiable(ctx.rendering.visible)
-        return ctx.rendering.image, ctx.rendering.visible
-
-    @staticmethod
-    def backward(ctx, cotangent, _):
-        g = ctx.rendering.vjp(cotangent[None])
-        return None, g.screen[0], *(x[0] for x in (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN, g.rgb))
 
 
 class Host:
@@ -43,10 +28,9 @@ class Host:
         opacities = p["opacities"].sigmoid() if z is None else p["opacities"].sigmoid() * z
         offset = p["detail"] if detail else torch.zeros_like(p["detail"])
         drawn = (p["means"], p["quats"], p["scales"].exp(), opacities, p["sh0"], p["shN"], offset)
-        probe = toy.RASTERIZER(Splats(*(x.detach() for x in drawn)), camera).means2d.requires_grad_()
-        image, visible = Draw.apply(camera, probe, *drawn)
+        shot = autograd.draw(toy.RASTERIZER, Splats(*drawn), camera)
         params = p if detail else {name: value for name, value in p.items() if name != "detail"}
-        return AutogradShot(image, probe, visible, params)
+        return AutogradShot(shot.image, shot.means2d, shot.visible, params)
 
 
 @pytest.mark.parametrize("strategies", [(), (GCO(),), (P2G(),), (SVS(),), (GCO(), P2G(), SVS())], ids=len)
