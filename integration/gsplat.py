@@ -284,7 +284,8 @@ def _threshold(strategy: Any, conductor: Conductor) -> float | None:
     """What the host's densifier holds ‖∇_u‖ against; says what of the strategies it does not heed."""
     threshold = getattr(strategy, "grow_grad2d", None)
     warn_of_unread_score(conductor, strategy, threshold)
-    warn_of_early_end(conductor, getattr(strategy, "refine_stop_iter", None), "refine_stop_iter")
+    if not getattr(strategy, "asks_the_conductor", False):
+        warn_of_early_end(conductor, getattr(strategy, "refine_stop_iter", None), "refine_stop_iter")
     return None if threshold is None else float(threshold)
 
 

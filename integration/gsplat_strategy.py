@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import gsplat.rendering
 from gsplat.strategy import DefaultStrategy
@@ -35,6 +35,9 @@ class ClearStrategy(DefaultStrategy):  # type: ignore[misc]
     detail: bool = True
     seed: int = 0
     attached: Attached | None = None
+
+    asks_the_conductor: ClassVar[bool] = True
+    """Densification ends where a strategy ends it, whatever refine_stop_iter says."""
 
     def check_sanity(self, params: Any, optimizers: Any) -> None:
         super().check_sanity(params, optimizers)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import build
+from rasterizers.checks import build, require_cotangents, require_finite, require_tiles
 from rasterizers.geometry import SH_C0, spherical_harmonics
 from rasterizers.interface import (
     BackendUnavailable,
@@ -82,12 +82,15 @@ class GsplatRasterizer(RasterSettings):
         """Draw.
 
         Raises:
-            ValueError: the splats lie elsewhere, or are not float32.
+            ValueError: the splats lie elsewhere, are not float32 or not finite; or the tile mask has another shape.
         """
+        if tiles is not None:
+            require_tiles(tiles, camera.width, camera.height, self.tile)
         if splats.means.device.type != self.device or splats.means.dtype != torch.float32:
             raise ValueError(
                 f"gsplat draws float32 tensors on {self.device}, got {splats.means.dtype} on {splats.means.device}."
             )
+        require_finite(splats)
         names = ("means", "quats", "scales", "opacities", "sh0", "shN")
         with torch.enable_grad():
             leaves = {name: getattr(splats, name).detach().requires_grad_() for name in names}
@@ -144,6 +147,7 @@ class GsplatRendering:
     asked: Bool[Tensor, "H W 1"] | None
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
+        require_cotangents(cotangents, self.image)
         pulled = []
         for cotangent in cotangents if self.asked is None else cotangents * self.asked:
             gradients = torch.autograd.grad(

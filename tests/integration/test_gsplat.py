@@ -377,7 +377,7 @@ class TestWithGsplat:
             self.run(attached, (SVS(anchor_start=10),), steps=1)
         assert "densifies until refine_stop_iter=24" in caplog.text
 
-    def test_clear_strategy_is_a_default_strategy_that_attaches_itself(self):
+    def test_clear_strategy_is_a_default_strategy_that_attaches_itself(self, caplog):
         from gsplat.strategy import DefaultStrategy
 
         from integration.gsplat_strategy import ClearStrategy
@@ -397,5 +397,6 @@ class TestWithGsplat:
             clear.attached.remove()
         sizes = len(host.splats["means"])
         assert sizes > 40
+        assert "densifies until" not in caplog.text  # it ends densification itself
         assert clear.attached.attachment.t == 30
         assert clear.attached.attachment.conductor.state_dict()["SVS.means"].shape == (sizes, 3)  # anchored at t = 15

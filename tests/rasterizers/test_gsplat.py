@@ -54,6 +54,18 @@ def test_tiles_that_nobody_asked_for_show_the_background_and_send_nothing_back()
     assert float(part.vjp(cotangent).means.abs().max()) == 0
 
 
+def test_bad_input_is_refused_in_the_words_of_every_backend():
+    mine, _ = both(tile=16)
+    splats, camera = toy.splats(10), toy.camera(0.0, 48, 32)
+    with pytest.raises(ValueError, match=r"tile mask must be \[2, 3\]"):
+        mine(splats, camera, torch.ones(3, 3, dtype=torch.bool))
+    with pytest.raises(ValueError, match="cotangents must be"):
+        mine(splats, camera).vjp(torch.zeros(1, 48, 32, 3))
+    splats.scales[7] = float("nan")
+    with pytest.raises(ValueError, match=r"splats\.scales must be finite; Gaussian 7"):
+        mine(splats, camera)
+
+
 def test_scales_are_drawn_one_after_the_other():
     mine, _ = both()
     splats, camera = toy.splats(10), toy.camera(0.0, 48, 32)
