@@ -21,7 +21,7 @@ def build(kind: type[Settings], settings: Mapping[str, Any]) -> Settings:
     Raises:
         ValueError: a setting that it does not have, or that is out of range.
     """
-    known = [f.name for f in fields(kind)]
+    known = [f.name for f in fields(kind) if f.init]
     unknown = sorted(set(settings) - set(known))
     if unknown:
         raise ValueError(f"unknown rasterizer setting {unknown[0]!r}; known are {', '.join(known)}.")

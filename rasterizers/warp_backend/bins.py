@@ -106,11 +106,12 @@ def count_tiles(ellipse: Ellipse, screen: Screen, masked: wp.bool, wanted: wp.ar
 def list_pairs(
     order: wp.array[wp.int32],
     counts: wp.array[wp.int32],
-    ends: wp.array[wp.int32],
+    ends: wp.array[wp.int64],
     rows: wp.array[Row],
     screen: Screen,
     masked: wp.bool,
     wanted: wp.array2d[wp.bool],
+    room: wp.int32,
     firsts: wp.array[wp.int32],
     tiles: wp.array[wp.int32],
     pairs: wp.array[wp.int32],
@@ -119,14 +120,18 @@ def list_pairs(
     """A thread per Gaussian, front to back: its tiles, from the top left on, at the places before `ends`.
 
     `counts` was found by the same function in another kernel, which a compiler may round otherwise. Should they differ,
-    the places decide, and one that is left over holds a tile that does not exist.
+    the places decide, and one that is left over holds a tile that does not exist. Places beyond `room` are not taken.
     """
     rank = wp.tid()
     i = order[rank]
     count = counts[i]
     if count == 0:
         return
-    first = ends[rank] - count
+    place_of_first = ends[rank] - wp.int64(count)
+    if place_of_first >= wp.int64(room):
+        return
+    first = wp.int32(place_of_first)
+    count = wp.min(count, room - first)
     firsts[i] = first
     ellipse = ellipse_of(rows[i])
     place = wp.int32(0)
@@ -149,13 +154,21 @@ def find_tiles(
     tiles: wp.array[wp.int32],
     pairs: wp.array[wp.int32],
     splats: wp.array[wp.int32],
-    count: wp.int32,
+    totals: wp.array[wp.int64],
+    nth: wp.int32,
+    room: wp.int32,
     listed: wp.array[wp.int32],
     starts: wp.array[wp.int32],
     ends: wp.array[wp.int32],
 ) -> None:
-    """A thread per pair, sorted by tile: where each tile's list begins and ends, and the Gaussians in it."""
+    """A thread per pair, sorted by tile: where each tile's list begins and ends, and the Gaussians in it.
+
+    `totals` of the `nth` screen: how many of the places hold a pair.
+    """
     at = wp.tid()
+    count = wp.int32(wp.min(totals[nth], wp.int64(room)))
+    if at >= count:
+        return
     tile = tiles[at]
     listed[at] = splats[pairs[at]]
     if at == 0 or tiles[at - 1] != tile:

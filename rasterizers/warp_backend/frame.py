@@ -2,8 +2,10 @@
 
     project (each screen) -> order by depth -> (each screen: list pairs -> blend)          and back: blend_vjp -> pull
 
-Memory is torch's (but the sort's scratch), and all work goes to torch's current stream. Nothing here waits for the device
-but for how many pairs of Gaussian and tile there are, and that while the depths are being sorted.
+Memory is torch's (but the sort's scratch), and all work goes to torch's current stream. Only the device knows how many
+pairs of Gaussian and tile a picture has. The first picture of its size waits for that number. Those after it are launched
+whole, with room for as many pairs as were needed before and some more; the number is read when somebody first looks at
+the picture, and should the room not have sufficed, it is drawn again before it is seen.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Final
 
@@ -34,6 +36,7 @@ _ROW: Final = 14
 _MARGIN: Final = 0.3  # share of the half field of view beyond the image up to which the Jacobian follows
 _PAIR_BYTES: Final = 24  # tile and place, twice for the sort, and the Gaussian, before and after it
 _SENT_BYTES: Final = 36  # what a pair sends back for one cotangent
+_LATE: Final = {"cuda": True, "cpu": False}  # whether numbers that are counted on the device are read late
 _LANES: Final = {"cuda": 32, "cpu": 1}  # threads a tile on the way back: a warp; on a CPU Warp's blocks have one
 
 
@@ -51,6 +54,7 @@ class WarpRasterizer(RasterSettings):
 
     memory: int = 4096
     device: str = "cpu"
+    _rooms: dict[tuple[int, int], int] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         RasterSettings.__post_init__(self)
@@ -58,6 +62,19 @@ class WarpRasterizer(RasterSettings):
             raise ValueError(f"tile must be a multiple of {_TILE} pixels, got {self.tile}.")
         if self.memory < 1:
             raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
+
+    def room(self, screen: Camera) -> int:
+        """For how many pairs a picture of this size gets room before they are counted; -1: none was drawn yet."""
+        return self._rooms.get((screen.width, screen.height), -1)
+
+    def remember(self, screen: Camera, pairs: int) -> None:
+        """Room for a quarter more than a picture needed; what others needed is forgotten slowly."""
+        room = max(pairs + pairs // 4, self.room(screen) * 63 // 64)
+        self._rooms[screen.width, screen.height] = room if self.allows(room) else pairs
+
+    def allows(self, pairs: int) -> bool:
+        """Whether lists of so many pairs, which are counted in 32 bits, stay within the budget."""
+        return _mebibytes(pairs) <= self.memory and pairs < 2**31
 
     @property
     def traits(self) -> Traits:
@@ -78,7 +95,7 @@ class WarpRasterizer(RasterSettings):
         """Screens of one pose share colour and depth order where their tensors are the same objects."""
         masks = [None] * len(jobs) if tiles is None else tiles
         if len(jobs) > 1 and all(shares(jobs[0], job) for job in jobs[1:]):
-            return _Frame(self, jobs, masks).draw()
+            return [*_Frame(self, jobs, masks).draw()]
         return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
 
 
@@ -98,14 +115,15 @@ class _Screen:
         self.visible = like.new_empty(n, dtype=torch.bool)
         self.counts = like.new_empty(n, dtype=torch.int32)  # tiles that list each Gaussian …
         self.firsts = like.new_empty(n, dtype=torch.int32)  # … and its first pair
-        self.lists: _Lists  # once they are sorted
+        self.pairs = 0  # as the host knows it, see `_Frame.settle`
+        self.lists: _Lists  # once they are sorted …
+        self.room = -1  # … of so many pairs; should there be more, of the foremost
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Lists:
     """Pairs of Gaussian and tile: the Gaussians tile by tile, and each pair's place among those of its Gaussian."""
 
-    count: int
     gaussians: Tensor
     places: Tensor
     starts: Tensor
@@ -142,26 +160,44 @@ class _Frame:
         self.slopes = self.empty(self.n if self.bands else 0, 3, 3)
         self.screens = [_Screen(settings, job, screen, mask) for (job, screen), mask in zip(jobs, tiles, strict=True)]
         self._basis: Tensor | None = None
+        self._settled = False
 
-    def draw(self) -> list[Rendering]:
-        """A picture on each screen.
+    def draw(self) -> list[WarpRendering]:
+        """A picture on each screen. What is wrong with its input may be said when it is first looked at."""
+        wp.init()
+        with self.on_stream():
+            keys = self._project()
+            self._read = _read_later(self._totals)
+            places = torch.arange(2 * self.n, dtype=torch.int32, device=self.like.device)
+            self._order = _sorted(keys, places, self.n, 31)[1]
+            rooms = [self.settings.room(screen.camera) for screen in self.screens]
+            if _LATE[self.settings.device] and min(rooms) >= 0:
+                for nth, room in enumerate(rooms):
+                    self._list(nth, room)
+            else:
+                self.settle()
+            return [WarpRendering(self, screen) for screen in self.screens]
+
+    def settle(self) -> None:
+        """Read how many pairs there are, and list them anew where they were given too little room.
 
         Raises:
             ValueError: a number is not finite.
             MemoryError: the lists of a picture would pass the budget.
         """
-        wp.init()
-        with self.on_stream():
-            keys, totals = self._project()
-            order = _sorted(keys, torch.arange(2 * self.n, dtype=torch.int32, device=self.like.device), self.n, 31)[1]
-            *pairs, poison = totals()
-            if poison:
-                for splats, _ in self.jobs:
-                    require_finite(splats)
-            for screen, count in zip(self.screens, pairs, strict=True):
-                self._require_memory(screen, count)
-                screen.lists = self._list(screen, order, count)
-            return [WarpRendering(self, screen) for screen in self.screens]
+        if self._settled:
+            return
+        *pairs, poison = self._read()
+        if poison:
+            for splats, _ in self.jobs:
+                require_finite(splats)
+        for nth, (screen, count) in enumerate(zip(self.screens, pairs, strict=True)):
+            self._require_memory(screen, count)
+            self.settings.remember(screen.camera, count)
+            screen.pairs = count
+            if screen.room < count:
+                self._list(nth, count)
+        self._settled = True
 
     def on_stream(self) -> AbstractContextManager[Any]:
         """Warp's work goes where torch's goes."""
@@ -188,8 +224,8 @@ class _Frame:
             self.launch(basis, self.n, *arguments)
         return self._basis
 
-    def _project(self) -> tuple[Tensor, Any]:
-        """Depth keys, with room for sorting them, and a function that waits for [pairs of each screen, poison]."""
+    def _project(self) -> Tensor:
+        """Depth keys, with room for sorting them; and the totals: pairs of each screen, and poison."""
         keys = self.empty(2 * self.n, dtype=torch.int32)
         poison = self.like.new_zeros(1, dtype=torch.int64)
         for nth, screen in enumerate(self.screens):
@@ -203,58 +239,77 @@ class _Frame:
                 _array(screen.ellipses, types.Row), _array(screen.means2d, wp.vec2), _array(screen.visible),
                 _array(screen.counts), _array(poison),
             )  # fmt: skip
-        return keys, _read_later(torch.cat([*(screen.counts.sum(0, True) for screen in self.screens), poison]))
+        self._totals = torch.cat([*(screen.counts.sum(0, True) for screen in self.screens), poison])
+        return keys
 
     def _require_memory(self, screen: _Screen, count: int) -> None:
         """Counts are 64-bit until here, where they are found to fit."""
-        mebibytes = _room(count) * (_PAIR_BYTES + _SENT_BYTES) >> 20
-        if mebibytes <= self.settings.memory and count < 2**31:
+        if self.settings.allows(count):
             return
         largest = int(screen.counts.argmax())
         raise MemoryError(
             f"a picture of {screen.camera.width}x{screen.camera.height} has {count} pairs of Gaussian and tile, "
-            f"{mebibytes} MiB of the {self.settings.memory} MiB that `memory` allows. The largest Gaussian is number "
+            f"{_mebibytes(count)} MiB of the {self.settings.memory} MiB that `memory` allows. The largest Gaussian is number "
             f"{largest}, on {int(screen.counts[largest])} tiles. Raise `memory`, or remove Gaussians that large."
         )
 
-    def _list(self, screen: _Screen, order: Tensor, count: int) -> _Lists:
-        tiles, pairs, splats, gaussians = (
-            self.empty(room, dtype=torch.int32)
-            for room in (2 * _room(count), 2 * _room(count), _room(count), _room(count))
-        )
-        after = torch.cumsum(screen.counts[order.long()], 0, dtype=torch.int32)
+    def _list(self, nth: int, room: int) -> None:
+        """The lists of a screen; places that no pair takes are sorted behind all others."""
+        screen, of = self.screens[nth], _room(room)
+        tiles, pairs, splats, gaussians = (self.empty(length, dtype=torch.int32) for length in (2 * of, 2 * of, of, of))
+        after = torch.cumsum(screen.counts[self._order.long()], 0)
         n_tiles = screen.columns * screen.rows_of_tiles
+        tiles[:room].fill_(n_tiles)
         starts, ends = self.like.new_zeros(2, n_tiles + 1, dtype=torch.int32)
         self.launch(
-            list_pairs, self.n, _array(order), _array(screen.counts), _array(after), _array(screen.ellipses, types.Row),
-            screen.struct, screen.wanted is not None, _array(screen.wanted), _array(screen.firsts), _array(tiles),
-            _array(pairs), _array(splats),
+            list_pairs, self.n, _array(self._order), _array(screen.counts), _array(after),
+            _array(screen.ellipses, types.Row), screen.struct, screen.wanted is not None, _array(screen.wanted), room,
+            _array(screen.firsts), _array(tiles), _array(pairs), _array(splats),
         )  # fmt: skip
-        sorted_tiles, places = _sorted(tiles, pairs, count, n_tiles.bit_length())
+        sorted_tiles, places = _sorted(tiles, pairs, room, n_tiles.bit_length())
         self.launch(
-            find_tiles, count, _array(sorted_tiles), _array(places), _array(splats), count, _array(gaussians),
-            _array(starts), _array(ends),
+            find_tiles, room, _array(sorted_tiles), _array(places), _array(splats), _array(self._totals), nth, room,
+            _array(gaussians), _array(starts), _array(ends),
         )  # fmt: skip
-        return _Lists(count, gaussians, places, starts, ends)
+        screen.room, screen.lists = room, _Lists(gaussians, places, starts, ends)
 
 
 class WarpRendering:
-    """A picture on one screen of a frame."""
+    """A picture on one screen of a frame; to look at it is to settle the frame."""
 
     def __init__(self, frame: _Frame, screen: _Screen) -> None:
         self._frame, self._screen = frame, screen
-        height, width, lists = screen.camera.height, screen.camera.width, screen.lists
-        self.image: Float[Tensor, "H W 3"] = frame.empty(height, width, 3)
-        self.alpha: Float[Tensor, "H W"] = frame.empty(height, width)
+        height, width = screen.camera.height, screen.camera.width
         self.means2d: Float[Tensor, "N 2"] = screen.means2d
         self.visible: Bool[Tensor, " N"] = screen.visible
+        self._image, self._alpha = frame.empty(height, width, 3), frame.empty(height, width)
         self._transmittance = frame.empty(height, width)
         self._ended = frame.empty(height, width, dtype=torch.int32)
-        self._reached = torch.zeros_like(lists.starts)
+        self._blend()
+
+    @property
+    def image(self) -> Float[Tensor, "H W 3"]:
+        self._settle()
+        return self._image
+
+    @property
+    def alpha(self) -> Float[Tensor, "H W"]:
+        self._settle()
+        return self._alpha
+
+    def _settle(self) -> None:
+        with self._frame.on_stream():
+            self._frame.settle()
+            if self._drawn_from is not self._screen.lists:
+                self._blend()
+
+    def _blend(self) -> None:
+        frame, screen, lists = self._frame, self._screen, self._screen.lists
+        self._drawn_from, self._reached = lists, torch.zeros_like(lists.starts)
         frame.launch(
             blend, screen.columns * screen.rows_of_tiles * _PIXELS, screen.struct, frame.cuts,
             _array(screen.ellipses, types.Row), _array(lists.gaussians), _array(lists.starts), _array(lists.ends),
-            _array(self.image, wp.vec3), _array(self.alpha), _array(self._transmittance), _array(self._ended),
+            _array(self._image, wp.vec3), _array(self._alpha), _array(self._transmittance), _array(self._ended),
             _array(self._reached),
         )  # fmt: skip
 
@@ -262,10 +317,10 @@ class WarpRendering:
         """One traversal for up to three cotangents; see `Rendering.vjp`."""
         require_cotangents(cotangents, self.image)
         k, n, frame = len(cotangents), len(self.visible), self._frame
-        v = cotangents.detach().to(self.image).contiguous()
+        v = cotangents.detach().to(self._image).contiguous()
         means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
         opacities = frame.empty(k, n)
-        room = _room(self._screen.lists.count)
+        room = _room(self._screen.pairs)
         together = max(1, min(3, ((frame.settings.memory << 20) - room * _PAIR_BYTES) // (room * _SENT_BYTES)))
         with frame.on_stream():
             for part in range(0, k, together):
@@ -276,8 +331,8 @@ class WarpRendering:
 
     def _pull(self, v: Tensor, *out: Tensor) -> None:
         """Fill one to three cotangents' part of the gradients."""
-        frame, screen, lists, k = self._frame, self._screen, self._screen.lists, len(v)
-        sent = frame.empty(_room(lists.count), 9 * k)
+        frame, screen, lists, k = self._frame, self._screen, self._drawn_from, len(v)
+        sent = frame.empty(_room(screen.pairs), 9 * k)
         sent_row = wp.types.vector(length=9 * k, dtype=wp.float32)
         lanes = _LANES[frame.settings.device]
         wp.launch_tiled(
@@ -320,6 +375,11 @@ def _sorted(keys: Tensor, values: Tensor, count: int, bits: int) -> tuple[Tensor
 def _room(count: int) -> int:
     """Lengths double, so that torch finds memory of the right size among what the last picture gave back."""
     return 1 << max(0, count - 1).bit_length()
+
+
+def _mebibytes(pairs: int) -> int:
+    """Of their lists, and of what they send back for one cotangent."""
+    return _room(pairs) * (_PAIR_BYTES + _SENT_BYTES) >> 20
 
 
 def _read_later(numbers: Tensor) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import builtins
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -92,16 +93,82 @@ def test_places_left_over_change_nothing(monkeypatch):
     left_over = torch.arange(200) % 3
 
     def counting_too_many(self):
-        keys, totals = project(self)
+        keys = project(self)
         counts = self.screens[0].counts
         counts += left_over * (counts > 0)
-        return keys, lambda: [int(counts.sum()), totals()[1]]
+        self._totals[0] = counts.sum()
+        return keys
 
     monkeypatch.setattr(frame._Frame, "_project", counting_too_many)
     monkeypatch.setattr(
         frame._Frame, "empty", lambda self, *s, dtype=torch.float32: empty(self, *s, dtype=dtype).fill_(7)
     )
     require_same_bits(everything(rasterizers.load("warp", device="cpu")(splats, view), v), expected)
+
+
+@pytest.fixture
+def late(monkeypatch):
+    """Numbers are read late, as on CUDA; what nobody has written holds sevens."""
+    from rasterizers.warp_backend import frame
+
+    empty = frame._Frame.empty
+    monkeypatch.setitem(frame._LATE, "cpu", True)
+    monkeypatch.setattr(
+        frame._Frame, "empty", lambda self, *s, dtype=torch.float32: empty(self, *s, dtype=dtype).fill_(7)
+    )
+
+
+@installed
+@pytest.mark.parametrize("room", [None, 0, 1, 1000, 50_000])
+def test_a_picture_is_the_same_whatever_room_its_lists_were_given(room, late):
+    splats, view = dense_scene(200)
+    jobs = [(splats, view), (splats, camera(64, 48))]
+    v = [cotangents(2, c.height, c.width) for _, c in jobs]
+    expected = [everything(rasterizers.load("warp", device="cpu")(*job), w) for job, w in zip(jobs, v, strict=True)]
+    rasterizer = rasterizers.load("warp", device="cpu")
+    rasterizer.render_scales(jobs)
+    if room is not None:
+        rasterizer._rooms.update(dict.fromkeys(rasterizer._rooms, room))
+    found = [everything(r, w) for r, w in zip(rasterizer.render_scales(jobs), v, strict=True)]
+    for one, other in zip(found, expected, strict=True):
+        require_same_bits(one, other)
+
+
+@installed
+def test_what_is_wrong_is_said_at_the_first_look(late):
+    from rasterizers.warp_backend import frame
+
+    splats, view = dense_scene(200)
+    rasterizer = rasterizers.load("warp", device="cpu", memory=1)
+    rasterizer(splats, view)
+
+    def launched(splats):  # by itself: the tests' type checks would look at what `rasterizer` returns
+        return frame._Frame(rasterizer, [(splats, view)], [None]).draw()[0]
+
+    huge = launched(dataclasses.replace(splats, scales=splats.scales * 100))
+    with pytest.raises(MemoryError, match="Raise `memory`"):
+        huge.vjp(cotangents(1, view.height, view.width))
+    splats.means[3] = float("nan")
+    poisoned = launched(splats)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"splats\.means must be finite; Gaussian 3"):
+            poisoned.image  # noqa: B018
+
+
+@installed
+def test_room_follows_the_pictures(late):
+    splats, view = dense_scene(200)
+    rasterizer = rasterizers.load("warp", device="cpu")
+    rasterizer(splats, view).image  # noqa: B018
+    many = rasterizer.room(view)
+    assert rasterizer.room(camera(64, 48)) == -1
+    few = dataclasses.replace(splats, scales=splats.scales * 0.1)
+    rooms = []
+    for _ in range(200):
+        rasterizer(few, view).image  # noqa: B018
+        rooms.append(rasterizer.room(view))
+    assert rooms[0] == many * 63 // 64
+    assert rooms[-1] == rooms[-2] < many / 2
 
 
 @installed
