@@ -50,13 +50,13 @@ def haar_l1(images: Prepared, levels: int) -> Float[Tensor, ""]:
                 inputs=[array(finer, wp.vec3), array(y, wp.vec3), finer is x, array(low, wp.vec3)],
             )  # fmt: skip
             pyramid.append(low)
-        rows = [-(-level.shape[0] // 2) for level in pyramid]
+        rows = [-(-level.shape[0] // 2) for level in pyramid]  # of blocks
         parts, above = _parts(x, sum(rows)), None
-        for level, height, own in reversed(list(zip(pyramid, rows, torch.split(parts, rows), strict=True))):
+        for level, own in zip(reversed(pyramid), reversed(torch.split(parts, rows)), strict=True):
             gradient = out if level is x else torch.empty_like(level)
-            weight = 1 / (9 * height * -(-level.shape[1] // 2) * levels)  # three details of three channels
+            weight = 1 / (9 * len(own) * -(-level.shape[1] // 2) * levels)  # three details of three channels
             _launch(
-                haar.details, [height], x.device, array(level, wp.vec3), array(y, wp.vec3), level is x,
+                haar.details, [len(own)], x.device, array(level, wp.vec3), array(y, wp.vec3), level is x,
                 array(above, wp.vec3), above is None, weight, array(gradient, wp.vec3), array(own),
             )  # fmt: skip
             above = gradient

@@ -104,11 +104,11 @@ def similarity(lanes: int) -> Any:
             origin = pair_at(x, y, wp.min(top + ROWS / 2, height - 1), column)
             MS, MD, VS, VD = Rows(), Rows(), Rows(), Rows()
             for k in range(SPAN):
-                near = pair_at(x, y, top - REACH + k, column) - origin
-                MS += SHARES[k] * near[0]
-                MD += SHARES[k] * near[1]
-                VS += SHARES[k] * (near[0] * near[0])
-                VD += SHARES[k] * (near[1] * near[1])
+                near, w = pair_at(x, y, top - REACH + k, column) - origin, SHARES[k]
+                MS += w * near[0]
+                MD += w * near[1]
+                VS += w * (near[0] * near[0])
+                VD += w * (near[1] * near[1])
             wp.tile_assign(mean_s, wp.tile(MS + Rows(origin[0])), offset=(0, at))
             wp.tile_assign(mean_d, wp.tile(MD + Rows(origin[1])), offset=(0, at))
             wp.tile_assign(var_s, wp.tile(VS - wp.cw_mul(MS, MS)), offset=(0, at))
@@ -177,12 +177,12 @@ def gradient(lanes: int) -> Any:
             s0, d0 = map_at(maps, 0, middle, column), map_at(maps, 1, middle, column)
             A, B, C = Rows(), Rows(), Rows()
             for k in range(SPAN):
-                row = top - REACH + k
+                row, w = top - REACH + k, SHARES[k]
                 ms, md = map_at(maps, 0, row, column), map_at(maps, 1, row, column)
                 b, c = map_at(maps, 3, row, column), map_at(maps, 4, row, column)
-                A += SHARES[k] * (map_at(maps, 2, row, column) + b * (s0 - ms) + c * (d0 - md))
-                B += SHARES[k] * b
-                C += SHARES[k] * c
+                A += w * (map_at(maps, 2, row, column) + b * (s0 - ms) + c * (d0 - md))
+                B += w * b
+                C += w * c
             wp.tile_assign(sum_a, wp.tile(A), offset=(0, at))
             wp.tile_assign(sum_b, wp.tile(B), offset=(0, at))
             wp.tile_assign(sum_c, wp.tile(C), offset=(0, at))
