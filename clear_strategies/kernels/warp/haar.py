@@ -52,7 +52,10 @@ def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, low
 @cache
 @no_type_check
 def details(lanes: int) -> Any:
-    """The kernel that writes the gradient of weight · Σ |details| + <above, low part>, and a part for each row of blocks."""
+    """The kernel, with `lanes` threads for each row of blocks, of weight · Σ |details| + <above, low part>.
+
+    It writes the gradient, and the row's part of the first sum. There is no `above` at the last level.
+    """
 
     @wp.kernel(module="unique", enable_backward=False)
     def details(

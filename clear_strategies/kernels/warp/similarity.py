@@ -48,7 +48,7 @@ SHARES: Final = wp.constant(
         *(gaussian_window()[k - r] if 0 <= k - r < TAPS else 0.0 for k in range(SPAN) for r in range(ROWS))
     )
 )
-"""Of the k-th row that a block reads, in the windows around each of its rows."""
+"""Weights of the k-th row that a block reads in the windows around each of its rows."""
 C1: Final = wp.constant(0.01**2)
 C2: Final = wp.constant(0.03**2)
 
@@ -79,7 +79,7 @@ def blocks_across(width: wp.int32) -> wp.int32:
 @cache
 @no_type_check
 def similarity(lanes: int) -> Any:
-    """The kernel that makes the maps, and of every block Σ (1 - SSIM)."""
+    """The kernel, with `lanes` threads a block, that makes the maps; a block's part is weight · Σ (1 - SSIM)."""
     turns = WIDTH // lanes
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -148,7 +148,7 @@ def similarity(lanes: int) -> Any:
 @cache
 @no_type_check
 def gradient(lanes: int) -> Any:
-    """The kernel that takes the maps, and the signs of L1, back to x. What a block sums goes to the part that it had."""
+    """The kernel, with `lanes` threads a block, that takes the maps back to x, and L1's signs; a block adds to its part."""
     turns = WIDTH // lanes
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -203,7 +203,7 @@ def gradient(lanes: int) -> Any:
         total *= l1_weight
         part = group * blocks_across(width) + across
         if lane == 0:
-            total += parts[part]
+            total += parts[part]  # what `similarity` left
         wp.tile_store(parts, wp.tile_sum(wp.tile(total)), offset=(part,))
 
     return gradient

@@ -23,7 +23,7 @@ def sign(x: wp.float32) -> wp.float32:
 @cache
 @no_type_check
 def absolute(lanes: int) -> Any:
-    """The kernel of L1, a block per row: step · sign(x - y), and its part of weight · Σ |x - y|."""
+    """The kernel of L1, with a block of `lanes` threads a row: step · sign(x - y), and the part weight · Σ |x - y|."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def absolute(
@@ -48,7 +48,7 @@ def absolute(lanes: int) -> Any:
 @cache
 @no_type_check
 def total(lanes: int) -> Any:
-    """The kernel of one block: start + Σ parts, in float32."""
+    """The kernel, of one block of `lanes` threads, that writes start + Σ parts in float32."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def total(parts: wp.array[wp.float64], start: wp.float64, value: wp.array[wp.float32]) -> None:
