@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, Final
 
 import torch
@@ -28,6 +26,7 @@ from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
 from rasterizers.warp_backend.blend import blend, blend_vjp
 from rasterizers.warp_backend.colour import basis
+from rasterizers.warp_backend.launch import array, on_stream
 from rasterizers.warp_backend.project import project, pull
 
 _TILE: Final = int(types.TILE)
@@ -164,8 +163,7 @@ class _Frame:
 
     def draw(self) -> list[WarpRendering]:
         """A picture on each screen. What is wrong with its input may be said when it is first looked at."""
-        wp.init()
-        with self.on_stream():
+        with on_stream(self.like.device):
             keys = self._project()
             self._read = _read_later(self._totals)
             places = torch.arange(2 * self.n, dtype=torch.int32, device=self.like.device)
@@ -199,15 +197,6 @@ class _Frame:
                 self._list(nth, count)
         self._settled = True
 
-    def on_stream(self) -> AbstractContextManager[Any]:
-        """Warp's work goes where torch's goes."""
-        if self.like.device.type == "cpu":
-            return nullcontext()
-        scope: AbstractContextManager[Any] = wp.ScopedStream(
-            _stream(torch.cuda.current_stream(self.like.device)), sync_enter=False
-        )
-        return scope
-
     def launch(self, kernel: Any, threads: int, *arguments: Any) -> None:
         """A thread per Gaussian, pair or pixel; the arguments are the kernel's."""
         wp.launch(kernel, threads, inputs=arguments, device=wp.device_from_torch(self.like.device))
@@ -220,7 +209,7 @@ class _Frame:
         if self._basis is None:
             visible = torch.stack([screen.visible for screen in self.screens]).any(0)
             self._basis = self.like.new_zeros(self.n, self.bands + 1)
-            arguments = (self.pose, _array(self.means, wp.vec3), _array(visible), _array(self._basis))
+            arguments = (self.pose, array(self.means, wp.vec3), array(visible), array(self._basis))
             self.launch(basis, self.n, *arguments)
         return self._basis
 
@@ -231,13 +220,13 @@ class _Frame:
         for nth, screen in enumerate(self.screens):
             self.launch(
                 project, self.n, self.pose, screen.struct, self.cuts,
-                _array(self.means, wp.vec3), _array(self.quats, wp.vec4), _array(self.scales, wp.vec3),
-                _array(screen.opacities), _array(self.sh0, wp.vec3), _array(self.shN, wp.vec3),
-                screen.offsets is not None, _array(screen.offsets, wp.vec3),
-                screen.wanted is not None, _array(screen.wanted), nth == 0,
-                _array(keys), _array(self.colours, wp.vec3), _array(self.slopes, wp.mat33),
-                _array(screen.ellipses, types.Row), _array(screen.means2d, wp.vec2), _array(screen.visible),
-                _array(screen.counts), _array(poison),
+                array(self.means, wp.vec3), array(self.quats, wp.vec4), array(self.scales, wp.vec3),
+                array(screen.opacities), array(self.sh0, wp.vec3), array(self.shN, wp.vec3),
+                screen.offsets is not None, array(screen.offsets, wp.vec3),
+                screen.wanted is not None, array(screen.wanted), nth == 0,
+                array(keys), array(self.colours, wp.vec3), array(self.slopes, wp.mat33),
+                array(screen.ellipses, types.Row), array(screen.means2d, wp.vec2), array(screen.visible),
+                array(screen.counts), array(poison),
             )  # fmt: skip
         self._totals = torch.cat([*(screen.counts.sum(0, True) for screen in self.screens), poison])
         return keys
@@ -262,14 +251,14 @@ class _Frame:
         tiles[:room].fill_(n_tiles)
         starts, ends = self.like.new_zeros(2, n_tiles + 1, dtype=torch.int32)
         self.launch(
-            list_pairs, self.n, _array(self._order), _array(screen.counts), _array(after),
-            _array(screen.ellipses, types.Row), screen.struct, screen.wanted is not None, _array(screen.wanted), room,
-            _array(screen.firsts), _array(tiles), _array(pairs), _array(splats),
+            list_pairs, self.n, array(self._order), array(screen.counts), array(after),
+            array(screen.ellipses, types.Row), screen.struct, screen.wanted is not None, array(screen.wanted), room,
+            array(screen.firsts), array(tiles), array(pairs), array(splats),
         )  # fmt: skip
         sorted_tiles, places = _sorted(tiles, pairs, room, n_tiles.bit_length())
         self.launch(
-            find_tiles, room, _array(sorted_tiles), _array(places), _array(splats), _array(self._totals), nth, room,
-            _array(gaussians), _array(starts), _array(ends),
+            find_tiles, room, array(sorted_tiles), array(places), array(splats), array(self._totals), nth, room,
+            array(gaussians), array(starts), array(ends),
         )  # fmt: skip
         screen.room, screen.lists = room, _Lists(gaussians, places, starts, ends)
 
@@ -298,7 +287,7 @@ class WarpRendering:
         return self._alpha
 
     def _settle(self) -> None:
-        with self._frame.on_stream():
+        with on_stream(self._frame.like.device):
             self._frame.settle()
             if self._drawn_from is not self._screen.lists:
                 self._blend()
@@ -308,9 +297,9 @@ class WarpRendering:
         self._drawn_from, self._reached = lists, torch.zeros_like(lists.starts)
         frame.launch(
             blend, screen.columns * screen.rows_of_tiles * _PIXELS, screen.struct, frame.cuts,
-            _array(screen.ellipses, types.Row), _array(lists.gaussians), _array(lists.starts), _array(lists.ends),
-            _array(self._image, wp.vec3), _array(self._alpha), _array(self._transmittance), _array(self._ended),
-            _array(self._reached),
+            array(screen.ellipses, types.Row), array(lists.gaussians), array(lists.starts), array(lists.ends),
+            array(self._image, wp.vec3), array(self._alpha), array(self._transmittance), array(self._ended),
+            array(self._reached),
         )  # fmt: skip
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
@@ -322,7 +311,7 @@ class WarpRendering:
         opacities = frame.empty(k, n)
         room = _room(self._screen.pairs)
         together = max(1, min(3, ((frame.settings.memory << 20) - room * _PAIR_BYTES) // (room * _SENT_BYTES)))
-        with frame.on_stream():
+        with on_stream(frame.like.device):
             for part in range(0, k, together):
                 some = slice(part, part + together)
                 out = (x[some] for x in (means, quats, scales, opacities, screen, rgb))
@@ -339,30 +328,19 @@ class WarpRendering:
             blend_vjp(k, lanes), dim=[len(lists.starts)], block_dim=lanes,  # also for what is left over, see list_pairs
             device=wp.device_from_torch(frame.like.device),
             inputs=[
-                screen.struct, frame.cuts, _array(screen.ellipses, types.Row), _array(lists.gaussians),
-                _array(lists.places), _array(lists.starts), _array(lists.ends), _array(self._transmittance),
-                _array(self._ended), _array(self._reached), _array(v, wp.vec3), wp.from_torch(sent, sent_row),
+                screen.struct, frame.cuts, array(screen.ellipses, types.Row), array(lists.gaussians),
+                array(lists.places), array(lists.starts), array(lists.ends), array(self._transmittance),
+                array(self._ended), array(self._reached), array(v, wp.vec3), wp.from_torch(sent, sent_row),
             ],
         )  # fmt: skip
         widths = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec2, wp.vec3)
         frame.launch(
             pull(k), frame.n, frame.pose, screen.struct, frame.cuts,
-            _array(frame.means, wp.vec3), _array(frame.quats, wp.vec4), _array(frame.scales, wp.vec3),
-            _array(screen.opacities), _array(frame.slopes, wp.mat33), frame.bands > 0,
-            _array(screen.ellipses, types.Row), _array(screen.counts), _array(screen.firsts), _array(sent, sent_row),
-            *(_array(x, width) for x, width in zip(out, widths, strict=True)),
+            array(frame.means, wp.vec3), array(frame.quats, wp.vec4), array(frame.scales, wp.vec3),
+            array(screen.opacities), array(frame.slopes, wp.mat33), frame.bands > 0,
+            array(screen.ellipses, types.Row), array(screen.counts), array(screen.firsts), array(sent, sent_row),
+            *(array(x, width) for x, width in zip(out, widths, strict=True)),
         )  # fmt: skip
-
-
-@cache
-def _stream(stream: torch.cuda.Stream) -> Any:
-    """Torch's stream as Warp knows it; kept, for Warp keeps the scratch of its sort with it."""
-    return wp.stream_from_torch(stream)
-
-
-def _array(tensor: Tensor | None, dtype: Any = None) -> Any:
-    """A tensor as a kernel's argument, without a copy; the caller keeps it alive. None is an array of nothing."""
-    return None if tensor is None else wp.from_torch(tensor, dtype, return_ctype=True)
 
 
 def _sorted(keys: Tensor, values: Tensor, count: int, bits: int) -> tuple[Tensor, Tensor]:
