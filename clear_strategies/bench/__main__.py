@@ -1,5 +1,5 @@
-"""The benchmark's command line. Exit codes: 0, 2 for arguments or input that cannot be used, 130 and 143
-when stopped by a signal.
+"""The benchmark's command line. Exit codes: 0, 1 where a step of `device` failed, 2 for arguments or input that cannot be
+used, 130 and 143 when stopped by a signal.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final, NoReturn
 
 import torch
 
-from clear_strategies.bench import iteration, kernels, pareto, rasterizers
+from clear_strategies.bench import device, iteration, kernels, pareto, rasterizers
 from clear_strategies.bench.iteration import STRATEGIES
 from clear_strategies.bench.kernels import SIZES
 from clear_strategies.bench.output import Findings, between_markers, leave
@@ -31,6 +31,7 @@ _QUESTIONS: Final = {
     "kernels": "image losses with their gradients and the per-Gaussian pass, ours and everyone's",
     "iteration": "one iteration of training, stage by stage",
     "pareto": "seconds against PSNR and SSIM of whole trainings",
+    "device": "everything that only a GPU can show, step by step, into a folder",
 }
 
 Draw = Callable[[Path], None]
@@ -46,6 +47,11 @@ class _Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     options = _parser().parse_args(arguments)
+    if options.question == "device":
+        options.json, options.markdown = (
+            named or options.out / f"summary.{kind}"
+            for named, kind in ((options.json, "json"), (options.markdown, "md"))
+        )
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
         _require_writable(options)
@@ -64,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         _log.error("stopped; no table was written.")
         return 130
-    return 0
+    return int(findings.failed)
 
 
 def _measure(options: argparse.Namespace) -> tuple[Findings, Draw | None]:
@@ -87,6 +93,11 @@ def _measure(options: argparse.Namespace) -> tuple[Findings, Draw | None]:
         )  # fmt: skip
         findings, trained = pareto.measure(whole, _log.info)
         return findings, lambda path: time_against_quality(path, trained, findings.sections[0].title)
+    if options.question == "device":
+        everything = device.Request(
+            options.out, options.device, options.quick, options.data_root, options.data, tuple(options.scene)
+        )
+        return device.measure(everything, _log.info), None
     request = rasterizers.Request(
         options.scene, options.backend, options.preset, options.repeats, options.limit,
         options.device, options.data, options.prototype, options.memory, _floors(options),
@@ -164,6 +175,16 @@ def _parser() -> argparse.ArgumentParser:
     names = [variant.name for variant in pareto.VARIANTS]
     ask.add_argument("--variants", nargs="+", default=names, metavar="NAME", help=f"default: {', '.join(names)}")
     ask.add_argument("--picture", type=Path, metavar="FILE", help="PNG: time against quality")
+
+    ask = questions.add_parser("device", parents=[common], help=_QUESTIONS["device"])
+    ask.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder for logs, tables and runs")
+    ask.add_argument("--device", default="cuda", choices=["cpu", "cuda"], help="default: cuda")
+    ask.add_argument("--quick", action="store_true", help="tiny everything, to see that the steps run")
+    ask.add_argument("--data-root", type=Path, metavar="DIR", help="holds LLFF's fern with images_4 and images_2")
+    ask.add_argument("--data", type=Path, metavar="PATH", help="the garden's .npz, or its folder")
+    ask.add_argument(
+        "--scene", nargs="+", type=Path, default=[], metavar="PATH", help="a trained .ply or a checkpoint to measure, too"
+    )  # fmt: skip
     return parser
 
 
