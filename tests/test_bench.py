@@ -311,7 +311,7 @@ def test_a_page_without_its_markers_is_refused(page):
 
 def test_the_documentation_has_the_markers():
     page = Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md"
-    for question in ("rasterizers", "kernels", "iteration", "pareto"):
+    for question in ("rasterizers", "kernels", "iteration", "pareto", "device"):
         output.between_markers(page.read_text(), question, "", source=page)
 
 

@@ -108,24 +108,14 @@ def measure(request: Request, say: Callable[[str], None]) -> Findings:
         say(f"{step.name}: {outcomes[-1].result}. {outcomes[-1].says}".strip())
     findings.sections = [_summary(outcomes), *_stages(request.out)]
     findings.failed = any(outcome.result == FAILED for outcome in outcomes)
-    findings.raw = {
-        "device": request.device,
-        "quick": request.quick,
-        "steps": [asdict(outcome) for outcome in outcomes],
-    }
+    findings.raw = {"device": request.device, "quick": request.quick, "steps": [asdict(one) for one in outcomes]}
     return findings
 
 
 def steps(request: Request) -> list[Step]:
     """What is done, in this order."""
-    return [
-        *_tests(request),
-        *_tables(request),
-        *_first_use(request),
-        *_trainings(request),
-        *_again(request),
-        *_sanitized(request),
-    ]
+    groups = (_tests, _first_use, _tables, _trainings, _trained, _again, _sanitized)
+    return [step for group in groups for step in group(request)]
 
 
 def taken(step: Step, request: Request, log: Path) -> Outcome:
@@ -154,32 +144,41 @@ def _tests(request: Request) -> list[Step]:
     return [Step("tests", command, why_not)]
 
 
+def _table(request: Request, name: str, *arguments: str, why_not: str | None = None) -> Step:
+    """The tables of another question, as Markdown and JSON."""
+    files = ("--json", str(request.out / f"{name}.json"), "--markdown", str(request.out / f"{name}.md"))
+    question, device = name.partition("_")[0], ("--device", request.device)
+    command = (sys.executable, "-m", "clear_strategies.bench", question, *device, *arguments, *files)
+    return Step(f"bench {name}", command, why_not, learn=lambda: f"{name}.md")
+
+
 def _tables(request: Request) -> list[Step]:
-    """The tables of the other questions, each as Markdown and JSON."""
-
-    def table(name: str, *arguments: str) -> Step:
-        files = ("--json", str(request.out / f"{name}.json"), "--markdown", str(request.out / f"{name}.md"))
-        question, device = name.partition("_")[0], ("--device", request.device)
-        command = (sys.executable, "-m", "clear_strategies.bench", question, *device, *arguments, *files)
-        return Step(f"bench {name}", command, learn=lambda: f"{name}.md")
-
     scenes = [str(path) for path in request.scenes]
     if request.quick:
+        few = ("--repeats", "1", "--no-memory", "--preset", "fast")
         return [
-            table("rasterizers", "--repeats", "1", "--no-memory", "--preset", "fast", "--scene", "tiny", *scenes),
-            table("kernels", "--repeats", "1", "--size", "32x16", "--gaussians", "500"),
-            table("iteration", "--repeats", "1", "--scene", "tiny"),
+            _table(request, "rasterizers", "--scene", "tiny", *scenes, *few),
+            _table(request, "kernels", "--repeats", "1", "--size", "32x16", "--gaussians", "500"),
+            _table(request, "iteration", "--repeats", "1", "--scene", "tiny"),
         ]
     picture = ("--picture", str(request.out / "rasterizers.png"), "--limit", "600")
     garden = ("--data", str(request.data)) if request.data is not None else ()
-    sizes = ("1008x756", "252x189", "2016x1512", "504x378")
-    trained = [table(f"iteration_trained{i}", "--scene", scene) for i, scene in enumerate(scenes)]
     return [
-        table("rasterizers", "--scene", "s100k", "s100k-lr", "garden", "s500k", *scenes, *picture, *garden),
-        table("kernels", "--size", *sizes),
-        table("iteration_1008", "--scene", "s100k"),
-        table("iteration_2016", "--scene", "s300k-2016"),
-        *trained,
+        _table(request, "rasterizers", "--scene", "s100k", "s100k-lr", "garden", "s500k", *scenes, *picture, *garden),
+        _table(request, "kernels", "--size", "1008x756", "252x189", "2016x1512", "504x378"),
+        _table(request, "iteration_1008", "--scene", "s100k"),
+        _table(request, "iteration_2016", "--scene", "s300k-2016"),
+    ]
+
+
+def _trained(request: Request) -> list[Step]:
+    """The same of what the first training left: Gaussians as they are, not as they were made up."""
+    folder, why_not = ("demo", None) if request.quick else ("fern_images_4", _missing(request, "images_4"))
+    field, few = str(request.out / "runs" / folder / "point_cloud.ply"), ("--repeats", "1") if request.quick else ()
+    rasterizers = ("--scene", field, *few, *(("--no-memory", "--preset", "fast") if request.quick else ()))
+    return [
+        _table(request, "rasterizers_trained", *rasterizers, why_not=why_not),
+        _table(request, "iteration_trained", "--scene", field, *few, why_not=why_not),
     ]
 
 
@@ -202,16 +201,21 @@ def _trainings(request: Request) -> list[Step]:
         return [_training(request, "train, demo", "runs/demo", _TINY)]
     found = []
     for size, folder in _FERN.items():
-        why_not = None
-        if request.root is None:
-            why_not = "give the folder that holds fern with --data-root"
-        elif not (request.root / "fern" / folder).is_dir():
-            why_not = f"{request.root / 'fern' / folder} is not there"
         scene = ("+scene=fern", f"data.root={request.root}", f"data.reader.images={folder}", *_FULL)
-        found.append(_training(request, f"train, fern {size}", f"runs/fern_{folder}", (*scene, "skips=none"), why_not))
-        economical = f"runs/fern_{folder}_skips"
-        found.append(_training(request, f"train, fern {size}, default skips", economical, scene, why_not))
+        for name, run, skips in (("", "", ("skips=none",)), (", default skips", "_skips", ())):
+            out = f"runs/fern_{folder}{run}"
+            found.append(
+                _training(request, f"train, fern {size}{name}", out, (*scene, *skips), _missing(request, folder))
+            )
     return found
+
+
+def _missing(request: Request, folder: str) -> str | None:
+    """Why fern cannot be trained on the photos of a folder."""
+    if request.root is None:
+        return "give the folder that holds fern with --data-root"
+    photos = request.root / "fern" / folder
+    return None if photos.is_dir() else f"{photos} is not there"
 
 
 def _training(request: Request, name: str, folder: str, overrides: Sequence[str], why_not: str | None = None) -> Step:
