@@ -110,8 +110,9 @@ class SplatSuRe(Strategy):
         self.state[name] = torch.where(visible & (z > 0), camera.fx / z, before)
 
     def _pose(self, name: str, camera: Camera) -> Float[Tensor, "4 4"]:
-        """World to camera, where the field lies; sent there once a view."""
-        if ("pose", name) not in self.cache:
-            self.cache["pose", name] = camera.world_to_camera.to(self.device)
-        pose: Tensor = self.cache["pose", name]
+        """World to camera, where the field lies; sent there once, and again when the view has another camera."""
+        sent, pose = self.cache.get(("pose", name), (None, camera.world_to_camera))
+        if sent is not camera:
+            pose = camera.world_to_camera.to(self.device)
+            self.cache["pose", name] = camera, pose
         return pose
