@@ -140,6 +140,7 @@ class Conductor:
 
     def on_fit_start(self, n_views: int, seed: int, device: torch.device | str = "cpu") -> None:
         """Once, before the first iteration; `device` is where the field lies."""
+        self.ledger.device = torch.device(device)
         for s in self.strategies:
             s.on_fit_start(n_views, seed)
             s.to(device)

@@ -38,11 +38,11 @@ class Objective:
         lambda_ssim, lambda_ssim_hr: share of 1 - SSIM in L_LR and L_base, in [0, 1]; the rest is L1.
         haar_levels: levels of the Haar transform; 1 is the top octave, 2 is exactly the band that 4x SR adds.
         clamp_render: compare renders clamped to [0, 1] (DropGaussian); 3DGS clamps for metrics only.
-        kernels: what computes the losses: "cpp", "torch", or "auto", the fastest that runs here.
+        kernels: what computes the losses: "cpp", "warp", "torch", or "auto", the fastest for images where they lie.
 
     Raises:
         ValueError: a setting is outside its range, or nothing would move the Gaussians at the first iteration.
-        BackendUnavailable: kernels="cpp" was not built.
+        BackendUnavailable: kernels="cpp" was not built, or "warp" is not installed.
     """
 
     lambda_hr: WarmupDecay = field(default_factory=WarmupDecay)

@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies import kernels
-from clear_strategies.kernels import cpp
+from clear_strategies.kernels import cpp, warp
 from clear_strategies.kernels import torch as reference
+from clear_strategies.kernels.prepared import prepared
 from clear_strategies.objective import Objective
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, milestones, scaled
 from rasterizers.interface import BackendUnavailable
@@ -110,12 +111,11 @@ PAIRS = {
     "photo inverted": (photo(50, 60), 1 - photo(50, 60)),
     "beyond [0, 1]": (3 * photo(50, 60) - 1, photo(50, 60, 6)),
 }
-IMPLEMENTATIONS = [
-    pytest.param("cpp", marks=pytest.mark.skipif(not cpp.available(), reason="the compiled kernels were not built")),
-    "torch",
-]
 needs_cpp = pytest.mark.skipif(not cpp.available(), reason="the compiled kernels were not built")
-every_implementation = pytest.mark.parametrize("name", IMPLEMENTATIONS)
+needs_warp = pytest.mark.skipif(not warp.available("cpu"), reason="NVIDIA Warp is not installed")
+COMPILED = [pytest.param("cpp", marks=needs_cpp), pytest.param("warp", marks=needs_warp)]
+every_compiled = pytest.mark.parametrize("name", COMPILED)
+every_implementation = pytest.mark.parametrize("name", [*COMPILED, "torch"])
 
 
 @every_implementation
@@ -138,11 +138,11 @@ def test_photometric_is_that_of_float64(name, x, y, share):
     assert_close(gradient, exact.gradient, 1e-5)
 
 
-@needs_cpp
+@every_compiled
 @pytest.mark.parametrize(("x", "y"), PAIRS.values(), ids=PAIRS)
 @pytest.mark.parametrize("levels", [1, 2, 3, 7])
-def test_compiled_haar_is_the_reference(x, y, levels):
-    value, gradient = cpp.haar_l1(x, y, levels)
+def test_compiled_haar_is_the_reference(name, x, y, levels):
+    value, gradient = kernels.haar_l1(x, y, levels, kernels=name)
     expected = reference.haar_l1(x, y, levels)  # in float32: a detail that rounding makes 0 must be 0 in both
     assert float(value) == pytest.approx(float(reference.haar_l1(x.double(), y.double(), levels).value), abs=1e-6)
     assert_close(gradient, expected.gradient, 1e-6)
@@ -153,20 +153,31 @@ def assert_close(gradient, exact, relative):
     assert error <= relative * float(exact.abs().max()) + 1e-12
 
 
-@needs_cpp
-def test_equal_images_have_no_gradient_at_all():
+@every_compiled
+def test_equal_images_have_no_gradient_at_all(name):
     x = photo(60, 70)
-    for loss in (cpp.ssim, cpp.haar_l1, lambda x, y: cpp.photometric(x, y, 0.2)):
-        value, gradient = loss(x, x.clone())
-        assert float(value) in {0.0, 1.0}
+    for loss, perfect in (("photometric", 0.0), ("l1", 0.0), ("ssim", 1.0), ("haar", 0.0)):
+        value, gradient = TRAINED_WITH[loss](x, x.clone(), name)
+        assert float(value) == perfect
         assert not gradient.any()
 
 
-COMPILED = {
-    "photometric": lambda x, y: cpp.photometric(x, y, 0.2),
-    "l1": cpp.l1,
-    "haar": lambda x, y: cpp.haar_l1(x, y, 3),
+TRAINED_WITH = {
+    "photometric": lambda x, y, name: kernels.photometric(x, y, 0.2, kernels=name),
+    "l1": lambda x, y, name: kernels.l1(x, y, kernels=name),
+    "ssim": lambda x, y, name: kernels.ssim(x, y, kernels=name),
+    "haar": lambda x, y, name: kernels.haar_l1(x, y, 3, kernels=name),
 }
+
+
+@every_compiled
+@pytest.mark.parametrize("loss", TRAINED_WITH.values(), ids=TRAINED_WITH)
+def test_a_value_is_one_number_of_float32(name, loss):
+    value, gradient = loss(photo(20, 30), photo(20, 30, 6), name)
+    assert value.shape == ()
+    assert value.dtype == gradient.dtype == torch.float32
+    assert not value.requires_grad
+    assert not gradient.requires_grad
 
 
 @pytest.fixture
@@ -177,16 +188,16 @@ def threads():
 
 
 @needs_cpp
-@pytest.mark.parametrize("loss", COMPILED.values(), ids=COMPILED)
+@pytest.mark.parametrize("loss", TRAINED_WITH.values(), ids=TRAINED_WITH)
 def test_the_bits_do_not_depend_on_threads_or_luck(loss, threads):
     x, y = rough(photo(261, 350), 0.1)
     results = []
     for n in (1, 2, 3, 4, 8, 8, 1):
         threads(n)
-        results.append(loss(x, y))
+        results.append(loss(x, y, "cpp"))
     threads(2)
     with ThreadPoolExecutor(3) as callers:  # only one of them gets the pool
-        results += callers.map(lambda _: loss(x, y), range(6))
+        results += callers.map(lambda _: loss(x, y, "cpp"), range(6))
     for value, gradient in results[1:]:
         assert torch.equal(value, results[0].value)
         assert torch.equal(gradient, results[0].gradient)
@@ -195,9 +206,9 @@ def test_the_bits_do_not_depend_on_threads_or_luck(loss, threads):
 ISA_SCRIPT = """
 import sys, torch
 sys.path.insert(0, {tests!r})
-from test_kernels import COMPILED, cpp, photo, rough
+from test_kernels import TRAINED_WITH, cpp, photo, rough
 x, y = rough(photo(141, 353), 0.1)
-torch.save([cpp.native().isa, *(tuple(loss(x, y)) for loss in COMPILED.values())], {out!r})
+torch.save([cpp.native().isa, *(tuple(loss(x, y, "cpp")) for loss in TRAINED_WITH.values())], {out!r})
 """
 
 
@@ -214,18 +225,18 @@ def test_every_instruction_set_agrees(isa, tmp_path):
     found, *theirs = torch.load(out)
     assert found == isa
     x, y = rough(photo(141, 353), 0.1)
-    for loss, (value, gradient) in zip(COMPILED.values(), theirs, strict=True):
-        mine = loss(x, y)
+    for loss, (value, gradient) in zip(TRAINED_WITH.values(), theirs, strict=True):
+        mine = loss(x, y, "cpp")
         assert float(value) == pytest.approx(float(mine.value), rel=1e-6)
         assert_close(gradient, mine.gradient, 2e-6)
 
 
-@needs_cpp
-def test_images_of_any_layout_are_taken():
+@every_compiled
+def test_images_of_any_layout_are_taken(name):
     x, y = photo(40, 50), photo(40, 50, 6)
-    expected = cpp.photometric(x, y, 0.2)
+    expected = kernels.photometric(x, y, 0.2, kernels=name)
     planar = x.movedim(-1, 0).contiguous().movedim(0, -1).requires_grad_()
-    value, gradient = cpp.photometric(planar, y.flip(0).flip(0), 0.2)
+    value, gradient = kernels.photometric(planar, y.flip(0).flip(0), 0.2, kernels=name)
     assert torch.equal(value, expected.value)
     assert torch.equal(gradient, expected.gradient)
     assert gradient.is_contiguous()
@@ -242,7 +253,6 @@ def test_gradients_go_where_they_are_wanted(name):
     assert torch.equal(out[0], kernels.photometric(x, y, 0.2, kernels=name).gradient)
 
 
-@needs_cpp
 @pytest.mark.parametrize(
     ("x", "y", "error", "message"),
     [
@@ -261,7 +271,13 @@ def test_gradients_go_where_they_are_wanted(name):
 )
 def test_what_the_compiled_kernels_refuse(x, y, error, message):
     with pytest.raises(error, match=message):  # behind the shapes that only the tests' type checker knows
-        cpp._prepared(x, y, None)
+        prepared(("cpu",), x, y, None)
+
+
+def test_both_images_lie_on_one_device():
+    x, y = torch.rand(4, 5, 3), torch.rand(4, 5, 3, device="meta")
+    with pytest.raises(TypeError, match="y must be where x is, on cpu, got meta"):
+        prepared(("cpu", "meta"), x, y, None)
 
 
 def test_auto_takes_what_the_compiled_kernels_do_not():

@@ -7,6 +7,7 @@ import json
 import pytest
 import torch
 
+from clear_strategies import Conductor
 from clear_strategies import ledger as module
 from clear_strategies.ledger import Ledger
 
@@ -125,3 +126,10 @@ def test_on_a_cpu_no_event_is_made(monkeypatch):
     assert ledger.entries["render"].runs == 1
     assert 0 < ledger.entries["render"].seconds < 1
     assert ledger.entries["render"].skipped == {"nothing to see": 1}
+
+
+def test_a_run_tells_its_ledger_where_it_trains():
+    conductor = Conductor()
+    assert conductor.ledger.device.type == "cpu"
+    conductor.on_fit_start(1, 0, "cuda")
+    assert conductor.ledger.device.type == "cuda"

@@ -220,8 +220,8 @@ def _missing(request: Request, folder: str) -> str | None:
 
 def _training(request: Request, name: str, folder: str, overrides: Sequence[str], why_not: str | None = None) -> Step:
     out = request.out / folder
-    command = (sys.executable, "-m", "clear_strategies.run", "+strategy=clear", *overrides, f"hydra.run.dir={out}")
-    return Step(name, command, why_not, learn=lambda: folder)
+    fixed = ("+strategy=clear", f"fit.device={request.device}", f"hydra.run.dir={out}")
+    return Step(name, (sys.executable, "-m", "clear_strategies.run", *fixed, *overrides), why_not, learn=lambda: folder)
 
 
 def _again(request: Request) -> list[Step]:

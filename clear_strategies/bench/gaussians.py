@@ -92,7 +92,7 @@ class _Ours:
         self.field = GaussianField(_parameters(n, device), degree=3)
         self.field.filter_3d += 0.01
         self.conductor = Conductor(*STRATEGIES["clear"]())
-        self.conductor.on_fit_start(1, 0)
+        self.conductor.on_fit_start(1, 0, device)
         self.conductor.after_step(self.field.raw(), SVS().anchor_start)
         self.optimizer = Adam(self.field.raw(), STILL, 1.0)
         self.how = fused_step(self.conductor, self.optimizer, "auto" if fused else "off")

@@ -92,11 +92,11 @@ class Training:
     """A run in its middle, t_a behind it: HR at full weight, dropout, evidence, correction and anchor are all on."""
 
     def __init__(self, workload: Workload, view: View, rasterizer: Rasterizer, conductor: Conductor) -> None:
-        field = field_of(workload.splats)
+        field, device = field_of(workload.splats), workload.splats.means.device
         # Held from turning off after t_a, so that statistics are gathered; rounds of densification come too rarely.
-        density = Density(DensitySettings(stop=10_000), len(field), extent=1.0, seed=0)
+        density = Density(DensitySettings(stop=10_000), len(field), extent=1.0, seed=0, device=device)
         settings = FitSettings(degree_every=1)
-        conductor.on_fit_start(1, 0)
+        conductor.on_fit_start(1, 0, device)
         optimizer = Adam(field.raw(), STILL, 1.0)
         self.state = TrainState(
             field, conductor, optimizer, density, settings, MipFilter(), (view,),

@@ -126,17 +126,11 @@ def grouped_convolution(x: Float[Tensor, "1 C H W"], y: Float[Tensor, "1 C H W"]
 
 
 def _ours(loss: str, device: str = "cpu") -> list[Competitor]:
-    """Every implementation that the trainer has for images on the device; float64 of the specification is the truth.
-
-    `kernels.implementations()` gives them by name; one that says which images it `accepts` is asked.
-    """
-    x, y = (image.to(device) for image in images(16, 16))
-    specification = importlib.import_module("clear_strategies.kernels.torch")
-    truth = _gradient_of(specification, loss)
+    """Every implementation that the trainer has for images on the device; float64 of the specification is the truth."""
+    truth = _gradient_of(importlib.import_module("clear_strategies.kernels.torch"), loss)
     return [
         Competitor(f"ours, {name}", _gradient_of(implementation, loss), truth)
-        for name, implementation in kernels.implementations().items()
-        if not hasattr(implementation, "accepts") or implementation.accepts(x, y)
+        for name, implementation in kernels.implementations(device).items()
     ]
 
 

@@ -1,8 +1,8 @@
 """The trainer's own hot loops: image losses with their gradients.
 
-`torch` is the specification, in float64 inside; `cpp` agrees with it, and is what runs where it was built, for images of
-float32 on the CPU. Every function takes `kernels` to choose: "auto" (the fastest that takes these images), "torch" or
-"cpp".
+`torch` is the specification, in float64 inside; the others agree with it, for images of float32: `cpp` runs on the CPU,
+where it was built, `warp` on CUDA, where NVIDIA Warp is installed. Every function takes `kernels` to choose: "auto" (the
+fastest that takes these images where they lie), "torch", "cpp" or "warp".
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Literal, Protocol, get_args, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.kernels import cpp
+from clear_strategies.kernels import cpp, warp
 from clear_strategies.kernels import torch as reference
 from clear_strategies.kernels.torch import LossAndGradient
 
@@ -32,7 +32,7 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
-Choice = Literal["auto", "torch", "cpp"]
+Choice = Literal["auto", "torch", "cpp", "warp"]
 
 
 @runtime_checkable
@@ -48,9 +48,17 @@ class Implementation(Protocol):
     def haar_l1(self, x: Tensor, y: Tensor, levels: int = 1, out: Tensor | None = None) -> LossAndGradient: ...
 
 
-def implementations() -> dict[str, Implementation]:
-    """Those that run here, by name, the fastest first."""
-    return {"cpp": cpp, "torch": reference} if cpp.available() else {"torch": reference}
+def implementations(device: str = "cpu") -> dict[str, Implementation]:
+    """Those to be used for images on `device`, "cpu" or "cuda", by name, the fastest first.
+
+    On a CPU Warp's kernels are there to be checked: they are taken only by name.
+    """
+    found: dict[str, Implementation] = {}
+    if device == "cpu" and cpp.available():
+        found["cpp"] = cpp
+    if device == "cuda" and warp.available():
+        found["warp"] = warp
+    return found | {"torch": reference}
 
 
 def require(kernels: Choice) -> None:
@@ -58,12 +66,14 @@ def require(kernels: Choice) -> None:
 
     Raises:
         ValueError: there is no such implementation.
-        BackendUnavailable: "cpp" was not built; the message says what to do.
+        BackendUnavailable: "cpp" was not built, or Warp is not installed; the message says what to do.
     """
     if kernels not in get_args(Choice):
         raise ValueError(f"kernels must be one of {', '.join(get_args(Choice))}, got {kernels!r}.")
     if kernels == "cpp":
         cpp.native()
+    if kernels == "warp":
+        warp.needed("cpu")
 
 
 def photometric(
@@ -102,11 +112,16 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], *, kernels: Choic
 
 def _choose(kernels: Choice, x: Tensor, y: Tensor) -> Implementation:
     require(kernels)
-    if kernels == "cpp" or (kernels == "auto" and cpp.accepts(x, y) and cpp.available()):
-        _say(f"cpp, for {cpp.native().isa}")
-        return cpp
-    _say("torch")
-    return reference
+    if kernels == "auto":
+        kernels = _fastest(x, y)
+    _say(f"cpp, for {cpp.native().isa}" if kernels == "cpp" else kernels)
+    return {"torch": reference, "cpp": cpp, "warp": warp}[kernels]
+
+
+def _fastest(x: Tensor, y: Tensor) -> Choice:
+    if x.device.type == "cpu":
+        return "cpp" if cpp.accepts(x, y) and cpp.available() else "torch"
+    return "warp" if warp.accepts(x, y) and warp.available() else "torch"
 
 
 @cache

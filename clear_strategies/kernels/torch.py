@@ -132,7 +132,7 @@ def _window_mean(maps: Float[Tensor, "... H W"]) -> Float[Tensor, "... H W"]:
 def _mean_along(maps: Float[Tensor, "... H W"], dim: int) -> Float[Tensor, "... H W"]:
     size, reach = maps.shape[dim], _WINDOW // 2
     out = torch.zeros_like(maps)
-    for offset, weight in zip(range(-reach, reach + 1), _gaussian_window(), strict=True):
+    for offset, weight in zip(range(-reach, reach + 1), gaussian_window(), strict=True):
         overlap = size - abs(offset)
         if overlap > 0:
             source = maps.narrow(dim, max(offset, 0), overlap)
@@ -141,7 +141,7 @@ def _mean_along(maps: Float[Tensor, "... H W"], dim: int) -> Float[Tensor, "... 
 
 
 @lru_cache(maxsize=1)
-def _gaussian_window() -> tuple[float, ...]:
+def gaussian_window() -> tuple[float, ...]:
     offsets = torch.arange(_WINDOW, dtype=torch.float64, device="cpu") - _WINDOW // 2
     weights = torch.exp(-0.5 * (offsets / _SIGMA) ** 2)
     return tuple((weights / weights.sum()).tolist())

@@ -1,7 +1,7 @@
 """A rasterizer in NVIDIA Warp: Python functions compiled at first use, one source for CUDA and for the CPU, in float32.
 
 The stages are those of `rasterizers.reference`, and so are their names: project, bin, blend, and back. `frame` runs them;
-the other files hold what runs on the device, adjoints written by hand. This file knows whether Warp can run here.
+`launch` knows Warp and whether it is here; the other files hold what runs on the device, adjoints written by hand.
 
 Deterministic: every sum has one order, and there are no floating-point atomics.
 """
@@ -12,7 +12,8 @@ from typing import Any
 
 import torch
 
-from rasterizers.interface import BackendUnavailable, Rasterizer
+from rasterizers.interface import Rasterizer
+from rasterizers.warp_backend.launch import require
 
 
 def create(device: str | None = None, **settings: Any) -> Rasterizer:
@@ -27,27 +28,9 @@ def create(device: str | None = None, **settings: Any) -> Rasterizer:
     """
     if device not in (None, "cpu", "cuda"):
         raise ValueError(f"device must be cpu or cuda, got {device!r}.")
-    try:
-        import warp as wp
-    except ImportError as error:
-        raise BackendUnavailable(
-            f"the warp rasterizer needs NVIDIA Warp, which is not installed ({error}); pip install 'clear-strategies[warp]'."
-        ) from error
-    # Its greeting, and a line for every compilation, would go to stdout, which is the caller's.
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
-    if device == "cuda":
-        if not torch.cuda.is_available():
-            raise BackendUnavailable(
-                "the warp rasterizer cannot draw on CUDA: torch finds no CUDA device. Install NVIDIA's driver and a torch "
-                "built for CUDA; device=cpu runs here, slowly."
-            )
-        if wp.get_cuda_device_count() == 0:
-            raise BackendUnavailable(
-                "the warp rasterizer cannot draw on CUDA: torch finds a CUDA device, Warp does not. Update NVIDIA's driver "
-                "or warp-lang; device=cpu runs here, slowly."
-            )
+    require("the warp rasterizer", device, "device=cpu runs here, slowly")
     from rasterizers.checks import build
     from rasterizers.warp_backend.frame import WarpRasterizer
 

@@ -1,0 +1,63 @@
+"""What runs on the device for L1, and for every loss: the sign that is 0 at 0, and the sum of what blocks have summed.
+
+A block leaves its share of a loss in `parts`, in float64; one block then adds them up. So every sum has one order.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, no_type_check
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+@no_type_check
+def sign(x: wp.float32) -> wp.float32:
+    """Of NaN it is 0, too."""
+    return wp.where(x > 0.0, 1.0, 0.0) - wp.where(x < 0.0, 1.0, 0.0)
+
+
+@cache
+@no_type_check
+def absolute(lanes: int) -> Any:
+    """The kernel of L1, with a block of `lanes` threads a row: step · sign(x - y), and the part weight · Σ |x - y|."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def absolute(
+        x: wp.array2d[wp.float32],
+        y: wp.array2d[wp.float32],
+        weight: wp.float64,
+        step: wp.float32,
+        out: wp.array2d[wp.float32],
+        parts: wp.array[wp.float64],
+    ) -> None:
+        row, lane = wp.tid()
+        share = wp.float64(0.0)
+        for column in range(lane, x.shape[1], lanes):
+            difference = x[row, column] - y[row, column]
+            out[row, column] = step * sign(difference)
+            share += wp.float64(wp.abs(difference))
+        wp.tile_store(parts, wp.tile_sum(wp.tile(weight * share)), offset=(row,))
+
+    return absolute
+
+
+@cache
+@no_type_check
+def total(lanes: int) -> Any:
+    """The kernel, of one block of `lanes` threads, that writes start + Σ parts in float32."""
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def total(parts: wp.array[wp.float64], start: wp.float64, value: wp.array[wp.float32]) -> None:
+        _, lane = wp.tid()
+        share = wp.float64(0.0)
+        for part in range(lane, parts.shape[0], lanes):
+            share += parts[part]
+        if lane == 0:
+            share += start
+        wp.tile_store(value, wp.tile_astype(wp.tile_sum(wp.tile(share)), wp.float32))
+
+    return total
