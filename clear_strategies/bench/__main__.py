@@ -1,5 +1,5 @@
-"""The benchmark's command line. Exit codes: 0, 2 for arguments or input that cannot be used, 130 and 143
-when stopped by a signal.
+"""The benchmark's command line. Exit codes: 0, 1 where a step of `device` failed, 2 for arguments or input that cannot be
+used, 130 and 143 when stopped by a signal.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final, NoReturn
 
 import torch
 
-from clear_strategies.bench import iteration, kernels, pareto, rasterizers
+from clear_strategies.bench import device, iteration, kernels, pareto, rasterizers
 from clear_strategies.bench.iteration import STRATEGIES
 from clear_strategies.bench.kernels import SIZES
 from clear_strategies.bench.output import Findings, between_markers, leave
@@ -28,9 +28,10 @@ _log = logging.getLogger(__name__)
 
 _QUESTIONS: Final = {
     "rasterizers": "time, memory and error of every backend at every preset",
-    "kernels": "image losses with their gradients, ours and everyone's",
+    "kernels": "image losses with their gradients and the per-Gaussian pass, ours and everyone's",
     "iteration": "one iteration of training, stage by stage",
     "pareto": "seconds against PSNR and SSIM of whole trainings",
+    "device": "everything that only a GPU can show, step by step, into a folder",
 }
 
 Draw = Callable[[Path], None]
@@ -46,6 +47,11 @@ class _Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit code."""
     options = _parser().parse_args(arguments)
+    if options.question == "device":
+        options.json, options.markdown = (
+            named or options.out / f"summary.{kind}"
+            for named, kind in ((options.json, "json"), (options.markdown, "md"))
+        )
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
         _require_writable(options)
@@ -64,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         _log.error("stopped; no table was written.")
         return 130
-    return 0
+    return int(findings.failed)
 
 
 def _measure(options: argparse.Namespace) -> tuple[Findings, Draw | None]:
@@ -72,11 +78,12 @@ def _measure(options: argparse.Namespace) -> tuple[Findings, Draw | None]:
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     if options.question == "kernels":
-        return kernels.measure(options.size, options.repeats, _log.info), None
+        losses = kernels.Request(options.size, options.repeats, options.device, options.gaussians, _floors(options))
+        return kernels.measure(losses, _log.info), None
     if options.question == "iteration":
         one = iteration.Request(
             options.scene, options.strategy, options.backend, options.preset, options.repeats,
-            options.data, options.prototype,
+            options.data, options.prototype, options.device, _floors(options),
         )  # fmt: skip
         return iteration.measure(one, _log.info), None
     if options.question == "pareto":
@@ -86,12 +93,21 @@ def _measure(options: argparse.Namespace) -> tuple[Findings, Draw | None]:
         )  # fmt: skip
         findings, trained = pareto.measure(whole, _log.info)
         return findings, lambda path: time_against_quality(path, trained, findings.sections[0].title)
+    if options.question == "device":
+        everything = device.Request(
+            options.out, options.device, options.quick, options.data_root, options.data, tuple(options.scene)
+        )
+        return device.measure(everything, _log.info), None
     request = rasterizers.Request(
         options.scene, options.backend, options.preset, options.repeats, options.limit,
-        options.device, options.data, options.prototype, options.memory,
+        options.device, options.data, options.prototype, options.memory, _floors(options),
     )  # fmt: skip
     findings, drawn = rasterizers.measure(request, _log.info)
     return findings, lambda path: time_against_error(path, drawn)
+
+
+def _floors(options: argparse.Namespace) -> bool:
+    return options.device == "cuda" if options.floors is None else bool(options.floors)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -105,6 +121,12 @@ def _parser() -> argparse.ArgumentParser:
 
     turns = _Parser(add_help=False)
     turns.add_argument("--repeats", type=_positive, default=9, metavar="N", help="turns of each (default 9)")
+
+    turns.add_argument("--device", default="cpu", choices=["cpu", "cuda"], help="default: cpu")
+    turns.add_argument(
+        "--floors", action=argparse.BooleanOptionalAction,
+        help="how near each stage comes to the device's bandwidth and arithmetic (default: on CUDA)",
+    )  # fmt: skip
 
     splats = _Parser(add_help=False)
     splats.add_argument("--data", type=Path, metavar="PATH", help="the garden's .npz, or its folder")
@@ -120,12 +142,15 @@ def _parser() -> argparse.ArgumentParser:
     ask.add_argument("--backend", nargs="+", metavar="NAME", help="default: all that run here")
     ask.add_argument("--preset", nargs="+", default=list(PRESETS), choices=list(PRESETS), help="default: all")
     ask.add_argument("--limit", type=_seconds, default=180.0, metavar="S", help="skip what would take longer (180 s)")
-    ask.add_argument("--device", default="cpu", choices=["cpu", "cuda"], help="default: cpu")
     ask.add_argument("--no-memory", dest="memory", action="store_false", help="do not measure peak memory")
     ask.add_argument("--picture", type=Path, metavar="FILE", help="PNG: time against error")
 
     ask = questions.add_parser("kernels", parents=[common, turns], help=_QUESTIONS["kernels"])
     ask.add_argument("--size", nargs="+", default=list(SIZES), metavar="WxH", help=f"default: {' '.join(SIZES)}")
+    ask.add_argument(
+        "--gaussians", nargs="*", type=_positive, default=[100_000, 500_000], metavar="N",
+        help="time the per-Gaussian pass of so many, too (default: 100000 500000)",
+    )  # fmt: skip
 
     ask = questions.add_parser("iteration", parents=[common, turns, splats], help=_QUESTIONS["iteration"])
     ask.add_argument("--scene", default="s100k", metavar="SCENE", help="as above; HR is its image (default: s100k)")
@@ -150,6 +175,16 @@ def _parser() -> argparse.ArgumentParser:
     names = [variant.name for variant in pareto.VARIANTS]
     ask.add_argument("--variants", nargs="+", default=names, metavar="NAME", help=f"default: {', '.join(names)}")
     ask.add_argument("--picture", type=Path, metavar="FILE", help="PNG: time against quality")
+
+    ask = questions.add_parser("device", parents=[common], help=_QUESTIONS["device"])
+    ask.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder for logs, tables and runs")
+    ask.add_argument("--device", default="cuda", choices=["cpu", "cuda"], help="default: cuda")
+    ask.add_argument("--quick", action="store_true", help="tiny everything, to see that the steps run")
+    ask.add_argument("--data-root", type=Path, metavar="DIR", help="holds LLFF's fern with images_4 and images_2")
+    ask.add_argument("--data", type=Path, metavar="PATH", help="the garden's .npz, or its folder")
+    ask.add_argument(
+        "--scene", nargs="+", type=Path, default=[], metavar="PATH", help="a trained .ply or a checkpoint to measure, too"
+    )  # fmt: skip
     return parser
 
 

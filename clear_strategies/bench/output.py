@@ -32,9 +32,9 @@ class Findings:
     """Everything one question found.
 
     Args:
-        question: "rasterizers", "kernels", "iteration" or "pareto"; names the markers in the documentation.
+        question: "rasterizers", "kernels", "iteration", "pareto" or "device"; names the markers in the documentation.
         skipped: one line each: what was not measured, and why.
-        raw: for the JSON file: settings, and rows with every repeat.
+        raw: for the JSON file: settings, and rows with every repeat. failed: something that should work did not.
     """
 
     question: str
@@ -42,6 +42,7 @@ class Findings:
     sections: list[Section] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
     raw: dict[str, Any] = field(default_factory=dict)
+    failed: bool = False
 
 
 def markdown(findings: Findings) -> str:

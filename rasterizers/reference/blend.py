@@ -190,5 +190,5 @@ def _at_least(x: Tensor, limit: float) -> Tensor:
 
 
 def _just_below(limit: float, dtype: torch.dtype) -> float:
-    at = torch.tensor(limit, dtype=dtype)
-    return float(torch.nextafter(at, torch.tensor(-math.inf, dtype=dtype)))
+    at = torch.tensor(limit, dtype=dtype, device="cpu")
+    return float(torch.nextafter(at, torch.tensor(-math.inf, dtype=dtype, device="cpu")))

@@ -1,0 +1,289 @@
+"""Training on a device, as far as it can be seen without one.
+
+torch's device "meta" holds shapes and no numbers: whoever reads one there fails. A state that lies on meta therefore shows
+that nothing crosses over to the host while iterating; and with meta as the *default* device of a state that lies on the CPU,
+a tensor that forgets where it belongs cannot be reckoned with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from clear_strategies import GCO, P2G, SVS, Conductor, SplatSuRe, checkpoint, late
+from clear_strategies.data.view import View
+from clear_strategies.density_gsplat import GsplatDensifier, GsplatSettings
+from clear_strategies.errors import DataError
+from clear_strategies.fit import TrainState, iterate
+from clear_strategies.run import _device, _drawn_on
+from clear_strategies.skips import Economy, Skips
+from rasterizers.interface import Rendering, SplatGradients, Traits
+from tests import toy
+from tests.test_resume import ITERATIONS, SCENE, SUBSETS, start, tensors
+
+STEADY = (8, 12, 13, 14)  # HR coarse; the anchor is taken; HR left out; all there is
+EVERY_SKIP = Skips(coarse_until=9, hr_every=2, hr_every_from=12, flat=0.02)
+
+
+@dataclass
+class Drawn:
+    """A picture of the right shapes, made where the splats lie."""
+
+    image: Tensor
+    alpha: Tensor
+    means2d: Tensor
+    visible: Tensor
+    like: Tensor
+    bands: int
+
+    def vjp(self, cotangents: Tensor) -> SplatGradients:
+        k, n = len(cotangents), len(self.like)
+        means, quats, scales, screen, rgb = (self.like.new_zeros(k, n, width) for width in (3, 4, 3, 2, 3))
+        basis = self.like.new_zeros(n, self.bands + 1)
+        return SplatGradients(means, quats, scales, self.like.new_zeros(k, n), screen, rgb, basis)
+
+
+class Blank:
+    """Draws nothing, anywhere."""
+
+    tile = 8
+    traits = Traits(frozenset({"cpu", "meta"}), frozenset({torch.float32}), True, True, True)
+
+    def __call__(self, splats, camera, tiles=None) -> Rendering:
+        like, n = splats.means, len(splats)
+        image = like.new_zeros(camera.height, camera.width, 3)
+        visible = like.new_ones(n, dtype=torch.bool)
+        return Drawn(image, image[..., 0], like.new_zeros(n, 2), visible, like, splats.shN.shape[1])
+
+    def render_scales(self, jobs, tiles=None) -> list[Rendering]:
+        return [self(splats, camera) for splats, camera in jobs]
+
+
+class Crossings(TorchDispatchMode):
+    """Operations with tensors of two devices: one of them was carried over, and somebody waited."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, operation, types, arguments=(), keywords=None):
+        answer = operation(*arguments, **(keywords or {}))
+        devices = {x.device.type for x in tree_leaves((arguments, keywords, answer)) if isinstance(x, Tensor)}
+        if len(devices) > 1:
+            self.found.append(str(operation))
+        return answer
+
+
+class Written(TorchFunctionMode):
+    """Tensors written from Python's numbers: on a device they are carried over, and somebody waits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_function__(self, function, types, arguments=(), keywords=None):
+        answer = function(*arguments, **(keywords or {}))
+        if function in (torch.tensor, torch.as_tensor, Tensor.new_tensor) and answer.device.type != "cpu":
+            self.found.append(function.__name__)
+        return answer
+
+
+class Quiet:
+    """A densifier of gsplat's shape that leaves the structure as it is."""
+
+    def check_sanity(self, params, optimizers): ...
+
+    def initialize_state(self, scene_scale=1.0):
+        return {"count": None}
+
+    def step_pre_backward(self, params, optimizers, state, step, info): ...
+
+    def step_post_backward(self, params, optimizers, state, step, info):
+        state["count"] = torch.ones_like(info["radii"])
+
+
+@pytest.fixture
+def no_data(monkeypatch):
+    """What is made once, from the data, is there already; meta has no generator of its own."""
+    make = torch.Generator
+    monkeypatch.setattr(torch, "Generator", lambda device="cpu": make("cpu" if str(device) == "meta" else device))
+    monkeypatch.setattr(TrainState, "refilter", lambda self: None)
+    monkeypatch.setattr(P2G, "_patch_evidence", lambda self, view: (view.lr.image.new_zeros(2, 2),) * 2)
+
+    def tiles(self: Economy, view: View, tile: int) -> tuple[Tensor, int]:
+        return view.hr.image.new_ones(8, 12, dtype=torch.bool), 1
+
+    monkeypatch.setattr(Economy, "_with_detail", tiles)
+
+
+def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:
+    """A run in its middle, of which all lies on meta but the cameras."""
+    monkeypatch.setattr("tests.test_resume.SCENE", SCENE.to("meta"))
+    state = start(names)
+    state.fused = None
+    state.economy = Economy(EVERY_SKIP)
+    # Statistics are gathered; a round reads, and does not come.
+    state.density.settings = replace(state.density.settings, start=90, stop=100, statistics_from=1)
+    return state
+
+
+def steadily(state: TrainState) -> None:
+    """Iterations between changes of structure."""
+    for t in STEADY:
+        for s in state.conductor.strategies:
+            if isinstance(s, SVS):
+                s.cache["extent"] = 1.0  # of the anchor, read once
+        state.t = t
+        with Crossings() as crossings, Written() as written:
+            iterate(state, Blank())
+        assert not crossings.found, f"t={t}"
+        assert not written.found, f"t={t}"
+
+
+def lying(state: TrainState) -> dict[str, Tensor]:
+    """Everything that a checkpoint would hold, unread."""
+    strategies, moments = state.conductor.state_dict(), state.optimizer.state_dict()
+    return {**state.field.raw(), "filter": state.field.filter_3d, **moments, **state.density.state_dict(), **strategies}
+
+
+@pytest.mark.parametrize("names", SUBSETS, ids=lambda s: "+".join(s) or "none")
+def test_an_iteration_reads_nothing_and_carries_nothing_over(names, no_data, monkeypatch):
+    state = on_meta(monkeypatch, names)
+    steadily(state)
+    assert {x.device.type for x in lying(state).values()} == {"meta"}
+    assert all(not isinstance(row["loss_lr"], float) for row in state.history)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [SplatSuRe, lambda: GCO(eps="absolute:1e-8", bound="coefficient"),
+     lambda: P2G(lookup="bilinear", outside="neutral", score_by="sum")],
+    ids=["splatsure", "gco literal", "p2g otherwise"],
+)  # fmt: skip
+def test_other_readings_read_nothing_either(make, no_data, monkeypatch):
+    state = on_meta(monkeypatch, ())
+    state.conductor = Conductor(make(), objective=state.conductor.objective, statistics_from=1)
+    state.conductor.on_fit_start(len(SCENE.train), 0, "meta")
+    for view in state.views:  # whose poses are sent once, for either reference
+        for t in (1, ITERATIONS):
+            seen = state.economy.view(view, t)
+            for s in state.conductor.strategies:
+                if isinstance(s, SplatSuRe):
+                    s._pose(seen.name, seen.hr.camera)
+    state.economy = Economy(replace(EVERY_SKIP, coarse_until=0))
+    steadily(state)
+
+
+@pytest.mark.parametrize("change", ["visible rows", "clamped", "low from high"])
+def test_other_settings_read_nothing_either(change, no_data, monkeypatch):
+    state = on_meta(monkeypatch, ("gco", "p2g", "svs"))
+    objective = state.conductor.objective
+    if change == "visible rows":
+        state.optimizer.rates = replace(state.optimizer.rates, rows="visible")
+    elif change == "clamped":
+        state.conductor.objective = replace(objective, clamp_render=True)
+    else:
+        state.conductor.objective = replace(objective, lr_from="hr", lambda_lr=0.6)
+    steadily(state)
+
+
+def test_somebody_elses_densifier_is_asked_without_reading_what_it_did(no_data, monkeypatch):
+    state = on_meta(monkeypatch, ("p2g",))
+    settings = GsplatSettings({}, start=1, stop=13, every=5)
+    state.density = GsplatDensifier(settings, Quiet(), len(state.field), extent=1.0, seed=0, device="meta")
+    steadily(state)
+
+
+def test_a_read_would_be_seen(no_data, monkeypatch):
+    state = on_meta(monkeypatch, ())
+    state.t = 15
+    monkeypatch.setattr(late, "at_once", lambda x: True)
+    with pytest.raises(RuntimeError, match="meta"):
+        iterate(state, Blank())
+
+
+@pytest.mark.parametrize("names", SUBSETS, ids=lambda s: "+".join(s) or "none")
+def test_every_tensor_is_made_where_the_field_lies_and_late_numbers_are_the_same(names, tmp_path, monkeypatch):
+    """Density, resets, anchor, skips and a resumption included."""
+
+    def begun() -> TrainState:
+        state = start(names)
+        state.economy, state.fused = Economy(EVERY_SKIP), None
+        state.conductor.objective = replace(state.conductor.objective, kernels="torch")
+        return state
+
+    def trained(cut: int | None) -> TrainState:
+        state = begun()
+        while state.t <= STEADY[-1]:
+            if state.t == cut:
+                path = checkpoint.save(tmp_path, state.checkpoint({}))
+                state = begun()
+                state.restore(checkpoint.load(path), path)
+            with torch.device("meta" if cut else "cpu"):
+                iterate(state, toy.RASTERIZER)
+        return state
+
+    at_once = trained(None)
+    monkeypatch.setattr(late, "at_once", lambda x: False)
+    unread = trained(9)
+    for name, value in tensors(at_once).items():
+        assert torch.equal(tensors(unread)[name], value), name
+    for then, now in zip(at_once.told(), unread.told(), strict=True):
+        if not now.get("corrected", 0.0) > 0:  # that is known too late to leave the share out
+            then.pop("omega_at_lower_bound", None)
+            now.pop("omega_at_lower_bound", None)
+        assert now == pytest.approx(then, rel=1e-6, nan_ok=True)
+
+
+def test_a_scene_moves_as_one_and_its_cameras_and_cloud_stay():
+    there = SCENE.to("meta")
+    assert there.device.type == "meta"
+    for view in (*there.train, *there.test):
+        assert {x.device.type for x in (view.lr.image, view.hr.image, view.truth)} == {"meta"}
+        assert {photo.camera.world_to_camera.device.type for photo in (view.lr, view.hr)} == {"cpu"}
+    assert there.cloud.means.device.type == "cpu"
+    assert there.to("meta").train[0].factor == SCENE.train[0].factor
+
+
+def test_a_checkpoint_is_taken_to_wherever_the_run_is(tmp_path, no_data, monkeypatch):
+    saved = start(("svs",))
+    for _ in range(13):
+        iterate(saved, toy.RASTERIZER)
+    path = checkpoint.save(tmp_path, saved.checkpoint({}))
+    found = checkpoint.load(path)
+    assert found.device == "cpu"
+    state = on_meta(monkeypatch, ("svs",))
+    state.restore(found, path)
+    assert {x.device.type for x in lying(state).values()} == {"meta"}
+    assert lying(state).keys() == lying(saved).keys()
+    assert state.t == 14
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"), [("tpu", "must be cpu, cuda or null, got 'tpu'"), ("cuda", "torch finds no CUDA device")]
+)
+def test_a_device_that_cannot_be_had_is_refused_in_one_sentence(asked, message, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(DataError, match=message):
+        _device(asked)
+
+
+@pytest.mark.parametrize(
+    ("devices", "asked", "there", "expected"),
+    [({"cpu"}, None, True, "cpu"), ({"cuda"}, None, True, "cuda"), ({"cpu", "cuda"}, None, True, "cuda"),
+     ({"cpu", "cuda"}, None, False, "cpu"), ({"cpu", "cuda"}, "cpu", True, "cpu"), ({"cuda"}, "cuda", True, "cuda")],
+)  # fmt: skip
+def test_null_is_cuda_where_it_is_and_the_rasterizer_draws_there(devices, asked, there, expected, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    assert _drawn_on(frozenset(devices), "this", asked) == expected
+
+
+def test_a_rasterizer_of_the_other_device_is_refused_in_one_sentence():
+    with pytest.raises(DataError, match="is cuda, and the rasterizer cpp draws on cpu alone"):
+        _drawn_on(frozenset({"cpu"}), "cpp", "cuda")
