@@ -10,9 +10,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, Final
 
 import torch
@@ -26,6 +24,8 @@ from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
 from rasterizers.warp_backend.blend import blend, blend_vjp
 from rasterizers.warp_backend.colour import basis
+from rasterizers.warp_backend.launch import array as _array
+from rasterizers.warp_backend.launch import on_stream
 from rasterizers.warp_backend.project import project, pull
 
 _TILE: Final = int(types.TILE)
@@ -150,8 +150,7 @@ class _Frame:
             ValueError: a number is not finite.
             MemoryError: the lists of a picture would pass the budget.
         """
-        wp.init()
-        with self.on_stream():
+        with on_stream(self.like.device):
             keys, totals = self._project()
             order = _sorted(keys, torch.arange(2 * self.n, dtype=torch.int32, device=self.like.device), self.n, 31)[1]
             *pairs, poison = totals()
@@ -162,15 +161,6 @@ class _Frame:
                 self._require_memory(screen, count)
                 screen.lists = self._list(screen, order, count)
             return [WarpRendering(self, screen) for screen in self.screens]
-
-    def on_stream(self) -> AbstractContextManager[Any]:
-        """Warp's work goes where torch's goes."""
-        if self.like.device.type == "cpu":
-            return nullcontext()
-        scope: AbstractContextManager[Any] = wp.ScopedStream(
-            _stream(torch.cuda.current_stream(self.like.device)), sync_enter=False
-        )
-        return scope
 
     def launch(self, kernel: Any, threads: int, *arguments: Any) -> None:
         """A thread per Gaussian, pair or pixel; the arguments are the kernel's."""
@@ -267,7 +257,7 @@ class WarpRendering:
         opacities = frame.empty(k, n)
         room = _room(self._screen.lists.count)
         together = max(1, min(3, ((frame.settings.memory << 20) - room * _PAIR_BYTES) // (room * _SENT_BYTES)))
-        with frame.on_stream():
+        with on_stream(frame.like.device):
             for part in range(0, k, together):
                 some = slice(part, part + together)
                 out = (x[some] for x in (means, quats, scales, opacities, screen, rgb))
@@ -297,17 +287,6 @@ class WarpRendering:
             _array(screen.ellipses, types.Row), _array(screen.counts), _array(screen.firsts), _array(sent, sent_row),
             *(_array(x, width) for x, width in zip(out, widths, strict=True)),
         )  # fmt: skip
-
-
-@cache
-def _stream(stream: torch.cuda.Stream) -> Any:
-    """Torch's stream as Warp knows it; kept, for Warp keeps the scratch of its sort with it."""
-    return wp.stream_from_torch(stream)
-
-
-def _array(tensor: Tensor | None, dtype: Any = None) -> Any:
-    """A tensor as a kernel's argument, without a copy; the caller keeps it alive. None is an array of nothing."""
-    return None if tensor is None else wp.from_torch(tensor, dtype, return_ctype=True)
 
 
 def _sorted(keys: Tensor, values: Tensor, count: int, bits: int) -> tuple[Tensor, Tensor]:
