@@ -36,6 +36,7 @@ class Checkpoint:
         t: the next iteration. config: the run's composed configuration, to refuse another one on resume.
         facts: small numbers (Adam's step count, the active SH degree …). history: one row an iteration.
         ledger: what was computed and skipped until then, `Ledger.state_dict`.
+        device: "cpu" or "cuda", where it was made; tensors are saved from and loaded to the CPU.
     """
 
     t: int
@@ -44,6 +45,7 @@ class Checkpoint:
     facts: Mapping[str, float]
     history: list[dict[str, float]]
     ledger: Mapping[str, Any] = field(default_factory=dict)
+    device: str = "cpu"
 
 
 def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
@@ -64,6 +66,7 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
         "config": checkpoint.config,
         "facts": checkpoint.facts,
         "ledger": checkpoint.ledger,
+        "device": checkpoint.device,
         "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
     }
     files[_MANIFEST] = json.dumps(manifest, indent=1).encode()
@@ -119,6 +122,7 @@ def load(path: Path) -> Checkpoint:
         facts=manifest["facts"],
         history=json.loads(files[_HISTORY]),
         ledger=manifest.get("ledger", {}),
+        device=manifest.get("device", "cpu"),
     )
 
 

@@ -17,6 +17,7 @@ from clear_strategies import images
 from clear_strategies.errors import StrategyConflict
 from clear_strategies.evidence import Evidence
 from clear_strategies.gradients import Grads, Shot, conflict_ratio, to_ndc
+from clear_strategies.late import Number, Scalar
 from clear_strategies.ledger import Ledger
 from clear_strategies.objective import Objective
 from clear_strategies.strategy import Screens, Strategy, answers
@@ -38,15 +39,17 @@ class Update:
         score: S_i, what densification goes by; `ordinary` is what it would go by without strategies.
         conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
         losses: scalars by name. readings: the strategies' own numbers, for logs.
+
+    On a device, losses, conflict and readings are not floats yet: `late.read`.
     """
 
     grads: Grads
     score: Float[Tensor, " N"]
     ordinary: Float[Tensor, " N"]
     evidence: Evidence | None
-    conflict: Mapping[str, float] = field(default_factory=dict)
-    losses: Mapping[str, float] = field(default_factory=dict)
-    readings: Mapping[str, float] = field(default_factory=dict)
+    conflict: Mapping[str, Number] = field(default_factory=dict)
+    losses: Mapping[str, Scalar] = field(default_factory=dict)
+    readings: Mapping[str, Number] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,7 +70,7 @@ class Heard:
     size: tuple[int, int] = (1, 1)
     evidence: Evidence | None = None
     m: float | Float[Tensor, " N"] = 1.0
-    losses: Mapping[str, float] = field(default_factory=dict)
+    losses: Mapping[str, Scalar] = field(default_factory=dict)
 
 
 @runtime_checkable
@@ -92,7 +95,7 @@ class Merger(Protocol):
         m: float | Float[Tensor, " N"],
         e: Evidence | None,
         t: int,
-    ) -> tuple[Grads, Mapping[str, float]]:
+    ) -> tuple[Grads, Mapping[str, Number]]:
         """The merged gradient and the conflict ratio by group; see `Conductor.merge`."""
         ...
 
@@ -135,9 +138,11 @@ class Conductor:
             if not any(answers(s, hook) for hook in (*_ONE_ANSWER, "regularize", "may_densify", "after_step")):
                 _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
 
-    def on_fit_start(self, n_views: int, seed: int) -> None:
+    def on_fit_start(self, n_views: int, seed: int, device: torch.device | str = "cpu") -> None:
+        """Once, before the first iteration; `device` is where the field lies."""
         for s in self.strategies:
             s.on_fit_start(n_views, seed)
+            s.to(device)
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""
@@ -262,7 +267,7 @@ class Conductor:
         m: float | Float[Tensor, " N"],
         e: Evidence | None,
         t: int,
-    ) -> tuple[Grads, Mapping[str, float]]:
+    ) -> tuple[Grads, Mapping[str, Number]]:
         """The gradient g_LR + λ_HR ĝ_HR + λ∇L_stab, and the conflict ratio before correction."""
         if g_base is None:
             return g_lr + self._regularize(params, t), {}
@@ -272,7 +277,7 @@ class Conductor:
             g_hf = g_hf * m * λ_hf
             g_hr = g_base + g_hf  # g^HR           Eq. 13
         base_lr, base_hr = _without_detail(g_lr), _without_detail(g_hr)
-        conflict: Mapping[str, float] = {}
+        conflict: Mapping[str, Number] = {}
         if λ > 0:
             conflict = conflict_ratio(base_lr, base_hr)  # before correction
             base_hr = self._ask("correct", base_hr, base_lr, base_hr, e)  # corrected      Eq. 6, 7, 11
@@ -309,7 +314,7 @@ class Conductor:
             owner, _, name = key.partition(".")
             if owner not in by_name:
                 raise ValueError(f"state {key!r} belongs to no strategy of this run ({', '.join(by_name) or 'none'}).")
-            by_name[owner].state[name] = rows.clone()
+            by_name[owner].state[name] = rows.to(by_name[owner].device, copy=True)
 
     def _by_name(self) -> dict[str, Strategy]:
         named: dict[str, Strategy] = {}
@@ -337,7 +342,7 @@ class Conductor:
                 total = total + g
         return total
 
-    def readings(self) -> dict[str, float]:
+    def readings(self) -> dict[str, Number]:
         """The strategies' own numbers of the last iteration."""
         return {name: value for s in self.strategies for name, value in s.readings.items()}
 

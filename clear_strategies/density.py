@@ -75,8 +75,10 @@ class Densifier(Protocol):
 class DensifierSettings(Protocol):
     """What a configuration's `density` is: a frozen dataclass that makes its densifier once the scene is known."""
 
-    def densifier(self, n: int, *, extent: float, seed: int, white_background: bool) -> Densifier:
-        """For a field of n Gaussians; `extent` is 3DGS's cameras_extent, world units."""
+    def densifier(
+        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
+    ) -> Densifier:
+        """For a field of n Gaussians on `device`; `extent` is 3DGS's cameras_extent, world units."""
         ...
 
 
@@ -128,8 +130,10 @@ class DensitySettings:
         """`every`, or less where the window would not hold 10 rounds."""
         return max(1, min(self.every, (self.stop - self.start) // _FEWEST_ROUNDS))
 
-    def densifier(self, n: int, *, extent: float, seed: int, white_background: bool) -> Density:
-        return Density(self, n, extent=extent, seed=seed, white_background=white_background)
+    def densifier(
+        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
+    ) -> Density:
+        return Density(self, n, extent=extent, seed=seed, white_background=white_background, device=device)
 
 
 class Density:
@@ -137,15 +141,23 @@ class Density:
 
     Args:
         extent: 3DGS's cameras_extent, world units. white_background: adds the early opacity reset.
+        device: where the field lies.
     """
 
     name: Final = "density control"
 
     def __init__(
-        self, settings: DensitySettings, n: int, *, extent: float, seed: int, white_background: bool = False
+        self,
+        settings: DensitySettings,
+        n: int,
+        *,
+        extent: float,
+        seed: int,
+        white_background: bool = False,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.settings, self.extent, self.seed, self.white_background = settings, extent, seed, white_background
-        self.score, self.ordinary, self.count = torch.zeros(n), torch.zeros(n), torch.zeros(n)
+        self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
         self._said_cap = False
 
     @property
@@ -203,15 +215,15 @@ class Density:
                 f"{int(keep.sum())} of {n:,} Gaussians, fewer than min_gaussians={s.min_gaussians}. Lower "
                 "density.prune_opacity, or start from a denser cloud."
             )
-        rows = torch.arange(n)
+        rows = torch.arange(n, device=chosen.device)
         stay, clones, splits = rows[keep & ~split], rows[keep & chosen & ~split], rows[keep & split]
         children = splits.repeat(_CHILDREN)
         parents = torch.cat((stay, clones, children))
-        fresh = torch.arange(len(parents)) >= len(stay)
+        fresh = torch.arange(len(parents), device=parents.device) >= len(stay)
         field.take(parents, fresh)
         optimizer.take(parents, fresh)
         self._spread(field, slice(len(stay) + len(clones), len(parents)), t)
-        self.score, self.ordinary, self.count = (torch.zeros(len(parents)) for _ in range(3))
+        self.score, self.ordinary, self.count = (self.score.new_zeros(len(parents)) for _ in range(3))
         _log.info(
             "t=%d: %d cloned, %d split, %d pruned: %d -> %d Gaussians.",
             t, len(clones), len(splits), n - int(keep.sum()), n, len(parents),
@@ -229,7 +241,10 @@ class Density:
         return {"score": self.score, "ordinary": self.ordinary, "count": self.count}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        self.score, self.ordinary, self.count = (tensors[name].clone() for name in ("score", "ordinary", "count"))
+        device = self.score.device
+        self.score, self.ordinary, self.count = (
+            tensors[name].to(device, copy=True) for name in ("score", "ordinary", "count")
+        )
 
     def _chosen(self) -> Bool[Tensor, " N"]:
         """Which Gaussians get more structure: the top by score, as many as the threshold and the cap allow."""
@@ -252,8 +267,8 @@ class Density:
     def _spread(self, field: GaussianField, children: slice, t: int) -> None:
         """Place split children at random inside their parent, and make them smaller."""
         scales = field.scales.data[children]
-        generator = torch.Generator().manual_seed(self.seed * 1_000_003 + t)
-        offset = torch.randn(scales.shape, generator=generator) * scales.exp()
+        generator = torch.Generator(scales.device).manual_seed(self.seed * 1_000_003 + t)
+        offset = torch.randn(scales.shape, generator=generator, device=scales.device) * scales.exp()
         rotation = rotation_matrix(field.quats.data[children])
         field.means.data[children] += (rotation @ offset[..., None])[..., 0]
         field.scales.data[children] = scales - math.log(_SHRINK)

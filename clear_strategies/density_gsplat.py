@@ -91,17 +91,20 @@ class GsplatSettings:
             raise ValueError(f"threshold must be > 0, got {self.threshold}.")
         require_in_range(self)
 
-    def densifier(self, n: int, *, extent: float, seed: int, white_background: bool) -> GsplatDensifier:
+    def densifier(
+        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
+    ) -> GsplatDensifier:
         """Import and build the strategy.
 
         Raises:
             DataError: it cannot be imported or built, or asks for what this trainer does not have.
         """
-        return GsplatDensifier(self, self._build(), n, extent=extent, seed=seed)
+        device = torch.device(device)
+        return GsplatDensifier(self, self._build(device), n, extent=extent, seed=seed, device=device)
 
-    def _build(self) -> Any:
+    def _build(self, device: torch.device) -> Any:
         given = dict(self.strategy)
-        kind = _imported(given.pop("_target_", None))
+        kind = _imported(given.pop("_target_", None), device)
         for name, (silent, what) in _NOT_REPORTED.items():
             if given.get(name, silent) != silent:
                 raise _unusable(name, f"asks for {what}, which our rasterizers do not report", f"leave it at {silent}")
@@ -138,13 +141,23 @@ class GsplatDensifier:
         strategy: has check_sanity, initialize_state, step_pre_backward and step_post_backward. It and its `state` dict
             are its own; tensors and numbers in the dict are saved with the run.
         extent: 3DGS's cameras_extent, world units: gsplat's scene_scale. seed: of whatever the strategy draws.
+        device: where the field lies.
     """
 
-    def __init__(self, settings: GsplatSettings, strategy: Any, n: int, *, extent: float, seed: int) -> None:
+    def __init__(
+        self,
+        settings: GsplatSettings,
+        strategy: Any,
+        n: int,
+        *,
+        extent: float,
+        seed: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
         self.settings, self.strategy, self.extent, self.seed = settings, strategy, extent, seed
         self.kind = type(strategy).__name__
         self.state = self._initial_state()
-        self.score, self.ordinary, self.count = torch.zeros(n), torch.zeros(n), torch.zeros(n)
+        self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
         self._seen: _Seen | None = None
         self._checked = False
         self._said: set[str] = set()
@@ -186,12 +199,14 @@ class GsplatDensifier:
         info = _Info(_info(seen))
         accepted = inspect.signature(self.strategy.step_post_backward).parameters
         rest = {"lr": rates["means"]} if "lr" in accepted else {}
-        with torch.no_grad(), _seeded(self.seed * 1_000_003 + t), self._threshold(t):
+        lent = _Lent(params[_ROWS])
+        with torch.no_grad(), _seeded(self.seed * 1_000_003 + t, lent.rows.device), self._threshold(t):
             self.strategy.step_pre_backward(params, optimizers, self.state, t, info)
             self.strategy.step_post_backward(params, optimizers, self.state, t, info, **rest)
-        parents = take_back(field, optimizer, params, optimizers, self.kind)
+        moved = not lent.untouched(params[_ROWS])
+        parents = take_back(field, optimizer, params, optimizers, self.kind, moved=moved)
         self._remark(t, seen, info, optimizer)
-        changed = not torch.equal(parents, torch.arange(n))
+        changed = moved and not torch.equal(parents, torch.arange(n, device=parents.device))
         if changed:
             self.score, self.ordinary, self.count = (x[parents] for x in (self.score, self.ordinary, self.count))
             self._report(parents, n, t)
@@ -215,13 +230,16 @@ class GsplatDensifier:
         return own
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        self.score, self.ordinary, self.count = (tensors[name].clone() for name in ("score", "ordinary", "count"))
+        device = self.score.device
+        self.score, self.ordinary, self.count = (
+            tensors[name].to(device, copy=True) for name in ("score", "ordinary", "count")
+        )
         self.state = self._initial_state()
         for key, value in tensors.items():
             if key.startswith("state."):
                 name = key.removeprefix("state.")
                 number = isinstance(self.state.get(name), bool | int | float)
-                self.state[name] = value.item() if number else value.clone()
+                self.state[name] = value.item() if number else value.to(device, copy=True)
 
     def _initial_state(self) -> dict[str, Any]:
         make = self.strategy.initialize_state
@@ -266,9 +284,10 @@ class GsplatDensifier:
     def _begin_anew(self) -> None:
         """Our sums are set to 0 when the strategy's own are."""
         count = self.state.get("count")
-        if isinstance(count, Tensor) and not bool(count.any()):
+        if isinstance(count, Tensor):
+            begun = ~count.any()
             for total in (self.score, self.ordinary, self.count):
-                total.zero_()
+                total.masked_fill_(begun, 0)
 
     def _report(self, parents: Int[Tensor, " M"], n: int, t: int) -> None:
         children = torch.bincount(parents, minlength=n)
@@ -308,6 +327,16 @@ class Optimizer:
         self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict, {parameter: dict(moments)})
 
 
+class _Lent:
+    """The row numbers as they were lent. Whether they were gathered is seen from outside, without reading them."""
+
+    def __init__(self, rows: nn.Parameter) -> None:
+        self.rows, self._version = rows, rows._version
+
+    def untouched(self, now: Tensor) -> bool:
+        return now is self.rows and now._version == self._version
+
+
 class _Info(dict[str, Any]):
     """gsplat's `info`, which notes what of it was read."""
 
@@ -328,7 +357,7 @@ def lend(
 ) -> tuple[dict[str, nn.Parameter], dict[str, Optimizer]]:
     """Field and moments as gsplat's dicts, sharing memory, with the row numbers as one more parameter."""
     params = {name: nn.Parameter(p) for name, p in field.raw().items()}
-    steps = torch.tensor(float(optimizer.steps))
+    steps = torch.tensor(float(optimizer.steps), device="cpu")  # as torch's Adam keeps it
     optimizers = {
         name: Optimizer(
             p, rates[name], {"step": steps, "exp_avg": optimizer.first[name], "exp_avg_sq": optimizer.second[name]}
@@ -336,7 +365,7 @@ def lend(
         for name, p in params.items()
     }
     # In float64: a parameter that an optimizer holds cannot be of integers, and these are exact up to 2⁵³.
-    params[_ROWS] = nn.Parameter(torch.arange(len(field), dtype=torch.float64))
+    params[_ROWS] = nn.Parameter(torch.arange(len(field), dtype=torch.float64, device=field.means.device))
     optimizers[_ROWS] = Optimizer(params[_ROWS], 0.0, {})
     return params, optimizers
 
@@ -347,15 +376,20 @@ def take_back(
     params: Mapping[str, Tensor],
     optimizers: Mapping[str, Optimizer],
     kind: str = "the strategy",
+    *,
+    moved: bool = True,
 ) -> Int[Tensor, " M"]:
     """Put what a strategy left into field and moments; returns parents[M].
+
+    Args:
+        moved: whether the row numbers may be others than were lent.
 
     Raises:
         DensityError: the rows of parameters, moments and row numbers do not belong together.
     """
     rows = params[_ROWS].detach()
     parents = rows.long()
-    if not bool(((parents == rows) & (parents >= 0) & (parents < len(field))).all()):
+    if moved and not bool(((parents == rows) & (parents >= 0) & (parents < len(field))).all()):
         raise DensityError(f"{kind} changed the parameter {_ROWS!r}; row numbers may only be gathered.")
     for name in ATTRIBUTES:
         p = params[name]
@@ -369,7 +403,8 @@ def take_back(
         getattr(field, name).data = p.detach().contiguous()
         optimizer.first[name] = moments["exp_avg"].detach().contiguous()
         optimizer.second[name] = moments["exp_avg_sq"].detach().contiguous()
-    field.filter_3d = field.filter_3d[parents]
+    if moved:
+        field.filter_3d = field.filter_3d[parents]
     field.constrain()
     return parents
 
@@ -414,14 +449,17 @@ def _radii_by_axis() -> bool:
 
 
 @contextmanager
-def _seeded(seed: int) -> Iterator[None]:
+def _seeded(seed: int, device: torch.device) -> Iterator[None]:
     """What torch draws globally, as gsplat does, is here a function of (seed, t), and as before afterwards."""
-    with torch.random.fork_rng(devices=[]):
+    on_cuda = device.type == "cuda"
+    with torch.random.fork_rng(devices=[device] if on_cuda else []):
         torch.default_generator.manual_seed(seed)  # torch.manual_seed would look for other devices, every time
+        if on_cuda:
+            torch.cuda.manual_seed(seed)
         yield
 
 
-def _imported(target: str | None) -> Any:
+def _imported(target: str | None, device: torch.device) -> Any:
     """The class of that dotted name."""
     if target is None:
         example = "density.strategy._target_=your_package.YourStrategy"
@@ -435,7 +473,7 @@ def _imported(target: str | None) -> Any:
         raise _unusable("_target_", f"{target} cannot be imported ({error})", remedy) from error
     except (AttributeError, ValueError) as error:
         raise _unusable("_target_", f"{target} is not there ({error})", "correct its dotted name") from error
-    if f"{kind.__module__}.{kind.__qualname__}" == _NEEDS_CUDA:
+    if f"{kind.__module__}.{kind.__qualname__}" == _NEEDS_CUDA and device.type != "cuda":
         raise _unusable(
             "_target_", "gsplat's MCMCStrategy moves Gaussians by CUDA kernels, and these are on the CPU",
             "take density=gsplat_mcmc, the same strategy with those computations in torch",

@@ -54,14 +54,14 @@ def lift(
         values = patch_map[row, column]
     counted = visible
     if outside == "neutral":
-        limit = centers.new_tensor(size)
-        counted = counted & ((centers >= 0) & (centers < limit)).all(-1)
+        (x, y), (width, height) = centers.unbind(-1), size
+        counted = counted & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     return torch.where(counted, values, torch.zeros_like(values))
 
 
 def _bilinear(patch_map: Float[Tensor, "ph pw"], grid: Float[Tensor, "N 2"]) -> Float[Tensor, " N"]:
-    extent = grid.new_tensor((patch_map.shape[1], patch_map.shape[0]))
-    points = (2 * grid / extent - 1)[None, None]
+    height, width = patch_map.shape
+    points = torch.stack((2 * grid[:, 0] / width - 1, 2 * grid[:, 1] / height - 1), dim=-1)[None, None]
     return F.grid_sample(patch_map[None, None], points, mode="bilinear", padding_mode="border", align_corners=False)[
         0, 0, 0
     ]

@@ -10,7 +10,7 @@ import logging
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from clear_strategies import checkpoint, images
+from clear_strategies import checkpoint, images, late
 from clear_strategies.checkpoint import Checkpoint
 from clear_strategies.conductor import Conductor, Update
 from clear_strategies.data.view import Scene, View
@@ -29,6 +29,7 @@ from clear_strategies.density import Densifier, DensifierSettings, cameras_exten
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.field import GaussianField
 from clear_strategies.fused import Fused, FusedStep, fused_step
+from clear_strategies.late import Number
 from clear_strategies.mip import MipFilter
 from clear_strategies.optim import Adam, LearningRates
 from clear_strategies.schedules import REFERENCE_ITERATIONS, milestone
@@ -101,7 +102,12 @@ class Interrupted(ClearError):
 
 @dataclass(slots=True)
 class TrainState:
-    """Everything that changes while training. `t` is the iteration to come, from 1."""
+    """Everything that changes while training, on the device where the views lie.
+
+    Args:
+        t: the iteration to come, from 1.
+        history: one row an iteration; to be looked at by `told`, for on a device its numbers are read late.
+    """
 
     field: GaussianField
     conductor: Conductor
@@ -111,7 +117,7 @@ class TrainState:
     mip: MipFilter
     views: tuple[View, ...]
     t: int = 1
-    history: list[dict[str, float]] = field(default_factory=list)
+    history: list[dict[str, Number]] = field(default_factory=list)
     fused: FusedStep | None = None
     economy: Economy = field(default_factory=Economy)
 
@@ -127,13 +133,18 @@ class TrainState:
         mip: MipFilter,
         skips: Skips | None = None,
     ) -> TrainState:
-        """The state before the first iteration; milestones in the settings are already those of this run."""
-        theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree)
+        """The state before the first iteration, where the scene's views lie; milestones in the settings are already those
+        of this run.
+        """
+        device = scene.device
+        theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
         extent = cameras_extent(torch.stack([view.hr.camera.center.float() for view in scene.train]))
         white = all(c == 1.0 for c in scene.background)
-        control = density.densifier(len(theta), extent=extent, seed=settings.seed, white_background=white)
+        control = density.densifier(
+            len(theta), extent=extent, seed=settings.seed, white_background=white, device=device
+        )
         optimizer = Adam(theta.raw(), rates, extent)
-        conductor.on_fit_start(len(scene.train), settings.seed)
+        conductor.on_fit_start(len(scene.train), settings.seed, device)
         fused = fused_step(conductor, optimizer, settings.fused)
         state = cls(
             theta, conductor, optimizer, control, settings, mip, scene.train, fused=fused, economy=Economy(skips)
@@ -145,7 +156,22 @@ class TrainState:
         """The view of this iteration: every view once, in random order, then again in another."""
         epoch, position = divmod(self.t - 1, len(self.views))
         generator = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + epoch)
-        return self.views[int(torch.randperm(len(self.views), generator=generator)[position])]
+        order = torch.randperm(len(self.views), generator=generator, device=generator.device)
+        return self.views[int(order[position])]
+
+    @property
+    def device(self) -> torch.device:
+        """Where the field lies, and everything else per Gaussian or pixel."""
+        return self.field.means.device
+
+    def told(self) -> Sequence[dict[str, float]]:
+        """The history, all of it read."""
+        return late.settle(self.history)
+
+    @property
+    def seconds(self) -> float:
+        """Of training, until the last iteration, whoever trained."""
+        return self.told()[-1]["seconds"] if self.history else 0.0
 
     @property
     def ended(self) -> bool:
@@ -190,10 +216,12 @@ class TrainState:
         ):
             tensors |= {f"{prefix}/{name}": value for name, value in table.items()}
         facts = {"optimizer_steps": float(self.optimizer.steps), "degree": float(self.field.degree)}
-        return Checkpoint(self.t, tensors, config, facts, self.history, self.conductor.ledger.state_dict())
+        return Checkpoint(
+            self.t, tensors, config, facts, list(self.told()), self.conductor.ledger.state_dict(), self.device.type
+        )
 
     def restore(self, saved: Checkpoint, source: Path) -> None:
-        """Go on from a checkpoint.
+        """Go on from a checkpoint, whatever device it was made on.
 
         Raises:
             DataError: its tensors do not belong to this run.
@@ -203,9 +231,9 @@ class TrainState:
             prefix, _, rest = name.partition("/")
             tables.setdefault(prefix, {})[rest] = value
         try:
-            parameters = tables["field"]
-            self.field = GaussianField(parameters, degree=int(saved.facts["degree"]))
-            self.field.filter_3d = parameters["filter_3d"].clone()
+            parameters, device = tables["field"], self.device
+            self.field = GaussianField(parameters, degree=int(saved.facts["degree"])).to(device)
+            self.field.filter_3d = parameters["filter_3d"].to(device, copy=True)
             self.optimizer.load_state_dict(tables["optimizer"], int(saved.facts["optimizer_steps"]))
             self.density.load_state_dict(tables["density"])
             self.conductor.load_state_dict(tables.get("strategies", {}))
@@ -215,7 +243,7 @@ class TrainState:
                 source, "tensors", f"do not fit this run ({error})", "resume with the run's own config"
             ) from error
         self.t = saved.t
-        self.history = list(saved.history)
+        self.history = [dict(row) for row in saved.history]
 
 
 def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
@@ -283,12 +311,13 @@ def fit(
             return None
         return checkpoint.save(checkpoints, state.checkpoint(config or {}), keep=settings.keep)
 
-    began = time.perf_counter() - (state.history[-1]["seconds"] if state.history else 0.0)
+    began = time.perf_counter() - state.seconds
     with _deferred_signals() as pending, cores(state, rasterizer):
         ended = state.ended
         while not ended:
+            done = state.t
             iterate(state, rasterizer)
-            done, ended = int(state.history[-1]["t"]), state.ended
+            ended = state.ended
             state.history[-1]["seconds"] = time.perf_counter() - began
             if settings.probe_every and (done % settings.probe_every == 0 or ended):
                 with state.conductor.ledger.stage("probe test views"):
@@ -304,25 +333,29 @@ def fit(
                 save()
     _require_finite(state)
     save()
+    state.told()
     return state
 
 
-def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, float]:
+def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Number]:
     """One line of the history."""
-    row = {
+    row: dict[str, Number] = {
         "t": float(s.t),
         "lambda_hr": s.conductor.objective.lambda_hr(s.t),
         "psnr_train_lr": _psnr(lr_image, view.lr.image),
         "n_gaussians": float(len(s.field)),
-        "detail_abs": float(s.field.detail.data.abs().mean()),
+        "detail_abs": late.number(s.field.detail.data.abs().mean()),
     }
     row |= {f"loss_{name}": value for name, value in u.losses.items()}
     row |= {("conflict" if group == "gaussian" else f"conflict_{group}"): share for group, share in u.conflict.items()}
     return row | dict(u.readings)
 
 
-def _psnr(image: Tensor, target: Tensor) -> float:
-    mse = float((image.clamp(0, 1) - target).square().mean())
+def _psnr(image: Tensor, target: Tensor) -> Number:
+    return late.made(_decibels, late.number((image.clamp(0, 1) - target).square().mean()))
+
+
+def _decibels(mse: float) -> float:
     return -10 * math.log10(max(mse, 1e-10))
 
 
@@ -332,7 +365,7 @@ def _probe(state: TrainState, scene: Scene, rasterizer: Rasterizer) -> float | N
     for view in scene.test[: state.settings.probe_views]:
         if view.truth is not None:
             values.append(_psnr(state.field.render(rasterizer, view.hr.camera), view.truth))
-    return sum(values) / len(values) if values else None
+    return sum(late.read(values)) / len(values) if values else None
 
 
 def _require_finite(state: TrainState) -> None:

@@ -5,16 +5,21 @@ margin, Gaussian by Gaussian and group by group; LR gradients are never changed.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+import math
+import operator
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final, Literal
+from functools import partial
+from typing import ClassVar, Final, Literal, overload
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from clear_strategies import late
 from clear_strategies.evidence import Evidence
 from clear_strategies.gradients import CONFLICT_GROUPS, Grads, row_dot, row_norm, scale_rows
+from clear_strategies.late import Number, Scalar
 from clear_strategies.strategy import Strategy
 
 _log = logging.getLogger(__name__)
@@ -84,17 +89,17 @@ class GCO(Strategy):
         g_lr, g_hr = lr[group], hr[group]
         dot, n_lr, n_hr = row_dot(g_lr, g_hr), row_norm(g_lr), row_norm(g_hr)
         both = (n_lr > 0) & (n_hr > 0)
-        compared = int(both.sum())
-        means = (float(n_lr[both].mean()), float(n_hr[both].mean())) if compared else (0.0, 0.0)
-        eps_cos, eps_corr = self.epsilons(*means)
+        eps_cos, eps_corr = self.epsilons(late.mean(n_lr, both), late.mean(n_hr, both))
         n = n_lr * n_hr
         c = torch.where(n > 0, dot / (n + eps_cos).clamp_min(_TINY), 0.0)  # Eq. 6
         conflict = c < -self.tolerance
         if group == "quats":
             conflict &= ~(_turns_nothing(lr) | _turns_nothing(hr))
 
-        # Only the rows in conflict are touched; every other row is handed back bit for bit.
-        i = conflict.nonzero()[:, 0]
+        # Only the rows in conflict are touched; every other row is handed back bit for bit. They are picked out where that
+        # makes nobody wait; elsewhere all rows are corrected, and the others put back.
+        i = conflict.nonzero()[:, 0] if late.at_once(conflict) else slice(None)
+        hit = conflict[i]
         q = evidence.reliability[i].double() if evidence is not None else 0.0
         s = ((-c[i] - self.tolerance) / (1 - self.tolerance)).clamp(0, 1)
         omega = s * (1 - q)  # Eq. 11
@@ -106,56 +111,68 @@ class GCO(Strategy):
         else:
             step = -(omega * coefficient).abs().clamp(self.weight_min, self.weight_max)
         corrected = g_hr.clone()
-        corrected[i] = (g_hr[i].double() - scale_rows(g_lr[i].double(), step)).to(g_hr.dtype)  # Eq. 7
-        at_bound = int((omega <= self.weight_min).sum())
-        return corrected, Correction(group, compared, len(i), float(omega.sum()), at_bound, self.margin(n, eps_cos))
+        moved = (g_hr[i].double() - scale_rows(g_lr[i].double(), step)).to(g_hr.dtype)  # Eq. 7
+        corrected[i] = torch.where(hit.view(-1, *[1] * (moved.dim() - 1)), moved, corrected[i])
+        at_bound = hit & (omega <= self.weight_min)
+        compared, touched, bound = (late.number(rows.sum()) for rows in (both, conflict, at_bound))
+        return corrected, Correction(group, compared, touched, late.total(omega, hit), bound, self.margin(n, eps_cos))
 
-    def epsilons(self, mean_lr: float, mean_hr: float) -> tuple[float, float]:
+    @overload
+    def epsilons(self, mean_lr: float, mean_hr: float) -> tuple[float, float]: ...
+
+    @overload
+    def epsilons(self, mean_lr: Scalar, mean_hr: Scalar) -> tuple[Scalar, Scalar]: ...
+
+    def epsilons(self, mean_lr: Scalar, mean_hr: Scalar) -> tuple[Scalar, Scalar]:
         """ε of the cosine and of the correction, both in the unit gradient², from the mean norms of what is compared."""
         kind, value = _parse_eps(self.eps)
         if kind == "absolute":
             return value, value
         return value * mean_lr * mean_hr, value * mean_lr**2
 
-    def margin(self, product: Float[Tensor, " N"], eps: float) -> float | None:
-        """The median of ‖g_LR‖‖g_HR‖ over an absolute ε; None where ε is relative, or nothing is compared."""
-        compared = product > 0
-        if _parse_eps(self.eps)[0] != "absolute" or eps == 0 or not bool(compared.any()):
+    def margin(self, product: Float[Tensor, " N"], eps: Scalar) -> Number | None:
+        """The median of ‖g_LR‖‖g_HR‖ over an absolute ε, NaN where nothing is compared; None where ε is relative, or 0."""
+        if _parse_eps(self.eps)[0] != "absolute" or eps == 0:
             return None
-        return float(product[compared].median()) / eps
+        return late.made(operator.truediv, late.median(product, product > 0), eps)
 
     def report(self, done: Sequence[Correction], evidence: Evidence | None) -> None:
         """Put what was done into `readings`, and say what makes GCO idle."""
-        compared, corrected = sum(c.compared for c in done), sum(c.corrected for c in done)
-        self.readings["corrected"] = corrected / compared if compared else float("nan")
-        self.readings["mean_omega"] = sum(c.omega for c in done) / corrected if corrected else float("nan")
+        compared, corrected, omega, at_bound = (
+            late.made(late.added, *(getattr(c, name) for c in done))
+            for name in ("compared", "corrected", "omega", "at_lower_bound")
+        )
+        self.readings["corrected"] = late.made(late.ratio, corrected, compared)
+        self.readings["mean_omega"] = late.made(late.ratio, omega, corrected)
         for c in done:
-            self.readings[f"corrected_{c.group}"] = c.corrected / c.compared if c.compared else float("nan")
-        self._warn_of_epsilon(done)
-        if corrected and evidence is not None and self.weight_min > 0:
-            at_bound = sum(c.at_lower_bound for c in done) / corrected
-            self.readings["omega_at_lower_bound"] = at_bound
-            if at_bound > _INACTIVE_SHARE and self._first("inactive"):
-                _log.info(
-                    "GCO is inactive: omega sits at its lower bound %g in %.0f %% of the corrections, because the "
-                    "prior agrees with the LR images (reliability near 1).", self.weight_min, 100 * at_bound,
-                )  # fmt: skip
+            margin = math.nan if c.margin is None else c.margin
+            share = partial(self._share_of_group, c.group)
+            self.readings[f"corrected_{c.group}"] = late.made(share, c.corrected, c.compared, margin)
+        if corrected != 0 and evidence is not None and self.weight_min > 0:
+            self.readings["omega_at_lower_bound"] = late.made(self._share_at_bound, at_bound, corrected)
 
-    def _warn_of_epsilon(self, done: Iterable[Correction]) -> None:
+    def _share_of_group(self, group: str, corrected: float, compared: float, margin: float) -> float:
         """Below 20 ε a conflict loses strength; below τ/(1 - τ) ε none can be seen at all (STRESS §2.1)."""
-        for c in done:
-            if c.margin is None:
-                continue
-            if c.margin < self.tolerance / (1 - self.tolerance) and self._first(f"eps cannot {c.group}"):
-                _log.warning(
-                    "GCO cannot fire for %s: the median of |g_LR||g_HR| is %.2g of eps=%s. Use eps=relative:1e-12.",
-                    c.group, c.margin, self.eps,
-                )  # fmt: skip
-            elif c.margin < 20 and self._first(f"eps weak {c.group}"):
-                _log.warning(
-                    "GCO is weakened for %s: the median of |g_LR||g_HR| is only %.2g times eps=%s.",
-                    c.group, c.margin, self.eps,
-                )  # fmt: skip
+        if margin < self.tolerance / (1 - self.tolerance) and self._first(f"eps cannot {group}"):
+            _log.warning(
+                "GCO cannot fire for %s: the median of |g_LR||g_HR| is %.2g of eps=%s. Use eps=relative:1e-12.",
+                group, margin, self.eps,
+            )  # fmt: skip
+        elif margin < 20 and self._first(f"eps weak {group}"):
+            _log.warning(
+                "GCO is weakened for %s: the median of |g_LR||g_HR| is only %.2g times eps=%s.",
+                group, margin, self.eps,
+            )  # fmt: skip
+        return late.ratio(corrected, compared)
+
+    def _share_at_bound(self, at_bound: float, corrected: float) -> float:
+        share = late.ratio(at_bound, corrected)
+        if share > _INACTIVE_SHARE and self._first("inactive"):
+            _log.info(
+                "GCO is inactive: omega sits at its lower bound %g in %.0f %% of the corrections, because the "
+                "prior agrees with the LR images (reliability near 1).", self.weight_min, 100 * share,
+            )  # fmt: skip
+        return share
 
     def _first(self, what: str) -> bool:
         said = what in self.cache
@@ -170,11 +187,11 @@ class Correction:
     """
 
     group: str
-    compared: int
-    corrected: int
-    omega: float
-    at_lower_bound: int
-    margin: float | None
+    compared: Number
+    corrected: Number
+    omega: Number
+    at_lower_bound: Number
+    margin: Number | None
 
 
 _TINY: Final = torch.finfo(torch.float64).tiny

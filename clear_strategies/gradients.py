@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final, Protocol, runtime_checkable
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from clear_strategies import late
+from clear_strategies.late import Number
 
 ATTRIBUTES: Final = ("means", "quats", "scales", "opacities", "sh0", "shN", "detail")
 """gsplat's names for the raw parameters (log scales, logit opacities), and the detail feature f_det."""
@@ -77,13 +81,13 @@ def row_norm(a: Float[Tensor, "N ..."]) -> Float[Tensor, " N"]:
     return row_dot(a, a).sqrt()
 
 
-def conflict_ratio(lr: Grads, hr: Grads) -> dict[str, float]:
+def conflict_ratio(lr: Grads, hr: Grads) -> dict[str, Number]:
     """Share of Gaussians whose LR and HR gradients point apart (cosine < 0), by group and for the groups together.
 
     Counted among Gaussians where neither gradient is zero: invisible and dropped ones have no say (METHOD, F38, F42).
     "gaussian" is one decision per Gaussian over its concatenated groups. NaN where nothing could be compared.
     """
-    shares: dict[str, float] = {}
+    shares: dict[str, Number] = {}
     dot: Tensor | float = 0.0
     norms: list[Tensor | float] = [0.0, 0.0]
     for group in CONFLICT_GROUPS:
@@ -98,13 +102,12 @@ def conflict_ratio(lr: Grads, hr: Grads) -> dict[str, float]:
     return shares
 
 
-def _share_below_zero(dot: Tensor, l2: Tensor, h2: Tensor) -> float:
+def _share_below_zero(dot: Tensor, l2: Tensor, h2: Tensor) -> Number:
     comparable = (l2 > 0) & (h2 > 0)
-    count = int(comparable.sum())
-    return int(((dot < 0) & comparable).sum()) / count if count else float("nan")
+    return late.made(late.ratio, late.number(((dot < 0) & comparable).sum()), late.number(comparable.sum()))
 
 
 def to_ndc(screen: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor, "N 2"]:
     """∇_u in NDC from ∇_u in pixels of an image of `size` (width, height)."""
     width, height = size
-    return screen * screen.new_tensor((width / 2, height / 2))
+    return torch.stack((screen[:, 0] * (width / 2), screen[:, 1] * (height / 2)), dim=1)

@@ -59,9 +59,9 @@ def relocation(
     n = copies.clamp(1, _MOST_COPIES)
     o = opacities.double()
     shared = -torch.expm1(torch.log1p(-o) / n)
-    j = torch.arange(1, _MOST_COPIES + 1, dtype=torch.float64)
+    j = torch.arange(1, _MOST_COPIES + 1, dtype=torch.float64, device=o.device)
     signs = 1 - 2 * ((j - 1) % 2)
-    total = (_BINOMIALS[n, 1:] * signs * shared[:, None] ** j / j.sqrt()).sum(-1)
+    total = (_BINOMIALS.to(o.device)[n, 1:] * signs * shared[:, None] ** j / j.sqrt()).sum(-1)
     return shared.to(opacities), scales * (o / total).to(scales)[:, None]
 
 

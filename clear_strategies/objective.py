@@ -11,8 +11,9 @@ from typing import Literal, NamedTuple, get_args
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies import kernels
+from clear_strategies import kernels, late
 from clear_strategies.kernels import Choice, LossAndGradient
+from clear_strategies.late import Scalar
 from clear_strategies.schedules import WarmupDecay
 
 LowFrom = Literal["lr", "hr"]
@@ -21,7 +22,7 @@ LowFrom = Literal["lr", "hr"]
 class Losses(NamedTuple):
     """Scalars by name, and the cotangents of one image in the order of the names."""
 
-    values: Mapping[str, float]
+    values: Mapping[str, Scalar]
     cotangents: Float[Tensor, "K H W 3"]
 
 
@@ -107,4 +108,4 @@ class Objective:
     ) -> Losses:
         if self.clamp_render:
             cotangents *= (image >= 0) & (image <= 1)
-        return Losses({name: float(loss.value) for name, loss in losses.items()}, cotangents)
+        return Losses({name: late.number(loss.value) for name, loss in losses.items()}, cotangents)

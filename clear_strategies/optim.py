@@ -78,8 +78,7 @@ class Adam:
             params["detail"].mul_(1 - self.rates.detail_decay)
         for name, p in params.items():
             m, v, g = self.first[name], self.second[name], grads.get(name)
-            if rows is not None:
-                before = p[~rows], m[~rows], v[~rows]
+            before = None if rows is None else (p.clone(), m.clone(), v.clone())
             m.mul_(BETA1)
             v.mul_(BETA2)
             if g is not None:
@@ -87,8 +86,10 @@ class Adam:
                 v.addcmul_(g, g, value=1 - BETA2)
             denominator = (v / bias2).sqrt_().add_(self.rates.eps)
             p.addcdiv_(m, denominator, value=-rates[name])
-            if rows is not None:
-                p[~rows], m[~rows], v[~rows] = before
+            if rows is not None and before is not None:
+                stepped = rows.view(-1, *[1] * (p.dim() - 1))
+                for now, then in zip((p, m, v), before, strict=True):
+                    torch.where(stepped, now, then, out=now)
 
     def advance(self) -> tuple[dict[str, float], float]:
         """Count a step: every attribute's rate over the bias of the first moment, and the bias of the second."""
@@ -115,5 +116,7 @@ class Adam:
 
     def load_state_dict(self, tensors: Mapping[str, Tensor], steps: int) -> None:
         self.steps = steps
-        self.first = {name: tensors[f"first.{name}"].clone() for name in self.first}
-        self.second = {name: tensors[f"second.{name}"].clone() for name in self.second}
+        self.first, self.second = (
+            {name: tensors[f"{kind}.{name}"].to(rows.device, copy=True) for name, rows in moments.items()}
+            for kind, moments in (("first", self.first), ("second", self.second))
+        )

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies import late
 from clear_strategies.evidence import Evidence, Lookup, Outside, lift
 from clear_strategies.gradients import Shot
 from clear_strategies.images import DownKernel, UpKernel, downsample, patch_means, upsample
@@ -82,8 +83,8 @@ class P2G(Strategy):
         u = hr.means2d / view.factor  # patches live on the LR grid
         q = lift(R, u, hr.visible, self.patch, size, self.lookup, self.outside)
         a = lift(A, u, hr.visible, self.patch, size, self.lookup, self.outside)
-        self.readings["mean_q"] = float(q[hr.visible].mean()) if bool(hr.visible.any()) else float("nan")
-        self.readings["mean_w"] = float((q * a)[hr.visible].mean()) if bool(hr.visible.any()) else float("nan")
+        self.readings["mean_q"] = late.mean(q, hr.visible)
+        self.readings["mean_w"] = late.mean(q * a, hr.visible)
         return Evidence(q, a)
 
     def route(self, evidence: Evidence | None) -> Float[Tensor, " N"]:

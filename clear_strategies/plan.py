@@ -5,9 +5,13 @@ from __future__ import annotations
 import logging
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Final
+
+import torch
 
 from clear_strategies.data.view import Scene
 from clear_strategies.fit import Progress, TrainState
@@ -15,6 +19,8 @@ from clear_strategies.schedules import milestones
 from clear_strategies.svs import SVS
 
 _log = logging.getLogger(__name__)
+
+_LOOK_EVERY: Final = 0.25  # seconds between two looks at the numbers for the bar: on a device each look waits
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +45,7 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, *, rasterizer: str
         **scene.notes,
         **({} if chosen.method is None else {"method": f"{chosen.method}; strategies named before it take no part"}),
         "strategies": strategies or ("none (the paper's baseline)" if chosen.method is None else "none"),
+        "device": _named(state.device),
         "rasterizer": rasterizer,
         "threads": threads,
         "per-Gaussian pass": "readable" if state.fused is None else "compiled",
@@ -75,6 +82,10 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, *, rasterizer: str
     return "\n".join(f"  {label:<{width}}  {text}" for label, text in lines.items())
 
 
+def _named(device: torch.device) -> str:
+    return f"{device.type}, {torch.cuda.get_device_name(device)}" if device.type == "cuda" else device.type
+
+
 def marks(state: TrainState) -> dict[str, int]:
     """The milestones worth a mark on a curve."""
     hr = state.conductor.objective.lambda_hr
@@ -100,9 +111,9 @@ def progress(state: TrainState, watch: Callable[[], None] | None = None) -> Iter
         logging_redirect_tqdm(),
         tqdm(total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=every) as bar,
     ):
+        looked = -math.inf
 
-        def update(state: TrainState) -> None:
-            row = state.history[-1]
+        def look(row: Mapping[str, float]) -> None:
             λ_lr, λ_hr = state.conductor.objective.lambda_lr, row["lambda_hr"]
             shown["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
             shown["N"] = f"{int(row['n_gaussians']):,}"
@@ -111,6 +122,13 @@ def progress(state: TrainState, watch: Callable[[], None] | None = None) -> Iter
             if "psnr_test" in row:
                 shown["psnr"] = f"{row['psnr_test']:.2f} dB"
             bar.set_postfix(shown, refresh=False)
+
+        def update(state: TrainState) -> None:
+            nonlocal looked
+            telling = state.ended or "psnr_test" in state.history[-1]
+            if telling or time.monotonic() - looked >= _LOOK_EVERY:
+                look(state.told()[-1])
+                looked = time.monotonic()
             bar.update(1)
             if watch is not None:
                 watch()

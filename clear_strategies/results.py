@@ -40,14 +40,15 @@ def leave(
     """Evaluate, write everything, say the scores; returns the mean PSNR of the test views.
 
     Args:
-        down: D, which made the LR images. map_views: training views of which maps are left, at most.
+        scene: on the CPU, wherever the field is. down: D, which made the LR images.
+        map_views: training views of which maps are left, at most.
         seconds: of training. config: kept in metrics.json, for whoever finds the finished run.
     """
-    field, ledger = state.field, state.conductor.ledger
+    field, ledger, history = state.field, state.conductor.ledger, state.told()
     with ledger.stage("evaluate"):
-        evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera), down=down)
+        evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera).cpu(), down=down)
     with ledger.stage("maps"):
-        mapped = pictures.evenly(scene.train, map_views)
+        mapped = pictures.evenly(state.views, map_views)
         if mapped:
             diagnosis.leave(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
     export_ply(folder / "point_cloud.ply", field)
@@ -62,17 +63,17 @@ def leave(
     if scene.synthetic_prior:
         title += " · SYNTHETIC prior"
     pictures.contact_sheet(folder / "contact_sheet.png", _sheet(scene, evaluation), title)
-    pictures.curves(folder / "curves.png", state.history, marks(state), title)
+    pictures.curves(folder / "curves.png", history, marks(state), title)
 
-    columns = list(dict.fromkeys(key for row in state.history for key in row))
-    files.write_csv(folder / "history.csv", state.history, columns)
+    columns = list(dict.fromkeys(key for row in history for key in row))
+    files.write_csv(folder / "history.csv", history, columns)
     shares = [
         "conflict",
         *(c for c in columns if c.startswith("conflict_")),
         *(c for c in columns if c.startswith("corrected")),
     ]
     readings = [c for c in ("mean_q", "mean_w", "mean_omega") if c in columns]
-    compared = [row for row in state.history if "conflict" in row]
+    compared = [row for row in history if "conflict" in row]
     files.write_csv(folder / "conflict.csv", compared, ["t", *dict.fromkeys(shares), *readings])
     files.write_csv(
         folder / "timing.csv", ledger.rows(), ["stage", "runs", "ms_each", "seconds", "skipped", "seconds_saved", "why"]

@@ -36,6 +36,7 @@ _log = logging.getLogger(__name__)
 # What may differ between a run and the one it resumes.
 _NOT_COMPARED: Final = {
     "fit.resume",
+    "fit.device",
     "fit.threads",
     "fit.keep",
     "fit.checkpoint_every",
@@ -183,10 +184,11 @@ def _run(config: DictConfig, folder: Path) -> float | None:
     if config.data.save_lr is not None:
         save_lr(scene, Path(config.data.save_lr))
         return None
-    rasterizer, backend = _rasterizer(config, scene.background)
+    rasterizer, backend, device = _rasterizer(config, scene.background)
 
+    there = scene.to(device)
     state = TrainState.start(
-        scene,
+        there,
         conductor,
         settings=scaled(settings, settings.stretch),
         density=density,
@@ -205,9 +207,9 @@ def _run(config: DictConfig, folder: Path) -> float | None:
         _log.warning("%s: of an earlier run; removed, for it says that a run is finished.", folder / "metrics.json")
         (folder / "metrics.json").unlink()
     # What a run that is resumed took before counts too.
-    began = time.perf_counter() - (state.history[-1]["seconds"] if state.history else 0.0)
+    began = time.perf_counter() - state.seconds
     with plan.progress(state, _watch()) as progress:
-        fit(state, scene, rasterizer, checkpoints=folder / "checkpoints", config=compared, progress=progress)
+        fit(state, there, rasterizer, checkpoints=folder / "checkpoints", config=compared, progress=progress)
     seconds = time.perf_counter() - began
     return results.leave(
         folder,
@@ -252,19 +254,52 @@ def _prior(config: Any, capture: Any) -> Any:
     return instantiate(config, "prior")
 
 
-def _rasterizer(config: DictConfig, background: tuple[float, float, float]) -> tuple[Any, str]:
+def _rasterizer(config: DictConfig, background: tuple[float, float, float]) -> tuple[Any, str, str]:
+    """The rasterizer, its name, and the device that it draws on and the field lies on."""
     import rasterizers
 
+    device = _device(config.fit.device)
     settings = {k: v for k, v in plain(config.rasterizer).items() if v is not None and k != "name"}
     settings.setdefault("background", background)
     settings["background"] = tuple(settings["background"])
     name = str(config.rasterizer.name)
     if name == "auto":
-        name = rasterizers.fastest("cpu")  # where the trainer keeps its field
+        name = rasterizers.fastest(device)
         for other, why_not in rasterizers.available().items():
             if why_not is not None:
                 _log.info("rasterizer %s is not available: %s", other, why_not)
-    return rasterizers.load(name, **settings), name
+    elif device is not None and "device" in config.rasterizer:  # one that draws where it is told
+        settings.setdefault("device", device)
+    rasterizer = rasterizers.load(name, **settings)
+    return rasterizer, name, _drawn_on(rasterizer.traits.devices, name, device)
+
+
+def _device(asked: str | None) -> str | None:
+    """What `fit.device` says, if it can be had."""
+    import torch
+
+    if asked not in (None, "cpu", "cuda"):
+        raise DataError("config", "fit.device", f"must be cpu, cuda or null, got {asked!r}", "null takes the best")
+    if asked == "cuda" and not torch.cuda.is_available():
+        raise DataError(
+            "config", "fit.device", "is cuda, and torch finds no CUDA device",
+            "install NVIDIA's driver and a torch built for CUDA, or take fit.device=cpu",
+        )  # fmt: skip
+    return asked
+
+
+def _drawn_on(devices: frozenset[str], name: str, asked: str | None) -> str:
+    """The device that was asked for, or else the best that this rasterizer draws on."""
+    import torch
+
+    if asked is None:
+        return "cuda" if "cuda" in devices and torch.cuda.is_available() else "cpu"
+    if asked not in devices:
+        raise DataError(
+            "config", "fit.device", f"is {asked}, and the rasterizer {name} draws on {' or '.join(sorted(devices))} alone",
+            "choose another of the two, or leave fit.device=null",
+        )  # fmt: skip
+    return asked
 
 
 def _threads(config: DictConfig) -> tuple[int, str]:
@@ -328,6 +363,11 @@ def _restore(state: Any, saved: Any, source: Path, config: Mapping[str, Any]) ->
     _require_same(source, saved.config, config)
     state.restore(saved, source)
     _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
+    if saved.device != state.device.type:
+        _log.warning(
+            "until now this run trained on %s, from here on %s: what follows is not bit for bit what would have followed.",
+            saved.device, state.device.type,
+        )  # fmt: skip
 
 
 def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:

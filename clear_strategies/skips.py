@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 from jaxtyping import Bool
 from torch import Tensor
 
-from clear_strategies import images
+from clear_strategies import images, late
 from clear_strategies.data.view import Photo, View
+from clear_strategies.late import Number
 from clear_strategies.ledger import Ledger
 from clear_strategies.schedules import milestone
 
@@ -86,7 +87,7 @@ class Economy:
     def __init__(self, skips: Skips | None = None) -> None:
         self.skips = skips if skips is not None else Skips()
         self._coarse: dict[str, View] = {}
-        self._wanted: dict[tuple[str, int], Bool[Tensor, "_ _"] | None] = {}
+        self._wanted: dict[tuple[str, int], tuple[Bool[Tensor, "_ _"], int]] = {}  # and how many are not
 
     def view(self, view: View, t: int) -> View:
         """The view as it is looked at in iteration t: with a coarse reference first, where LR divides evenly."""
@@ -112,24 +113,25 @@ class Economy:
         key = (view.name, view.factor)
         if key not in self._wanted:
             self._wanted[key] = self._with_detail(view, tile)
-        wanted = self._wanted[key]
-        if wanted is not None:
-            ledger.skip("HR tiles", "flat reference (skips.flat)", int((~wanted).sum()))
+        wanted, flat = self._wanted[key]
+        if not flat:
+            return None
+        ledger.skip("HR tiles", "flat reference (skips.flat)", flat)
         return wanted
 
-    def settled(self, history: Sequence[Mapping[str, float]], t: int) -> bool:
+    def settled(self, history: Sequence[dict[str, Number]], t: int) -> bool:
         """Whether the training views have stopped improving by iteration t, which then is followed by `plateau_to`."""
         s, window = self.skips, self.skips.plateau_window
         if s.plateau_gain == 0 or window < 1 or t % window or not s.plateau_from + 2 * window <= t < s.plateau_to:
             return False
-        rows = history[t - 2 * window : t]
+        rows = late.settle(history[t - 2 * window : t])
         column = "loss_base" if any("loss_base" in row for row in rows[window:]) else "loss_lr"
         before, now = ([row[column] for row in part if column in row] for part in (rows[:window], rows[window:]))
         if not before or not now:
             return False
         return math.fsum(now) / len(now) > (1 - s.plateau_gain) * math.fsum(before) / len(before)
 
-    def _with_detail(self, view: View, tile: int) -> Bool[Tensor, "th tw"] | None:
+    def _with_detail(self, view: View, tile: int) -> tuple[Bool[Tensor, "th tw"], int]:
         added = (view.hr.image - images.upsample(view.lr.image, view.factor)).abs()
         wanted = images.patch_means(added, tile) >= self.skips.flat
         flat = int((~wanted).sum())
@@ -137,4 +139,4 @@ class Economy:
             "%s: %d of %d HR tiles (%d px) are flat: LR alone looks after them.",
             view.name, flat, wanted.numel(), tile,
         )  # fmt: skip
-        return wanted if flat else None
+        return wanted, flat

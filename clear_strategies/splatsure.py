@@ -21,9 +21,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies import late
 from clear_strategies.evidence import Evidence
 from clear_strategies.gradients import Grads, Shot
 from clear_strategies.strategy import Strategy
+from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -76,7 +78,7 @@ class SplatSuRe(Strategy):
         name, _, visible = self.cache[_NOW]
         rows = next(iter(hr.values()))
         w = self.weight(name).to(rows) if self.state else rows.new_ones(len(rows))
-        self.readings["mean_hr_weight"] = float(w[visible].mean()) if bool(visible.any()) else float("nan")
+        self.readings["mean_hr_weight"] = late.mean(w, visible)
         return hr * w
 
     def weight(self, name: str) -> Float[Tensor, " N"]:
@@ -102,7 +104,14 @@ class SplatSuRe(Strategy):
         if _NOW not in self.cache:
             return
         name, camera, visible = self.cache.pop(_NOW)
-        pose = camera.world_to_camera.to(params["means"])
+        pose = self._pose(name, camera).to(params["means"])
         z = params["means"] @ pose[2, :3] + pose[2, 3]
         before = self.state.get(name, torch.zeros_like(z))
         self.state[name] = torch.where(visible & (z > 0), camera.fx / z, before)
+
+    def _pose(self, name: str, camera: Camera) -> Float[Tensor, "4 4"]:
+        """World to camera, where the field lies; sent there once a view."""
+        if ("pose", name) not in self.cache:
+            self.cache["pose", name] = camera.world_to_camera.to(self.device)
+        pose: Tensor = self.cache["pose", name]
+        return pose

@@ -11,11 +11,15 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.evidence import Evidence
 from clear_strategies.gradients import Grads, Shot
+from clear_strategies.late import Number
+
+_DEVICE = "device"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +44,7 @@ class Strategy:
     Args:
         state: per-Gaussian tensors [N, …] and nothing else: saved in checkpoints, gathered by `on_resize`.
         cache: whatever can be computed again (patch maps, keyed by view); never saved.
-        readings: numbers of the last iteration, for logs only.
+        readings: numbers of the last iteration, for logs only; on a device they are read late (`late.number`).
 
     Randomness must be a function of (seed, t), so that resuming needs no generator state.
     """
@@ -51,7 +55,7 @@ class Strategy:
 
     state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
     cache: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    readings: dict[str, float] = field(default_factory=dict, init=False, repr=False, compare=False)
+    readings: dict[str, Number] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
@@ -66,6 +70,17 @@ class Strategy:
         self.state.clear()
         self.cache.clear()
         self.readings.clear()
+
+    def to(self, device: torch.device | str) -> None:
+        """The field lies there: so do `state` from now on, and what is answered."""
+        self.cache[_DEVICE] = torch.device(device)
+        self.state.update({name: rows.to(device) for name, rows in self.state.items()})
+
+    @property
+    def device(self) -> torch.device:
+        """Where the field lies."""
+        device: torch.device = self.cache.get(_DEVICE, torch.device("cpu"))
+        return device
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """Before render: which Gaussians take part? z >= 0 multiplies the opacity; None: all of them.  Eq. 15"""

@@ -75,7 +75,7 @@ class SVS(Strategy):
         p = self.dropout(t)
         if p == 0:
             return None
-        return dropout_mask(n, p, self.cache.get("seed", 0), t)
+        return dropout_mask(n, p, self.cache.get("seed", 0), t, self.device)
 
     def regularize(self, params: Mapping[str, Tensor], t: int) -> Grads | None:
         """∇ λ_stab Σ_i ‖θ_i - θ_i^a‖²_W, for every Gaussian, seen or not; None before the anchor."""
@@ -133,10 +133,10 @@ class SVS(Strategy):
             )
 
 
-def dropout_mask(n: int, p: float, seed: int, t: int) -> Float[Tensor, " N"]:
-    """Bernoulli(1 - p) / (1 - p) for n Gaussians, reproducible from (seed, t).  Eq. 15"""
-    generator = torch.Generator().manual_seed(_mix(seed, t))
-    kept = torch.rand(n, generator=generator) >= p
+def dropout_mask(n: int, p: float, seed: int, t: int, device: torch.device | str = "cpu") -> Float[Tensor, " N"]:
+    """Bernoulli(1 - p) / (1 - p) for n Gaussians, drawn on `device` and reproducible there from (seed, t).  Eq. 15"""
+    generator = torch.Generator(device).manual_seed(_mix(seed, t))
+    kept = torch.rand(n, generator=generator, device=device) >= p
     return kept.to(torch.get_default_dtype()) / (1 - p)
 
 

@@ -24,10 +24,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from clear_strategies import late
 from clear_strategies.conductor import Conductor, Heard
 from clear_strategies.data.view import View
 from clear_strategies.errors import ClearError
 from clear_strategies.gradients import Grads, to_ndc
+from clear_strategies.late import Number
 from integration.bridge import AutogradShot
 from integration.densify import Scale, to_read
 
@@ -77,7 +79,7 @@ class Attachment:
         n_views, seed: for the strategies' start.
 
     Attributes:
-        t: the iteration that is under way, from 1. counts: what was done how often. log: numbers of the last iteration.
+        t: the iteration that is under way, from 1. counts: what was done how often.
     """
 
     def __init__(
@@ -102,7 +104,7 @@ class Attachment:
         self.conductor, self.accumulation = conductor, accumulation
         self.t = 1
         self.counts: Counter[str] = Counter()
-        self.log: dict[str, float] = {}
+        self._numbers: dict[str, Number] = {}
         self._params, self._rows, self._loss_scale = params, rows, loss_scale
         self._scale = None if threshold is None else Scale(threshold)
         self._n = len(params()["means"])
@@ -110,7 +112,7 @@ class Attachment:
         self._waiting: tuple[Drawing, Heard] | None = None  # drawn, not yet gone backward through
         self._before: dict[str, Tensor] = {}  # .grad when backward began
         self.removed = False
-        conductor.on_fit_start(n_views, seed)
+        conductor.on_fit_start(n_views, seed, params()["means"].device)
         if not conductor.strategies:
             _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
 
@@ -133,6 +135,11 @@ class Attachment:
             drawing.output.register_hook(self._begin)  # type: ignore[no-untyped-call]
         self.counts["LR renders"] += 1
         return drawing.returned
+
+    @property
+    def log(self) -> dict[str, float]:
+        """Numbers of the last iteration; on a device, looking waits for them."""
+        return late.settle([self._numbers])[0]
 
     def remove(self) -> None:
         """Leave the host as it was; drawings that are still under way go to it unmerged."""
@@ -208,8 +215,10 @@ class Attachment:
         self._passes += 1
         self.counts["merged"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
-        self.log = {"t": float(self.t), "lambda_hr": λ, **heard.losses, **self.conductor.readings()}
-        self.log |= {("conflict" if group == "gaussian" else f"conflict_{group}"): x for group, x in conflict.items()}
+        self._numbers = {"t": float(self.t), "lambda_hr": λ, **heard.losses, **self.conductor.readings()}
+        self._numbers |= {
+            ("conflict" if group == "gaussian" else f"conflict_{group}"): x for group, x in conflict.items()
+        }
 
     def _own(self, name: str, p: Tensor) -> Tensor:
         """This pass's part of `.grad`."""

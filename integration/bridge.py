@@ -16,6 +16,7 @@ from torch import Tensor
 
 from clear_strategies.conductor import Conductor, Update
 from clear_strategies.gradients import Grads, Shot
+from clear_strategies.late import Scalar
 from integration.densify import Scale, Screen, to_read
 
 
@@ -97,7 +98,7 @@ def joint_update(
     kept = lr.kept if scale is not None and isinstance(lr, AutogradShot) else None
     read = None if kept is None else to_read(kept, update.score, update.ordinary, lr.visible, scale)
 
-    def densify(times: float) -> None:
+    def densify(times: Float[Tensor, ""]) -> None:
         if kept is not None and read is not None:
             kept.hand_over(times * read)
 
@@ -110,12 +111,12 @@ class _GivenGradients(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, value: float, gradients: list[Tensor], densify: Callable[[float], None], *params: Tensor
+        ctx: Any, value: Scalar, gradients: list[Tensor], densify: Callable[[Tensor], None], *params: Tensor
     ) -> Tensor:
         ctx.gradients, ctx.densify = gradients, densify
-        return params[0].new_tensor(value)
+        return torch.as_tensor(value, dtype=params[0].dtype, device=params[0].device)
 
     @staticmethod
     def backward(ctx: Any, *times: Tensor) -> Any:
-        ctx.densify(float(times[0]))
+        ctx.densify(times[0])
         return None, None, None, *(g * times[0] for g in ctx.gradients)

@@ -12,7 +12,19 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = [
-    {"errors", "files", "images", "kernels", "schedules", "gradients", "evidence", "ledger", "lock", "provenance"},
+    {
+        "errors",
+        "files",
+        "images",
+        "kernels",
+        "late",
+        "schedules",
+        "gradients",
+        "evidence",
+        "ledger",
+        "lock",
+        "provenance",
+    },
     {"strategy"},
     {"gco", "p2g", "svs", "splatsure"},
     {"objective", "conductor"},

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -24,6 +25,10 @@ class Photo:
                 f"an image of {self.camera.width}x{self.camera.height} pixels has shape "
                 f"({self.camera.height}, {self.camera.width}, 3), got {found}."
             )
+
+    def to(self, device: torch.device | str) -> Photo:
+        """The same with its image on `device`; a camera stays on the CPU, whence kernels are told its numbers."""
+        return replace(self, image=self.image.to(device))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,6 +52,11 @@ class View:
     def factor(self) -> int:
         """HR pixels per LR pixel."""
         return self.hr.camera.width // self.lr.camera.width
+
+    def to(self, device: torch.device | str) -> View:
+        """The same with its images on `device`."""
+        truth = None if self.truth is None else self.truth.to(device)
+        return replace(self, lr=self.lr.to(device), hr=self.hr.to(device), truth=truth)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,3 +94,12 @@ class Scene:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     synthetic_prior: bool = False
     notes: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the training views' images lie, and whatever is trained on them."""
+        return self.train[0].lr.image.device
+
+    def to(self, device: torch.device | str) -> Scene:
+        """The same with all views on `device`; the cloud stays, for it is looked at once, on the CPU."""
+        return replace(self, train=tuple(v.to(device) for v in self.train), test=tuple(v.to(device) for v in self.test))

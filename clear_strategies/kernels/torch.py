@@ -142,6 +142,6 @@ def _mean_along(maps: Float[Tensor, "... H W"], dim: int) -> Float[Tensor, "... 
 
 @lru_cache(maxsize=1)
 def _gaussian_window() -> tuple[float, ...]:
-    offsets = torch.arange(_WINDOW, dtype=torch.float64) - _WINDOW // 2
+    offsets = torch.arange(_WINDOW, dtype=torch.float64, device="cpu") - _WINDOW // 2
     weights = torch.exp(-0.5 * (offsets / _SIGMA) ** 2)
     return tuple((weights / weights.sum()).tolist())
