@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 _QUESTIONS: Final = {
     "rasterizers": "time, memory and error of every backend at every preset",
-    "kernels": "image losses with their gradients, ours and everyone's",
+    "kernels": "image losses with their gradients and the per-Gaussian pass, ours and everyone's",
     "iteration": "one iteration of training, stage by stage",
     "pareto": "seconds against PSNR and SSIM of whole trainings",
 }
@@ -72,11 +72,12 @@ def _measure(options: argparse.Namespace) -> tuple[Findings, Draw | None]:
     if options.threads is not None:
         torch.set_num_threads(options.threads)
     if options.question == "kernels":
-        return kernels.measure(options.size, options.repeats, _log.info), None
+        losses = kernels.Request(options.size, options.repeats, options.device, options.gaussians, _floors(options))
+        return kernels.measure(losses, _log.info), None
     if options.question == "iteration":
         one = iteration.Request(
             options.scene, options.strategy, options.backend, options.preset, options.repeats,
-            options.data, options.prototype,
+            options.data, options.prototype, options.device, _floors(options),
         )  # fmt: skip
         return iteration.measure(one, _log.info), None
     if options.question == "pareto":
@@ -88,10 +89,14 @@ def _measure(options: argparse.Namespace) -> tuple[Findings, Draw | None]:
         return findings, lambda path: time_against_quality(path, trained, findings.sections[0].title)
     request = rasterizers.Request(
         options.scene, options.backend, options.preset, options.repeats, options.limit,
-        options.device, options.data, options.prototype, options.memory,
+        options.device, options.data, options.prototype, options.memory, _floors(options),
     )  # fmt: skip
     findings, drawn = rasterizers.measure(request, _log.info)
     return findings, lambda path: time_against_error(path, drawn)
+
+
+def _floors(options: argparse.Namespace) -> bool:
+    return options.device == "cuda" if options.floors is None else bool(options.floors)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -105,6 +110,12 @@ def _parser() -> argparse.ArgumentParser:
 
     turns = _Parser(add_help=False)
     turns.add_argument("--repeats", type=_positive, default=9, metavar="N", help="turns of each (default 9)")
+
+    turns.add_argument("--device", default="cpu", choices=["cpu", "cuda"], help="default: cpu")
+    turns.add_argument(
+        "--floors", action=argparse.BooleanOptionalAction,
+        help="how near each stage comes to the device's bandwidth and arithmetic (default: on CUDA)",
+    )  # fmt: skip
 
     splats = _Parser(add_help=False)
     splats.add_argument("--data", type=Path, metavar="PATH", help="the garden's .npz, or its folder")
@@ -120,12 +131,15 @@ def _parser() -> argparse.ArgumentParser:
     ask.add_argument("--backend", nargs="+", metavar="NAME", help="default: all that run here")
     ask.add_argument("--preset", nargs="+", default=list(PRESETS), choices=list(PRESETS), help="default: all")
     ask.add_argument("--limit", type=_seconds, default=180.0, metavar="S", help="skip what would take longer (180 s)")
-    ask.add_argument("--device", default="cpu", choices=["cpu", "cuda"], help="default: cpu")
     ask.add_argument("--no-memory", dest="memory", action="store_false", help="do not measure peak memory")
     ask.add_argument("--picture", type=Path, metavar="FILE", help="PNG: time against error")
 
     ask = questions.add_parser("kernels", parents=[common, turns], help=_QUESTIONS["kernels"])
     ask.add_argument("--size", nargs="+", default=list(SIZES), metavar="WxH", help=f"default: {' '.join(SIZES)}")
+    ask.add_argument(
+        "--gaussians", nargs="*", type=_positive, default=[100_000, 500_000], metavar="N",
+        help="time the per-Gaussian pass of so many, too (default: 100000 500000)",
+    )  # fmt: skip
 
     ask = questions.add_parser("iteration", parents=[common, turns, splats], help=_QUESTIONS["iteration"])
     ask.add_argument("--scene", default="s100k", metavar="SCENE", help="as above; HR is its image (default: s100k)")

@@ -72,19 +72,19 @@ def compare(found: Picture, truth: Picture) -> Errors:
     return Errors(image, relative, median)
 
 
-def oracle_backend(device: str) -> str | None:
-    """The fastest backend here that computes in float64."""
+def oracle_backend() -> str | None:
+    """The fastest backend here that computes in float64, on whichever device."""
     for name, why_not in rasterizers.available().items():
-        if why_not is None:
-            traits = rasterizers.load(name).traits
-            if torch.float64 in traits.dtypes and device in traits.devices:
-                return name
+        if why_not is None and torch.float64 in rasterizers.load(name).traits.dtypes:
+            return name
     return None
 
 
-def oracle(backend: str, splats: Splats, camera: Camera, cotangent: Tensor, cuts: Mapping[str, float]) -> Picture:
-    """The truth at some cut-offs."""
-    settings: dict[str, Any] = {**SETTINGS, **cuts}
+def oracle(backend: str, splats: Splats, camera: Camera, cotangent: Tensor, rules: Mapping[str, Any]) -> Picture:
+    """The truth by some rules: cut-offs, and whatever else is not as in `SETTINGS`."""
+    rasterizer = rasterizers.load(backend, **{**SETTINGS, **rules})
+    here = splats.means.device.type
+    device = here if here in rasterizer.traits.devices else "cpu"
     tensors = {f.name: getattr(splats, f.name) for f in fields(splats)}
-    wide = replace(splats, **{name: t.double() for name, t in tensors.items() if t is not None})
-    return draw(rasterizers.load(backend, **settings), wide, camera, cotangent.double())
+    wide = replace(splats, **{name: t.to(device, torch.float64) for name, t in tensors.items() if t is not None})
+    return draw(rasterizer, wide, camera, cotangent.double())

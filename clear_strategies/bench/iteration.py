@@ -1,22 +1,25 @@
-"""How long does one iteration of training take, stage by stage, and what would it cost without the HR scale?"""
+"""How long does one iteration of training take, stage by stage, and what would it cost without L_HF, and without HR?"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import torch
 from torch import Tensor
 
 import rasterizers
 from clear_strategies import images
-from clear_strategies.bench import scenes
+from clear_strategies.bench import counting, scenes
+from clear_strategies.bench.counting import Cost
 from clear_strategies.bench.output import UNKNOWN, Findings, Section, number, times
+from clear_strategies.bench.peaks import Peaks, attained
 from clear_strategies.bench.prototype import Prototype, started
-from clear_strategies.bench.rasterizers import noise, usable
-from clear_strategies.bench.rounds import Contender, Milliseconds, bar, interleaved, medians, milliseconds
+from clear_strategies.bench.rasterizers import noise, require_device, usable
+from clear_strategies.bench.rounds import WARM_UPS, Contender, Milliseconds, bar, interleaved, medians, milliseconds
 from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.conductor import Conductor
 from clear_strategies.data.view import Photo, View
@@ -57,8 +60,15 @@ STRATEGIES: Final[Mapping[str, Callable[[], tuple[Strategy, ...]]]] = {
     "svs": lambda: (_svs(),),
     "clear": lambda: (GCO(), _p2g(), _svs()),
 }
+STILL: Final = LearningRates(LogLinear(1e-30, 1e-30), *(0.0,) * 6, detail_decay=0.002)
+"""Adam does all its work, and the scene stays what it is, turn after turn."""
+
+TARGETS: Final[Mapping[tuple[int, int], float]] = {(1008, 756): 6.0, (2016, 1512): 12.0}
+"""Milliseconds of a full iteration of 100,000 to 300,000 Gaussians on a GPU of the H200's class, by the size of HR."""
+
 _TOTAL, _REST = "total", "everything else"
-_LR_ONLY: Final = "LR only"
+_WITHOUT_HF, _LR_ONLY = "K=1 (no L_HF)", "LR only"
+_TOGETHER: Final = {"cpu": 1, "cuda": 16}  # iterations of a turn: on CUDA one is launched while the last is computed
 _PEER: Final = "prototype, plain HR forward + backward"
 _NOISE: Final = 0.02  # of the photos, in image units
 
@@ -74,22 +84,20 @@ class Request:
     repeats: int
     data: Path | None = None
     prototype: Path | None = None
+    device: str = "cpu"
+    floors: bool = False
 
 
 class Training:
-    """A run in its middle, t_a behind it: HR at full weight, dropout, evidence, correction and anchor are all on.
-
-    The learning rates are 0: Adam does all its work and the scene stays what it is, turn after turn.
-    """
+    """A run in its middle, t_a behind it: HR at full weight, dropout, evidence, correction and anchor are all on."""
 
     def __init__(self, workload: Workload, view: View, rasterizer: Rasterizer, conductor: Conductor) -> None:
         field = field_of(workload.splats)
         # Held from turning off after t_a, so that statistics are gathered; rounds of densification come too rarely.
         density = Density(DensitySettings(stop=10_000), len(field), extent=1.0, seed=0)
-        rates = LearningRates(LogLinear(1e-30, 1e-30), *(0.0,) * 6, detail_decay=0.002)
         settings = FitSettings(degree_every=1)
         conductor.on_fit_start(1, 0)
-        optimizer = Adam(field.raw(), rates, 1.0)
+        optimizer = Adam(field.raw(), STILL, 1.0)
         self.state = TrainState(
             field, conductor, optimizer, density, settings, MipFilter(), (view,),
             t=SVS().anchor_start, fused=fused_step(conductor, optimizer),
@@ -99,22 +107,24 @@ class Training:
         iterate(self.state, rasterizer)  # takes the anchor
 
     def __call__(self) -> Milliseconds:
-        whole = Ledger()
-        self.state.conductor.ledger = Ledger()
+        device = self.state.field.means.device
+        together = _TOGETHER[device.type]
+        whole, self.state.conductor.ledger = Ledger(device), Ledger(device)
         with whole.stage(_TOTAL):
-            iterate(self.state, self.rasterizer)
-        stages = milliseconds(self.state.conductor.ledger)
+            for _ in range(together):
+                iterate(self.state, self.rasterizer)
+        stages = {name: ms / together for name, ms in milliseconds(self.state.conductor.ledger).items()}
         # What was skipped is no stage. "render LR" and "render LR + HR" are one.
         stages = {name.split()[0] if name.startswith("render") else name: ms for name, ms in stages.items() if ms > 0}
-        total = milliseconds(whole)[_TOTAL]
+        total = milliseconds(whole)[_TOTAL] / together
         return {**stages, _REST: max(0.0, total - sum(stages.values())), _TOTAL: total}
 
 
 def measure(request: Request, say: Callable[[str], None]) -> Findings:
-    """A full iteration, one without HR, and the prototype's forward and backward, taking turns.
+    """A full iteration, one without L_HF, one without HR, and the prototype's forward and backward, taking turns.
 
     Raises:
-        DataError: a name is unknown, or the scene has no LR grid.
+        DataError: a name is unknown, the scene has no LR grid, or there is no such device.
     """
     findings = Findings("iteration", torch.get_num_threads())
 
@@ -122,39 +132,75 @@ def measure(request: Request, say: Callable[[str], None]) -> Findings:
         say(line)
         findings.skipped.append(line)
 
+    require_device(request.device)
     workload = scenes.load(request.scene, request.data)
     if isinstance(workload, str):
         raise DataError("--scene", request.scene, workload, "or take another scene")
-    (backend,) = usable([request.backend or "auto"], "cpu", skip)
+    workload = workload.to(request.device)
+    (backend,) = usable([request.backend or rasterizers.fastest(request.device)], request.device, skip)
     rasterizer = rasterizers.load(backend, preset=request.preset, **SETTINGS)
     view = view_of(workload, rasterizer)
-    without_hr = Objective(lambda_hr=WarmupDecay(peak=0.0, final=0.0))
-    make = STRATEGIES[request.strategy]
     full = f"{request.strategy}, LR + HR"
-    trainings = (
-        Training(workload, view, rasterizer, Conductor(*make(), objective=Objective(), statistics_from=500)),
-        Training(workload, view, rasterizer, Conductor(*make(), objective=without_hr)),
-    )
-    turns: dict[str, Contender] = dict(zip((full, _LR_ONLY), trainings, strict=True))
-    with started(request.prototype, findings.threads) as peer:
+    trainings = _trainings(request, full, workload, view, rasterizer)
+    turns: dict[str, Contender] = {**trainings}
+    with started(request.prototype, findings.threads) if request.device == "cpu" else _no_prototype() as peer:
         if isinstance(peer, str):
             skip(f"prototype: {peer}.")
         else:
             peer.scene(workload, noise(workload))
             turns[_PEER] = _plain(peer, PRESETS[request.preset])
-        progress_bar = bar(len(turns) * (request.repeats + 1), request.strategy)
-        with progress_bar as progress, cores(trainings[0].state, rasterizer):
-            ms = interleaved(turns, request.repeats, progress=progress)
+        warm_ups = WARM_UPS[request.device]
+        progress_bar = bar(len(turns) * (request.repeats + warm_ups), request.strategy)
+        with progress_bar as progress, cores(trainings[full].state, rasterizer):
+            ms = interleaved(turns, request.repeats, warm_ups=warm_ups, progress=progress)
     size = f"LR {view.lr.camera.width}x{view.lr.camera.height} + HR {view.hr.camera.width}x{view.hr.camera.height}"
     title = (
         f"{request.strategy} on {workload.name}: {len(workload.splats):,} Gaussians, {size}, {backend} {request.preset}"
     )
-    findings.sections = [_section(title, full, {name: medians(stages) for name, stages in ms.items()})]
+    median = {name: medians(stages) for name, stages in ms.items()}
+    findings.sections = [_section(title, full, median, _target(view, request.device))]
+    if request.floors:
+        rules = {**SETTINGS, **PRESETS[request.preset]}
+        costs = floors(workload, view, rules, anchored=request.strategy in ("clear", "svs"))
+        took = {(full, stage): ms for stage, ms in median[full].items()}
+        heading = f"{workload.name}: how near a full iteration comes to the device's limits"
+        findings.sections.append(attained(heading, took, costs, Peaks.measured(request.device)))
     findings.raw = {
         "scene": workload.name, "strategy": request.strategy, "backend": backend, "preset": request.preset,
-        "settings": SETTINGS, "ms": ms,
+        "device": request.device, "settings": SETTINGS, "ms": ms,
     }  # fmt: skip
     return findings
+
+
+def _trainings(
+    request: Request, full: str, workload: Workload, view: View, rasterizer: Rasterizer
+) -> dict[str, Training]:
+    """The same training three times, with less and less to listen to."""
+    without_hr = Objective(lambda_hr=WarmupDecay(peak=0.0, final=0.0))
+    conductors = {
+        full: Conductor(*STRATEGIES[request.strategy](), objective=Objective(), statistics_from=500),
+        _WITHOUT_HF: Conductor(
+            *STRATEGIES[request.strategy](), objective=Objective(lambda_hf=0.0), statistics_from=500
+        ),
+        _LR_ONLY: Conductor(*STRATEGIES[request.strategy](), objective=without_hr),
+    }
+    return {name: Training(workload, view, rasterizer, conductor) for name, conductor in conductors.items()}
+
+
+def floors(workload: Workload, view: View, rules: Mapping[str, Any], *, anchored: bool) -> dict[str, Cost]:
+    """By stage of a full iteration; "total" is their sum."""
+    hr = counting.load_of(workload, rules)
+    lr = counting.load_of(replace(workload, camera=view.lr.camera), rules)
+    losses = counting.photometric(3 * hr.pixels) + counting.haar(3 * hr.pixels)
+    costs = {
+        "render": counting.forward(lr) + counting.forward(hr),
+        "losses LR": counting.photometric(3 * lr.pixels),
+        "backward LR": counting.backward(lr, 1),
+        "losses HR": losses,
+        "backward HR": counting.backward(hr, 2),
+        "per-Gaussian pass": counting.gaussian_pass(hr.n, hr.bands, 3, anchored=anchored),
+    }
+    return {**costs, _TOTAL: sum(costs.values(), Cost(0, 0))}
 
 
 def field_of(splats: Splats) -> GaussianField:
@@ -189,7 +235,7 @@ def view_of(workload: Workload, rasterizer: Rasterizer) -> View:
     generator = torch.Generator().manual_seed(1)
 
     def noisy(image: Tensor) -> Tensor:
-        return (image + _NOISE * torch.randn(image.shape, generator=generator)).clamp(0, 1)
+        return (image + _NOISE * torch.randn(image.shape, generator=generator).to(image.device)).clamp(0, 1)
 
     lr = Photo(camera.scaled(1 / factor), noisy(images.downsample(clean, factor)))
     return View("bench", lr, Photo(camera, noisy(clean)), reference="render plus noise")
@@ -203,18 +249,33 @@ def _plain(prototype: Prototype, cuts: Mapping[str, float]) -> Contender:
     return turn
 
 
-def _section(title: str, full: str, median: Mapping[str, Mapping[str, float]]) -> Section:
-    ours = [name for name in (full, _LR_ONLY) if name in median]
+def _no_prototype() -> AbstractContextManager[Prototype | str]:
+    return nullcontext("it draws on CPUs only")
+
+
+def _target(view: View, device: str) -> float | None:
+    """Milliseconds; None where none was set."""
+    return TARGETS.get((view.hr.camera.width, view.hr.camera.height)) if device == "cuda" else None
+
+
+def _section(title: str, full: str, median: Mapping[str, Mapping[str, float]], target: float | None) -> Section:
+    ours = [name for name in (full, _WITHOUT_HF, _LR_ONLY) if name in median]
     stages = [s for s in dict.fromkeys(stage for name in ours for stage in median[name]) if s not in (_REST, _TOTAL)]
     stages += [_REST, _TOTAL]
     columns = {"stage": stages}
     for name in ours:
         columns[f"{name}, ms"] = [number(median[name][s]) if s in median[name] else UNKNOWN for s in stages]
     total = median[full][_TOTAL]
+    of_full = {name: times(median[name][_TOTAL] / total) for name in (_WITHOUT_HF, _LR_ONLY)}
+    minutes = total * 10 / 60
     notes = [
-        f"Medians by stage, so they need not add up. 10,000 such iterations take {total * 10 / 60:.0f} minutes. An "
-        f"iteration without the HR scale costs {times(median[_LR_ONLY][_TOTAL] / total)} of a full one."
+        f"Medians by stage, so they need not add up. 10,000 such iterations take {minutes:.{1 if minutes < 10 else 0}f} minutes. "
+        f"An iteration without L_HF costs {of_full[_WITHOUT_HF]}, without the HR scale {of_full[_LR_ONLY]} of a full one."
     ]
+    if target is not None:
+        notes.append(
+            f"Target at this size: {target:g} ms; {'reached' if total <= target else 'missed'} ({number(total)} ms)."
+        )
     if _PEER in median:
         plain = median[_PEER][_TOTAL]
         notes.append(

@@ -1,4 +1,6 @@
-"""How long do image losses with their gradients take, ours and everyone's, and how far off are they?"""
+"""How long do image losses with their gradients take, ours and everyone's, and how far off are they? And the pass over the
+Gaussians that follows: correct, merge, anchor, step?
+"""
 
 from __future__ import annotations
 
@@ -14,8 +16,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies import kernels
+from clear_strategies.bench import counting, gaussians
 from clear_strategies.bench.output import Findings, Section, number, small, times
-from clear_strategies.bench.rounds import Contender, Milliseconds, bar, interleaved, medians, milliseconds
+from clear_strategies.bench.peaks import Peaks, attained
+from clear_strategies.bench.rasterizers import require_device
+from clear_strategies.bench.rounds import WARM_UPS, Contender, Milliseconds, bar, interleaved, medians, milliseconds
 from clear_strategies.errors import DataError
 from clear_strategies.ledger import Ledger
 
@@ -43,11 +48,22 @@ class Competitor:
     prepare: Callable[[Tensor], Tensor] = lambda image: image
 
 
-def measure(sizes: Sequence[str], repeats: int, say: Callable[[str], None]) -> Findings:
-    """Every loss at every size.
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What was asked for on the command line."""
+
+    sizes: Sequence[str]
+    repeats: int
+    device: str = "cpu"
+    gaussians: Sequence[int] = ()
+    floors: bool = False
+
+
+def measure(request: Request, say: Callable[[str], None]) -> Findings:
+    """Every loss at every size, and the pass over so many Gaussians.
 
     Raises:
-        DataError: a size is not WIDTHxHEIGHT.
+        DataError: a size is not WIDTHxHEIGHT, or there is no such device.
     """
     findings = Findings("kernels", torch.get_num_threads())
     rows = []
@@ -56,18 +72,28 @@ def measure(sizes: Sequence[str], repeats: int, say: Callable[[str], None]) -> F
         say(line)
         findings.skipped.append(line)
 
-    losses = {SSIM: [*_ours(SSIM), *_peers(skip)], PHOTOMETRIC: _ours(PHOTOMETRIC), HAAR: _ours(HAAR)}
-    for size in sizes:
-        x, y = images(*_parsed(size))
+    require_device(request.device)
+    sizes = {size: _parsed(size) for size in request.sizes}
+    peaks = Peaks.measured(request.device) if request.floors else None
+    ours = {loss: _ours(loss, request.device) for loss in (SSIM, PHOTOMETRIC, HAAR)}
+    losses = {SSIM: [*ours[SSIM], *_peers(request.device, skip)], PHOTOMETRIC: ours[PHOTOMETRIC], HAAR: ours[HAAR]}
+    warm_ups = WARM_UPS[request.device]
+    for size, (width, height) in sizes.items():
+        x, y = (image.to(request.device) for image in images(width, height))
         for loss, competitors in losses.items():
             turns: dict[str, Contender] = {c.name: _turn(c, x, y) for c in competitors}
-            with bar(len(turns) * (repeats + 1), f"{loss} {size}") as progress:
-                ms = interleaved(turns, repeats, progress=progress)
+            with bar(len(turns) * (request.repeats + warm_ups), f"{loss} {size}") as progress:
+                ms = interleaved(turns, request.repeats, warm_ups=warm_ups, progress=progress)
             for c in competitors:
                 error = _error(c, x, y)
                 rows.append({"loss": loss, "size": size, "name": c.name, "ms": ms[c.name]["gradient"], "error": error})
-    findings.sections = [_section(rows, loss, sizes) for loss in losses]
-    findings.raw = {"rows": rows}
+    findings.sections = [_section(rows, loss, request.sizes) for loss in losses]
+    if peaks is not None:
+        findings.sections += [_floor_section(rows, size, 3 * w * h, peaks) for size, (w, h) in sizes.items()]
+    passes = [gaussians.measure(n, request.repeats, request.device, skip) for n in request.gaussians]
+    for one in passes:
+        findings.sections += one.sections(peaks)
+    findings.raw = {"device": request.device, "rows": rows, "gaussians": {one.n: one.ms for one in passes}}
     return findings
 
 
@@ -83,7 +109,7 @@ def images(width: int, height: int) -> tuple[Image, Image]:
 def grouped_convolution(x: Float[Tensor, "1 C H W"], y: Float[Tensor, "1 C H W"]) -> Tensor:
     """SSIM as 3DGS's trainer and most of its children compute it: five grouped convolutions, the rest by autograd."""
     channels = x.shape[1]
-    offsets = torch.arange(11, dtype=x.dtype) - 5
+    offsets = torch.arange(11, dtype=x.dtype, device=x.device) - 5
     line = torch.exp(-(offsets**2) / (2 * 1.5**2))
     line = line / line.sum()
     window = (line[:, None] * line[None, :]).expand(channels, 1, 11, 11).contiguous()
@@ -99,20 +125,19 @@ def grouped_convolution(x: Float[Tensor, "1 C H W"], y: Float[Tensor, "1 C H W"]
     return (numerator / ((mu_x**2 + mu_y**2 + c1) * (var_x + var_y + c2))).mean()
 
 
-def _ours(loss: str) -> list[Competitor]:
-    """Every implementation that the trainer has; float64 of the specification is the truth.
+def _ours(loss: str, device: str = "cpu") -> list[Competitor]:
+    """Every implementation that the trainer has for images on the device; float64 of the specification is the truth.
 
-    `kernels.implementations()` gives them by name, modules or anything with `ssim`, `l1` and `haar_l1`; one that has
-    `photometric(x, y, lambda_ssim)` too, L1 and SSIM in one pass, is timed with it.
+    `kernels.implementations()` gives them by name; one that says which images it `accepts` is asked.
     """
-    implementations: Mapping[str, Any]
-    if hasattr(kernels, "implementations"):
-        implementations = kernels.implementations()
-    else:
-        implementations = {"torch": importlib.import_module("clear_strategies.kernels.torch")}
+    x, y = (image.to(device) for image in images(16, 16))
     specification = importlib.import_module("clear_strategies.kernels.torch")
     truth = _gradient_of(specification, loss)
-    return [Competitor(f"ours, {name}", _gradient_of(i, loss), truth) for name, i in implementations.items()]
+    return [
+        Competitor(f"ours, {name}", _gradient_of(implementation, loss), truth)
+        for name, implementation in kernels.implementations().items()
+        if not hasattr(implementation, "accepts") or implementation.accepts(x, y)
+    ]
 
 
 def _gradient_of(implementation: Any, loss: str) -> Gradient:
@@ -120,24 +145,42 @@ def _gradient_of(implementation: Any, loss: str) -> Gradient:
         return lambda x, y: implementation.ssim(x, y).gradient
     if loss == HAAR:
         return lambda x, y: implementation.haar_l1(x, y).gradient
-    if hasattr(implementation, "photometric"):  # both in one pass
-        return lambda x, y: implementation.photometric(x, y, _LAMBDA).gradient
-    return lambda x, y: (1 - _LAMBDA) * implementation.l1(x, y).gradient - _LAMBDA * implementation.ssim(x, y).gradient
+    return lambda x, y: implementation.photometric(x, y, _LAMBDA).gradient
 
 
-def _peers(skip: Callable[[str], None]) -> list[Competitor]:
+def _peers(device: str, skip: Callable[[str], None]) -> list[Competitor]:
     """Those that are installed. Each in its own definition: kornia reflects the border, others leave it out."""
     (specification, *_) = _ours(SSIM)
     peers = [Competitor(_GROUPED, _taped(grouped_convolution), specification.truth, _nchw)]
     for package, build in (("kornia", _kornia), ("torchmetrics", _torchmetrics), ("pytorch-msssim", _msssim)):
-        try:
-            version = metadata.version(package)
-            gradient = _taped(build())
-        except (ImportError, metadata.PackageNotFoundError):
-            skip(f"{package}: not installed (pip install {package}).")
-            continue
-        peers.append(Competitor(f"{package} {version}", gradient, gradient, _nchw))
+        if found := _installed(package, build, skip):
+            version, gradient = found
+            peers.append(Competitor(f"{package} {version}", gradient, gradient, _nchw))
+    for package, build in (("fused-ssim", _fused_ssim), ("gswarp", _gswarp)) if device == "cuda" else ():
+        if found := _installed(package, build, skip):  # float32 alone, of 3DGS's definition
+            version, gradient = found
+            peers.append(Competitor(f"{package} {version}", gradient, specification.truth, _nchw))
     return peers
+
+
+def _installed(
+    package: str, build: Callable[[], Callable[[Tensor, Tensor], Tensor]], skip: Callable[[str], None]
+) -> tuple[str, Gradient] | None:
+    try:
+        return metadata.version(package), _taped(build())
+    except (ImportError, metadata.PackageNotFoundError):
+        skip(f"{package}: not installed (pip install {package}).")
+        return None
+
+
+def _fused_ssim() -> Callable[[Tensor, Tensor], Tensor]:
+    ssim: Callable[[Tensor, Tensor], Tensor] = importlib.import_module("fused_ssim").fused_ssim
+    return ssim
+
+
+def _gswarp() -> Callable[[Tensor, Tensor], Tensor]:
+    ssim: Callable[[Tensor, Tensor], Tensor] = importlib.import_module("gswarp").fused_ssim
+    return ssim
 
 
 def _kornia() -> Callable[[Tensor, Tensor], Tensor]:
@@ -173,7 +216,7 @@ def _turn(c: Competitor, x: Image, y: Image) -> Contender:
     prepared = c.prepare(x), c.prepare(y)
 
     def turn() -> Milliseconds:
-        ledger = Ledger()
+        ledger = Ledger(x.device)
         with ledger.stage("gradient"):
             c.gradient(*prepared)
         return milliseconds(ledger)
@@ -209,6 +252,13 @@ def _section(rows: Sequence[Mapping[str, Any]], loss: str, sizes: Sequence[str])
         f"L2 against float64{own}."
     )
     return Section(f"{loss}, with its gradient", columns, (note,))
+
+
+def _floor_section(rows: Sequence[Mapping[str, Any]], size: str, values: int, peaks: Peaks) -> Section:
+    costs = {SSIM: counting.ssim(values), PHOTOMETRIC: counting.photometric(values), HAAR: counting.haar(values)}
+    ours = [row for row in rows if row["size"] == size and row["name"].startswith("ours")]
+    ms = {(row["name"], row["loss"]): medians({"ms": row["ms"]})["ms"] for row in ours}
+    return attained(f"{size}: how near the losses come to the device's limits", ms, costs, peaks)
 
 
 def _parsed(size: str) -> tuple[int, int]:

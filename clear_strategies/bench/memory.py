@@ -9,7 +9,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,15 +19,23 @@ _RESET_PEAK: Final = "5"  # proc(5), clear_refs: VmHWM starts again from what is
 
 
 def peaks(
-    scene: str, data: Path | None, backend: str, presets: Sequence[str], threads: int, *, device: str, seconds: float
+    scene: str,
+    data: Path | None,
+    backend: str,
+    presets: Sequence[str],
+    threads: int,
+    *,
+    device: str,
+    seconds: float,
+    is_peer: bool = False,
 ) -> dict[str, float] | str:
     """MiB that forward and backward (K = 2) add at their peak, by preset; the reason where it cannot be measured.
 
-    On CUDA it is what torch's allocator handed out.
+    On CUDA it is what torch's allocator handed out; what a library takes from the driver itself is not in it.
     """
     task = {
         "scene": scene, "data": str(data) if data is not None else None, "backend": backend, "presets": list(presets),
-        "threads": threads, "device": device,
+        "threads": threads, "device": device, "is_peer": is_peer,
     }  # fmt: skip
     paths = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     command = [sys.executable, "-m", __name__, json.dumps(task)]
@@ -54,7 +62,6 @@ def measure(task: Mapping[str, Any]) -> dict[str, float]:
     """In the child: MiB by preset."""
     import torch
 
-    import rasterizers
     from clear_strategies.bench import scenes
 
     torch.set_num_threads(task["threads"])
@@ -66,25 +73,49 @@ def measure(task: Mapping[str, Any]) -> dict[str, float]:
     on_cuda = task["device"] == "cuda"
     found = {}
     for i, preset in enumerate(task["presets"]):
-        rasterizer = rasterizers.load(task["backend"], preset=preset, **scenes.SETTINGS)
+        draw = _drawing(task["backend"], preset, is_peer=task["is_peer"])
         if i == 0:  # libraries, thread pools
-            _draw(rasterizer, warm)
+            draw(warm)
             before = torch.cuda.memory_allocated() / _MIB if on_cuda else _resident("VmRSS")
         _release()
         _reset_peak()
         if on_cuda:
             torch.cuda.reset_peak_memory_stats()
-        _draw(rasterizer, workload)
+        draw(workload)
         after = torch.cuda.max_memory_allocated() / _MIB if on_cuda else _resident("VmHWM")
         found[preset] = max(0.0, after - before)
     return found
 
 
-def _draw(rasterizer: Any, workload: Any) -> None:
+def _drawing(backend: str, preset: str, *, is_peer: bool) -> Callable[[Any], None]:
+    """Forward, and backward of two cotangents, of a workload."""
     import torch
 
-    camera, device = workload.camera, workload.splats.means.device
-    rasterizer(workload.splats, camera).vjp(torch.ones(2, camera.height, camera.width, 3, device=device))
+    import rasterizers
+    from clear_strategies.bench import peers, scenes
+
+    def cotangents(workload: Any) -> Any:
+        camera = workload.camera
+        return torch.ones(2, camera.height, camera.width, 3, device=workload.splats.means.device)
+
+    if not is_peer:
+        rasterizer = rasterizers.load(backend, preset=preset, **scenes.SETTINGS)
+
+        def draw(workload: Any) -> None:
+            rasterizer(workload.splats, workload.camera).vjp(cotangents(workload))
+
+        return draw
+    said: list[str] = []
+    peer = next((peer for peer in peers.found(said.append) if peer.name == backend), None)
+    if peer is None:
+        raise LookupError(" ".join(said))
+
+    def draw_peer(workload: Any) -> None:
+        drawing = peer.draw(workload)
+        for cotangent in cotangents(workload):
+            drawing.pull(cotangent)
+
+    return draw_peer
 
 
 def _resident(field: str) -> float:

@@ -6,14 +6,15 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Final
+from types import MappingProxyType
+from typing import Any, Final
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 import rasterizers
-from clear_strategies.bench import memory, scenes
+from clear_strategies.bench import counting, memory, peers, scenes
 from clear_strategies.bench.accuracy import (
     ATTRIBUTES,
     NO_CUT_OFFS,
@@ -25,8 +26,10 @@ from clear_strategies.bench.accuracy import (
     oracle_backend,
 )
 from clear_strategies.bench.output import UNKNOWN, Findings, Section, number, small, times
+from clear_strategies.bench.peaks import Peaks, attained
+from clear_strategies.bench.peers import Peer
 from clear_strategies.bench.prototype import Prototype, started
-from clear_strategies.bench.rounds import Contender, Milliseconds, bar, interleaved, medians, milliseconds, timed
+from clear_strategies.bench.rounds import WARM_UPS, Contender, Milliseconds, bar, interleaved, medians, milliseconds
 from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.errors import DataError
 from clear_strategies.ledger import Ledger
@@ -35,7 +38,7 @@ from rasterizers.interface import PRESETS, Rasterizer, RasterSettings
 SCENES: Final = ("small", "s100k", "s100k-lr", "garden", "s500k")
 COTANGENTS: Final = 3
 DEMAND: Final = 0.25  # share of the tiles that are asked for
-PEER: Final = "prototype"
+PROTOTYPE: Final = "prototype"
 
 FORWARD, TILES, SHARED, SEPARATE = "forward", "tiles 25 %", "LR+HR shared", "LR+HR separate"
 BACKWARD: Final = tuple(f"backward K={k}" for k in range(1, COTANGENTS + 1))
@@ -45,22 +48,23 @@ Say = Callable[[str], None]
 
 @dataclass(slots=True, eq=False)
 class Row:
-    """A backend at a preset on a scene.
+    """A backend, or a peer, at a preset on a scene.
 
     Args:
         ms: stage -> every repeat. same, none: errors against float64 at the same cut-offs, and without any.
         peak: MiB that forward and backward (K = 2) add.
-        against: stage -> the prototype's median over this one's, both at these cut-offs and in this run.
+        against: of a peer: our backend -> stage -> its median, from the forward on, over ours at these cut-offs.
     """
 
     scene: str
     backend: str
     preset: str
     ms: Mapping[str, Sequence[float]]
+    is_peer: bool = False
     same: Errors | None = None
     none: Errors | None = None
     peak: float | None = None
-    against: Mapping[str, float] = field(default_factory=dict)
+    against: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def median(self) -> dict[str, float]:
@@ -80,6 +84,7 @@ class Request:
     data: Path | None = None
     prototype: Path | None = None
     memory: bool = True
+    floors: bool = False
 
 
 def measure(request: Request, say: Say) -> tuple[Findings, list[Row]]:
@@ -97,20 +102,22 @@ def measure(request: Request, say: Say) -> tuple[Findings, list[Row]]:
         say(line)
         findings.skipped.append(line)
 
-    if request.device == "cuda" and not torch.cuda.is_available():
-        raise DataError("--device", "cuda", "torch sees no such device here", "use --device cpu")
+    require_device(request.device)
     backends = usable(request.backends, request.device, skip)
     for preset in request.presets:
         if preset not in PRESETS:
             raise DataError("--preset", preset, "is no preset", f"choose of {', '.join(PRESETS)}")
     rows: list[Row] = []
-    truth = oracle_backend(request.device)
+    loads: dict[str, counting.Load] = {}
+    truth = oracle_backend()
     if truth is None:
         skip("errors: no backend here computes in float64.")
+    peaks = Peaks.measured(request.device) if request.floors else None
     workloads = [(name, scenes.load(name, request.data)) for name in request.scenes]
-    with _peer(request, findings.threads) as peer:
-        if isinstance(peer, str):
-            skip(f"prototype: {peer}.")
+    others = peers.found(skip) if request.device == "cuda" and peers.PRESET in request.presets else []
+    with _prototype(request, findings.threads) as prototype:
+        if isinstance(prototype, str):
+            skip(f"{PROTOTYPE}: {prototype}.")
         calibration = Calibration()
         for name, workload in workloads:
             if isinstance(workload, str):
@@ -118,20 +125,36 @@ def measure(request: Request, say: Say) -> tuple[Findings, list[Row]]:
                 continue
             say(workload.says())
             one = OnScene(
-                name, workload.to(request.device), request, None if isinstance(peer, str) else peer, calibration, skip
-            )
+                name, workload.to(request.device), request, None if isinstance(prototype, str) else prototype, others,
+                calibration, skip,
+            )  # fmt: skip
             rows += one.measure(backends, truth)
+            if peaks is not None:
+                loads[workload.name] = counting.load_of(one.workload, {**SETTINGS, **PRESETS[request.presets[0]]})
     for scene in dict.fromkeys(row.scene for row in rows):
-        findings.sections += _sections(rows, scene, truth, explained=bool(findings.sections))
+        findings.sections += _sections(rows, scene, truth, others, explained=bool(findings.sections))
+        if peaks is not None:
+            findings.sections.append(_floor_section(rows, scene, request.presets[0], loads[scene], peaks))
     cuts = {name: dict(PRESETS[name]) for name in request.presets}
     findings.raw = {"settings": SETTINGS, "presets": cuts, "oracle": truth, "device": request.device}
+    findings.raw["peers"] = {peer.name: {"says": peer.says, "differs": dict(peer.differs)} for peer in others}
     findings.raw["rows"] = [asdict(row) for row in rows]
+    if peaks is not None:
+        findings.raw |= {"peaks": asdict(peaks), "loads": {name: asdict(load) for name, load in loads.items()}}
     if not rows:
         raise DataError("bench", "rasterizers", "nothing could be measured", "see the lines above")
     return findings, rows
 
 
-def _peer(request: Request, threads: int) -> AbstractContextManager[Prototype | str]:
+def require_device(device: str) -> None:
+    """Raises:
+    DataError: there is no such device here.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise DataError("--device", "cuda", "torch sees no such device here", "use --device cpu")
+
+
+def _prototype(request: Request, threads: int) -> AbstractContextManager[Prototype | str]:
     if request.device == "cpu":
         return started(request.prototype, threads)
     return nullcontext(f"it knows no {request.device}")
@@ -154,6 +177,8 @@ def usable(asked: Sequence[str] | None, device: str, skip: Say) -> list[str]:
         why_not = reasons[name]
         if why_not is None and device not in rasterizers.load(name).traits.devices:
             why_not = f"it does not run on {device}; see --device"
+        if why_not is None and name == "gsplat":
+            why_not = "no backend of ours; on CUDA it takes part as a peer"
         if why_not is None:
             found.append(name)
         else:
@@ -172,27 +197,44 @@ class Turn:
         self.lr = workload.camera.scaled(1 / workload.lr_factor) if workload.lr_factor else None
 
     def __call__(self) -> Milliseconds:
-        draw_it, splats, camera, ledger = self.rasterizer, self.workload.splats, self.workload.camera, Ledger()
-        device = splats.means.device.type
-        with timed(ledger, FORWARD, device):
+        draw_it, splats, camera = self.rasterizer, self.workload.splats, self.workload.camera
+        ledger = Ledger(splats.means.device)
+        with ledger.stage(FORWARD):
             rendering = draw_it(splats, camera)
         for k, stage in enumerate(BACKWARD, 1):
-            with timed(ledger, stage, device):
+            with ledger.stage(stage):
                 rendering.vjp(self.cotangents[:k])
         del rendering
-        with timed(ledger, TILES, device):
+        with ledger.stage(TILES):
             draw_it(splats, camera, tiles=self.mask).vjp(self.cotangents[:1])
         if self.lr is not None:
-            with timed(ledger, SHARED, device):
+            with ledger.stage(SHARED):
                 draw_it.render_scales([(splats, self.lr), (splats, camera)])
-            with timed(ledger, SEPARATE, device):
+            with ledger.stage(SEPARATE):
                 draw_it(splats, self.lr)
                 draw_it(splats, camera)
         return milliseconds(ledger)
 
 
 class PeerTurn:
-    """The same of the prototype, as far as it goes."""
+    """The same of a peer, as far as it goes: K cotangents are K backward passes."""
+
+    def __init__(self, peer: Peer, workload: Workload, cotangents: Float[Tensor, "K H W 3"]) -> None:
+        self.peer, self.workload, self.cotangents = peer, workload, cotangents
+
+    def __call__(self) -> Milliseconds:
+        ledger = Ledger(self.cotangents.device)
+        with ledger.stage(FORWARD):
+            drawing = self.peer.draw(self.workload)
+        for k, stage in enumerate(BACKWARD, 1):
+            with ledger.stage(stage):
+                for cotangent in self.cotangents[:k]:
+                    drawing.pull(cotangent)
+        return milliseconds(ledger)
+
+
+class PrototypeTurn:
+    """The same of the prototype."""
 
     def __init__(self, prototype: Prototype, cuts: Mapping[str, float]) -> None:
         self.prototype, self.cuts = prototype, cuts
@@ -202,6 +244,22 @@ class PeerTurn:
             FORWARD: self.prototype.forward(self.cuts),
             **{stage: self.prototype.backward(k) for k, stage in enumerate(BACKWARD, 1)},
         }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contestant:
+    """Who takes part on a scene.
+
+    Args:
+        picture: for the first cotangent. differs: its rules where they are not `SETTINGS`.
+    """
+
+    backend: str
+    preset: str
+    turn: Contender
+    picture: Callable[[], Picture]
+    is_peer: bool = False
+    differs: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
 
 
 class Calibration:
@@ -240,38 +298,72 @@ class OnScene:
     name: str
     workload: Workload
     request: Request
-    peer: Prototype | None
+    prototype: Prototype | None
+    peers: Sequence[Peer]
     calibration: Calibration
     skip: Say
 
     def measure(self, backends: Sequence[str], truth: str | None) -> list[Row]:
         cotangents = noise(self.workload)
-        drawn: dict[tuple[str, str], Rasterizer] = {}
+        contestants = [*self._ours(backends, cotangents), *self._peers(cotangents), *self._prototypes(cotangents)]
+        turns = {f"{c.backend} {c.preset}": c.turn for c in contestants}
+        warm_ups = WARM_UPS[self.request.device]
+        with bar(len(turns) * (self.request.repeats + warm_ups), self.workload.name) as progress:
+            ms = interleaved(turns, self.request.repeats, warm_ups=warm_ups, progress=progress)
+        rows = [
+            Row(self.workload.name, c.backend, c.preset, found, c.is_peer)
+            for c, found in zip(contestants, ms.values(), strict=True)
+        ]
+        self._add_errors(rows, contestants, cotangents[0], truth)
+        self._add_memory(rows)
+        add_ratios(rows)
+        return rows
+
+    def _ours(self, backends: Sequence[str], cotangents: Float[Tensor, "K H W 3"]) -> list[Contestant]:
+        ours = []
         for backend in backends:
             for preset in self.request.presets:
                 rasterizer = rasterizers.load(backend, preset=preset, **SETTINGS)
                 if self._affordable(backend, preset, rasterizer):
-                    drawn[backend, preset] = rasterizer
-        turns: dict[str, Contender] = {}
-        for (backend, preset), rasterizer in drawn.items():
-            turns[f"{backend} {preset}"] = Turn(rasterizer, self.workload, cotangents)
-        if self.peer is not None:
-            self.peer.scene(self.workload, cotangents)
-            turns |= {f"{PEER} {preset}": PeerTurn(self.peer, PRESETS[preset]) for preset in self.request.presets}
-        with bar(len(turns) * (self.request.repeats + 1), self.workload.name) as progress:
-            ms = interleaved(turns, self.request.repeats, progress=progress)
-        rows = [Row(self.workload.name, *_split(turn), found) for turn, found in ms.items()]
-        self._add_errors(rows, drawn, cotangents[0], truth)
-        self._add_memory(rows, list(dict.fromkeys(backend for backend, _ in drawn)))
-        _add_ratios(rows)
-        return rows
+                    ours.append(self._one_of_ours(backend, preset, rasterizer, cotangents))
+        return ours
+
+    def _one_of_ours(self, backend: str, preset: str, rasterizer: Rasterizer, cotangents: Tensor) -> Contestant:
+        workload = self.workload
+
+        def picture() -> Picture:
+            return draw(rasterizer, workload.splats, workload.camera, cotangents[0])
+
+        return Contestant(backend, preset, Turn(rasterizer, workload, cotangents), picture)
+
+    def _peers(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Contestant]:
+        workload = self.workload
+
+        def contestant(peer: Peer) -> Contestant:
+            turn = PeerTurn(peer, workload, cotangents)
+            picture = lambda: peer.picture(workload, cotangents[0])  # noqa: E731 - as short as it is
+            return Contestant(peer.name, peers.PRESET, turn, picture, True, peer.differs)
+
+        return [contestant(peer) for peer in self.peers]
+
+    def _prototypes(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Contestant]:
+        prototype = self.prototype
+        if prototype is None:
+            return []
+        prototype.scene(self.workload, cotangents)
+
+        def contestant(preset: str) -> Contestant:
+            cuts = PRESETS[preset]
+            return Contestant(PROTOTYPE, preset, PrototypeTurn(prototype, cuts), lambda: prototype.picture(cuts), True)
+
+        return [contestant(preset) for preset in self.request.presets]
 
     def _affordable(self, backend: str, preset: str, rasterizer: Rasterizer) -> bool:
         if self.name in ("tiny", "small"):
             return True
         seconds = self.calibration.predict(
             (backend, preset), lambda scene: Turn(rasterizer, scene, noise(scene)), self.workload
-        ) * (self.request.repeats + 1)
+        ) * (self.request.repeats + WARM_UPS[self.request.device])
         if seconds > self.request.limit:
             self.skip(
                 f"{backend} {preset} on {self.workload.name}: predicted to take {seconds:.0f} s, "
@@ -280,55 +372,55 @@ class OnScene:
         return seconds <= self.request.limit
 
     def _add_errors(
-        self, rows: Sequence[Row], drawn: Mapping[tuple[str, str], Rasterizer], cotangent: Tensor, truth: str | None
+        self, rows: Sequence[Row], contestants: Sequence[Contestant], cotangent: Tensor, truth: str | None
     ) -> None:
         if truth is None or not rows:
             return
-        workload, presets = self.workload, self.request.presets
-
-        def answer(cuts: Mapping[str, float], scene: Workload = workload, v: Tensor = cotangent) -> Picture:
-            return oracle(truth, scene.splats, scene.camera, v, cuts)
-
+        splats, camera = self.workload.splats, self.workload.camera
         if self.name not in ("tiny", "small"):
 
             def turn_on(scene: Workload) -> Contender:
                 def turn() -> Milliseconds:
                     ledger = Ledger()
-                    with timed(ledger, "oracle", self.request.device):
-                        answer(NO_CUT_OFFS, scene, noise(scene)[0])
+                    with ledger.stage("oracle"):
+                        oracle(truth, scene.splats, scene.camera, noise(scene)[0], NO_CUT_OFFS)
                     return milliseconds(ledger)
 
                 return turn
 
-            seconds = self.calibration.predict((truth, "float64"), turn_on, workload) * (len(presets) + 1)
+            seconds = self.calibration.predict((truth, "float64"), turn_on, self.workload)
+            seconds *= len(self.request.presets) + 1 + 2 * len({tuple(c.differs) for c in contestants if c.differs})
             if seconds > self.request.limit:
                 self.skip(
                     f"errors on {self.workload.name}: float64 of {truth} is predicted to take {seconds:.0f} s, "
                     f"more than --limit {self.request.limit:g}."
                 )
                 return
-        with bar(len(presets) + 1, f"{self.workload.name}, float64") as progress:
-            none = answer(NO_CUT_OFFS)
-            progress()
-            for preset in presets:
-                same = answer(PRESETS[preset])
-                for row in (row for row in rows if row.preset == preset):
-                    if row.backend == PEER and self.peer is not None:
-                        found = self.peer.picture(PRESETS[preset])
-                    else:
-                        found = draw(drawn[row.backend, preset], workload.splats, workload.camera, cotangent)
-                    row.same, row.none = compare(found, same), compare(found, none)
+
+        known: dict[tuple[Any, ...], Picture] = {}
+
+        def answer(rules: Mapping[str, Any]) -> Picture:
+            key = tuple(sorted(rules.items()))
+            if key not in known:
+                known[key] = oracle(truth, splats, camera, cotangent, rules)
+            return known[key]
+
+        with bar(len(rows), f"{self.workload.name}, float64") as progress:
+            for row, c in zip(rows, contestants, strict=True):
+                found = c.picture()
+                row.same = compare(found, answer({**c.differs, **PRESETS[c.preset]}))
+                row.none = compare(found, answer({**c.differs, **NO_CUT_OFFS}))
                 progress()
 
-    def _add_memory(self, rows: Sequence[Row], backends: Sequence[str]) -> None:
+    def _add_memory(self, rows: Sequence[Row]) -> None:
         if not self.request.memory:
             self.skip(f"memory on {self.workload.name}: not asked for.")
             return
-        for backend in backends:
+        for backend in dict.fromkeys(row.backend for row in rows if row.backend != PROTOTYPE):
             mine = [row for row in rows if row.backend == backend]
             found = memory.peaks(
                 self.name, self.request.data, backend, [row.preset for row in mine], torch.get_num_threads(),
-                device=self.request.device, seconds=60 + self.request.limit,
+                device=self.request.device, seconds=60 + self.request.limit, is_peer=mine[0].is_peer,
             )  # fmt: skip
             if isinstance(found, str):
                 self.skip(f"memory of {backend} on {self.workload.name}: {found}")
@@ -352,23 +444,20 @@ def demand(rasterizer: Rasterizer, workload: Workload) -> Bool[Tensor, "th tw"]:
     return (order < round(DEMAND * rows * columns)).view(rows, columns).to(workload.splats.means.device)
 
 
-def _split(turn: str) -> tuple[str, str]:
-    backend, _, preset = turn.rpartition(" ")
-    return backend, preset
+def add_ratios(rows: Sequence[Row]) -> None:
+    """Each peer's time over ours, from this run alone."""
+    for peer in (row for row in rows if row.is_peer):
+        theirs = peer.median
+        peer.against = {
+            row.backend: {FORWARD: theirs[FORWARD] / ours[FORWARD]}
+            | {stage: (theirs[FORWARD] + theirs[stage]) / (ours[FORWARD] + ours[stage]) for stage in BACKWARD}
+            for row, ours in ((row, row.median) for row in rows if not row.is_peer and row.preset == peer.preset)
+        }
 
 
-def _add_ratios(rows: Sequence[Row]) -> None:
-    for row in rows:
-        peer = next((r for r in rows if r.backend == PEER and r.preset == row.preset), None)
-        if peer is None or peer is row:
-            continue
-        ours, theirs = row.median, peer.median
-        row.against = {
-            stage: (theirs[FORWARD] + theirs[stage]) / (ours[FORWARD] + ours[stage]) for stage in BACKWARD
-        } | {FORWARD: theirs[FORWARD] / ours[FORWARD]}
-
-
-def _sections(rows: Sequence[Row], scene: str, truth: str | None, *, explained: bool) -> list[Section]:
+def _sections(
+    rows: Sequence[Row], scene: str, truth: str | None, others: Sequence[Peer], *, explained: bool
+) -> list[Section]:
     """Its tables; what their columns mean is said once, with the first scene's."""
     rows = [row for row in rows if row.scene == scene]
     head = {"backend": [row.backend for row in rows], "cut-offs": [row.preset for row in rows]}
@@ -386,21 +475,45 @@ def _sections(rows: Sequence[Row], scene: str, truth: str | None, *, explained: 
         TILES: beside(TILES, lambda m: m[FORWARD] + m[BACKWARD[0]]),
         SHARED: beside(SHARED, lambda m: m[SEPARATE]),
         "peak MiB": [number(row.peak) for row in rows],
-        f"{PEER}/this, K=1": [times(row.against.get(BACKWARD[0])) for row in rows],
-        "K=2": [times(row.against.get(BACKWARD[1])) for row in rows],
     }
     notes = (
         "Milliseconds, medians of turns taken alternately. In brackets: K=2 and K=3 over K=1, a quarter of the tiles "
-        "over all, LR and HR together over one by one."
-        + (f" {PEER}/this: its forward + backward over ours, above 1 we are faster." if _has_peer(rows) else ""),
+        "over all, LR and HR together over one by one. Memory: what forward and backward of K=2 add at their peak.",
     )
     sections = [Section(f"{scene}: time", time_columns, () if explained else notes)]
+    if any(row.against for row in rows):
+        legend = "A peer's time over ours in the same run, forward and then with the backward; above 1 we are faster."
+        about = [] if explained else [legend, *(f"{peer.name}: {peer.says}" for peer in others)]
+        sections.append(_ratio_section(rows, scene, about))
     measured = [(row, row.same, row.none) for row in rows if row.same is not None and row.none is not None]
     if measured:
         lines = [(row, "the same", same) for row, same, _ in measured]
         lines += [(row, "none", none) for row, _, none in measured]
         sections.append(_error_section(scene, lines, None if explained else truth))
     return sections
+
+
+def _ratio_section(rows: Sequence[Row], scene: str, notes: Sequence[str]) -> Section:
+    lines = [(row, ours, ratio) for row in rows for ours, ratio in row.against.items()]
+    columns = {
+        "peer": [row.backend for row, _, _ in lines],
+        "over": [f"{ours} {row.preset}" for row, ours, _ in lines],
+        FORWARD: [times(ratio[FORWARD]) for *_, ratio in lines],
+        **{f"+ {stage}": [times(ratio[stage]) for *_, ratio in lines] for stage in BACKWARD},
+    }
+    return Section(f"{scene}: peers over ours", columns, notes)
+
+
+def _floor_section(rows: Sequence[Row], scene: str, preset: str, load: counting.Load, peaks: Peaks) -> Section:
+    """How near our backends come to what the device could do."""
+    costs = {FORWARD: counting.forward(load)}
+    costs |= {stage: counting.backward(load, k) for k, stage in enumerate(BACKWARD, 1)}
+    ours = [row for row in rows if row.scene == scene and row.preset == preset and not row.is_peer]
+    timed = {(row.backend, stage): row.median[stage] for row in ours for stage in costs}
+    return attained(
+        f"{scene}: how near to the device's limits, {preset}", timed, costs, peaks,
+        f"{load.visible:,} of {load.n:,} Gaussians visible, {load.contributions:,} contributions to {load.pixels:,} pixels.",
+    )  # fmt: skip
 
 
 def _error_section(scene: str, lines: Sequence[tuple[Row, str, Errors]], truth: str | None) -> Section:
@@ -413,7 +526,3 @@ def _error_section(scene: str, lines: Sequence[tuple[Row, str, Errors]], truth: 
     }
     note = f"Gradients: relative L2 over all Gaussians / median per Gaussian. The truth is float64 of {truth}."
     return Section(f"{scene}: error", columns, () if truth is None else (note,))
-
-
-def _has_peer(rows: Sequence[Row]) -> bool:
-    return any(row.backend == PEER for row in rows)

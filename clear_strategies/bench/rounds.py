@@ -1,4 +1,9 @@
-"""Taking times: contenders take turns, so that the machine's other work hits all of them alike."""
+"""Taking times: contenders take turns, so that the machine's other work hits all of them alike.
+
+On a CPU times are wall-clock. On CUDA they are between events on torch's current stream (`Ledger`), and the device is
+waited for between turns alone, so that a stage costs what it costs in a loop: its kernels, and the host where they wait
+for it.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +11,15 @@ import statistics
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-
-import torch
+from typing import Final
 
 from clear_strategies.ledger import Ledger
 
 Milliseconds = Mapping[str, float]  # by stage
 Contender = Callable[[], Milliseconds]  # each call is one turn: all its stages once
+
+WARM_UPS: Final = {"cpu": 1, "cuda": 3}
+"""Rounds that do not count: in the first kernels are compiled and lists find their length, then clocks rise."""
 
 
 def milliseconds(ledger: Ledger) -> Milliseconds:
@@ -20,25 +27,20 @@ def milliseconds(ledger: Ledger) -> Milliseconds:
     return {name: 1e3 * entry.seconds for name, entry in ledger.entries.items()}
 
 
-@contextmanager
-def timed(ledger: Ledger, stage: str, device: str) -> Iterator[None]:
-    """A stage until its work is done: CUDA only queues it."""
-    with ledger.stage(stage):
-        yield
-        if device == "cuda":
-            torch.cuda.synchronize()
-
-
 def interleaved(
-    contenders: Mapping[str, Contender], repeats: int, *, progress: Callable[[], object] = lambda: None
+    contenders: Mapping[str, Contender],
+    repeats: int,
+    *,
+    warm_ups: int = WARM_UPS["cpu"],
+    progress: Callable[[], object] = lambda: None,
 ) -> dict[str, dict[str, list[float]]]:
-    """Contender -> stage -> ms of every repeat, round robin, after one round that does not count (caches, lists)."""
+    """Contender -> stage -> ms of every repeat, round robin, after rounds that do not count."""
     times: dict[str, dict[str, list[float]]] = {name: {} for name in contenders}
-    for turn in range(repeats + 1):
+    for turn in range(warm_ups + repeats):
         for name, contender in contenders.items():
             ms = contender()
             progress()
-            if turn > 0:
+            if turn >= warm_ups:
                 for stage, value in ms.items():
                     times[name].setdefault(stage, []).append(value)
     return times

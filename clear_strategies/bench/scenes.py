@@ -223,6 +223,7 @@ _MADE: Final[dict[str, Callable[[], Workload]]] = {
     "small": lambda: surfaces("small", 5_000, 252, 189, radius=5.5),
     "s100k": lambda: surfaces("s100k", 100_000, 1008, 756, radius=5.5),
     "s100k-lr": lambda: to_lr(_MADE["s100k"](), "s100k-lr"),
+    "s300k-2016": lambda: surfaces("s300k-2016", 300_000, 2016, 1512, radius=2 * 5.5 * 3**-0.3),
     "s500k": lambda: surfaces("s500k", 500_000, 1008, 756, radius=5.5 * 5**-0.3),
 }
 NAMES: Final = (*_MADE, "garden")
