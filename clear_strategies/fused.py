@@ -30,7 +30,7 @@ from clear_strategies.late import Number
 from clear_strategies.optim import BETA1, BETA2, Adam
 from rasterizers.interface import BackendUnavailable, SplatGradients
 from rasterizers.native import load_kernels
-from rasterizers.warp_backend import require
+from rasterizers.warp_backend.launch import require
 
 _log = logging.getLogger(__name__)
 
@@ -262,9 +262,9 @@ class FusedStep:
         epsilons = self._gco.epsilons
         if isinstance(c.comparable, Tensor):
             n = c.comparable[:-1].clamp_min(1)  # where nothing could be compared, the sums are 0
-            means = (torch.as_tensor(norms) / n for norms in (c.norm_lr, c.norm_hr))
-            on_device = [x if isinstance(x, Tensor) else torch.full_like(n, x) for x in epsilons(*means)]
-            return on_device[0], on_device[1]
+            lr, hr = (torch.as_tensor(norms) / n for norms in (c.norm_lr, c.norm_hr))
+            cos, corr = (x if isinstance(x, Tensor) else torch.full_like(lr, x) for x in epsilons(lr, hr))
+            return cos, corr
         norms = zip(c.norm_lr, c.norm_hr, c.comparable, strict=False)
         each = [epsilons(lr / n, hr / n) if n else epsilons(0.0, 0.0) for lr, hr, n in norms]
         return [cos for cos, _ in each], [corr for _, corr in each]

@@ -41,7 +41,7 @@ HEAVY = {
     "kornia": {"data"},
     "open3d": {"data"},
     "PIL": {"data", "images"},
-    "warp": set(),
+    "warp": {"kernels"},
     "gsplat": {"mcmc"},  # which nothing imports: a configuration names it
 }
 HEAVY |= {"hydra": HYDRA, "omegaconf": HYDRA}
@@ -99,7 +99,7 @@ def test_heavy_libraries_stay_in_their_rooms(path):
 
 @pytest.mark.parametrize("path", modules("clear_strategies"), ids=lambda p: str(p.relative_to(ROOT)))
 def test_no_concrete_rasterizer_is_imported(path):
-    allowed = ("rasterizers.interface", "rasterizers.geometry", "rasterizers.native")
+    allowed = ("rasterizers.interface", "rasterizers.geometry", "rasterizers.native", "rasterizers.warp_backend.launch")
     for name in imports(path):
         if name.startswith("rasterizers.") and unit(path) != "testing":
             assert name.startswith(allowed), f"{unit(path)} imports {name}"

@@ -25,7 +25,7 @@ from clear_strategies.optim import Adam, LearningRates
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from rasterizers.interface import BackendUnavailable, SplatGradients
 from rasterizers.native import load_kernels
-from rasterizers.warp_backend import require
+from rasterizers.warp_backend.launch import require
 
 EPS = torch.finfo(torch.float32).eps
 T = 5  # any iteration at which λ_HR = 1

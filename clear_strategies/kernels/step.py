@@ -24,8 +24,8 @@ class Comparison:
         norm_lr, norm_hr: Σ ‖g_LR‖ and Σ ‖g_HR‖ over the comparable Gaussians, by group.
     """
 
-    comparable: Sequence[int] | Float[Tensor, " 7"]
-    opposed: Sequence[int] | Float[Tensor, " 7"]
+    comparable: Sequence[int] | Int[Tensor, " 7"]
+    opposed: Sequence[int] | Int[Tensor, " 7"]
     norm_lr: Sequence[float] | Float[Tensor, " 6"]
     norm_hr: Sequence[float] | Float[Tensor, " 6"]
 
@@ -89,9 +89,9 @@ class Step:
 class Stepped:
     """By conflict group: rows corrected, Σ ω, rows with ω at its lower bound; and how many rows took no step, and why."""
 
-    corrected: Sequence[int] | Float[Tensor, " 6"]
+    corrected: Sequence[int] | Int[Tensor, " 6"]
     omega: Sequence[float] | Float[Tensor, " 6"]
-    at_lower_bound: Sequence[int] | Float[Tensor, " 6"]
+    at_lower_bound: Sequence[int] | Int[Tensor, " 6"]
     still: int | Int[Tensor, ""]
     invisible: int | Int[Tensor, ""]
 

@@ -1,7 +1,7 @@
 """A rasterizer in NVIDIA Warp: Python functions compiled at first use, one source for CUDA and for the CPU, in float32.
 
 The stages are those of `rasterizers.reference`, and so are their names: project, bin, blend, and back. `frame` runs them;
-the other files hold what runs on the device, adjoints written by hand. This file knows whether Warp can run here.
+`launch` knows Warp and whether it is here; the other files hold what runs on the device, adjoints written by hand.
 
 Deterministic: every sum has one order, and there are no floating-point atomics.
 """
@@ -12,7 +12,8 @@ from typing import Any
 
 import torch
 
-from rasterizers.interface import BackendUnavailable, Rasterizer
+from rasterizers.interface import Rasterizer
+from rasterizers.warp_backend.launch import require
 
 
 def create(device: str | None = None, **settings: Any) -> Rasterizer:
@@ -34,33 +35,3 @@ def create(device: str | None = None, **settings: Any) -> Rasterizer:
     from rasterizers.warp_backend.frame import WarpRasterizer
 
     return build(WarpRasterizer, {**settings, "device": device})
-
-
-def require(what: str, device: str, otherwise: str) -> None:
-    """Make sure of Warp before `what` imports it, and keep it off stdout.
-
-    Args:
-        device: "cuda" or "cpu", where `what` is to run.
-        otherwise: what runs here where CUDA is not to be had.
-
-    Raises:
-        BackendUnavailable: Warp is not installed, or finds no CUDA device.
-    """
-    try:
-        import warp as wp
-    except ImportError as error:
-        raise BackendUnavailable(
-            f"{what} needs NVIDIA Warp, which is not installed ({error}); pip install 'clear-strategies[warp]'."
-        ) from error
-    # Its greeting, and a line for every compilation, would go to stdout, which is the caller's.
-    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    if device == "cuda" and not torch.cuda.is_available():
-        raise BackendUnavailable(
-            f"{what} cannot run on CUDA: torch finds no CUDA device. Install NVIDIA's driver and a torch built for CUDA; "
-            f"{otherwise}."
-        )
-    if device == "cuda" and wp.get_cuda_device_count() == 0:
-        raise BackendUnavailable(
-            f"{what} cannot run on CUDA: torch finds a CUDA device, Warp does not. Update NVIDIA's driver or warp-lang; "
-            f"{otherwise}."
-        )

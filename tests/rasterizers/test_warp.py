@@ -115,11 +115,13 @@ def test_no_local_name_hides_a_constant_of_warp():
     # Warp's hash of a kernel would take `e.A` for a property of Euler's number until it has compiled `e`: no cache hit.
     import warp as wp
 
+    from clear_strategies.kernels import warp_step
     from rasterizers import warp_backend
 
     constants = {name for name in dir(wp) if isinstance(getattr(wp, name), (int, float))}
     assert {"e", "pi", "inf"} <= {name.lower() for name in constants}
-    for path in Path(warp_backend.__file__).parent.glob("*.py"):
+    folders = [Path(package.__file__).parent for package in (warp_backend, warp_step)]
+    for path in (path for folder in folders for path in folder.glob("*.py")):
         names = {
             n.id
             for n in ast.walk(ast.parse(path.read_text()))

@@ -1,7 +1,7 @@
 """The per-Gaussian pass in Warp, the same one as in C++ (`step`): for CUDA, and on a CPU the same kernels, to check them.
 
-What is counted stays on the device: a `Comparison` and a `Stepped` hold tensors there, float64 and int64, and nobody waits
-for them. To be imported once `rasterizers.warp_backend.require` has found Warp.
+What is counted stays on the device: a `Comparison` and a `Stepped` hold tensors there, counts int64 and sums float64, and
+nobody waits for them. To be imported once `rasterizers.warp_backend.launch.require` has found Warp.
 """
 
 from __future__ import annotations
@@ -70,12 +70,13 @@ class GaussianPass:
             raise ValueError("there is no HR gradient to compare with.")
         if products is not None:
             self._required("products", products, (_GROUPS, self._n), torch.float64)
-        blocks = self._blocks(sweeps.Compared)
+        counts, norms = self._blocks(sweeps.Counts, torch.int32), self._blocks(sweeps.Norms, torch.float64)
         with on_stream(self._like.device):
             self._launch_tiled(
-                sweeps.compare, *self._gradients, products is not None, array(products), array(blocks, sweeps.Compared)
-            )
-        comparable, opposed, norm_lr, norm_hr = torch.split(blocks.sum(0), [_GROUPS + 1, _GROUPS + 1, _GROUPS, _GROUPS])
+                sweeps.compare, *self._gradients, products is not None, array(products),
+                array(counts, sweeps.Counts), array(norms, sweeps.Norms),
+            )  # fmt: skip
+        (comparable, opposed), (norm_lr, norm_hr) = counts.sum(0).view(2, -1), norms.sum(0).view(2, -1)
         return Comparison(comparable, opposed, norm_lr, norm_hr)
 
     def step(self, attributes: Mapping[str, Attribute], correction: Correction | None, step: Step) -> Stepped:
@@ -92,13 +93,13 @@ class GaussianPass:
             self._required("visible", step.visible, (self._n,), torch.uint8)
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
-        blocks = self._blocks(sweeps.Counted)
+        counts, omegas = self._blocks(sweeps.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
         rule, *numbers = self._rule(correction)
         with on_stream(self._like.device):
             self._launch_tiled(
                 sweeps.step, *self._gradients, rule, *(array(x) for x in numbers), self._sweep(correction, step),
                 _adam(step), *parameters.values(), bands, array(step.visible), array(colours), array(moving),
-                array(blocks, sweeps.Counted),
+                array(counts, sweeps.Counts), array(omegas, conflict.Six),
             )  # fmt: skip
             wp.launch(
                 sweeps.step_bands, (self._n, step.width), device=self._device, block_dim=self._lanes,
@@ -107,10 +108,9 @@ class GaussianPass:
                     array(moving), _adam(step), bands,
                 ],
             )  # fmt: skip
-        corrected, omega, at_lower_bound, resting = torch.split(blocks.sum(0), [_GROUPS, _GROUPS, _GROUPS, 2])
-        still, invisible = resting.long().unbind()
+        corrected, at_lower_bound, (still, invisible) = torch.split(counts.sum(0), [_GROUPS, _GROUPS, 2])
         return Stepped(
-            corrected, omega, at_lower_bound,
+            corrected, omegas.sum(0), at_lower_bound,
             still if step.skips else 0, 0 if step.visible is None else invisible,
         )  # fmt: skip
 
@@ -128,9 +128,9 @@ class GaussianPass:
             kernel, dim=[-(-self._n // self._lanes)], inputs=arguments, block_dim=self._lanes, device=self._device
         )
 
-    def _blocks(self, row: Any) -> Tensor:
+    def _blocks(self, row: Any, dtype: torch.dtype) -> Tensor:
         """Room for what each block counts."""
-        return self._like.new_empty(-(-self._n // self._lanes), len(row()), dtype=torch.float64)
+        return self._like.new_empty(-(-self._n // self._lanes), len(row()), dtype=dtype)
 
     def _attribute(self, name: str, a: Attribute, width: int) -> Any:
         tensors = {"p": a.p, "m": a.m, "v": a.v, "anchor": a.anchor, "merged": a.merged}
@@ -145,7 +145,6 @@ class GaussianPass:
         out = sweeps.Sweep()
         out.lambda_hr, out.skips, out.width = step.lambda_hr, step.skips, step.width
         out.corrects, out.chooses = correction is not None, step.visible is not None
-        out.judged = correction is not None and correction.reliability is not None
         return out
 
     def _rule(self, c: Correction | None) -> tuple[Any, Tensor | None, Tensor | None, Tensor | None]:
@@ -161,6 +160,7 @@ class GaussianPass:
         )
         if not len(c.groups) == len(eps_cos) == len(eps_corr) == _GROUPS:
             raise ValueError(f"groups, eps_cos and eps_corr must have one entry for each of {_GROUPS} conflict groups.")
+        rule.judged = c.reliability is not None
         if c.reliability is not None:
             self._required("reliability", c.reliability, (self._n,), torch.float32)
         return rule, eps_cos, eps_corr, c.reliability

@@ -46,17 +46,18 @@ class Rule:
     weight_max: wp.float64
     rotation_noise: wp.float64  # ‖g_quats‖ at or below this times ‖g_scales‖ is rounding
     bounds_hold_omega: wp.bool  # else they hold the coefficient
+    judged: wp.bool  # a reliability is given, else q = 0
 
 
 @wp.struct
 @no_type_check
 class Corrected:
-    """By group: of which multiple of g_LR the HR gradient is freed, ω, and 1 where it is and where ω is at its lower bound."""
+    """By group: of which multiple of g_LR the HR gradient is freed, and ω; bit k: group k is, and with ω at its lower bound."""
 
     step: Six
     omega: Six
-    rows: Six
-    at_lower_bound: Six
+    rows: wp.int32
+    at_lower_bound: wp.int32
 
 
 @wp.func
@@ -103,11 +104,18 @@ def turns_something(p: Products, rotation_noise: wp.float64) -> wp.bool:
 @wp.func
 @no_type_check
 def correct(
-    p: Products, rule: Rule, eps_cos: wp.array[wp.float64], eps_corr: wp.array[wp.float64], q: wp.float64
+    p: Products,
+    rule: Rule,
+    eps_cos: wp.array[wp.float64],
+    eps_corr: wp.array[wp.float64],
+    reliability: wp.array[wp.float32],
+    i: wp.int32,
 ) -> Corrected:
     """Eq. 6, 7, 11"""
-    step, omegas, rows, at_bound = Six(), Six(), Six(), Six()
-    one, tau = wp.float64(1.0), rule.tolerance
+    step, omegas, rows, at_bound = Six(), Six(), wp.int32(0), wp.int32(0)
+    one, tolerance, q = wp.float64(1.0), rule.tolerance, wp.float64(0.0)
+    if rule.judged:
+        q = wp.float64(reliability[i])
     for k in range(GROUPS):
         apart = ((rule.groups >> k) & 1) == 1 and p.dot[k] < wp.float64(0.0)
         if k == QUATS:
@@ -115,18 +123,18 @@ def correct(
         if apart:
             n = wp.sqrt(p.l2[k] * p.h2[k])  # ‖low‖‖high‖; squares of floats leave room for a product
             cosine = p.dot[k] / wp.max(n + eps_cos[k], SMALLEST)  # Eq. 6
-            if n > wp.float64(0.0) and cosine < -tau:
-                omega = wp.clamp((-cosine - tau) / (one - tau), wp.float64(0.0), one) * (one - q)  # Eq. 11
-                coefficient = (p.dot[k] + tau * n) / (p.l2[k] + eps_corr[k])
+            if n > wp.float64(0.0) and cosine < -tolerance:
+                omega = wp.clamp((-cosine - tolerance) / (one - tolerance), wp.float64(0.0), one) * (one - q)  # Eq. 11
+                coefficient = (p.dot[k] + tolerance * n) / (p.l2[k] + eps_corr[k])
                 if rule.bounds_hold_omega:
                     omega = wp.clamp(omega, rule.weight_min, rule.weight_max)
                     step[k] = omega * coefficient
                 else:
                     step[k] = -wp.clamp(wp.abs(omega * coefficient), rule.weight_min, rule.weight_max)
                 omegas[k] = omega
-                rows[k] = one
+                rows |= 1 << k
                 if omega <= rule.weight_min:
-                    at_bound[k] = one
+                    at_bound |= 1 << k
     out = Corrected()
     out.step = step
     out.omega = omegas

@@ -24,6 +24,7 @@ from clear_strategies.kernels.warp_step.conflict import (
     SHN,
     Corrected,
     Rule,
+    Six,
     correct,
     corrected3,
     group_products,
@@ -35,10 +36,12 @@ from clear_strategies.kernels.warp_step.pulled import Activation, Gradient, View
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
-Compared: Final[Any] = wp.types.vector(length=26, dtype=wp.float64)
-"""Comparable and opposed [7] each, Σ ‖l‖ and Σ ‖h‖ [6] each."""
-Counted: Final[Any] = wp.types.vector(length=20, dtype=wp.float64)
-"""Corrected rows, Σ ω and rows with ω at its lower bound [6] each; rows that were still, and that were not visible."""
+Counts: Final[Any] = wp.types.vector(length=14, dtype=wp.int32)
+"""`compare`: Gaussians that are comparable, and opposed, [7] each. `step`: rows corrected, and with ω at its lower bound, [6]
+each; rows that were still, and that were not visible.
+"""
+Norms: Final[Any] = wp.types.vector(length=12, dtype=wp.float64)
+"""Σ ‖l‖ and Σ ‖h‖ [6] each."""
 
 
 @wp.struct
@@ -48,7 +51,6 @@ class Sweep:
 
     lambda_hr: wp.float32
     corrects: wp.bool
-    judged: wp.bool  # a reliability is given, else q = 0
     skips: wp.bool  # leave out rows that would not move
     chooses: wp.bool  # only visible rows may step
     width: wp.int32  # numbers of an shN row that are stepped
@@ -64,36 +66,31 @@ def compare(
     view: View,
     keeps: wp.bool,
     norm_products: wp.array2d[wp.float64],
-    blocks: wp.array[Compared],
+    counts: wp.array[Counts],
+    norms: wp.array[Norms],
 ) -> None:
     """A thread per Gaussian: is it comparable, does it point apart, and how long are its gradients?"""
     block, lane = wp.tid()
     i = block * wp.block_dim() + lane
-    found = Compared()
+    found, lengths = Counts(), Norms()
     if i < view.n:
         g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
         p = group_products(g_lr, g_hr, lr, base, view, i)
         for k in range(GROUPS + 1):
             comparable = p.l2[k] > wp.float64(0.0) and p.h2[k] > wp.float64(0.0)
             if comparable:
-                found[k] = wp.float64(1.0)
+                found[k] = 1
                 if p.dot[k] < wp.float64(0.0):
-                    found[7 + k] = wp.float64(1.0)
+                    found[GROUPS + 1 + k] = 1
             if k < GROUPS:
                 norm_l, norm_h = wp.sqrt(p.l2[k]), wp.sqrt(p.h2[k])
                 if comparable:
-                    found[14 + k] = norm_l
-                    found[20 + k] = norm_h
+                    lengths[k] = norm_l
+                    lengths[GROUPS + k] = norm_h
                 if keeps:
                     norm_products[k, i] = norm_l * norm_h
-    wp.tile_store(blocks, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(block,))
-
-
-@wp.func
-@no_type_check
-def keep_colour(colours: wp.array3d[wp.float32], which: wp.int32, i: wp.int32, rgb: wp.vec3) -> None:
-    for channel in range(3):
-        colours[which, i, channel] = rgb[channel]
+    wp.tile_store(counts, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(block,))
+    wp.tile_store(norms, wp.tile_sum(wp.tile(lengths, preserve_type=True)), offset=(block,))
 
 
 @wp.kernel
@@ -120,7 +117,8 @@ def step(
     visible: wp.array[wp.uint8],
     colours: wp.array3d[wp.float32],
     moving: wp.array[wp.bool],
-    blocks: wp.array[Counted],
+    counts: wp.array[Counts],
+    omegas: wp.array[Six],
 ) -> None:
     """A thread per Gaussian: everything but shN, of which the merged colour is left in `colours`.
 
@@ -131,31 +129,14 @@ def step(
     i = wp.min(at, view.n - 1)  # lanes beyond the last Gaussian count nothing and write nothing
     g_lr, g_hr, g_hf = load(activation, lr, base, hf, view, i)
     seen = not sweep.chooses or visible[i] != wp.uint8(0)
-    still = False
-    if sweep.skips and size(g_lr) + size(g_hr) + size(g_hf) <= 0.0:
-        still = is_still(means, i, 3) and is_still(quats, i, 4) and is_still(scales, i, 3)
-        still = still and is_still(opacities, i, 1) and is_still(sh0, i, 3) and is_still(detail, i, 3)
-        still = still and is_still(shN, i, sweep.width)
+    still = sweep.skips and size(g_lr) + size(g_hr) + size(g_hf) <= 0.0
+    still = still and is_still(means, i, 3) and is_still(quats, i, 4) and is_still(scales, i, 3)
+    still = still and is_still(opacities, i, 1) and is_still(sh0, i, 3) and is_still(detail, i, 3)
+    still = still and is_still(shN, i, sweep.width)
     change = Corrected()
     if sweep.corrects:
-        q = wp.float64(0.0)
-        if sweep.judged:
-            q = wp.float64(reliability[i])
-        change = correct(group_products(g_lr, g_hr, lr, base, view, i), rule, eps_cos, eps_corr, q)
-
-    count = Counted()
-    if at < view.n:
-        for k in range(GROUPS):
-            count[k] = change.rows[k]
-            count[6 + k] = change.omega[k]
-            count[12 + k] = change.at_lower_bound[k]
-        if not seen:
-            count[19] = wp.float64(1.0)
-        elif still:
-            count[18] = wp.float64(1.0)
-    wp.tile_store(blocks, wp.tile_sum(wp.tile(count, preserve_type=True)), offset=(block,))
-    if at >= view.n:
-        return
+        products = group_products(g_lr, g_hr, lr, base, view, i)
+        change = correct(products, rule, eps_cos, eps_corr, reliability, i)
 
     moves, λ = seen and not still, sweep.lambda_hr
     d_means = merged3(g_lr.means, g_hr.means, change.step[MEANS], λ)
@@ -165,12 +146,30 @@ def step(
     d_sh0 = merged3(g_lr.sh0, g_hr.sh0, change.step[SH0], λ)
     # f_det: never corrected, never from L_base
     d_detail = g_hf.rgb * route_of(activation, view, i) * view.lambda_hf * λ
-    if view.one_basis:
-        keep_colour(colours, 0, i, merged3(g_lr.rgb, g_hr.rgb, change.step[SHN], λ))
-    else:
-        keep_colour(colours, 0, i, corrected3(g_lr.rgb, g_lr.rgb, change.step[SHN] * wp.float64(λ)))
-        keep_colour(colours, 1, i, g_hr.rgb * λ)
+    rgb_lr, rgb_hr = merged3(g_lr.rgb, g_hr.rgb, change.step[SHN], λ), wp.vec3()
+    if not view.one_basis:
+        rgb_lr, rgb_hr = corrected3(g_lr.rgb, g_lr.rgb, change.step[SHN] * wp.float64(λ)), g_hr.rgb * λ
+
+    found, omega = Counts(), Six()
+    if at < view.n:
+        omega = change.omega
+        for k in range(GROUPS):
+            found[k] = (change.rows >> k) & 1
+            found[GROUPS + k] = (change.at_lower_bound >> k) & 1
+        if not seen:
+            found[13] = 1
+        elif still:
+            found[12] = 1
+    wp.tile_store(counts, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(block,))
+    wp.tile_store(omegas, wp.tile_sum(wp.tile(omega, preserve_type=True)), offset=(block,))
+    if at >= view.n:
+        return
+
     moving[i] = moves
+    for channel in range(3):
+        colours[0, i, channel] = rgb_lr[channel]
+        if not view.one_basis:
+            colours[1, i, channel] = rgb_hr[channel]
     for d in range(3):
         step_number(adam, means, 3 * i + d, d_means[d], moves)
         step_number(adam, scales, 3 * i + d, d_scales[d], moves)
