@@ -29,7 +29,8 @@ _WIDTHS: Final = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3,
 class GaussianPass:
     """The gradients of one view's losses, as a rasterizer left them, and the sweeps over them.
 
-    Args: as of `step.GaussianPass`; all tensors on one device.
+    Args:
+        activation, lr, base, hf: as for `step.GaussianPass`, all on one device.
 
     Raises:
         TypeError, ValueError: a tensor is not float32, contiguous and on that device, or has another shape.
@@ -47,6 +48,8 @@ class GaussianPass:
         self._n, self._bases = self._like.shape
         if not 1 <= self._bases <= 16:
             raise ValueError(f"the basis must have 1 to 16 columns, got {self._bases}.")
+        if 45 * self._n >= 2**31:
+            raise ValueError(f"numbers of shN are counted in 32 bits, got {self._n} Gaussians. Set fit.fused=off.")
         if base is None and hf is not None:
             raise ValueError("hf needs base, got None.")
         self._kept = (activation, lr, base, hf)  # while kernels may read them
@@ -94,18 +97,18 @@ class GaussianPass:
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
         counts, omegas = self._blocks(sweeps.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
-        rule, *numbers = self._rule(correction)
+        (rule, *numbers), adam_step = self._rule(correction), _adam(step)
         with on_stream(self._like.device):
             self._launch_tiled(
                 sweeps.step, *self._gradients, rule, *(array(x) for x in numbers), self._sweep(correction, step),
-                _adam(step), *parameters.values(), bands, array(step.visible), array(colours), array(moving),
+                adam_step, *parameters.values(), bands, array(step.visible), array(colours), array(moving),
                 array(counts, sweeps.Counts), array(omegas, conflict.Six),
             )  # fmt: skip
             wp.launch(
                 sweeps.step_bands, (self._n, step.width), device=self._device, block_dim=self._lanes,
                 inputs=[
                     self._gradients[-1], array(self._like), array(self._hr_basis), array(colours),
-                    array(moving), _adam(step), bands,
+                    array(moving), adam_step, bands,
                 ],
             )  # fmt: skip
         corrected, at_lower_bound, (still, invisible) = torch.split(counts.sum(0), [_GROUPS, _GROUPS, 2])
@@ -186,7 +189,7 @@ class GaussianPass:
         if tensor is None or tensor.dtype != dtype or tensor.device != device or not tensor.is_contiguous():
             where = "in the CPU's memory" if device.type == "cpu" else f"on {device}"
             raise TypeError(f"{name} must be a contiguous {str(dtype).removeprefix('torch.')} tensor {where}.")
-        if tensor.dim() == 0 or len(tensor) != rows or tensor.numel() != rows * width:
+        if tensor.dim() == 0 or tensor.shape[0] != rows or tensor.numel() != rows * width:
             raise ValueError(f"{name} must have {rows} rows of {width} numbers, got shape {tuple(tensor.shape)}.")
         return tensor
 
