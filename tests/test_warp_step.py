@@ -118,5 +118,7 @@ def test_the_kernels_compile_for_cuda_without_one(warp_step, monkeypatch, tmp_pa
     monkeypatch.setitem(module.options, "block_dim", warp_step.LANES["cuda"])
     wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
     (compiled,) = tmp_path.glob("*.ptx")
-    assert ".target sm_90" in compiled.read_text()
-    assert "fma.rn.f32" not in compiled.read_text()  # products and sums round as they do in torch
+    assembly = compiled.read_text()
+    assert ".target sm_90" in assembly
+    assert ".local" not in assembly  # everything of a thread is in registers
+    assert "fma.rn.f32" not in assembly  # products and sums round as they do in torch
