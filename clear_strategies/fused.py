@@ -3,12 +3,15 @@
 `Conductor.merge`, `GCO.correct`, `SVS.regularize`, `Activation.pull`, `Adam.step` and `GaussianField.constrain` are what
 it computes; they remain the source of truth, and `tests/test_fused.py` holds the two side by side. What the strategies
 say in a few numbers per Gaussian (gate, observe, route, score) is asked of them as always.
+
+C++ sweeps over Gaussians in the CPU's memory, Warp over those on CUDA. There nothing is waited for: what was counted stays
+on the device, and so do the numbers that are made of it (`late`).
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -16,19 +19,25 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from clear_strategies import late
 from clear_strategies.conductor import Conductor
 from clear_strategies.evidence import Evidence
 from clear_strategies.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.gco import ROTATION_NOISE, Correction
 from clear_strategies.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels import step as kernel
+from clear_strategies.late import Number
 from clear_strategies.optim import BETA1, BETA2, Adam
 from rasterizers.interface import BackendUnavailable, SplatGradients
 from rasterizers.native import load_kernels
+from rasterizers.warp_backend.launch import require
 
 _log = logging.getLogger(__name__)
 
 Fused = Literal["auto", "every_row", "off"]
+
+GaussianPass = Callable[..., kernel.Sweeps]
+"""`kernels.step.GaussianPass`, or another class of its signature."""
 
 _KNOWN: Final = ("gco", "p2g", "svs")
 _LIMITS: Final = {"opacities": LOGIT_LIMIT, "scales": LOG_SCALE_LIMIT}
@@ -53,13 +62,29 @@ def _why_not(conductor: Conductor, optimizer: Adam, mode: Fused) -> str | None:
         if type(thing) is not base:
             return f"{type(thing).__name__} may do something else than {base.__name__}"
     for name, moments in optimizer.first.items():
-        if moments.device.type != "cpu" or moments.dtype != torch.float32:
-            return f"{name} is {moments.dtype} on {moments.device}, not float32 on the CPU"
+        if moments.device.type not in ("cpu", "cuda") or moments.dtype != torch.float32:
+            return f"{name} is {moments.dtype} on {moments.device}, not float32 on the CPU or on CUDA"
     try:
-        load_kernels("clear_strategies.kernels")
+        gaussian_pass(optimizer)
     except BackendUnavailable as error:
         return str(error).rstrip(".")
     return None
+
+
+def gaussian_pass(optimizer: Adam) -> GaussianPass:
+    """The pass for where the optimizer's moments lie.
+
+    Raises:
+        BackendUnavailable: C++ was not compiled for the CPU, or Warp is not there for CUDA.
+    """
+    device = optimizer.first["means"].device.type
+    if device == "cpu":
+        load_kernels("clear_strategies.kernels")
+        return kernel.GaussianPass
+    require("the compiled pass", device, "it runs in C++ for a field in the CPU's memory")
+    from clear_strategies.kernels import warp_step
+
+    return warp_step.GaussianPass
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,15 +111,25 @@ class FusedStep:
 
     A row stays as it is where its gradient, both moments and the anchor's pull are 0, and so do bands of the spherical
     harmonics above the active degree; `skips` False visits them all the same, and finds the same bits.
+
+    Args:
+        sweeps: who does the arithmetic; None: who can, where the optimizer's moments lie.
+
+    Raises:
+        BackendUnavailable: nobody can.
     """
 
     stage: Final = "per-Gaussian pass"
 
-    def __init__(self, conductor: Conductor, optimizer: Adam, *, skips: bool = True) -> None:
+    def __init__(
+        self, conductor: Conductor, optimizer: Adam, *, skips: bool = True, sweeps: GaussianPass | None = None
+    ) -> None:
         self.conductor, self.optimizer, self.skips = conductor, optimizer, skips
+        self._sweeps = gaussian_pass(optimizer) if sweeps is None else sweeps
         self._gco: Any = conductor.owner("correct")
         self._svs: Any = next((s for s in conductor.strategies if type(s).fused == "svs"), None)
-        self._quiet: tuple[int, Sequence[Tensor | None]] | None = None
+        self._looked_at: tuple[int, Sequence[Tensor | None]] | None = None
+        self._quiet = False
 
     def pull(self, shot: FieldShot, cotangents: Float[Tensor, "K H W 3"]) -> list[Factors]:
         g = shot.gradients(cotangents)
@@ -109,7 +144,7 @@ class FusedStep:
         m: float | Float[Tensor, " N"],
         e: Evidence | None,
         t: int,
-    ) -> tuple[Grads, Mapping[str, float]]:
+    ) -> tuple[Grads, Mapping[str, Number]]:
         """Step `params` and the optimizer's moments in place; no gradient is left, only the conflict ratio."""
         rates, bias2 = self.optimizer.advance()
         only = self.optimizer.rates.rows == "visible"
@@ -126,7 +161,7 @@ class FusedStep:
         m: float | Float[Tensor, " N"],
         e: Evidence | None,
         t: int,
-    ) -> tuple[Grads, Mapping[str, float]]:
+    ) -> tuple[Grads, Mapping[str, Number]]:
         """For checking: the dense gradient that `merge` steps by, and nothing moved."""
         merged = Grads({name: torch.zeros_like(p) for name, p in params.items()})
         rates = dict.fromkeys(params, 0.0)
@@ -146,13 +181,13 @@ class FusedStep:
         bias2: float,
         visible: Tensor | None,
         merged: Grads | None,
-    ) -> Mapping[str, float]:
+    ) -> Mapping[str, Number]:
         o, a = self.conductor.objective, g_lr.activation
         activation = {
             "scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid,
             "factor": a.factor.contiguous(), "route": m.float().contiguous() if isinstance(m, Tensor) else None,
         }  # fmt: skip
-        gaussians = kernel.GaussianPass(
+        gaussians = self._sweeps(
             activation,
             g_lr.table(),
             None if g_base is None else g_base.table(),
@@ -160,13 +195,13 @@ class FusedStep:
             o.lambda_hf,
         )
         λ = o.lambda_hr(t)
-        conflict: dict[str, float] = {}
+        conflict: dict[str, Number] = {}
         correction, compared, margins = None, None, None
         if g_base is not None and λ > 0:
-            products = self._products(len(a.sigmoid))
+            products = self._products(a.sigmoid)
             compared = gaussians.compare(products)  # before correction
             shares = zip((*CONFLICT_GROUPS, "gaussian"), compared.opposed, compared.comparable, strict=True)
-            conflict = {group: opposed / n if n else float("nan") for group, opposed, n in shares}
+            conflict = {group: late.made(late.ratio, opposed, n) for group, opposed, n in shares}
             if self._gco is not None:
                 correction, margins = self._correction(compared, products, e)
         anchor, stiffness = self._anchor(len(a.sigmoid))
@@ -196,25 +231,23 @@ class FusedStep:
             self._note_skips(stepped, bands, shN.shape[1])
         return conflict
 
-    def _products(self, n: int) -> Float[Tensor, "6 N"] | None:
+    def _products(self, like: Float[Tensor, " N"]) -> Float[Tensor, "6 N"] | None:
         """Room for ‖g_LR‖‖g_HR‖ by group, which only an absolute ε is held against."""
         if self._gco is None or not self._gco.eps.startswith("absolute"):
             return None
-        return torch.empty(len(CONFLICT_GROUPS), n, dtype=torch.float64)
+        return like.new_empty(len(CONFLICT_GROUPS), len(like), dtype=torch.float64)
 
     def _correction(
         self, compared: kernel.Comparison, products: Tensor | None, e: Evidence | None
-    ) -> tuple[kernel.Correction, list[float | None]]:
+    ) -> tuple[kernel.Correction, list[Number | None]]:
         gco = self._gco
-        eps = [
-            gco.epsilons(lr / n, hr / n) if n else gco.epsilons(0.0, 0.0)
-            for lr, hr, n in zip(compared.norm_lr, compared.norm_hr, compared.comparable, strict=False)
-        ]
-        margins = [None if products is None else gco.margin(products[k], cos) for k, (cos, _) in enumerate(eps)]
+        eps_cos, eps_corr = self._epsilons(compared)
+        absolute, _ = gco.epsilons(0.0, 0.0)  # whatever the norms are
+        margins = [None] * len(CONFLICT_GROUPS) if products is None else [gco.margin(x, absolute) for x in products]
         correction = kernel.Correction(
             [group in gco.groups for group in CONFLICT_GROUPS],
-            [cos for cos, _ in eps],
-            [corr for _, corr in eps],
+            eps_cos,
+            eps_corr,
             gco.tolerance,
             gco.weight_min,
             gco.weight_max,
@@ -224,10 +257,22 @@ class FusedStep:
         )
         return correction, margins
 
+    def _epsilons(self, c: kernel.Comparison) -> tuple[Sequence[float] | Tensor, Sequence[float] | Tensor]:
+        """ε of the cosine and of the correction by group; on the device, if that is where the mean norms are."""
+        epsilons = self._gco.epsilons
+        if isinstance(c.comparable, Tensor):
+            n = c.comparable[:-1].clamp_min(1)  # where nothing could be compared, the sums are 0
+            lr, hr = (torch.as_tensor(norms) / n for norms in (c.norm_lr, c.norm_hr))
+            cos, corr = (x if isinstance(x, Tensor) else torch.full_like(lr, x) for x in epsilons(lr, hr))
+            return cos, corr
+        norms = zip(c.norm_lr, c.norm_hr, c.comparable, strict=False)
+        each = [epsilons(lr / n, hr / n) if n else epsilons(0.0, 0.0) for lr, hr, n in norms]
+        return [cos for cos, _ in each], [corr for _, corr in each]
+
     def _report(
         self,
         compared: kernel.Comparison,
-        margins: Sequence[float | None],
+        margins: Sequence[Number | None],
         stepped: kernel.Stepped,
         e: Evidence | None,
     ) -> None:
@@ -250,23 +295,27 @@ class FusedStep:
 
     def _above_is_quiet(self, shN: Tensor, active: int, anchor: Tensor | None) -> bool:
         """Whether bands above the active degree have no momentum and no pull. Looked at again when a tensor is another
-        one (densification, resuming, the anchor); while it is the same, a pass that left them alone left them quiet.
+        one (densification, resuming, the anchor); while it is the same, a pass that left them alone left them quiet, and
+        momentum that is there does not end.
         """
         tensors = (self.optimizer.first["shN"], self.optimizer.second["shN"], anchor)
-        if self._quiet is not None:
-            looked_from, same = self._quiet
-            if looked_from <= active and all(a is b for a, b in zip(same, tensors, strict=True)):
-                return True
+        if self._looked_at is not None:
+            looked_from, same = self._looked_at
+            known = looked_from <= active if self._quiet else looked_from == active
+            if known and all(a is b for a, b in zip(same, tensors, strict=True)):
+                return self._quiet
         moved = any(bool(moments[:, active:].any()) for moments in tensors[:2] if moments is not None)
         pulled = anchor is not None and not torch.equal(anchor[:, active:], shN[:, active:])
-        self._quiet = None if moved or pulled else (active, tensors)
-        return self._quiet is not None
+        self._looked_at, self._quiet = (active, tensors), not (moved or pulled)
+        return self._quiet
 
     def _note_skips(self, stepped: kernel.Stepped, bands: int, all_bands: int) -> None:
         skip = self.conductor.ledger.skip
-        if stepped.still:
-            skip("optimizer rows", "gradient, moments and anchor's pull are 0", stepped.still)
-        if stepped.invisible:
-            skip("optimizer rows", "not visible (optim.rows=visible)", stepped.invisible)
+        for reason, rows in (
+            ("gradient, moments and anchor's pull are 0", stepped.still),
+            ("not visible (optim.rows=visible)", stepped.invisible),
+        ):
+            if isinstance(rows, Tensor) or rows:  # a number on the device is not looked at
+                skip("optimizer rows", reason, rows)
         if bands < all_bands:
             skip("SH bands in the optimizer", "above the active degree", all_bands - bands)

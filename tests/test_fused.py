@@ -1,17 +1,21 @@
-"""The fused per-Gaussian pass beside what it stands for: Conductor.merge, Adam.step and GaussianField.constrain."""
+"""The fused per-Gaussian pass beside what it stands for: Conductor.merge, Adam.step and GaussianField.constrain.
+
+In C++ and in Warp, whose kernels for CUDA run on a CPU, too.
+"""
 
 from __future__ import annotations
 
 import itertools
 import logging
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import pytest
 import torch
 import toy
 
-from clear_strategies import CONFLICT_GROUPS, GCO, P2G, SVS, Conductor, Evidence, Objective
+from clear_strategies import CONFLICT_GROUPS, GCO, P2G, SVS, Conductor, Evidence, Objective, late
 from clear_strategies.density import DensitySettings
 from clear_strategies.field import GaussianField
 from clear_strategies.fit import FitSettings, TrainState, iterate
@@ -22,20 +26,65 @@ from clear_strategies.optim import Adam, LearningRates
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from rasterizers.interface import BackendUnavailable, SplatGradients
 from rasterizers.native import load_kernels
+from rasterizers.warp_backend.launch import require
 
 EPS = torch.finfo(torch.float32).eps
 T = 5  # any iteration at which λ_HR = 1
 
 
-def _built() -> bool:
+@pytest.fixture(params=["cpp", "warp", "warp-cuda"])
+def sweeps(request):
+    """The pass in C++ or in Warp, for tensors in the CPU's memory."""
     try:
-        load_kernels("clear_strategies.kernels")
-    except BackendUnavailable:
-        return False
-    return True
+        if request.param == "cpp":
+            load_kernels("clear_strategies.kernels")
+            return kernel.GaussianPass
+        require("the compiled pass", "cuda" if request.param == "warp-cuda" else "cpu", "")
+    except BackendUnavailable as reason:
+        pytest.skip(str(reason))
+    from clear_strategies.kernels import warp_step
+
+    return warp_step.GaussianPass if request.param == "warp" else partial(Elsewhere, warp_step.GaussianPass, "cuda")
 
 
-needs_kernels = pytest.mark.skipif(not _built(), reason="the compiled kernels are not built here")
+class Elsewhere:
+    """A pass on another device; what it writes comes back to the tests' tensors."""
+
+    def __init__(self, sweeps, device, activation, lr, base, hf, lambda_hf) -> None:
+        self.device = device
+        self.there: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}  # the same tensor stays the same tensor
+        tables = ({name: self.bring(x) for name, x in t.items()} if t else None for t in (activation, lr, base, hf))
+        self.sweeps = sweeps(*tables, lambda_hf)
+
+    def bring(self, x):
+        if not isinstance(x, torch.Tensor):
+            return x
+        return self.there.setdefault(id(x), (x, x.to(self.device, copy=True)))[1]
+
+    def fetch(self, *written) -> None:
+        for x in written:
+            if x is not None:
+                x.copy_(self.there.pop(id(x))[1])
+
+    def compare(self, products=None):
+        found = self.sweeps.compare(self.bring(products))
+        self.fetch(products)
+        return found
+
+    def step(self, attributes, correction, step):
+        def brought(thing):
+            return thing and replace(thing, **{f.name: self.bring(getattr(thing, f.name)) for f in fields(thing)})
+
+        found = self.sweeps.step(
+            {name: brought(a) for name, a in attributes.items()}, brought(correction), brought(step)
+        )
+        self.fetch(*(x for a in attributes.values() for x in (a.p, a.m, a.v, a.merged)))
+        return found
+
+
+def told(numbers) -> dict[str, float]:
+    """Numbers by name, read if they are still on a device."""
+    return dict(zip(numbers, late.read(list(numbers.values())), strict=True))
 
 
 @dataclass
@@ -140,7 +189,10 @@ def assert_same_gradient(c: Case, expected, found, λ=1.0, hr="both"):
 
 
 def same(a, b):
-    assert a.keys() == b.keys()
+    assert a.keys() <= b.keys()
+    assert all(
+        math.isnan(b[name]) for name in b.keys() - a.keys()
+    )  # on a device nobody knows that there is nothing to say
     for name, value in a.items():
         assert b[name] == pytest.approx(value, rel=1e-6, nan_ok=True), name
 
@@ -161,10 +213,9 @@ GCO_SETTINGS = {
 KINDS = ("random", "tiny", "huge", "mixed", "opposite", "parallel", "sparse", "zero", "round")
 
 
-@needs_kernels
 @pytest.mark.parametrize("setting", GCO_SETTINGS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_merged_gradient_is_the_readable_one(setting, kind, caplog):
+def test_the_merged_gradient_is_the_readable_one(sweeps, setting, kind, caplog):
     for gate, evidence in ((False, True), (True, False)):
         c = case(237, kind=kind, gate=gate, evidence=evidence)
         readable, compiled = conductors(lambda: GCO(**GCO_SETTINGS[setting]), SVS, anchored=c.fields[0])
@@ -172,46 +223,44 @@ def test_the_merged_gradient_is_the_readable_one(setting, kind, caplog):
         expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
         said = caplog.messages
         caplog.clear()
-        step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0))
+        step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
         before = {name: p.clone() for name, p in c.fields[1].raw().items()}
         found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
         assert_same_gradient(c, expected, found)
         assert all(torch.equal(before[name], p) for name, p in c.fields[1].raw().items())
-        assert repr(found_conflict) == repr(conflict)
-        same(readable.strategies[0].readings, compiled.strategies[0].readings)
+        assert repr(told(found_conflict)) == repr(told(conflict))
+        same(told(readable.strategies[0].readings), told(compiled.strategies[0].readings))
         assert caplog.messages == said
 
 
-@needs_kernels
 @pytest.mark.parametrize("names", [s for k in range(4) for s in itertools.combinations((GCO, P2G, SVS), k)], ids=str)
-def test_every_subset_of_strategies_with_and_without_hr(names):
+def test_every_subset_of_strategies_with_and_without_hr(sweeps, names):
     for hr, anchored, hf in itertools.product(_K, (False, True), (0.2, 1.0)):
         c = case(100, kind="random", evidence=P2G in names)
         readable, compiled = conductors(*names, anchored=c.fields[0] if anchored else None, hf=hf)
         e = c.e if hr != "none" else None
         expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0, hr), c.m, e, T)
-        step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0))
+        step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
         found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1, hr), c.m, e, T)
         assert_same_gradient(c, expected, found, hr=hr)
-        assert repr(found_conflict) == repr(conflict)
+        assert repr(told(found_conflict)) == repr(told(conflict))
 
 
-@needs_kernels
-def test_hr_for_the_score_alone_is_neither_compared_nor_corrected():
+def test_hr_for_the_score_alone_is_neither_compared_nor_corrected(sweeps):
     later = WarmupDecay(start=T + 5, full=T + 10, decay_from=40, end=50)
     c = case(50)
     readable, compiled = conductors(GCO, λ=later)
     expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
-    step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0))
+    step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
     found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
     assert conflict == found_conflict == {}
     assert all(torch.equal(expected[name], found[name]) for name in expected)
 
 
-def three_steps(c: Case, both, rates: LearningRates, hr="both", skips=True, steps=3):
+def three_steps(sweeps, c: Case, both, rates: LearningRates, hr="both", skips=True, steps=3):
     """Three steps each way: readable parameters and moments, and compiled ones."""
     adams = [Adam(f.raw(), rates, 2.0) for f in c.fields]
-    step = FusedStep(both[1], adams[1], skips=skips)
+    step = FusedStep(both[1], adams[1], skips=skips, sweeps=sweeps)
     for i in range(steps):
         g, _ = both[0].merge(c.fields[0].raw(), *c.grads(0, hr), c.m, c.e, T + i)
         adams[0].step(c.fields[0].raw(), g, c.visible)
@@ -231,48 +280,45 @@ def assert_same_state(c: Case, adams, rates: LearningRates):
             assert bool(((a[name] - b[name]).abs() <= 4 * EPS * size).all()), name
 
 
-@needs_kernels
 @pytest.mark.parametrize("rows", ["all", "visible"])
 @pytest.mark.parametrize("kind", ["random", "sparse", "zero"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_step_is_adams(degree, kind, rows):
-    for n, hr in itertools.product((0, 1, 15, 16, 17), _K):
+def test_a_step_is_adams(sweeps, degree, kind, rows):
+    sizes = (0, 1, 15, 16, 17) if sweeps is kernel.GaussianPass else (0, 17)  # C++ takes sixteen at a time
+    for n, hr in itertools.product(sizes, _K):
         c = case(n, degree, kind)
         rates = LearningRates(rows=rows, detail_decay=0.1, means=LogLinear(end=10))
-        adams = three_steps(c, conductors(P2G), rates, hr)
+        adams = three_steps(sweeps, c, conductors(P2G), rates, hr)
         assert_same_state(c, adams, rates)
         assert adams[0].steps == adams[1].steps == 3
     c = case(1000, degree, kind)
     rates = LearningRates(rows=rows)
     # One step: an anchor hands the last bit of a parameter on to the next gradient, much enlarged beside it.
-    assert_same_state(c, three_steps(c, conductors(P2G, SVS, anchored=c.fields[0]), rates, steps=1), rates)
+    assert_same_state(c, three_steps(sweeps, c, conductors(P2G, SVS, anchored=c.fields[0]), rates, steps=1), rates)
 
 
-@needs_kernels
 @pytest.mark.parametrize("bands", [0, 3, 8, 15])
-def test_fields_of_every_degree_step(bands):
+def test_fields_of_every_degree_step(sweeps, bands):
     for degree in range(math.isqrt(bands + 1)):
         c = case(33, degree, bands=bands)
-        assert_same_state(c, three_steps(c, conductors(GCO), LearningRates()), LearningRates())
+        assert_same_state(c, three_steps(sweeps, c, conductors(GCO), LearningRates()), LearningRates())
 
 
-@needs_kernels
-def test_parameters_are_projected_and_what_is_not_finite_is_not_hidden():
+def test_parameters_are_projected_and_what_is_not_finite_is_not_hidden(sweeps):
     c = case(40, kind="sparse")
     for field in c.fields:
         field.opacities.data[:20], field.scales.data[5:30] = 50.0, -90.0
         field.means.data[3], field.opacities.data[4] = float("nan"), float("nan")
-    three_steps(c, conductors(), LearningRates())
+    three_steps(sweeps, c, conductors(), LearningRates())
     for name, p in c.fields[0].raw().items():
         assert torch.allclose(p, c.fields[1].raw()[name], rtol=1e-6, atol=1e-9, equal_nan=True), name
     assert float(c.fields[1].opacities.data.nan_to_num().max()) <= 15
     assert bool(c.fields[1].opacities.data[4].isnan())
 
 
-@needs_kernels
 @pytest.mark.parametrize("degree", [0, 1, 2])
 @pytest.mark.parametrize("anchored", [False, True])
-def test_rows_and_bands_that_are_left_out_would_not_have_moved(degree, anchored):
+def test_rows_and_bands_that_are_left_out_would_not_have_moved(sweeps, degree, anchored):
     rates = LearningRates(detail_decay=0.1)
     states, ledgers = [], []
     for skips in (True, False):
@@ -281,7 +327,7 @@ def test_rows_and_bands_that_are_left_out_would_not_have_moved(degree, anchored)
         if anchored:  # at θ^a itself nothing pulls
             for conductor in both:
                 conductor.after_step(c.fields[1].raw(), conductor.strategies[1].anchor_start)
-        adams = three_steps(c, both, rates, skips=skips)
+        adams = three_steps(sweeps, c, both, rates, skips=skips)
         states.append([*c.fields[1].raw().values(), *adams[1].first.values(), *adams[1].second.values()])
         ledgers.append(both[1].ledger.entries)
     assert all(torch.equal(a, b) for a, b in zip(*states, strict=True))
@@ -292,8 +338,7 @@ def test_rows_and_bands_that_are_left_out_would_not_have_moved(degree, anchored)
     assert "optimizer rows" not in ledgers[1]
 
 
-@needs_kernels
-def test_bands_with_momentum_are_not_left_out():
+def test_bands_with_momentum_are_not_left_out(sweeps):
     c = case(20, degree=1)
     both = conductors()
     adams = [Adam(f.raw(), LearningRates(), 1.0) for f in c.fields]
@@ -301,13 +346,12 @@ def test_bands_with_momentum_are_not_left_out():
         adam.first["shN"][:, 10], adam.second["shN"][:, 10] = 1e-3, 1e-6
     g, _ = both[0].merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
     adams[0].step(c.fields[0].raw(), g)
-    FusedStep(both[1], adams[1]).merge(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
+    FusedStep(both[1], adams[1], sweeps=sweeps).merge(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
     assert torch.allclose(c.fields[0].shN.data, c.fields[1].shN.data, rtol=1e-6, atol=1e-9)
     assert bool((c.fields[1].shN.data[:, 10] != 0).all())
 
 
-@needs_kernels
-def test_the_same_bits_for_any_number_of_threads():
+def test_the_same_bits_for_any_number_of_threads(sweeps):
     states = []
     threads = torch.get_num_threads()
     try:
@@ -316,11 +360,11 @@ def test_the_same_bits_for_any_number_of_threads():
             c = case(5000, kind="mixed")
             _, conductor = conductors(GCO, SVS, anchored=c.fields[0])
             adam = Adam(c.fields[1].raw(), LearningRates(), 1.0)
-            step = FusedStep(conductor, adam)
+            step = FusedStep(conductor, adam, sweeps=sweeps)
             for i in range(3):
                 step.merge(c.fields[1].raw(), *c.factors(1), c.m, c.e, T + i)
             state = [*c.fields[1].raw().values(), *adam.first.values(), *adam.second.values()]
-            states.append((state, repr(conductor.strategies[0].readings)))
+            states.append((state, repr(told(conductor.strategies[0].readings))))
     finally:
         torch.set_num_threads(threads)
     for state, readings in states[1:]:
@@ -328,37 +372,35 @@ def test_the_same_bits_for_any_number_of_threads():
         assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(state, states[0][0], strict=True))
 
 
-@needs_kernels
-def test_bases_of_both_scales_may_differ():
+def test_bases_of_both_scales_may_differ(sweeps):
     c = case(64)
     c.hr = replace(c.hr, basis=c.hr.basis * 1.5 + 0.1)
     readable, compiled = conductors(GCO)
     expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
-    step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0))
+    step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
     found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
     assert_same_gradient(c, expected, found)
-    assert conflict == found_conflict
+    assert told(conflict) == told(found_conflict)
 
 
-@needs_kernels
-def test_wrong_tensors_are_refused_at_the_border():
+def test_wrong_tensors_are_refused_at_the_border(sweeps):
     c = case(8)
     lr, a = c.factors(1)[0].table(), c.fields[1]._activate(None)
     drawn = {"scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid}
     drawn |= {"factor": a.factor, "route": None}
     for wrong, error, message in (
-        (lr["means"].double(), TypeError, "means must be a contiguous float32 tensor in the CPU's memory"),
+        (lr["means"].double(), TypeError, r"means must be a contiguous float32 tensor (in the CPU's memory|on cuda:0)"),
         (lr["means"].T.contiguous().T, TypeError, "means must be a contiguous float32 tensor"),
         (lr["means"][:5], ValueError, r"means must have 8 rows of 3 numbers, got shape \(5, 3\)"),
     ):
         with pytest.raises(error, match=message):
-            kernel.GaussianPass(drawn, lr | {"means": wrong}, None, None, 0.2)
+            sweeps(drawn, lr | {"means": wrong}, None, None, 0.2)
     with pytest.raises(KeyError, match="means"):
-        kernel.GaussianPass(drawn, {"basis": lr["basis"]}, None, None, 0.2)
+        sweeps(drawn, {"basis": lr["basis"]}, None, None, 0.2)
     with pytest.raises(ValueError, match="hf needs base"):
-        kernel.GaussianPass(drawn, lr, None, lr, 0.2)
+        sweeps(drawn, lr, None, lr, 0.2)
     with pytest.raises(ValueError, match="no HR gradient"):
-        kernel.GaussianPass(drawn, lr, None, None, 0.2).compare()
+        sweeps(drawn, lr, None, None, 0.2).compare()
 
 
 # --- who gets it -------------------------------------------------------------------------------------------------
@@ -436,8 +478,7 @@ def test_the_readable_path_is_taken_where_it_must_be_and_that_is_said_once(caplo
     assert caplog.messages == ["The per-Gaussian pass takes the readable path: the compiled kernels are not installed."]
 
 
-@needs_kernels
-def test_thirty_iterations_are_those_of_the_readable_path():
+def test_thirty_iterations_are_those_of_the_readable_path(sweeps):
     scene = toy.scene(16, seed=2, train=3, test=1)
     states = {}
     for mode in ("off", "auto"):
@@ -451,11 +492,13 @@ def test_thirty_iterations_are_those_of_the_readable_path():
             rates=LearningRates(means=LogLinear(end=30), detail_decay=0.01),
             mip=MipFilter(every=7, last=1),
         )
+        if mode == "auto":
+            states[mode].fused = FusedStep(states[mode].conductor, states[mode].optimizer, sweeps=sweeps)
         for _ in range(30):
             iterate(states[mode], toy.RASTERIZER)
+        late.settle(states[mode].history)
     readable, compiled = states["off"], states["auto"]
     assert readable.fused is None
-    assert isinstance(compiled.fused, FusedStep)
     assert len(readable.field) == len(compiled.field)
     for a, b in zip(readable.history, compiled.history, strict=True):
         assert a.keys() == b.keys()

@@ -1,12 +1,16 @@
-"""The per-Gaussian pass in C++: pointers and numbers in, numbers out. What they mean is known to `fused.py`."""
+"""The per-Gaussian pass: what goes in and what comes out, and how C++ does it. What the numbers mean is known to `fused.py`.
+
+C++ counts in Python's numbers, and is done when it returns; Warp (`warp_step`) leaves its numbers on the device.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from rasterizers.native import load_kernels, threads
@@ -20,10 +24,10 @@ class Comparison:
         norm_lr, norm_hr: Σ ‖g_LR‖ and Σ ‖g_HR‖ over the comparable Gaussians, by group.
     """
 
-    comparable: Sequence[int]
-    opposed: Sequence[int]
-    norm_lr: Sequence[float]
-    norm_hr: Sequence[float]
+    comparable: Sequence[int] | Int[Tensor, " 7"]
+    opposed: Sequence[int] | Int[Tensor, " 7"]
+    norm_lr: Sequence[float] | Float[Tensor, " 6"]
+    norm_hr: Sequence[float] | Float[Tensor, " 6"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,8 +35,8 @@ class Correction:
     """GCO's settings as numbers, by conflict group where they differ. reliability: q [N], or None for 0."""
 
     groups: Sequence[bool]
-    eps_cos: Sequence[float]
-    eps_corr: Sequence[float]
+    eps_cos: Sequence[float] | Float[Tensor, " 6"]
+    eps_corr: Sequence[float] | Float[Tensor, " 6"]
     tolerance: float
     weight_min: float
     weight_max: float
@@ -85,15 +89,27 @@ class Step:
 class Stepped:
     """By conflict group: rows corrected, Σ ω, rows with ω at its lower bound; and how many rows took no step, and why."""
 
-    corrected: Sequence[int]
-    omega: Sequence[float]
-    at_lower_bound: Sequence[int]
-    still: int
-    invisible: int
+    corrected: Sequence[int] | Int[Tensor, " 6"]
+    omega: Sequence[float] | Float[Tensor, " 6"]
+    at_lower_bound: Sequence[int] | Int[Tensor, " 6"]
+    still: int | Int[Tensor, ""]
+    invisible: int | Int[Tensor, ""]
+
+
+class Sweeps(Protocol):
+    """The two sweeps over one view's gradients."""
+
+    def compare(self, products: Float[Tensor, "6 N"] | None = None) -> Comparison:
+        """Conflicts before correction. products, float64: takes ‖g_LR‖‖g_HR‖ by group."""
+        ...
+
+    def step(self, attributes: Mapping[str, Attribute], correction: Correction | None, step: Step) -> Stepped:
+        """Merge, correct, anchor and step, in place."""
+        ...
 
 
 class GaussianPass:
-    """The gradients of one view's losses, as a rasterizer left them, and the two sweeps over them.
+    """In C++: the gradients of one view's losses, as a rasterizer left them, and the two sweeps over them.
 
     Args:
         activation: scales, filtered [N, 3], filter, sigmoid, factor [N], and route: m [N] or None for 1.
@@ -117,11 +133,9 @@ class GaussianPass:
         self._pass = native.GaussianPass(dict(activation), lr, base, hf, lr["basis"].shape[1], lambda_hf)
 
     def compare(self, products: Tensor | None = None) -> Comparison:
-        """Conflicts before correction. products [6, N], float64: takes ‖g_LR‖‖g_HR‖ by group."""
         return Comparison(*self._pass.compare({"products": products}, threads()))
 
     def step(self, attributes: Mapping[str, Attribute], correction: Correction | None, step: Step) -> Stepped:
-        """Merge, correct, anchor and step, in place."""
         tables = {
             name: {slot: getattr(a, slot) for slot in Attribute.__slots__} | {"width": math.prod(a.p.shape[1:])}
             for name, a in attributes.items()

@@ -183,11 +183,12 @@ def test_no_local_name_hides_a_constant_of_warp():
     import warp as wp
 
     from clear_strategies.kernels import warp as losses
+    from clear_strategies.kernels import warp_step
     from rasterizers import warp_backend
 
     constants = {name for name in dir(wp) if isinstance(getattr(wp, name), (int, float))}
     assert {"e", "pi", "inf"} <= {name.lower() for name in constants}
-    folders = [Path(package.__file__).parent for package in (warp_backend, losses)]
+    folders = [Path(package.__file__).parent for package in (warp_backend, losses, warp_step)]
     for path in (path for folder in folders for path in folder.glob("*.py")):
         names = {
             n.id
