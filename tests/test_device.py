@@ -108,11 +108,17 @@ class Quiet:
         state["count"] = torch.ones_like(info["radii"])
 
 
+class Generator(torch.Generator):
+    """Meta has none of its own."""
+
+    def __new__(cls, device="cpu"):
+        return super().__new__(cls, "cpu" if str(device) == "meta" else device)
+
+
 @pytest.fixture
 def no_data(monkeypatch):
-    """What is made once, from the data, is there already; meta has no generator of its own."""
-    make = torch.Generator
-    monkeypatch.setattr(torch, "Generator", lambda device="cpu": make("cpu" if str(device) == "meta" else device))
+    """What is made once, from the data, is there already."""
+    monkeypatch.setattr(torch, "Generator", Generator)
     monkeypatch.setattr(TrainState, "refilter", lambda self: None)
     monkeypatch.setattr(P2G, "_patch_evidence", lambda self, view: (view.lr.image.new_zeros(2, 2),) * 2)
 
