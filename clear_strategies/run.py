@@ -255,7 +255,7 @@ def _prior(config: Any, capture: Any) -> Any:
 
 
 def _rasterizer(config: DictConfig, background: tuple[float, float, float]) -> tuple[Any, str, str]:
-    """The rasterizer, its name, and the device that it draws on and the field lies on."""
+    """The rasterizer, what it is called, and the device that it draws on and the field lies on."""
     import rasterizers
 
     device = _device(config.fit.device)
@@ -271,7 +271,8 @@ def _rasterizer(config: DictConfig, background: tuple[float, float, float]) -> t
     elif device is not None and "device" in config.rasterizer:  # one that draws where it is told
         settings.setdefault("device", device)
     rasterizer = rasterizers.load(name, **settings)
-    return rasterizer, name, _drawn_on(rasterizer.traits.devices, name, device)
+    there = _drawn_on(rasterizer.traits.devices, name, device)
+    return rasterizer, name if there == "cpu" else f"{name} on {there}", there
 
 
 def _device(asked: str | None) -> str | None:

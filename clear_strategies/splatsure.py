@@ -111,8 +111,7 @@ class SplatSuRe(Strategy):
 
     def _pose(self, name: str, camera: Camera) -> Float[Tensor, "4 4"]:
         """World to camera, where the field lies; sent there once, and again when the view has another camera."""
-        sent, pose = self.cache.get(("pose", name), (None, camera.world_to_camera))
-        if sent is not camera:
-            pose = camera.world_to_camera.to(self.device)
-            self.cache["pose", name] = camera, pose
-        return pose
+        sent: tuple[Camera, Tensor] | None = self.cache.get(("pose", name))
+        if sent is None or sent[0] is not camera:
+            sent = self.cache["pose", name] = camera, camera.world_to_camera.to(self.device)
+        return sent[1]

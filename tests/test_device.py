@@ -8,9 +8,11 @@ a tensor that forgets where it belongs cannot be reckoned with.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -21,7 +23,8 @@ from clear_strategies.data.view import View
 from clear_strategies.density_gsplat import GsplatDensifier, GsplatSettings
 from clear_strategies.errors import DataError
 from clear_strategies.fit import TrainState, iterate
-from clear_strategies.run import _device, _drawn_on
+from clear_strategies.gradients import Grads
+from clear_strategies.run import CONF, _comparable, _device, _drawn_on, _rasterizer, _restore
 from clear_strategies.skips import Economy, Skips
 from rasterizers.interface import Rendering, SplatGradients, Traits
 from tests import toy
@@ -108,11 +111,17 @@ class Quiet:
         state["count"] = torch.ones_like(info["radii"])
 
 
+class Generator(torch.Generator):
+    """Meta has none of its own."""
+
+    def __new__(cls, device="cpu"):
+        return super().__new__(cls, "cpu" if str(device) == "meta" else device)
+
+
 @pytest.fixture
 def no_data(monkeypatch):
-    """What is made once, from the data, is there already; meta has no generator of its own."""
-    make = torch.Generator
-    monkeypatch.setattr(torch, "Generator", lambda device="cpu": make("cpu" if str(device) == "meta" else device))
+    """What is made once, from the data, is there already."""
+    monkeypatch.setattr(torch, "Generator", Generator)
     monkeypatch.setattr(TrainState, "refilter", lambda self: None)
     monkeypatch.setattr(P2G, "_patch_evidence", lambda self, view: (view.lr.image.new_zeros(2, 2),) * 2)
 
@@ -198,6 +207,25 @@ def test_somebody_elses_densifier_is_asked_without_reading_what_it_did(no_data, 
     settings = GsplatSettings({}, start=1, stop=13, every=5)
     state.density = GsplatDensifier(settings, Quiet(), len(state.field), extent=1.0, seed=0, device="meta")
     steadily(state)
+
+
+class Elsewhere(SVS):
+    def gate(self, t, n):
+        return torch.ones(n, device="cpu")
+
+
+class Writing(SVS):
+    def regularize(self, params, t):
+        return Grads({"opacities": params["opacities"] * params["opacities"].new_tensor(0.5)})
+
+
+@pytest.mark.parametrize("careless", [Elsewhere, Writing])
+def test_carrying_over_and_writing_would_be_seen(careless, no_data, monkeypatch):
+    state = on_meta(monkeypatch, ())
+    state.conductor = Conductor(careless(), objective=state.conductor.objective)
+    state.conductor.on_fit_start(len(SCENE.train), 0, "meta")
+    with pytest.raises(AssertionError, match="t=8"):
+        steadily(state)
 
 
 def test_a_read_would_be_seen(no_data, monkeypatch):
@@ -287,3 +315,33 @@ def test_null_is_cuda_where_it_is_and_the_rasterizer_draws_there(devices, asked,
 def test_a_rasterizer_of_the_other_device_is_refused_in_one_sentence():
     with pytest.raises(DataError, match="is cuda, and the rasterizer cpp draws on cpu alone"):
         _drawn_on(frozenset({"cpu"}), "cpp", "cuda")
+
+
+def test_warp_is_told_the_device_that_was_asked_for(monkeypatch):
+    told = {}
+
+    def load(name, **settings):
+        told[name] = settings
+        return Blank()
+
+    monkeypatch.setattr("rasterizers.load", load)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        for override, expected in (("fit.device=cpu", "cpu"), ("fit.device=null", None)):
+            config = compose("config", ["rasterizer=warp", override])
+            assert _rasterizer(config, (0, 0, 0))[1:] == ("warp", "cpu")
+            assert told["warp"].get("device") == expected
+
+
+def test_going_on_on_another_device_is_said(caplog):
+    state = start(())
+    iterate(state, toy.RASTERIZER)
+    saved = state.checkpoint({})
+    _restore(start(()), saved, Path("there"), {})
+    assert "bit for bit" not in caplog.text
+    _restore(start(()), replace(saved, device="cuda"), Path("there"), {})
+    assert "until now this run trained on cuda, from here on cpu" in caplog.text
+
+
+def test_the_device_is_no_part_of_what_a_resumed_run_must_agree_with():
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        assert "fit.device" not in _comparable(compose("config"))
