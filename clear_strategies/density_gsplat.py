@@ -299,14 +299,16 @@ class GsplatDensifier:
                 f"min_gaussians={self.settings.min_gaussians}. Prune less, or start from a denser cloud."
             )
 
+    def reset_due(self, t: int) -> bool:
+        return t < self.settings.stop and t % getattr(self.strategy, "reset_every", sys.maxsize) == 0
+
     def _remark(self, t: int, seen: _Seen, info: _Info, optimizer: Adam) -> None:
         """Say once what was set and had no effect."""
         if seen.score is not seen.ordinary and "means2d" not in info.read:
             self._warn_once(
                 "score", f"{self.kind} reads no screen gradient: P2G's score has no effect on the structure."
             )
-        due = t < self.settings.stop and t % getattr(self.strategy, "reset_every", sys.maxsize) == 0
-        if due and bool(optimizer.second["opacities"].any()):  # a reset leaves no momentum
+        if self.reset_due(t) and bool(optimizer.second["opacities"].any()):  # a reset leaves no momentum
             self._warn_once(
                 "reset",
                 f"t={t}: density.reset_every falls here, and {self.name} reset no opacity. gsplat 1.5's DefaultStrategy "

@@ -39,6 +39,8 @@ from rasterizers.interface import Rasterizer
 
 _log = logging.getLogger(__name__)
 
+_PROBING: Final = "probe test views"  # the ledger's stage
+
 
 @dataclass(frozen=True, slots=True)
 class FitSettings:
@@ -320,10 +322,7 @@ def fit(
             ended = state.ended
             state.history[-1]["seconds"] = time.perf_counter() - began
             if settings.probe_every and (done % settings.probe_every == 0 or ended):
-                with state.conductor.ledger.stage("probe test views"):
-                    psnr = _probe(state, scene, rasterizer)
-                if psnr is not None:
-                    state.history[-1]["psnr_test"] = psnr
+                _look(state, scene, rasterizer, done)
             if progress is not None:
                 progress(state)
             if pending:
@@ -357,6 +356,18 @@ def _psnr(image: Tensor, target: Tensor) -> Number:
 
 def _decibels(mse: float) -> float:
     return -10 * math.log10(max(mse, 1e-10))
+
+
+def _look(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int) -> None:
+    """Add what the test views say to the history's last row."""
+    ledger = state.conductor.ledger
+    if state.density.reset_due(done) and not state.ended:
+        ledger.skip(_PROBING, "opacities were reset in this iteration")
+        return
+    with ledger.stage(_PROBING):
+        psnr = _probe(state, scene, rasterizer)
+    if psnr is not None:
+        state.history[-1]["psnr_test"] = psnr
 
 
 def _probe(state: TrainState, scene: Scene, rasterizer: Rasterizer) -> float | None:
