@@ -134,6 +134,16 @@ def test_the_same_seed_is_the_same_run_and_another_is_not():
     assert any(runs[0][n].shape != runs[2][n].shape or not torch.equal(runs[0][n], runs[2][n]) for n in runs[0])
 
 
+def test_nobody_looks_at_the_test_views_when_opacities_were_just_reset():
+    state = start(())
+    state.settings = FitSettings(iterations=13, scale_schedule=False, probe_every=3, checkpoint_every=0, seed=5)
+    fit(state, SCENE, toy.RASTERIZER)
+    assert [row["t"] for row in state.history if "psnr_test" in row] == [3, 9, 13]  # not 6 and 12
+    looks = state.conductor.ledger.entries["probe test views"]
+    assert looks.runs == 3
+    assert looks.skipped == {"opacities were reset in this iteration": 2}
+
+
 @pytest.fixture
 def saved(tmp_path):
     state = start(("svs",))
