@@ -90,21 +90,28 @@ def test_nobody_waits_for_the_device(warp_step, eps):
     assert all(0 <= share <= 1 for share in told(conflict).values())
 
 
-def test_on_cuda_the_pass_is_warps_and_without_warp_that_is_said(monkeypatch, caplog):
-    there = {"means": SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)}
+@pytest.fixture
+def adam_on_cuda() -> Adam:
+    """As far as it says where its moments lie."""
     adam = Adam({}, LearningRates(), 1.0)
-    adam.first = there
+    adam.first = {"means": SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)}
+    return adam
+
+
+def test_on_cuda_the_pass_is_warps(warp_step, adam_on_cuda, monkeypatch):
     asked = []
     monkeypatch.setattr("clear_strategies.fused.require", lambda *arguments: asked.append(arguments))
-    assert gaussian_pass(adam).__module__ == "clear_strategies.kernels.warp_step"
+    assert gaussian_pass(adam_on_cuda) is warp_step.GaussianPass
     assert [device for _, device, _ in asked] == ["cuda"]
 
+
+def test_on_cuda_without_warp_the_readable_path_is_taken_and_that_is_said(adam_on_cuda, monkeypatch, caplog):
     def missing(what, device, otherwise):
         raise BackendUnavailable(f"{what} needs NVIDIA Warp, which is not installed.")
 
     monkeypatch.setattr("clear_strategies.fused.require", missing)
     with caplog.at_level("INFO"):
-        assert fused_step(Conductor(), adam) is None
+        assert fused_step(Conductor(), adam_on_cuda) is None
     assert caplog.messages == [
         "The per-Gaussian pass takes the readable path: the compiled pass needs NVIDIA Warp, which is not installed."
     ]
