@@ -29,6 +29,7 @@ from clear_strategies.density import Densifier, DensifierSettings, cameras_exten
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.field import GaussianField
 from clear_strategies.fused import Fused, FusedStep, fused_step
+from clear_strategies.gradients import conflict_columns
 from clear_strategies.late import Number
 from clear_strategies.mip import MipFilter
 from clear_strategies.optim import Adam, LearningRates
@@ -39,7 +40,8 @@ from rasterizers.interface import Rasterizer
 
 _log = logging.getLogger(__name__)
 
-_PROBING: Final = "probe test views"  # the ledger's stage
+PROBING: Final = "probe test views"
+"""The ledger's stage of looking at them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,8 +348,7 @@ def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Nu
         "detail_abs": late.number(s.field.detail.data.abs().mean()),
     }
     row |= {f"loss_{name}": value for name, value in u.losses.items()}
-    row |= {("conflict" if group == "gaussian" else f"conflict_{group}"): share for group, share in u.conflict.items()}
-    return row | dict(u.readings)
+    return row | conflict_columns(u.conflict) | dict(u.readings)
 
 
 def _psnr(image: Tensor, target: Tensor) -> Number:
@@ -362,9 +363,9 @@ def _look(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int) ->
     """Add what the test views say to the history's last row."""
     ledger = state.conductor.ledger
     if state.density.reset_due(done) and not state.ended:
-        ledger.skip(_PROBING, "opacities were reset in this iteration")
+        ledger.skip(PROBING, "opacities were reset in this iteration")
         return
-    with ledger.stage(_PROBING):
+    with ledger.stage(PROBING):
         psnr = _probe(state, scene, rasterizer)
     if psnr is not None:
         state.history[-1]["psnr_test"] = psnr

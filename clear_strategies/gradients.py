@@ -102,6 +102,11 @@ def conflict_ratio(lr: Grads, hr: Grads) -> dict[str, Number]:
     return shares
 
 
+def conflict_columns(conflict: Mapping[str, Number]) -> dict[str, Number]:
+    """The shares as a history calls them: "conflict" of Gaussians, "conflict_means" … of groups."""
+    return {("conflict" if group == "gaussian" else f"conflict_{group}"): share for group, share in conflict.items()}
+
+
 def _share_below_zero(dot: Tensor, l2: Tensor, h2: Tensor) -> Number:
     comparable = (l2 > 0) & (h2 > 0)
     return late.made(late.ratio, late.number(((dot < 0) & comparable).sum()), late.number(comparable.sum()))

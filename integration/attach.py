@@ -28,7 +28,7 @@ from clear_strategies import late
 from clear_strategies.conductor import Conductor, Heard
 from clear_strategies.data.view import View
 from clear_strategies.errors import ClearError
-from clear_strategies.gradients import Grads, to_ndc
+from clear_strategies.gradients import Grads, conflict_columns, to_ndc
 from clear_strategies.late import Number
 from integration.bridge import AutogradShot
 from integration.densify import Scale, to_read
@@ -216,9 +216,7 @@ class Attachment:
         self.counts["merged"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
         self._numbers = {"t": float(self.t), "lambda_hr": λ, **heard.losses, **self.conductor.readings()}
-        self._numbers |= {
-            ("conflict" if group == "gaussian" else f"conflict_{group}"): x for group, x in conflict.items()
-        }
+        self._numbers |= conflict_columns(conflict)
 
     def _own(self, name: str, p: Tensor) -> Tensor:
         """This pass's part of `.grad`."""

@@ -7,7 +7,7 @@ from dataclasses import fields
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rasterizers.interface import Camera, RasterSettings, Splats
@@ -77,6 +77,11 @@ def shares(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
     (a, from_a), (b, from_b) = first, other
     same = all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
     return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
+
+
+def spread(mask: Bool[Tensor, "h w"], times: int, height: int, width: int) -> Bool[Tensor, "H W"]:
+    """A mask on a grid `times` as fine, which ends where the image does."""
+    return mask.repeat_interleave(times, 0).repeat_interleave(times, 1)[:height, :width]
 
 
 def packed_rows(shN: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:

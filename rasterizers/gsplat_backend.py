@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import build, require_cotangents, require_finite, require_tiles
+from rasterizers.checks import build, require_cotangents, require_finite, require_tiles, spread
 from rasterizers.geometry import SH_C0, spherical_harmonics
 from rasterizers.interface import (
     BackendUnavailable,
@@ -110,7 +110,7 @@ class GsplatRasterizer(RasterSettings):
             )  # fmt: skip
         radii = info["radii"][0]
         visible = (radii > 0).all(-1) if radii.dim() == 2 else radii > 0
-        asked = None if tiles is None else _enlarged(tiles, self.tile, camera)
+        asked = None if tiles is None else spread(tiles, self.tile, camera.height, camera.width)[..., None]
         image = images[0] if asked is None else torch.where(asked, images[0], images[0].new_tensor(self.background))
         direction = torch.nn.functional.normalize(splats.means.detach() - camera.center.to(splats.means), dim=-1)
         basis = spherical_harmonics(direction, splats.shN.shape[1])
@@ -161,8 +161,3 @@ class GsplatRendering:
         return SplatGradients(
             of("means"), of("quats"), of("scales"), of("opacities"), of("screen")[:, 0], of("rgb"), self.basis
         )
-
-
-def _enlarged(tiles: Bool[Tensor, "th tw"], tile: int, camera: Camera) -> Bool[Tensor, "H W 1"]:
-    pixels = tiles.repeat_interleave(tile, 0).repeat_interleave(tile, 1)
-    return pixels[: camera.height, : camera.width, None]

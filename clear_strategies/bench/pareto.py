@@ -26,6 +26,7 @@ from clear_strategies.bench.output import UNKNOWN, Findings, Section, number, ti
 from clear_strategies.bench.rasterizers import usable
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
+from clear_strategies.fit import PROBING
 from clear_strategies.report.runs import Run, history
 
 STRATEGIES, SKIPS, LENGTH, CUT_OFFS, BACKEND = "strategies", "skips", "run length", "cut-offs", "backend"
@@ -88,7 +89,6 @@ _TAKEN: Final = re.compile(
     r"[+~]*(strategy|skips|rasterizer|rasterizer\.preset|objective\.kernels|hydra[./].*"
     r"|fit\.(iterations|seed|threads|resume|probe_every|probe_views|checkpoint_every|map_views))(=|$)"
 )
-_PROBING: Final = "probe test views"  # the ledger's stage
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,7 +294,7 @@ def _look(path: Path) -> float:
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
-            return sum(float(row["ms_each"]) / 1e3 for row in csv.DictReader(file) if row["stage"] == _PROBING)
+            return sum(float(row["ms_each"]) / 1e3 for row in csv.DictReader(file) if row["stage"] == PROBING)
     except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise DataError(
             path, "table", f"cannot be read ({error})", "remove the folder, and it is trained again"
@@ -317,7 +317,7 @@ def _section(request: Request, rows: Sequence[Row], best: Sequence[Row]) -> Sect
     }
     seeds = f"seed{'s' * (len(request.seeds) > 1)} {', '.join(map(str, request.seeds))}"
     notes = [
-        f'Seconds: of the training loop (history.csv) without its looks at the test views (the ledger\'s "{_PROBING}"); '
+        f'Seconds: of the training loop (history.csv) without its looks at the test views (the ledger\'s "{PROBING}"); '
         'start-up, the last checkpoint, "evaluate" and the pictures lie outside of the loop. PSNR and SSIM: mean over '
         f"the test views at the end. Of {REFERENCE.name}, and Δ in dB: against {REFERENCE.name} with every inexact skip "
         "off, paired by seed. front: nothing here reaches its PSNR in as little time."

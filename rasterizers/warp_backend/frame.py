@@ -20,7 +20,7 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import packed_rows, require_cotangents, require_finite, require_tiles, shares
+from rasterizers.checks import packed_rows, require_cotangents, require_finite, require_tiles, shares, spread
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
@@ -379,8 +379,7 @@ def _read_later(numbers: Tensor) -> Any:
 def _tiles_of(mask: Tensor, camera: Camera, edge: int) -> Tensor:
     """The demand mask for our tiles, contiguous."""
     columns, rows = -(-camera.width // _TILE), -(-camera.height // _TILE)
-    finer = mask.bool().repeat_interleave(edge // _TILE, 0).repeat_interleave(edge // _TILE, 1)
-    return finer[:rows, :columns].contiguous()
+    return spread(mask.bool(), edge // _TILE, rows, columns).contiguous()
 
 
 def _pose_struct(camera: Camera) -> Any:
