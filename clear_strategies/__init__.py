@@ -4,16 +4,16 @@ A strategy is a small object that answers questions about a 3D Gaussian Splattin
 paper's order and merges the gradients. GCO, P2G and SVS work alone and together, in our trainer and in others'.
 """
 
-from clear_strategies.conductor import Conductor, Update
+from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.gradients import ATTRIBUTES, CONFLICT_GROUPS, Grads, Shot
 from clear_strategies.errors import AnchorError, ClearError, DataError, StrategyConflict
-from clear_strategies.evidence import Evidence
-from clear_strategies.gco import GCO
-from clear_strategies.gradients import ATTRIBUTES, CONFLICT_GROUPS, Grads, Shot
-from clear_strategies.objective import Objective
-from clear_strategies.p2g import P2G
-from clear_strategies.splatsure import SplatSuRe
-from clear_strategies.strategy import Screens, Strategy
-from clear_strategies.svs import SVS
+from clear_strategies.merging.conductor import Conductor, Update
+from clear_strategies.merging.objective import Objective
+from clear_strategies.strategies.base import ScreenGradients, Strategy
+from clear_strategies.strategies.gco import GCO
+from clear_strategies.strategies.p2g import P2G
+from clear_strategies.strategies.splatsure import SplatSuRe
+from clear_strategies.strategies.svs import SVS
 
 __all__ = [
     "ATTRIBUTES",
@@ -28,7 +28,7 @@ __all__ = [
     "Evidence",
     "Grads",
     "Objective",
-    "Screens",
+    "ScreenGradients",
     "Shot",
     "SplatSuRe",
     "Strategy",

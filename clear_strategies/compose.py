@@ -15,10 +15,10 @@ from hydra.errors import HydraException, InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from clear_strategies.conductor import Conductor
 from clear_strategies.errors import ClearError, DataError
+from clear_strategies.merging.conductor import Conductor
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
-from clear_strategies.strategy import Strategy
+from clear_strategies.strategies.base import Strategy
 
 _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
@@ -41,10 +41,10 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
         raise ValueError(f"iterations must be at least 1, got {iterations}.")
     names = [name.strip() for name in strategy.split(",")]
     said = [f"+strategy=[{','.join(names)}]" if len(names) > 1 else f"+strategy={names[0]}", *overrides]
-    return conducted(_compose(said), iterations / REFERENCE_ITERATIONS)
+    return build_conductor(_compose(said), iterations / REFERENCE_ITERATIONS)
 
 
-def conducted(config: DictConfig, stretch: float) -> Conductor:
+def build_conductor(config: DictConfig, stretch: float) -> Conductor:
     """The conductor of a composed configuration, its milestones times `stretch`."""
     return Conductor(
         *(scaled(s, stretch) for s in strategies(config)),

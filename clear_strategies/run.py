@@ -25,11 +25,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from clear_strategies import sweep
-from clear_strategies.compose import CONF, conducted, instantiate, one_line, plain
+from clear_strategies.compose import CONF, build_conductor, instantiate, one_line, plain
 from clear_strategies.errors import ClearError, DataError
-from clear_strategies.lock import HeldError, hold
-from clear_strategies.sweep import Sweep
+from clear_strategies.jobs import sweep
+from clear_strategies.jobs.lock import HeldError, hold
+from clear_strategies.jobs.sweep import Sweep
 
 _log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ _AUTO: Final = "auto"
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(config: DictConfig) -> float | None:
     """One job: returns the mean PSNR of the test views, which a sweeper may optimize."""
-    from clear_strategies.fit import Interrupted
+    from clear_strategies.training.loop import Interrupted
     from rasterizers.interface import BackendUnavailable
 
     job, ours = HydraConfig.get(), _sweep()
@@ -157,10 +157,10 @@ def run(config: DictConfig, folder: Path) -> float | None:
 def _run(config: DictConfig, folder: Path) -> float | None:
     import torch
 
-    from clear_strategies import plan, results
-    from clear_strategies.data.scene import save_lr
-    from clear_strategies.fit import FitSettings, TrainState, fit
+    from clear_strategies.data.prepare import save_lr
+    from clear_strategies.outputs import plan, results
     from clear_strategies.schedules import scaled
+    from clear_strategies.training.loop import FitSettings, TrainState, fit
 
     if missing := [f"data.{key}" for key in config.data if OmegaConf.is_missing(config.data, key)]:
         raise DataError("config", missing[0], "is needed by this data set and missing", f"add {missing[0]}=…")
@@ -179,7 +179,7 @@ def _run(config: DictConfig, folder: Path) -> float | None:
     rates = scaled(instantiate(config.optim, "optim"), settings.stretch)
     mip = scaled(_mip(config), settings.stretch)
     skips = scaled(instantiate(config.skips, "skips"), settings.stretch)
-    conductor = conducted(config, settings.stretch)
+    conductor = build_conductor(config, settings.stretch)
     scene = _scene(config, settings.seed)
     if config.data.save_lr is not None:
         save_lr(scene, Path(config.data.save_lr))
@@ -226,8 +226,8 @@ def _run(config: DictConfig, folder: Path) -> float | None:
 
 
 def _scene(config: DictConfig, seed: int) -> Any:
-    from clear_strategies.data.scene import prepare
-    from clear_strategies.data.upscale import Bicubic, Prior, cached
+    from clear_strategies.data.prepare import prepare
+    from clear_strategies.data.priors.upscale import Bicubic, Prior, cached
 
     capture = instantiate(config.data.reader, "data.reader")
     views = instantiate(config.data.views, "data.views")
@@ -339,7 +339,7 @@ def _finished(folder: Path, config: Mapping[str, Any]) -> tuple[float | None] | 
 
 def _resume_newest(state: Any, folder: Path, config: Mapping[str, Any]) -> None:
     """Go on from the newest checkpoint that is whole; start anew where there is none."""
-    from clear_strategies import checkpoint
+    from clear_strategies.training import checkpoint
 
     found = checkpoint.saved(folder)
     for source in reversed(found):
@@ -355,7 +355,7 @@ def _resume_newest(state: Any, folder: Path, config: Mapping[str, Any]) -> None:
 
 
 def _resume(state: Any, source: Path, config: Mapping[str, Any]) -> None:
-    from clear_strategies import checkpoint
+    from clear_strategies.training import checkpoint
 
     _restore(state, checkpoint.load(source), source, config)
 
@@ -391,7 +391,7 @@ def _watch() -> Callable[[], None] | None:
 
 
 def _mip(config: DictConfig) -> Any:
-    from clear_strategies.mip import MipFilter
+    from clear_strategies.training.mip import MipFilter
 
     return MipFilter(**plain(config.mip))
 

@@ -24,12 +24,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from clear_strategies import late
-from clear_strategies.conductor import Conductor, Heard
-from clear_strategies.data.view import View
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.gradients import Grads, conflict_columns, to_ndc
+from clear_strategies.core.view import View
 from clear_strategies.errors import ClearError
-from clear_strategies.gradients import Grads, conflict_columns, to_ndc
-from clear_strategies.late import Number
+from clear_strategies.merging.conductor import Conductor, HrGradients
 from integration.bridge import AutogradShot
 from integration.densify import Scale, to_read
 
@@ -109,7 +109,7 @@ class Attachment:
         self._scale = None if threshold is None else Scale(threshold)
         self._n = len(params()["means"])
         self._passes = 0  # backward passes of this iteration
-        self._waiting: tuple[Drawing, Heard] | None = None  # drawn, not yet gone backward through
+        self._waiting: tuple[Drawing, HrGradients] | None = None  # drawn, not yet gone backward through
         self._before: dict[str, Tensor] = {}  # .grad when backward began
         self.removed = False
         conductor.on_fit_start(n_views, seed, params()["means"].device)
@@ -125,13 +125,13 @@ class Attachment:
         z = conductor.gate(t, self._n)
         if z is not None:
             z = z.to(self._params()["means"])
-        heard = Heard()
+        hr_grads = HrGradients()
         if conductor.wants_hr(t):
             self.counts["HR renders"] += 1
-            heard = conductor.hear(draw("hr", z).shot, view)
+            hr_grads = conductor.hr_gradients(draw("hr", z).shot, view)
         drawing = draw("lr", z)
         if drawing.output.requires_grad:
-            self._waiting = drawing, heard
+            self._waiting = drawing, hr_grads
             drawing.output.register_hook(self._begin)  # type: ignore[no-untyped-call]
         self.counts["LR renders"] += 1
         return drawing.returned
@@ -139,7 +139,7 @@ class Attachment:
     @property
     def log(self) -> dict[str, float]:
         """Numbers of the last iteration; on a device, looking waits for them."""
-        return late.settle([self._numbers])[0]
+        return deferred.resolve([self._numbers])[0]
 
     def remove(self) -> None:
         """Leave the host as it was; drawings that are still under way go to it unmerged."""
@@ -195,13 +195,13 @@ class Attachment:
         """The host's backward pass has ended: make its gradients the merged ones."""
         if self._waiting is None:
             return
-        (drawing, heard), self._waiting = self._waiting, None
+        (drawing, hr_grads), self._waiting = self._waiting, None
         times = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
         moved = {name: p for name, p in self._params().items() if p.grad is not None or name == "detail"}
         g_lr = Grads({name: self._own(name, p) * (1 / times) for name, p in moved.items() if p.grad is not None})
         values = {name: p.detach() for name, p in moved.items()}
         g, conflict = self.conductor.merge(
-            values, g_lr, _of(heard.base, moved), _of(heard.hf, moved), heard.m, heard.evidence, self.t
+            values, g_lr, _of(hr_grads.base, moved), _of(hr_grads.hf, moved), hr_grads.m, hr_grads.evidence, self.t
         )
         for (
             name,
@@ -210,12 +210,12 @@ class Attachment:
             total = g[name] * times if name in g else torch.zeros_like(p)
             p.grad = (total + self._before[name] if name in self._before else total).to(p)
         if screen is not None:
-            self._densify(drawing.shot, screen / times, heard, times)
+            self._densify(drawing.shot, screen / times, hr_grads, times)
         self._before = {}
         self._passes += 1
         self.counts["merged"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
-        self._numbers = {"t": float(self.t), "lambda_hr": λ, **heard.losses, **self.conductor.readings()}
+        self._numbers = {"t": float(self.t), "lambda_hr": λ, **hr_grads.losses, **self.conductor.readings()}
         self._numbers |= conflict_columns(conflict)
 
     def _own(self, name: str, p: Tensor) -> Tensor:
@@ -226,13 +226,13 @@ class Attachment:
             )
         return p.grad - self._before[name] if name in self._before else p.grad
 
-    def _densify(self, shot: AutogradShot, gradient: Tensor, heard: Heard, times: float) -> None:
+    def _densify(self, shot: AutogradShot, gradient: Tensor, hr_grads: HrGradients, times: float) -> None:
         """Leave the score where the host's densifier reads ∇_u, if it does."""
         kept = shot.kept
         held = kept.tensor.is_leaf or kept.tensor.retains_grad
-        if heard.base is None or not held or kept.tensor.grad is None:
+        if hr_grads.base is None or not held or kept.tensor.grad is None:
             return
-        score, ordinary = self.conductor.scores(to_ndc(kept.gradient(gradient, self._n), kept.size), heard, self.t)
+        score, ordinary = self.conductor.scores(to_ndc(kept.gradient(gradient, self._n), kept.size), hr_grads, self.t)
         read = to_read(kept, score, ordinary, shot.visible, self._scale, times)
         if read is not None:
             kept.hand_over(times * read)

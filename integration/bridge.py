@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from clear_strategies.conductor import Conductor, Update
-from clear_strategies.gradients import Grads, Shot
-from clear_strategies.late import Scalar
+from clear_strategies.core.deferred import Scalar
+from clear_strategies.core.gradients import Grads, Shot
+from clear_strategies.merging.conductor import Conductor, Update
 from integration.densify import Scale, Screen, to_read
 
 
@@ -42,7 +42,7 @@ class AutogradShot:
         """Where ∇_u is kept."""
         return self.screen or Screen(self.means2d, (self.image.shape[1], self.image.shape[0]))
 
-    def pull(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         """One pass through the host's graph for each cotangent; the graph is kept."""
         inputs = [*self.params.values(), self.kept.tensor]
         pulled = []
@@ -68,7 +68,7 @@ def joint_loss(
 
     Args:
         params: the leaves that the host optimizes, by gsplat's names (and "detail", if it has one).
-        lr, hr: this view rendered at both scales, e.g. as `AutogradShot`. view: see `clear_strategies.data.view.View`.
+        lr, hr: this view rendered at both scales, e.g. as `AutogradShot`. view: see `clear_strategies.core.view.View`.
         scale: given the host's densification threshold, `backward()` also leaves the score where the host's densifier
             reads ∇_u of the LR rendering.
     """

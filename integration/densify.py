@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.conductor import Conductor
-from clear_strategies.gradients import to_ndc
+from clear_strategies.core.gradients import to_ndc
+from clear_strategies.merging.conductor import Conductor
 
 _log = logging.getLogger(__name__)
 

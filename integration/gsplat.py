@@ -21,9 +21,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.conductor import Conductor
-from clear_strategies.data.view import View
-from clear_strategies.optim import LearningRates
+from clear_strategies.core.view import View
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.training.optim import LearningRates
 from integration.attach import Attachment, Drawing, HostError, Which
 from integration.bridge import AutogradShot
 from integration.densify import Screen, warn_of_early_end, warn_of_unread_score

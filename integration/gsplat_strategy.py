@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 import gsplat.rendering
 from gsplat.strategy import DefaultStrategy
 
-from clear_strategies.conductor import Conductor
-from clear_strategies.data.view import View
+from clear_strategies.core.view import View
+from clear_strategies.merging.conductor import Conductor
 from integration.gsplat import Attached, attach
 
 

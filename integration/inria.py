@@ -25,9 +25,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.conductor import Conductor
+from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.data.view import View
+from clear_strategies.merging.conductor import Conductor
 from integration.attach import Attachment, Drawing, HostError, Which
 from integration.densify import warn_of_early_end
 from integration.lineage import Detail
@@ -70,8 +70,8 @@ def attach(
     Args:
         gaussians: the host's GaussianModel.
         cameras: all training cameras (`scene.getTrainCameras()`), each with its photograph.
-        sr: where SR pictures come from: their folder, or a function (`clear_strategies.data.upscale` has some). None: there
-            are none, for strategies and objectives that never look at HR.
+        sr: where SR pictures come from: their folder, or a function (`clear_strategies.data.priors` has some).
+            None: there are none, for strategies and objectives that never look at HR.
         factor: HR pixels per LR pixel.
         threshold: opt.densify_grad_threshold, scales P2G's score; None: a loop without densification.
         densify_until: opt.densify_until_iter, to say beforehand where a strategy ends densification earlier.

@@ -22,9 +22,9 @@ from internal.density_controllers.density_controller import DensityController
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.conductor import Conductor
-from clear_strategies.data.upscale import Images
-from clear_strategies.data.view import View
+from clear_strategies.core.view import View
+from clear_strategies.data.priors.upscale import Images
+from clear_strategies.merging.conductor import Conductor
 from integration.attach import Attachment, Drawing, HostError, Which
 from integration.densify import warn_of_early_end, warn_of_unread_score
 from integration.lineage import Detail

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.optim import LearningRates
+from clear_strategies.training.optim import LearningRates
 from integration.attach import HostError
 from rasterizers.geometry import SH_C0
 

@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.conductor import Conductor
-from clear_strategies.data.view import View
+from clear_strategies.core.view import View
+from clear_strategies.merging.conductor import Conductor
 from integration.attach import Drawing, HostError, Which
 from integration.bridge import AutogradShot
 from integration.densify import Screen

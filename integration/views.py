@@ -9,14 +9,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.conductor import Conductor
-from clear_strategies.data.upscale import Images
-from clear_strategies.data.view import Photo, View
+from clear_strategies.core.view import Photo, View
+from clear_strategies.data.priors.upscale import Images
 from clear_strategies.errors import DataError
+from clear_strategies.merging.conductor import Conductor
 from rasterizers.interface import Camera
 
 SuperResolve = Callable[[str, Float[Tensor, "h w 3"], int], Float[Tensor, "H W 3"]]
-"""I_HR of the view of this name, from its LR image and the factor: any of `clear_strategies.data.upscale`, or yours."""
+"""I_HR of the view of this name, from its LR image and the factor: any of `clear_strategies.data.priors.upscale`, or yours."""
 
 
 def view(

@@ -13,7 +13,6 @@ import toy
 from PIL import Image
 
 import rasterizers
-from clear_strategies import kernels
 from clear_strategies.bench import accuracy, iteration, memory, output, prototype, rounds, scenes
 from clear_strategies.bench import kernels as losses
 from clear_strategies.bench.__main__ import main
@@ -32,9 +31,10 @@ from clear_strategies.bench.rasterizers import (
     noise,
     usable,
 )
-from clear_strategies.checkpoint import Checkpoint, save
 from clear_strategies.errors import DataError
-from clear_strategies.export import export_ply
+from clear_strategies.kernels import losses as kernels
+from clear_strategies.outputs.export import export_ply
+from clear_strategies.training.checkpoint import Checkpoint, save
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +247,7 @@ def test_memory_is_measured_in_a_child_and_a_failure_is_a_reason():
 def test_grouped_convolution_is_the_ssim_that_3dgs_trains_with():
     x, y = losses.images(40, 30)
     peer = losses.grouped_convolution(losses._nchw(x.double()), losses._nchw(y.double()))
-    assert float(peer) == pytest.approx(float(kernels.ssim(x.double(), y.double()).value), abs=1e-12)
+    assert float(peer) == pytest.approx(float(losses.ssim(x.double(), y.double()).value), abs=1e-12)
 
 
 def test_losses_are_held_against_float64(capsys):
@@ -259,7 +259,7 @@ def test_losses_are_held_against_float64(capsys):
 
 
 def test_another_implementation_takes_part_under_its_name(monkeypatch):
-    torch_module = losses.importlib.import_module("clear_strategies.kernels.torch")
+    torch_module = losses.importlib.import_module("clear_strategies.kernels.losses.reference")
     both = {"torch": torch_module, "quick": torch_module}
     monkeypatch.setattr(kernels, "implementations", lambda device: both)
     assert [c.name for c in losses._ours(losses.HAAR)] == ["ours, torch", "ours, quick"]
@@ -268,7 +268,7 @@ def test_another_implementation_takes_part_under_its_name(monkeypatch):
 def test_an_iteration_stands_still_and_has_everything_on(tiny):
     rasterizer = rasterizers.load("torch", preset="fast", **scenes.SETTINGS)
     view = iteration.view_of(tiny, rasterizer)
-    from clear_strategies.conductor import Conductor
+    from clear_strategies.merging.conductor import Conductor
 
     training = iteration.Training(
         tiny, view, rasterizer, Conductor(*iteration.STRATEGIES["clear"](), statistics_from=500)

@@ -9,10 +9,11 @@ import torch
 import toy
 from torch import Tensor
 
-from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, SplatSuRe, Strategy, StrategyConflict, kernels
-from clear_strategies.field import GaussianField
+from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, SplatSuRe, Strategy, StrategyConflict
+from clear_strategies.kernels import losses
 from clear_strategies.schedules import WarmupDecay
-from clear_strategies.testing import CHECKS, ContractError, check_strategy
+from clear_strategies.strategies.testing import CHECKS, ContractError, check_strategy
+from clear_strategies.training.field import GaussianField
 from rasterizers import Splats, autograd
 
 ALWAYS = WarmupDecay(start=0, full=1, decay_from=10, end=10)
@@ -105,7 +106,7 @@ def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective
             return None, cotangent * ctx.gradient, None
 
     def photometric(x: Tensor, y: Tensor) -> Tensor:
-        return 0.8 * Loss.apply(kernels.l1, x, y) + 0.2 * (1 - Loss.apply(kernels.ssim, x, y))
+        return 0.8 * Loss.apply(losses.l1, x, y) + 0.2 * (1 - Loss.apply(losses.ssim, x, y))
 
     common = (raw["means"], raw["quats"], scales, opacities, raw["sh0"], raw["shN"][:, :bands])
     zero = torch.zeros_like(raw["detail"])
@@ -116,7 +117,7 @@ def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective
         lr = draw(view.lr.camera, *common, zero)
     loss = objective.lambda_lr * photometric(lr, view.lr.image.double()) + λ * (
         photometric(hr, view.hr.image.double())
-        + objective.lambda_hf * Loss.apply(kernels.haar_l1, hr, view.hr.image.double())
+        + objective.lambda_hf * Loss.apply(losses.haar_l1, hr, view.hr.image.double())
     )
     gradients = torch.autograd.grad(loss, list(raw.values()))
     return Grads(dict(zip(raw, gradients, strict=True)))
@@ -157,7 +158,7 @@ def test_without_lr_photos_only_the_reference_moves_gaussians():
     conductor = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0, lambda_lr=0.0))
     _, hr = field.render_scales(toy.RASTERIZER, view, lr=False)
     update = conductor.update(field.raw(), None, hr, view, 5)
-    (g_base,) = hr.pull(conductor.objective.hr(hr.image, view.hr.image).cotangents)
+    (g_base,) = hr.vjp(conductor.objective.hr(hr.image, view.hr.image).cotangents)
     for name in ("means", "quats", "scales", "opacities", "sh0"):
         assert torch.allclose(update.grads[name], g_base[name], rtol=1e-12, atol=0)
     assert update.losses["lr"] > 0  # measured, for the log
@@ -188,7 +189,7 @@ def test_the_detail_feature_moves_by_routed_high_frequencies_alone():
     lr, hr = field.render_scales(toy.RASTERIZER, view)
     p2g = P2G()
     update = Conductor(GCO(), p2g, objective=objective).update(field.raw(), lr, hr, view, 5)
-    _, g_hf = hr.pull(objective.hr(hr.image, view.hr.image).cotangents)
+    _, g_hf = hr.vjp(objective.hr(hr.image, view.hr.image).cotangents)
     m = p2g.route(update.evidence)
     assert torch.allclose(update.grads["detail"], 0.2 * m[:, None] * g_hf["detail"], rtol=1e-6, atol=1e-15)
     without = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0))
@@ -203,8 +204,8 @@ def test_routing_weighs_the_high_frequency_gradient_only():
     lr, hr = field.render_scales(toy.RASTERIZER, view)
     p2g = P2G()
     update = Conductor(p2g, objective=objective).update(field.raw(), lr, hr, view, 5)
-    (g_lr,) = lr.pull(objective.lr(lr.image, view.lr.image).cotangents)
-    g_base, g_hf = hr.pull(objective.hr(hr.image, view.hr.image).cotangents)
+    (g_lr,) = lr.vjp(objective.lr(lr.image, view.lr.image).cotangents)
+    g_base, g_hf = hr.vjp(objective.hr(hr.image, view.hr.image).cotangents)
     m = p2g.route(update.evidence)[:, None]
     expected = g_lr["means"] + g_base["means"] + 0.2 * m * g_hf["means"]
     assert torch.allclose(update.grads["means"], expected, rtol=1e-6, atol=1e-15)
@@ -262,7 +263,7 @@ def test_a_strategy_without_hooks_is_warned_of(caplog):
 def _double(view):
     from dataclasses import replace
 
-    from clear_strategies.data.view import Photo
+    from clear_strategies.core.view import Photo
 
     return replace(
         view, lr=Photo(view.lr.camera, view.lr.image.double()), hr=Photo(view.hr.camera, view.hr.image.double())

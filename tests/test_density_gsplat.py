@@ -14,32 +14,27 @@ import toy
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from clear_strategies import (
-    GCO,
-    P2G,
-    SVS,
-    Conductor,
-    DataError,
-    Objective,
-    Strategy,
-    Update,
-    checkpoint,
-    density_gsplat,
-)
-from clear_strategies.density import Densifier, DensifierSettings, Density, DensityError, DensitySettings
-from clear_strategies.density_gsplat import GsplatDensifier, GsplatSettings, passed_by
-from clear_strategies.field import GaussianField
-from clear_strategies.fit import FitSettings, TrainState, iterate
-from clear_strategies.gradients import Grads
-from clear_strategies.mip import MipFilter
-from clear_strategies.optim import Adam, LearningRates
+from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, Strategy, Update
+from clear_strategies.core.gradients import Grads
+from clear_strategies.density import gsplat
+from clear_strategies.density.adaptive import Densifier, DensifierSettings, Density, DensityError, DensitySettings
+from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings, topk_threshold
 from clear_strategies.run import CONF
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, scaled
-from clear_strategies.testing import StubShot
+from clear_strategies.strategies.testing import StubShot
+from clear_strategies.training import checkpoint
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import Adam, LearningRates
 from tests.test_lifecycle import cloud
 from tests.test_run import TINY, run
 
-DEFAULT, MCMC, TINY_ONE = "gsplat.strategy.DefaultStrategy", "clear_strategies.mcmc.MCMC", "tests.gsplat_like.Tiny"
+DEFAULT, MCMC, TINY_ONE = (
+    "gsplat.strategy.DefaultStrategy",
+    "clear_strategies.density.mcmc.MCMC",
+    "tests.gsplat_like.Tiny",
+)
 KINDS = [TINY_ONE, DEFAULT, MCMC]
 N = 12
 
@@ -156,7 +151,7 @@ def test_the_strategys_statistic_is_the_score_that_it_was_given():
 
 @pytest.mark.parametrize(("version", "shape"), [("1.4.0", (1, N)), ("1.5.3", (1, N, 2)), (None, (1, N, 2))])
 def test_radii_have_the_layout_of_the_installed_gsplat(version, shape, monkeypatch):
-    monkeypatch.setattr(density_gsplat, "_gsplat_version", lambda: version)
+    monkeypatch.setattr(gsplat, "_gsplat_version", lambda: version)
     theta, optimizer, made = tagged()
     look(made, torch.ones(N))
     made.strategy.step_post_backward = lambda p, o, s, t, info: made.strategy.infos.append(info)
@@ -197,7 +192,7 @@ def test_the_cap_binds_and_is_said(caplog):
 )
 def test_a_threshold_that_the_k_highest_pass(k, threshold, chosen):
     score = torch.tensor([0.0, 2.0, 4.0, 1.0])
-    assert passed_by(score, k) == threshold
+    assert topk_threshold(score, k) == threshold
     assert int((score > threshold).sum()) == chosen
 
 
@@ -346,7 +341,7 @@ def test_a_strategy_that_cannot_be_used_is_told_in_one_sentence(target, message)
 def test_a_missing_gsplat_is_told_with_the_command_that_installs_it(monkeypatch):
     for name in [name for name in sys.modules if name.partition(".")[0] == "gsplat"]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delitem(sys.modules, "clear_strategies.mcmc", raising=False)
+    monkeypatch.delitem(sys.modules, "clear_strategies.density.mcmc", raising=False)
     monkeypatch.setitem(sys.modules, "gsplat", None)
     for target in (DEFAULT, MCMC):
         with pytest.raises(DataError, match=r"pip install 'clear-strategies\[gsplat\]'"):
@@ -398,7 +393,7 @@ def test_a_strategy_that_breaks_the_contract_is_named(name, message):
 def test_relocation_leaves_what_is_seen():
     """An opacity of 0.75 as two Gaussians: each has 1 - √0.25 = 0.5, and shrinks by 0.75 / (2 · 0.5 - 0.5² / √2)."""
     need(MCMC)
-    from clear_strategies.mcmc import relocation
+    from clear_strategies.density.mcmc import relocation
 
     opacities, scales = relocation(torch.tensor([0.75, 0.3]), torch.ones(2, 3), torch.tensor([2, 1]))
     assert opacities.tolist() == pytest.approx([0.5, 0.3])
@@ -412,7 +407,7 @@ def test_our_mcmc_is_gsplats_but_for_its_cuda_kernels(monkeypatch):
     need(MCMC)
     from gsplat.strategy import MCMCStrategy, ops
 
-    from clear_strategies import mcmc
+    from clear_strategies.density import mcmc
     from rasterizers.geometry import rotation_matrix
 
     def covariances(quats, scales, **_):

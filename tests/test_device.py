@@ -18,14 +18,16 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from clear_strategies import GCO, P2G, SVS, Conductor, SplatSuRe, checkpoint, late
-from clear_strategies.data.view import View
-from clear_strategies.density_gsplat import GsplatDensifier, GsplatSettings
+from clear_strategies import GCO, P2G, SVS, Conductor, SplatSuRe
+from clear_strategies.core import deferred
+from clear_strategies.core.gradients import Grads
+from clear_strategies.core.view import View
+from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings
 from clear_strategies.errors import DataError
-from clear_strategies.fit import TrainState, iterate
-from clear_strategies.gradients import Grads
 from clear_strategies.run import CONF, _comparable, _device, _drawn_on, _rasterizer, _restore
-from clear_strategies.skips import Economy, Skips
+from clear_strategies.training import checkpoint
+from clear_strategies.training.loop import TrainState, iterate
+from clear_strategies.training.skips import SkipPolicy, Skips
 from rasterizers.interface import Rendering, SplatGradients, Traits
 from tests import toy
 from tests.test_resume import ITERATIONS, SCENE, SUBSETS, start, tensors
@@ -125,18 +127,18 @@ def no_data(monkeypatch):
     monkeypatch.setattr(TrainState, "refilter", lambda self: None)
     monkeypatch.setattr(P2G, "_patch_evidence", lambda self, view: (view.lr.image.new_zeros(2, 2),) * 2)
 
-    def tiles(self: Economy, view: View, tile: int) -> tuple[Tensor, int]:
+    def tiles(self: SkipPolicy, view: View, tile: int) -> tuple[Tensor, int]:
         return view.hr.image.new_ones(8, 12, dtype=torch.bool), 1
 
-    monkeypatch.setattr(Economy, "_with_detail", tiles)
+    monkeypatch.setattr(SkipPolicy, "_with_detail", tiles)
 
 
 def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:
     """A run in its middle, of which all lies on meta but the cameras."""
     monkeypatch.setattr("tests.test_resume.SCENE", SCENE.to("meta"))
     state = start(names)
-    state.fused = None
-    state.economy = Economy(EVERY_SKIP)
+    state.compiled_step = None
+    state.skip_policy = SkipPolicy(EVERY_SKIP)
     # Statistics are gathered; a round reads, and does not come.
     state.density.settings = replace(state.density.settings, start=90, stop=100, statistics_from=1)
     return state
@@ -181,11 +183,11 @@ def test_other_readings_read_nothing_either(make, no_data, monkeypatch):
     state.conductor.on_fit_start(len(SCENE.train), 0, "meta")
     for view in state.views:  # whose poses are sent once, for either reference
         for t in (1, ITERATIONS):
-            seen = state.economy.view(view, t)
+            seen = state.skip_policy.view(view, t)
             for s in state.conductor.strategies:
                 if isinstance(s, SplatSuRe):
                     s._pose(seen.name, seen.hr.camera)
-    state.economy = Economy(replace(EVERY_SKIP, coarse_until=0))
+    state.skip_policy = SkipPolicy(replace(EVERY_SKIP, coarse_until=0))
     steadily(state)
 
 
@@ -231,7 +233,7 @@ def test_carrying_over_and_writing_would_be_seen(careless, no_data, monkeypatch)
 def test_a_read_would_be_seen(no_data, monkeypatch):
     state = on_meta(monkeypatch, ())
     state.t = 15
-    monkeypatch.setattr(late, "at_once", lambda x: True)
+    monkeypatch.setattr(deferred, "is_immediate", lambda x: True)
     with pytest.raises(RuntimeError, match="meta"):
         iterate(state, Blank())
 
@@ -242,7 +244,7 @@ def test_every_tensor_is_made_where_the_field_lies_and_late_numbers_are_the_same
 
     def begun() -> TrainState:
         state = start(names)
-        state.economy, state.fused = Economy(EVERY_SKIP), None
+        state.skip_policy, state.compiled_step = SkipPolicy(EVERY_SKIP), None
         state.conductor.objective = replace(state.conductor.objective, kernels="torch")
         return state
 
@@ -258,11 +260,11 @@ def test_every_tensor_is_made_where_the_field_lies_and_late_numbers_are_the_same
         return state
 
     at_once = trained(None)
-    monkeypatch.setattr(late, "at_once", lambda x: False)
+    monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
     unread = trained(9)
     for name, value in tensors(at_once).items():
         assert torch.equal(tensors(unread)[name], value), name
-    for then, now in zip(at_once.told(), unread.told(), strict=True):
+    for then, now in zip(at_once.history_as_floats(), unread.history_as_floats(), strict=True):
         if not now.get("corrected", 0.0) > 0:  # that is known too late to leave the share out
             then.pop("omega_at_lower_bound", None)
             now.pop("omega_at_lower_bound", None)

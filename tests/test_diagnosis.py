@@ -12,17 +12,17 @@ import toy
 from torch import Tensor
 
 from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies.core.gradients import Grads, conflict_ratio
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.density import DensitySettings
-from clear_strategies.diagnosis import MAPS, diagnose, leave
-from clear_strategies.fit import FitSettings, TrainState, iterate
-from clear_strategies.gradients import Grads, conflict_ratio
-from clear_strategies.mip import MipFilter
-from clear_strategies.objective import Objective
-from clear_strategies.optim import LearningRates
-from clear_strategies.p2g import patch_evidence
+from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.merging.objective import Objective
+from clear_strategies.outputs.maps import MAPS, diagnose, leave
 from clear_strategies.schedules import WarmupDecay
-from clear_strategies.strategy import Strategy
+from clear_strategies.strategies.base import Strategy
+from clear_strategies.strategies.p2g import patch_evidence
+from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import LearningRates
 
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
 
@@ -53,7 +53,7 @@ def test_asking_changes_nothing() -> None:
     strategies = (GCO(), P2G(), SVS(anchor_start=2))
     state = trained(*strategies)
     before, readings = everything(state), [dict(s.readings) for s in strategies]
-    caches, entries = [set(s.cache) for s in strategies], dict(state.conductor.ledger.entries)
+    caches, entries = [set(s.cache) for s in strategies], dict(state.conductor.work_log.entries)
     for view in state.views:
         diagnose(state.field, state.conductor, toy.RASTERIZER, view)
     after = everything(state)
@@ -61,7 +61,7 @@ def test_asking_changes_nothing() -> None:
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert [dict(s.readings) for s in strategies] == readings
     assert [set(s.cache) for s in strategies] == caches
-    assert state.conductor.ledger.entries == entries
+    assert state.conductor.work_log.entries == entries
 
 
 def test_patch_maps_are_those_that_p2g_routes_by_enlarged_to_hr() -> None:
@@ -91,8 +91,8 @@ def test_conflict_is_the_share_that_training_reports() -> None:
     found = diagnose(state.field, state.conductor, toy.RASTERIZER, view)
     lr, hr = state.field.render_scales(toy.RASTERIZER, view)
     assert hr is not None
-    (g_lr,) = lr.pull(OBJECTIVE.lr(lr.image, view.lr.image).cotangents)
-    g_base, g_hf = hr.pull(OBJECTIVE.hr(hr.image, view.hr.image).cotangents)
+    (g_lr,) = lr.vjp(OBJECTIVE.lr(lr.image, view.lr.image).cotangents)
+    g_base, g_hf = hr.vjp(OBJECTIVE.hr(hr.image, view.hr.image).cotangents)
     assert found.means["conflict"] == pytest.approx(conflict_ratio(g_lr, g_base + g_hf * 0.2)["gaussian"])
     assert 0 < found.means["conflict"] < 1
     assert "corrected" not in found.maps

@@ -22,11 +22,11 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import Conductor
-from clear_strategies.data.scene import ViewSettings
-from clear_strategies.fit import FitSettings, TrainState, fit, iterate
-from clear_strategies.mip import MipFilter
+from clear_strategies.data.prepare import ViewSettings
 from clear_strategies.run import CONF
 from clear_strategies.schedules import scaled
+from clear_strategies.training.loop import FitSettings, TrainState, fit, iterate
+from clear_strategies.training.mip import MipFilter
 from tests.test_run import TINY, run
 
 
@@ -77,13 +77,13 @@ def test_every_method_trains(name, fused):
     state = TrainState.start(
         scene, conductor, settings=scaled(settings, settings.stretch), density=density, rates=rates, mip=mip
     )
-    compiled = state.fused is not None
+    compiled = state.compiled_step is not None
     assert not (compiled and (fused == "off" or "splatsure" in name))
     fit(state, scene, toy.RASTERIZER)
-    drawn = {stage for stage in conductor.ledger.entries if stage.startswith("render")}
+    drawn = {stage for stage in conductor.work_log.entries if stage.startswith("render")}
     if (name.endswith("_lr") and name != "srgs_lr") or name == "dropgaussian":
         assert drawn == {"render LR", "render LR + HR"}  # the second one only as skipped
-        assert conductor.ledger.entries["render LR + HR"].runs == 0
+        assert conductor.work_log.entries["render LR + HR"].runs == 0
         told = "loss_lr"
     else:
         assert drawn == {"render HR"}
@@ -105,7 +105,7 @@ def test_the_compiled_pass_sees_the_same_gradients(lambda_lr, lr_from):
         strategies, objective, density, rates, mip = pieces(config)
         conductor = Conductor(*strategies, objective=objective)
         state = TrainState.start(toy.scene(), conductor, settings=settings, density=density, rates=rates, mip=mip)
-        if fused == "auto" and state.fused is None:
+        if fused == "auto" and state.compiled_step is None:
             pytest.skip("the kernels are not installed")
         iterate(state, toy.RASTERIZER)
         moments.append(state.optimizer.first)

@@ -15,15 +15,16 @@ import pytest
 import torch
 import toy
 
-from clear_strategies import CONFLICT_GROUPS, GCO, P2G, SVS, Conductor, Evidence, Objective, late
-from clear_strategies.density import DensitySettings
-from clear_strategies.field import GaussianField
-from clear_strategies.fit import FitSettings, TrainState, iterate
-from clear_strategies.fused import Factors, FusedStep, fused_step
-from clear_strategies.kernels import step as kernel
-from clear_strategies.mip import MipFilter
-from clear_strategies.optim import Adam, LearningRates
+from clear_strategies import CONFLICT_GROUPS, GCO, P2G, SVS, Conductor, Evidence, Objective
+from clear_strategies.core import deferred
+from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.kernels.gaussian_step import cpp as kernel
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
+from clear_strategies.training.compiled_step import CompiledStep, Factors, compiled_step_for
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import BackendUnavailable, SplatGradients
 from rasterizers.native import load_kernels
 from rasterizers.warp_backend.launch import require
@@ -42,9 +43,9 @@ def sweeps(request):
         require("the compiled pass", "cuda" if request.param == "warp-cuda" else "cpu", "")
     except BackendUnavailable as reason:
         pytest.skip(str(reason))
-    from clear_strategies.kernels import warp_step
+    from clear_strategies.kernels.gaussian_step import warp
 
-    return warp_step.GaussianPass if request.param == "warp" else partial(Elsewhere, warp_step.GaussianPass, "cuda")
+    return warp.GaussianPass if request.param == "warp" else partial(Elsewhere, warp.GaussianPass, "cuda")
 
 
 class Elsewhere:
@@ -84,7 +85,7 @@ class Elsewhere:
 
 def told(numbers) -> dict[str, float]:
     """Numbers by name, read if they are still on a device."""
-    return dict(zip(numbers, late.read(list(numbers.values())), strict=True))
+    return dict(zip(numbers, deferred.read(list(numbers.values())), strict=True))
 
 
 @dataclass
@@ -106,8 +107,8 @@ class Case:
 
     def grads(self, use: int, hr: str = "both") -> tuple:
         a = self.fields[use]._activate(self.z)
-        hf = (a.pull(self.hr, k, detail=True) if k < _K[hr] else None for k in (0, 1))
-        return a.pull(self.lr, 0, detail=False), *hf
+        hf = (a.vjp(self.hr, k, detail=True) if k < _K[hr] else None for k in (0, 1))
+        return a.vjp(self.lr, 0, detail=False), *hf
 
 
 _K = {"none": 0, "base": 1, "both": 2}
@@ -223,7 +224,7 @@ def test_the_merged_gradient_is_the_readable_one(sweeps, setting, kind, caplog):
         expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
         said = caplog.messages
         caplog.clear()
-        step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
+        step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
         before = {name: p.clone() for name, p in c.fields[1].raw().items()}
         found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
         assert_same_gradient(c, expected, found)
@@ -240,7 +241,7 @@ def test_every_subset_of_strategies_with_and_without_hr(sweeps, names):
         readable, compiled = conductors(*names, anchored=c.fields[0] if anchored else None, hf=hf)
         e = c.e if hr != "none" else None
         expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0, hr), c.m, e, T)
-        step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
+        step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
         found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1, hr), c.m, e, T)
         assert_same_gradient(c, expected, found, hr=hr)
         assert repr(told(found_conflict)) == repr(told(conflict))
@@ -251,7 +252,7 @@ def test_hr_for_the_score_alone_is_neither_compared_nor_corrected(sweeps):
     c = case(50)
     readable, compiled = conductors(GCO, λ=later)
     expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
-    step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
+    step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
     found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
     assert conflict == found_conflict == {}
     assert all(torch.equal(expected[name], found[name]) for name in expected)
@@ -260,7 +261,7 @@ def test_hr_for_the_score_alone_is_neither_compared_nor_corrected(sweeps):
 def three_steps(sweeps, c: Case, both, rates: LearningRates, hr="both", skips=True, steps=3):
     """Three steps each way: readable parameters and moments, and compiled ones."""
     adams = [Adam(f.raw(), rates, 2.0) for f in c.fields]
-    step = FusedStep(both[1], adams[1], skips=skips, sweeps=sweeps)
+    step = CompiledStep(both[1], adams[1], skips=skips, sweeps=sweeps)
     for i in range(steps):
         g, _ = both[0].merge(c.fields[0].raw(), *c.grads(0, hr), c.m, c.e, T + i)
         adams[0].step(c.fields[0].raw(), g, c.visible)
@@ -329,9 +330,9 @@ def test_rows_and_bands_that_are_left_out_would_not_have_moved(sweeps, degree, a
                 conductor.after_step(c.fields[1].raw(), conductor.strategies[1].anchor_start)
         adams = three_steps(sweeps, c, both, rates, skips=skips)
         states.append([*c.fields[1].raw().values(), *adams[1].first.values(), *adams[1].second.values()])
-        ledgers.append(both[1].ledger.entries)
+        ledgers.append(both[1].work_log.entries)
     assert all(torch.equal(a, b) for a, b in zip(*states, strict=True))
-    assert ledgers[0]["optimizer rows"].skipped["gradient, moments and anchor's pull are 0"] > 500
+    assert ledgers[0]["optimizer rows"].skipped["gradient, moments and anchor's vjp are 0"] > 500
     assert ledgers[0]["SH bands in the optimizer"].skipped == {
         "above the active degree": 3 * (15 - (degree + 1) ** 2 + 1)
     }
@@ -346,7 +347,7 @@ def test_bands_with_momentum_are_not_left_out(sweeps):
         adam.first["shN"][:, 10], adam.second["shN"][:, 10] = 1e-3, 1e-6
     g, _ = both[0].merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
     adams[0].step(c.fields[0].raw(), g)
-    FusedStep(both[1], adams[1], sweeps=sweeps).merge(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
+    CompiledStep(both[1], adams[1], sweeps=sweeps).merge(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
     assert torch.allclose(c.fields[0].shN.data, c.fields[1].shN.data, rtol=1e-6, atol=1e-9)
     assert bool((c.fields[1].shN.data[:, 10] != 0).all())
 
@@ -360,7 +361,7 @@ def test_the_same_bits_for_any_number_of_threads(sweeps):
             c = case(5000, kind="mixed")
             _, conductor = conductors(GCO, SVS, anchored=c.fields[0])
             adam = Adam(c.fields[1].raw(), LearningRates(), 1.0)
-            step = FusedStep(conductor, adam, sweeps=sweeps)
+            step = CompiledStep(conductor, adam, sweeps=sweeps)
             for i in range(3):
                 step.merge(c.fields[1].raw(), *c.factors(1), c.m, c.e, T + i)
             state = [*c.fields[1].raw().values(), *adam.first.values(), *adam.second.values()]
@@ -377,7 +378,7 @@ def test_bases_of_both_scales_may_differ(sweeps):
     c.hr = replace(c.hr, basis=c.hr.basis * 1.5 + 0.1)
     readable, compiled = conductors(GCO)
     expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
-    step = FusedStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
+    step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
     found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
     assert_same_gradient(c, expected, found)
     assert told(conflict) == told(found_conflict)
@@ -465,16 +466,16 @@ def test_the_readable_path_is_taken_where_it_must_be_and_that_is_said_once(caplo
     for arguments, reason in cases:
         caplog.clear()
         with caplog.at_level(logging.INFO):
-            assert fused_step(*arguments) is None
+            assert compiled_step_for(*arguments) is None
         assert [reason in message for message in caplog.messages] == [True]
 
     def missing(_):
         raise BackendUnavailable("the compiled kernels are not installed.")
 
-    monkeypatch.setattr("clear_strategies.fused.load_kernels", missing)
+    monkeypatch.setattr("clear_strategies.training.compiled_step.load_kernels", missing)
     caplog.clear()
     with caplog.at_level(logging.INFO):
-        assert fused_step(Conductor(), adam) is None
+        assert compiled_step_for(Conductor(), adam) is None
     assert caplog.messages == ["The per-Gaussian pass takes the readable path: the compiled kernels are not installed."]
 
 
@@ -493,12 +494,12 @@ def test_thirty_iterations_are_those_of_the_readable_path(sweeps):
             mip=MipFilter(every=7, last=1),
         )
         if mode == "auto":
-            states[mode].fused = FusedStep(states[mode].conductor, states[mode].optimizer, sweeps=sweeps)
+            states[mode].fused = CompiledStep(states[mode].conductor, states[mode].optimizer, sweeps=sweeps)
         for _ in range(30):
             iterate(states[mode], toy.RASTERIZER)
-        late.settle(states[mode].history)
+        deferred.resolve(states[mode].history)
     readable, compiled = states["off"], states["auto"]
-    assert readable.fused is None
+    assert readable.compiled_step is None
     assert len(readable.field) == len(compiled.field)
     for a, b in zip(readable.history, compiled.history, strict=True):
         assert a.keys() == b.keys()
@@ -509,7 +510,7 @@ def test_thirty_iterations_are_those_of_the_readable_path(sweeps):
         # beside itself, disturbed by 1e-7 a step, keeps 0.72 of the opacities and 0.80 of the means this near.
         near = (p - compiled.field.raw()[name]).abs() <= 1e-3 * (1 + p.abs())
         assert float(near.float().mean()) > 0.7, name
-    stages = compiled.conductor.ledger.entries
+    stages = compiled.conductor.work_log.entries
     assert stages["per-Gaussian pass"].runs == 30
     assert "optimizer" not in stages
     assert set(CONFLICT_GROUPS) <= {key.removeprefix("conflict_") for row in compiled.history for key in row}

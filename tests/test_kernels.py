@@ -14,11 +14,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies import kernels
-from clear_strategies.kernels import cpp, warp
-from clear_strategies.kernels import torch as reference
-from clear_strategies.kernels.prepared import prepared
-from clear_strategies.objective import Objective
+from clear_strategies.kernels import losses as kernels
+from clear_strategies.kernels.losses import cpp, reference, warp
+from clear_strategies.kernels.losses.prepared import prepared
+from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, milestones, scaled
 from rasterizers.interface import BackendUnavailable
 
@@ -302,7 +301,7 @@ def test_without_a_compiler_torch_does_it(monkeypatch):
 def test_the_objective_is_the_same_by_either_kernels(caplog):
     x, y = rough(photo(60, 70), 0.1)
     kernels._say.cache_clear()
-    with caplog.at_level(logging.INFO, "clear_strategies.kernels"):
+    with caplog.at_level(logging.INFO, "clear_strategies.kernels.losses"):
         fast = [Objective(kernels="auto", clamp_render=clamp).hr(x, y) for clamp in (False, True)]
     assert [record.message for record in caplog.records] == [f"image losses: cpp, for {cpp.native().isa}."]
     for clamp, losses in zip((False, True), fast, strict=True):

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from clear_strategies import late
+from clear_strategies.core import deferred
 
 
 class Reads(TorchDispatchMode):
@@ -26,61 +26,68 @@ class Reads(TorchDispatchMode):
 @pytest.fixture
 def on_a_device(monkeypatch):
     """The CPU's tensors as if they lay where reading waits."""
-    monkeypatch.setattr(late, "at_once", lambda x: False)
+    monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
 
 
 def test_on_the_cpu_numbers_are_floats():
-    assert late.number(torch.tensor(1.5)) == 1.5
-    assert late.made(late.ratio, 1.0, 4.0) == 0.25
-    assert math.isnan(late.made(late.ratio, 0.0, 0.0))
+    assert deferred.scalar(torch.tensor(1.5)) == 1.5
+    assert deferred.defer(deferred.ratio, 1.0, 4.0) == 0.25
+    assert math.isnan(deferred.defer(deferred.ratio, 0.0, 0.0))
 
 
 def test_elsewhere_nothing_is_read_until_it_is_asked_for(on_a_device):
     with Reads() as reads:
-        part, whole = late.number(torch.tensor(3)), late.number(torch.tensor(4.0, dtype=torch.float64))
-        share = late.made(late.ratio, part, late.made(late.added, whole, 8.0))
+        part, whole = deferred.scalar(torch.tensor(3)), deferred.scalar(torch.tensor(4.0, dtype=torch.float64))
+        share = deferred.defer(deferred.ratio, part, deferred.defer(deferred.added, whole, 8.0))
         rows = [{"t": 1.0, "share": share, "part": part}, {"t": 2.0, "share": share}]
     assert reads.count == 0
-    assert late.settle(rows) == [{"t": 1.0, "share": 0.25, "part": 3.0}, {"t": 2.0, "share": 0.25}]
+    assert deferred.resolve(rows) == [{"t": 1.0, "share": 0.25, "part": 3.0}, {"t": 2.0, "share": 0.25}]
 
 
 def test_a_number_that_takes_part_in_several_crosses_once(on_a_device, monkeypatch):
     moved = []
     monkeypatch.setattr(torch, "stack", lambda tensors, real=torch.stack: moved.append(len(tensors)) or real(tensors))
     a, b = torch.tensor(1.0), torch.tensor(2.0)
-    assert late.read([late.made(late.added, a, b), late.made(late.ratio, a, b), a, 5.0]) == [3.0, 0.5, 1.0, 5.0]
+    assert deferred.read([deferred.defer(deferred.added, a, b), deferred.defer(deferred.ratio, a, b), a, 5.0]) == [
+        3.0,
+        0.5,
+        1.0,
+        5.0,
+    ]
     assert moved == [2]
 
 
 def test_counts_beyond_float32_stay_exact(on_a_device):
     large = torch.tensor(2**24 + 1)
-    assert late.read([late.number(large), torch.tensor(0.5)]) == [2**24 + 1, 0.5]
+    assert deferred.read([deferred.scalar(large), torch.tensor(0.5)]) == [2**24 + 1, 0.5]
 
 
 def test_rows_before_one_that_was_read_are_not_looked_at(monkeypatch):
     looked = []
-    monkeypatch.setattr(late, "_is_unread", lambda row, real=late._is_unread: looked.append(row["t"]) or real(row))
-    late.settle([{"t": float(t), "x": 0.0 if t < 7 else torch.tensor(0.0)} for t in range(10)])
+    monkeypatch.setattr(
+        deferred, "_is_unread", lambda row, real=deferred._is_unread: looked.append(row["t"]) or real(row)
+    )
+    deferred.resolve([{"t": float(t), "x": 0.0 if t < 7 else torch.tensor(0.0)} for t in range(10)])
     assert looked == [9, 8, 7, 6]
 
 
 def test_a_recipe_may_say_what_it_finds_and_says_it_once(on_a_device):
     said = []
-    row = {"x": late.made(lambda x: said.append(x) or x, torch.tensor(7.0))}
+    row = {"x": deferred.defer(lambda x: said.append(x) or x, torch.tensor(7.0))}
     assert not said
-    late.settle([row])
-    late.settle([row])
+    deferred.resolve([row])
+    deferred.resolve([row])
     assert said == [7.0]
 
 
 @pytest.mark.parametrize("chosen", [[True, False, True, True], [False] * 4, [False, True, False, True]])
-@pytest.mark.parametrize("statistic", [late.total, late.mean, late.median])
+@pytest.mark.parametrize("statistic", [deferred.total, deferred.mean, deferred.median])
 def test_statistics_of_chosen_rows_are_the_same_without_counting_them(statistic, chosen, monkeypatch):
     values, chosen = torch.tensor([4.0, 2.0, 1.0, 3.0]), torch.tensor(chosen)
     values[~chosen] = math.inf  # which must not leak in
     expected = statistic(values, chosen)
-    monkeypatch.setattr(late, "at_once", lambda x: False)
+    monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
     with Reads() as reads:
         found = statistic(values, chosen)
     assert reads.count == 0
-    assert late.read([found]) == pytest.approx([expected], nan_ok=True)
+    assert deferred.read([found]) == pytest.approx([expected], nan_ok=True)

@@ -1,4 +1,4 @@
-"""The ledger on a device: stamps instead of clocks, nothing waited for while there is work, nothing lost."""
+"""The work_log on a device: stamps instead of clocks, nothing waited for while there is work, nothing lost."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from clear_strategies import Conductor
-from clear_strategies import ledger as module
-from clear_strategies.ledger import Ledger
+from clear_strategies.core import work_log as module
+from clear_strategies.core.work_log import WorkLog
 
 
 class Device:
@@ -50,18 +50,18 @@ def device(monkeypatch) -> Device:
     return fake
 
 
-def work(ledger: Ledger, device: Device, name: str, ms: float) -> None:
-    with ledger.stage(name):
+def work(work_log: WorkLog, device: Device, name: str, ms: float) -> None:
+    with work_log.stage(name):
         device.queued += ms
 
 
 def test_on_cuda_nobody_waits_until_somebody_looks(device):
-    ledger = Ledger("cuda")
+    work_log = WorkLog("cuda")
     for _ in range(3):
-        work(ledger, device, "render", 2.0)
-        work(ledger, device, "step", 0.5)
+        work(work_log, device, "render", 2.0)
+        work(work_log, device, "step", 0.5)
     assert device.waits == 0
-    rows = {row["stage"]: row for row in ledger.rows()}
+    rows = {row["stage"]: row for row in work_log.rows()}
     assert device.waits > 0
     assert (rows["render"]["runs"], rows["render"]["ms_each"], rows["render"]["seconds"]) == (3, 2.0, 0.006)
     assert rows["step"]["ms_each"] == 0.5
@@ -70,32 +70,32 @@ def test_on_cuda_nobody_waits_until_somebody_looks(device):
 
 def test_stamps_that_the_device_has_passed_are_read_without_waiting(device, monkeypatch):
     monkeypatch.setattr(module, "_BATCH", 4)
-    ledger = Ledger("cuda")
+    work_log = WorkLog("cuda")
     for n in range(4):
         device.reached = 3.0  # of 1, 2, 3 and 4 ms
-        work(ledger, device, "render", 1.0)
-        assert len(ledger._stamped) == (n + 1 if n < 3 else 1)
+        work(work_log, device, "render", 1.0)
+        assert len(work_log._stamped) == (n + 1 if n < 3 else 1)
     assert device.waits == 0
-    assert ledger.entries["render"].seconds == pytest.approx(4e-3)
+    assert work_log.entries["render"].seconds == pytest.approx(4e-3)
 
 
 def test_a_failing_stage_is_stamped_too(device):
-    ledger = Ledger("cuda")
-    with pytest.raises(ZeroDivisionError), ledger.stage("render"):
-        work(ledger, device, "inner", 1 / 0)
-    assert ledger.entries["render"].runs == 1
+    work_log = WorkLog("cuda")
+    with pytest.raises(ZeroDivisionError), work_log.stage("render"):
+        work(work_log, device, "inner", 1 / 0)
+    assert work_log.entries["render"].runs == 1
 
 
 def test_the_state_is_ready_for_json_and_counting_goes_on_from_it(device):
-    ledger = Ledger()
-    ledger.device = torch.device("cuda")  # once the trainer knows
-    work(ledger, device, "render", 1000.0)
-    ledger.skip("rows", "still", torch.tensor(7))
-    state = json.loads(json.dumps(ledger.state_dict()))
+    work_log = WorkLog()
+    work_log.device = torch.device("cuda")  # once the trainer knows
+    work(work_log, device, "render", 1000.0)
+    work_log.skip("rows", "still", torch.tensor(7))
+    state = json.loads(json.dumps(work_log.state_dict()))
     assert state == {
         "render": {"runs": 1, "seconds": 1.0, "skipped": {}}, "rows": {"runs": 0, "seconds": 0.0, "skipped": {"still": 7}},
     }  # fmt: skip
-    resumed = Ledger("cuda")
+    resumed = WorkLog("cuda")
     work(resumed, device, "lost", 1.0)
     resumed.load_state_dict(state)
     work(resumed, device, "render", 500.0)
@@ -106,30 +106,30 @@ def test_the_state_is_ready_for_json_and_counting_goes_on_from_it(device):
 
 
 def test_skips_on_the_device_are_summed_late_and_nothing_skipped_leaves_no_line():
-    ledger, buffer = Ledger(), torch.tensor([3, 0], dtype=torch.int32)
-    ledger.skip("rows", "still", buffer[0])
-    ledger.skip("rows", "not visible", buffer[1])
-    ledger.skip("bands", "above", torch.tensor(0))
+    work_log, buffer = WorkLog(), torch.tensor([3, 0], dtype=torch.int32)
+    work_log.skip("rows", "still", buffer[0])
+    work_log.skip("rows", "not visible", buffer[1])
+    work_log.skip("bands", "above", torch.tensor(0))
     buffer[0] = 4  # whose numbers these are may write over them
-    ledger.skip("rows", "still", buffer[0])
-    assert not ledger._entries
-    assert {name: entry.skipped for name, entry in ledger.entries.items()} == {"rows": {"still": 7}}
-    assert ledger.rows()[0]["why"] == "still (7x)"
+    work_log.skip("rows", "still", buffer[0])
+    assert not work_log._entries
+    assert {name: entry.skipped for name, entry in work_log.entries.items()} == {"rows": {"still": 7}}
+    assert work_log.rows()[0]["why"] == "still (7x)"
 
 
 def test_on_a_cpu_no_event_is_made(monkeypatch):
     monkeypatch.setattr(torch.cuda, "Event", None)
-    ledger = Ledger()
-    with ledger.stage("render"):
+    work_log = WorkLog()
+    with work_log.stage("render"):
         pass
-    ledger.skip("render", "nothing to see")
-    assert ledger.entries["render"].runs == 1
-    assert 0 < ledger.entries["render"].seconds < 1
-    assert ledger.entries["render"].skipped == {"nothing to see": 1}
+    work_log.skip("render", "nothing to see")
+    assert work_log.entries["render"].runs == 1
+    assert 0 < work_log.entries["render"].seconds < 1
+    assert work_log.entries["render"].skipped == {"nothing to see": 1}
 
 
 def test_a_run_tells_its_ledger_where_it_trains():
     conductor = Conductor()
-    assert conductor.ledger.device.type == "cpu"
+    assert conductor.work_log.device.type == "cpu"
     conductor.on_fit_start(1, 0, "cuda")
-    assert conductor.ledger.device.type == "cuda"
+    assert conductor.work_log.device.type == "cuda"

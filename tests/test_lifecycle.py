@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies import SVS, Conductor, Update
-from clear_strategies.data.view import PointCloud
-from clear_strategies.density import Density, DensityError, DensitySettings, cameras_extent
-from clear_strategies.field import GaussianField
-from clear_strategies.gradients import Grads
-from clear_strategies.mip import filter_std
-from clear_strategies.optim import Adam, LearningRates
-from clear_strategies.testing import StubShot
+from clear_strategies.core.gradients import Grads
+from clear_strategies.data.scene import PointCloud
+from clear_strategies.density.adaptive import Density, DensityError, DensitySettings, cameras_extent
+from clear_strategies.strategies.testing import StubShot
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.mip import filter_std
+from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.geometry import SH_C0
 
 
@@ -241,7 +241,7 @@ def test_filtered_opacity_sends_its_gradient_into_the_scales():
 
     smooth = rasterizers.load("torch", alpha_min=1e-9, transmittance_min=0.0)
     _, hr = field.render_scales(smooth, view)
-    (gradient,) = hr.pull(v)
+    (gradient,) = hr.vjp(v)
     g = torch.Generator().manual_seed(1)
     for name in ("scales", "opacities", "means", "quats", "detail"):
         direction = torch.randn(gradient[name].shape, generator=g, dtype=torch.float64)
@@ -262,7 +262,7 @@ def test_lr_does_not_see_the_detail_feature():
     lr, hr = field.render_scales(toy.RASTERIZER, scene.train[0])
     assert torch.equal(lr.image, plain_lr.image)
     assert not torch.equal(hr.image, plain_hr.image)
-    assert "detail" not in lr.pull(torch.ones(1, 16, 24, 3))[0]
+    assert "detail" not in lr.vjp(torch.ones(1, 16, 24, 3))[0]
 
 
 def test_extent_of_cameras():

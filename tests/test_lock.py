@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from clear_strategies import DataError
-from clear_strategies.lock import NAME, HeldError, hold
+from clear_strategies.jobs.lock import NAME, HeldError, hold
 
 
 def leave(folder, **facts):
@@ -92,7 +92,7 @@ def test_of_many_at_once_exactly_one_gets_it(tmp_path, stale):
     code = (
         "import sys\n"
         "from pathlib import Path\n"
-        "from clear_strategies.lock import HeldError, hold\n"
+        "from clear_strategies.jobs.lock import HeldError, hold\n"
         "def say(word):\n"
         "    print(word, flush=True)\n"
         "    sys.stdin.readline()\n"

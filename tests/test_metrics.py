@@ -15,9 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clear_strategies import files, images, metrics
+from clear_strategies import files
+from clear_strategies.core import images
+from clear_strategies.core.view import Photo, View
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.data.view import Photo, PointCloud, Scene, View
+from clear_strategies.data.scene import PointCloud, Scene
+from clear_strategies.outputs import metrics
 from rasterizers.interface import Camera
 
 

@@ -10,10 +10,11 @@ import toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies import P2G, Evidence, Screens, images
-from clear_strategies.evidence import lift
-from clear_strategies.field import GaussianField
-from clear_strategies.p2g import patch_evidence
+from clear_strategies import P2G, Evidence, ScreenGradients
+from clear_strategies.core import images
+from clear_strategies.core.evidence import lift
+from clear_strategies.strategies.p2g import patch_evidence
+from clear_strategies.training.field import GaussianField
 
 
 def test_reliability_is_one_where_the_reference_agrees_with_lr():
@@ -101,7 +102,7 @@ def test_observation_is_made_once_a_view_and_invisible_gaussians_have_none(caplo
 
 def screens(ordinary, hf):
     n = len(ordinary)
-    return Screens(torch.zeros(n, 2), torch.zeros(n, 2), torch.tensor(hf), torch.tensor(ordinary))
+    return ScreenGradients(torch.zeros(n, 2), torch.zeros(n, 2), torch.tensor(hf), torch.tensor(ordinary))
 
 
 def test_scores():

@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from clear_strategies import pictures
-from clear_strategies.pictures import SheetRow
+from clear_strategies.outputs import pictures
+from clear_strategies.outputs.pictures import SheetRow
 
 
 def random_image(seed: int, height: int = 40, width: int = 60) -> Tensor:

@@ -9,7 +9,7 @@ from importlib import metadata
 import pytest
 import torch
 
-from clear_strategies.provenance import provenance
+from clear_strategies.outputs.provenance import provenance
 
 
 def test_it_names_versions_machine_and_the_facts_of_the_run() -> None:

@@ -14,13 +14,14 @@ import pytest
 import torch
 import toy
 
-from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, checkpoint
-from clear_strategies.density import DensitySettings, cameras_extent
-from clear_strategies.field import GaussianField
-from clear_strategies.fit import FitSettings, TrainState, fit, iterate
-from clear_strategies.mip import MipFilter
-from clear_strategies.optim import LearningRates
+from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective
+from clear_strategies.density.adaptive import DensitySettings, cameras_extent
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
+from clear_strategies.training import checkpoint
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.loop import FitSettings, TrainState, fit, iterate
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import LearningRates
 
 ITERATIONS = 20
 # 3 warm-up starts · 2 to 12 densify and prune · 6, 12 reset · 8 warm · 12 anchor · 14 decay. Cuts around each.
@@ -139,7 +140,7 @@ def test_nobody_looks_at_the_test_views_when_opacities_were_just_reset():
     state.settings = FitSettings(iterations=13, scale_schedule=False, probe_every=3, checkpoint_every=0, seed=5)
     fit(state, SCENE, toy.RASTERIZER)
     assert [row["t"] for row in state.history if "psnr_test" in row] == [3, 9, 13]  # not 6 and 12
-    looks = state.conductor.ledger.entries["probe test views"]
+    looks = state.conductor.work_log.entries["probe test views"]
     assert looks.runs == 3
     assert looks.skipped == {"opacities were reset in this iteration": 2}
 

@@ -93,9 +93,9 @@ def test_the_exported_ply_looks_as_it_was_measured(finished):
     import torch
 
     import rasterizers
-    from clear_strategies.data import demo
     from clear_strategies.data.photo_files import read_image
     from clear_strategies.data.ply import read_gaussians
+    from clear_strategies.data.readers import demo
     from rasterizers import Splats
 
     g = read_gaussians(finished / "here" / "point_cloud.ply")

@@ -1,4 +1,4 @@
-"""What is left out: only what its setting says, said in the ledger, and harmless where nothing is flat or settled."""
+"""What is left out: only what its setting says, said in the work_log, and harmless where nothing is flat or settled."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import images
-from clear_strategies.data.view import Photo
-from clear_strategies.field import GaussianField, filled
-from clear_strategies.fit import fit, iterate
-from clear_strategies.ledger import Ledger
+from clear_strategies.core import images
+from clear_strategies.core.view import Photo
+from clear_strategies.core.work_log import WorkLog
 from clear_strategies.schedules import scaled
-from clear_strategies.skips import Economy, Skips
+from clear_strategies.training.field import GaussianField, filled
+from clear_strategies.training.loop import fit, iterate
+from clear_strategies.training.skips import SkipPolicy, Skips
 from tests import toy
 from tests.test_resume import ITERATIONS, start
 
@@ -23,35 +23,35 @@ def loss_rows(*losses: float, column: str = "loss_base") -> list[dict[str, float
 
 
 def test_nothing_is_left_out_by_default():
-    view, economy, ledger = toy.scene().train[0], Economy(), Ledger()
-    assert economy.view(view, 1) is view
-    assert economy.hr_due(10_000, ledger)
-    assert economy.wanted(view, 8, ledger) is None
-    assert not economy.settled(loss_rows(*[1.0] * 20_000), 20_000)
-    assert not ledger.entries
+    view, skip_policy, work_log = toy.scene().train[0], SkipPolicy(), WorkLog()
+    assert skip_policy.view(view, 1) is view
+    assert skip_policy.hr_due(10_000, work_log)
+    assert skip_policy.wanted(view, 8, work_log) is None
+    assert not skip_policy.settled(loss_rows(*[1.0] * 20_000), 20_000)
+    assert not work_log.entries
 
 
 def test_the_coarse_reference_is_the_mean_of_blocks_seen_by_the_scaled_camera():
-    view, economy = toy.scene().train[0], Economy(Skips(coarse_until=10))
-    coarse = economy.view(view, 10)
+    view, skip_policy = toy.scene().train[0], SkipPolicy(Skips(coarse_until=10))
+    coarse = skip_policy.view(view, 10)
     assert coarse.factor == view.factor // 2
     assert torch.equal(coarse.hr.image, images.downsample(view.hr.image, 2, "area"))
     assert coarse.hr.camera.fx == view.hr.camera.fx / 2
     assert coarse.lr is view.lr
-    assert economy.view(view, 11) is view
-    assert economy.view(view, 9) is coarse
+    assert skip_policy.view(view, 11) is view
+    assert skip_policy.view(view, 9) is coarse
 
 
 def test_a_factor_that_two_does_not_divide_keeps_its_reference():
     view = toy.scene().train[0]
     same = replace(view, hr=view.lr)
-    assert Economy(Skips(coarse_until=10)).view(same, 1) is same
+    assert SkipPolicy(Skips(coarse_until=10)).view(same, 1) is same
 
 
 def test_hr_takes_part_in_every_nth_iteration_and_the_ledger_says_why_not_in_the_others():
-    economy, ledger = Economy(Skips(hr_every=3, hr_every_from=6)), Ledger()
-    assert [t for t in range(1, 16) if economy.hr_due(t, ledger)] == [1, 2, 3, 4, 5, 6, 9, 12, 15]
-    assert sum(ledger.entries["HR scale"].skipped.values()) == 6
+    skip_policy, work_log = SkipPolicy(Skips(hr_every=3, hr_every_from=6)), WorkLog()
+    assert [t for t in range(1, 16) if skip_policy.hr_due(t, work_log)] == [1, 2, 3, 4, 5, 6, 9, 12, 15]
+    assert sum(work_log.entries["HR scale"].skipped.values()) == 6
 
 
 def test_tiles_are_flat_where_the_reference_adds_nothing_to_lr():
@@ -59,17 +59,17 @@ def test_tiles_are_flat_where_the_reference_adds_nothing_to_lr():
     smooth = images.upsample(view.lr.image, view.factor)
     busy = smooth.clone()
     busy[:8, :8] = 1 - busy[:8, :8]  # the first tile
-    camera, economy, ledger = view.hr.camera, Economy(Skips(flat=0.01)), Ledger()
-    wanted = economy.wanted(replace(view, hr=Photo(camera, busy)), 8, ledger)
+    camera, skip_policy, work_log = view.hr.camera, SkipPolicy(Skips(flat=0.01)), WorkLog()
+    wanted = skip_policy.wanted(replace(view, hr=Photo(camera, busy)), 8, work_log)
     assert wanted is not None
     assert wanted.nonzero().tolist() == [[0, 0]]
-    assert sum(ledger.entries["HR tiles"].skipped.values()) == wanted.numel() - 1
+    assert sum(work_log.entries["HR tiles"].skipped.values()) == wanted.numel() - 1
 
 
 def test_where_every_tile_has_detail_nothing_is_masked():
     view = toy.scene().train[0]
     busy = Photo(view.hr.camera, 1 - images.upsample(view.lr.image, view.factor).round())
-    assert Economy(Skips(flat=1e-6)).wanted(replace(view, hr=busy), 8, Ledger()) is None
+    assert SkipPolicy(Skips(flat=1e-6)).wanted(replace(view, hr=busy), 8, WorkLog()) is None
 
 
 def test_undrawn_tiles_show_the_reference_and_send_no_gradient():
@@ -84,28 +84,28 @@ def test_undrawn_tiles_show_the_reference_and_send_no_gradient():
     assert torch.equal(shot.image[8:], view.hr.image[8:])
     cotangent = torch.ones(1, height, width, 3)
     drawn = filled(cotangent[0], tiles, torch.zeros(height, width, 3), 8)[None]
-    found, expected = shot.pull(cotangent)[0], whole.pull(drawn)[0]
+    found, expected = shot.vjp(cotangent)[0], whole.vjp(drawn)[0]
     for name in ("means", "opacities", "sh0"):
         torch.testing.assert_close(found[name], expected[name], rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize(("now", "ends"), [(0.99, True), (0.97, False), (1.10, True)])
 def test_a_plateau_is_a_window_that_gains_less_than_asked(now, ends):
-    economy = Economy(Skips(plateau_gain=0.02, plateau_window=4, plateau_from=0))
-    assert economy.settled(loss_rows(*[1.0] * 4, *[now] * 4), 8) is ends
+    skip_policy = SkipPolicy(Skips(plateau_gain=0.02, plateau_window=4, plateau_from=0))
+    assert skip_policy.settled(loss_rows(*[1.0] * 4, *[now] * 4), 8) is ends
 
 
 def test_a_plateau_begins_neither_early_nor_between_windows_nor_late():
     skips = Skips(plateau_gain=0.5, plateau_window=4, plateau_from=4, plateau_to=20)
     rows = loss_rows(*[1.0] * 24)
-    assert [t for t in range(1, 25) if Economy(skips).settled(rows, t)] == [12, 16]
+    assert [t for t in range(1, 25) if SkipPolicy(skips).settled(rows, t)] == [12, 16]
 
 
 def test_without_hr_the_lr_loss_decides_and_rows_without_hr_are_left_out():
     skips = Skips(plateau_gain=0.02, plateau_window=2, plateau_from=0)
-    assert Economy(skips).settled(loss_rows(1, 1, 1, 1, column="loss_other"), 4)
+    assert SkipPolicy(skips).settled(loss_rows(1, 1, 1, 1, column="loss_other"), 4)
     mixed = [{"loss_lr": 9.0}, {"loss_lr": 1.0, "loss_base": 1.0}, {"loss_lr": 1.0}, {"loss_lr": 1.0, "loss_base": 0.5}]
-    assert not Economy(skips).settled(mixed, 4)
+    assert not SkipPolicy(skips).settled(mixed, 4)
 
 
 def test_every_milestone_stretches_with_the_run():
@@ -115,19 +115,19 @@ def test_every_milestone_stretches_with_the_run():
 
 def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
     state = start(("gco",))
-    state.economy = Economy(Skips(plateau_gain=0.99, plateau_window=2, plateau_from=6, plateau_to=17))
+    state.skip_policy = SkipPolicy(Skips(plateau_gain=0.99, plateau_window=2, plateau_from=6, plateau_to=17))
     with caplog.at_level("INFO"):
         fit(state, toy.scene(), toy.RASTERIZER)
     assert [int(row["t"]) for row in state.history] == [*range(1, 11), 18, 19, 20]
     assert state.optimizer.steps == ITERATIONS  # so the learning rates are those of the end
     assert "training goes on at t=18" in caplog.text
-    assert sum(state.conductor.ledger.entries["iterations"].skipped.values()) == 7
+    assert sum(state.conductor.work_log.entries["iterations"].skipped.values()) == 7
 
 
 @pytest.mark.parametrize("skips", [Skips(coarse_until=12), Skips(hr_every=2, hr_every_from=3), Skips(flat=0.02)])
 def test_every_skip_trains(skips):
     state = start(("gco", "p2g", "svs"))
-    state.economy = Economy(skips)
+    state.skip_policy = SkipPolicy(skips)
     for _ in range(ITERATIONS):
         iterate(state, toy.RASTERIZER)
     assert all(bool(p.isfinite().all()) for p in state.field.raw().values())

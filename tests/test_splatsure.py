@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from clear_strategies import Grads, SplatSuRe
-from clear_strategies.testing import StubShot
+from clear_strategies.strategies.testing import StubShot
 from rasterizers import Camera
 
 

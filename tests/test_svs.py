@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies import SVS, AnchorError
-from clear_strategies.field import GaussianField
 from clear_strategies.schedules import Ramp
-from clear_strategies.svs import PAPER_WEIGHTS, dropout_mask
+from clear_strategies.strategies.svs import PAPER_WEIGHTS, dropout_mask
+from clear_strategies.training.field import GaussianField
 
 
 @given(p=st.floats(0, 0.95), seed=st.integers(0, 2**31), t=st.integers(1, 10_000))
@@ -75,10 +75,10 @@ def test_anchored_positions_do_not_depend_on_the_unit_of_the_world():
         theta["means"] = theta["means"] * unit
         svs.after_step(theta, 1)
         theta["means"] = theta["means"] * 1.1
-        pull = svs.regularize(theta, 2)["means"] * unit  # ∂/∂(x / unit)
+        vjp = svs.regularize(theta, 2)["means"] * unit  # ∂/∂(x / unit)
         if unit == 1.0:
-            expected = pull
-    assert torch.allclose(pull, expected, rtol=1e-4)
+            expected = vjp
+    assert torch.allclose(vjp, expected, rtol=1e-4)
 
 
 def test_the_mean_reading_divides_by_the_number_of_gaussians():

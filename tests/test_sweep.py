@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from clear_strategies import checkpoint, sweep
+from clear_strategies.jobs import sweep
+from clear_strategies.training import checkpoint
 from tests.test_run import ROOT, TINY, run
 
 AUTO = ["fit.resume=auto", *TINY]
@@ -125,7 +126,7 @@ def test_torch_and_kernels_divide_the_cores_among_the_jobs(monkeypatch):
 
 def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, monkeypatch):
     """So the same command, started several times, shares the work."""
-    from clear_strategies.lock import hold
+    from clear_strategies.jobs.lock import hold
 
     with hold(tmp_path / "all" / "1"):
         result = run(*SWEEP, "+strategy=baseline,gco", "fit.iterations=3", cwd=tmp_path)

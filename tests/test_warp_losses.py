@@ -13,8 +13,9 @@ import torch
 from test_kernels import TRAINED_WITH, needs_warp, photo, rough
 from torch._subclasses import FakeTensor, FakeTensorMode
 
-from clear_strategies import Objective, kernels
-from clear_strategies.kernels import cpp, warp
+from clear_strategies import Objective
+from clear_strategies.kernels import losses
+from clear_strategies.kernels.losses import cpp, warp
 from rasterizers.interface import BackendUnavailable
 
 
@@ -50,17 +51,17 @@ def on_cuda(dtype=torch.float32):
 def test_auto_takes_warp_on_cuda_alone(monkeypatch):
     x = torch.rand(4, 5, 3)
     monkeypatch.setattr(warp, "available", lambda device="cuda": True)
-    assert kernels._fastest(on_cuda(), on_cuda()) == "warp"
-    assert kernels._fastest(on_cuda(), x) == "torch"
-    assert kernels._fastest(on_cuda(torch.float64), on_cuda(torch.float64)) == "torch"
-    assert kernels._fastest(x, x) == ("cpp" if cpp.available() else "torch")
-    assert list(kernels.implementations("cuda")) == ["warp", "torch"]
-    assert "warp" not in kernels.implementations("cpu")
+    assert losses._fastest(on_cuda(), on_cuda()) == "warp"
+    assert losses._fastest(on_cuda(), x) == "torch"
+    assert losses._fastest(on_cuda(torch.float64), on_cuda(torch.float64)) == "torch"
+    assert losses._fastest(x, x) == ("cpp" if cpp.available() else "torch")
+    assert list(losses.implementations("cuda")) == ["warp", "torch"]
+    assert "warp" not in losses.implementations("cpu")
 
 
 def test_without_warp_torch_does_it_on_cuda(missing):
-    assert kernels._fastest(on_cuda(), on_cuda()) == "torch"
-    assert list(kernels.implementations("cuda")) == ["torch"]
+    assert losses._fastest(on_cuda(), on_cuda()) == "torch"
+    assert list(losses.implementations("cuda")) == ["torch"]
 
 
 def test_without_warp_the_remedy_is_named(missing):
@@ -80,7 +81,7 @@ def test_without_cuda_the_remedy_is_named(forgotten):
 def test_images_on_a_cpu_never_ask_for_warp(monkeypatch):
     monkeypatch.setattr(warp, "needed", lambda device: pytest.fail("asked for Warp"))
     x, y = photo(20, 30), photo(20, 30, 6)
-    assert kernels.implementations()
+    assert losses.implementations()
     for loss in TRAINED_WITH.values():
         loss(x, y, "auto")
     Objective().hr(x, y)
@@ -112,7 +113,7 @@ def test_a_block_of_threads_finds_what_one_thread_finds(monkeypatch, loss):
     """The losses as CUDA runs them, 256 threads a block: on a CPU, where Warp can imitate them."""
     import warp as wp
 
-    from clear_strategies.kernels.warp import launches
+    from clear_strategies.kernels.losses.warp import launches
 
     if not hasattr(wp.config, "enable_cpu_blocks"):
         pytest.skip("this Warp has no blocks of several threads on a CPU")
@@ -130,7 +131,7 @@ def test_a_block_of_threads_finds_what_one_thread_finds(monkeypatch, loss):
 def test_the_kernels_compile_for_cuda_without_one(monkeypatch, tmp_path):
     import warp as wp
 
-    from clear_strategies.kernels.warp import haar, launches, similarity, sums
+    from clear_strategies.kernels.losses.warp import haar, launches, similarity, sums
 
     lanes = launches._LANES["cuda"]
     made = (similarity.similarity, similarity.gradient, haar.details, sums.absolute, sums.total)

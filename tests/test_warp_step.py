@@ -11,8 +11,8 @@ from test_fused import Case, T, case, conductors, told
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from clear_strategies import GCO, P2G, SVS, Conductor
-from clear_strategies.fused import FusedStep, fused_step, gaussian_pass
-from clear_strategies.optim import Adam, LearningRates
+from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for, gaussian_pass
+from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import BackendUnavailable
 from rasterizers.warp_backend.launch import require
 
@@ -23,26 +23,27 @@ def warp_step():
         require("the compiled pass", "cpu", "")
     except BackendUnavailable as reason:
         pytest.skip(str(reason))
-    from clear_strategies.kernels import warp_step
 
-    return warp_step
+    from clear_strategies.kernels.gaussian_step import warp
+
+    return warp
 
 
-def started(warp_step, **settings) -> tuple[Case, FusedStep]:
+def started(warp_step, **settings) -> tuple[Case, CompiledStep]:
     """Everything at once, with rows and bands that rest, and rows that nobody sees."""
     c = case(1000, degree=2, kind="sparse")
     _, conductor = conductors(lambda: GCO(**settings), P2G, SVS, anchored=c.fields[0])
     adam = Adam(c.fields[1].raw(), LearningRates(detail_decay=0.1, rows="visible"), 1.0)
-    return c, FusedStep(conductor, adam, sweeps=warp_step.GaussianPass)
+    return c, CompiledStep(conductor, adam, sweeps=warp_step.GaussianPass)
 
 
 def two_steps(warp_step):
-    """Parameters and moments, conflicts and readings, and the ledger's counts."""
+    """Parameters and moments, conflicts and readings, and the work_log's counts."""
     c, step = started(warp_step)
     conflicts = [told(step.merge(c.fields[1].raw(), *c.factors(1), c.m, c.e, T + i)[1]) for i in range(2)]
     state = [*c.fields[1].raw().values(), *step.optimizer.first.values(), *step.optimizer.second.values()]
     numbers = told(step.conductor.readings())
-    return state, conflicts, numbers, step.conductor.ledger.entries["optimizer rows"].skipped
+    return state, conflicts, numbers, step.conductor.work_log.entries["optimizer rows"].skipped
 
 
 def test_blocks_of_many_threads_find_what_one_thread_finds(warp_step, monkeypatch):
@@ -100,7 +101,7 @@ def adam_on_cuda() -> Adam:
 
 def test_on_cuda_the_pass_is_warps(warp_step, adam_on_cuda, monkeypatch):
     asked = []
-    monkeypatch.setattr("clear_strategies.fused.require", lambda *arguments: asked.append(arguments))
+    monkeypatch.setattr("clear_strategies.training.compiled_step.require", lambda *arguments: asked.append(arguments))
     assert gaussian_pass(adam_on_cuda) is warp_step.GaussianPass
     assert [device for _, device, _ in asked] == ["cuda"]
 
@@ -109,9 +110,9 @@ def test_on_cuda_without_warp_the_readable_path_is_taken_and_that_is_said(adam_o
     def missing(what, device, otherwise):
         raise BackendUnavailable(f"{what} needs NVIDIA Warp, which is not installed.")
 
-    monkeypatch.setattr("clear_strategies.fused.require", missing)
+    monkeypatch.setattr("clear_strategies.training.compiled_step.require", missing)
     with caplog.at_level("INFO"):
-        assert fused_step(Conductor(), adam_on_cuda) is None
+        assert compiled_step_for(Conductor(), adam_on_cuda) is None
     assert caplog.messages == [
         "The per-Gaussian pass takes the readable path: the compiled pass needs NVIDIA Warp, which is not installed."
     ]

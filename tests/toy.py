@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 import rasterizers
-from clear_strategies import images
-from clear_strategies.data.view import Photo, PointCloud, Scene, View
+from clear_strategies.core import images
+from clear_strategies.core.view import Photo, View
+from clear_strategies.data.scene import PointCloud, Scene
 from rasterizers import Camera, Splats
 
 FACTOR = 4

@@ -17,14 +17,14 @@ from clear_strategies.bench.iteration import STILL, STRATEGIES
 from clear_strategies.bench.output import Section, number, times
 from clear_strategies.bench.peaks import Peaks, attained
 from clear_strategies.bench.rounds import WARM_UPS, Contender, Milliseconds, bar, interleaved, medians, milliseconds
-from clear_strategies.conductor import Conductor
-from clear_strategies.data.view import Photo, View
-from clear_strategies.evidence import Evidence
-from clear_strategies.field import FieldShot, GaussianField
-from clear_strategies.fused import fused_step
-from clear_strategies.ledger import Ledger
-from clear_strategies.optim import Adam
-from clear_strategies.svs import SVS
+from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.view import Photo, View
+from clear_strategies.core.work_log import WorkLog
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.strategies.svs import SVS
+from clear_strategies.training.compiled_step import compiled_step_for
+from clear_strategies.training.field import FieldShot, GaussianField
+from clear_strategies.training.optim import Adam
 from rasterizers.interface import Camera, Rendering, SplatGradients, Splats
 
 PASS, STEP = "merge and step", "step alone"
@@ -95,7 +95,7 @@ class _Ours:
         self.conductor.on_fit_start(1, 0, device)
         self.conductor.after_step(self.field.raw(), SVS().anchor_start)
         self.optimizer = Adam(self.field.raw(), STILL, 1.0)
-        self.how = fused_step(self.conductor, self.optimizer, "auto" if fused else "off")
+        self.how = compiled_step_for(self.conductor, self.optimizer, "auto" if fused else "off")
         lr, hr = self.field.render_scales(_Given(n, device), _view(device))
         if lr is None or hr is None:
             raise TypeError("both scales were asked for")
@@ -107,15 +107,15 @@ class _Ours:
 
     def __call__(self) -> Milliseconds:
         merger: Any = self.how if self.how is not None else self.conductor
-        ledger, raw = Ledger(self.m.device), self.field.raw()
-        with ledger.stage(PASS):
-            (g_lr,) = merger.pull(self.lr, self.lr.image[None])
-            base, hf = merger.pull(self.hr, self.hr.image[None].expand(2, -1, -1, -1))
+        work_log, raw = WorkLog(self.m.device), self.field.raw()
+        with work_log.stage(PASS):
+            (g_lr,) = merger.vjp(self.lr, self.lr.image[None])
+            base, hf = merger.vjp(self.hr, self.hr.image[None].expand(2, -1, -1, -1))
             g, _ = merger.merge(raw, g_lr, base, hf, self.m, self.evidence, _T)
             if self.how is None:
                 self.optimizer.step(raw, g)
                 self.field.constrain()
-        return milliseconds(ledger)
+        return milliseconds(work_log)
 
 
 class _Torch:
@@ -129,10 +129,10 @@ class _Torch:
         self.device = device
 
     def __call__(self) -> Milliseconds:
-        ledger = Ledger(self.device)
-        with ledger.stage(STEP):
+        work_log = WorkLog(self.device)
+        with work_log.stage(STEP):
             self.optimizer.step()
-        return milliseconds(ledger)
+        return milliseconds(work_log)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 import rasterizers
-from clear_strategies import images
 from clear_strategies.bench import counting, scenes
 from clear_strategies.bench.counting import Cost
 from clear_strategies.bench.output import UNKNOWN, Findings, Section, number, times
@@ -21,22 +20,23 @@ from clear_strategies.bench.prototype import Prototype, started
 from clear_strategies.bench.rasterizers import noise, require_device, usable
 from clear_strategies.bench.rounds import WARM_UPS, Contender, Milliseconds, bar, interleaved, medians, milliseconds
 from clear_strategies.bench.scenes import SETTINGS, Workload
-from clear_strategies.conductor import Conductor
-from clear_strategies.data.view import Photo, View
-from clear_strategies.density import Density, DensitySettings
+from clear_strategies.core import images
+from clear_strategies.core.view import Photo, View
+from clear_strategies.core.work_log import WorkLog
+from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.errors import DataError
-from clear_strategies.field import GaussianField
-from clear_strategies.fit import FitSettings, TrainState, cores, iterate
-from clear_strategies.fused import fused_step
-from clear_strategies.gco import GCO
-from clear_strategies.ledger import Ledger
-from clear_strategies.mip import MipFilter
-from clear_strategies.objective import Objective
-from clear_strategies.optim import Adam, LearningRates
-from clear_strategies.p2g import P2G
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import LogLinear, WarmupDecay
-from clear_strategies.strategy import Strategy
-from clear_strategies.svs import SVS
+from clear_strategies.strategies.base import Strategy
+from clear_strategies.strategies.gco import GCO
+from clear_strategies.strategies.p2g import P2G
+from clear_strategies.strategies.svs import SVS
+from clear_strategies.training.compiled_step import compiled_step_for
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.loop import FitSettings, TrainState, cores, iterate
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import PRESETS, Rasterizer, Splats
 
 # As conf/strategy has them.
@@ -100,7 +100,7 @@ class Training:
         optimizer = Adam(field.raw(), STILL, 1.0)
         self.state = TrainState(
             field, conductor, optimizer, density, settings, MipFilter(), (view,),
-            t=SVS().anchor_start, fused=fused_step(conductor, optimizer),
+            t=SVS().anchor_start, compiled_step=compiled_step_for(conductor, optimizer),
         )  # fmt: skip
         self.state.refilter()
         self.rasterizer = rasterizer
@@ -109,11 +109,11 @@ class Training:
     def __call__(self) -> Milliseconds:
         device = self.state.field.means.device
         together = _TOGETHER[device.type]
-        whole, self.state.conductor.ledger = Ledger(device), Ledger(device)
+        whole, self.state.conductor.work_log = WorkLog(device), WorkLog(device)
         with whole.stage(_TOTAL):
             for _ in range(together):
                 iterate(self.state, self.rasterizer)
-        stages = {name: ms / together for name, ms in milliseconds(self.state.conductor.ledger).items()}
+        stages = {name: ms / together for name, ms in milliseconds(self.state.conductor.work_log).items()}
         # What was skipped is no stage. "render LR" and "render LR + HR" are one.
         stages = {name.split()[0] if name.startswith("render") else name: ms for name, ms in stages.items() if ms > 0}
         total = milliseconds(whole)[_TOTAL] / together

@@ -15,14 +15,14 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies import kernels
 from clear_strategies.bench import counting, gaussians
 from clear_strategies.bench.output import Findings, Section, number, small, times
 from clear_strategies.bench.peaks import Peaks, attained
 from clear_strategies.bench.rasterizers import require_device
 from clear_strategies.bench.rounds import WARM_UPS, Contender, Milliseconds, bar, interleaved, medians, milliseconds
+from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
-from clear_strategies.ledger import Ledger
+from clear_strategies.kernels import losses
 
 SIZES: Final = ("1008x756", "252x189")  # HR and LR of the iteration that is timed
 SSIM, PHOTOMETRIC, HAAR = "SSIM", "L1 + SSIM", "Haar L1"
@@ -127,10 +127,10 @@ def grouped_convolution(x: Float[Tensor, "1 C H W"], y: Float[Tensor, "1 C H W"]
 
 def _ours(loss: str, device: str = "cpu") -> list[Competitor]:
     """Every implementation that the trainer has for images on the device; float64 of the specification is the truth."""
-    truth = _gradient_of(importlib.import_module("clear_strategies.kernels.torch"), loss)
+    truth = _gradient_of(importlib.import_module("clear_strategies.kernels.losses.reference"), loss)
     return [
         Competitor(f"ours, {name}", _gradient_of(implementation, loss), truth)
-        for name, implementation in kernels.implementations(device).items()
+        for name, implementation in losses.implementations(device).items()
     ]
 
 
@@ -210,10 +210,10 @@ def _turn(c: Competitor, x: Image, y: Image) -> Contender:
     prepared = c.prepare(x), c.prepare(y)
 
     def turn() -> Milliseconds:
-        ledger = Ledger(x.device)
-        with ledger.stage("gradient"):
+        work_log = WorkLog(x.device)
+        with work_log.stage("gradient"):
             c.gradient(*prepared)
-        return milliseconds(ledger)
+        return milliseconds(work_log)
 
     return turn
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import torch
 
-from clear_strategies.provenance import provenance
+from clear_strategies.outputs.provenance import provenance
 
 _ON_CUDA: Final = ("warp-lang", "gsplat", "gswarp", "fused-ssim")
 

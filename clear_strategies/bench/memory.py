@@ -113,7 +113,7 @@ def _drawing(backend: str, preset: str, *, is_peer: bool) -> Callable[[Any], Non
     def draw_peer(workload: Any) -> None:
         drawing = peer.draw(workload)
         for cotangent in cotangents(workload):
-            drawing.pull(cotangent)
+            drawing.vjp(cotangent)
 
     return draw_peer
 

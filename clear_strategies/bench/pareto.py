@@ -26,8 +26,8 @@ from clear_strategies.bench.output import UNKNOWN, Findings, Section, number, ti
 from clear_strategies.bench.rasterizers import usable
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
-from clear_strategies.fit import PROBING
 from clear_strategies.report.runs import Run, history
+from clear_strategies.training.loop import PROBING
 
 STRATEGIES, SKIPS, LENGTH, CUT_OFFS, BACKEND = "strategies", "skips", "run length", "cut-offs", "backend"
 KINDS: Final = (STRATEGIES, SKIPS, LENGTH, CUT_OFFS, BACKEND)
@@ -317,7 +317,7 @@ def _section(request: Request, rows: Sequence[Row], best: Sequence[Row]) -> Sect
     }
     seeds = f"seed{'s' * (len(request.seeds) > 1)} {', '.join(map(str, request.seeds))}"
     notes = [
-        f'Seconds: of the training loop (history.csv) without its looks at the test views (the ledger\'s "{PROBING}"); '
+        f'Seconds: of the training loop (history.csv) without its looks at the test views (the work_log\'s "{PROBING}"); '
         'start-up, the last checkpoint, "evaluate" and the pictures lie outside of the loop. PSNR and SSIM: mean over '
         f"the test views at the end. Of {REFERENCE.name}, and Δ in dB: against {REFERENCE.name} with every inexact skip "
         "off, paired by seed. front: nothing here reaches its PSNR in as little time."

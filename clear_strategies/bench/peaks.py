@@ -16,7 +16,7 @@ import torch
 
 from clear_strategies.bench.counting import FLOAT, Cost
 from clear_strategies.bench.output import Section, number
-from clear_strategies.ledger import Ledger
+from clear_strategies.core.work_log import WorkLog
 
 _log = logging.getLogger(__name__)
 
@@ -88,8 +88,8 @@ def _share(value: float) -> str:
 def _best_seconds(work: Callable[[], object], device: str) -> float:
     best = float("inf")
     for _ in range(_ROUNDS):
-        ledger = Ledger(device)
-        with ledger.stage("work"):
+        work_log = WorkLog(device)
+        with work_log.stage("work"):
             work()
-        best = min(best, ledger.entries["work"].seconds)
+        best = min(best, work_log.entries["work"].seconds)
     return best

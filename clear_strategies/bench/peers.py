@@ -38,7 +38,7 @@ class Drawing:
     """A picture, and what pulls one cotangent back to the tensors of `accuracy.ATTRIBUTES`."""
 
     image: Float[Tensor, "H W 3"]
-    pull: Callable[[Float[Tensor, "H W 3"]], Mapping[str, Tensor]]
+    vjp: Callable[[Float[Tensor, "H W 3"]], Mapping[str, Tensor]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ class Peer:
     def picture(self, workload: Workload, cotangent: Float[Tensor, "H W 3"]) -> Picture:
         """The image, and the gradients for one cotangent; in main memory."""
         drawing = self.draw(workload)
-        gradients = drawing.pull(cotangent)
+        gradients = drawing.vjp(cotangent)
         return Picture(drawing.image.detach().cpu(), {name: gradients[name].cpu() for name in _LEAVES})
 
 
@@ -130,11 +130,11 @@ def _behind_our_interface(version: str) -> Peer:
     def draw(workload: Workload) -> Drawing:
         rendering = rasterizer(workload.splats, workload.camera)
 
-        def pull(cotangent: Tensor) -> Mapping[str, Tensor]:
+        def vjp(cotangent: Tensor) -> Mapping[str, Tensor]:
             g = rendering.vjp(cotangent[None])
             return {name: getattr(g, name)[0] for name in _LEAVES}
 
-        return Drawing(rendering.image, pull)
+        return Drawing(rendering.image, vjp)
 
     return Peer(
         f"gsplat {version}, rasterizer=gsplat", draw, "the same kernels in our trainer, with all that it asks for."
@@ -170,12 +170,12 @@ def _taped(draw: Callable[[Workload, Leaves], Tensor]) -> Callable[[Workload], D
         with torch.enable_grad():
             image = draw(workload, leaves)
 
-        def pull(cotangent: Tensor) -> Mapping[str, Tensor]:
+        def vjp(cotangent: Tensor) -> Mapping[str, Tensor]:
             tensors = list(leaves.values())
             gradients = torch.autograd.grad(image, tensors, cotangent, retain_graph=True, materialize_grads=True)
             return dict(zip(leaves, gradients, strict=True))
 
-        return Drawing(image, pull)
+        return Drawing(image, vjp)
 
     return drawing
 

@@ -31,8 +31,8 @@ from clear_strategies.bench.peers import Peer
 from clear_strategies.bench.prototype import Prototype, started
 from clear_strategies.bench.rounds import WARM_UPS, Contender, Milliseconds, bar, interleaved, medians, milliseconds
 from clear_strategies.bench.scenes import SETTINGS, Workload
+from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
-from clear_strategies.ledger import Ledger
 from rasterizers.interface import PRESETS, Rasterizer, RasterSettings
 
 SCENES: Final = ("small", "s100k", "s100k-lr", "garden", "s500k")
@@ -198,22 +198,22 @@ class Turn:
 
     def __call__(self) -> Milliseconds:
         draw_it, splats, camera = self.rasterizer, self.workload.splats, self.workload.camera
-        ledger = Ledger(splats.means.device)
-        with ledger.stage(FORWARD):
+        work_log = WorkLog(splats.means.device)
+        with work_log.stage(FORWARD):
             rendering = draw_it(splats, camera)
         for k, stage in enumerate(BACKWARD, 1):
-            with ledger.stage(stage):
+            with work_log.stage(stage):
                 rendering.vjp(self.cotangents[:k])
         del rendering
-        with ledger.stage(TILES):
+        with work_log.stage(TILES):
             draw_it(splats, camera, tiles=self.mask).vjp(self.cotangents[:1])
         if self.lr is not None:
-            with ledger.stage(SHARED):
+            with work_log.stage(SHARED):
                 draw_it.render_scales([(splats, self.lr), (splats, camera)])
-            with ledger.stage(SEPARATE):
+            with work_log.stage(SEPARATE):
                 draw_it(splats, self.lr)
                 draw_it(splats, camera)
-        return milliseconds(ledger)
+        return milliseconds(work_log)
 
 
 class PeerTurn:
@@ -223,14 +223,14 @@ class PeerTurn:
         self.peer, self.workload, self.cotangents = peer, workload, cotangents
 
     def __call__(self) -> Milliseconds:
-        ledger = Ledger(self.cotangents.device)
-        with ledger.stage(FORWARD):
+        work_log = WorkLog(self.cotangents.device)
+        with work_log.stage(FORWARD):
             drawing = self.peer.draw(self.workload)
         for k, stage in enumerate(BACKWARD, 1):
-            with ledger.stage(stage):
+            with work_log.stage(stage):
                 for cotangent in self.cotangents[:k]:
-                    drawing.pull(cotangent)
-        return milliseconds(ledger)
+                    drawing.vjp(cotangent)
+        return milliseconds(work_log)
 
 
 class PrototypeTurn:
@@ -381,10 +381,10 @@ class OnScene:
 
             def turn_on(scene: Workload) -> Contender:
                 def turn() -> Milliseconds:
-                    ledger = Ledger()
-                    with ledger.stage("oracle"):
+                    work_log = WorkLog()
+                    with work_log.stage("oracle"):
                         oracle(truth, scene.splats, scene.camera, noise(scene)[0], NO_CUT_OFFS)
-                    return milliseconds(ledger)
+                    return milliseconds(work_log)
 
                 return turn
 

@@ -1,6 +1,6 @@
 """Taking times: contenders take turns, so that the machine's other work hits all of them alike.
 
-On a CPU times are wall-clock. On CUDA they are between events on torch's current stream (`Ledger`), and the device is
+On a CPU times are wall-clock. On CUDA they are between events on torch's current stream (`WorkLog`), and the device is
 waited for between turns alone, so that a stage costs what it costs in a loop: its kernels, and the host where they wait
 for it.
 """
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Final
 
-from clear_strategies.ledger import Ledger
+from clear_strategies.core.work_log import WorkLog
 
 Milliseconds = Mapping[str, float]  # by stage
 Contender = Callable[[], Milliseconds]  # each call is one turn: all its stages once
@@ -22,9 +22,9 @@ WARM_UPS: Final = {"cpu": 1, "cuda": 3}
 """Rounds that do not count: in the first kernels are compiled and lists find their length, then clocks rise."""
 
 
-def milliseconds(ledger: Ledger) -> Milliseconds:
+def milliseconds(work_log: WorkLog) -> Milliseconds:
     """What one turn took, by stage."""
-    return {name: 1e3 * entry.seconds for name, entry in ledger.entries.items()}
+    return {name: 1e3 * entry.seconds for name, entry in work_log.entries.items()}
 
 
 def interleaved(

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from clear_strategies import checkpoint
+from clear_strategies.core.gradients import ATTRIBUTES
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import DataError
-from clear_strategies.field import GaussianField
-from clear_strategies.gradients import ATTRIBUTES
+from clear_strategies.training import checkpoint
+from clear_strategies.training.field import GaussianField
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Splats
 

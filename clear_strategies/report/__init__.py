@@ -15,9 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from clear_strategies import files, pictures
+from clear_strategies import files
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
+from clear_strategies.outputs import pictures
 from clear_strategies.report import page
 from clear_strategies.report.published import PAPER, Beside, beside
 from clear_strategies.report.runs import Run, collect, history

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from clear_strategies.pictures import RUN_COLORS
+from clear_strategies.outputs.pictures import RUN_COLORS
 
 _WIDTH, _HEIGHT = 460, 250  # px, before the page scales them
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 24, 30, 40  # the right one holds half a label

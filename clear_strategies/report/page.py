@@ -20,9 +20,9 @@ from typing import Any, Final
 from clear_strategies import files
 from clear_strategies.data.photo_files import image_size, jpeg, read_image
 from clear_strategies.data.strict_json import read_object
-from clear_strategies.diagnosis import MAPS
 from clear_strategies.errors import DataError
-from clear_strategies.pictures import evenly
+from clear_strategies.outputs.maps import MAPS
+from clear_strategies.outputs.pictures import evenly
 from clear_strategies.report import charts
 from clear_strategies.report.runs import Run, skips
 from clear_strategies.report.table import Columns

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, runtime_checkable
 
-from clear_strategies.metrics import NOTE
+from clear_strategies.outputs.metrics import NOTE
 from clear_strategies.report.runs import BASELINES, SCORES, Run
 
 _log = logging.getLogger(__name__)

@@ -16,13 +16,14 @@ import torch
 from gsplat.strategy import DefaultStrategy
 from torch import Tensor
 
-from clear_strategies import images, kernels
 from clear_strategies.compose import conductor
-from clear_strategies.data import demo
-from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.scene import ViewSettings, prepare
-from clear_strategies.data.view import Scene
-from clear_strategies.field import GaussianField
+from clear_strategies.core import images
+from clear_strategies.data.points.cloud import CloudSettings
+from clear_strategies.data.prepare import ViewSettings, prepare
+from clear_strategies.data.readers import demo
+from clear_strategies.data.scene import Scene
+from clear_strategies.kernels import losses
+from clear_strategies.training.field import GaussianField
 from integration.gsplat import attach
 from integration.views import view
 from rasterizers import native
@@ -90,7 +91,7 @@ class Photometric(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor) -> Tensor:
-        loss = kernels.photometric(image.detach().contiguous(), target, 0.2)
+        loss = losses.photometric(image.detach().contiguous(), target, 0.2)
         ctx.gradient = loss.gradient
         return image.new_tensor(float(loss.value))
 

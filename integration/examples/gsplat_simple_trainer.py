@@ -19,8 +19,8 @@ from typing import Any
 import torch
 
 from clear_strategies.compose import conductor
-from clear_strategies.data.upscale import Images, Onnx
-from clear_strategies.data.view import View
+from clear_strategies.core.view import View
+from clear_strategies.data.priors.upscale import Images, Onnx
 from integration.gsplat_strategy import ClearStrategy
 from integration.views import SuperResolve, view
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from PIL import Image
 
-from clear_strategies.data import blender
 from clear_strategies.data.photo_files import frame_number
+from clear_strategies.data.readers import blender
 from tests.data import tiny
 
 PROTOCOL = {2, 16, 26, 55, 73, 76, 86, 93}

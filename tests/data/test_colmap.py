@@ -11,8 +11,9 @@ import pytest
 import torch
 from PIL import Image
 
-from clear_strategies.data import colmap, photo_files
+from clear_strategies.data import photo_files
 from clear_strategies.data.cameras import Lens
+from clear_strategies.data.readers import colmap
 from clear_strategies.errors import DataError
 from tests.data import tiny
 

@@ -7,9 +7,9 @@ import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from clear_strategies import images
-from clear_strategies.data.corrupt import Corrupted
-from clear_strategies.data.upscale import Bicubic, Cached
+from clear_strategies.core import images
+from clear_strategies.data.priors.corrupted import Corrupted
+from clear_strategies.data.priors.upscale import Bicubic, Cached
 from clear_strategies.run import CONF
 
 

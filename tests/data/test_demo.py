@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clear_strategies import images
-from clear_strategies.data import demo
+from clear_strategies.core import images
 from clear_strategies.data.capture import Capture
-from clear_strategies.data.demo import Ball, DemoPrior, Finish, Panel
+from clear_strategies.data.readers import demo
+from clear_strategies.data.readers.demo import Ball, DemoPrior, Finish, Panel
 from clear_strategies.errors import DataError
 from rasterizers import Camera
 

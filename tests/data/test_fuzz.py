@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clear_strategies.data import colmap, llff, nerfstudio
+from clear_strategies.data.readers import colmap, llff, nerfstudio
 from clear_strategies.errors import DataError
 from tests.data.malformed import GOOD
 

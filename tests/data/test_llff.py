@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from clear_strategies.data import llff
 from clear_strategies.data.capture import Capture
+from clear_strategies.data.readers import llff
 from clear_strategies.errors import DataError
 from tests.data import tiny
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from clear_strategies.data import blender, colmap, llff, nerfstudio
 from clear_strategies.data.capture import Capture
+from clear_strategies.data.readers import blender, colmap, llff, nerfstudio
 from clear_strategies.errors import DataError
 from tests.data.malformed import CASES, GOOD, Case
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clear_strategies.data import neighbours
-from clear_strategies.data.neighbours import remove_outliers, voxel_grid
+from clear_strategies.data.points import neighbours
+from clear_strategies.data.points.neighbours import remove_outliers, voxel_grid
 
 
 @pytest.fixture

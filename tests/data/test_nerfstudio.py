@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from clear_strategies.data import nerfstudio
+from clear_strategies.data.readers import nerfstudio
 from tests.data import tiny
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from clear_strategies.data import colmap, photos
+from clear_strategies.data.readers import colmap, photos
 from clear_strategies.errors import DataError
 
 pycolmap = pytest.importorskip("pycolmap")

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clear_strategies import images
-from clear_strategies.data import llff
+from clear_strategies.core import images
+from clear_strategies.core.view import Photo
 from clear_strategies.data.capture import SfmPoints
 from clear_strategies.data.ply import write_points
-from clear_strategies.data.points import (
+from clear_strategies.data.points.cloud import (
     CloudSettings,
     common_box,
     densify,
@@ -24,9 +24,10 @@ from clear_strategies.data.points import (
     initial_cloud,
     random_cloud,
 )
-from clear_strategies.data.scene import ViewSettings, split
-from clear_strategies.data.triangulate import project
-from clear_strategies.data.view import Photo, PointCloud
+from clear_strategies.data.points.sift import project
+from clear_strategies.data.prepare import ViewSettings, split
+from clear_strategies.data.readers import llff
+from clear_strategies.data.scene import PointCloud
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
 from tests.data.test_triangulate import camera, plane_photos

@@ -6,10 +6,10 @@ import logging
 
 import pytest
 
-from clear_strategies.data import demo
-from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.scene import ViewSettings, prepare
-from clear_strategies.data.upscale import Bicubic
+from clear_strategies.data.points.cloud import CloudSettings
+from clear_strategies.data.prepare import ViewSettings, prepare
+from clear_strategies.data.priors.upscale import Bicubic
+from clear_strategies.data.readers import demo
 
 POINTS = CloudSettings(init="random", random_points=50)
 

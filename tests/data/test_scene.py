@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from clear_strategies import images
+from clear_strategies.core import images
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.scene import ViewSettings, prepare, rounded, split
-from clear_strategies.data.upscale import Bicubic
+from clear_strategies.data.points.cloud import CloudSettings
+from clear_strategies.data.prepare import ViewSettings, prepare, rounded, split
+from clear_strategies.data.priors.upscale import Bicubic
 from rasterizers import Camera
 
 # Training indices among the n photos of each LLFF scene, and the number of test views: the 3-view protocol of RegNeRF,

@@ -11,7 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies.data.triangulate import (
+from clear_strategies.core.view import Photo
+from clear_strategies.data.points.sift import (
     Features,
     Pairs,
     TriangulationSettings,
@@ -23,7 +24,6 @@ from clear_strategies.data.triangulate import (
     triangulate,
     triangulate_pair,
 )
-from clear_strategies.data.view import Photo
 from rasterizers.interface import Camera
 
 

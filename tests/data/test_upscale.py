@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clear_strategies import images
+from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
-from clear_strategies.data.upscale import Bicubic, Cached, DnnSuperres, Images, Onnx, cache_folder, tiled
+from clear_strategies.data.priors.upscale import Bicubic, Cached, DnnSuperres, Images, Onnx, cache_folder, tiled
 from clear_strategies.errors import DataError
 
 

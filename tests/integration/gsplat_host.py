@@ -6,9 +6,9 @@ import functools
 
 import torch
 
-from clear_strategies import kernels
-from clear_strategies.field import GaussianField
-from clear_strategies.optim import LearningRates
+from clear_strategies.kernels import losses
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.optim import LearningRates
 from rasterizers import autograd
 
 
@@ -17,7 +17,7 @@ class Photometric(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, image, target):
-        loss = kernels.photometric(image.detach().contiguous(), target, 0.2, kernels="torch")
+        loss = losses.photometric(image.detach().contiguous(), target, 0.2, kernels="torch")
         ctx.gradient = loss.gradient
         return image.new_tensor(float(loss.value))
 

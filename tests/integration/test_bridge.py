@@ -7,8 +7,8 @@ import torch
 import toy
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective
-from clear_strategies.field import GaussianField
 from clear_strategies.schedules import WarmupDecay
+from clear_strategies.training.field import GaussianField
 from integration.bridge import AutogradShot, joint_loss, joint_update
 from rasterizers import Splats, autograd
 

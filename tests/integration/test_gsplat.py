@@ -13,12 +13,12 @@ import yaml
 import rasterizers
 from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, Objective
 from clear_strategies.compose import conductor as composed
-from clear_strategies.data.view import Photo, View
-from clear_strategies.density import DensitySettings
-from clear_strategies.fit import FitSettings, TrainState, iterate
-from clear_strategies.mip import MipFilter
-from clear_strategies.optim import LearningRates
+from clear_strategies.core.view import Photo, View
+from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.schedules import LogLinear, WarmupDecay, scaled
+from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import LearningRates
 from integration.attach import HostError
 from integration.gsplat import ROWS, attach
 from rasterizers import Splats, autograd

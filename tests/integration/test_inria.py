@@ -18,12 +18,12 @@ from safetensors.torch import load_file
 import rasterizers
 from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, DataError, Objective
 from clear_strategies.compose import conductor
-from clear_strategies.data.view import Photo, View
-from clear_strategies.density import DensitySettings
-from clear_strategies.fit import FitSettings, TrainState, iterate
-from clear_strategies.mip import MipFilter
-from clear_strategies.optim import LearningRates
+from clear_strategies.core.view import Photo, View
+from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, scaled
+from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import LearningRates
 from integration import launch
 from integration.attach import HostError
 from integration.inria import attach, enlarged, intrinsics

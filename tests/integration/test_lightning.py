@@ -12,7 +12,7 @@ import pytest
 import torch
 import toy
 
-from clear_strategies import images
+from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
 from integration.attach import HostError
 

@@ -182,8 +182,8 @@ def test_no_local_name_hides_a_constant_of_warp():
     # Warp's hash of a kernel would take `e.A` for a property of Euler's number until it has compiled `e`: no cache hit.
     import warp as wp
 
-    from clear_strategies.kernels import warp as losses
-    from clear_strategies.kernels import warp_step
+    from clear_strategies.kernels.gaussian_step import warp as warp_step
+    from clear_strategies.kernels.losses import warp as losses
     from rasterizers import warp_backend
 
     constants = {name for name in dir(wp) if isinstance(getattr(wp, name), (int, float))}
@@ -207,7 +207,7 @@ def test_the_kernels_compile_for_cuda_without_one(monkeypatch, tmp_path):
 
     back = blend.blend_vjp(1, 32)
     monkeypatch.setitem(back.module.options, "block_dim", 32)
-    for kernel in (bins.list_pairs, blend.blend, colour.basis, project.project, back, project.pull(1)):
+    for kernel in (bins.list_pairs, blend.blend, colour.basis, project.project, back, project.vjp(1)):
         wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path / kernel.key, use_ptx=True)
         (compiled,) = (tmp_path / kernel.key).glob("*.ptx")
         assert ".target sm_90" in compiled.read_text()

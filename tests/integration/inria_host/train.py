@@ -6,7 +6,7 @@ import torch
 from gaussian_renderer import render
 from scene import GaussianModel, Scene
 
-from clear_strategies import kernels
+from clear_strategies.kernels import losses
 
 
 class Photometric(torch.autograd.Function):
@@ -15,7 +15,7 @@ class Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx, image, target):
         x, y = (i.detach().permute(1, 2, 0).contiguous() for i in (image, target))
-        loss = kernels.photometric(x, y, 0.2, kernels="torch")
+        loss = losses.photometric(x, y, 0.2, kernels="torch")
         ctx.gradient = loss.gradient.permute(2, 0, 1)
         return image.new_tensor(float(loss.value))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from clear_strategies import images
+from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
 from scene.gaussian_model import GaussianModel
 

@@ -3,8 +3,8 @@
 import torch
 from safetensors.torch import save_file
 
-from clear_strategies.data.view import PointCloud
-from clear_strategies.field import GaussianField
+from clear_strategies.data.scene import PointCloud
+from clear_strategies.training.field import GaussianField
 from rasterizers.geometry import rotation_matrix
 
 GROUPS = {

@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import torch
 
-from clear_strategies import kernels
-from clear_strategies.field import GaussianField
+from clear_strategies.kernels import losses
+from clear_strategies.training.field import GaussianField
 from rasterizers import Camera as Pinhole
 from rasterizers import Splats, autograd, load
 
@@ -106,7 +106,7 @@ class GaussianSplatting(torch.nn.Module):
         told = (outputs, batch, self.gaussian_model, self.gaussian_optimizers, global_step, self)
         self.density_controller.before_backward(*told)
         image = outputs["render"].permute(1, 2, 0)
-        loss = kernels.photometric(image.detach(), gt_image.permute(1, 2, 0), 0.2, kernels="torch")
+        loss = losses.photometric(image.detach(), gt_image.permute(1, 2, 0), 0.2, kernels="torch")
         (image * loss.gradient).sum().backward()
         self.grads = {k: p.grad for k, p in self.gaussian_model.gaussians.items()}
         self.points = outputs["viewspace_points"]

@@ -1,0 +1,120 @@
+"""Floor 0: per-Gaussian gradients by attribute, their row algebra, and what strategies see of a rendering."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
+
+ATTRIBUTES: Final = ("means", "quats", "scales", "opacities", "sh0", "shN", "detail")
+"""gsplat's names for the raw parameters (log scales, logit opacities), and the detail feature f_det."""
+
+CONFLICT_GROUPS: Final = ("means", "sh0", "shN", "opacities", "scales", "quats")
+"""The paper's six: position, base appearance, higher-order appearance, opacity, scale, rotation."""
+
+
+class Grads(dict[str, Tensor]):
+    """attribute -> gradient [N, …], with + and * by a number or by one number per Gaussian [N].
+
+    An attribute that is absent has gradient 0. `screen` is the gradient of the projected centre [N, 2], 1/pixel;
+    arithmetic drops it, since it is a statistic and no parameter's gradient.
+    """
+
+    screen: Float[Tensor, "N 2"] | None
+
+    def __init__(self, values: Mapping[str, Tensor] | None = None, *, screen: Tensor | None = None) -> None:
+        super().__init__(values or {})
+        self.screen = screen
+
+    def __add__(self, other: Mapping[str, Tensor]) -> Grads:
+        total = Grads(self)
+        for name, value in other.items():
+            total[name] = total[name] + value if name in total else value
+        return total
+
+    def __mul__(self, weight: float | Float[Tensor, " N"]) -> Grads:
+        return Grads({name: scale_rows(value, weight) for name, value in self.items()})
+
+    __rmul__ = __mul__
+
+
+@runtime_checkable
+class Shot(Protocol):
+    """A rendering as strategies and hosts see it."""
+
+    @property
+    def image(self) -> Float[Tensor, "H W 3"]: ...
+
+    @property
+    def means2d(self) -> Float[Tensor, "N 2"]:
+        """Projected centres, pixels of this image."""
+        ...
+
+    @property
+    def visible(self) -> Bool[Tensor, " N"]: ...
+
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
+        """∇θ of Σ cotangent·image on the raw parameters, one per cotangent, each with `.screen`."""
+        ...
+
+
+def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"]) -> Float[Tensor, "N ..."]:
+    """Each row times its weight."""
+    if isinstance(weight, Tensor) and weight.dim() == 1:
+        weight = weight.to(value).view(-1, *[1] * (value.dim() - 1))
+    return value * weight
+
+
+def row_dot(a: Float[Tensor, "N ..."], b: Float[Tensor, "N ..."]) -> Float[Tensor, " N"]:
+    """⟨a_i, b_i⟩ in float64: no product of two finite float32 numbers over- or underflows there (STRESS §2)."""
+    return (a.double() * b.double()).flatten(1).sum(1) if a.dim() > 1 else a.double() * b.double()
+
+
+def row_norm(a: Float[Tensor, "N ..."]) -> Float[Tensor, " N"]:
+    """‖a_i‖₂ in float64."""
+    return row_dot(a, a).sqrt()
+
+
+def conflict_ratio(lr: Grads, hr: Grads) -> dict[str, Number]:
+    """Share of Gaussians whose LR and HR gradients point apart (cosine < 0), by group and for the groups together.
+
+    Counted among Gaussians where neither gradient is zero: invisible and dropped ones have no say (METHOD, F38, F42).
+    "gaussian" is one decision per Gaussian over its concatenated groups. NaN where nothing could be compared.
+    """
+    shares: dict[str, Number] = {}
+    dot: Tensor | float = 0.0
+    norms: list[Tensor | float] = [0.0, 0.0]
+    for group in CONFLICT_GROUPS:
+        if group in lr and group in hr:
+            g_lr, g_hr = lr[group], hr[group]
+            group_dot, group_norms = row_dot(g_lr, g_hr), (row_dot(g_lr, g_lr), row_dot(g_hr, g_hr))
+            shares[group] = _share_below_zero(group_dot, *group_norms)
+            dot = dot + group_dot
+            norms = [total + part for total, part in zip(norms, group_norms, strict=True)]
+    if isinstance(dot, Tensor) and all(isinstance(norm, Tensor) for norm in norms):
+        shares["gaussian"] = _share_below_zero(dot, *norms)  # type: ignore[arg-type]
+    return shares
+
+
+def conflict_columns(conflict: Mapping[str, Number]) -> dict[str, Number]:
+    """The shares as a history calls them: "conflict" of Gaussians, "conflict_means" … of groups."""
+    return {("conflict" if group == "gaussian" else f"conflict_{group}"): share for group, share in conflict.items()}
+
+
+def _share_below_zero(dot: Tensor, l2: Tensor, h2: Tensor) -> Number:
+    comparable = (l2 > 0) & (h2 > 0)
+    return deferred.defer(
+        deferred.ratio, deferred.scalar(((dot < 0) & comparable).sum()), deferred.scalar(comparable.sum())
+    )
+
+
+def to_ndc(screen: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor, "N 2"]:
+    """∇_u in NDC from ∇_u in pixels of an image of `size` (width, height)."""
+    width, height = size
+    return torch.stack((screen[:, 0] * (width / 2), screen[:, 1] * (height / 2)), dim=1)

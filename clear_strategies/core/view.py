@@ -1,0 +1,59 @@
+"""A view of a scene at two scales: the photos at LR and HR, and their cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rasterizers.interface import Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Photo:
+    """An image, float32 in [0, 1], and the camera on its pixel grid."""
+
+    camera: Camera
+    image: Float[Tensor, "H W 3"]
+
+    def __post_init__(self) -> None:
+        found = tuple(self.image.shape)
+        if found != (self.camera.height, self.camera.width, 3):
+            raise ValueError(
+                f"an image of {self.camera.width}x{self.camera.height} pixels has shape "
+                f"({self.camera.height}, {self.camera.width}, 3), got {found}."
+            )
+
+    def to(self, device: torch.device | str) -> Photo:
+        """The same with its image on `device`; a camera stays on the CPU, whence kernels are told its numbers."""
+        return replace(self, image=self.image.to(device))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """One view v: I_LR^v, I_HR^v and C^v at both scales; HR is exactly an integer times LR.
+
+    Args:
+        lr: the authentic low-resolution observation.
+        hr: the super-resolved reference. Never the truth.
+        truth: the real image at HR, for evaluation only; training never touches it.
+        reference: where `hr` came from, e.g. "onnx span_x4.onnx".
+    """
+
+    name: str
+    lr: Photo
+    hr: Photo
+    truth: Float[Tensor, "H W 3"] | None = None
+    reference: str = "unknown"
+
+    @property
+    def factor(self) -> int:
+        """HR pixels per LR pixel."""
+        return self.hr.camera.width // self.lr.camera.width
+
+    def to(self, device: torch.device | str) -> View:
+        """The same with its images on `device`."""
+        truth = None if self.truth is None else self.truth.to(device)
+        return replace(self, lr=self.lr.to(device), hr=self.hr.to(device), truth=truth)

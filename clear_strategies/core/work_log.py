@@ -1,0 +1,127 @@
+"""Floor 0: what was computed, what was skipped and why, and how long it took. Written as timing.csv after a run.
+
+On CUDA nothing is waited for while training: stages are stamped by events that the device passes, skips are summed there,
+and both are read when somebody looks, or once the device is past them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import Any, Final
+
+import torch
+from jaxtyping import Shaped
+from torch import Tensor
+
+_BATCH: Final = 1024  # stamps that are kept before a look at how far the device has come
+
+
+@dataclass(slots=True)
+class Entry:
+    """One stage: how often it ran, for how many seconds in all, and how often each reason kept it from running."""
+
+    runs: int = 0
+    seconds: float = 0.0
+    skipped: dict[str, int] = field(default_factory=dict)
+
+
+class WorkLog:
+    """Stages by name, in the order they first appeared.
+
+    Args:
+        device: where the work is done; may be set until the first stage. On "cuda" a stage's seconds are those between the
+            moments at which torch's current stream of that time reached its beginning and its end.
+    """
+
+    def __init__(self, device: torch.device | str = "cpu") -> None:
+        self.device = torch.device(device)
+        self._entries: dict[str, Entry] = {}
+        self._stamped: deque[tuple[Entry, Any, Any]] = deque()
+        self._counted: dict[tuple[str, str], Tensor] = {}
+
+    @property
+    def entries(self) -> dict[str, Entry]:
+        """All that was noted; waits for the device where it has not come that far."""
+        self._read_stamps(wait=True)
+        counted, self._counted = self._counted, {}
+        for (name, reason), count in counted.items():
+            if (found := int(count)) > 0:  # who counts on the device cannot know whether there was anything to count
+                self._add(name, reason, found)
+        return self._entries
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count and time a block; seconds are wall-clock, on CUDA the device's, and stages do not nest."""
+        on_cuda = self.device.type == "cuda"
+        start = _stamp() if on_cuda else time.perf_counter()
+        try:
+            yield
+        finally:
+            entry = self._entries.setdefault(name, Entry())
+            entry.runs += 1
+            if on_cuda:
+                self._stamped.append((entry, start, _stamp()))
+                if len(self._stamped) >= _BATCH:
+                    self._read_stamps(wait=False)
+            else:
+                entry.seconds += time.perf_counter() - start
+
+    def skip(self, name: str, reason: str, count: int | Shaped[Tensor, ""] = 1) -> None:
+        """Count a block that was not needed, or `count` rows of one; a number on the device is read late."""
+        if not isinstance(count, Tensor):
+            self._add(name, reason, count)
+        elif (name, reason) in self._counted:
+            self._counted[name, reason] += count
+        else:
+            self._counted[name, reason] = count.to(torch.int64, copy=True)  # the caller may write over its own
+
+    def rows(self) -> list[dict[str, str | int | float]]:
+        """One row a stage: runs, ms each, seconds, and the skips with what they saved at that price."""
+        table: list[dict[str, str | int | float]] = []
+        for name, entry in self.entries.items():
+            each = entry.seconds / entry.runs if entry.runs else 0.0
+            skips = sum(entry.skipped.values())
+            table.append(
+                {
+                    "stage": name,
+                    "runs": entry.runs,
+                    "ms_each": round(each * 1e3, 3),
+                    "seconds": round(entry.seconds, 3),
+                    "skipped": skips,
+                    "seconds_saved": round(each * skips, 3),
+                    "why": "; ".join(f"{reason} ({count}x)" for reason, count in entry.skipped.items()),
+                }
+            )
+        return table
+
+    def state_dict(self) -> dict[str, Any]:
+        """JSON-ready, for a checkpoint."""
+        return {name: asdict(entry) for name, entry in self.entries.items()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Count on from there."""
+        self._stamped.clear()
+        self._counted.clear()
+        self._entries = {name: Entry(**entry) for name, entry in state.items()}
+
+    def _add(self, name: str, reason: str, count: int) -> None:
+        skipped = self._entries.setdefault(name, Entry()).skipped
+        skipped[reason] = skipped.get(reason, 0) + count
+
+    def _read_stamps(self, *, wait: bool) -> None:
+        """Turn stamps into seconds: those that the device has passed, or, waiting, all."""
+        while self._stamped and (wait or self._stamped[0][2].query()):
+            entry, start, end = self._stamped.popleft()
+            end.synchronize()
+            entry.seconds += start.elapsed_time(end) / 1e3
+
+
+def _stamp() -> Any:
+    """An event that CUDA will time when its current stream gets here."""
+    event: Any = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
+    event.record()
+    return event

@@ -1,0 +1,191 @@
+"""Points from the training LR images alone, under their known poses: no test view and no HR pixel has a part in them.
+
+SIFT finds features, each pair of views matches them both ways, the known epipolar geometry throws out what cannot be
+the same point, and what is triangulated must lie in front of both cameras, reproject closely, and be seen under an angle.
+Matches that share features are one point seen by several views; the pair that saw it under the widest angle places it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from clear_strategies.core.view import Photo
+from clear_strategies.data.scene import PointCloud
+from rasterizers.interface import Camera
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class TriangulationSettings:
+    """What counts as the same point.
+
+    Args:
+        enlarge: images are enlarged this often before features are sought; small images have few otherwise.
+        contrast: SIFT's contrast threshold; lower finds more and weaker features.
+        ratio: a match must be this much closer than the second best (Lowe).
+        epipolar: largest distance from the epipolar lines, root mean square over both views, LR px.
+        reprojection: largest error in either view, LR px.
+        angle: smallest angle between the two rays, degrees.
+
+    Raises:
+        ValueError: a number is outside its range.
+    """
+
+    enlarge: int = 2
+    contrast: float = 0.01
+    ratio: float = 0.85
+    epipolar: float = 1.0
+    reprojection: float = 1.0
+    angle: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.enlarge < 1:
+            raise ValueError(f"enlarge must be at least 1, got {self.enlarge}.")
+        for name in ("contrast", "epipolar", "reprojection", "angle"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be > 0, got {getattr(self, name)}.")
+        if not 0 < self.ratio <= 1:
+            raise ValueError(f"ratio must lie in (0, 1], got {self.ratio}.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """Keypoints of one image, in its own pixels, and their descriptors of length 1."""
+
+    pixels: Float[Tensor, "F 2"]
+    descriptors: Float[Tensor, "F 128"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """Points that two views agree on: where, from which two features (numbered over all views), under which angle."""
+
+    means: Float[Tensor, "P 3"]
+    features: Int[Tensor, "P 2"]
+    angles: Float[Tensor, " P"]
+
+
+def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None = None) -> PointCloud:
+    """A cloud of what at least two photos agree on; empty where nothing matches."""
+    settings = settings or TriangulationSettings()
+    features = [find_features(photo, settings) for photo in photos]
+    view = torch.repeat_interleave(torch.arange(len(photos)), torch.tensor([len(f.pixels) for f in features]))
+    first_of = torch.searchsorted(view, torch.arange(len(photos)))
+    found = [Pairs(torch.zeros(0, 3).double(), torch.zeros(0, 2, dtype=torch.long), torch.zeros(0).double())]
+    for i, j in itertools.combinations(range(len(photos)), 2):
+        index = match(features[i], features[j], settings.ratio)
+        x, y = features[i].pixels[index[:, 0]], features[j].pixels[index[:, 1]]
+        points, angles, good = triangulate_pair(photos[i].camera, photos[j].camera, x, y, settings)
+        found.append(Pairs(points[good], index[good] + first_of[[i, j]], angles[good]))
+        _log.debug("views %d and %d: %d matches, %d points.", i, j, len(index), int(good.sum()))
+    pairs = Pairs(*(torch.cat([getattr(p, name) for p in found]) for name in ("means", "features", "angles")))
+    chosen = one_per_track(pairs, view)
+
+    shades = [sample_colors(photo.image, f.pixels) for photo, f in zip(photos, features, strict=True)]
+    colors = torch.cat(shades)[pairs.features[chosen]].mean(dim=1) if len(chosen) else torch.zeros(0, 3)
+    _log.info("%d features, %d pairs of them, %d points.", len(view), len(pairs.means), len(chosen))
+    source = f"{len(chosen):,} points triangulated from the {len(photos)} training LR images"
+    return PointCloud(pairs.means[chosen].float(), colors, source, saw_test_views="no")
+
+
+def find_features(photo: Photo, settings: TriangulationSettings) -> Features:
+    """SIFT keypoints of the enlarged image, with the square roots of their descriptors (RootSIFT)."""
+    import cv2
+
+    pixels = (photo.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
+    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    size = (grey.shape[1] * settings.enlarge, grey.shape[0] * settings.enlarge)
+    large = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)
+    # Without the precise upscale every keypoint lies a quarter of a pixel too far to the right and down.
+    sift: Any = cv2.SIFT_create(contrastThreshold=settings.contrast, enable_precise_upscale=True)  # type: ignore[attr-defined]
+    keypoints, descriptors = sift.detectAndCompute(large, None)
+    if descriptors is None:
+        return Features(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128))
+    # OpenCV's pixel (0, 0) has its centre at (0, 0), ours at (0.5, 0.5).
+    points = (np.array([k.pt for k in keypoints], np.float64) + 0.5) / settings.enlarge
+    relative = torch.nn.functional.normalize(torch.from_numpy(descriptors), p=1, dim=1)
+    return Features(torch.from_numpy(points), relative.sqrt())
+
+
+def match(a: Features, b: Features, ratio: float) -> Int[Tensor, "M 2"]:
+    """Indices of features that are each other's nearest, and nearer by `ratio` than the second nearest in b."""
+    if len(a.pixels) < 1 or len(b.pixels) < 2:
+        return torch.zeros(0, 2, dtype=torch.long)
+    # |x - y|² = 2 - 2 x·y: descriptors have length 1.
+    distance = (2 - 2 * a.descriptors @ b.descriptors.T).clamp_min(0).sqrt()
+    nearest, candidate = distance.topk(2, dim=1, largest=False)
+    here = torch.arange(len(a.pixels))
+    mutual = distance.argmin(dim=0)[candidate[:, 0]] == here
+    good = mutual & (nearest[:, 0] < ratio * nearest[:, 1])
+    return torch.stack((here[good], candidate[good, 0]), dim=1)
+
+
+def triangulate_pair(
+    a: Camera, b: Camera, x: Float[Tensor, "M 2"], y: Float[Tensor, "M 2"], settings: TriangulationSettings
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"], Bool[Tensor, " M"]]:
+    """Where the rays through pixels x of a and y of b meet, under which angle (degrees), and whether to believe it."""
+    from kornia.geometry import epipolar
+
+    if len(x) == 0:  # kornia refuses empty batches
+        return x.new_zeros(0, 3), x.new_zeros(0), torch.zeros(0, dtype=torch.bool)
+    P, Q = _projection(a)[None], _projection(b)[None]
+    F = epipolar.fundamental_from_projections(P, Q)
+    squares: Tensor = epipolar.symmetrical_epipolar_distance(x[None], y[None], F)[0]
+    points: Tensor = epipolar.triangulate_points(P, Q, x[None], y[None])[0]
+
+    (u, depth_a), (v, depth_b) = project(a, points), project(b, points)
+    error = torch.maximum(torch.linalg.vector_norm(u - x, dim=-1), torch.linalg.vector_norm(v - y, dim=-1))
+    rays = points - a.center.double(), points - b.center.double()
+    # The tangent, since a cosine cannot tell small angles from zero.
+    sine = torch.linalg.vector_norm(torch.linalg.cross(*rays), dim=-1)
+    angle = torch.rad2deg(torch.atan2(sine, (rays[0] * rays[1]).sum(-1)))
+
+    good = points.isfinite().all(-1) & (depth_a > 0) & (depth_b > 0)
+    good &= (squares / 2).sqrt() <= settings.epipolar
+    good &= (error <= settings.reprojection) & (angle >= settings.angle)
+    return points, angle, good
+
+
+def one_per_track(pairs: Pairs, view: Int[Tensor, " F"]) -> Int[Tensor, " T"]:
+    """For each set of connected features the pair with the widest angle; none if it holds two features of one view."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    a, b = pairs.features.numpy().T
+    graph = coo_array((np.ones(len(a)), (a, b)), shape=(len(view), len(view)))
+    count, track = connected_components(graph, directed=False)
+    seen = np.unique(np.stack((track, view.numpy())), axis=1)[0]  # each track once per view that saw it
+    contradictory = np.bincount(track, minlength=count) != np.bincount(seen, minlength=count)
+    order = np.argsort(-pairs.angles.numpy(), kind="stable")
+    tracks, widest = np.unique(track[a[order]], return_index=True)
+    return torch.from_numpy(order[widest[~contradictory[tracks]]])
+
+
+def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
+    """(pixels, depths in world units), float64; pixels mean something where depth > 0."""
+    homogeneous = points.double() @ _projection(camera)[:, :3].T + _projection(camera)[:, 3]
+    return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
+
+
+def sample_colors(image: Float[Tensor, "H W 3"], pixels: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+    """Bilinear samples; beyond the centres of the outermost pixels, their colour."""
+    height, width = image.shape[:2]
+    grid = (2 * pixels / torch.tensor([width, height]) - 1).to(image)[None, None]
+    batch = image.permute(2, 0, 1)[None]
+    samples = torch.nn.functional.grid_sample(batch, grid, padding_mode="border", align_corners=False)
+    return samples[0, :, 0].T.cpu()
+
+
+def _projection(camera: Camera) -> Float[Tensor, "3 4"]:
+    K = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]], dtype=torch.float64)
+    return K @ camera.world_to_camera.double().cpu()[:3]

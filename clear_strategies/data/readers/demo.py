@@ -1,0 +1,501 @@
+"""The embedded default: a procedural room, so that a bare machine runs the main job with nothing else.
+
+Pictures, boxes and balls at several depths, textured with photographs that scikit-image ships inside its wheel, ray-cast
+with anti-aliasing from exact poses. Its prior is the truth with seeded errors that differ from view to view, so that
+reliability means something; every report calls it synthetic.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, lru_cache, partial
+from pathlib import Path
+from typing import Final, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from PIL import Image
+from torch import Tensor
+
+from clear_strategies.core import images
+from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.priors.corrupted import corrupted, require_errors
+from clear_strategies.errors import DataError
+from rasterizers.interface import Camera
+
+Array = np.ndarray
+Vector = tuple[float, float, float]
+
+_RAYS: Final = 4  # per pixel and axis
+_BAND: Final = 16  # image rows cast at once: small enough for the caches
+_FIELD_OF_VIEW: Final = math.radians(58)
+_ARC: Final = 0.75  # the cameras' way to the left and right, world units
+_TARGET: Final = np.array([0.0, 0.15, 5.0])
+
+_FLOOR: Final = 1.35  # y; y points down
+_WALL: Final = 7.5  # z
+_LAMP: Final = np.array([-4.0, -2.9, 1.2])
+_LAMP_SIZE: Final = 0.9  # edge of the square lamp, which makes shadows soft
+_LAMP_REACH: Final = 8.5  # distance at which its light has halved
+_AMBIENT: Final = 0.3
+_EXPOSURE: Final = 1.9
+_LIGHT_TEXEL: Final = 0.08  # of the baked light, world units
+
+
+def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3) -> Capture:
+    """The room, seen from an arc; `train` views spread over it are for training, the others for testing.
+
+    Args:
+        width, height: of the HR images, px.
+
+    Raises:
+        ValueError: fewer views than training views, or fewer than two of those.
+    """
+    if not 2 <= train < views:
+        raise ValueError(f"2 <= train < views must hold, got train={train}, views={views}.")
+    chosen = {round((i + 0.5) * views / train - 0.5) for i in range(train)}
+    frames = []
+    for i in range(views):
+        camera = _camera(2 * i / (views - 1) - 1, width, height)
+        load = lru_cache(maxsize=1)(partial(render, camera))
+        frames.append(Frame(f"demo_{i:02d}", camera, load, split="train" if i in chosen else "test"))
+    return Capture(
+        "demo",
+        tuple(frames),
+        notes={"poses": "exact", "scene": "procedural room, photographs from scikit-image"},
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DemoPrior:
+    """Ground-truth detail with seeded errors that differ from view to view: see `corrupt.corrupted`.
+
+    Args:
+        truth: HR image of each view by name. share, strength, patch: as in `corrupt.Corrupted`.
+
+    Raises:
+        ValueError: a number is outside its range.
+    """
+
+    truth: Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]
+    share: float = 0.3
+    strength: float = 1.0
+    patch: int = 64
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require_errors(self.share, self.strength, self.patch)
+
+    @property
+    def label(self) -> str:
+        return f"demo (synthetic: truth with seeded errors in {self.share:.0%} of the patches)"
+
+    def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
+        truth = self._truth(name, lr.shape[1] * factor, lr.shape[0] * factor, factor)
+        return corrupted(truth, lr, factor, name, self.share, self.strength, self.patch, self.seed)
+
+    def _truth(self, name: str, width: int, height: int, factor: int) -> Float[Tensor, "H W 3"]:
+        """Cropped as the HR photo is, at the right and at the bottom, to a multiple of the factor."""
+        truth = self.truth[name]()
+        spare = (truth.shape[1] - width, truth.shape[0] - height)
+        if not all(0 <= pixels < factor for pixels in spare):
+            raise DataError(
+                name, "truth", f"is {truth.shape[1]}x{truth.shape[0]} where HR is {width}x{height}",
+                "use the photos at their own size (shrink=1, photos_are=hr), or another prior",
+            )  # fmt: skip
+        return truth[:height, :width]
+
+
+def render(camera: Camera) -> Float[Tensor, "H W 3"]:
+    """Ray-cast with 4 × 4 rays a pixel and prefiltered textures; 8-bit values, as a photo would have."""
+    bands = []
+    for first in range(0, camera.height, _BAND):
+        rays = _Rays.through(camera, first, min(first + _BAND, camera.height), _RAYS)
+        colors = _cast(rays).reshape(-1, _RAYS, camera.width, _RAYS, 3)
+        bands.append(colors.mean(axis=(1, 3)))
+    return images.quantize(torch.from_numpy(np.concatenate(bands)).clamp(0, 1))
+
+
+def depth(camera: Camera) -> Float[Tensor, "H W"]:
+    """Depth (z) through each pixel's centre, infinite where nothing is; the truth that tests compare with."""
+    rays = _Rays.through(camera, 0, camera.height, 1)
+    return torch.from_numpy(np.min([surface.depth(rays) for surface in _room()], axis=0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rays:
+    """The rays of a pixel grid, origin + t · (x · right + y · down + forward): t is the depth.
+
+    Being linear in x and y, their dot product with anything fixed is a sum of a row and a column, which makes planes and
+    spheres cheap.
+    """
+
+    origin: Float[Array, " 3"]
+    axes: Float[Array, "3 3"]
+    x: Float[Array, "1 w"]
+    y: Float[Array, "h 1"]
+    spacing: float
+
+    @staticmethod
+    def through(camera: Camera, first: int, last: int, per_pixel: int) -> _Rays:
+        """Of the image rows from `first` up to `last`, `per_pixel`² through each pixel."""
+        x = (np.arange(camera.width * per_pixel) + 0.5) / per_pixel
+        y = (np.arange(first * per_pixel, last * per_pixel) + 0.5) / per_pixel
+        return _Rays(
+            camera.center.double().numpy(),
+            camera.world_to_camera[:3, :3].double().numpy(),
+            ((x - camera.cx) / camera.fx)[None, :].astype(np.float32),
+            ((y - camera.cy) / camera.fy)[:, None].astype(np.float32),
+            1 / (camera.fx * per_pixel),
+        )
+
+    def dot(self, vector: Array) -> Float[Array, "h w"]:
+        right, down, forward = _f32(self.axes @ vector)
+        return np.asarray(self.x * right + (self.y * down + forward))
+
+    def directions(self, which: Int[Array, " n"]) -> Float[Array, "n 3"]:
+        """Of the rays with these places in the grid, counted row by row."""
+        right, down, forward = _f32(self.axes)
+        row, column = np.divmod(which, self.x.size)
+        return np.asarray(self.x[0, column, None] * right + (self.y * down + forward)[row])
+
+
+def _cast(rays: _Rays) -> Float[Array, "h w 3"]:
+    """The colour of the nearest surface along each ray; black where there is none."""
+    nearest = np.full((rays.y.size, rays.x.size), np.inf, np.float32)
+    owner = np.full(nearest.shape, -1, np.int8)
+    for k, surface in enumerate(_room()):
+        distance = surface.depth(rays)
+        owner[distance < nearest] = k
+        np.minimum(nearest, distance, out=nearest)
+    colors = np.zeros((nearest.size, 3), np.float32)
+    for k, surface in enumerate(_room()):
+        mine = np.flatnonzero(owner == k)
+        if mine.size:
+            distance, directions = nearest.ravel()[mine], rays.directions(mine)
+            points = _f32(rays.origin) + distance[:, None] * directions
+            colors[mine] = _color(surface, points, directions, distance * rays.spacing)
+    return colors.reshape(*nearest.shape, 3)
+
+
+def _color(
+    surface: Surface, points: Float[Array, "n 3"], directions: Float[Array, "n 3"], spacing: Float[Array, " n"]
+) -> Float[Array, "n 3"]:
+    """Photograph × light, and the lamp's reflection where the surface is glossy. `spacing`: of the rays, world units."""
+    finish, chart = surface.finish, surface.chart(points)
+    picture = _texture(finish.texture)
+    at = chart * _f32(finish.repeat) + _f32(finish.shift)
+    albedo = picture.sample(at, spacing * (finish.repeat[0] * float(picture.widths[0]) / surface.extent[0]))
+    light = _light(surface).sample(chart, np.ones_like(spacing))
+    color = albedo * (_f32(finish.tint) * light)
+    if finish.gloss:
+        half = _unit(_unit(_LAMP - points) - _unit(directions))
+        color += finish.gloss * np.maximum((half * surface.normal(points)).sum(-1, keepdims=True), 0) ** 40
+    return np.asarray(color, np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Finish:
+    """How a surface looks.
+
+    Args:
+        texture: a photograph of scikit-image. tint: times its colour. repeat, shift: where it lies on the surface's
+            chart; it is mirrored where it is repeated, so that it has no seam. gloss: strength of the lamp's reflection.
+    """
+
+    texture: str
+    tint: Vector = (1.0, 1.0, 1.0)
+    repeat: tuple[float, float] = (1.0, 1.0)
+    shift: tuple[float, float] = (0.0, 0.0)
+    gloss: float = 0.0
+
+
+@runtime_checkable
+class Surface(Protocol):
+    """A shape with a chart: coordinates in [0, 1]² for its picture and its light."""
+
+    def __hash__(self) -> int: ...
+
+    @property
+    def finish(self) -> Finish: ...
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """The chart's width and height, world units."""
+        ...
+
+    def depth(self, rays: _Rays) -> Float[Array, "h w"]:
+        """Along each ray; infinite where it misses."""
+        ...
+
+    def chart(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]: ...
+
+    def points(self, chart: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+        """The inverse of `chart`."""
+        ...
+
+    def normal(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """Unit length, towards the outside."""
+        ...
+
+    def blocks(self, points: Float[Array, "n 3"], lamp: Float[Array, " 3"]) -> Bool[Array, " n"]:
+        """Does it stand between the points and the lamp?"""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """A rectangle: its centre, and half its sides as vectors; it faces down × right."""
+
+    finish: Finish
+    center: Vector
+    right: Vector
+    down: Vector
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        return 2 * math.hypot(*self.right), 2 * math.hypot(*self.down)
+
+    def depth(self, rays: _Rays) -> Float[Array, "h w"]:
+        offset = rays.origin - np.asarray(self.center)
+        right, down = _dual(self.right), _dual(self.down)
+        normal = self._normal
+        facing = rays.dot(normal)
+        # A ray along the plane divides by zero, and misses.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.float32(-offset @ normal) / facing
+            u = np.float32(offset @ right) + t * rays.dot(right)
+            v = np.float32(offset @ down) + t * rays.dot(down)
+            inside = (t > 0) & (np.abs(u) <= 1) & (np.abs(v) <= 1)
+        return np.asarray(np.where(inside, t, np.float32(np.inf)))
+
+    def chart(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
+        basis = np.stack((_dual(self.right), _dual(self.down)), -1)
+        return np.asarray((points - _f32(self.center)) @ _f32(basis) / 2 + np.float32(0.5))
+
+    def points(self, chart: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+        return np.asarray(np.asarray(self.center) + (2 * chart - 1) @ np.array((self.right, self.down)))
+
+    def normal(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        return np.broadcast_to(self._normal, points.shape)
+
+    def blocks(self, points: Float[Array, "n 3"], lamp: Float[Array, " 3"]) -> Bool[Array, " n"]:
+        normal = self._normal
+        here, there = (points - self.center) @ normal, (lamp - self.center) @ normal
+        apart = (np.abs(here) > 1e-4) & (here * there < 0)
+        s = (here / np.where(apart, here - there, 1))[:, None]
+        return np.asarray(apart & (np.abs(2 * self.chart(points + s * (lamp - points)) - 1) <= 1).all(-1))
+
+    @property
+    def _normal(self) -> Float[Array, " 3"]:
+        return _unit(np.cross(self.down, self.right))
+
+
+@dataclass(frozen=True, slots=True)
+class Ball:
+    """A sphere, its chart longitude and latitude."""
+
+    finish: Finish
+    center: Vector
+    radius: float
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        return 2 * math.pi * self.radius, math.pi * self.radius
+
+    def depth(self, rays: _Rays) -> Float[Array, "h w"]:
+        offset = rays.origin - np.asarray(self.center)
+        b, square = rays.dot(offset), 1 + rays.x**2 + rays.y**2
+        discriminant = b * b - square * np.float32(offset @ offset - self.radius**2)
+        t = (-b - np.sqrt(np.maximum(discriminant, 0))) / square
+        return np.where((discriminant > 0) & (t > 0), t, np.float32(np.inf))
+
+    def chart(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
+        x, y, z = self.normal(points).T
+        longitude, latitude = np.arctan2(x, -z) / (2 * math.pi), np.arccos(np.clip(-y, -1, 1)) / math.pi
+        return np.stack((longitude + 0.5, latitude), -1).astype(np.float32)
+
+    def points(self, chart: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+        longitude, latitude = 2 * math.pi * (chart[:, 0] - 0.5), math.pi * chart[:, 1]
+        ring = np.sin(latitude)
+        unit = np.stack((ring * np.sin(longitude), -np.cos(latitude), -ring * np.cos(longitude)), -1)
+        return np.asarray(self.center) + self.radius * unit
+
+    def normal(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        return np.asarray((points - np.asarray(self.center, points.dtype)) / self.radius)
+
+    def blocks(self, points: Float[Array, "n 3"], lamp: Float[Array, " 3"]) -> Bool[Array, " n"]:
+        way = lamp - points
+        s = np.clip(((self.center - points) * way).sum(-1) / (way * way).sum(-1), 0, 1)[:, None]
+        return np.asarray(np.linalg.norm(points + s * way - self.center, axis=-1) < self.radius * (1 - 1e-4))
+
+
+@cache
+def _room() -> tuple[Surface, ...]:
+    """A yard: pictures on the wall and leaning before it, a box, and balls on the ground."""
+    brick = Finish("brick", (1.12, 0.80, 0.66), repeat=(2.0, 3.0), shift=(0.1, 0.35))
+    gravel = Finish("gravel", (0.78, 0.74, 0.68), repeat=(4.0, 3.0))
+    # On a ball, repeat (2, 1) shows the whole photograph from the front; less enlarges its middle.
+    marble = Finish("ihc", repeat=(2.0, 1.0), shift=(-0.5, 0.0), gloss=0.3)
+    moss = Finish("grass", (0.62, 0.95, 0.42), repeat=(2.0, 1.0), shift=(-0.5, 0.0))
+    retina = Finish("retina", (1.1, 1.1, 1.1), repeat=(1.2, 0.6), shift=(-0.1, 0.2), gloss=0.35)
+    rainbow = Finish("color", (1.1, 1.1, 1.1), repeat=(1.2, 0.6), shift=(-0.1, 0.2), gloss=0.35)
+    return (
+        # The photograph's courses of bricks stand upright; turned by a right angle they lie.
+        Panel(brick, center=(0.0, -1.2, _WALL), right=(0.0, -4.2, 0.0), down=(7.0, 0.0, 0.0)),
+        Panel(gravel, center=(0.0, _FLOOR, 3.75), right=(7.0, 0.0, 0.0), down=(0.0, 0.0, -4.75)),
+        *_hung("rocket", x=-1.75, y=-1.05, width=2.1),
+        *_hung("motorcycle_left", x=0.75, y=-0.95, width=1.6),
+        *_hung("hubble_deep_field", x=2.7, y=-1.1, width=1.35),
+        _leaning("astronaut", x=-1.95, z=5.6, width=1.7, turn=0.42),
+        _leaning("chelsea", x=1.8, z=5.1, width=2.0, turn=-0.45),
+        *_box("coffee", x=-0.1, z=5.0, size=(0.96, 0.64, 0.64), turn=0.5),
+        Ball(rainbow, (-0.1, _FLOOR - 0.64 - 0.27, 5.0), 0.27),
+        Ball(marble, (-1.05, _FLOOR - 0.42, 4.15), 0.42),
+        Ball(retina, (0.75, _FLOOR - 0.33, 3.95), 0.33),
+        Ball(moss, (-0.3, _FLOOR - 0.2, 3.7), 0.2),
+    )
+
+
+def _hung(texture: str, *, x: float, y: float, width: float) -> tuple[Panel, Panel]:
+    """A framed picture on the wall."""
+    half, frame = width / 2, 0.07
+    tall = half / _texture(texture).aspect
+    wood = Finish("coffee", (0.55, 0.42, 0.32), repeat=(0.1, 0.1), shift=(0.02, 0.02))
+    return (
+        Panel(wood, (x, y, _WALL - 0.05), (half + frame, 0.0, 0.0), (0.0, tall + frame, 0.0)),
+        Panel(Finish(texture), (x, y, _WALL - 0.06), (half, 0.0, 0.0), (0.0, tall, 0.0)),
+    )
+
+
+def _leaning(texture: str, *, x: float, z: float, width: float, turn: float, lean: float = 0.16) -> Panel:
+    """A picture that stands on the ground, turned about the vertical, leaning back; angles in radians."""
+    half = width / 2
+    tall = half / _texture(texture).aspect
+    right, back = _turned(turn)
+    down = tall * (math.cos(lean) * np.array([0, 1, 0]) - math.sin(lean) * back)
+    center = np.array([x, _FLOOR, z]) - down
+    return Panel(Finish(texture), tuple(center), tuple(half * right), tuple(down))
+
+
+def _box(texture: str, *, x: float, z: float, size: Vector, turn: float) -> tuple[Panel, ...]:
+    """The five faces of a box on the ground that one may see; `size`: width, height, length."""
+    right, back = (side * length / 2 for side, length in zip(_turned(turn), size[::2], strict=True))
+    down, finish = np.array([0, size[1] / 2, 0]), Finish(texture)
+    center = np.array([x, _FLOOR - size[1] / 2, z])
+    faces = (
+        (-back, right, down),
+        (right, back, down),
+        (-right, -back, down),
+        (back, -right, down),
+        (-down, right, -back),
+    )
+    return tuple(Panel(finish, tuple(center + out), tuple(across), tuple(along)) for out, across, along in faces)
+
+
+def _turned(angle: float) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
+    """Right and back after a turn about the vertical, radians."""
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([c, 0, s]), np.array([-s, 0, c])
+
+
+@cache
+def _light(surface: Surface) -> _Texture:
+    """What the lamp and the sky give to each place of a surface, with soft shadows; the same from everywhere, so baked."""
+    width, height = (max(math.ceil(side / _LIGHT_TEXEL), 4) for side in surface.extent)
+    u, v = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
+    points = surface.points(np.stack((u.ravel(), v.ravel()), -1))
+    normal = surface.normal(points)
+    offsets = np.array((-1, 0, 1)) * _LAMP_SIZE / 3
+    direct = np.zeros(len(points))
+    for dx in offsets:
+        for dz in offsets:
+            lamp = _LAMP + np.array((dx, 0, dz))
+            way = lamp - points
+            distance = np.linalg.norm(way, axis=-1)
+            cosine = np.maximum((way * normal).sum(-1) / distance, 0)
+            shadowed = np.any([other.blocks(points, lamp) for other in _room() if other is not surface], axis=0)
+            direct += np.where(shadowed, 0, cosine) / (1 + (distance / _LAMP_REACH) ** 2) / offsets.size**2
+    light = _EXPOSURE * (_AMBIENT * (0.75 - 0.25 * normal[:, 1]) + (1 - _AMBIENT) * direct)
+    return _Texture.of(light.reshape(height, width, 1), levels=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Texture:
+    """An image and its halvings (area means), one after the other in one table."""
+
+    texels: Float[Array, "T C"]
+    starts: Int[Array, " L"]
+    widths: Int[Array, " L"]
+    heights: Int[Array, " L"]
+
+    @staticmethod
+    def of(image: Float[Array, "H W C"], levels: int | None = None) -> _Texture:
+        pyramid = [image]
+        while min(pyramid[-1].shape[:2]) > 4 and len(pyramid) != levels:
+            fine = pyramid[-1][: pyramid[-1].shape[0] // 2 * 2, : pyramid[-1].shape[1] // 2 * 2]
+            pyramid.append((fine[0::2, 0::2] + fine[1::2, 0::2] + fine[0::2, 1::2] + fine[1::2, 1::2]) / 4)
+        heights, widths = np.array([level.shape[:2] for level in pyramid]).T
+        texels = np.concatenate([level.reshape(-1, image.shape[2]) for level in pyramid]).astype(np.float32)
+        return _Texture(texels, np.concatenate(([0], np.cumsum(heights * widths)[:-1])), widths, heights)
+
+    @property
+    def aspect(self) -> float:
+        return float(self.widths[0] / self.heights[0])
+
+    def sample(self, at: Float[Array, "n 2"], footprint: Float[Array, " n"]) -> Float[Array, "n C"]:
+        """Bilinear, in the level whose texels are about as large as the ray spacing (`footprint`, texels of the first)."""
+        level = np.log2(np.maximum(footprint, 1)).round().astype(int).clip(0, len(self.widths) - 1)
+        start, width, height = self.starts[level], self.widths[level], self.heights[level]
+        folded = np.abs(at - 2 * np.round(at / 2))  # mirrored at every whole number
+        x, y = folded.T * np.stack((width, height)).astype(np.float32) - np.float32(0.5)
+        left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+        fx, fy = (x - left)[:, None], (y - top)[:, None]
+        x0, x1 = np.maximum(left, 0), np.minimum(left + 1, width - 1)
+        y0, y1 = start + np.maximum(top, 0) * width, start + np.minimum(top + 1, height - 1) * width
+        upper = self.texels.take(y0 + x0, 0) * (1 - fx) + self.texels.take(y0 + x1, 0) * fx
+        lower = self.texels.take(y1 + x0, 0) * (1 - fx) + self.texels.take(y1 + x1, 0) * fx
+        return np.asarray(upper * (1 - fy) + lower * fy)
+
+
+@cache
+def _texture(name: str) -> _Texture:
+    """A photograph that scikit-image ships, RGB in [0, 1]."""
+    import skimage
+
+    folder = Path(skimage.__file__).parent / "data"
+    path = next((p for suffix in (".png", ".jpg") if (p := folder / f"{name}{suffix}").exists()), None)
+    if path is None:
+        remedy = "install scikit-image 0.24 to 0.26, or train on data of your own"
+        raise DataError(folder, name, "is not among the photographs of this scikit-image", remedy)
+    with Image.open(path) as photo:
+        return _Texture.of(np.asarray(photo.convert("RGB"), np.float32) / 255)
+
+
+def _camera(position: float, width: int, height: int) -> Camera:
+    """On the arc, `position` in [-1, 1] from left to right, looking at the room's middle."""
+    center = np.array([_ARC * position, -0.15 + 0.12 * math.cos(2.2 * position), 0.35 * position**2])
+    forward = _unit(_TARGET - center)
+    right = _unit(np.cross([0.0, 1.0, 0.0], forward))
+    rotation = np.stack((right, np.cross(forward, right), forward))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ center
+    focal = width / (2 * math.tan(_FIELD_OF_VIEW / 2))
+    return Camera(torch.from_numpy(pose), focal, focal, width / 2, height / 2, width, height)
+
+
+def _unit(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def _dual(side: Vector) -> Float[Array, " 3"]:
+    """The vector whose dot product with `side` is one."""
+    return np.asarray(np.asarray(side) / np.dot(side, side))
+
+
+def _f32(values: Array | tuple[float, ...]) -> Float[Array, "*shape"]:
+    """Casting is done in single precision: it is twice as fast, and a texel is far larger than its error."""
+    return np.asarray(values, np.float32)

@@ -1,0 +1,161 @@
+"""LLFF scenes: a folder with images, images_4 or images_8, poses_bounds.npy, and often COLMAP's sparse/0."""
+
+from __future__ import annotations
+
+import io
+import logging
+from dataclasses import replace
+from pathlib import Path
+from tokenize import TokenError
+from typing import Final
+
+import numpy as np
+from numpy.lib import format as npy_format
+
+from clear_strategies.data.cameras import Lens, by_name, lens_notes, make_frame, rigid_inverse
+from clear_strategies.data.capture import Capture
+from clear_strategies.data.photo_files import image_folder, inside, list_images
+from clear_strategies.data.readers import colmap
+from clear_strategies.errors import DataError
+
+_log = logging.getLogger(__name__)
+
+Color = tuple[float, float, float]
+
+_COLUMNS: Final = 17  # a 3 x 5 matrix [R | t | height width focal], then the near and far bounds
+# What numpy's parser of the header's Python literal raises on damaged ones.
+_HEADER_ERRORS: Final = (
+    ValueError,
+    KeyError,
+    SyntaxError,
+    TypeError,
+    EOFError,
+    RecursionError,
+    MemoryError,
+    TokenError,
+)
+_REMEDY: Final = "write it with LLFF's img2poses again"
+
+
+def read(
+    root: str | Path,
+    images: str | None = None,
+    poses: str = "auto",
+    *,
+    background: Color | None = None,
+) -> Capture:
+    """An LLFF scene.
+
+    Args:
+        images: folder of the photos below root; None: images, images_2, images_4, images_8, the first that is there.
+        poses: "colmap" (sparse/0), "poses_bounds", or "auto": COLMAP's where they are.
+        background: RGB in [0, 1] behind transparent pixels; None: black.
+
+    Raises:
+        DataError: something is missing or not what it should be.
+    """
+    root = Path(root)
+    if poses not in ("auto", "colmap", "poses_bounds"):
+        raise DataError("config", "data.reader.poses", f"is {poses!r}", "use auto, colmap or poses_bounds")
+    if not root.is_dir():
+        raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
+    folder = image_folder(root, images)
+    has_model = any((root / layout).is_dir() for layout in ("sparse", "colmap/sparse"))
+    if poses == "colmap" or (poses == "auto" and has_model):
+        return _from_colmap(root, folder, background)
+    return _from_bounds(root, folder, has_model, background)
+
+
+def _from_colmap(root: Path, folder: Path, background: Color | None) -> Capture:
+    model = colmap.read_model(colmap.find_model(root))
+    registered = sorted(image.name for image in model.images)
+    files = {p.name: inside(folder, p.name, file=folder) for p in list_images(folder)}
+    if all(name in files for name in registered):
+        return colmap.capture(root, model, folder, {name: files[name] for name in registered}, background=background)
+    # images_4 and the like were renamed by LLFF's scripts, in the order of the originals.
+    if len(files) != len(registered):
+        raise DataError(
+            folder, "images", f"holds {len(files)} images, the model {len(registered)} under other names",
+            "set data.reader.images to the folder that the model was made from",
+        )  # fmt: skip
+    ordered = dict(zip(registered, (files[name] for name in sorted(files)), strict=True))
+    found = colmap.capture(root, model, folder, ordered, background=background)
+    first = f"{registered[0]} is {ordered[registered[0]].name}"
+    return replace(found, notes={**found.notes, "names": f"photos matched to the model's by order ({first})"})
+
+
+def _from_bounds(root: Path, folder: Path, has_model: bool, background: Color | None) -> Capture:
+    file = root / "poses_bounds.npy"
+    table = _read_table(file)
+    paths = list_images(folder)
+    if len(paths) != len(table):
+        raise DataError(
+            file,
+            "rows",
+            f"there are {len(table)}, but {folder.name} holds {len(paths)} images",
+            "give one row an image",
+        )
+    model = colmap.read_model(colmap.find_model(root)) if has_model else None
+    ids = _ids_by_order(model, len(paths))
+    frames, lenses = [], []
+    for i, (row, path) in enumerate(zip(table, paths, strict=True)):
+        pose = row[:15].reshape(3, 5)
+        height, width, focal = pose[:, 4]
+        down, right, back = pose[:, 0], pose[:, 1], pose[:, 2]  # LLFF's axes
+        rotation = np.stack((right, down, -back), axis=1)
+        lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2).check(file, f"row {i}")
+        world_to_camera = rigid_inverse(file, f"row {i}", rotation, pose[:, 3])
+        inside(folder, path.name, file=folder)
+        lenses.append(lens)
+        frames.append(make_frame(path.name, path, lens, world_to_camera, background=background, sfm_id=ids[i]))
+    near, far = table[:, 15].min(), table[:, 16].max()
+    if not 0 < near < far:
+        raise DataError(file, "bounds", f"are {near:g} and {far:g}; 0 < near < far must hold", _REMEDY)
+    notes = {
+        "poses": f"poses_bounds.npy, {len(frames)} images",
+        "photos": folder.name,
+        "depths": f"{near:.4g} to {far:.4g} world units, says poses_bounds.npy",
+        **lens_notes(lenses, frames),
+    }
+    points = None
+    if model is not None and ids[0] is not None:  # LLFF's poses stand in the frame of the COLMAP model they came from
+        points = colmap.sfm_points(model, model.folder.relative_to(root).as_posix())
+    return Capture(root.resolve().name, by_name(frames, folder), points, background or (0.0, 0.0, 0.0), notes)
+
+
+def _ids_by_order(model: colmap.Model | None, n: int) -> list[int | None]:
+    """The model's ids of the n photos: both in order of names."""
+    if model is None:
+        return [None] * n
+    registered = sorted(model.images, key=lambda image: image.name)
+    if len(registered) != n:
+        _log.info("%s has %d of %d photos: its points are not used.", model.folder, len(registered), n)
+        return [None] * n
+    return [image.id for image in registered]
+
+
+def _read_table(file: Path) -> np.ndarray:
+    """[n, 17] float64; the header is held against the file's size before anything is allocated."""
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise DataError(file, "file", f"cannot be read ({error.strerror})", "check the path") from error
+    stream = io.BytesIO(data)
+    try:
+        version = npy_format.read_magic(stream)
+        reader = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}[version]
+        shape, fortran, dtype = reader(stream)
+    except _HEADER_ERRORS as error:
+        raise DataError(file, "header", f"is no .npy header ({str(error)[:80]})", _REMEDY) from error
+    if dtype.kind != "f":
+        raise DataError(file, "header", f"has the type {dtype}, not floating point", _REMEDY)
+    if len(shape) != 2 or shape[1] != _COLUMNS or not 0 < shape[0] < 1 << 20:
+        raise DataError(file, "header", f"has the shape {shape}, not (images, {_COLUMNS})", _REMEDY)
+    needed, left = shape[0] * _COLUMNS * dtype.itemsize, len(data) - stream.tell()
+    if needed != left:
+        raise DataError(file, "size", f"the header asks for {needed} bytes, {left} follow it", _REMEDY)
+    table = np.frombuffer(data, dtype, shape[0] * _COLUMNS, stream.tell())
+    table = table.reshape(shape, order="F" if fortran else "C").astype(np.float64)
+    if not np.isfinite(table).all() or np.abs(table).max() > 1e12:
+        raise DataError(file, "values", "are not all finite", _REMEDY)
+    return table

@@ -1,0 +1,296 @@
+"""Floor 4: who decides the structure, and our own answer: adaptive density control (METHOD, A), where clone, split and
+prune are one gather map, driven by a score. `density_gsplat` lets another library's strategy answer instead.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from clear_strategies.core.gradients import Shot
+from clear_strategies.errors import ClearError
+from clear_strategies.merging.conductor import Update
+from clear_strategies.schedules import milestone
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.optim import Adam
+from rasterizers.geometry import rotation_matrix
+
+_log = logging.getLogger(__name__)
+
+_CHILDREN: Final = 2  # a split Gaussian becomes two …
+_SHRINK: Final = 0.8 * _CHILDREN  # … each smaller by this factor
+_RESET_OPACITY: Final = 0.01
+_FEWEST_ROUNDS: Final = 10
+
+
+class DensityError(ClearError, RuntimeError):
+    """Pruning would leave too few Gaussians to go on."""
+
+
+@runtime_checkable
+class Densifier(Protocol):
+    """Who changes the structure while the trainer trains."""
+
+    @property
+    def name(self) -> str:
+        """For the printed plan."""
+        ...
+
+    @property
+    def settings(self) -> Any:
+        """A dataclass; its milestones are printed."""
+        ...
+
+    @property
+    def marks(self) -> Mapping[str, int]:
+        """The iterations worth a mark on a curve."""
+        ...
+
+    def accumulate(self, update: Update, shot: Shot, t: int) -> None:
+        """Note what iteration t says about each Gaussian; `shot` is the rendering that its scores are of."""
+        ...
+
+    def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
+        """Whatever falls on t, after the optimizer's step; whether the structure changed.
+
+        Args:
+            resized: told parents[M] once field and optimizer have followed; row i of everything else per Gaussian now
+                comes from row parents[i].
+        """
+        ...
+
+    def reset_due(self, t: int) -> bool:
+        """Whether opacities are lowered at t; what is drawn right after that says nothing about the field."""
+        ...
+
+    def state_dict(self) -> dict[str, Tensor]: ...
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None: ...
+
+
+@runtime_checkable
+class DensifierSettings(Protocol):
+    """What a configuration's `density` is: a frozen dataclass that makes its densifier once the scene is known."""
+
+    def densifier(
+        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
+    ) -> Densifier:
+        """For a field of n Gaussians on `device`; `extent` is 3DGS's cameras_extent, world units."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class DensitySettings:
+    """When Gaussians are cloned, split, pruned and reset. Window bounds are strict: start < t < stop.
+
+    Args:
+        threshold: on the mean over views of ‖∇_u‖ in NDC units; 3DGS 2e-4, sparse-view forks 5e-4.
+        mode: "quantile" picks as many by the score as the ordinary statistic would pick by the threshold; "fixed"
+            holds the score itself against the threshold. The same where the score is the ordinary one.
+        reduce: a Gaussian's statistic is the "mean" or the "max" over the views since the last round.
+        statistics_from: no statistics before it.
+        every: iterations between rounds; lowered where fewer than 10 rounds would fit.
+        clone_below: up to this share of the scene's extent a Gaussian is cloned, above it is split.
+        prune_opacity: fainter ones are removed. prune_world: also those larger than this share of the extent; None:
+            never.
+        reset_every: opacities are lowered to 0.01 this often inside the window; 0: never. White backgrounds get one
+            more reset at `start`.
+        max_gaussians: the cap; said when it binds.
+        min_gaussians: pruning below it is an error.
+    """
+
+    threshold: float = 5e-4
+    mode: Literal["quantile", "fixed"] = "quantile"
+    reduce: Literal["mean", "max"] = "mean"
+    start: int = milestone(500)
+    stop: int = milestone(5_000)
+    statistics_from: int = milestone(500)
+    reset_every: int = milestone(3_000)
+    every: int = 100
+    clone_below: float = 0.01
+    prune_opacity: float = 0.005
+    prune_world: float | None = None
+    max_gaussians: int = 1_000_000
+    min_gaussians: int = 10
+
+    def __post_init__(self) -> None:
+        if not self.threshold > 0:
+            raise ValueError(f"threshold must be > 0, got {self.threshold}.")
+        require_in_range(self)
+        if self.reduce not in ("mean", "max"):
+            raise ValueError(f"reduce must be mean or max, got {self.reduce!r}.")
+        if not 0 <= self.prune_opacity < 1:
+            raise ValueError(f"prune_opacity must lie in [0, 1), got {self.prune_opacity}.")
+
+    @property
+    def interval(self) -> int:
+        """`every`, or less where the window would not hold 10 rounds."""
+        return max(1, min(self.every, (self.stop - self.start) // _FEWEST_ROUNDS))
+
+    def densifier(
+        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
+    ) -> Density:
+        return Density(self, n, extent=extent, seed=seed, white_background=white_background, device=device)
+
+
+class Density:
+    """Statistics per Gaussian, and the change of structure that follows from them.
+
+    Args:
+        extent: 3DGS's cameras_extent, world units. white_background: adds the early opacity reset.
+        device: where the field lies.
+    """
+
+    name: Final = "density control"
+
+    def __init__(
+        self,
+        settings: DensitySettings,
+        n: int,
+        *,
+        extent: float,
+        seed: int,
+        white_background: bool = False,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.settings, self.extent, self.seed, self.white_background = settings, extent, seed, white_background
+        self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
+        self._said_cap = False
+
+    @property
+    def marks(self) -> Mapping[str, int]:
+        s = self.settings
+        reset = {"opacity reset": s.reset_every} if 0 < s.reset_every < s.stop else {}
+        return {"densify until": s.stop, **reset}
+
+    def accumulate(self, update: Update, shot: Shot, t: int) -> None:
+        """Add this view's scores for the Gaussians it saw (dropped ones are not seen)."""
+        if not self.settings.statistics_from < t < self.settings.stop:
+            return
+        seen = shot.visible
+        for total, value in ((self.score, update.score), (self.ordinary, update.ordinary)):
+            if self.settings.reduce == "max":
+                torch.maximum(total, torch.where(seen, value, total), out=total)
+            else:
+                total.add_(torch.where(seen, value, 0.0))
+        self.count += seen
+
+    def due(self, t: int) -> bool:
+        """Whether a round of densification and pruning falls on t."""
+        s = self.settings
+        return s.start < t < s.stop and t % s.interval == 0
+
+    def reset_due(self, t: int) -> bool:
+        """Whether opacities are reset at t."""
+        s = self.settings
+        early = self.white_background and t == s.start
+        return early or (s.start < t < s.stop and s.reset_every > 0 and t % s.reset_every == 0)
+
+    def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
+        if due := self.due(t):
+            resized(self.restructure(field, optimizer, t))
+        if self.reset_due(t):
+            self.reset_opacity(field, optimizer)
+        return due
+
+    def restructure(self, field: GaussianField, optimizer: Adam, t: int) -> Int[Tensor, " M"]:
+        """Clone, split, prune: returns parents[M], row i of everything per Gaussian now comes from row parents[i].
+
+        Raises:
+            DensityError: fewer than min_gaussians would be left.
+        """
+        s, n = self.settings, len(field)
+        chosen = self._chosen()
+        largest = field.scales.data.exp().amax(-1)
+        split = chosen & (largest > s.clone_below * self.extent)
+        keep = field.filtered_opacities() >= s.prune_opacity
+        if s.prune_world is not None:
+            keep &= largest <= s.prune_world * self.extent
+        if int(keep.sum()) < s.min_gaussians:
+            raise DensityError(
+                f"t={t}: pruning (opacity < {s.prune_opacity}, world size > {s.prune_world}) would leave "
+                f"{int(keep.sum())} of {n:,} Gaussians, fewer than min_gaussians={s.min_gaussians}. Lower "
+                "density.prune_opacity, or start from a denser cloud."
+            )
+        rows = torch.arange(n, device=chosen.device)
+        stay, clones, splits = rows[keep & ~split], rows[keep & chosen & ~split], rows[keep & split]
+        children = splits.repeat(_CHILDREN)
+        parents = torch.cat((stay, clones, children))
+        fresh = torch.arange(len(parents), device=parents.device) >= len(stay)
+        field.take(parents, fresh)
+        optimizer.take(parents, fresh)
+        self._spread(field, slice(len(stay) + len(clones), len(parents)), t)
+        self.score, self.ordinary, self.count = (self.score.new_zeros(len(parents)) for _ in range(3))
+        _log.info(
+            "t=%d: %d cloned, %d split, %d pruned: %d -> %d Gaussians.",
+            t, len(clones), len(splits), n - int(keep.sum()), n, len(parents),
+        )  # fmt: skip
+        return parents
+
+    def reset_opacity(self, field: GaussianField, optimizer: Adam) -> None:
+        """Lower what is drawn to 0.01, so that only what the views confirm comes back (Mip-Splatting's form)."""
+        coefficient = field.opacity_coefficient().clamp_min(torch.finfo(torch.float32).tiny)
+        target = field.filtered_opacities().clamp_max(_RESET_OPACITY) / coefficient
+        field.opacities.data = torch.minimum(field.opacities.data, torch.logit(target.clamp(1e-6, 1 - 1e-6)))
+        optimizer.forget("opacities")
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"score": self.score, "ordinary": self.ordinary, "count": self.count}
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        device = self.score.device
+        self.score, self.ordinary, self.count = (
+            tensors[name].to(device, copy=True) for name in ("score", "ordinary", "count")
+        )
+
+    def _chosen(self) -> Bool[Tensor, " N"]:
+        """Which Gaussians get more structure: the top by score, as many as the threshold and the cap allow."""
+        s = self.settings
+        seen = self.count.clamp_min(1) if s.reduce == "mean" else torch.ones_like(self.count)
+        score, ordinary = self.score / seen, self.ordinary / seen
+        wanted = int(((ordinary if s.mode == "quantile" else score) >= s.threshold).sum())
+        room = max(0, s.max_gaussians - len(score))
+        if wanted > room and not self._said_cap:
+            _log.warning(
+                "the cap of %d Gaussians binds: %d want to densify, %d may. Raise density.max_gaussians, or "
+                "density.threshold.", s.max_gaussians, wanted, room,
+            )  # fmt: skip
+            self._said_cap = True
+        order = torch.argsort(score, descending=True, stable=True)[: min(wanted, room)]
+        chosen = torch.zeros_like(score, dtype=torch.bool)
+        chosen[order] = score[order] > 0
+        return chosen
+
+    def _spread(self, field: GaussianField, children: slice, t: int) -> None:
+        """Place split children at random inside their parent, and make them smaller."""
+        scales = field.scales.data[children]
+        generator = torch.Generator(scales.device).manual_seed(self.seed * 1_000_003 + t)
+        offset = torch.randn(scales.shape, generator=generator, device=scales.device) * scales.exp()
+        rotation = rotation_matrix(field.quats.data[children])
+        field.means.data[children] += (rotation @ offset[..., None])[..., 0]
+        field.scales.data[children] = scales - math.log(_SHRINK)
+
+
+def cameras_extent(centers: Float[Tensor, "V 3"]) -> float:
+    """3DGS's scene size: 1.1 times the largest distance of a training camera from their mean, at least a little."""
+    radius = torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()
+    return max(1.1 * float(radius), 1e-6)
+
+
+def require_in_range(settings: Any) -> None:
+    """What every densifier's settings have in common.
+
+    Raises:
+        ValueError: one is outside its range.
+    """
+    if settings.mode not in ("quantile", "fixed"):
+        raise ValueError(f"mode must be quantile or fixed, got {settings.mode!r}.")
+    if min(settings.every, settings.max_gaussians, settings.min_gaussians) < 1 or settings.reset_every < 0:
+        raise ValueError("every, max_gaussians and min_gaussians must be at least 1, reset_every at least 0.")

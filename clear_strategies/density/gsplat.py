@@ -1,0 +1,487 @@
+"""Floor 4: another library's answer to who decides the structure: any strategy of gsplat's shape, over our field.
+
+gsplat's strategies rewrite dicts of parameters and of optimizers by gathering rows, and read the gradient of the projected
+centres. Here they get our parameters, our Adam's moments and our score in that shape, and what they leave is taken back.
+Which row became which is not guessed: the row numbers travel as one more parameter, and are gathered with the others.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import logging
+import math
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any, Final, Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from clear_strategies.core.gradients import ATTRIBUTES, Shot
+from clear_strategies.density.adaptive import DensityError, require_in_range
+from clear_strategies.errors import DataError
+from clear_strategies.merging.conductor import Update
+from clear_strategies.schedules import milestone
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.optim import Adam
+
+_log = logging.getLogger(__name__)
+
+_ROWS: Final = "rows"  # the parameter that holds the row numbers
+# gsplat's names of what every densifier of ours has, and ours.
+_OURS: Final = {
+    "refine_start_iter": "start",
+    "refine_stop_iter": "stop",
+    "refine_every": "every",
+    "reset_every": "reset_every",
+    "grow_grad2d": "threshold",
+    "cap_max": "max_gaussians",
+}
+_NEEDS_CUDA: Final = "gsplat.strategy.mcmc.MCMCStrategy"
+# Settings that ask for what a view of this trainer does not report, and the value that does not ask.
+_NOT_REPORTED: Final = {
+    "absgrad": (False, "absolute screen gradients"),
+    "refine_scale2d_stop_iter": (0, "screen radii"),
+    "key_for_gradient": ("means2d", "other gradients than that of the projected centre"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class GsplatSettings:
+    """Which strategy, and what it shares with `DensitySettings`, by the names there; start < t < stop here as well.
+
+    Args:
+        strategy: `_target_`, the dotted name of a class of gsplat's shape, and its other settings by their own names. It
+            is imported when training starts.
+        threshold: gsplat's grow_grad2d, on the mean over views of ‖∇_u‖ in NDC units; None: the strategy's own.
+        mode: "quantile" moves the threshold so that as many Gaussians pass it by the score as would by the ordinary
+            statistic; "fixed" leaves it. The same where the score is the ordinary one.
+        start, stop, every: gsplat's refine_start_iter, refine_stop_iter and refine_every.
+        reset_every: 0: never (then DefaultStrategy never prunes by size either).
+        statistics_from: before it no Gaussian counts as seen.
+        max_gaussians: gsplat's cap_max; DefaultStrategy has none, there the threshold rises until it holds.
+        min_gaussians: fewer are an error.
+
+    Raises:
+        ValueError: a setting is outside its range, or written in `strategy` although it stands beside it.
+    """
+
+    strategy: Mapping[str, Any]
+    threshold: float | None = None
+    mode: Literal["quantile", "fixed"] = "quantile"
+    start: int = milestone(500)
+    stop: int = milestone(5_000)
+    every: int = milestone(100, least=1)
+    reset_every: int = milestone(3_000)
+    statistics_from: int = milestone(500)
+    max_gaussians: int = 1_000_000
+    min_gaussians: int = 10
+
+    def __post_init__(self) -> None:
+        for theirs, ours in _OURS.items():
+            if theirs in self.strategy:
+                raise ValueError(f"strategy.{theirs} must stand beside the strategy, not in it: density.{ours}.")
+        if self.threshold is not None and not self.threshold > 0:
+            raise ValueError(f"threshold must be > 0, got {self.threshold}.")
+        require_in_range(self)
+
+    def densifier(
+        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
+    ) -> GsplatDensifier:
+        """Import and build the strategy.
+
+        Raises:
+            DataError: it cannot be imported or built, or asks for what this trainer does not have.
+        """
+        device = torch.device(device)
+        return GsplatDensifier(self, self._build(device), n, extent=extent, seed=seed, device=device)
+
+    def _build(self, device: torch.device) -> Any:
+        given = dict(self.strategy)
+        kind = _imported(given.pop("_target_", None), device)
+        for name, (silent, what) in _NOT_REPORTED.items():
+            if given.get(name, silent) != silent:
+                raise _unusable(name, f"asks for {what}, which our rasterizers do not report", f"leave it at {silent}")
+        ours = {theirs: getattr(self, name) for theirs, name in _OURS.items()}
+        ours["reset_every"] = self.reset_every or sys.maxsize
+        accepted = inspect.signature(kind).parameters
+        taken = {name: value for name, value in ours.items() if name in accepted and value is not None}
+        for theirs, name in _OURS.items():
+            capped = name == "max_gaussians" and "grow_grad2d" in accepted
+            if theirs not in accepted and getattr(self, name) and not capped:
+                _log.warning("%s has no %s: density.%s has no effect.", kind.__name__, theirs, name)
+        try:
+            return kind(**given, **taken)
+        except (TypeError, ValueError) as error:
+            raise _unusable("", f"{kind.__name__} cannot be built: {error}", "see its own documentation") from error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Seen:
+    """What one view says; `score` is `ordinary` itself where no strategy of ours gave another."""
+
+    score: Float[Tensor, " N"]
+    ordinary: Float[Tensor, " N"]
+    visible: Bool[Tensor, " N"]
+    means2d: Float[Tensor, "N 2"]
+    width: int
+    height: int
+
+
+class GsplatDensifier:
+    """Drives a strategy of gsplat's shape over our field and our Adam.
+
+    Args:
+        strategy: has check_sanity, initialize_state, step_pre_backward and step_post_backward. It and its `state` dict
+            are its own; tensors and numbers in the dict are saved with the run.
+        extent: 3DGS's cameras_extent, world units: gsplat's scene_scale. seed: of whatever the strategy draws.
+        device: where the field lies.
+    """
+
+    def __init__(
+        self,
+        settings: GsplatSettings,
+        strategy: Any,
+        n: int,
+        *,
+        extent: float,
+        seed: int,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.settings, self.strategy, self.extent, self.seed = settings, strategy, extent, seed
+        self.kind = type(strategy).__name__
+        self.state = self._initial_state()
+        self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
+        self._seen: _Seen | None = None
+        self._checked = False
+        self._said: set[str] = set()
+
+    @property
+    def name(self) -> str:
+        version = _gsplat_version()
+        return self.kind if version is None else f"{self.kind} (gsplat {version})"
+
+    @property
+    def marks(self) -> Mapping[str, int]:
+        s = self.settings
+        reset = {"opacity reset": s.reset_every} if 0 < s.reset_every < s.stop else {}
+        return {"densify until": s.stop, **reset}
+
+    def accumulate(self, update: Update, shot: Shot, t: int) -> None:
+        """Hold this view's score ready for `step`."""
+        height, width = shot.image.shape[:2]
+        visible = shot.visible if t > self.settings.statistics_from else torch.zeros_like(shot.visible)
+        self._seen = _Seen(update.score, update.ordinary, visible, shot.means2d.detach(), width, height)
+
+    def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
+        """Let the strategy do what falls on t.
+
+        Raises:
+            DensityError: it left too few Gaussians, or rows that do not belong together.
+        """
+        seen, self._seen = self._seen, None
+        if seen is None:
+            raise ValueError(f"t={t}: step() must follow accumulate() of the same iteration.")
+        n = len(field)
+        self.score += torch.where(seen.visible, seen.score, 0.0)
+        self.ordinary += torch.where(seen.visible, seen.ordinary, 0.0)
+        self.count += seen.visible
+        rates = optimizer.rates.at(optimizer.steps, optimizer.extent)
+        params, optimizers = lend(field, optimizer, rates)
+        if not self._checked:
+            self._check(params, optimizers)
+        info = _Info(_info(seen))
+        accepted = inspect.signature(self.strategy.step_post_backward).parameters
+        rest = {"lr": rates["means"]} if "lr" in accepted else {}
+        lent = _Lent(params[_ROWS])
+        with torch.no_grad(), _seeded(self.seed * 1_000_003 + t, lent.rows.device), self._threshold(t):
+            self.strategy.step_pre_backward(params, optimizers, self.state, t, info)
+            self.strategy.step_post_backward(params, optimizers, self.state, t, info, **rest)
+        moved = not lent.untouched(params[_ROWS])
+        parents = take_back(field, optimizer, params, optimizers, self.kind, moved=moved)
+        self._remark(t, seen, info, optimizer)
+        changed = moved and not torch.equal(parents, torch.arange(n, device=parents.device))
+        if changed:
+            self.score, self.ordinary, self.count = (x[parents] for x in (self.score, self.ordinary, self.count))
+            self._report(parents, n, t)
+            resized(parents)
+        self._begin_anew()
+        return changed
+
+    def state_dict(self) -> dict[str, Tensor]:
+        own = {"score": self.score, "ordinary": self.ordinary, "count": self.count}
+        for name, value in self.state.items():
+            if isinstance(value, Tensor):
+                own[f"state.{name}"] = value
+            elif isinstance(value, bool | int | float):
+                own[f"state.{name}"] = torch.tensor(value, dtype=torch.float64 if isinstance(value, float) else None)
+            elif value is not None:
+                self._warn_once(
+                    name,
+                    f"checkpoints cannot hold {self.kind}'s {name!r}, a {type(value).__name__}: a resumed run starts it "
+                    "anew.",
+                )
+        return own
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        device = self.score.device
+        self.score, self.ordinary, self.count = (
+            tensors[name].to(device, copy=True) for name in ("score", "ordinary", "count")
+        )
+        self.state = self._initial_state()
+        for key, value in tensors.items():
+            if key.startswith("state."):
+                name = key.removeprefix("state.")
+                number = isinstance(self.state.get(name), bool | int | float)
+                self.state[name] = value.item() if number else value.to(device, copy=True)
+
+    def _initial_state(self) -> dict[str, Any]:
+        make = self.strategy.initialize_state
+        scene = {"scene_scale": self.extent} if "scene_scale" in inspect.signature(make).parameters else {}
+        return dict(make(**scene))
+
+    def _check(self, params: dict[str, nn.Parameter], optimizers: Mapping[str, Optimizer]) -> None:
+        try:
+            self.strategy.check_sanity(params, optimizers)
+        except AssertionError as error:
+            raise DensityError(f"{self.kind} refuses these parameters: {error}") from error
+        self._checked = True
+
+    @contextmanager
+    def _threshold(self, t: int) -> Iterator[None]:
+        """While the strategy may grow, its threshold is one that the right number of Gaussians pass."""
+        own = getattr(self.strategy, "grow_grad2d", None)
+        if own is None or t % getattr(self.strategy, "refine_every", 1) != 0:
+            yield
+            return
+        self.strategy.grow_grad2d = self._selective(own)
+        try:
+            yield
+        finally:
+            self.strategy.grow_grad2d = own
+
+    def _selective(self, threshold: float) -> float:
+        """`threshold` where it picks as many by the score as are wanted and the cap allows, else one that does."""
+        s, seen = self.settings, self.count.clamp_min(1)
+        score, ordinary = self.score / seen, self.ordinary / seen
+        wanted = int(((ordinary if s.mode == "quantile" else score) > threshold).sum())
+        room = max(0, s.max_gaussians - len(score))
+        if wanted > room:
+            self._warn_once(
+                "cap",
+                f"the cap of {s.max_gaussians} Gaussians binds: {wanted} want to densify, {room} may. Raise "
+                "density.max_gaussians, or density.threshold.",
+            )
+        allowed = min(wanted, room)
+        return threshold if allowed == int((score > threshold).sum()) else topk_threshold(score, allowed)
+
+    def _begin_anew(self) -> None:
+        """Our sums are set to 0 when the strategy's own are."""
+        count = self.state.get("count")
+        if isinstance(count, Tensor):
+            begun = ~count.any()
+            for total in (self.score, self.ordinary, self.count):
+                total.masked_fill_(begun, 0)
+
+    def _report(self, parents: Int[Tensor, " M"], n: int, t: int) -> None:
+        children = torch.bincount(parents, minlength=n)
+        grown, gone = int((children > 1).sum()), int((children == 0).sum())
+        _log.info("t=%d: %s: %d grown, %d removed: %d -> %d Gaussians.", t, self.kind, grown, gone, n, len(parents))
+        if len(parents) < self.settings.min_gaussians:
+            raise DensityError(
+                f"t={t}: {self.kind} left {len(parents)} of {n:,} Gaussians, fewer than "
+                f"min_gaussians={self.settings.min_gaussians}. Prune less, or start from a denser cloud."
+            )
+
+    def reset_due(self, t: int) -> bool:
+        return t < self.settings.stop and t % getattr(self.strategy, "reset_every", sys.maxsize) == 0
+
+    def _remark(self, t: int, seen: _Seen, info: _Info, optimizer: Adam) -> None:
+        """Say once what was set and had no effect."""
+        if seen.score is not seen.ordinary and "means2d" not in info.read:
+            self._warn_once(
+                "score", f"{self.kind} reads no screen gradient: P2G's score has no effect on the structure."
+            )
+        if self.reset_due(t) and bool(optimizer.second["opacities"].any()):  # a reset leaves no momentum
+            self._warn_once(
+                "reset",
+                f"t={t}: density.reset_every falls here, and {self.name} reset no opacity. gsplat 1.5's DefaultStrategy "
+                "never does.",
+            )
+
+    def _warn_once(self, about: str, message: str) -> None:
+        if about not in self._said:
+            self._said.add(about)
+            _log.warning("%s", message)
+
+
+class Optimizer:
+    """What a strategy of gsplat's shape may touch of a torch optimizer: one group, and its one parameter's moments."""
+
+    def __init__(self, parameter: nn.Parameter, lr: float, moments: Mapping[str, Tensor]) -> None:
+        self.param_groups: list[dict[str, Any]] = [{"params": [parameter], "lr": lr}]
+        self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict, {parameter: dict(moments)})
+
+
+class _Lent:
+    """The row numbers as they were lent. Whether they were gathered is seen from outside, without reading them."""
+
+    def __init__(self, rows: nn.Parameter) -> None:
+        self.rows, self._version = rows, rows._version
+
+    def untouched(self, now: Tensor) -> bool:
+        return now is self.rows and now._version == self._version
+
+
+class _Info(dict[str, Any]):
+    """gsplat's `info`, which notes what of it was read."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        super().__init__(values)
+        self.read: set[str] = set()
+
+    def __getitem__(self, key: str) -> Any:
+        self.read.add(key)
+        return super().__getitem__(key)
+
+    def __missing__(self, key: str) -> Any:
+        raise DensityError(f"the strategy reads info[{key!r}]; this trainer has {', '.join(self)}.")
+
+
+def lend(
+    field: GaussianField, optimizer: Adam, rates: Mapping[str, float]
+) -> tuple[dict[str, nn.Parameter], dict[str, Optimizer]]:
+    """Field and moments as gsplat's dicts, sharing memory, with the row numbers as one more parameter."""
+    params = {name: nn.Parameter(p) for name, p in field.raw().items()}
+    steps = torch.tensor(float(optimizer.steps), device="cpu")  # as torch's Adam keeps it
+    optimizers = {
+        name: Optimizer(
+            p, rates[name], {"step": steps, "exp_avg": optimizer.first[name], "exp_avg_sq": optimizer.second[name]}
+        )
+        for name, p in params.items()
+    }
+    # In float64: a parameter that an optimizer holds cannot be of integers, and these are exact up to 2⁵³.
+    params[_ROWS] = nn.Parameter(torch.arange(len(field), dtype=torch.float64, device=field.means.device))
+    optimizers[_ROWS] = Optimizer(params[_ROWS], 0.0, {})
+    return params, optimizers
+
+
+def take_back(
+    field: GaussianField,
+    optimizer: Adam,
+    params: Mapping[str, Tensor],
+    optimizers: Mapping[str, Optimizer],
+    kind: str = "the strategy",
+    *,
+    moved: bool = True,
+) -> Int[Tensor, " M"]:
+    """Put what a strategy left into field and moments; returns parents[M].
+
+    Args:
+        moved: whether the row numbers may be others than were lent.
+
+    Raises:
+        DensityError: the rows of parameters, moments and row numbers do not belong together.
+    """
+    rows = params[_ROWS].detach()
+    parents = rows.long()
+    if moved and not bool(((parents == rows) & (parents >= 0) & (parents < len(field))).all()):
+        raise DensityError(f"{kind} changed the parameter {_ROWS!r}; row numbers may only be gathered.")
+    for name in ATTRIBUTES:
+        p = params[name]
+        moments = optimizers[name].state.get(p, {})
+        for found in (p, moments.get("exp_avg"), moments.get("exp_avg_sq")):
+            if found is None or len(found) != len(parents):
+                raise DensityError(
+                    f"{kind} left {name} with {'no moments' if found is None else f'{len(found)} rows'} where {_ROWS!r} "
+                    f"has {len(parents)}; it must rewrite every entry of params and optimizers alike."
+                )  # fmt: skip
+        getattr(field, name).data = p.detach().contiguous()
+        optimizer.first[name] = moments["exp_avg"].detach().contiguous()
+        optimizer.second[name] = moments["exp_avg_sq"].detach().contiguous()
+    if moved:
+        field.filter_3d = field.filter_3d[parents]
+    field.constrain()
+    return parents
+
+
+def topk_threshold(score: Float[Tensor, " N"], k: int) -> float:
+    """A threshold that the k highest scores exceed (fewer where scores are equal); scores of 0 never do."""
+    if k == 0:
+        return math.inf
+    ranked = score.double().sort(descending=True).values
+    following = float(ranked[k]) if k < len(ranked) else 0.0
+    return (float(ranked[k - 1]) + following) / 2
+
+
+def _info(seen: _Seen) -> dict[str, Any]:
+    """One camera's `info`, not packed; the screen gradient is the score, along x.
+
+    gsplat takes the gradient in pixels to NDC by W/2 times the number of cameras; so its statistic is the score itself.
+    """
+    means2d = seen.means2d[None].clone().requires_grad_()
+    means2d.grad = torch.zeros_like(means2d)
+    means2d.grad[0, :, 0] = seen.score / (seen.width / 2)
+    radii = seen.visible.float()[None]  # 1 where seen: our rasterizers report no size
+    if _radii_by_axis():
+        radii = radii[..., None].expand(-1, -1, 2)
+    return {
+        "means2d": means2d, "radii": radii, "width": seen.width, "height": seen.height, "n_cameras": 1,
+        "gaussian_ids": None, "camera_ids": None,
+    }  # fmt: skip
+
+
+def _gsplat_version() -> str | None:
+    try:
+        return metadata.version("gsplat")
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _radii_by_axis() -> bool:
+    """Since gsplat 1.5 radii are [C, N, 2], before it [C, N]."""
+    version = _gsplat_version()
+    return version is None or tuple(int(part) for part in version.split(".")[:2]) >= (1, 5)
+
+
+@contextmanager
+def _seeded(seed: int, device: torch.device) -> Iterator[None]:
+    """What torch draws globally, as gsplat does, is here a function of (seed, t), and as before afterwards."""
+    on_cuda = device.type == "cuda"
+    with torch.random.fork_rng(devices=[device] if on_cuda else []):
+        torch.default_generator.manual_seed(seed)  # torch.manual_seed would look for other devices, every time
+        if on_cuda:
+            torch.cuda.manual_seed(seed)
+        yield
+
+
+def _imported(target: str | None, device: torch.device) -> Any:
+    """The class of that dotted name."""
+    if target is None:
+        example = "density.strategy._target_=your_package.YourStrategy"
+        raise _unusable("_target_", "no strategy is named", f"{example}, or density=gsplat_default")
+    module, _, name = target.rpartition(".")
+    try:
+        kind = getattr(importlib.import_module(module), name)
+    except ImportError as error:
+        gsplat = "gsplat" in f"{target} {error}"
+        remedy = "pip install 'clear-strategies[gsplat]'" if gsplat else "correct its dotted name"
+        raise _unusable("_target_", f"{target} cannot be imported ({error})", remedy) from error
+    except (AttributeError, ValueError) as error:
+        raise _unusable("_target_", f"{target} is not there ({error})", "correct its dotted name") from error
+    if f"{kind.__module__}.{kind.__qualname__}" == _NEEDS_CUDA and device.type != "cuda":
+        raise _unusable(
+            "_target_", "gsplat's MCMCStrategy moves Gaussians by CUDA kernels, and these are on the CPU",
+            "take density=gsplat_mcmc, the same strategy with those computations in torch",
+        )  # fmt: skip
+    return kind
+
+
+def _unusable(field: str, problem: str, remedy: str) -> DataError:
+    return DataError("config", f"density.strategy.{field}".rstrip("."), problem, remedy)

@@ -1,0 +1,129 @@
+"""The trainer's own hot loops: image losses with their gradients.
+
+`torch` is the specification, in float64 inside; the others agree with it, for images of float32: `cpp` runs on the CPU,
+where it was built, `warp` on CUDA, where NVIDIA Warp is installed. Every function takes `kernels` to choose: "auto" (the
+fastest that takes these images where they lie), "torch", "cpp" or "warp".
+"""
+
+from __future__ import annotations
+
+import logging
+from functools import cache
+from typing import Literal, Protocol, get_args, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.kernels.losses import cpp, warp
+from clear_strategies.kernels.losses import reference as reference
+from clear_strategies.kernels.losses.reference import LossAndGradient
+
+__all__ = [
+    "Choice",
+    "Implementation",
+    "LossAndGradient",
+    "haar_l1",
+    "implementations",
+    "l1",
+    "photometric",
+    "require",
+    "ssim",
+]
+
+_log = logging.getLogger(__name__)
+
+Choice = Literal["auto", "torch", "cpp", "warp"]
+
+
+@runtime_checkable
+class Implementation(Protocol):
+    """What a module of kernels offers; `torch` says what each function means."""
+
+    def photometric(self, x: Tensor, y: Tensor, lambda_ssim: float, out: Tensor | None = None) -> LossAndGradient: ...
+
+    def l1(self, x: Tensor, y: Tensor) -> LossAndGradient: ...
+
+    def ssim(self, x: Tensor, y: Tensor) -> LossAndGradient: ...
+
+    def haar_l1(self, x: Tensor, y: Tensor, levels: int = 1, out: Tensor | None = None) -> LossAndGradient: ...
+
+
+def implementations(device: str = "cpu") -> dict[str, Implementation]:
+    """Those to be used for images on `device`, "cpu" or "cuda", by name, the fastest first.
+
+    On a CPU Warp's kernels are there to be checked: they are taken only by name.
+    """
+    found: dict[str, Implementation] = {}
+    if device == "cpu" and cpp.available():
+        found["cpp"] = cpp
+    if device == "cuda" and warp.available():
+        found["warp"] = warp
+    return found | {"torch": reference}
+
+
+def require(kernels: Choice) -> None:
+    """Make sure of a choice before it is needed.
+
+    Raises:
+        ValueError: there is no such implementation.
+        BackendUnavailable: "cpp" was not built, or Warp is not installed; the message says what to do.
+    """
+    if kernels not in get_args(Choice):
+        raise ValueError(f"kernels must be one of {', '.join(get_args(Choice))}, got {kernels!r}.")
+    if kernels == "cpp":
+        cpp.native()
+    if kernels == "warp":
+        warp.needed("cpu")
+
+
+def photometric(
+    x: Float[Tensor, "H W C"],
+    y: Float[Tensor, "H W C"],
+    lambda_ssim: float,
+    *,
+    kernels: Choice = "auto",
+    out: Float[Tensor, "H W C"] | None = None,
+) -> LossAndGradient:
+    """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient with respect to x, written into `out` if given."""
+    return _choose(kernels, x, y).photometric(x, y, lambda_ssim, out)
+
+
+def haar_l1(
+    x: Float[Tensor, "H W C"],
+    y: Float[Tensor, "H W C"],
+    levels: int = 1,
+    *,
+    kernels: Choice = "auto",
+    out: Float[Tensor, "H W C"] | None = None,
+) -> LossAndGradient:
+    """Mean absolute difference of Haar details, averaged over levels, with its gradient, written into `out` if given."""
+    return _choose(kernels, x, y).haar_l1(x, y, levels, out)
+
+
+def l1(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], *, kernels: Choice = "auto") -> LossAndGradient:
+    """Mean absolute difference, with its gradient."""
+    return _choose(kernels, x, y).l1(x, y)
+
+
+def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], *, kernels: Choice = "auto") -> LossAndGradient:
+    """Mean structural similarity, with its gradient."""
+    return _choose(kernels, x, y).ssim(x, y)
+
+
+def _choose(kernels: Choice, x: Tensor, y: Tensor) -> Implementation:
+    require(kernels)
+    if kernels == "auto":
+        kernels = _fastest(x, y)
+    _say(f"cpp, for {cpp.native().isa}" if kernels == "cpp" else kernels)
+    return {"torch": reference, "cpp": cpp, "warp": warp}[kernels]
+
+
+def _fastest(x: Tensor, y: Tensor) -> Choice:
+    if x.device.type == "cpu":
+        return "cpp" if cpp.accepts(x, y) and cpp.available() else "torch"
+    return "warp" if warp.accepts(x, y) and warp.available() else "torch"
+
+
+@cache
+def _say(which: str) -> None:
+    _log.info("image losses: %s.", which)

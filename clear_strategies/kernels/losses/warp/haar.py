@@ -1,0 +1,98 @@
+"""What runs on the device for Haar-L1: the details of every block of 2 x 2 pixels, and their signs' way back.
+
+A level turns a block (a b; c d) of x - y into its low part (a+b+c+d)/2, which the next level goes on with, and three
+details: (a-b+c-d)/2, (a+b-c-d)/2, (a-b-c+d)/2. An odd last row or column is repeated; the pixel that stood in for its
+neighbour then receives the gradient of both.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, no_type_check
+
+import warp as wp
+
+from clear_strategies.kernels.losses.warp.sums import sign
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+@no_type_check
+def pixel(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, row: wp.int32, column: wp.int32) -> wp.vec3:
+    """Of x - y at the first level, of x, a low part, at the others; the last one stands in for those beyond it."""
+    i, j = wp.min(row, x.shape[0] - 1), wp.min(column, x.shape[1] - 1)
+    if first:
+        return x[i, j] - y[i, j]
+    return x[i, j]
+
+
+@wp.func
+@no_type_check
+def signs(v: wp.vec3) -> wp.vec3:
+    return wp.vec3(sign(v[0]), sign(v[1]), sign(v[2]))
+
+
+@wp.func
+@no_type_check
+def magnitude(v: wp.vec3) -> wp.float32:
+    return wp.abs(v[0]) + wp.abs(v[1]) + wp.abs(v[2])
+
+
+@wp.kernel
+@no_type_check
+def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, low: wp.array2d[wp.vec3]) -> None:
+    """A thread per block."""
+    i, j = wp.tid()
+    a, b = pixel(x, y, first, 2 * i, 2 * j), pixel(x, y, first, 2 * i, 2 * j + 1)
+    c, d = pixel(x, y, first, 2 * i + 1, 2 * j), pixel(x, y, first, 2 * i + 1, 2 * j + 1)
+    low[i, j] = 0.5 * (a + b + c + d)
+
+
+@cache
+@no_type_check
+def details(lanes: int) -> Any:
+    """The kernel, with `lanes` threads for each row of blocks, of weight · Σ |details| + <above, low part>.
+
+    It writes the gradient, and the row's part of the first sum. There is no `above` at the last level.
+    """
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def details(
+        x: wp.array2d[wp.vec3],
+        y: wp.array2d[wp.vec3],
+        first: wp.bool,
+        above: wp.array2d[wp.vec3],
+        last: wp.bool,
+        weight: wp.float64,
+        out: wp.array2d[wp.vec3],
+        parts: wp.array[wp.float64],
+    ) -> None:
+        i, lane = wp.tid()
+        step = 0.5 * wp.float32(weight)
+        share = wp.float64(0.0)
+        for j in range(lane, (x.shape[1] + 1) / 2, lanes):
+            a, b = pixel(x, y, first, 2 * i, 2 * j), pixel(x, y, first, 2 * i, 2 * j + 1)
+            c, d = pixel(x, y, first, 2 * i + 1, 2 * j), pixel(x, y, first, 2 * i + 1, 2 * j + 1)
+            horizontal, vertical, diagonal = a - b + c - d, a + b - c - d, a - b - c + d  # doubled
+            share += wp.float64(magnitude(horizontal) + magnitude(vertical) + magnitude(diagonal))
+            h, v, hv = step * signs(horizontal), step * signs(vertical), step * signs(diagonal)
+            low = wp.vec3(0.0, 0.0, 0.0)
+            if not last:
+                low = 0.5 * above[i, j]
+            a, b, c, d = low + h + v + hv, low - h + v - hv, low + h - v - hv, low - h - v + hv
+            has_right, has_lower = 2 * j + 1 < x.shape[1], 2 * i + 1 < x.shape[0]
+            if not has_right:
+                a, c = a + b, c + d
+            if not has_lower:
+                a, b = a + c, b + d
+            out[2 * i, 2 * j] = a
+            if has_right:
+                out[2 * i, 2 * j + 1] = b
+            if has_lower:
+                out[2 * i + 1, 2 * j] = c
+            if has_right and has_lower:
+                out[2 * i + 1, 2 * j + 1] = d
+        wp.tile_store(parts, wp.tile_sum(wp.tile(wp.float64(0.5) * weight * share)), offset=(i,))
+
+    return details

@@ -1,0 +1,79 @@
+"""The order of the kernels, and the memory between them. What they write goes to `images.gradient`; the loss is returned."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import torch
+import warp as wp
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.kernels.losses.prepared import Prepared
+from clear_strategies.kernels.losses.warp import haar, similarity, sums
+from rasterizers.warp_backend.launch import array, on_stream
+
+_LANES: Final = {"cuda": 256, "cpu": 1}  # threads a block; on a CPU Warp's blocks have one
+
+
+def photometric(images: Prepared, l1: float, dssim: float, start: float = 0.0) -> Float[Tensor, ""]:
+    """The value l1 · mean |x - y| + dssim · (1 - SSIM) + start; without weight on SSIM none is computed."""
+    x, y, out = (image.flatten(1) for image in images)
+    height, width = x.shape
+    l1_share, dssim_share = l1 / x.numel(), dssim / x.numel()
+    with on_stream(x.device):
+        if dssim == 0:
+            parts = _parts(x, height)
+            _launch(sums.absolute, [height], x.device, array(x), array(y), l1_share, l1_share, array(out), array(parts))
+        else:
+            blocks = [-(-height // similarity.ROWS), -(-width // similarity.STRIDE)]
+            parts, maps = _parts(x, blocks[0] * blocks[1]), x.new_empty(similarity.MAPS, height, width)
+            _launch(similarity.similarity, blocks, x.device, array(x), array(y), dssim_share, array(maps), array(parts))
+            _launch(
+                similarity.gradient, blocks, x.device, array(x), array(y), array(maps), l1_share, l1_share,
+                -dssim_share, array(out), array(parts),
+            )  # fmt: skip
+        return _total(parts, start)
+
+
+def haar_l1(images: Prepared, levels: int) -> Float[Tensor, ""]:
+    """Mean |detail| of each level, averaged over the levels."""
+    x, y, out = images
+    with on_stream(x.device):
+        pyramid = [x]  # what each level takes apart; at the first it is x - y
+        for _ in range(levels - 1):
+            finer = pyramid[-1]
+            low = finer.new_empty(-(-finer.shape[0] // 2), -(-finer.shape[1] // 2), 3)
+            wp.launch(
+                haar.low_part, low.shape[:2], device=wp.device_from_torch(x.device),
+                inputs=[array(finer, wp.vec3), array(y, wp.vec3), finer is x, array(low, wp.vec3)],
+            )  # fmt: skip
+            pyramid.append(low)
+        rows = [-(-level.shape[0] // 2) for level in pyramid]  # of blocks
+        parts, above = _parts(x, sum(rows)), None
+        for level, own in zip(reversed(pyramid), reversed(torch.split(parts, rows)), strict=True):
+            gradient = out if level is x else torch.empty_like(level)
+            weight = 1 / (9 * len(own) * -(-level.shape[1] // 2) * levels)  # three details of three channels
+            _launch(
+                haar.details, [len(own)], x.device, array(level, wp.vec3), array(y, wp.vec3), level is x,
+                array(above, wp.vec3), above is None, weight, array(gradient, wp.vec3), array(own),
+            )  # fmt: skip
+            above = gradient
+        return _total(parts, 0.0)
+
+
+def _parts(like: Tensor, blocks: int) -> Tensor:
+    return like.new_empty(blocks, dtype=torch.float64)
+
+
+def _total(parts: Tensor, start: float) -> Float[Tensor, ""]:
+    value = parts.new_empty((), dtype=torch.float32)
+    _launch(sums.total, [1], parts.device, array(parts), start, array(value.view(1)))
+    return value
+
+
+def _launch(kernel: Any, blocks: Sequence[int], device: torch.device, *arguments: Any) -> None:
+    """`kernel` is made for a number of threads a block; the arguments are the kernel's."""
+    lanes = _LANES[device.type]
+    wp.launch_tiled(kernel(lanes), dim=blocks, block_dim=lanes, inputs=arguments, device=wp.device_from_torch(device))

@@ -1,0 +1,209 @@
+"""What runs on the device for SSIM (11 x 11 Gaussian window of σ = 1.5, zero padding): its maps, and the gradient.
+
+In the sum s = x + y and the difference d = y - x of the images the formula falls into two factors,
+
+    SSIM = (1 - u)(1 - n),   u = μd² / B1,  B1 = (μs² + μd²)/2 + C1,   n = σd² / B2,  B2 = (σs² + σd²)/2 + C2,
+
+and with a window w around q the gradient at a pixel p is
+
+    ∂Σ SSIM / ∂x_p = Σ_q w(p-q) [a(q) + b(q) (s_p - μs(q)) + c(q) (d_p - μd(q))],
+    a = (1-n) (2μd + u (μs - μd)) / B1,   b = (1-u) n / B2,   c = (1-u) (2-n) / B2.
+
+Windows are separable: down the columns first, then along the rows; and every sum is taken about a value from within its
+window, or flat regions would lose their variance (STRESS row 8). Both are as in `kernels/src/ssim.hpp`.
+
+Pixels are interleaved: a row is W · 3 numbers, and a neighbour is three further on. A block of threads owns `ROWS` rows of
+`WIDTH` numbers, those that its windows reach on either side included, a thread a column: it goes down the column with the
+block's rows in registers, leaves the sums where the other threads see them (shared memory), and goes on along the rows.
+On a CPU, where Warp's blocks have one thread, that thread takes the columns in turn.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, Final, no_type_check
+
+import warp as wp
+
+from clear_strategies.kernels.losses.reference import gaussian_window
+from clear_strategies.kernels.losses.warp.sums import sign
+
+wp.set_module_options({"enable_backward": False})
+
+REACH: Final = 5
+TAPS: Final = 2 * REACH + 1
+ROWS: Final = 6  # with what the window reaches above and below 16, the longest loop that Warp unrolls
+SPAN: Final = ROWS + TAPS - 1
+WIDTH: Final = 256
+HALO: Final = 3 * REACH
+STRIDE: Final = WIDTH - 2 * HALO
+"""Numbers of a row that a block answers for; the rest is what their windows reach."""
+MAPS: Final = 5
+"""For each number: μs, μd, a, b and c."""
+
+Rows: Final[Any] = wp.types.vector(length=ROWS, dtype=wp.float32)
+WINDOW: Final = wp.constant(wp.types.vector(length=TAPS, dtype=wp.float32)(*gaussian_window()))
+SHARES: Final = wp.constant(
+    wp.types.matrix(shape=(SPAN, ROWS), dtype=wp.float32)(
+        *(gaussian_window()[k - r] if 0 <= k - r < TAPS else 0.0 for k in range(SPAN) for r in range(ROWS))
+    )
+)
+"""Weights of the k-th row that a block reads in the windows around each of its rows."""
+C1: Final = wp.constant(0.01**2)
+C2: Final = wp.constant(0.03**2)
+
+
+@wp.func
+@no_type_check
+def pair_at(x: wp.array2d[wp.float32], y: wp.array2d[wp.float32], row: wp.int32, column: wp.int32) -> wp.vec2:
+    """The sum s and the difference d, 0 beyond the image. It reads in any case: loads that wait for no condition overlap."""
+    i, j = wp.clamp(row, 0, x.shape[0] - 1), wp.clamp(column, 0, x.shape[1] - 1)
+    pair = wp.vec2(x[i, j] + y[i, j], y[i, j] - x[i, j])
+    return wp.where(i == row and j == column, pair, wp.vec2(0.0, 0.0))
+
+
+@wp.func
+@no_type_check
+def map_at(maps: wp.array3d[wp.float32], nth: wp.int32, row: wp.int32, column: wp.int32) -> wp.float32:
+    """Beyond the image 0: nothing is passed on from there."""
+    i, j = wp.clamp(row, 0, maps.shape[1] - 1), wp.clamp(column, 0, maps.shape[2] - 1)
+    return wp.where(i == row and j == column, maps[nth, i, j], 0.0)
+
+
+@wp.func
+@no_type_check
+def blocks_across(width: wp.int32) -> wp.int32:
+    return (width + STRIDE - 1) / STRIDE
+
+
+@cache
+@no_type_check
+def similarity(lanes: int) -> Any:
+    """The kernel, with `lanes` threads a block, that makes the maps; a block's part is weight · Σ (1 - SSIM)."""
+    turns = WIDTH // lanes
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def similarity(
+        x: wp.array2d[wp.float32],
+        y: wp.array2d[wp.float32],
+        weight: wp.float64,
+        maps: wp.array3d[wp.float32],
+        parts: wp.array[wp.float64],
+    ) -> None:
+        group, across, lane = wp.tid()
+        height, width = x.shape[0], x.shape[1]
+        top, left = group * ROWS, across * STRIDE - HALO
+        mean_s = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+        mean_d = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+        var_s = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+        var_d = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+
+        for turn in range(turns):
+            at = turn * lanes
+            column = left + at + lane
+            origin = pair_at(x, y, wp.min(top + ROWS / 2, height - 1), column)
+            MS, MD, VS, VD = Rows(), Rows(), Rows(), Rows()
+            for k in range(SPAN):
+                near, w = pair_at(x, y, top - REACH + k, column) - origin, SHARES[k]
+                MS += w * near[0]
+                MD += w * near[1]
+                VS += w * (near[0] * near[0])
+                VD += w * (near[1] * near[1])
+            wp.tile_assign(mean_s, wp.tile(MS + Rows(origin[0])), offset=(0, at))
+            wp.tile_assign(mean_d, wp.tile(MD + Rows(origin[1])), offset=(0, at))
+            wp.tile_assign(var_s, wp.tile(VS - wp.cw_mul(MS, MS)), offset=(0, at))
+            wp.tile_assign(var_d, wp.tile(VD - wp.cw_mul(MD, MD)), offset=(0, at))
+
+        total = wp.float64(0.0)
+        for at in range(HALO + lane, wp.min(WIDTH - HALO, width - left), lanes):
+            for r in range(wp.min(ROWS, height - top)):
+                s0, d0 = mean_s[r, at], mean_d[r, at]
+                ms, md, vs, vd = wp.float32(0.0), wp.float32(0.0), wp.float32(0.0), wp.float32(0.0)
+                for k in range(TAPS):
+                    beside = at + (k - REACH) * 3
+                    s, d = mean_s[r, beside] - s0, mean_d[r, beside] - d0
+                    ms += WINDOW[k] * s
+                    md += WINDOW[k] * d
+                    vs += WINDOW[k] * (var_s[r, beside] + s * s)
+                    vd += WINDOW[k] * (var_d[r, beside] + d * d)
+                vs -= ms * ms
+                vd -= md * md
+                ms += s0
+                md += d0
+                over_B1 = 1.0 / (0.5 * (ms * ms + md * md) + C1)
+                over_B2 = 1.0 / (0.5 * (vs + vd) + C2)
+                u, n = md * md * over_B1, vd * over_B2
+                row, column = top + r, left + at
+                maps[0, row, column] = ms
+                maps[1, row, column] = md
+                maps[2, row, column] = (1.0 - n) * (2.0 * md + u * (ms - md)) * over_B1
+                maps[3, row, column] = (1.0 - u) * over_B2 * n
+                maps[4, row, column] = (1.0 - u) * over_B2 * (2.0 - n)
+                total += wp.float64(u + n - u * n)
+        wp.tile_store(parts, wp.tile_sum(wp.tile(weight * total)), offset=(group * blocks_across(width) + across,))
+
+    return similarity
+
+
+@cache
+@no_type_check
+def gradient(lanes: int) -> Any:
+    """The kernel, with `lanes` threads a block, that takes the maps back to x, and L1's signs; a block adds to its part."""
+    turns = WIDTH // lanes
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def gradient(
+        x: wp.array2d[wp.float32],
+        y: wp.array2d[wp.float32],
+        maps: wp.array3d[wp.float32],
+        l1_weight: wp.float64,
+        l1_step: wp.float32,
+        ssim_step: wp.float32,
+        out: wp.array2d[wp.float32],
+        parts: wp.array[wp.float64],
+    ) -> None:
+        group, across, lane = wp.tid()
+        height, width = x.shape[0], x.shape[1]
+        top, left = group * ROWS, across * STRIDE - HALO
+        sum_a = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+        sum_b = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+        sum_c = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+        origin_s = wp.tile_empty(shape=(WIDTH,), dtype=wp.float32, storage="shared")
+        origin_d = wp.tile_empty(shape=(WIDTH,), dtype=wp.float32, storage="shared")
+
+        for turn in range(turns):
+            at = turn * lanes
+            column, middle = left + at + lane, wp.min(top + ROWS / 2, height - 1)
+            s0, d0 = map_at(maps, 0, middle, column), map_at(maps, 1, middle, column)
+            A, B, C = Rows(), Rows(), Rows()
+            for k in range(SPAN):
+                row, w = top - REACH + k, SHARES[k]
+                ms, md = map_at(maps, 0, row, column), map_at(maps, 1, row, column)
+                b, c = map_at(maps, 3, row, column), map_at(maps, 4, row, column)
+                A += w * (map_at(maps, 2, row, column) + b * (s0 - ms) + c * (d0 - md))
+                B += w * b
+                C += w * c
+            wp.tile_assign(sum_a, wp.tile(A), offset=(0, at))
+            wp.tile_assign(sum_b, wp.tile(B), offset=(0, at))
+            wp.tile_assign(sum_c, wp.tile(C), offset=(0, at))
+            wp.tile_assign(origin_s, wp.tile(s0), offset=(at,))
+            wp.tile_assign(origin_d, wp.tile(d0), offset=(at,))
+
+        total = wp.float64(0.0)
+        for at in range(HALO + lane, wp.min(WIDTH - HALO, width - left), lanes):
+            for r in range(wp.min(ROWS, height - top)):
+                pair = pair_at(x, y, top + r, left + at)
+                g = wp.float32(0.0)
+                for k in range(TAPS):
+                    beside = at + (k - REACH) * 3
+                    about = pair - wp.vec2(origin_s[beside], origin_d[beside])
+                    g += WINDOW[k] * (sum_a[r, beside] + sum_b[r, beside] * about[0] + sum_c[r, beside] * about[1])
+                out[top + r, left + at] = ssim_step * g - l1_step * sign(pair[1])
+                total += wp.float64(wp.abs(pair[1]))
+        total *= l1_weight
+        part = group * blocks_across(width) + across
+        if lane == 0:
+            total += parts[part]  # what `similarity` left
+        wp.tile_store(parts, wp.tile_sum(wp.tile(total)), offset=(part,))
+
+    return gradient

@@ -1,0 +1,112 @@
+"""Floor 3: what the images should look like. Images in, losses and image-space cotangents out; knows no Gaussian.
+Eq. 4, 5
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, get_args
+
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Scalar
+from clear_strategies.kernels import losses as kernels
+from clear_strategies.kernels.losses import Choice, LossAndGradient
+from clear_strategies.schedules import WarmupDecay
+
+LowFrom = Literal["lr", "hr"]
+
+
+class Losses(NamedTuple):
+    """Scalars by name, and the cotangents of one image in the order of the names."""
+
+    values: Mapping[str, Scalar]
+    cotangents: Float[Tensor, "K H W 3"]
+
+
+@dataclass(frozen=True, slots=True)
+class Objective:
+    """L = λ_LR L_LR + λ_HR(t) (L_base + λ_HF L_HF); the paper's λ_LR is 1.
+
+    Args:
+        lambda_hr: λ_HR(t).
+        lambda_hf: λ_HF >= 0; 0 skips the high-frequency loss altogether.
+        lambda_lr: λ_LR >= 0; at 0 the LR photos take no part: nothing is drawn at LR, L_LR is for the log alone.
+        lr_from: where Î_LR comes from: drawn at "lr"; or the area mean of Î_HR, "hr", which then is all that is drawn.
+        lambda_ssim, lambda_ssim_hr: share of 1 - SSIM in L_LR and L_base, in [0, 1]; the rest is L1.
+        haar_levels: levels of the Haar transform; 1 is the top octave, 2 is exactly the band that 4x SR adds.
+        clamp_render: compare renders clamped to [0, 1] (DropGaussian); 3DGS clamps for metrics only.
+        kernels: what computes the losses: "cpp", "warp", "torch", or "auto", the fastest for images where they lie.
+
+    Raises:
+        ValueError: a setting is outside its range, or nothing would move the Gaussians at the first iteration.
+        BackendUnavailable: kernels="cpp" was not built, or "warp" is not installed.
+    """
+
+    lambda_hr: WarmupDecay = field(default_factory=WarmupDecay)
+    lambda_hf: float = 0.2
+    lambda_lr: float = 1.0
+    lr_from: LowFrom = "lr"
+    lambda_ssim: float = 0.2
+    lambda_ssim_hr: float = 0.2
+    haar_levels: int = 1
+    clamp_render: bool = False
+    kernels: Choice = "auto"
+
+    def __post_init__(self) -> None:
+        kernels.require(self.kernels)
+        for name in ("lambda_ssim", "lambda_ssim_hr"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}.")
+        for name in ("lambda_lr", "lambda_hf"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}.")
+        if self.lr_from not in get_args(LowFrom):
+            raise ValueError(f"lr_from must be lr or hr, got {self.lr_from!r}.")
+        if self.lambda_lr == 0 and not self.lambda_hr(1) > 0:
+            raise ValueError(
+                "without L_LR (lambda_lr=0) L_base must act from the first iteration, got "
+                f"lambda_hr.peak={self.lambda_hr.peak}, start={self.lambda_hr.start}. Set lambda_hr.start=0 and full=0."
+            )
+        if self.haar_levels < 1:
+            raise ValueError(f"haar_levels must be at least 1, got {self.haar_levels}.")
+
+    @property
+    def draws_lr(self) -> bool:
+        """Whether Î_LR is drawn; else it is the area mean of Î_HR, which is then needed at every iteration."""
+        return self.lr_from == "lr" and self.lambda_lr > 0
+
+    def lr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:
+        """L_LR by value, and one cotangent: that of λ_LR L_LR."""
+        shown = self._shown(image)
+        cotangents = shown.new_empty(1, *shown.shape)
+        loss = kernels.photometric(shown, target, self.lambda_ssim, kernels=self.kernels, out=cotangents[0])  # Eq. 4
+        if self.lambda_lr != 1:
+            cotangents *= self.lambda_lr
+        return self._losses({"lr": loss}, image, cotangents)
+
+    def hr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:
+        """L_base and L_HF, two cotangents; L_base alone where λ_HF = 0."""
+        shown, use = self._shown(image), self.kernels
+        cotangents = shown.new_empty(2 if self.lambda_hf > 0 else 1, *shown.shape)
+        base = kernels.photometric(shown, target, self.lambda_ssim_hr, kernels=use, out=cotangents[0])  # Eq. 5
+        losses = {"base": base}
+        if self.lambda_hf > 0:
+            losses["hf"] = kernels.haar_l1(shown, target, self.haar_levels, kernels=use, out=cotangents[1])  # Eq. 5
+        return self._losses(losses, image, cotangents)
+
+    def _shown(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+        return image.clamp(0, 1) if self.clamp_render else image
+
+    def _losses(
+        self,
+        losses: Mapping[str, LossAndGradient],
+        image: Float[Tensor, "H W 3"],
+        cotangents: Float[Tensor, "K H W 3"],
+    ) -> Losses:
+        if self.clamp_render:
+            cotangents *= (image >= 0) & (image <= 1)
+        return Losses({name: deferred.scalar(loss.value) for name, loss in losses.items()}, cotangents)

@@ -1,0 +1,34 @@
+"""What leaves a run: the field as a PLY that viewers show as it was measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from clear_strategies.data.ply import GaussianPly, write_gaussians
+from clear_strategies.training.field import GaussianField
+from rasterizers.geometry import SH_C0
+
+
+def export_ply(path: Path, field: GaussianField) -> None:
+    """The standard 3DGS layout with f_det folded into the colour, and the 3D filter into scales and opacities.
+
+    Viewers that honour the header's `SplatRenderMode: mip` draw it with opacity compensation, as it was trained.
+    """
+    splats = field.fused()
+    tiny = torch.finfo(torch.float32).eps
+    offset = splats.rgb_offset if splats.rgb_offset is not None else torch.zeros_like(splats.means)
+    higher = torch.zeros_like(field.shN.data)
+    higher[:, : splats.shN.shape[1]] = splats.shN  # bands above the active degree were never drawn
+    write_gaussians(
+        path,
+        GaussianPly(
+            means=splats.means,
+            sh0=splats.sh0 + offset[:, None] / SH_C0,
+            shN=higher,
+            opacities=torch.logit(splats.opacities.clamp(tiny, 1 - tiny)),
+            scales=splats.scales.log(),
+            quats=torch.nn.functional.normalize(splats.quats, dim=-1),
+        ),
+    )

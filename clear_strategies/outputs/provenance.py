@@ -1,0 +1,65 @@
+"""Where a result came from: versions, machine, source, settings. Never fails; what cannot be known is "unknown"."""
+
+from __future__ import annotations
+
+import datetime
+import platform
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Final
+
+_PACKAGES: Final = (
+    "clear-strategies", "torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless", "pillow", "kornia",
+    "open3d-cpu", "open3d", "hydra-core",
+)  # fmt: skip
+
+
+def provenance(**facts: Any) -> dict[str, Any]:
+    """What to write beside every number; `facts` are the run's own (seed, backend, kernels, notes)."""
+    from rasterizers import native
+
+    return {
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "versions": {name: version for name in _PACKAGES if (version := _version(name)) is not None},
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.machine()}, {_processor()}",
+        "threads": native.threads(),
+        "git": _git(),
+        "command": sys.argv,
+        **facts,
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "source checkout" if package == "clear-strategies" else None
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or "unknown"
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+def _git() -> str:
+    """Commit of the checkout this package runs from, "+dirty" with uncommitted changes."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return "no checkout"
+    try:
+        commit = _run(root, "rev-parse", "HEAD").strip()
+        return commit + ("+dirty" if _run(root, "status", "--porcelain").strip() else "")
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+
+
+def _run(root: Path, *arguments: str) -> str:
+    # Looking must not take the lock of a checkout that someone is working in.
+    command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout  # noqa: S603

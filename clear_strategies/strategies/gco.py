@@ -1,0 +1,216 @@
+"""GCO: Gaussian-wise conflict-aware optimization. HR gradients that fight the authentic LR ones are corrected to the
+margin, Gaussian by Gaussian and group by group; LR gradients are never changed.  Eq. 6, 7, 11
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar, Final, Literal, overload
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number, Scalar
+from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot, row_norm, scale_rows
+from clear_strategies.strategies.base import Strategy
+
+_log = logging.getLogger(__name__)
+
+# A Gaussian whose axes are equally long does not change when it is turned: in exact arithmetic its rotation gradient
+# is 0, in floating point it is noise that would "conflict" one time in five (STRESS §2.3).
+ROTATION_NOISE: Final = 2.0**-18
+
+# ω at its lower bound in this share of the corrections means that the prior agrees with LR and GCO does nothing.
+_INACTIVE_SHARE: Final = 0.9
+
+
+@dataclass(frozen=True)
+class GCO(Strategy):
+    """Correct conflicting HR gradients.
+
+    Args:
+        tolerance: τ_c in [0, 1): cosines down to -τ_c are no conflict.
+        weight_min, weight_max: bounds of ω where a conflict is corrected, 0 <= min <= max <= 1.
+        bound: what the bounds hold: "omega", or the "coefficient" ω|d|/‖g_LR‖² (the rival reading, METHOD F28).
+        eps: "relative:r" scales ε with the mean gradient norms of the group, so that no change of the losses' unit
+            changes a decision; "absolute:x" takes the paper's symbol literally (1e-8 finds almost nothing).
+        groups: the attributes that are compared and corrected, each on its own.
+
+    The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
+    Without evidence q = 0: nothing speaks for the prior, the authentic gradient prevails (METHOD, F32).
+
+    Raises:
+        ValueError: a setting is outside its range.
+    """
+
+    fused: ClassVar[str | None] = "gco"
+
+    tolerance: float = 0.05
+    weight_min: float = 0.05
+    weight_max: float = 0.75
+    bound: Literal["omega", "coefficient"] = "omega"
+    eps: str = "relative:1e-12"
+    groups: Sequence[str] = CONFLICT_GROUPS
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "groups", tuple(self.groups))
+        if not 0 <= self.tolerance < 1:
+            raise ValueError(f"tolerance must lie in [0, 1), got {self.tolerance}.")
+        if not 0 <= self.weight_min <= self.weight_max <= 1:
+            raise ValueError(
+                f"0 <= weight_min <= weight_max <= 1 must hold, got {self.weight_min} and {self.weight_max}."
+            )
+        if self.bound not in ("omega", "coefficient"):
+            raise ValueError(f"bound must be omega or coefficient, got {self.bound!r}.")
+        unknown = sorted(set(self.groups) - set(CONFLICT_GROUPS))
+        if unknown:
+            raise ValueError(f"groups must be among {', '.join(CONFLICT_GROUPS)}, got {unknown[0]!r}.")
+        _parse_eps(self.eps)
+
+    def correct(self, lr: Grads, hr: Grads, evidence: Evidence | None) -> Grads:
+        """g̃_HR for every group, and what was done in `readings`."""
+        corrected, done = Grads(hr), []
+        for group in self.groups:
+            if group in lr and group in hr:
+                corrected[group], correction = self._correct_group(group, lr, hr, evidence)
+                done.append(correction)
+        self.report(done, evidence)
+        return corrected
+
+    def _correct_group(self, group: str, lr: Grads, hr: Grads, evidence: Evidence | None) -> tuple[Tensor, Correction]:
+        g_lr, g_hr = lr[group], hr[group]
+        dot, n_lr, n_hr = row_dot(g_lr, g_hr), row_norm(g_lr), row_norm(g_hr)
+        both = (n_lr > 0) & (n_hr > 0)
+        eps_cos, eps_corr = self.epsilons(deferred.mean(n_lr, both), deferred.mean(n_hr, both))
+        n = n_lr * n_hr
+        c = torch.where(n > 0, dot / (n + eps_cos).clamp_min(_TINY), 0.0)  # Eq. 6
+        conflict = c < -self.tolerance
+        if group == "quats":
+            conflict &= ~(_turns_nothing(lr) | _turns_nothing(hr))
+
+        # Only the rows in conflict are touched; every other row is handed back bit for bit. They are picked out where that
+        # makes nobody wait; elsewhere all rows are corrected, and the others put back.
+        i = conflict.nonzero()[:, 0] if deferred.is_immediate(conflict) else slice(None)
+        hit = conflict[i]
+        q = evidence.reliability[i].double() if evidence is not None else 0.0
+        s = ((-c[i] - self.tolerance) / (1 - self.tolerance)).clamp(0, 1)
+        omega = s * (1 - q)  # Eq. 11
+        d = dot[i] + self.tolerance * n[i]
+        coefficient = d / (n_lr[i].square() + eps_corr)
+        if self.bound == "omega":
+            omega = omega.clamp(self.weight_min, self.weight_max)
+            step = omega * coefficient
+        else:
+            step = -(omega * coefficient).abs().clamp(self.weight_min, self.weight_max)
+        corrected = g_hr.clone()
+        moved = (g_hr[i].double() - scale_rows(g_lr[i].double(), step)).to(g_hr.dtype)  # Eq. 7
+        corrected[i] = torch.where(hit.view(-1, *[1] * (moved.dim() - 1)), moved, corrected[i])
+        at_bound = hit & (omega <= self.weight_min)
+        compared, touched, bound = (deferred.scalar(rows.sum()) for rows in (both, conflict, at_bound))
+        return corrected, Correction(
+            group, compared, touched, deferred.total(omega, hit), bound, self.margin(n, eps_cos)
+        )
+
+    @overload
+    def epsilons(self, mean_lr: float, mean_hr: float) -> tuple[float, float]: ...
+
+    @overload
+    def epsilons(self, mean_lr: Scalar, mean_hr: Scalar) -> tuple[Scalar, Scalar]: ...
+
+    def epsilons(self, mean_lr: Scalar, mean_hr: Scalar) -> tuple[Scalar, Scalar]:
+        """ε of the cosine and of the correction, both in the unit gradient², from the mean norms of what is compared."""
+        kind, value = _parse_eps(self.eps)
+        if kind == "absolute":
+            return value, value
+        return value * mean_lr * mean_hr, value * mean_lr**2
+
+    def margin(self, product: Float[Tensor, " N"], eps: Scalar) -> Number | None:
+        """The median of ‖g_LR‖‖g_HR‖ over an absolute ε, NaN where nothing is compared; None where ε is relative, or 0."""
+        if _parse_eps(self.eps)[0] != "absolute" or eps == 0:
+            return None
+        return deferred.defer(operator.truediv, deferred.median(product, product > 0), eps)
+
+    def report(self, done: Sequence[Correction], evidence: Evidence | None) -> None:
+        """Put what was done into `readings`, and say what makes GCO idle."""
+        compared, corrected, omega, at_bound = (
+            deferred.defer(deferred.added, *(getattr(c, name) for c in done))
+            for name in ("compared", "corrected", "omega", "at_lower_bound")
+        )
+        self.readings["corrected"] = deferred.defer(deferred.ratio, corrected, compared)
+        self.readings["mean_omega"] = deferred.defer(deferred.ratio, omega, corrected)
+        for c in done:
+            margin = math.nan if c.margin is None else c.margin
+            share = partial(self._share_of_group, c.group)
+            self.readings[f"corrected_{c.group}"] = deferred.defer(share, c.corrected, c.compared, margin)
+        if corrected != 0 and evidence is not None and self.weight_min > 0:
+            self.readings["omega_at_lower_bound"] = deferred.defer(self._share_at_bound, at_bound, corrected)
+
+    def _share_of_group(self, group: str, corrected: float, compared: float, margin: float) -> float:
+        """Below 20 ε a conflict loses strength; below τ/(1 - τ) ε none can be seen at all (STRESS §2.1)."""
+        if margin < self.tolerance / (1 - self.tolerance) and self._first(f"eps cannot {group}"):
+            _log.warning(
+                "GCO cannot fire for %s: the median of |g_LR||g_HR| is %.2g of eps=%s. Use eps=relative:1e-12.",
+                group, margin, self.eps,
+            )  # fmt: skip
+        elif margin < 20 and self._first(f"eps weak {group}"):
+            _log.warning(
+                "GCO is weakened for %s: the median of |g_LR||g_HR| is only %.2g times eps=%s.",
+                group, margin, self.eps,
+            )  # fmt: skip
+        return deferred.ratio(corrected, compared)
+
+    def _share_at_bound(self, at_bound: float, corrected: float) -> float:
+        share = deferred.ratio(at_bound, corrected)
+        if share > _INACTIVE_SHARE and self._first("inactive"):
+            _log.info(
+                "GCO is inactive: omega sits at its lower bound %g in %.0f %% of the corrections, because the "
+                "prior agrees with the LR images (reliability near 1).", self.weight_min, 100 * share,
+            )  # fmt: skip
+        return share
+
+    def _first(self, what: str) -> bool:
+        said = what in self.cache
+        self.cache[what] = True
+        return not said
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """What was done to one group: Gaussians compared and corrected, the sum of their ω and how many sit at the lower
+    bound, and how far ‖g_LR‖‖g_HR‖ lies above an absolute ε.
+    """
+
+    group: str
+    compared: Number
+    corrected: Number
+    omega: Number
+    at_lower_bound: Number
+    margin: Number | None
+
+
+_TINY: Final = torch.finfo(torch.float64).tiny
+
+
+def _turns_nothing(g: Grads) -> Bool[Tensor, " N"]:
+    if "scales" not in g:
+        return torch.zeros_like(g["quats"][:, 0], dtype=torch.bool)
+    return row_norm(g["quats"]) <= ROTATION_NOISE * row_norm(g["scales"])
+
+
+def _parse_eps(eps: str) -> tuple[str, float]:
+    kind, _, number = str(eps).partition(":")
+    try:
+        value = float(number)
+    except ValueError:
+        value = -1.0
+    if kind not in ("relative", "absolute") or not 0 <= value < float("inf"):
+        raise ValueError(f'eps must be "relative:<number >= 0>" or "absolute:<number >= 0>", got {eps!r}.')
+    return kind, value

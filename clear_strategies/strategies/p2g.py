@@ -1,0 +1,160 @@
+"""P2G: evidence-guided patch-to-Gaussian routing. Per patch, how far does the SR reference agree with the authentic LR
+image, and how much detail does it ask for? Lifted to Gaussians, that routes high-frequency gradients and densification.
+Eq. 9, 10, 12, 14
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.evidence import Evidence, Lookup, Outside, lift
+from clear_strategies.core.gradients import Shot
+from clear_strategies.core.images import DownKernel, UpKernel, downsample, patch_means, upsample
+from clear_strategies.strategies.base import ScreenGradients, Strategy
+
+if TYPE_CHECKING:
+    from clear_strategies.core.view import View
+
+_log = logging.getLogger(__name__)
+
+ScoreBy = Literal["evidence", "gradient", "sum", "max"]
+
+
+@dataclass(frozen=True)
+class P2G(Strategy):
+    """Weigh SR detail by evidence.
+
+    Args:
+        reliability_scale: τ_r > 0, the mean |D(I_HR) - I_LR| (images in [0, 1]) at which R falls to 1/e; "relative:k" is k
+            times the view's own mean, so that R spreads whatever the prior (a fidelity network is near 1 at 0.05).
+        floor: q_min in [0, 1], the share of its high-frequency gradient that every Gaussian keeps.
+        patch: edge of a patch in LR pixels; in HR pixels it is that times the SR factor.
+        down, up: D and U. D should be the very operator that made the LR images.
+        lookup: "nearest" patch of the projected centre, or "bilinear" between patches.
+        outside: a visible Gaussian centred outside the image takes the border patch ("clamp"), or none ("neutral").
+        detail_eps: ε of Eq. 9, in image units; below it (1/40 of a grey level) differences are rounding, not detail.
+        score_by: what densification goes by: "evidence" S_i alone (the paper; starves large splats when the initial
+            cloud is sparse), the ordinary "gradient", or both at equal mean, their "sum" or "max".
+
+    Raises:
+        ValueError: a setting is outside its range.
+    """
+
+    fused: ClassVar[str | None] = "p2g"
+
+    reliability_scale: float | str = 0.05
+    floor: float = 0.25
+    patch: int = 16
+    down: DownKernel = "bicubic"
+    up: UpKernel = "bicubic"
+    lookup: Lookup = "nearest"
+    outside: Outside = "clamp"
+    detail_eps: float = 1e-4
+    score_by: ScoreBy = "evidence"
+
+    def __post_init__(self) -> None:
+        _tau_r(self.reliability_scale, 1.0)
+        if not 0 <= self.floor <= 1:
+            raise ValueError(f"floor must lie in [0, 1], got {self.floor}.")
+        if self.patch < 1:
+            raise ValueError(f"patch must be at least 1 LR pixel, got {self.patch}.")
+        if not self.detail_eps > 0:
+            raise ValueError(f"detail_eps must be > 0, got {self.detail_eps}.")
+        for name, kind in (("down", DownKernel), ("up", UpKernel), ("lookup", Lookup), ("outside", Outside),
+                           ("score_by", ScoreBy)):  # fmt: skip
+            if getattr(self, name) not in get_args(kind):
+                raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}.")
+
+    def observe(self, view: View, hr: Shot) -> Evidence:
+        """q_i and a_i of every Gaussian this view sees."""
+        key = (view.name, view.factor)
+        if key not in self.cache:
+            self.cache[key] = self._patch_evidence(view)
+        R, A = self.cache[key]
+        size = (view.lr.camera.width, view.lr.camera.height)
+        u = hr.means2d / view.factor  # patches live on the LR grid
+        q = lift(R, u, hr.visible, self.patch, size, self.lookup, self.outside)
+        a = lift(A, u, hr.visible, self.patch, size, self.lookup, self.outside)
+        self.readings["mean_q"] = deferred.mean(q, hr.visible)
+        self.readings["mean_w"] = deferred.mean(q * a, hr.visible)
+        return Evidence(q, a)
+
+    def route(self, evidence: Evidence | None) -> Float[Tensor, " N"]:
+        """m_i = q_min + (1 - q_min) w_i."""
+        if evidence is None:
+            raise ValueError("P2G routes by evidence, but nothing observed this view; let P2G.observe run first.")
+        return self.floor + (1 - self.floor) * evidence.weight  # Eq. 12
+
+    def score(self, evidence: Evidence | None, screens: ScreenGradients) -> Float[Tensor, " N"] | None:
+        """S_i = w_i ‖∇_u L_HF‖, alone or joined with the ordinary statistic; None (ordinary) where HF is not there."""
+        if self.score_by == "gradient" or evidence is None or screens.hf is None:
+            return None
+        S: Tensor = evidence.weight * torch.linalg.vector_norm(screens.hf, dim=-1)  # Eq. 14
+        if self.score_by == "evidence":
+            return S
+        S = S * (screens.ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny))
+        return torch.maximum(screens.ordinary, S) if self.score_by == "max" else screens.ordinary + S
+
+    def _patch_evidence(self, view: View) -> tuple[Tensor, Tensor]:
+        R, A = patch_evidence(
+            view.lr.image, view.hr.image, view.factor, self.patch, self.reliability_scale, self.detail_eps, self.down,
+            self.up,
+        )  # fmt: skip
+        _log.info(
+            "%s: reliability R %.2f..%.2f (mean %.3f), detail demand A mean %.3f over %dx%d patches.",
+            view.name, float(R.min()), float(R.max()), float(R.mean()), float(A.mean()), R.shape[1], R.shape[0],
+        )  # fmt: skip
+        return R, A
+
+
+def patch_evidence(
+    lr: Float[Tensor, "h w 3"],
+    hr: Float[Tensor, "H W 3"],
+    factor: int,
+    patch: int = 16,
+    reliability_scale: float | str = 0.05,
+    detail_eps: float = 1e-4,
+    down: DownKernel = "bicubic",
+    up: UpKernel = "bicubic",
+) -> tuple[Float[Tensor, "ph pw"], Float[Tensor, "ph pw"]]:
+    """R_p, agreement with the LR observation, and A_p, share of detail relative to twice the image's mean.  Eq. 9
+
+    A flat image asks for nothing: A = 0. A patch with the image's mean detail has A = 1/2.
+
+    Raises:
+        ValueError: an image lies outside [0, 1] (τ_r and ε are in that unit).
+    """
+    for name, image in (("I_LR", lr), ("I_HR", hr)):
+        low, high = float(image.min()), float(image.max())
+        if not (low >= -1e-3 and high <= 1 + 1e-3):
+            raise ValueError(f"{name} must lie in [0, 1], got {low:.3g}..{high:.3g}. Divide 8-bit values by 255.")
+    reduced = downsample(hr, factor, down)
+    disagreement = (reduced - lr).abs()
+    R = torch.exp(-patch_means(disagreement, patch) / _tau_r(reliability_scale, float(disagreement.mean())))
+    residual = (hr - upsample(reduced, factor, up)).abs()
+    A = (patch_means(residual, patch * factor) / (2 * residual.mean() + detail_eps)).clamp(0, 1)
+    return R, A
+
+
+# An 8-bit image is off by a quarter of a grey level on average; to be relative to less would be to read rounding.
+_ROUNDING: Final = 0.25 / 255
+
+
+def _tau_r(scale: float | str, mean: float) -> float:
+    """τ_r of a view whose mean disagreement is `mean`."""
+    kind, _, number = str(scale).rpartition(":")
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if kind not in ("", "relative") or not 0 < value < math.inf:
+        raise ValueError(f'reliability_scale must be a number > 0 or "relative:<number > 0>", got {scale!r}.')
+    return value * max(mean, _ROUNDING) if kind else value

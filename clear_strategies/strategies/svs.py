@@ -1,0 +1,147 @@
+"""SVS: sparse-view stabilization. One dropout mask for both scales keeps Gaussians from co-adapting without making LR
+and HR disagree; once the structure has settled, an anchor holds the field near where it was.  Eq. 15, 16
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Final, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.gradients import ATTRIBUTES, Grads
+from clear_strategies.errors import AnchorError
+from clear_strategies.schedules import Ramp, milestone
+from clear_strategies.strategies.base import Strategy
+
+_log = logging.getLogger(__name__)
+
+# Geometry is held, appearance may still be refined (METHOD, F40). Position in units of the scene's extent.
+PAPER_WEIGHTS: Final[Mapping[str, float]] = {
+    "means": 1.0, "scales": 1.0, "quats": 1.0, "opacities": 0.1, "sh0": 0.01, "shN": 0.01, "detail": 0.0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SVS(Strategy):
+    """Shared dropout, then an anchor.
+
+    Args:
+        dropout: p_t, the share of Gaussians left out at iteration t.
+        anchor_start: t_a, the iteration after which densification stops and the anchor is taken.
+        anchor_strength: λ_stab >= 0; 0 anchors nothing (densification still stops at t_a).
+        anchor_weights: W by attribute, >= 0, on raw parameters; positions count in units of the extent of the anchored
+            cloud (90th percentile of the distance from its median).
+        reduction: "sum" over Gaussians as printed, or their "mean" (with 1e5 of them, nothing).
+
+    Raises:
+        ValueError: a setting is outside its range.
+        AnchorError: (while training) the number of Gaussians changed after t_a.
+    """
+
+    fused: ClassVar[str | None] = "svs"
+
+    dropout: Ramp = field(default_factory=Ramp)
+    anchor_start: int = milestone(5_000)
+    anchor_strength: float = 0.01
+    anchor_weights: Mapping[str, float] = field(default_factory=lambda: dict(PAPER_WEIGHTS))
+    reduction: Literal["sum", "mean"] = "sum"
+
+    def __post_init__(self) -> None:
+        if self.anchor_strength < 0:
+            raise ValueError(f"anchor_strength must be >= 0, got {self.anchor_strength}.")
+        if self.reduction not in ("sum", "mean"):
+            raise ValueError(f"reduction must be sum or mean, got {self.reduction!r}.")
+        for name, weight in self.anchor_weights.items():
+            if name not in ATTRIBUTES or not weight >= 0:
+                raise ValueError(
+                    f"anchor_weights must give numbers >= 0 for {', '.join(ATTRIBUTES)}, got {name}={weight}."
+                )
+
+    def on_fit_start(self, n_views: int, seed: int) -> None:
+        super().on_fit_start(n_views, seed)
+        self.cache["seed"] = seed
+        if self.dropout.maximum == 0 and (self.anchor_strength == 0 or not any(self.anchor_weights.values())):
+            _log.warning(
+                "SVS drops nothing and anchors nothing: it only ends densification at t=%d.", self.anchor_start
+            )
+
+    def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
+        """zᵗ: 0 for the dropped, 1 / (1 - p_t) for the rest; a function of (seed, t)."""
+        p = self.dropout(t)
+        if p == 0:
+            return None
+        return dropout_mask(n, p, self.cache.get("seed", 0), t, self.device)
+
+    def regularize(self, params: Mapping[str, Tensor], t: int) -> Grads | None:
+        """∇ λ_stab Σ_i ‖θ_i - θ_i^a‖²_W, for every Gaussian, seen or not; None before the anchor."""
+        if not self.state:
+            return None
+        stiffness = self.stiffness(next(iter(params.values())).shape[0])
+        return Grads(
+            {name: (params[name] - self.state[name]) * k for name, k in stiffness.items() if name in params}
+        )  # Eq. 16
+
+    def stiffness(self, n: int) -> dict[str, float]:
+        """2 λ_stab W by anchored attribute: the anchor's vjp per unit of distance.
+
+        Raises:
+            AnchorError: `n` is not the number of Gaussians that were anchored.
+        """
+        self._require_same_number(n)
+        strength = 2 * self.anchor_strength / (1 if self.reduction == "sum" else n)
+        return {name: strength * self._weight(name) for name in self.state}
+
+    def may_densify(self, t: int) -> bool:
+        return t < self.anchor_start
+
+    def after_step(self, params: Mapping[str, Tensor], t: int) -> None:
+        """θ^a = sg(θ(t_a)); the last structural change was at t < t_a."""
+        if t == self.anchor_start and self.anchor_strength > 0:
+            held = [name for name, w in self.anchor_weights.items() if w > 0 and name in params]
+            self.state.update({name: params[name].detach().clone() for name in held})
+            self.cache.pop("extent", None)
+
+    def on_resize(self, parents: Tensor) -> None:
+        if self.state:
+            self._require_same_number(len(parents))
+        super().on_resize(parents)
+
+    def _weight(self, name: str) -> float:
+        weight = self.anchor_weights[name]
+        return weight / self._extent() ** 2 if name == "means" else weight
+
+    def _extent(self) -> float:
+        if "extent" not in self.cache:
+            means = self.state["means"]
+            distances = torch.linalg.vector_norm(means - means.median(dim=0).values, dim=-1)
+            rank = max(1, round(0.9 * len(distances)))
+            self.cache["extent"] = max(float(distances.kthvalue(rank).values), torch.finfo(means.dtype).tiny ** 0.5)
+        return float(self.cache["extent"])
+
+    def _require_same_number(self, now: int) -> None:
+        then = next(iter(self.state.values())).shape[0]
+        if now != then:
+            raise AnchorError(
+                f"the anchor was taken at t={self.anchor_start} for {then:,} Gaussians, now there are {now:,}. Stop "
+                "densification at t_a (gsplat: refine_stop_iter; Inria: densify_until_iter) or raise "
+                "strategies.svs.anchor_start."
+            )
+
+
+def dropout_mask(n: int, p: float, seed: int, t: int, device: torch.device | str = "cpu") -> Float[Tensor, " N"]:
+    """Bernoulli(1 - p) / (1 - p) for n Gaussians, drawn on `device` and reproducible there from (seed, t).  Eq. 15"""
+    generator = torch.Generator(device).manual_seed(_mix(seed, t))
+    kept = torch.rand(n, generator=generator, device=device) >= p
+    return kept.to(torch.get_default_dtype()) / (1 - p)
+
+
+def _mix(seed: int, t: int) -> int:
+    """Spread (seed, t) over 63 bits, so that neighbouring iterations start far apart."""
+    x = (seed * 0x9E3779B97F4A7C15 + t * 0xBF58476D1CE4E5B9) & (2**64 - 1)
+    x = (x ^ (x >> 31)) * 0x94D049BB133111EB & (2**64 - 1)
+    return (x ^ (x >> 29)) >> 1

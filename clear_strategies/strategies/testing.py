@@ -1,0 +1,232 @@
+"""The contract of a strategy, as checks that anyone can run over their own.
+
+    from clear_strategies.testing import check_strategy
+    check_strategy(lambda: Mine(strength=2))
+
+Each check raises `ContractError` with what was expected and what was found.
+"""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, Final
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from clear_strategies.core import images
+from clear_strategies.core.gradients import ATTRIBUTES, Grads
+from clear_strategies.core.view import Photo, View
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.objective import Objective
+from clear_strategies.schedules import WarmupDecay, scaled
+from clear_strategies.strategies.base import Strategy
+from rasterizers.interface import Camera
+from rasterizers.testing import ContractError
+
+Make = Callable[[], Strategy]
+
+_N: Final = 30
+_STEPS: Final = 6
+_FACTOR: Final = 4
+
+
+def check_strategy(make: Make) -> None:
+    """Run every check.
+
+    Args:
+        make: builds the strategy, the same one each time.
+
+    Raises:
+        ContractError: the first promise that does not hold.
+    """
+    for check in CHECKS:
+        check(make)
+
+
+def check_is_frozen_settings(make: Make) -> None:
+    """A frozen dataclass with a repr that names its settings, and milestones that can be stretched."""
+    strategy = make()
+    _require(isinstance(strategy, Strategy), f"{type(strategy).__name__} is no Strategy")
+    _require(is_dataclass(strategy), "a strategy is a dataclass of settings")
+    settings = [f.name for f in fields(strategy) if f.init]
+    if settings:
+        try:
+            setattr(strategy, settings[0], getattr(strategy, settings[0]))
+        except AttributeError:
+            pass
+        else:
+            raise ContractError("settings can be assigned; declare the dataclass frozen")
+    _require(all(name in repr(strategy) for name in settings), f"repr does not show every setting: {strategy!r}")
+    _require(strategy == make(), "two strategies with the same settings are not equal")
+    _require(scaled(strategy, 1.0) == strategy, "stretching milestones by 1 changes the strategy")
+
+
+def check_gradients_are_left_alone(make: Make) -> None:
+    """The gradients and images a strategy is shown are not changed in place."""
+    lr, hr, view, params = _situation(0)
+    before = [copy.deepcopy(dict(g)) for shot in (lr, hr) for g in shot.gradients]
+    values = {name: p.clone() for name, p in params.items()}
+    conductor = _conductor(make, lambda_hf=0.0)  # then g_HR is the shot's own tensor, and no sum of two
+    for t in range(1, _STEPS):
+        conductor.gate(t, _N)
+        conductor.update(params, lr, hr, view, t)
+    after = [dict(g) for shot in (lr, hr) for g in shot.gradients]
+    for old, new in zip(before, after, strict=True):
+        _require(all(torch.equal(old[k], new[k]) for k in old), "a gradient was changed in place")
+    _require(all(torch.equal(values[k], params[k]) for k in values), "a parameter was changed in place by update()")
+
+
+def check_answers_have_their_shapes(make: Make) -> None:
+    """One number per Gaussian from gate and score, the same attributes and shapes from the merge, all finite."""
+    conductor = _conductor(make)
+    lr, hr, view, params = _situation(1)
+    for t in range(1, _STEPS):
+        z = conductor.gate(t, _N)
+        _require(z is None or (z.shape == (_N,) and bool((z >= 0).all())), "gate() must give [N] numbers >= 0, or None")
+        update = conductor.update(params, lr, hr, view, t)
+        _require(update.score.shape == (_N,), f"score() gave {tuple(update.score.shape)} for {_N} Gaussians")
+        for name, gradient in update.grads.items():
+            _require(gradient.shape == params[name].shape, f"the gradient of {name} has shape {tuple(gradient.shape)}")
+            _require(bool(gradient.isfinite().all()), f"the gradient of {name} is not finite")
+        if update.evidence is not None:
+            for q in (update.evidence.reliability, update.evidence.demand):
+                _require(bool(((q >= 0) & (q <= 1)).all()), "evidence must lie in [0, 1]")
+        conductor.after_step(params, t)
+
+
+def check_works_without_hr(make: Make) -> None:
+    """While HR is not rendered the authentic gradient passes, whatever the strategy."""
+    conductor = _conductor(make)
+    lr, _, view, params = _situation(2)
+    update = conductor.update(params, lr, None, view, 1)
+    for name in ("means", "opacities"):
+        _require(bool(update.grads[name].isfinite().all()), f"the gradient of {name} is not finite without HR")
+
+
+def check_is_reproducible(make: Make) -> None:
+    """The same seed and iteration give the same answers; nothing depends on global random state."""
+    results = []
+    for noise in (0, 1):
+        torch.manual_seed(noise)
+        results.append([*_trace(_conductor(make), 1, _STEPS)])
+    for first, second in zip(*results, strict=True):
+        _require(torch.equal(first, second), "two runs with one seed differ; derive randomness from (seed, t)")
+
+
+def check_state_is_all_there_is(make: Make) -> None:
+    """A strategy given its state back goes on as if it had never stopped, from any iteration."""
+    for cut in range(1, _STEPS):
+        whole = _conductor(make)
+        trace = [*_trace(whole, 1, _STEPS)]
+        first = _conductor(make)
+        beginning = [*_trace(first, 1, cut)]
+        second = _conductor(make)
+        second.load_state_dict(first.state_dict())
+        rest = [*_trace(second, cut, _STEPS)]
+        for a, b in zip(trace, [*beginning, *rest], strict=True):
+            _require(torch.equal(a, b), f"cut before t={cut}: resuming from `state` does not continue the run")
+
+
+def check_state_follows_its_gaussians(make: Make) -> None:
+    """Every tensor of `state` has one row a Gaussian, and a reordering takes the rows along."""
+    conductor = _conductor(make)
+    for _ in _trace(conductor, 1, _STEPS):
+        pass
+    before = {name: rows.clone() for name, rows in conductor.state_dict().items()}
+    for name, rows in before.items():
+        _require(rows.shape[:1] == (_N,), f"state {name!r} has shape {tuple(rows.shape)}; keep per-Gaussian rows only")
+    order = torch.randperm(_N, generator=torch.Generator().manual_seed(0))
+    conductor.on_resize(order)
+    for name, rows in conductor.state_dict().items():
+        _require(torch.equal(rows, before[name][order]), f"state {name!r} did not follow its Gaussians")
+
+
+def check_can_be_copied(make: Make) -> None:
+    """Sweeps send strategies to other processes."""
+    _require(pickle.loads(pickle.dumps(make())) == make(), "a strategy does not survive pickling")  # noqa: S301 - our own
+
+
+CHECKS: Final[Sequence[Callable[[Make], None]]] = (
+    check_is_frozen_settings,
+    check_gradients_are_left_alone,
+    check_answers_have_their_shapes,
+    check_works_without_hr,
+    check_is_reproducible,
+    check_state_is_all_there_is,
+    check_state_follows_its_gaussians,
+    check_can_be_copied,
+)
+
+
+@dataclass(slots=True, eq=False)
+class StubShot:
+    """A rendering with given gradients: what a strategy needs of one, without a rasterizer."""
+
+    image: Float[Tensor, "H W 3"]
+    means2d: Float[Tensor, "N 2"]
+    visible: Bool[Tensor, " N"]
+    gradients: list[Grads]
+
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
+        return self.gradients[: len(cotangents)]
+
+
+def random_params(n: int, g: torch.Generator) -> dict[str, Tensor]:
+    """Raw parameters by attribute."""
+    shapes: dict[str, tuple[int, ...]] = {
+        "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (15, 3), "detail": (3,),
+    }  # fmt: skip
+    return {name: torch.randn(n, *shapes[name], generator=g) for name in ATTRIBUTES}
+
+
+def _situation(seed: int) -> tuple[StubShot, StubShot, View, dict[str, Tensor]]:
+    g = torch.Generator().manual_seed(0)  # one view, whatever the seed: strategies may remember it by name
+    camera = Camera(torch.eye(4), 40.0, 40.0, 20.0, 16.0, 40, 32)
+    hr_image = images.quantize(torch.rand(32, 40, 3, generator=g))
+    lr_image = images.downsample(hr_image, _FACTOR)
+    noisy = (hr_image + 0.1 * torch.randn(32, 40, 3, generator=g)).clamp(0, 1)
+    view = View("checked", Photo(camera.scaled(1 / _FACTOR), lr_image), Photo(camera, noisy))
+    g = torch.Generator().manual_seed(seed)
+    visible = torch.rand(_N, generator=g) < 0.8
+    u = torch.rand(_N, 2, generator=g) * torch.tensor([40.0, 32.0])
+
+    def gradients(detail: bool) -> Grads:
+        values = {name: 1e-6 * p * visible.view(-1, *[1] * (p.dim() - 1)) for name, p in random_params(_N, g).items()}
+        if not detail:
+            del values["detail"]
+        return Grads(values, screen=1e-6 * torch.randn(_N, 2, generator=g))
+
+    lr = StubShot(lr_image * 0.9, u / _FACTOR, visible, [gradients(False)])
+    hr = StubShot(hr_image * 0.9, u, visible, [gradients(True), gradients(True)])
+    return lr, hr, view, random_params(_N, g)
+
+
+def _conductor(make: Make, *, lambda_hf: float = 0.2) -> Conductor:
+    """Milestones are compressed, so that every phase falls inside the few steps of a check."""
+    objective = Objective(WarmupDecay(start=0, full=1, decay_from=_STEPS, end=_STEPS), lambda_hf)
+    conductor = Conductor(scaled(make(), _STEPS / 2 / 5_000), objective=objective)
+    conductor.on_fit_start(3, seed=11)
+    return conductor
+
+
+def _trace(conductor: Conductor, start: int, stop: int) -> Any:
+    """Everything a conductor says from iteration `start` to before `stop`."""
+    for t in range(start, stop):
+        lr, hr, view, params = _situation(100 + t)
+        z = conductor.gate(t, _N)
+        yield torch.ones(_N) if z is None else z
+        update = conductor.update(params, lr, hr, view, t)
+        yield update.score
+        for name in sorted(update.grads):
+            yield update.grads[name]
+        conductor.after_step(params, t)
+
+
+def _require(holds: bool, otherwise: str) -> None:
+    if not holds:
+        raise ContractError(otherwise)

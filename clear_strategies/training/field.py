@@ -1,0 +1,253 @@
+"""Floor 4: the Gaussian field: raw parameters, their activations, and the two renderings of one view.  Eq. 1-3"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from clear_strategies.core import images
+from clear_strategies.core.gradients import ATTRIBUTES, Grads
+from clear_strategies.core.view import View
+from clear_strategies.data.scene import PointCloud
+from clear_strategies.training.mip import filter_std
+from rasterizers.geometry import SH_C0
+from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats
+
+_INITIAL_OPACITY: Final = 0.1
+_NEIGHBOURS: Final = 3  # 3DGS: a point's first size is the root mean square distance to its 3 nearest neighbours
+_SMALLEST_SQUARED_DISTANCE: Final = 1e-7
+
+# Beyond these a parameter can no longer move: sigmoid(17) is 1 in float32, exp(45)² is infinite (STRESS rows 10, 16).
+LOGIT_LIMIT: Final = 15.0
+LOG_SCALE_LIMIT: Final = 20.0
+
+
+class GaussianField(nn.Module):
+    """θ: raw parameters by gsplat's names, and f_det.
+
+    Attributes:
+        quats: wxyz, any norm. scales: log. opacities: logit.
+        detail: f_det, an RGB offset in HR renderings, 0 at the start.
+        filter_3d: standard deviation of the 3D filter, world units; no parameter.
+        degree: active degree of spherical harmonics.
+    """
+
+    means: Float[nn.Parameter, "N 3"]
+    quats: Float[nn.Parameter, "N 4"]
+    scales: Float[nn.Parameter, "N 3"]
+    opacities: Float[nn.Parameter, " N"]
+    sh0: Float[nn.Parameter, "N 1 3"]
+    shN: Float[nn.Parameter, "N B 3"]  # noqa: N815 - gsplat's name
+    detail: Float[nn.Parameter, "N 3"]
+    filter_3d: Float[Tensor, " N"]
+
+    def __init__(self, parameters: Mapping[str, Tensor], *, degree: int = 0) -> None:
+        super().__init__()
+        for name in ATTRIBUTES:
+            setattr(self, name, nn.Parameter(parameters[name].detach().clone(), requires_grad=False))
+        self.register_buffer("filter_3d", parameters["means"].new_zeros(len(parameters["means"])))
+        self.degree = degree
+
+    @classmethod
+    def from_cloud(cls, cloud: PointCloud, *, max_degree: int = 3) -> GaussianField:
+        """3DGS's start: isotropic, as large as the gap to the neighbours, opacity 0.1, the points' colours.
+
+        Raises:
+            ValueError: the cloud holds no point, or `max_degree` is not 0 to 3.
+        """
+        n = len(cloud)
+        if n == 0:
+            raise ValueError(f"an initial cloud needs at least one point, {cloud.source!r} has none.")
+        if max_degree not in (0, 1, 2, 3):
+            raise ValueError(f"max_degree must be 0, 1, 2 or 3, got {max_degree}.")
+        means = cloud.means.float()
+        quats = torch.zeros(n, 4)
+        quats[:, 0] = 1
+        return cls(
+            {
+                "means": means,
+                "quats": quats,
+                "scales": _neighbour_distance(means).log()[:, None].expand(n, 3),
+                "opacities": torch.logit(torch.full((n,), _INITIAL_OPACITY)),
+                "sh0": (cloud.colors.float()[:, None] - 0.5) / SH_C0,
+                "shN": torch.zeros(n, (max_degree + 1) ** 2 - 1, 3),
+                "detail": torch.zeros(n, 3),
+            }
+        )
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+    @property
+    def max_degree(self) -> int:
+        return math.isqrt(self.shN.shape[1] + 1) - 1
+
+    def raw(self) -> dict[str, Tensor]:
+        """The raw parameters by attribute; edit them in place only."""
+        return {name: getattr(self, name).data for name in ATTRIBUTES}
+
+    def render_scales(
+        self,
+        rasterizer: Rasterizer,
+        view: View,
+        *,
+        gate: Float[Tensor, " N"] | None = None,
+        lr: bool = True,
+        hr: bool = True,
+        tiles: Bool[Tensor, "th tw"] | None = None,
+    ) -> tuple[FieldShot | None, FieldShot | None]:
+        """Î_LR without f_det and Î_HR with it, of the same gated geometry; None for one that is not wanted.  Eq. 2, 3
+
+        Args:
+            tiles: those of Î_HR that are drawn, see `Rasterizer.tile`; the others show I_HR, so that no loss sees them.
+        """
+        active = self._activate(gate)
+        wanted = [
+            (detail, photo.camera, mask)
+            for detail, photo, on, mask in ((False, view.lr, lr, None), (True, view.hr, hr, tiles))
+            if on
+        ]
+        renderings = rasterizer.render_scales(
+            [(active.splats(detail=detail), camera) for detail, camera, _ in wanted], [mask for *_, mask in wanted]
+        )
+        shots = {d: FieldShot(r, active, detail=d) for (d, *_), r in zip(wanted, renderings, strict=True)}
+        if hr and tiles is not None:
+            shots[True].image = filled(shots[True].image, tiles, view.hr.image, rasterizer.tile)
+        return shots.get(False), shots.get(True)
+
+    def render(self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True) -> Float[Tensor, "H W 3"]:
+        """An image for looking at: no dropout, f = base + det, not clamped."""
+        return rasterizer(self._activate(None).splats(detail=detail), camera).image
+
+    def update_filter(self, cameras: Sequence[Camera], variance: float) -> None:
+        """Recompute the 3D filter; after every change of structure, and now and then as the means move."""
+        self.filter_3d = filter_std(self.means.data, cameras, variance)
+
+    def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
+        """Every change of structure is one gather: row i becomes a copy of row parents[i]."""
+        for name in ATTRIBUTES:
+            getattr(self, name).data = getattr(self, name).data[parents]
+        self.filter_3d = self.filter_3d[parents]
+
+    def constrain(self) -> None:
+        """Project parameters back to where they can still move: logits to ±15, log scales to ±20."""
+        self.opacities.data.clamp_(-LOGIT_LIMIT, LOGIT_LIMIT)
+        self.scales.data.clamp_(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
+
+    def filtered_opacities(self) -> Float[Tensor, " N"]:
+        """σ(opacity) times the 3D filter's coefficient: what is drawn, and what pruning looks at."""
+        return self._activate(None).opacities
+
+    def opacity_coefficient(self) -> Float[Tensor, " N"]:
+        """Π_k s_k / √(s_k² + f²): a filtered Gaussian is larger, and as much fainter."""
+        return self._activate(None).coefficient
+
+    def fused(self) -> Splats:
+        """Everything folded in: filter in scales and opacities, f_det in the colour; what exports and viewers need."""
+        return self._activate(None).splats(detail=True)
+
+    def _activate(self, gate: Tensor | None) -> Activation:
+        raw = self.raw()
+        scales = raw["scales"].exp()
+        # √(s² + f²), and s itself where the squares vanish; torch's hypot takes ten times as long.
+        filtered = torch.maximum(scales, (scales.square() + self.filter_3d[:, None].square()).sqrt_())
+        coefficient = (scales / filtered).prod(-1)
+        sigmoid = raw["opacities"].sigmoid()
+        z = coefficient if gate is None else coefficient * gate.to(coefficient)
+        bands = (self.degree + 1) ** 2 - 1
+        return Activation(raw, scales, filtered, self.filter_3d, sigmoid, coefficient, z, raw["shN"][:, :bands])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Activation:
+    """The field as it is drawn, with what the chain rule needs to get back to the raw parameters.
+
+    Args:
+        scales: s = exp(raw). filtered: √(s² + f²). sigmoid: σ(raw). factor: coefficient · z, so opacity = factor · σ.
+    """
+
+    raw: Mapping[str, Tensor]
+    scales: Float[Tensor, "N 3"]
+    filtered: Float[Tensor, "N 3"]
+    filter_3d: Float[Tensor, " N"]
+    sigmoid: Float[Tensor, " N"]
+    coefficient: Float[Tensor, " N"]
+    factor: Float[Tensor, " N"]
+    shN: Float[Tensor, "N B 3"]  # noqa: N815 - gsplat's name
+
+    @property
+    def opacities(self) -> Float[Tensor, " N"]:
+        return self.factor * self.sigmoid
+
+    def splats(self, *, detail: bool) -> Splats:
+        return Splats(
+            self.raw["means"], self.raw["quats"], self.filtered, self.opacities, self.raw["sh0"], self.shN,
+            self.raw["detail"] if detail else None,
+        )  # fmt: skip
+
+    def vjp(self, g: SplatGradients, k: int, *, detail: bool) -> Grads:
+        """Chain rule through the filter, exp and sigmoid, for cotangent k."""
+        d_opacity = g.opacities[k]
+        # log(coefficient) = Σ log(s / √(s² + f²)) grows with log(s) by f² / (s² + f²): opacity pulls on scale.
+        share = (self.filter_3d[:, None] / self.filtered).square()
+        d_scales = g.scales[k] * self.scales.square() / self.filtered
+        d_scales = d_scales + (d_opacity * self.opacities)[:, None] * share
+        d_shN = torch.zeros_like(self.raw["shN"])
+        d_shN[:, : self.shN.shape[1]] = g.basis[:, 1:, None] * g.rgb[k, :, None]
+        grads = {
+            "means": g.means[k],
+            "quats": g.quats[k],
+            "scales": d_scales,
+            "opacities": d_opacity * self.factor * self.sigmoid * (1 - self.sigmoid),
+            "sh0": g.basis[:, :1, None] * g.rgb[k, :, None],
+            "shN": d_shN,
+        }
+        if detail:
+            grads["detail"] = g.rgb[k]
+        return Grads(grads, screen=g.screen[k])
+
+
+class FieldShot:
+    """A rendering of the field; see `gradients.Shot`.
+
+    Attributes:
+        gradients: K cotangents to gradients of the drawn splats, before the chain rule of `activation`.
+    """
+
+    def __init__(self, rendering: Rendering, activation: Activation, *, detail: bool) -> None:
+        self.image, self.means2d, self.visible = rendering.image, rendering.means2d, rendering.visible
+        self.gradients: Callable[[Tensor], SplatGradients] = rendering.vjp
+        self.activation = activation
+        self._detail = detail
+
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
+        g = self.gradients(cotangents)
+        return [self.activation.vjp(g, k, detail=self._detail) for k in range(len(cotangents))]
+
+
+def filled(
+    image: Float[Tensor, "H W 3"], tiles: Bool[Tensor, "th tw"], reference: Float[Tensor, "H W 3"], tile: int
+) -> Float[Tensor, "H W 3"]:
+    """`image` where its tiles were drawn, `reference` elsewhere: no residual there, and no edge in an SSIM window."""
+    height, width = image.shape[:2]
+    drawn = images.upsample(tiles[..., None].to(image), tile, "nearest")[:height, :width]
+    return torch.where(drawn > 0, image, reference)
+
+
+def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+    from scipy.spatial import cKDTree
+
+    if len(means) == 1:
+        return means.new_full((1,), _SMALLEST_SQUARED_DISTANCE**0.5)
+    k = min(_NEIGHBOURS, len(means) - 1) + 1  # the nearest is the point itself
+    points = means.numpy()
+    distances = np.asarray(cKDTree(points).query(points, k=k)[0])
+    squared = torch.from_numpy(distances[:, 1:]).square().mean(1)
+    return squared.clamp_min(_SMALLEST_SQUARED_DISTANCE).sqrt().to(means)

@@ -1,0 +1,122 @@
+"""Floor 4: 3DGS's learning rates, and Adam over the field's attributes (METHOD, A and F8)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from clear_strategies.core.gradients import ATTRIBUTES
+from clear_strategies.schedules import LogLinear
+
+BETA1: Final = 0.9
+BETA2: Final = 0.999
+
+
+@dataclass(frozen=True, slots=True)
+class LearningRates:
+    """Per step, by attribute.
+
+    Args:
+        means: log-linear decay, in units of the scene's extent.
+        detail_decay: f_det is multiplied by 1 minus this at every step in which HR takes part. L_HF cannot see a
+            constant colour, so nothing else holds f_det near 0.
+        eps: Adam's; gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
+        rows: "all", or only the rows "visible" in this step (faster; not exact, the others' momentum waits).
+    """
+
+    means: LogLinear = field(default_factory=LogLinear)
+    quats: float = 1e-3
+    scales: float = 5e-3
+    opacities: float = 5e-2
+    sh0: float = 2.5e-3
+    shN: float = 1.25e-4  # noqa: N815 - gsplat's name
+    detail: float = 2.5e-3
+    detail_decay: float = 0.0
+    eps: float = 1e-15
+    rows: Literal["all", "visible"] = "all"
+
+    def __post_init__(self) -> None:
+        for name in ("quats", "scales", "opacities", "sh0", "shN", "detail", "eps"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}.")
+        if not 0 <= self.detail_decay < 1:
+            raise ValueError(f"detail_decay must lie in [0, 1), got {self.detail_decay}.")
+        if self.rows not in ("all", "visible"):
+            raise ValueError(f"rows must be all or visible, got {self.rows!r}.")
+
+    def at(self, t: int, extent: float) -> dict[str, float]:
+        """Every attribute's rate at iteration t, in its own unit."""
+        rates = {name: getattr(self, name) for name in ATTRIBUTES if name != "means"}
+        return {"means": self.means(t) * extent, **rates}
+
+
+class Adam:
+    """Adam with per-attribute learning rates and rows that follow their Gaussians.
+
+    Args:
+        extent: 3DGS's cameras_extent, world units: scales the positions' learning rate.
+    """
+
+    def __init__(self, params: Mapping[str, Tensor], rates: LearningRates, extent: float) -> None:
+        self.rates, self.extent = rates, extent
+        self.steps = 0
+        self.first = {name: torch.zeros_like(p) for name, p in params.items()}
+        self.second = {name: torch.zeros_like(p) for name, p in params.items()}
+
+    def step(
+        self, params: Mapping[str, Tensor], grads: Mapping[str, Tensor], visible: Bool[Tensor, " N"] | None = None
+    ) -> None:
+        """One step in place. An attribute without gradient has gradient 0: its momentum still moves it."""
+        rates, bias2 = self.advance()
+        rows = visible if self.rates.rows == "visible" else None
+        if "detail" in grads and self.rates.detail_decay > 0:
+            params["detail"].mul_(1 - self.rates.detail_decay)
+        for name, p in params.items():
+            m, v, g = self.first[name], self.second[name], grads.get(name)
+            before = None if rows is None else (p.clone(), m.clone(), v.clone())
+            m.mul_(BETA1)
+            v.mul_(BETA2)
+            if g is not None:
+                m.add_(g, alpha=1 - BETA1)
+                v.addcmul_(g, g, value=1 - BETA2)
+            denominator = (v / bias2).sqrt_().add_(self.rates.eps)
+            p.addcdiv_(m, denominator, value=-rates[name])
+            if rows is not None and before is not None:
+                stepped = rows.view(-1, *[1] * (p.dim() - 1))
+                for now, then in zip((p, m, v), before, strict=True):
+                    torch.where(stepped, now, then, out=now)
+
+    def advance(self) -> tuple[dict[str, float], float]:
+        """Count a step: every attribute's rate over the bias of the first moment, and the bias of the second."""
+        self.steps += 1
+        bias1, bias2 = 1 - BETA1**self.steps, 1 - BETA2**self.steps
+        return {name: rate / bias1 for name, rate in self.rates.at(self.steps, self.extent).items()}, bias2
+
+    def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
+        """Follow a change of structure; fresh rows start without momentum."""
+        for moments in (self.first, self.second):
+            for name, rows in moments.items():
+                gathered = rows[parents]
+                gathered[fresh] = 0
+                moments[name] = gathered
+
+    def forget(self, name: str) -> None:
+        """Zero an attribute's moments, e.g. after an opacity reset."""
+        self.first[name].zero_()
+        self.second[name].zero_()
+
+    def state_dict(self) -> dict[str, Tensor]:
+        moments = {"first": self.first, "second": self.second}
+        return {f"{kind}.{name}": rows for kind, table in moments.items() for name, rows in table.items()}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor], steps: int) -> None:
+        self.steps = steps
+        self.first, self.second = (
+            {name: tensors[f"{kind}.{name}"].to(rows.device, copy=True) for name, rows in moments.items()}
+            for kind, moments in (("first", self.first), ("second", self.second))
+        )
