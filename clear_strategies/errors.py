@@ -17,6 +17,10 @@ class DataError(ClearError, ValueError):
         super().__init__(": ".join(_one_line(part) for part in (self.file, field, problem, remedy)))
 
 
+class SettingError(ClearError, ValueError):
+    """A setting that cannot be used: `field: rule, value found: remedy`."""
+
+
 class StrategyConflict(ClearError, TypeError):
     """Two strategies answer a question that only one may answer."""
 

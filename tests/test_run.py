@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 
 from clear_strategies import Conductor, Strategy
 from clear_strategies.run import CONF
-from tests.data.malformed import CASES
+from tests.helpers.malformed import CASES
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = ["data.reader.width=64", "data.reader.height=48", "fit.iterations=12", "fit.max_degree=1", "data.cloud.init=random",

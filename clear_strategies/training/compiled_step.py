@@ -1,8 +1,8 @@
 """Floor 4: the conductor's merge and the optimizer's step in one compiled pass over the Gaussians.
 
 `Conductor.merge`, `GCO.correct`, `SVS.regularize`, `Activation.vjp`, `Adam.step` and `GaussianField.constrain` are what
-it computes; they remain the source of truth, and `tests/test_fused.py` holds the two side by side. What the strategies
-say in a few numbers per Gaussian (gate, observe, route, score) is asked of them as always.
+it computes; they remain the source of truth, and `tests/training/test_compiled_step.py` holds the two side by
+side. What the strategies say in a few numbers per Gaussian (gate, observe, route, score) is asked of them as always.
 
 C++ sweeps over Gaussians in the CPU's memory, Warp over those on CUDA. There nothing is waited for: what was counted stays
 on the device, and so do the numbers that are made of it (`late`).

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-import toy
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.field import GaussianField
 from integration.bridge import AutogradShot, joint_loss, joint_update
 from rasterizers import Splats, autograd
+from tests.helpers import toy
 
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
 

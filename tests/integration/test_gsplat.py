@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-import toy
 import yaml
 
 import rasterizers
@@ -22,8 +21,8 @@ from clear_strategies.training.optim import LearningRates
 from integration.attach import HostError
 from integration.gsplat import ROWS, attach
 from rasterizers import Splats, autograd
-from tests.integration import gsplat_host
-from tests.integration.gsplat_host import Host
+from tests.helpers import gsplat_host, toy
+from tests.helpers.gsplat_host import Host
 
 STEPS = 50
 EPS = 1e-10

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import toy
 from safetensors.torch import load_file
 
 import rasterizers
@@ -28,8 +27,9 @@ from integration import launch
 from integration.attach import HostError
 from integration.inria import attach, enlarged, intrinsics
 from integration.lineage import change
+from tests.helpers import toy
 
-HOST = Path(__file__).parent / "inria_host"
+HOST = Path(__file__).parents[1] / "helpers" / "inria_host"
 AT_ONCE = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
 SILENT = Objective(lambda_hr=WarmupDecay(peak=0, final=0))
 STEPS, N = 25, 24

@@ -10,11 +10,11 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-import toy
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
 from integration.attach import HostError
+from tests.helpers import toy
 
 N = 24
 AT_ONCE = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
@@ -23,7 +23,7 @@ AT_ONCE = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strateg
 @pytest.fixture
 def host(monkeypatch):
     """The stand-in's module, our controller, and photographs."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parent / "lightning_host"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "helpers" / "lightning_host"))
     splatting = importlib.import_module("internal.gaussian_splatting")
     controller = importlib.import_module("integration.lightning").ClearDensityController
     scene = toy.scene(N)

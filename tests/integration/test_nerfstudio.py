@@ -12,7 +12,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-import toy
 
 from clear_strategies import GCO, P2G, Conductor, Objective
 from clear_strategies.data.cameras import pose_from_opengl
@@ -22,8 +21,8 @@ from clear_strategies.errors import DataError
 from clear_strategies.schedules import WarmupDecay
 from integration.gsplat import attach
 from integration.nerfstudio_data import over_black, prior, save_lr, views, world_to_camera
-from tests.integration import gsplat_host
-from tests.integration.gsplat_host import Host
+from tests.helpers import gsplat_host, toy
+from tests.helpers.gsplat_host import Host
 
 AT_ONCE = WarmupDecay(start=0, full=1, decay_from=100, end=100)
 

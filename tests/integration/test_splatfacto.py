@@ -18,7 +18,8 @@ from pathlib import Path
 
 import pytest
 import torch
-import toy
+
+from tests.helpers import toy
 
 if importlib.util.find_spec("nerfstudio") is None:
     pytest.skip("nerfstudio is not installed: docs/hosts.md", allow_module_level=True)

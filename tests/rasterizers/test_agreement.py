@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from rasterizers_agreement import require_gradient, require_image
+
+from tests.helpers.agreement import require_gradient, require_image
 
 
 def test_equal_is_accepted_and_each_defect_is_not():

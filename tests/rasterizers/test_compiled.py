@@ -9,8 +9,12 @@ from itertools import product
 
 import pytest
 import torch
-from rasterizers_agreement import require_gradient, require_image, require_same_bits
-from rasterizers_backends import (
+
+from rasterizers import SplatGradients, Splats
+from rasterizers.reference import ReferenceRasterizer
+from rasterizers.testing import CHECKS, gradient_of, scene, select, to
+from tests.helpers.agreement import require_gradient, require_image, require_same_bits
+from tests.helpers.backends import (
     ATTRIBUTES,
     CLEAN,
     Backend,
@@ -21,10 +25,6 @@ from rasterizers_backends import (
     everything,
     exact,
 )
-
-from rasterizers import SplatGradients, Splats
-from rasterizers.reference import ReferenceRasterizer
-from rasterizers.testing import CHECKS, gradient_of, scene, select, to
 
 
 def require_reference(backend, splats, view, v, **settings):

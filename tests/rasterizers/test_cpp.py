@@ -8,12 +8,12 @@ import sys
 from dataclasses import replace
 
 import pytest
-from rasterizers_agreement import require_same_bits
-from rasterizers_backends import camera, cotangents, dense_scene, everything, why_not
 
 import rasterizers
 from rasterizers import BackendUnavailable, native
 from rasterizers.testing import scene
+from tests.helpers.agreement import require_same_bits
+from tests.helpers.backends import camera, cotangents, dense_scene, everything, why_not
 
 pytestmark = pytest.mark.skipif(bool(why_not("cpp")), reason=str(why_not("cpp")))
 

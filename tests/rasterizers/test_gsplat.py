@@ -6,11 +6,11 @@ import functools
 
 import pytest
 import torch
-import toy
 
 import rasterizers
 from rasterizers import BackendUnavailable, autograd
 from rasterizers.gsplat_backend import GsplatRasterizer
+from tests.helpers import toy
 
 STAND_IN = functools.partial(autograd.rasterization, backend="torch")
 

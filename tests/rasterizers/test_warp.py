@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from rasterizers_agreement import require_same_bits
-from rasterizers_backends import CLEAN, camera, cotangents, dense_scene, everything, why_not
 
 import rasterizers
 from rasterizers import BackendUnavailable
 from rasterizers.testing import gradient_of
+from tests.helpers.agreement import require_same_bits
+from tests.helpers.backends import CLEAN, camera, cotangents, dense_scene, everything, why_not
 
 installed = pytest.mark.skipif(bool(why_not("warp")), reason=str(why_not("warp")))
 no_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA")

@@ -30,7 +30,7 @@ from clear_strategies.data.readers import llff
 from clear_strategies.data.scene import PointCloud
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
-from tests.data.test_triangulate import camera, plane_photos
+from tests.data.points.test_sift import camera, plane_photos
 
 
 def photo(x: float = 0.0, size: int = 40) -> Photo:

@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-import toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,6 +14,7 @@ from clear_strategies.core import images
 from clear_strategies.core.evidence import lift
 from clear_strategies.strategies.p2g import patch_evidence
 from clear_strategies.training.field import GaussianField
+from tests.helpers import toy
 
 
 def test_reliability_is_one_where_the_reference_agrees_with_lr():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-import toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,6 +11,7 @@ from clear_strategies import SVS, AnchorError
 from clear_strategies.schedules import Ramp
 from clear_strategies.strategies.svs import PAPER_WEIGHTS, dropout_mask
 from clear_strategies.training.field import GaussianField
+from tests.helpers import toy
 
 
 @given(p=st.floats(0, 0.95), seed=st.integers(0, 2**31), t=st.integers(1, 10_000))

@@ -29,8 +29,8 @@ from clear_strategies.training import checkpoint
 from clear_strategies.training.loop import TrainState, iterate
 from clear_strategies.training.skips import SkipPolicy, Skips
 from rasterizers.interface import Rendering, SplatGradients, Traits
-from tests import toy
-from tests.test_resume import ITERATIONS, SCENE, SUBSETS, start, tensors
+from tests.helpers import toy
+from tests.training.test_resume import ITERATIONS, SCENE, SUBSETS, start, tensors
 
 STEADY = (8, 12, 13, 14)  # HR coarse; the anchor is taken; HR left out; all there is
 EVERY_SKIP = Skips(coarse_until=9, hr_every=2, hr_every_from=12, flat=0.02)
@@ -135,7 +135,7 @@ def no_data(monkeypatch):
 
 def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:
     """A run in its middle, of which all lies on meta but the cameras."""
-    monkeypatch.setattr("tests.test_resume.SCENE", SCENE.to("meta"))
+    monkeypatch.setattr("tests.training.test_resume.SCENE", SCENE.to("meta"))
     state = start(names)
     state.compiled_step = None
     state.skip_policy = SkipPolicy(EVERY_SKIP)

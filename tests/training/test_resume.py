@@ -12,7 +12,6 @@ import logging
 
 import pytest
 import torch
-import toy
 
 from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective
 from clear_strategies.density.adaptive import DensitySettings, cameras_extent
@@ -22,6 +21,7 @@ from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import FitSettings, TrainState, fit, iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from tests.helpers import toy
 
 ITERATIONS = 20
 # 3 warm-up starts · 2 to 12 densify and prune · 6, 12 reset · 8 warm · 12 anchor · 14 decay. Cuts around each.

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import toy
 from hydra import compose, initialize_config_dir
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
@@ -27,6 +26,7 @@ from clear_strategies.run import CONF
 from clear_strategies.schedules import scaled
 from clear_strategies.training.loop import FitSettings, TrainState, fit, iterate
 from clear_strategies.training.mip import MipFilter
+from tests.helpers import toy
 from tests.test_run import TINY, run
 
 

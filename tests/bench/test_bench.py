@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import toy
 from PIL import Image
 
 import rasterizers
@@ -35,6 +34,7 @@ from clear_strategies.errors import DataError
 from clear_strategies.kernels import losses as kernels
 from clear_strategies.outputs.export import export_ply
 from clear_strategies.training.checkpoint import Checkpoint, save
+from tests.helpers import toy
 
 
 @pytest.fixture(scope="module")
@@ -310,7 +310,7 @@ def test_a_page_without_its_markers_is_refused(page):
 
 
 def test_the_documentation_has_the_markers():
-    page = Path(__file__).resolve().parents[1] / "docs" / "benchmarks.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "benchmarks.md"
     for question in ("rasterizers", "kernels", "iteration", "pareto", "device"):
         output.between_markers(page.read_text(), question, "", source=page)
 

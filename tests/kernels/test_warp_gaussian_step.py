@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from test_fused import Case, T, case, conductors, told
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from clear_strategies import GCO, P2G, SVS, Conductor
@@ -15,6 +14,7 @@ from clear_strategies.training.compiled_step import CompiledStep, compiled_step_
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import BackendUnavailable
 from rasterizers.warp_backend.launch import require
+from tests.training.test_compiled_step import Case, T, case, conductors, told
 
 
 @pytest.fixture

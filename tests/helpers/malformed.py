@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from tests.data import tiny
+from tests.helpers import captures as tiny
 
 GOOD: dict[str, Callable[[Path], Path]] = {
     "colmap": tiny.colmap_bin,

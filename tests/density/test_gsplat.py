@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-import toy
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
@@ -27,13 +26,14 @@ from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import FitSettings, TrainState, iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
-from tests.test_lifecycle import cloud
+from tests.helpers import toy
 from tests.test_run import TINY, run
+from tests.training.test_lifecycle import cloud
 
 DEFAULT, MCMC, TINY_ONE = (
     "gsplat.strategy.DefaultStrategy",
     "clear_strategies.density.mcmc.MCMC",
-    "tests.gsplat_like.Tiny",
+    "tests.helpers.gsplat_like.Tiny",
 )
 KINDS = [TINY_ONE, DEFAULT, MCMC]
 N = 12
@@ -287,7 +287,7 @@ def test_numbers_of_the_strategys_own_are_saved_as_what_they_are():
 
 
 def test_svs_ends_densification_and_whatever_else_the_strategy_does():
-    state = start("tests.gsplat_like.Blind", SVS(dropout=Ramp(full=12), anchor_start=7))
+    state = start("tests.helpers.gsplat_like.Blind", SVS(dropout=Ramp(full=12), anchor_start=7))
     for _ in range(12):
         iterate(state, toy.RASTERIZER)
     assert state.density.strategy.steps == [1, 2, 3, 4, 5, 6]
@@ -295,7 +295,7 @@ def test_svs_ends_densification_and_whatever_else_the_strategy_does():
 
 
 def test_a_score_that_nobody_reads_is_said_once(caplog):
-    theta, optimizer, made = tagged("tests.gsplat_like.Blind", threshold=0.5)
+    theta, optimizer, made = tagged("tests.helpers.gsplat_like.Blind", threshold=0.5)
     for t in (1, 2):
         look(made, torch.ones(N), torch.zeros(N), t=t)
         made.step(theta, optimizer, t, pytest.fail)
@@ -309,7 +309,7 @@ def test_resets_reach_the_field_and_a_reset_that_does_not_come_is_said(caplog):
     assert float(theta.opacities.data.max()) == pytest.approx(-4.6)
     assert not optimizer.first["opacities"].any()
     assert "reset no opacity" not in caplog.text
-    theta, optimizer, made = tagged("tests.gsplat_like.Blind", threshold=100.0, reset_every=2)
+    theta, optimizer, made = tagged("tests.helpers.gsplat_like.Blind", threshold=100.0, reset_every=2)
     look(made, torch.ones(N), t=2)
     made.step(theta, optimizer, 2, pytest.fail)
     assert "t=2: density.reset_every falls here, and Blind" in caplog.text
@@ -326,7 +326,7 @@ def test_the_schedule_stretches_with_the_run():
 
 UNUSABLE = {
     "nowhere.Nothing": "nowhere.Nothing cannot be imported",
-    "tests.gsplat_like.Nothing": "tests.gsplat_like.Nothing is not there",
+    "tests.helpers.gsplat_like.Nothing": "tests.helpers.gsplat_like.Nothing is not there",
     "gsplat.strategy.MCMCStrategy": "take density=gsplat_mcmc",
 }
 
@@ -384,7 +384,7 @@ def test_settings_outside_their_range_are_refused(changes, message):
     ],
 )
 def test_a_strategy_that_breaks_the_contract_is_named(name, message):
-    theta, optimizer, made = tagged(f"tests.gsplat_like.{name}", min_gaussians=2)
+    theta, optimizer, made = tagged(f"tests.helpers.gsplat_like.{name}", min_gaussians=2)
     look(made, torch.ones(N))
     with pytest.raises(DensityError, match=message):
         made.step(theta, optimizer, 1, lambda _: None)

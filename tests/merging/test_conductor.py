@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import pytest
 import torch
-import toy
 from torch import Tensor
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, SplatSuRe, Strategy, StrategyConflict
@@ -15,6 +14,7 @@ from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.testing import CHECKS, ContractError, check_strategy
 from clear_strategies.training.field import GaussianField
 from rasterizers import Splats, autograd
+from tests.helpers import toy
 
 ALWAYS = WarmupDecay(start=0, full=1, decay_from=10, end=10)
 

@@ -12,7 +12,7 @@ import torch
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import llff
 from clear_strategies.errors import DataError
-from tests.data import tiny
+from tests.helpers import captures as tiny
 
 
 def test_poses_and_focal_lengths_are_turned_to_opencv_at_the_photos_size(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-import toy
 from torch import Tensor
 
 from clear_strategies import GCO, P2G, SVS, Conductor
@@ -23,6 +22,7 @@ from clear_strategies.strategies.p2g import patch_evidence
 from clear_strategies.training.loop import FitSettings, TrainState, iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from tests.helpers import toy
 
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
 

@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-import toy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,6 +18,7 @@ from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import filter_std
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.geometry import SH_C0
+from tests.helpers import toy
 
 
 def cloud(n=12, seed=0):

@@ -11,7 +11,7 @@ import pytest
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import blender, colmap, llff, nerfstudio
 from clear_strategies.errors import DataError
-from tests.data.malformed import CASES, GOOD, Case
+from tests.helpers.malformed import CASES, GOOD, Case
 
 READERS: dict[str, Callable[[Path], Capture]] = {
     "colmap": colmap.read,

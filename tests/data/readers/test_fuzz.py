@@ -11,7 +11,7 @@ import pytest
 
 from clear_strategies.data.readers import colmap, llff, nerfstudio
 from clear_strategies.errors import DataError
-from tests.data.malformed import GOOD
+from tests.helpers.malformed import GOOD
 
 READERS = {"colmap": colmap.read, "colmap_txt": colmap.read, "llff": llff.read, "nerfstudio": nerfstudio.read}
 FUZZED = [

@@ -13,7 +13,6 @@ from functools import partial
 
 import pytest
 import torch
-import toy
 
 from clear_strategies import CONFLICT_GROUPS, GCO, P2G, SVS, Conductor, Evidence, Objective
 from clear_strategies.core import deferred
@@ -28,6 +27,7 @@ from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import BackendUnavailable, SplatGradients
 from rasterizers.native import load_kernels
 from rasterizers.warp_backend.launch import require
+from tests.helpers import toy
 
 EPS = torch.finfo(torch.float32).eps
 T = 5  # any iteration at which λ_HR = 1

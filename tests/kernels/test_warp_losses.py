@@ -10,13 +10,13 @@ import sys
 
 import pytest
 import torch
-from test_kernels import TRAINED_WITH, needs_warp, photo, rough
 from torch._subclasses import FakeTensor, FakeTensorMode
 
 from clear_strategies import Objective
 from clear_strategies.kernels import losses
 from clear_strategies.kernels.losses import cpp, warp
 from rasterizers.interface import BackendUnavailable
+from tests.kernels.test_losses import TRAINED_WITH, needs_warp, photo, rough
 
 
 @pytest.fixture

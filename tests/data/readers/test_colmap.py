@@ -15,7 +15,7 @@ from clear_strategies.data import photo_files
 from clear_strategies.data.cameras import Lens
 from clear_strategies.data.readers import colmap
 from clear_strategies.errors import DataError
-from tests.data import tiny
+from tests.helpers import captures as tiny
 
 LAYOUTS = {"bin": tiny.colmap_bin, "txt": tiny.colmap_txt}
 

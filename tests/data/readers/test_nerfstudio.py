@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from clear_strategies.data.readers import nerfstudio
-from tests.data import tiny
+from tests.helpers import captures as tiny
 
 
 def changed(root: Path, change: Callable[[dict[str, Any]], object]) -> Path:

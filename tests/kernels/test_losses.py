@@ -205,7 +205,7 @@ def test_the_bits_do_not_depend_on_threads_or_luck(loss, threads):
 ISA_SCRIPT = """
 import sys, torch
 sys.path.insert(0, {tests!r})
-from test_kernels import TRAINED_WITH, cpp, photo, rough
+from tests.kernels.test_losses import TRAINED_WITH, cpp, photo, rough
 x, y = rough(photo(141, 353), 0.1)
 torch.save([cpp.native().isa, *(tuple(loss(x, y, "cpp")) for loss in TRAINED_WITH.values())], {out!r})
 """
@@ -216,10 +216,10 @@ torch.save([cpp.native().isa, *(tuple(loss(x, y, "cpp")) for loss in TRAINED_WIT
 def test_every_instruction_set_agrees(isa, tmp_path):
     if isa not in [*cpp.native().instruction_sets(), "baseline"]:
         pytest.skip(f"this processor has no {isa}")
-    tests, out = Path(__file__).parent, tmp_path / "results.pt"
+    tests, out = Path(__file__).parents[2], tmp_path / "results.pt"
     subprocess.run(
         [sys.executable, "-c", ISA_SCRIPT.format(tests=str(tests), out=str(out))],
-        env={**os.environ, "CLEAR_ISA": isa}, cwd=tests.parent, check=True,
+        env={**os.environ, "CLEAR_ISA": isa}, cwd=tests, check=True,
     )  # fmt: skip
     found, *theirs = torch.load(out)
     assert found == isa

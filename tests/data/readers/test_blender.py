@@ -11,7 +11,7 @@ from PIL import Image
 
 from clear_strategies.data.photo_files import frame_number
 from clear_strategies.data.readers import blender
-from tests.data import tiny
+from tests.helpers import captures as tiny
 
 PROTOCOL = {2, 16, 26, 55, 73, 76, 86, 93}
 
