@@ -291,7 +291,7 @@ def test_numbers_of_the_strategys_own_are_saved_as_what_they_are():
 
 
 def test_svs_ends_densification_and_whatever_else_the_strategy_does():
-    state = start("tests.helpers.gsplat_like.Blind", SVS(dropout=Ramp(full=12), anchor_start=7))
+    state = start("tests.helpers.gsplat_like.Blind", SVS(dropout=Ramp(full=12), anchor_start=7, anchor_strength=0.01))
     for _ in range(12):
         iterate(state, toy.RASTERIZER)
     assert state.density.strategy.steps == [1, 2, 3, 4, 5, 6]
