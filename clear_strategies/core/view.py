@@ -27,7 +27,7 @@ class Photo:
             )
 
     def to(self, device: torch.device | str) -> Photo:
-        """The same with its image on `device`; a camera stays on the CPU, whence kernels are told its numbers."""
+        """The same with its image on `device`; the camera stays on the CPU, where its numbers are read."""
         return replace(self, image=self.image.to(device))
 
 
@@ -36,9 +36,9 @@ class View:
     """One view v: I_LR^v, I_HR^v and C^v at both scales; HR is exactly an integer times LR.
 
     Args:
-        lr: the authentic low-resolution observation.
-        hr: the super-resolved reference. Never the truth.
-        truth: the real image at HR, for evaluation only; training never touches it.
+        lr: the authentic low-resolution photo.
+        hr: the SR image, never the truth.
+        truth: the real photo at HR, for evaluation only; training never uses it.
         reference: where `hr` came from, e.g. "onnx span_x4.onnx".
     """
 

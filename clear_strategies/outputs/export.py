@@ -16,7 +16,7 @@ def export_ply(path: Path, field: GaussianField) -> None:
 
     Viewers that honour the header's `SplatRenderMode: mip` draw it with opacity compensation, as it was trained.
     """
-    splats = field.fused()
+    splats = field.baked()
     tiny = torch.finfo(torch.float32).eps
     offset = splats.rgb_offset if splats.rgb_offset is not None else torch.zeros_like(splats.means)
     higher = torch.zeros_like(field.shN.data)

@@ -160,7 +160,7 @@ def _draw(
     field: GaussianField, rasterizer: Rasterizer, camera: Camera, numbers: Float[Tensor, "N K"]
 ) -> Float[Tensor, "H W 3"]:
     """The Gaussians with their K <= 3 numbers as colour, over black whatever the rasterizer's background is."""
-    splats = field.fused()
+    splats = field.baked()
 
     def drawn(rgb: Tensor) -> Tensor:
         sh0 = ((rgb - 0.5) / SH_C0)[:, None]
