@@ -306,7 +306,7 @@ class GsplatDensifier:
         """Warn once of settings that have no effect."""
         if seen.score is not seen.ordinary and "means2d" not in info.read:
             self._warn_once(
-                "score", f"{self.kind} reads no screen gradient: P2G's score has no effect on the structure."
+                "score", f"{self.kind} reads no screen gradient: the strategies' score has no effect on the structure."
             )
         if self.reset_due(t) and bool(optimizer.second["opacities"].any()):  # a reset leaves no momentum
             self._warn_once(

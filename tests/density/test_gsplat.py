@@ -303,7 +303,7 @@ def test_a_score_that_nobody_reads_is_said_once(caplog):
     for t in (1, 2):
         look(made, torch.ones(N), torch.zeros(N), t=t)
         made.step(theta, optimizer, t, pytest.fail)
-    assert caplog.text.count("Blind reads no screen gradient: P2G's score has no effect") == 1
+    assert caplog.text.count("Blind reads no screen gradient: the strategies' score has no effect") == 1
 
 
 def test_resets_reach_the_field_and_a_reset_that_does_not_come_is_said(caplog):
