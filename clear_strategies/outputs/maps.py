@@ -72,7 +72,7 @@ def diagnose(
     return Diagnosis(maps, means)
 
 
-def leave(
+def write_maps(
     folder: Path,
     views: Sequence[View],
     field: GaussianField,

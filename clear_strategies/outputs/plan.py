@@ -1,26 +1,19 @@
-"""Floor 5: what a run says before and while it trains."""
+"""The plan: what a run prints before it trains."""
 
 from __future__ import annotations
 
 import logging
-import math
-import sys
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import torch
 
 from clear_strategies.data.scene import Scene
 from clear_strategies.schedules import milestones
 from clear_strategies.strategies.svs import SVS
-from clear_strategies.training.loop import Progress, TrainState
+from clear_strategies.training.loop import TrainState
 
 _log = logging.getLogger(__name__)
-
-_LOOK_EVERY: Final = 0.25  # seconds between two looks at the numbers for the bar: on a device each look waits
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,41 +89,3 @@ def marks(state: TrainState) -> dict[str, int]:
         if isinstance(s, SVS) and s.anchor_strength > 0:
             at["anchor"] = s.anchor_start
     return at
-
-
-@contextmanager
-def progress(state: TrainState, watch: Callable[[], None] | None = None) -> Iterator[Progress]:
-    """A bar with loss, PSNR, Gaussians, conflict ratio and the time that is left; `watch` is called at each step."""
-    from tqdm import tqdm
-    from tqdm.contrib.logging import logging_redirect_tqdm
-
-    shown: dict[str, str] = {}
-    every = 0.5 if sys.stderr.isatty() else 15  # seconds; a log file needs no animation
-    total, done = state.settings.iterations, state.t - 1
-    with (
-        logging_redirect_tqdm(),
-        tqdm(total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=every) as bar,
-    ):
-        looked = -math.inf
-
-        def look(row: Mapping[str, float]) -> None:
-            λ_lr, λ_hr = state.conductor.objective.lambda_lr, row["lambda_hr"]
-            shown["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
-            shown["N"] = f"{int(row['n_gaussians']):,}"
-            if not math.isnan(row.get("conflict", math.nan)):
-                shown["conflict"] = f"{row['conflict']:.2f}"
-            if "psnr_test" in row:
-                shown["psnr"] = f"{row['psnr_test']:.2f} dB"
-            bar.set_postfix(shown, refresh=False)
-
-        def update(state: TrainState) -> None:
-            nonlocal looked
-            telling = state.ended or "psnr_test" in state.history[-1]
-            if telling or time.monotonic() - looked >= _LOOK_EVERY:
-                look(state.history_as_floats()[-1])
-                looked = time.monotonic()
-            bar.update(1)
-            if watch is not None:
-                watch()
-
-        yield update

@@ -15,7 +15,7 @@ from clear_strategies.core.gradients import Grads, conflict_ratio
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
-from clear_strategies.outputs.maps import MAPS, diagnose, leave
+from clear_strategies.outputs.maps import MAPS, diagnose, write_maps
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.strategies.p2g import patch_evidence
@@ -127,7 +127,7 @@ def test_maps_lie_over_black_whatever_the_background_is() -> None:
 
 def test_a_folder_of_maps_is_complete_and_says_what_it_holds(tmp_path: Path) -> None:
     state = trained(GCO(), P2G())
-    leave(tmp_path, state.views[:2], state.field, state.conductor, toy.RASTERIZER)
+    write_maps(tmp_path, state.views[:2], state.field, state.conductor, toy.RASTERIZER)
     content = json.loads((tmp_path / "maps.json").read_text())
     assert (content["corrector"], content["evidence"]) == ("GCO", "this run's P2G")
     assert set(content["views"]) == {view.name for view in state.views[:2]}
@@ -143,7 +143,7 @@ def test_a_folder_of_maps_is_complete_and_says_what_it_holds(tmp_path: Path) -> 
 def test_without_a_corrector_no_correction_is_claimed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     state = trained()
-    leave(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER)
+    write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER)
     content = json.loads((tmp_path / "maps.json").read_text())
     assert (content["corrector"], content["evidence"]) == (None, "P2G's defaults")
     assert not (tmp_path / state.views[0].name / "corrected.png").exists()
