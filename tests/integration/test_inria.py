@@ -38,7 +38,7 @@ STEPS, N = 25, 24
 def svs(**settings):
     """Made anew each time: a strategy remembers."""
     weights = {"means": 1e-4, "scales": 1e-4, "detail": 1e-6}
-    return scaled(SVS(anchor_weights=weights, **settings), STEPS / 10_000)
+    return scaled(SVS(**{"anchor_strength": 0.01, "anchor_weights": weights} | settings), STEPS / 10_000)
 
 
 @pytest.fixture
