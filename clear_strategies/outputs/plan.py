@@ -11,7 +11,7 @@ import torch
 from clear_strategies.data.scene import Scene
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.schedules import milestones
-from clear_strategies.training.loop import TrainState
+from clear_strategies.training.state import TrainState
 
 _log = logging.getLogger(__name__)
 

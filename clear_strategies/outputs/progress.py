@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Final
 
-from clear_strategies.training.loop import Progress, TrainState
+from clear_strategies.training.loop import Progress
+from clear_strategies.training.state import TrainState
 
 _READ_EVERY: Final = 0.25  # seconds; reading the history's numbers waits for the device
 

@@ -14,9 +14,11 @@ from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs.plan import Chosen
 from clear_strategies.outputs.results import FILES, write_results
 from clear_strategies.schedules import WarmupDecay
-from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 
 WRITTEN_BY_OTHERS = {".hydra/", "run.log", "checkpoints/"}
