@@ -31,8 +31,8 @@ from rasterizers.interface import Camera
 _log = logging.getLogger(__name__)
 
 NOTE: Final = (
-    "bicubic and prior see the view's own LR photo, which a render of a test view never does: they bound what "
-    "appearance could be, they synthesise no view"
+    "bicubic and prior are made from the view's own LR photo, which a run never sees of a test view: they show what "
+    "that photo allows, not what view synthesis can reach"
 )
 
 Table = dict[str, dict[str, ImageScores]]

@@ -151,7 +151,7 @@ def _view(section: Section, name: str, images: Images) -> dict[str, Any] | None:
             note = f"{run.views[name]:.2f} dB" if name in run.views else ""
             layers.append({"label": method, "kind": "method", "note": note, "image": images.add(path)})
     except DataError as error:
-        _log.warning("%s; the page leaves this view out.", error)
+        _log.warning("%s; this view is not on the page.", error)
         return None
     return {"name": name, "width": width, "height": height, "layers": layers}
 

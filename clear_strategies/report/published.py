@@ -91,7 +91,7 @@ class PaperTable:
             found.append(f"{', '.join(f'{n:,}' for n in iterations)} iterations")
         if counts := sorted({text.split(":")[0] for text in planned("train views")} - {str(self.views)}):
             found.append(f"{', '.join(counts)} training views")
-        inputs = [re.split(", (?:prior|reference): ", text, maxsplit=1) for text in planned("HR")]
+        inputs = [re.split(", (?:SR images|reference): ", text, maxsplit=1) for text in planned("HR")]
         if sizes := dict.fromkeys(size for size, *_ in inputs if size.partition(" ")[0] not in self.pixels):
             found.append(f"HR {', '.join(sizes)} (protocol: {' or '.join(self.pixels)})")
         if priors := dict.fromkeys(prior for _, *rest in inputs for prior in rest if "resshift" not in prior.lower()):

@@ -94,7 +94,7 @@ class Run:
         except KeyError as error:
             raise DataError(path, str(error), "is missing", "train the run again") from error
         except (TypeError, ValueError, AttributeError) as error:
-            raise DataError(path, "content", f"is not what a run leaves ({error})", "train the run again") from error
+            raise DataError(path, "content", f"is not that of a run ({error})", "train the run again") from error
 
 
 def collect(folders: Iterable[Path]) -> list[Run]:

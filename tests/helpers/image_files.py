@@ -24,9 +24,9 @@ def read(path: Path) -> np.ndarray:
     return np.asarray(Image.open(path).convert("RGB"))
 
 
-def holds(picture: np.ndarray, image: np.ndarray, times: int = 1) -> bool:
-    """Whether the image, every pixel `times` larger, is somewhere in the picture, exactly."""
+def holds(page: np.ndarray, image: np.ndarray, times: int = 1) -> bool:
+    """Whether the image, every pixel `times` larger, is somewhere on the page, exactly."""
     pixels = (image * 255).round().astype(np.uint8).repeat(times, axis=0).repeat(times, axis=1)
     height, width = pixels.shape[:2]
-    corners = np.argwhere((picture[: -height + 1, : -width + 1] == pixels[0, 0]).all(axis=-1))
-    return any(np.array_equal(picture[y : y + height, x : x + width], pixels) for y, x in corners)
+    corners = np.argwhere((page[: -height + 1, : -width + 1] == pixels[0, 0]).all(axis=-1))
+    return any(np.array_equal(page[y : y + height, x : x + width], pixels) for y, x in corners)

@@ -35,7 +35,7 @@ def test_curves_draw_whatever_was_measured(tmp_path: Path, rows: list[dict[str, 
     assert read(tmp_path / "curves.png").shape == (800, 1500, 3)
 
 
-def test_a_measured_column_changes_the_picture_and_an_unknown_one_does_not(tmp_path: Path) -> None:
+def test_a_measured_column_is_drawn_and_an_unknown_one_is_not(tmp_path: Path) -> None:
     histories = {
         "plain": history(loss_lr=0.1),
         "measured": history(loss_lr=0.1, conflict=0.4),

@@ -158,6 +158,6 @@ def test_real_photographs_rank_truth_network_bicubic_x4_bicubic_x8(shared_data: 
     truth = image[top : top + 256, left : left + 256]
     network = cv2.dnn.readNetFromONNX(str(shared_data / "sr_weights" / "span_x4.onnx"))
     network.setInput(images.downsample(truth, 4).permute(2, 0, 1)[None].numpy())
-    reference = torch.from_numpy(network.forward()[0]).permute(1, 2, 0)
-    candidates = (truth, reference, enlarged(truth, 4), enlarged(truth, 8))
+    enhanced = torch.from_numpy(network.forward()[0]).permute(1, 2, 0)
+    candidates = (truth, enhanced, enlarged(truth, 4), enlarged(truth, 8))
     assert_ranked(*(score(candidate, truth) for candidate in candidates))

@@ -14,9 +14,9 @@ def test_a_comparison_enlarges_the_part_where_runs_differ_most(tmp_path: Path) -
     other[32:48, 120:180] = array(1, 16, 60)  # a quarter of the size each way, on the grid of windows
     other[0, 0] = 1 - other[0, 0]
     write_comparison(tmp_path / "c.png", {"one": base, "two": other}, {"one": "20 dB"}, "scene · view")
-    picture = read(tmp_path / "c.png")
+    drawn = read(tmp_path / "c.png")
     for tile in (base, other):
-        assert holds(picture, tile[32:48, 120:180], times=4)
+        assert holds(drawn, tile[32:48, 120:180], times=4)
 
 
 def test_equal_runs_and_a_single_run_are_compared_at_the_centre(tmp_path: Path) -> None:
@@ -29,11 +29,11 @@ def test_equal_runs_and_a_single_run_are_compared_at_the_centre(tmp_path: Path) 
 def test_many_runs_go_to_more_lines_and_long_names_are_wrapped(tmp_path: Path) -> None:
     tiles = {f"run {i}, objective.lambda_hr.peak=0.0, objective.lambda_hr.final=0.0": array(i) for i in range(8)}
     write_comparison(tmp_path / "c.png", tiles, {}, "scene · view")
-    picture = read(tmp_path / "c.png")
-    assert picture.shape[1] < 7 * 260
-    assert picture.shape[0] > 2 * 2 * 160
+    drawn = read(tmp_path / "c.png")
+    assert drawn.shape[1] < 7 * 260
+    assert drawn.shape[0] > 2 * 2 * 160
 
 
-def test_nothing_to_compare_makes_no_picture(tmp_path: Path) -> None:
+def test_nothing_to_compare_makes_no_file(tmp_path: Path) -> None:
     write_comparison(tmp_path / "c.png", {}, {}, "scene")
     assert not (tmp_path / "c.png").exists()

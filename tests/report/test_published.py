@@ -10,7 +10,7 @@ from tests.helpers.finished_run import cells, make_run
 
 
 def test_published_numbers_stand_right_of_ours_and_the_notes_name_the_differences(tmp_path: Path) -> None:
-    plan = {"train views": "3: a, b, c", "HR": "504x376 (x4), reference: onnx span.onnx", "initial points": "9,199: LR"}
+    plan = {"train views": "3: a, b, c", "HR": "504x376 (x4), SR images: onnx span.onnx", "initial points": "9,199: LR"}
     make_run(tmp_path / "0", "+method=dropgaussian", provenance={"plan": plan}, iterations=1500)
     make_run(tmp_path / "1", "+strategy=clear", "density.threshold=1e-3", provenance={"plan": plan}, iterations=1500)
     make_run(tmp_path / "2", "+strategy=mine", provenance={"plan": plan}, iterations=1500)
