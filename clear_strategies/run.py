@@ -159,6 +159,7 @@ def _run(config: DictConfig, folder: Path) -> float | None:
 
     from clear_strategies.data.prepare import save_lr
     from clear_strategies.outputs import plan, results
+    from clear_strategies.outputs.progress import progress_bar
     from clear_strategies.schedules import scaled
     from clear_strategies.training.loop import fit
     from clear_strategies.training.settings import FitSettings
@@ -210,10 +211,10 @@ def _run(config: DictConfig, folder: Path) -> float | None:
         (folder / "metrics.json").unlink()
     # What a run that is resumed took before counts too.
     began = time.perf_counter() - state.seconds
-    with plan.progress(state, _watch()) as progress:
+    with progress_bar(state, _watch()) as progress:
         fit(state, there, rasterizer, checkpoints=folder / "checkpoints", config=compared, progress=progress)
     seconds = time.perf_counter() - began
-    return results.leave(
+    return results.write_results(
         folder,
         scene,
         state,
