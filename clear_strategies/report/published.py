@@ -195,7 +195,7 @@ class Beside:
             found.append(f"{', '.join(f'{n:,}' for n in iterations)} iterations")
         if counts := sorted({text.split(":")[0] for text in each("train views")} - {str(facts.views)}):
             found.append(f"{', '.join(counts)} training views")
-        inputs = [text.partition(", reference: ") for text in each("HR")]
+        inputs = [text.partition(", SR images: ") for text in each("HR")]
         sizes = dict.fromkeys(size for size, _, _ in inputs if size.partition(" ")[0] not in facts.pixels)
         if sizes:
             found.append(f"HR {', '.join(sizes)} (protocol: {' or '.join(facts.pixels)})")

@@ -1,6 +1,6 @@
-"""Malformed inputs: tiny good scenes with one thing spoilt. Each must be refused in one line that names the file.
+"""Malformed inputs: tiny valid scenes with one defect each. Each must be refused in one line that names the file.
 
-`CASES` serves the readers' tests and the command line's: a case builds its scene and says which `data=` reads it.
+`CASES` is for the tests of the readers and of the command line: a case builds its scene and names the `data=` for it.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ class Case:
     """One malformed scene.
 
     Args:
-        good: which tiny scene it is made from. spoil: what is done to the scene's folder.
-        pattern: regular expression that the message must match, from the file's name on.
+        good: the tiny scene it is made from.
+        spoil: the change to the scene's folder.
+        pattern: regular expression that the message must match.
     """
 
     name: str
@@ -63,7 +64,7 @@ def bomb(width: int, height: int) -> bytes:
 
 
 class Canary:
-    """Unpickling it leaves a file behind: whoever reads the scene must not."""
+    """Unpickling it creates a folder, which a test can detect."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -131,7 +132,7 @@ def edit_frame(name: str, **values: object) -> Spoil:
 
 
 def save_image(name: str, **options: Any) -> Spoil:
-    """A photo of another kind in the place of a good one."""
+    """Replace a photo by another kind of image."""
     size = options.pop("size", (tiny.WIDTH, tiny.HEIGHT))
     mode = options.pop("mode", "RGB")
     return lambda root: Image.new(mode, size).save(root / name, **options)
@@ -156,7 +157,7 @@ def raw_pickle(root: Path) -> None:
 
 
 def link_outside(name: str) -> Spoil:
-    """The photo becomes a link to a file beside the scene's folder."""
+    """Replace a photo by a link to a file outside the scene's folder."""
 
     def spoil(root: Path) -> None:
         outside = root.parent / "outside.png"
@@ -206,7 +207,7 @@ TRAIN, SHARED = "transforms_train.json", "transforms.json"
 CASES = [
     # COLMAP, binary
     Case("no model", "colmap", remove(CAMERAS), r"cameras\.bin: file"),
-    Case("no photos", "colmap", lambda root: (root / "images").rename(root / "photos"), r"scene: images: has none"),
+    Case("no photos", "colmap", lambda root: (root / "images").rename(root / "photos"), r"scene/images: images: is no folder"),
     Case("photo absent", "colmap", remove("images/b.png"), r"images\.bin: b\.png: is not in"),
     Case("empty file", "colmap", write(IMAGES, b""), r"images\.bin: number of images: .*truncated"),
     Case("cameras truncated", "colmap", cut(CAMERAS, -1), r"cameras\.bin: .*bytes"),

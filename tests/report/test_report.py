@@ -230,7 +230,7 @@ def test_a_method_names_its_runs_and_where_a_scene_lies_separates_none(tmp_path:
 
 
 def test_published_numbers_stand_right_of_ours_and_the_caption_says_what_differs(tmp_path: Path) -> None:
-    plan = {"train views": "3: a, b, c", "HR": "504x376 (x4), reference: onnx span.onnx", "initial points": "9,199: LR"}
+    plan = {"train views": "3: a, b, c", "HR": "504x376 (x4), SR images: onnx span.onnx", "initial points": "9,199: LR"}
     make_run(tmp_path / "0", "+method=dropgaussian", provenance={"plan": plan}, iterations=1500)
     make_run(tmp_path / "1", "+strategy=clear", "density.threshold=1e-3", provenance={"plan": plan}, iterations=1500)
     make_run(tmp_path / "2", "+strategy=mine", provenance={"plan": plan}, iterations=1500)

@@ -57,7 +57,7 @@ def test_random_damage_gives_a_sound_capture_or_a_data_error(
             assert (rotation @ rotation.T - rotation.new_ones(3).diag()).abs().max() < 1e-6
         if capture.points is not None:
             assert capture.points.means.isfinite().all()
-            assert set(capture.points.seen_by.tolist()) <= {frame.sfm_id for frame in capture.frames}
+            assert set(capture.points.track_image.tolist()) <= {frame.sfm_id for frame in capture.frames}
     assert refused > 50
 
 
