@@ -53,7 +53,7 @@ class GaussianPly:
         opacities: logit. scales: natural logarithm. quats: wxyz, any norm.
 
     Raises:
-        ValueError: the shapes do not belong together.
+        ValueError: the shapes do not match.
     """
 
     means: Float[Tensor, "N 3"]
@@ -228,10 +228,10 @@ def _read_ascii(path: Path, header: _Header, body: bytes) -> np.ndarray:
 def _check_length(path: Path, header: _Header, needed: int, after: int, left: int, unit: str) -> None:
     """Compare the header's counts with the data that follow it."""
     if needed > left:
-        problem = f"says {header.vertex.count} vertices, which need {needed} {unit}, but {left} are left"
+        problem = f"has a count of {header.vertex.count}, which needs {needed} {unit}, but {left} are left"
         raise DataError(path, "element vertex", problem, "the file is truncated; write it again")
     if all(e.row is not None for e in header.after) and needed + after != left:
-        problem = f"says that {needed + after} {unit} follow, but {left} do"
+        problem = f"needs {needed + after} {unit} after it, but {left} follow"
         raise DataError(path, "header", problem, "the file is damaged; write it again")
 
 
@@ -279,7 +279,7 @@ def _header_lines(path: Path, head: bytes) -> tuple[list[str], int]:
 
 def _count(path: Path, element: str, text: str) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= _LONGEST_COUNT):
-        problem = f"must say a whole number >= 0, says {text[:40]!r}"
+        problem = f"must have a whole number >= 0 as its count, has {text[:40]!r}"
         raise DataError(path, f"element {element}", problem, "export it again")
     return int(text)
 

@@ -75,7 +75,7 @@ def test_llff_trains_and_tests_on_the_papers_views(scene):
 
 
 @pytest.mark.parametrize("scene", MIP360)
-def test_mip360_trains_on_24_views_spread_over_the_pool(scene):
+def test_mip360_trains_on_24_views_evenly_spaced_in_the_pool(scene):
     n, n_pool, n_test = MIP360[scene]
     train, test = split(capture(n), ViewSettings(train=24))
     pool = [i for i in range(n) if i % 8]

@@ -214,7 +214,7 @@ CASES = [
     Case("images truncated", "colmap", cut(IMAGES, -9), r"images\.bin: .*left"),
     Case("points truncated", "colmap", cut(POINTS, -3), r"points3D\.bin: .*left"),
     Case("trailing bytes", "colmap", append(POINTS, b"\0" * 5), r"points3D\.bin: end: 5 bytes"),
-    Case("count beyond file", "colmap", patch(IMAGES, 0, "<Q", 2**61), r"images\.bin: number of images: says 23058"),
+    Case("count beyond file", "colmap", patch(IMAGES, 0, "<Q", 2**61), r"images\.bin: number of images: is 23058"),
     Case("2D count beyond file", "colmap", patch(IMAGES, NAME_AT + 6, "<Q", 2**60), r"images\.bin: 2D points of 'a"),
     Case("track beyond file", "colmap", patch(POINTS, 8 + 8 + 24 + 3 + 8, "<Q", 2**59), r"points3D\.bin: track of"),
     Case("zero quaternion", "colmap", patch(IMAGES, QUATERNION_AT, "<4d", 0, 0, 0, 0), r"images\.bin: a\.png: .*leng"),

@@ -62,8 +62,8 @@ def _samples(
 ) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, " V"]]:
     """(pixels, inverse depths) of the points that project into the photo, the nearest one per square of `cell` pixels.
 
-    Tracks, which say what each view sees, are not always known. Occluded points would distort the depth, so the nearest
-    point stands for its square.
+    Tracks, which list the points that a view observes, are not always known. Occluded points would distort the depth,
+    so only the nearest point in each square is kept.
     """
     camera = photo.camera
     pixels, depth = project(camera, means)

@@ -1,4 +1,4 @@
-"""Random points, where a scene has none of its own."""
+"""Random points, for scenes without other points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bicubic enlargement as a prior: it adds no detail, and serves where no network is at hand."""
+"""Bicubic enlargement as a prior: it adds no detail beyond LR."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from clear_strategies.errors import DataError
 _LARGEST_FILE: Final = 2 << 30  # bytes; protobuf's own limit
 _LARGEST_VALUE: Final = 1e6  # neither a [0, 1] nor a [0, 255] network gives more
 # A protobuf entry with the key "location" (field 1, length 8, in any valid encoding of these numbers) names a file of
-# weights beside the model. OpenCV would open whatever path stands there.
+# weights beside the model. OpenCV would open any path named there.
 _EXTERNAL_DATA: Final = re.compile(rb"(?:\x0a|\x8a\x80*\x00)(?:\x08|\x88\x80*\x00)location")
 
 

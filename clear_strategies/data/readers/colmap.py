@@ -261,7 +261,10 @@ class _Bytes:
         (n,) = self.take("<Q", field)
         if n * record > self.left:
             raise DataError(
-                self.path, field, f"says {n} records of {record} bytes, {self.left} bytes are left", _WRITE_AGAIN
+                self.path,
+                field,
+                f"is {n}, of {record} bytes or more each, but {self.left} bytes are left",
+                _WRITE_AGAIN,
             )
         return int(n)
 

@@ -38,7 +38,7 @@ def test_tiles_join_to_the_whole_where_the_overlap_reaches_as_far_as_the_network
 
 
 def test_tiles_that_differ_are_faded_into_each_other() -> None:
-    """Each tile gets a grey of its own; along a row the result then changes by at most one ramp's slope per pixel."""
+    """Two tiles of different grey: along a row, the result changes by one ramp's slope per pixel."""
     greys = iter([0.0, 1.0])
     joined = tiled(lambda lr: torch.full((4 * lr.shape[0], 4 * lr.shape[1], 3), next(greys)), photo(8, 80), 4, 72, 8)
     row = joined[0, :, 0]

@@ -27,7 +27,7 @@ FUZZED = [
 
 @pytest.fixture
 def bounded_memory() -> Iterator[None]:
-    """A reader that believes a damaged count fails here instead of filling the machine."""
+    """Limit the memory, so that a reader that allocates by a damaged count fails here."""
     before = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + 2**30, before[1]))
