@@ -27,6 +27,19 @@ def test_the_scenes_without_defect_are_valid(kind: str, tmp_path: Path) -> None:
     assert [frame.load().shape for frame in capture.frames] == [(12, 16, 3)] * 3
 
 
+@pytest.mark.parametrize("kind", GOOD)
+def test_reading_poses_decodes_no_photo(kind: str, tmp_path: Path) -> None:
+    """Truncated photos still have their headers: they are read, and refused when they are loaded."""
+    root = GOOD[kind](tmp_path)
+    for path in root.rglob("*.png"):
+        path.write_bytes(path.read_bytes()[:-60])
+    frames = READERS[kind.removesuffix("_txt")](root).frames
+    assert len(frames) == 3
+    for frame in frames:
+        with pytest.raises(DataError, match="pixels: cannot be decoded"):
+            frame.load()
+
+
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_malformed_input_is_refused_in_one_line_that_names_the_file(case: Case, tmp_path: Path) -> None:
     kind, path = case.build(tmp_path)
