@@ -230,7 +230,7 @@ def _run(config: DictConfig, folder: Path) -> float | None:
 
 def _scene(config: DictConfig, seed: int) -> Any:
     from clear_strategies.data.prepare import prepare
-    from clear_strategies.data.priors.upscale import Bicubic, Prior, cached
+    from clear_strategies.data.priors import Bicubic, Prior, cached
 
     capture = instantiate(config.data.reader, "data.reader")
     views = instantiate(config.data.views, "data.views")

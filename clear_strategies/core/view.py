@@ -27,7 +27,7 @@ class Photo:
             )
 
     def to(self, device: torch.device | str) -> Photo:
-        """The same with its image on `device`; the camera stays on the CPU, where its numbers are read."""
+        """The same photo with its image on `device`. The camera stays on the CPU, where kernels read its numbers."""
         return replace(self, image=self.image.to(device))
 
 
@@ -37,16 +37,16 @@ class View:
 
     Args:
         lr: the authentic low-resolution photo.
-        hr: the SR image, never the truth.
+        hr: the super-resolved (SR) image of the prior; never the truth.
         truth: the real photo at HR, for evaluation only; training never uses it.
-        reference: where `hr` came from, e.g. "onnx span_x4.onnx".
+        sr_source: the prior's label, e.g. "onnx span_x4.onnx".
     """
 
     name: str
     lr: Photo
     hr: Photo
     truth: Float[Tensor, "H W 3"] | None = None
-    reference: str = "unknown"
+    sr_source: str = "unknown"
 
     @property
     def factor(self) -> int:
@@ -54,6 +54,6 @@ class View:
         return self.hr.camera.width // self.lr.camera.width
 
     def to(self, device: torch.device | str) -> View:
-        """The same with its images on `device`."""
+        """The same view with its images on `device`."""
         truth = None if self.truth is None else self.truth.to(device)
         return replace(self, lr=self.lr.to(device), hr=self.hr.to(device), truth=truth)
