@@ -299,8 +299,8 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
 
 def cores(state: TrainState, rasterizer: Rasterizer) -> AbstractContextManager[None]:
     """To train inside of: the cores go to the compiled kernels where they do nearly all of the work."""
-    if rasterizer.traits.own_threads and state.compiled_step is not None:
-        return native.own_threads(native.threads())
+    if rasterizer.traits.native_threads and state.compiled_step is not None:
+        return native.kernel_threads(native.threads())
     return nullcontext()
 
 
