@@ -23,21 +23,22 @@ from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
-from clear_strategies.kernels.gaussian_step import cpp as kernel
+from clear_strategies.kernels import gaussian_step as kernel
+from clear_strategies.kernels.gaussian_step import cpp
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.strategies.gco import ROTATION_NOISE, Correction
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
 from rasterizers.interface import BackendUnavailable, SplatGradients
 from rasterizers.native import load_kernels
-from rasterizers.warp_backend.launch import require
+from rasterizers.warp_runtime import require_warp
 
 _log = logging.getLogger(__name__)
 
 FusedMode = Literal["auto", "every_row", "off"]
 
-GaussianPass = Callable[..., kernel.Sweeps]
-"""`kernels.step.GaussianPass`, or another class of its signature."""
+GaussianPass = Callable[..., kernel.GaussianStep]
+"""`gaussian_step.cpp.CppGaussianStep`, or another class of its signature."""
 
 _KNOWN: Final = ("gco", "p2g", "svs")
 _LIMITS: Final = {"opacities": LOGIT_LIMIT, "scales": LOG_SCALE_LIMIT}
@@ -80,11 +81,11 @@ def gaussian_pass(optimizer: Adam) -> GaussianPass:
     device = optimizer.first["means"].device.type
     if device == "cpu":
         load_kernels("clear_strategies.kernels")
-        return kernel.GaussianPass
-    require("the compiled pass", device, "it runs in C++ for a field in the CPU's memory")
+        return cpp.CppGaussianStep
+    require_warp("the compiled pass", device, "it runs in C++ for a field in the CPU's memory")
     from clear_strategies.kernels.gaussian_step import warp
 
-    return warp.GaussianPass
+    return warp.WarpGaussianStep
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -220,7 +221,7 @@ class CompiledStep:
         bands = active if skips and self._above_is_quiet(shN, active, anchor.get("shN")) else shN.shape[1]
         stepped = gaussians.step(
             attributes, correction,
-            kernel.Step(
+            kernel.StepSettings(
                 BETA1, BETA2, bias2, self.optimizer.rates.eps, λ,
                 None if visible is None else visible.contiguous().view(torch.uint8), skips, 3 * bands,
             ),
@@ -273,7 +274,7 @@ class CompiledStep:
         self,
         compared: kernel.Comparison,
         margins: Sequence[Number | None],
-        stepped: kernel.Stepped,
+        stepped: kernel.StepCounts,
         e: Evidence | None,
     ) -> None:
         index = {group: k for k, group in enumerate(CONFLICT_GROUPS)}
@@ -309,7 +310,7 @@ class CompiledStep:
         self._looked_at, self._quiet = (active, tensors), not (moved or pulled)
         return self._quiet
 
-    def _note_skips(self, stepped: kernel.Stepped, bands: int, all_bands: int) -> None:
+    def _note_skips(self, stepped: kernel.StepCounts, bands: int, all_bands: int) -> None:
         skip = self.conductor.work_log.skip
         for reason, rows in (
             ("gradient, moments and anchor's vjp are 0", stepped.still),
