@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final
 
 import torch
@@ -51,7 +51,7 @@ class GsplatRasterizer(RasterSettings):
 
     Args:
         device: where the splats' tensors are.
-        rasterization: a function with the signature of gsplat's, by default gsplat's own.
+        rasterization: a function with the signature of gsplat's, for tests; None: gsplat's own.
 
     Raises:
         BackendUnavailable: gsplat is not installed, or there is no CUDA.
@@ -59,7 +59,7 @@ class GsplatRasterizer(RasterSettings):
     """
 
     device: str = "cuda"
-    rasterization: Callable[..., Any] = field(default_factory=_gsplat_rasterization)
+    rasterization: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:
         RasterSettings.__post_init__(self)
@@ -68,6 +68,8 @@ class GsplatRasterizer(RasterSettings):
                 raise ValueError(
                     f"gsplat's cut-offs cannot be chosen; {name} must stay {fixed:g}, got {getattr(self, name):g}."
                 )
+        if self.rasterization is None:
+            _gsplat_rasterization()
 
     @property
     def traits(self) -> Traits:
@@ -96,7 +98,7 @@ class GsplatRasterizer(RasterSettings):
             quats = torch.where(leaves["quats"].abs().amax(-1, keepdim=True) > 0, leaves["quats"], identity)
             base = leaves["sh0"] + leaves["rgb"][:, None] / SH_C0
             K = splats.means.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-            images, alphas, info = self.rasterization(
+            images, alphas, info = (self.rasterization or _gsplat_rasterization())(
                 leaves["means"], quats, leaves["scales"], leaves["opacities"], torch.cat((base, leaves["shN"]), 1),
                 camera.world_to_camera.to(splats.means)[None], K[None], camera.width, camera.height,
                 near_plane=self.near, eps2d=self.kernel, sh_degree=math.isqrt(splats.shN.shape[1] + 1) - 1, packed=False,

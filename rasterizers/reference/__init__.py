@@ -4,7 +4,7 @@ It has three steps, each in its file: `projection` (Gaussians to ellipses on the
 touch each tile, front to back) and `blend` (compositing, and its VJP). Autograd differentiates the projection. The VJP of
 blending is written by hand, because autograd would keep a dozen tensors per pair of pixel and Gaussian.
 
-The other backends are tested against this one. It can also train: `lanes` bounds its memory, whatever the scene.
+The other backends are tested against this one. It can also train: `lanes` bounds its memory independently of the scene.
 """
 
 from __future__ import annotations

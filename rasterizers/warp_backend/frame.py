@@ -48,7 +48,7 @@ class _View:
         self.columns, self.rows_of_tiles = -(-camera.width // TILE), -(-camera.height // TILE)
         self.opacities = splats.opacities.detach().contiguous()
         self.offsets = None if splats.rgb_offset is None else splats.rgb_offset.detach().contiguous()
-        self.wanted = None if mask is None else _tiles_of(mask, camera, settings.tile).to(like.device)
+        self.requested = None if mask is None else _tiles_of(mask, camera, settings.tile).to(like.device)
         self.grid = _grid_struct(camera, self.columns, self.rows_of_tiles)
         self.ellipses = like.new_empty(n, _ROW)
         self.means2d = like.new_empty(n, 2)
@@ -164,7 +164,7 @@ class Frame:
                 array(self.means, wp.vec3), array(self.quats, wp.vec4), array(self.scales, wp.vec3),
                 array(view.opacities), array(self.sh0, wp.vec3), array(self.shN, wp.vec3),
                 view.offsets is not None, array(view.offsets, wp.vec3),
-                view.wanted is not None, array(view.wanted), nth == 0,
+                view.requested is not None, array(view.requested), nth == 0,
                 array(keys), array(self.colours, wp.vec3), array(self.slopes, wp.mat33),
                 array(view.ellipses, types.Row), array(view.means2d, wp.vec2), array(view.visible),
                 array(view.counts), array(not_finite),
@@ -195,7 +195,7 @@ class Frame:
         starts, ends = self.like.new_zeros(2, n_tiles + 1, dtype=torch.int32)
         self.launch(
             list_pairs, self.n, array(self._order), array(view.counts), array(after),
-            array(view.ellipses, types.Row), view.grid, view.wanted is not None, array(view.wanted), capacity,
+            array(view.ellipses, types.Row), view.grid, view.requested is not None, array(view.requested), capacity,
             array(view.firsts), array(tiles), array(pairs), array(splats),
         )  # fmt: skip
         sorted_tiles, places = _sorted(tiles, pairs, capacity, n_tiles.bit_length())

@@ -70,7 +70,7 @@ def project(
     has_offsets: wp.bool,
     offsets: wp.array[wp.vec3],
     masked: wp.bool,
-    wanted: wp.array2d[wp.bool],
+    requested: wp.array2d[wp.bool],
     first: wp.bool,
     keys: wp.array[wp.int32],
     colours: wp.array[wp.vec3],
@@ -108,7 +108,7 @@ def project(
             ellipse = ellipse_at(u, v, footprint, opacity, cuts)
             if is_visible(ellipse, grid):
                 visible[i] = True
-                count = count_tiles(ellipse, grid, masked, wanted)
+                count = count_tiles(ellipse, grid, masked, requested)
                 if count > 0:
                     counts[i] = count
                     if keys[i] == FAR:

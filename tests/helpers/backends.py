@@ -130,8 +130,8 @@ def cotangents(k, height, width, seed=0) -> torch.Tensor:
 
 def everything(rendering, v):
     g = rendering.vjp(v)
-    picture = (rendering.image, rendering.alpha, rendering.means2d, rendering.visible)
-    return (*picture, *(gradient_of(g, name) for name in ATTRIBUTES), g.basis)
+    pixels = (rendering.image, rendering.alpha, rendering.means2d, rendering.visible)
+    return (*pixels, *(gradient_of(g, name) for name in ATTRIBUTES), g.basis)
 
 
 def dense_scene(n=3000):

@@ -100,12 +100,12 @@ def adam_on_cuda() -> Adam:
 
 
 def test_cuda_fields_use_warp(warp_step, adam_on_cuda, monkeypatch):
-    asked = []
+    required = []
     monkeypatch.setattr(
-        "clear_strategies.training.compiled_step.require_warp", lambda *arguments: asked.append(arguments)
+        "clear_strategies.training.compiled_step.require_warp", lambda *arguments: required.append(arguments)
     )
     assert gaussian_pass(adam_on_cuda) is warp_step.WarpGaussianStep
-    assert [device for _, device, _ in asked] == ["cuda"]
+    assert [device for _, device, _ in required] == ["cuda"]
 
 
 def test_cuda_fields_without_warp_use_the_readable_path_and_log_why(adam_on_cuda, monkeypatch, caplog):

@@ -33,15 +33,15 @@ def require_reference(backend, splats, view, v, **settings):
     settings = {**settings, **(CLEAN if narrow else {})}
     of_image, of_gradient = (5e-6, 5e-5) if narrow else (1e-12, 1e-10)
     found = backend(**settings)(to(splats, backend.widest), view)
-    truth = ReferenceRasterizer(**settings)(to(splats, torch.float64), view)
-    assert float((found.image.double() - truth.image).abs().max()) < of_image
-    assert float((found.alpha.double() - truth.alpha).abs().max()) < of_image
-    ours, theirs = found.vjp(v), truth.vjp(v.double())
+    expected = ReferenceRasterizer(**settings)(to(splats, torch.float64), view)
+    assert float((found.image.double() - expected.image).abs().max()) < of_image
+    assert float((found.alpha.double() - expected.alpha).abs().max()) < of_image
+    ours, theirs = found.vjp(v), expected.vjp(v.double())
     for name in ATTRIBUTES:
         a, b = gradient_of(ours, name), gradient_of(theirs, name)
         assert a.shape == b.shape
         assert float((a - b).norm()) <= of_gradient * float(b.norm()) + 1e-14, name
-    return found, truth
+    return found, expected
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
@@ -78,8 +78,8 @@ def dense_gradients(backend: Backend) -> tuple[SplatGradients, SplatGradients]:
 @pytest.mark.parametrize("name", ATTRIBUTES)
 @backends(dtype=torch.float32)
 def test_gradients_agree_without_cut_offs(backend, name):
-    found, truth = dense_gradients(backend)
-    require_gradient(name, gradient_of(found, name)[0], gradient_of(truth, name)[0])
+    found, expected = dense_gradients(backend)
+    require_gradient(name, gradient_of(found, name)[0], gradient_of(expected, name)[0])
 
 
 @backends(dtype=torch.float32)
@@ -99,9 +99,9 @@ def test_transmittance_survives_four_hundred_layers(backend):
         settings = {"alpha_min": 1e-6, "transmittance_min": 1e-9}
         found, right = backend(**settings)(splats, view), exact(splats, view, **settings)
         assert float((found.image.double() - right.image).abs().max()) < 5e-6
-        ours, truth = found.vjp(v), right.vjp(v.double())
+        ours, expected = found.vjp(v), right.vjp(v.double())
         for name in ("opacities", "sh0"):
-            a, b = gradient_of(ours, name).double(), gradient_of(truth, name)
+            a, b = gradient_of(ours, name).double(), gradient_of(expected, name)
             assert float((a - b).norm() / b.norm()) < tolerance
 
 
@@ -125,9 +125,9 @@ def test_needles_keep_their_shape(backend, aspect, pixels):
         one = select(splats, torch.tensor([i]))
         found, right = backend(**CLEAN)(one, view), ReferenceRasterizer(**CLEAN)(to(one, torch.float64), view)
         assert float((found.image.double() - right.image).abs().max()) < 5e-5
-        ours, truth = found.vjp(v), right.vjp(v.double())
+        ours, expected = found.vjp(v), right.vjp(v.double())
         for name in ("means", "scales", "opacities"):
-            a, b = gradient_of(ours, name).double(), gradient_of(truth, name)
+            a, b = gradient_of(ours, name).double(), gradient_of(expected, name)
             assert bool(a.isfinite().all())
             assert float((a - b).norm()) <= 2e-3 * float(b.norm()) + 1e-6, (name, i)
 
@@ -239,8 +239,8 @@ def test_any_number_of_gaussians(backend, n):
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (15, 16), (16, 17), (31, 33), (32, 32), (64, 65)])
 @backends()
 def test_any_image_size(backend, size):
-    found, truth = require_reference(backend, scene(80), camera(*size), cotangents(1, size[1], size[0]))
-    assert torch.equal(found.visible, truth.visible)
+    found, expected = require_reference(backend, scene(80), camera(*size), cotangents(1, size[1], size[0]))
+    assert torch.equal(found.visible, expected.visible)
 
 
 @pytest.mark.parametrize("tile", [4, 8, 16, 32, 64])

@@ -398,7 +398,7 @@ def test_thirty_iterations_are_those_of_the_readable_path(sweeps):
             mip=MipFilter(every=7, last=1),
         )
         if mode == "auto":
-            states[mode].fused = CompiledStep(states[mode].conductor, states[mode].optimizer, sweeps=sweeps)
+            states[mode].compiled_step = CompiledStep(states[mode].conductor, states[mode].optimizer, sweeps=sweeps)
         for _ in range(30):
             iterate(states[mode], toy.RASTERIZER)
         deferred.resolve(states[mode].history)

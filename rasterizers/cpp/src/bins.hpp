@@ -54,9 +54,9 @@ inline std::vector<std::int64_t> count_pairs(int rows, const Buffer<BinRange>& r
   return pairs;
 }
 
-// Lists the pairs of rows [first_row, end_row). Bins with `wanted[bin]` = 0 are left out; null: none is.
+// Lists the pairs of rows [first_row, end_row). Bins with `requested[bin]` = 0 are left out; null: none is.
 inline void list_pairs(int columns, int first_row, int end_row, const Buffer<std::uint32_t>& order,
-                       const Buffer<BinRange>& ranges, std::int64_t n, const std::uint64_t* wanted, Bins& out, int threads) {
+                       const Buffer<BinRange>& ranges, std::int64_t n, const std::uint64_t* requested, Bins& out, int threads) {
   out.columns = columns, out.first_row = first_row, out.end_row = end_row, out.has_masks = false;
   const int bins = out.bins();
   auto clipped = [&](std::uint32_t i) {
@@ -67,7 +67,7 @@ inline void list_pairs(int columns, int first_row, int end_row, const Buffer<std
   auto each_bin = [&](const BinRange& r, auto&& visit) {
     for (int y = r.y0; y <= r.y1; ++y)
       for (int x = r.x0; x <= r.x1; ++x)
-        if (!wanted || wanted[y * columns + x]) visit((y - first_row) * columns + x);
+        if (!requested || requested[y * columns + x]) visit((y - first_row) * columns + x);
   };
 
   // Count each Gaussian's pairs.
@@ -79,7 +79,7 @@ inline void list_pairs(int columns, int first_row, int end_row, const Buffer<std
     for (std::int64_t i = c * chunk; i < std::min(n, (c + 1) * chunk); ++i) {
       out.first[i] = std::uint32_t(count);
       BinRange r = clipped(std::uint32_t(i));
-      if (wanted) each_bin(r, [&](int) { ++count; });
+      if (requested) each_bin(r, [&](int) { ++count; });
       else count += r.count();
     }
     base[c + 1] = count;

@@ -72,18 +72,18 @@ inline std::uint64_t blocks_in_image(int bin_x, int bin_y, int width, int height
 // The blocks of the requested tiles, by bin; tiles have `edge` px, a multiple of 4.
 inline std::vector<std::uint64_t> blocks_of_tiles(const bool* tiles, int edge, int width, int height) {
   const int columns = (width + kBin - 1) / kBin, rows = (height + kBin - 1) / kBin, across = (width + edge - 1) / edge;
-  std::vector<std::uint64_t> wanted(std::size_t(columns) * rows, 0);
+  std::vector<std::uint64_t> requested(std::size_t(columns) * rows, 0);
   for (int y = 0; y * kBlock < height; ++y)
     for (int x = 0; x * kBlock < width; ++x)
       if (tiles[y * kBlock / edge * across + x * kBlock / edge])
-        wanted[y / kBlocksAcross * columns + x / kBlocksAcross] |=
+        requested[y / kBlocksAcross * columns + x / kBlocksAcross] |=
             std::uint64_t(1) << (y % kBlocksAcross * kBlocksAcross + x % kBlocksAcross);
-  return wanted;
+  return requested;
 }
 
 // Gathers a segment's Gaussians and lists those of each block. Masks are computed once and kept for the backward pass.
 template <class T>
-void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_t first, std::uint64_t wanted,
+void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_t first, std::uint64_t requested,
             Segment<T>& out) {
   const std::int64_t begin = bins.starts[bin] + first;
   const int n = out.count = int(std::min<std::int64_t>(kSegment, bins.starts[bin + 1] - begin));
@@ -112,7 +112,7 @@ void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_
       std::uint64_t fresh[kLanes];
       transpose(rows);
       block_masks(rows, rows[kU] + (rows[kWholeU] - Lanes<T>(X)), rows[kV] + (rows[kWholeV] - Lanes<T>(Y)), fresh);
-      for (int i = 0; i < count; ++i) masks[start + i] = fresh[i] & wanted;
+      for (int i = 0; i < count; ++i) masks[start + i] = fresh[i] & requested;
     }
     for (int i = 0; i < count; ++i)
       for (std::uint64_t m = masks[start + i]; m; m &= m - 1) *next[__builtin_ctzll(m)]++ = std::uint16_t(start + i);

@@ -149,7 +149,7 @@ class Frame {
 
   void list(View& view, int first_row, int end_row, int threads) {
     list_pairs(view.target.grid.columns(), first_row, end_row, order_, view.target.ranges, n_,
-               view.target.wanted.empty() ? nullptr : view.target.wanted.data(), view.bins, threads);
+               view.target.requested.empty() ? nullptr : view.target.requested.data(), view.bins, threads);
   }
 
   // The job of a bin of the band, with its requested blocks.
@@ -166,7 +166,7 @@ class Frame {
             x,
             y,
             inside,
-            view.target.wanted.empty() ? inside : inside & view.target.wanted[place],
+            view.target.requested.empty() ? inside : inside & view.target.requested[place],
             view.ends.data() + place * kBlocks};
   }
 

@@ -13,7 +13,7 @@ struct BinJob {
   const Buffer<Ellipse<T>>& ellipses;
   Bins& bins;
   int bin, x, y;                 // its index in the band, and its place on the pixel grid
-  std::uint64_t inside, wanted;  // blocks in the image; the requested ones among them
+  std::uint64_t inside, requested;  // blocks in the image; the requested ones among them
   BlockEnd<T>* ends;             // [64]
 
   std::int64_t pairs() const { return bins.starts[bin + 1] - bins.starts[bin]; }
@@ -44,10 +44,10 @@ void draw_bin(const BinJob<T>& job, T* image, T* alpha) {
     colours[b] = {};
   });
   const std::int64_t n = job.pairs();
-  std::uint64_t open = job.wanted;
+  std::uint64_t open = job.requested;
   for (std::int64_t first = 0; first < n && open; first += kSegment) {
     Segment<T>& part = thread_segment<T>();
-    gather(job.ellipses, job.bins, job.bin, first, job.wanted, part);
+    gather(job.ellipses, job.bins, job.bin, first, job.requested, part);
     each_block(open, [&](int b) {
       if (!part.lengths[b]) return;
       blend_block(part, b, job.settings, colours[b], job.ends[b]);
@@ -75,7 +75,7 @@ template <class T, int K>
 void start_vjp(const BinJob<T>& job, const T* cotangents, BinVjp<T, K>& out) {
   using L = Lanes<T>;
   const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * 3;
-  each_block(job.wanted, [&](int b) {
+  each_block(job.requested, [&](int b) {
     const L through = L::load(job.ends[b].transmittance);
     through.store(out.back[b].transmittance);
     for (int k = 0; k < K; ++k) {
@@ -109,7 +109,7 @@ void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T>* pair_
   BinVjp<T, K>& mine = scratch;
   fetch_cotangents<T, K>(job, cotangents);
   std::int64_t end = 0;  // no pixel blended a pair from here on, and their segments may not have been listed
-  each_block(job.wanted, [&](int b) {
+  each_block(job.requested, [&](int b) {
     for (std::int32_t e : job.ends[b].ended) end = std::max<std::int64_t>(end, std::min<std::int64_t>(e, n));
   });
   bool started = false;
@@ -119,9 +119,9 @@ void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T>* pair_
     std::memset(static_cast<void*>(sums), 0, sizeof(PairSums<T>) * count * K);
     if (first >= end) continue;
     Segment<T>& part = thread_segment<T>();
-    gather(job.ellipses, job.bins, job.bin, first, job.wanted, part);
+    gather(job.ellipses, job.bins, job.bin, first, job.requested, part);
     if (!std::exchange(started, true)) start_vjp(job, cotangents, mine);
-    each_block(job.wanted, [&](int b) {
+    each_block(job.requested, [&](int b) {
       if (part.lengths[b])
         blend_block_vjp<T, K>(part, b, job.settings, job.ends[b], mine.cotangent[b], mine.back[b], sums);
     });

@@ -28,7 +28,7 @@ struct Target {
   const T* rgb_offset;  // [n, 3] or null
   T* means2d;           // out [n, 2]
   bool* visible;        // out [n]
-  std::vector<std::uint64_t> wanted;  // the requested blocks of each bin; empty: all
+  std::vector<std::uint64_t> requested;  // the requested blocks of each bin; empty: all
   Buffer<Ellipse<T>> ellipses;
   Buffer<BinRange> ranges;    // [n]
   Buffer<std::uint16_t> lit;  // [groups, 3]: the lanes whose channel was not clamped at 0, and so has a gradient
@@ -54,18 +54,18 @@ CLEAR_INLINE void bins_of(const Grid<T>& grid, const Lanes<T> (&e)[kLanes], std:
 
 // The visible Gaussians with a requested bin; the ranges of the others become empty.
 template <class T>
-std::uint32_t asked_for(const Target<T>& target, std::uint32_t shown, BinRange* ranges) {
-  if (target.wanted.empty()) return shown;
-  std::uint32_t asked = 0;
+std::uint32_t keep_requested(const Target<T>& target, std::uint32_t shown, BinRange* ranges) {
+  if (target.requested.empty()) return shown;
+  std::uint32_t requested = 0;
   for (std::uint32_t m = shown; m; m &= m - 1) {
     const int i = __builtin_ctz(m);
     bool any = false;
     for (int y = ranges[i].y0; y <= ranges[i].y1 && !any; ++y)
-      for (int x = ranges[i].x0; x <= ranges[i].x1 && !any; ++x) any = target.wanted[y * target.grid.columns() + x] != 0;
-    if (any) asked |= 1u << i;
+      for (int x = ranges[i].x0; x <= ranges[i].x1 && !any; ++x) any = target.requested[y * target.grid.columns() + x] != 0;
+    if (any) requested |= 1u << i;
     else ranges[i] = BinRange{};
   }
-  return asked;
+  return requested;
 }
 
 inline std::int64_t groups_of(std::int64_t n) { return (n + kLanes - 1) / kLanes; }
@@ -152,7 +152,7 @@ bool project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& spla
     store_rows<2>(target.means2d, first, count, uv);
     store_bits(target.visible + first, count, visible);
     bins_of(target.grid, ellipse[i], visible, count, target.ranges.data() + first);
-    any |= shown[i] = asked_for(target, visible, target.ranges.data() + first);
+    any |= shown[i] = keep_requested(target, visible, target.ranges.data() + first);
   }
 
   Colour<T> colour;

@@ -93,14 +93,14 @@ class Pool {
   }
 
   void serve(int index) {
-    std::uint64_t seen = 0;
+    std::uint64_t last_round = 0;
     for (;;) {
-      for (int spins = 0; round_.load(std::memory_order_acquire) == seen && spins < kSpins; ++spins) pause();
+      for (int spins = 0; round_.load(std::memory_order_acquire) == last_round && spins < kSpins; ++spins) pause();
       std::function<void()>* work;
       {
         std::unique_lock<std::mutex> lock(mutex_);
-        wake_.wait(lock, [&] { return round_.load(std::memory_order_acquire) != seen; });
-        seen = round_.load(std::memory_order_acquire);
+        wake_.wait(lock, [&] { return round_.load(std::memory_order_acquire) != last_round; });
+        last_round = round_.load(std::memory_order_acquire);
         if (index >= helpers_) continue;
         work = work_;
       }
