@@ -121,6 +121,6 @@ if __name__ == "__main__":
     chosen = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     torch.manual_seed(0)  # gsplat splits by torch's global generator
-    with native.own_threads(native.threads()):  # else torch's threads keep the cores that the kernels need
+    with native.kernel_threads(native.threads()):  # else torch's threads keep the cores that the kernels need
         found = main(chosen.iterations, None if chosen.strategies == "none" else chosen.strategies)
     sys.stdout.write(f"{chosen.strategies}: {found:.2f} dB on the test views at HR\n")

@@ -1,4 +1,7 @@
-"""For whatever runs on Warp: whether it is here, torch's tensors as its kernels' arguments, and torch's stream as its own."""
+"""What the Warp packages share: a check that Warp runs here, torch tensors as kernel arguments, and torch's stream.
+
+Used by `rasterizers.warp_backend` and by the Warp kernels in `clear_strategies.kernels`. Imports Warp only when called.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,16 @@ from torch import Tensor
 from rasterizers.interface import BackendUnavailable
 
 
-def require(what: str, device: str, otherwise: str) -> None:
-    """Make sure of Warp before `what` imports it, and keep it off stdout.
+def require_warp(what: str, device: str, otherwise: str) -> None:
+    """Check that Warp can run `what`, before it is imported, and silence Warp's output on stdout.
 
     Args:
-        device: "cuda" or "cpu", where `what` is to run.
-        otherwise: what runs here where CUDA is not to be had.
+        what: names the caller in the error message.
+        device: "cuda" or "cpu".
+        otherwise: says in the error message what runs without CUDA.
 
     Raises:
-        BackendUnavailable: Warp is not installed, or finds no CUDA device.
+        BackendUnavailable: Warp is not installed, or there is no CUDA device.
     """
     try:
         import warp as wp
@@ -28,7 +32,7 @@ def require(what: str, device: str, otherwise: str) -> None:
         raise BackendUnavailable(
             f"{what} needs NVIDIA Warp, which is not installed ({error}); pip install 'clear-strategies[warp]'."
         ) from error
-    # Its greeting, and a line for every compilation, would go to stdout, which is the caller's.
+    # Warp would print a greeting and a line per compilation to stdout, which belongs to the application.
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     if device == "cuda" and not torch.cuda.is_available():
         raise BackendUnavailable(
@@ -43,14 +47,14 @@ def require(what: str, device: str, otherwise: str) -> None:
 
 
 def array(tensor: Tensor | None, dtype: Any = None) -> Any:
-    """A tensor as a kernel's argument, without a copy; the caller keeps it alive. None is an array of nothing."""
+    """The tensor as a kernel argument, without a copy; the caller keeps it alive. None becomes an empty array."""
     import warp as wp
 
     return None if tensor is None else wp.from_torch(tensor, dtype, return_ctype=True)
 
 
 def on_stream(device: torch.device) -> AbstractContextManager[Any]:
-    """Warp's work goes where torch's goes."""
+    """A scope in which Warp launches on torch's current stream."""
     import warp as wp
 
     wp.init()
@@ -62,7 +66,7 @@ def on_stream(device: torch.device) -> AbstractContextManager[Any]:
 
 @cache
 def _stream(stream: torch.cuda.Stream) -> Any:
-    """Torch's stream as Warp knows it; kept, for Warp keeps the scratch of its sort with it."""
+    """Torch's stream as a Warp stream. Cached, because Warp keeps the scratch memory of its sort with the stream."""
     import warp as wp
 
     return wp.stream_from_torch(stream)

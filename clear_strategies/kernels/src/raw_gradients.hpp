@@ -1,18 +1,18 @@
-// The gradients of a view's three losses on raw parameters, as a sweep reads them: Gaussian by Gaussian, never in memory.
+// The gradients of a view's three losses with respect to the raw parameters, computed per Gaussian and never stored.
 #pragma once
 
 #include "block.hpp"
 
 namespace clear {
 
-// One cotangent's gradient of the drawn splats (rasterizers.interface.SplatGradients), row-major; colour as its factors.
+// One cotangent's rasterizers.interface.SplatGradients, row-major; the colour gradient as its factors rgb and basis.
 struct SplatGradient {
   const float *means = nullptr, *quats = nullptr, *scales = nullptr, *opacities = nullptr, *rgb = nullptr;
   const float* basis = nullptr;  // Y [N, bases]
   explicit operator bool() const { return means != nullptr; }
 };
 
-// What the chain rule needs of the field as it was drawn (field.Activation).
+// The inputs of the activations' VJP (training.field.Activation).
 struct Activation {
   const float *scales, *filtered, *filter, *sigmoid, *factor;
 };
@@ -26,12 +26,12 @@ struct Gradients {
   float lambda_hf;
 };
 
-// ∇θ of one loss for sixteen Gaussians. shN stays rank one: Y ⊗ rgb.
-struct Pulled {
+// ∇θ of one loss for sixteen Gaussians. shN's gradient stays in factors: Y ⊗ rgb.
+struct RawGradients {
   Floats means[3], quats[4], scales[3], opacities[1], sh0[3], rgb[3];
 };
 
-// What the chain rule needs of sixteen Gaussians, whichever the loss.
+// The part of the activations' VJP for sixteen Gaussians that the three losses share.
 struct Activated {
   Floats squares[3], filtered[3], shares[3], sigmoid, factor, opacity, slope;
 };
@@ -51,8 +51,8 @@ CLEAR_INLINE void load(const Activation& a, std::int64_t i, int count, Activated
   }
 }
 
-// Chain rule through the 3D filter, exp and sigmoid; operation by operation field.Activation.pull.
-CLEAR_INLINE void pull(const SplatGradient& g, const Activated& a, const Floats& Y0, std::int64_t i, int count, Pulled& out) {
+// The VJP of the 3D filter, exp and sigmoid. Same operations as training.field.Activation.vjp.
+CLEAR_INLINE void activation_vjp(const SplatGradient& g, const Activated& a, const Floats& Y0, std::int64_t i, int count, RawGradients& out) {
   load_columns(g.means + 3 * i, count, out.means);
   load_columns(g.quats + 4 * i, count, out.quats);
   load_columns(g.scales + 3 * i, count, out.scales);
@@ -71,7 +71,7 @@ CLEAR_INLINE Floats first_band(const SplatGradient& g, int bases, std::int64_t i
   return Y0[0];
 }
 
-// The higher bands of sixteen bases, a lane each.
+// The higher bands of sixteen bases, one Gaussian per lane.
 CLEAR_INLINE void load_bands(const float* basis, int bases, std::int64_t i, int count, Floats (&bands)[kLanes]) {
   for (int row = 0; row < kLanes; ++row) bands[row] = row < count ? load_some(basis + bases * (i + row), bases) : Floats(0.0f);
   transpose(bands);
@@ -100,15 +100,15 @@ CLEAR_INLINE BasisProducts basis_products(const float* lr, const float* hr, int 
   return out;
 }
 
-// g^HR = g_base + λ_HF m g_HF, in the order in which the conductor multiplies.
+// g^HR = g_base + λ_HF m g_HF, multiplied in the same order as the conductor does.
 template <int D>
 CLEAR_INLINE void route(Floats (&base)[D], const Floats (&hf)[D], const Floats& m, const Floats& lambda_hf) {
   for (int d = 0; d < D; ++d) base[d] += hf[d] * m * lambda_hf;  // Eq. 13
 }
 
-// Sixteen Gaussians' gradients of one view; `hr` is g^HR, routed.
+// The gradients of sixteen Gaussians for one view; `hr` is g^HR, after routing.
 struct Block {
-  Pulled lr, hr, hf;
+  RawGradients lr, hr, hf;
   Floats m;
 };
 
@@ -116,12 +116,12 @@ CLEAR_INLINE void load(const Gradients& g, std::int64_t i, int count, Block& b) 
   Activated a;
   load(g.activation, i, count, a);
   Floats Y0 = first_band(g.lr, g.bases, i, count);
-  pull(g.lr, a, Y0, i, count, b.lr);
+  activation_vjp(g.lr, a, Y0, i, count, b.lr);
   if (!g.base) return;
   if (g.base.basis != g.lr.basis) Y0 = first_band(g.base, g.bases, i, count);
-  pull(g.base, a, Y0, i, count, b.hr);
+  activation_vjp(g.base, a, Y0, i, count, b.hr);
   if (!g.hf) return;
-  pull(g.hf, a, Y0, i, count, b.hf);
+  activation_vjp(g.hf, a, Y0, i, count, b.hf);
   b.m = g.route ? load_some(g.route + i, count) : Floats(1.0f);
   route(b.hr.means, b.hf.means, b.m, g.lambda_hf);
   route(b.hr.quats, b.hf.quats, b.m, g.lambda_hf);

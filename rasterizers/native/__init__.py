@@ -1,4 +1,7 @@
-"""Compiled kernels: which instruction set this processor has, the module that was built for it, and how many threads."""
+"""What the compiled packages share: loading the module for this processor's instruction set, and the number of threads.
+
+`src/` holds the C++ headers that both packages (`rasterizers.cpp` and `clear_strategies.kernels`) include.
+"""
 
 from __future__ import annotations
 
@@ -17,40 +20,40 @@ from rasterizers.interface import BackendUnavailable
 
 _log = logging.getLogger(__name__)
 
-_ISAS: Final = ("avx512", "avx2", "baseline")  # best first
-_OVERRIDE: Final = "CLEAR_ISA"  # for tests and comparisons
+_ISAS: Final = ("avx512", "avx2", "baseline")  # fastest first
+_OVERRIDE: Final = "CLEAR_ISA"  # environment variable for tests and comparisons
 
-_owned: list[int] = []
+_scopes: list[int] = []  # thread counts of the active `kernel_threads` scopes, innermost last
 
 
 def threads() -> int:
-    """How many threads kernels use: as many as torch, unless somebody holds `own_threads`."""
-    return _owned[-1] if _owned else torch.get_num_threads()
+    """The number of threads that compiled kernels use: that of the innermost `kernel_threads` scope, else torch's."""
+    return _scopes[-1] if _scopes else torch.get_num_threads()
 
 
 @contextmanager
-def own_threads(n: int) -> Iterator[None]:
-    """The cores belong to the kernels: they use n threads, torch uses one.
+def kernel_threads(n: int) -> Iterator[None]:
+    """A scope in which compiled kernels use n threads and torch uses one.
 
-    OpenMP's threads, torch's too, wait by spinning: for a while after each of its operations torch would keep every
-    core but one from our own threads. With the kernels doing the work, its small operations are as fast on one.
+    OpenMP threads, torch's included, spin for a while after each operation and would occupy the cores that the kernels
+    need. Torch's operations between the kernels are small, and as fast on one thread.
     """
     before = torch.get_num_threads()
-    _owned.append(n)
+    _scopes.append(n)
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        _owned.pop()
+        _scopes.pop()
         torch.set_num_threads(before)
 
 
 @cache
 def load_kernels(package: str) -> ModuleType:
-    """The fastest of `package`'s modules `_avx512`, `_avx2`, `_baseline` that this processor runs.
+    """The fastest of `package`'s modules `_avx512`, `_avx2` and `_baseline` that this processor can run.
 
     Raises:
-        BackendUnavailable: none was built, or `CLEAR_ISA` names one that cannot run here.
+        BackendUnavailable: none was compiled, or `CLEAR_ISA` names one that this processor cannot run.
     """
     try:
         baseline = importlib.import_module(f"{package}._baseline")
@@ -67,8 +70,8 @@ def load_kernels(package: str) -> ModuleType:
         try:
             module = importlib.import_module(f"{package}._{isa}")
         except ImportError as error:
-            _log.warning("%s was not built for %s: %s", package, isa, error)
+            _log.warning("%s was not compiled for %s: %s", package, isa, error)
             continue
         _log.debug("%s: kernels for %s.", package, isa)
         return module
-    raise BackendUnavailable(f"{package} was not built for {wanted}; unset {_OVERRIDE}.")
+    raise BackendUnavailable(f"{package} was not compiled for {wanted}; unset {_OVERRIDE}.")

@@ -1,10 +1,12 @@
-"""What runs on the device: a sweep that counts, one that merges, corrects, anchors and steps, and one for the rows of shN.
+"""The kernels of the two passes: `compare` counts conflicts; `step` merges, corrects, adds the anchor's gradient and applies
+Adam, and `step_bands` does this for the rows of shN.
 
-A Gaussian has a thread; of shN, with three quarters of all numbers, every number has one, so that neighbours read and
-write side by side. In between lies a table of colours: shN's gradient is Y ⊗ colour, also when it is merged.
+`compare` and `step` use one thread per Gaussian. `step_bands` uses one per number, because shN has three quarters of all
+numbers and neighbouring threads then access neighbouring memory. `step` passes it a table of colours: the merged gradient
+of shN is Y ⊗ colour.
 
-Products and sums round as they do in torch (no contraction), so gradients agree with the readable path bit for bit where
-it matters: equal decisions. What is counted is added up block by block, and the blocks by torch: every sum has one order.
+Products and sums round as in torch (no contraction), so that the step makes the same decisions as the readable path.
+Blocks sum their counts, and torch sums over the blocks: every sum has a fixed order.
 """
 
 from __future__ import annotations
@@ -32,13 +34,13 @@ from clear_strategies.kernels.gaussian_step.warp.conflict import (
     merged3,
     merged4,
 )
-from clear_strategies.kernels.gaussian_step.warp.pulled import Activation, Gradient, View, load, route_of, size
+from clear_strategies.kernels.gaussian_step.warp.raw_gradients import Activation, Gradient, View, load, route_of, size
 
 wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 Counts: Final[Any] = wp.types.vector(length=14, dtype=wp.int32)
-"""`compare`: Gaussians that are comparable, and opposed, [7] each. `step`: rows corrected, and with ω at its lower bound, [6]
-each; rows that were still, and that were not visible.
+"""For `compare`: comparable and opposed Gaussians, [7] each. For `step`: rows corrected, and with ω at its lower bound, [6]
+each; then still and invisible rows.
 """
 Norms: Final[Any] = wp.types.vector(length=12, dtype=wp.float64)
 """Σ ‖l‖ and Σ ‖h‖ [6] each."""
@@ -46,13 +48,13 @@ Norms: Final[Any] = wp.types.vector(length=12, dtype=wp.float64)
 
 @wp.struct
 @no_type_check
-class Sweep:
-    """What a step is to do beside Adam's arithmetic."""
+class StepOptions:
+    """The settings of a step other than Adam's."""
 
     lambda_hr: wp.float32
     corrects: wp.bool
-    skips: wp.bool  # leave out rows that would not move
-    chooses: wp.bool  # only visible rows may step
+    skips: wp.bool  # skip rows that would not change
+    has_visible: wp.bool  # only visible rows may step
     width: wp.int32  # numbers of an shN row that are stepped
 
 
@@ -64,12 +66,12 @@ def compare(
     base: Gradient,
     hf: Gradient,
     view: View,
-    keeps: wp.bool,
+    has_products: wp.bool,
     norm_products: wp.array2d[wp.float64],
     counts: wp.array[Counts],
     norms: wp.array[Norms],
 ) -> None:
-    """A thread per Gaussian: is it comparable, does it point apart, and how long are its gradients?"""
+    """One thread per Gaussian: whether its gradients are comparable and opposed, and their norms."""
     block, lane = wp.tid()
     i = block * wp.block_dim() + lane
     found, lengths = Counts(), Norms()
@@ -87,7 +89,7 @@ def compare(
                 if comparable:
                     lengths[k] = norm_l
                     lengths[GROUPS + k] = norm_h
-                if keeps:
+                if has_products:
                     norm_products[k, i] = norm_l * norm_h
     wp.tile_store(counts, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(block,))
     wp.tile_store(norms, wp.tile_sum(wp.tile(lengths, preserve_type=True)), offset=(block,))
@@ -105,7 +107,7 @@ def step(
     eps_cos: wp.array[wp.float64],
     eps_corr: wp.array[wp.float64],
     reliability: wp.array[wp.float32],
-    sweep: Sweep,
+    options: StepOptions,
     adam: AdamStep,
     means: Attribute,
     quats: Attribute,
@@ -120,35 +122,35 @@ def step(
     counts: wp.array[Counts],
     omegas: wp.array[Six],
 ) -> None:
-    """A thread per Gaussian: everything but shN, of which the merged colour is left in `colours`.
+    """One thread per Gaussian: steps everything but shN, for which it writes the merged colour to `colours`.
 
-    Where LR and HR have bases of their own there are two colours, one for each.
+    If LR and HR have different bases, there are two colours, one for each.
     """
     block, lane = wp.tid()
     at = block * wp.block_dim() + lane
-    i = wp.min(at, view.n - 1)  # lanes beyond the last Gaussian count nothing and write nothing
+    i = wp.min(at, view.n - 1)  # lanes beyond the last Gaussian neither count nor write
     g_lr, g_hr, g_hf = load(activation, lr, base, hf, view, i)
-    seen = not sweep.chooses or visible[i] != wp.uint8(0)
-    still = sweep.skips and size(g_lr) + size(g_hr) + size(g_hf) <= 0.0
+    may_step = not options.has_visible or visible[i] != wp.uint8(0)
+    still = options.skips and size(g_lr) + size(g_hr) + size(g_hf) <= 0.0
     still = still and is_still(means, i, 3) and is_still(quats, i, 4) and is_still(scales, i, 3)
     still = still and is_still(opacities, i, 1) and is_still(sh0, i, 3) and is_still(detail, i, 3)
-    still = still and is_still(shN, i, sweep.width)
+    still = still and is_still(shN, i, options.width)
     change = Corrected()
-    if sweep.corrects:
+    if options.corrects:
         products = group_products(g_lr, g_hr, lr, base, view, i)
         change = correct(products, rule, eps_cos, eps_corr, reliability, i)
 
-    moves, λ = seen and not still, sweep.lambda_hr
-    d_means = merged3(g_lr.means, g_hr.means, change.step[MEANS], λ)
-    d_quats = merged4(g_lr.quats, g_hr.quats, change.step[QUATS], λ)
-    d_scales = merged3(g_lr.scales, g_hr.scales, change.step[SCALES], λ)
-    d_opacity = merged1(g_lr.opacity, g_hr.opacity, change.step[OPACITIES], λ)
-    d_sh0 = merged3(g_lr.sh0, g_hr.sh0, change.step[SH0], λ)
-    # f_det: never corrected, never from L_base
+    moves, λ = may_step and not still, options.lambda_hr
+    d_means = merged3(g_lr.means, g_hr.means, change.multiple[MEANS], λ)
+    d_quats = merged4(g_lr.quats, g_hr.quats, change.multiple[QUATS], λ)
+    d_scales = merged3(g_lr.scales, g_hr.scales, change.multiple[SCALES], λ)
+    d_opacity = merged1(g_lr.opacity, g_hr.opacity, change.multiple[OPACITIES], λ)
+    d_sh0 = merged3(g_lr.sh0, g_hr.sh0, change.multiple[SH0], λ)
+    # f_det gets only the routed gradient of L_HF, uncorrected
     d_detail = g_hf.rgb * route_of(activation, view, i) * view.lambda_hf * λ
-    rgb_lr, rgb_hr = merged3(g_lr.rgb, g_hr.rgb, change.step[SHN], λ), wp.vec3()
+    rgb_lr, rgb_hr = merged3(g_lr.rgb, g_hr.rgb, change.multiple[SHN], λ), wp.vec3()
     if not view.one_basis:
-        rgb_lr, rgb_hr = corrected3(g_lr.rgb, g_lr.rgb, change.step[SHN] * wp.float64(λ)), g_hr.rgb * λ
+        rgb_lr, rgb_hr = corrected3(g_lr.rgb, g_lr.rgb, change.multiple[SHN] * wp.float64(λ)), g_hr.rgb * λ
 
     found, omega = Counts(), Six()
     if at < view.n:
@@ -156,7 +158,7 @@ def step(
         for k in range(GROUPS):
             found[k] = (change.rows >> k) & 1
             found[GROUPS + k] = (change.at_lower_bound >> k) & 1
-        if not seen:
+        if not may_step:
             found[13] = 1
         elif still:
             found[12] = 1
@@ -191,7 +193,7 @@ def step_bands(
     adam: AdamStep,
     shN: Attribute,
 ) -> None:
-    """A thread per number of shN's active bands."""
+    """One thread per number of shN's stepped bands."""
     i, j = wp.tid()
     if not moving[i]:
         return

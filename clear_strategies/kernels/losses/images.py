@@ -1,4 +1,4 @@
-"""The images that compiled kernels take: float32, [H, W, 3], in the memory of a device that they run on."""
+"""The images that the compiled losses support: float32 [H, W, 3] on a device that the kernels run on."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor
 
-_SPOKEN: Final = {"cpu": "the CPU", "cuda": "CUDA"}
+_IN_WORDS: Final = {"cpu": "the CPU", "cuda": "CUDA"}
 
 
-class Prepared(NamedTuple):
-    """Both images, contiguous and free of any graph, and where the gradient goes."""
+class ImagePair(NamedTuple):
+    """Two images, contiguous and detached, and the tensor that receives the gradient."""
 
     x: Tensor
     y: Tensor
     gradient: Tensor
 
 
-def takes(devices: Collection[str], *images: Tensor) -> bool:
-    """Whether these images are of the type and shape that compiled kernels for `devices` are written for."""
+def supported(devices: Collection[str], *images: Tensor) -> bool:
+    """Whether kernels for `devices` support the type, shape and device of these images."""
     return all(
         image.dtype == torch.float32
         and image.device.type in devices
@@ -32,23 +32,23 @@ def takes(devices: Collection[str], *images: Tensor) -> bool:
     )
 
 
-def prepared(devices: Collection[str], x: Tensor, y: Tensor, out: Tensor | None) -> Prepared:
+def image_pair(devices: Collection[str], x: Tensor, y: Tensor, out: Tensor | None) -> ImagePair:
     """The images as kernels for `devices` read them.
 
     Raises:
-        TypeError: one is not float32 on such a device, or is on another than x.
-        ValueError: one is no image [H, W, 3], or not as large as x; or `out` is not contiguous.
+        TypeError: an image is not float32, or not on such a device, or not on the same device as x.
+        ValueError: an image is not [H, W, 3], or not as large as x; or `out` is not contiguous.
     """
     for name, image in (("x", x), ("y", y), ("out", out)):
         if image is None:
             continue
         if image.dtype != torch.float32 or image.device.type not in devices:
             raise TypeError(
-                f"{name} must be float32 on {' or '.join(_SPOKEN[device] for device in devices)}, got {image.dtype} on "
-                f"{image.device}; kernels=torch takes any."
+                f"{name} must be float32 on {' or '.join(_IN_WORDS[device] for device in devices)}, got {image.dtype} on "
+                f"{image.device}; kernels=torch supports any."
             )
         if image.device != x.device:
-            raise TypeError(f"{name} must be where x is, on {x.device}, got {image.device}.")
+            raise TypeError(f"{name} must be on {x.device}, where x is, got {image.device}.")
         if image.ndim != 3 or image.shape[2] != 3 or image.shape != x.shape or image.numel() == 0:
             raise ValueError(
                 f"{name} must be an image [H, W, 3] with pixels, and as large as x; got {tuple(image.shape)} "
@@ -57,4 +57,4 @@ def prepared(devices: Collection[str], x: Tensor, y: Tensor, out: Tensor | None)
     gradient = torch.empty_like(x, memory_format=torch.contiguous_format, requires_grad=False) if out is None else out
     if not gradient.is_contiguous():
         raise ValueError(f"out must be contiguous, got strides {gradient.stride()}.")
-    return Prepared(x.detach().contiguous(), y.detach().contiguous(), gradient)
+    return ImagePair(x.detach().contiguous(), y.detach().contiguous(), gradient)

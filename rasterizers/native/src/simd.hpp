@@ -1,7 +1,7 @@
-// Sixteen numbers at a time, whatever the processor: the 4 x 4 pixels of a block, or sixteen Gaussians.
+// `Lanes<T>`: sixteen numbers at a time on every processor, for the 4 x 4 pixels of a block or for sixteen Gaussians.
 //
-// AVX-512 holds sixteen floats in one register; narrower machines use several registers for the same sixteen, so every
-// other file is written once. Arithmetic is the compiler's own (vector types); what it cannot say is below, in `Native`.
+// AVX-512 holds sixteen floats in one register; narrower processors use several registers for the same sixteen, so every
+// other file is written once. Arithmetic uses the compiler's vector types; `Native` holds the operations they lack.
 #pragma once
 
 #include <cmath>
@@ -37,7 +37,7 @@ struct IntegerOf<double> {
   using type = std::int64_t;
 };
 
-// One register of T: its type, the type of its comparisons, and the operations that have no operator.
+// One register of T: its type, the type of a comparison's result, and the operations that have no operator.
 template <class T>
 struct Native {
   static constexpr int width = kRegisterBytes / sizeof(T);
@@ -45,7 +45,7 @@ struct Native {
   typedef typename IntegerOf<T>::type Integer __attribute__((vector_size(kRegisterBytes)));
 
 #if defined(__AVX512F__)
-  using Mask = std::uint16_t;  // one bit a lane
+  using Mask = std::uint16_t;  // one bit per lane
   static constexpr Mask all = Mask((1u << width) - 1);
   static CLEAR_INLINE Mask less(Register a, Register b) {
     if constexpr (sizeof(T) == 4) return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ);
@@ -79,7 +79,7 @@ struct Native {
     if constexpr (sizeof(T) == 4) return (Register)_mm512_roundscale_ps((__m512)a, 0);
     else return (Register)_mm512_roundscale_pd((__m512d)a, 0);
   }
-  // a · 2^n for whole n.
+  // a · 2^n for an integer n.
   static CLEAR_INLINE Register scale_by_power(Register a, Register n) {
     if constexpr (sizeof(T) == 4) return (Register)_mm512_scalef_ps((__m512)a, (__m512)n);
     else return (Register)_mm512_scalef_pd((__m512d)a, (__m512d)n);
@@ -123,7 +123,7 @@ struct Native {
     for (int i = 0; i < width; ++i) m[i] = -(typename IntegerOf<T>::type)((b >> i) & 1);
     return m;
   }
-  // NaN as x86 has it: the second operand wins.
+  // NaN as on x86: the result is the second operand.
   static CLEAR_INLINE Register minimum(Register a, Register b) {
 #if defined(__AVX2__)
     if constexpr (sizeof(T) == 4) return (Register)_mm256_min_ps((__m256)a, (__m256)b);
@@ -149,7 +149,7 @@ struct Native {
     return a;
 #endif
   }
-  // Adding and taking away 1.5 · 2^mantissa leaves no room for a fraction; good for |a| < 2^22 (2^51).
+  // Rounds by adding and subtracting 1.5 · 2^mantissa; valid for |a| < 2^22 (double: 2^51).
   static CLEAR_INLINE Register nearest(Register a) {
     constexpr T big = sizeof(T) == 4 ? T(12582912.0) : T(6755399441055744.0);
     return (a + big) - big;
@@ -209,10 +209,10 @@ struct Lanes {
 
   Lanes() = default;
   CLEAR_INLINE Lanes(T x) {
-    for (int i = 0; i < registers; ++i) r[i] = x - Register{};  // x - 0 is x, for -0 too: the compiler makes it a broadcast
+    for (int i = 0; i < registers; ++i) r[i] = x - Register{};  // x - 0 is x, also for -0; compiles to a broadcast
   }
   static CLEAR_INLINE Lanes load(const T* p) {
-    // Register by register: one copy of all would go through the stack where there are several.
+    // Register by register: one memcpy of several registers would go through the stack.
     Lanes a;
     for (int i = 0; i < registers; ++i) std::memcpy(&a.r[i], p + i * Native<T>::width, sizeof(Register));
     return a;
@@ -325,7 +325,7 @@ CLEAR_INLINE Lanes<T> where(const Mask<T>& m, const Lanes<T>& a) {
   return select(m, a, Lanes<T>(T(0)));
 }
 
-// 2^x. In float a polynomial of degree 5 on [-1/2, 1/2], relative error 1e-7; float64 is for checking, and asks libm.
+// 2^x. In float a polynomial of degree 5 on [-1/2, 1/2], relative error 1e-7; in double, which is for checking, libm.
 template <class T>
 CLEAR_INLINE Lanes<T> exp2(const Lanes<T>& x) {
   if constexpr (sizeof(T) == 4) {
@@ -375,7 +375,7 @@ CLEAR_INLINE Lanes<T> log2(const Lanes<T>& x) {
 }
 
 #if defined(__AVX512F__)
-// Indices that pick number D · i + d out of D registers in a row, two registers at a time, and the way back.
+// Permutation indices between D consecutive registers of rows of D numbers and D columns, two registers at a time.
 template <int D>
 struct Interleaving {
   alignas(64) std::int32_t apart[D][D - 1][kLanes], together[D][D - 1][kLanes];
@@ -383,7 +383,7 @@ struct Interleaving {
   constexpr Interleaving() : apart{}, together{} {
     for (int out = 0; out < D; ++out)
       for (int i = 0; i < kLanes; ++i) {
-        int p = D * i + out, q = kLanes * out + i;  // where column `out` reads, and what register `out` of the rows holds
+        int p = D * i + out, q = kLanes * out + i;  // what column `out` reads, and what register `out` of the rows holds
         for (int k = 1; k < D; ++k) {
           apart[out][k - 1][i] = p / kLanes == k ? kLanes + p % kLanes : k == 1 ? p % kLanes : i;
           together[out][k - 1][i] = q % D == k ? kLanes + q / D : k == 1 ? q / D : i;
@@ -404,7 +404,7 @@ template <int D>
 inline constexpr Interleaving<D> kInterleaving;
 #endif
 
-// Sixteen rows of D numbers, one after the other in memory, to D columns of sixteen; and back.
+// Converts sixteen contiguous rows of D numbers to D columns of sixteen, and back.
 template <int D, class T>
 CLEAR_INLINE void split_rows(const T* rows, Lanes<T> (&columns)[D]) {
 #if defined(__AVX512F__)
@@ -438,7 +438,7 @@ CLEAR_INLINE void join_rows(T* rows, const Lanes<T> (&columns)[D]) {
     for (int d = 0; d < D; ++d) rows[D * i + d] = split[d][i];
 }
 
-// rows[i] lane j  <->  rows[j] lane i.
+// Transposes in place: rows[i] lane j  <->  rows[j] lane i.
 template <class T>
 CLEAR_INLINE void transpose(Lanes<T> (&rows)[kLanes]) {
 #if defined(__AVX512F__)
@@ -455,7 +455,7 @@ CLEAR_INLINE void transpose(Lanes<T> (&rows)[kLanes]) {
       u[4 * i + 2] = (__m512)_mm512_unpacklo_pd(b, d);
       u[4 * i + 3] = (__m512)_mm512_unpackhi_pd(b, d);
     }
-    for (int i = 0; i < 4; ++i) {  // then the quarters change places
+    for (int i = 0; i < 4; ++i) {  // then exchange the quarters
       __m512 even_low = _mm512_shuffle_f32x4(u[i], u[4 + i], 0x88), odd_low = _mm512_shuffle_f32x4(u[i], u[4 + i], 0xdd);
       __m512 even_high = _mm512_shuffle_f32x4(u[8 + i], u[12 + i], 0x88);
       __m512 odd_high = _mm512_shuffle_f32x4(u[8 + i], u[12 + i], 0xdd);

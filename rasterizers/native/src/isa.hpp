@@ -1,4 +1,4 @@
-// Which instruction sets this processor has, by the names of our modules.
+// The instruction sets that this processor supports, by the names of the compiled modules.
 #pragma once
 
 #include <string>

@@ -1,4 +1,4 @@
-// Back: what the bins sent, summed Gaussian by Gaussian in the order of its bins, and pulled through the projection.
+// Adds up each Gaussian's pair sums in the order of its bins, and applies the VJP of the projection.
 #pragma once
 
 #include "blend.hpp"
@@ -6,28 +6,28 @@
 
 namespace clear {
 
-// Where the gradients go: the fields of rasterizers.interface.SplatGradients, [K, n, …]; fully written.
+// The output: the fields of rasterizers.interface.SplatGradients, [K, n, …]; every element is written.
 template <class T>
 struct Gradients {
   T *means, *quats, *scales, *opacities, *screen, *rgb;
 };
 
-// To the K rows of each of a group's Gaussians, add what this band's bins sent. The rows lie anywhere, so those of the
-// groups to come are fetched ahead.
+// Adds the pair sums of this band to the K rows of each Gaussian of a group. Their addresses are scattered, so those of
+// later groups are prefetched.
 template <class T, int K>
-CLEAR_INLINE void add_sent(const Bins& bins, std::int64_t first, int count, std::int64_t n,
-                           const Buffer<Pulled<T>>& sent, Lanes<T> (&rows)[K][kLanes]) {
+CLEAR_INLINE void add_pair_sums(const Bins& bins, std::int64_t first, int count, std::int64_t n,
+                           const Buffer<PairSums<T>>& pair_sums, Lanes<T> (&rows)[K][kLanes]) {
   constexpr std::int64_t ahead = 6 * kLanes;
   const std::uint32_t* mine = bins.first.data();
   for (std::uint32_t p = mine[std::min(n, first + ahead)]; p < mine[std::min(n, first + ahead + kLanes)]; ++p)
-    for (int k = 0; k < K; ++k) __builtin_prefetch(&sent[std::size_t(bins.where[p]) * K + k], 0, 1);
+    for (int k = 0; k < K; ++k) __builtin_prefetch(&pair_sums[std::size_t(bins.where[p]) * K + k], 0, 1);
   for (int i = 0; i < count; ++i)
     for (std::uint32_t p = mine[first + i]; p < mine[first + i + 1]; ++p)
-      for (int k = 0; k < K; ++k) rows[k][i] += Lanes<T>::load(&sent[std::size_t(bins.where[p]) * K + k].q);
+      for (int k = 0; k < K; ++k) rows[k][i] += Lanes<T>::load(&pair_sums[std::size_t(bins.where[p]) * K + k].q);
 }
 
 template <class T, int K>
-void pull_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, const Target<T>& target,
+void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, const Target<T>& target,
                 const Palette<T>& palette, std::int64_t group, Lanes<T> (&rows)[K][kLanes], std::uint32_t touched,
                 const Gradients<T>& out) {
   using L = Lanes<T>;
@@ -47,31 +47,31 @@ void pull_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats,
   load_rows<4>(splats.quats, first, count, quat);
   load_rows<3>(splats.scales, first, count, scale);
   const L opacity = load_row(target.opacities, first, count);
-  const Geometry<T> g(pose, target.screen, Centre(pose, mean), quat, scale);
-  const Footprint<T> f(g, target.screen, s);
+  const Geometry<T> g(pose, target.grid, Centre(pose, mean), quat, scale);
+  const Footprint<T> f(g, target.grid, s);
   for (int k = 0; k < K; ++k) {
     L(&sum)[kLanes] = rows[k];
     transpose(sum);
-    Pull<T> pull;
-    project_vjp(pose, target.screen, s, g, f, scale, opacity, sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], pull);
+    LaneGradients<T> gradient;
+    project_vjp(pose, target.grid, s, g, f, scale, opacity, sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], gradient);
     L rgb[3];
     for (int c = 0; c < 3; ++c) {
       rgb[c] = where(Mask<T>::from_bits(target.lit[3 * group + c]), sum[6 + c]);
       if (!splats.bands) continue;
       const T* slope = palette.slope.data() + group * palette.kSlope + 3 * c * kLanes;
-      for (int axis = 0; axis < 3; ++axis) pull.mean[axis] += L::load(slope + axis * kLanes) * rgb[c];
+      for (int axis = 0; axis < 3; ++axis) gradient.mean[axis] += L::load(slope + axis * kLanes) * rgb[c];
     }
     auto keep = [&](auto& columns) {
       for (L& column : columns) column = where(real, column);
     };
-    L alone[1] = {pull.opacity};
-    keep(pull.mean), keep(pull.quat), keep(pull.scale), keep(pull.screen), keep(rgb), keep(alone);
+    L alone[1] = {gradient.opacity};
+    keep(gradient.mean), keep(gradient.quat), keep(gradient.scale), keep(gradient.screen), keep(rgb), keep(alone);
     const std::int64_t row = k * n + first;
-    store_rows<3>(out.means, row, count, pull.mean);
-    store_rows<4>(out.quats, row, count, pull.quat);
-    store_rows<3>(out.scales, row, count, pull.scale);
+    store_rows<3>(out.means, row, count, gradient.mean);
+    store_rows<4>(out.quats, row, count, gradient.quat);
+    store_rows<3>(out.scales, row, count, gradient.scale);
     store_rows<1>(out.opacities, row, count, alone);
-    store_rows<2>(out.screen, row, count, pull.screen);
+    store_rows<2>(out.screen, row, count, gradient.screen);
     store_rows<3>(out.rgb, row, count, rgb);
   }
 }

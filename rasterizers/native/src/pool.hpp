@@ -1,7 +1,7 @@
-// Threads of our own. OpenMP would share, or duplicate, the pool of whichever library was imported first, and its
-// waiting threads spin: two such pools on two cores run ten times slower.
+// A thread pool for the compiled kernels. OpenMP would share, or duplicate, the pool of whichever library was imported
+// first, and its waiting threads spin: two such pools on two cores run ten times slower.
 //
-// Work is handed out by a counter, results go to places that only depend on the task: who did it never shows.
+// A counter hands out the tasks, and each task writes to places of its own, so results do not depend on which thread ran it.
 #pragma once
 
 #include <algorithm>
@@ -21,7 +21,7 @@ namespace clear {
 
 class Pool {
  public:
-  // The process's pool. A forked child gets a new one: threads do not survive a fork.
+  // The process's pool. A forked child gets a new one, because threads do not survive a fork.
   static Pool& instance() {
     static std::atomic<Pool*> pool{nullptr};
     static std::mutex making;
@@ -29,12 +29,12 @@ class Pool {
     if (p && p->process_ == process()) return *p;
     std::lock_guard<std::mutex> lock(making);
     p = pool.load(std::memory_order_acquire);
-    if (!p || p->process_ != process()) pool.store(p = new Pool, std::memory_order_release);  // lives until exit
+    if (!p || p->process_ != process()) pool.store(p = new Pool, std::memory_order_release);  // never deleted
     return *p;
   }
 
-  // Runs task(0) … task(n - 1) on up to `threads` threads, the caller's among them. A pool that is busy (another Python
-  // thread, or a task that calls `run`) is not waited for: the caller then works alone. The first exception is rethrown.
+  // Runs task(0) … task(n - 1) on up to `threads` threads, including the caller's. If the pool is busy (another Python
+  // thread uses it, or a task calls `run`), the caller runs all tasks itself. Rethrows the first exception.
   template <class Task>
   void run(int threads, std::int64_t n, Task&& task) {
     std::unique_lock<std::mutex> only(running_, std::try_to_lock);
@@ -77,7 +77,7 @@ class Pool {
   }
 
  private:
-  static constexpr int kSpins = 400;  // some 20 µs: stages follow each other closely, a sleeping thread takes longer to wake
+  static constexpr int kSpins = 400;  // about 20 µs: stages follow each other closely, and waking a sleeping thread takes longer
 
   static long process() {
 #if defined(__unix__) || defined(__APPLE__)
@@ -93,14 +93,14 @@ class Pool {
   }
 
   void serve(int index) {
-    std::uint64_t seen = 0;
+    std::uint64_t last_round = 0;
     for (;;) {
-      for (int spins = 0; round_.load(std::memory_order_acquire) == seen && spins < kSpins; ++spins) pause();
+      for (int spins = 0; round_.load(std::memory_order_acquire) == last_round && spins < kSpins; ++spins) pause();
       std::function<void()>* work;
       {
         std::unique_lock<std::mutex> lock(mutex_);
-        wake_.wait(lock, [&] { return round_.load(std::memory_order_acquire) != seen; });
-        seen = round_.load(std::memory_order_acquire);
+        wake_.wait(lock, [&] { return round_.load(std::memory_order_acquire) != last_round; });
+        last_round = round_.load(std::memory_order_acquire);
         if (index >= helpers_) continue;
         work = work_;
       }

@@ -1,4 +1,4 @@
-"""The gradients of a view's three losses on raw parameters, as a sweep reads them: Gaussian by Gaussian, never in memory."""
+"""The gradients of a view's three losses with respect to the raw parameters, computed per Gaussian and never stored."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import warp as wp
 @wp.struct
 @no_type_check
 class Gradient:
-    """One cotangent's gradient of the drawn splats (rasterizers.interface.SplatGradients), row-major; colour as its factors."""
+    """One cotangent's rasterizers.interface.SplatGradients, row-major; the colour gradient as its factors rgb and basis."""
 
     means: wp.array[wp.float32]
     quats: wp.array[wp.float32]
@@ -23,7 +23,7 @@ class Gradient:
 @wp.struct
 @no_type_check
 class Activation:
-    """What the chain rule needs of the field as it was drawn (field.Activation), and m where it is not 1."""
+    """The inputs of the activations' VJP (training.field.Activation), and m unless it is 1."""
 
     scales: wp.array[wp.float32]
     filtered: wp.array[wp.float32]
@@ -36,7 +36,7 @@ class Activation:
 @wp.struct
 @no_type_check
 class View:
-    """How much there is of it, and which of it is there."""
+    """The sizes, and which gradients are given."""
 
     n: wp.int32
     bases: wp.int32  # columns of Y: 1 + active higher bands
@@ -49,8 +49,8 @@ class View:
 
 @wp.struct
 @no_type_check
-class Pulled:
-    """∇θ of one loss for one Gaussian. shN stays rank one: Y ⊗ rgb."""
+class RawGradient:
+    """∇θ of one loss for one Gaussian. shN's gradient stays in factors: Y ⊗ rgb."""
 
     means: wp.vec3
     quats: wp.vec4
@@ -74,9 +74,9 @@ def row4(rows: wp.array[wp.float32], i: wp.int32) -> wp.vec4:
 
 @wp.func
 @no_type_check
-def pull(g: Gradient, a: Activation, bases: wp.int32, i: wp.int32) -> Pulled:
-    """Chain rule through the 3D filter, exp and sigmoid; operation by operation field.Activation.pull."""
-    out = Pulled()
+def activation_vjp(g: Gradient, a: Activation, bases: wp.int32, i: wp.int32) -> RawGradient:
+    """The VJP of the 3D filter, exp and sigmoid. Same operations as training.field.Activation.vjp."""
+    out = RawGradient()
     scales, filtered, reach = row3(a.scales, i), row3(a.filtered, i), a.filter[i]
     factor, sigmoid, d_opacity = a.factor[i], a.sigmoid[i], g.opacities[i]
     share = wp.vec3(reach / filtered[0], reach / filtered[1], reach / filtered[2])
@@ -103,9 +103,9 @@ def route_of(a: Activation, view: View, i: wp.int32) -> wp.float32:
 
 @wp.func
 @no_type_check
-def routed(base: Pulled, hf: Pulled, m: wp.float32, lambda_hf: wp.float32) -> Pulled:
-    """g^HR = g_base + λ_HF m g_HF, in the order in which the conductor multiplies.  Eq. 13"""
-    out = Pulled()
+def routed(base: RawGradient, hf: RawGradient, m: wp.float32, lambda_hf: wp.float32) -> RawGradient:
+    """g^HR = g_base + λ_HF m g_HF (Eq. 13), multiplied in the same order as the conductor does."""
+    out = RawGradient()
     out.means = base.means + hf.means * m * lambda_hf
     out.quats = base.quats + hf.quats * m * lambda_hf
     out.scales = base.scales + hf.scales * m * lambda_hf
@@ -119,13 +119,13 @@ def routed(base: Pulled, hf: Pulled, m: wp.float32, lambda_hf: wp.float32) -> Pu
 @no_type_check
 def load(
     activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View, i: wp.int32
-) -> tuple[Pulled, Pulled, Pulled]:
-    """∇L_LR, g^HR and ∇L_HF of a Gaussian; 0 for what is not there."""
-    g_lr, g_hr, g_hf = pull(lr, activation, view.bases, i), Pulled(), Pulled()
+) -> tuple[RawGradient, RawGradient, RawGradient]:
+    """∇L_LR, g^HR and ∇L_HF of a Gaussian; 0 for those not given."""
+    g_lr, g_hr, g_hf = activation_vjp(lr, activation, view.bases, i), RawGradient(), RawGradient()
     if view.has_base:
-        g_hr = pull(base, activation, view.bases, i)
+        g_hr = activation_vjp(base, activation, view.bases, i)
     if view.has_hf:
-        g_hf = pull(hf, activation, view.bases, i)
+        g_hf = activation_vjp(hf, activation, view.bases, i)
         g_hr = routed(g_hr, g_hf, route_of(activation, view, i), view.lambda_hf)
     return g_lr, g_hr, g_hf
 
@@ -152,7 +152,7 @@ def size3(v: wp.vec3) -> wp.float32:
 
 @wp.func
 @no_type_check
-def size(g: Pulled) -> wp.float32:
-    """0 where the gradient is; sh0 follows rgb."""
+def size(g: RawGradient) -> wp.float32:
+    """A norm that is 0 only if the gradient is 0; sh0 follows rgb."""
     turn = wp.abs(g.quats[0]) + wp.abs(g.quats[1]) + wp.abs(g.quats[2]) + wp.abs(g.quats[3])
     return size3(g.means) + turn + size3(g.scales) + wp.abs(g.opacity) + size3(g.rgb)
