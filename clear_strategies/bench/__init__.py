@@ -1,8 +1,9 @@
-"""`python -m clear_strategies.bench`: run time against error, and what a second of training buys, on this machine.
+"""`python -m clear_strategies.bench`: run time against error, and what a second of training buys.
 
-The questions are `rasterizers`, `kernels`, `iteration` (one training iteration, stage by stage), `pareto` (whole
-trainings: seconds against PSNR) and `device` (all checks that need a GPU). `scenes` makes what is drawn; `timing` and
-`accuracy` take the measurements; `peers` wraps other rasterizers; `results` and `plots` write the files.
+The questions are `rasterizers`, `kernels`, `iteration` (one training iteration, stage by stage),
+`pareto` (whole trainings: seconds against PSNR) and `device` (all checks that need a GPU). `scenes`
+makes what is drawn; `timing` and `accuracy` take the measurements; `peers` wraps other rasterizers;
+`results` and `plots` write the files.
 """
 
 from importlib.util import find_spec

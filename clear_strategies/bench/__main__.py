@@ -1,6 +1,7 @@
 """The benchmark's command line.
 
-Exit codes: 0; 1 if a step of `device` failed; 2 for arguments or input that cannot be used; 130 after Ctrl-C.
+Exit codes: 0; 1 if a step of `device` failed; 2 for arguments or input that cannot be used; 130
+after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -30,15 +31,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     if threads is not None:
         torch.set_num_threads(threads)
-    results = Results(question, _log.info)
+    shown: dict[str, Any] = {
+        name: options[name] for name in ("device", "repeats", "iterations", "seeds") if name in options
+    }
+    results = Results(question, _log.info, shown)
     try:
         if (
             out is not None and question != "device"
         ):  # a folder that cannot be made is known before minutes of measuring
             out.mkdir(parents=True, exist_ok=True)
         _measure(question, options, results)
-        encoding = sys.stdout.encoding or "utf-8"  # a terminal may not know every character
-        sys.stdout.write(results.text().encode(encoding, "replace").decode(encoding))
+        sys.stdout.write(results.text())
         if out is not None:
             results.write(out)
     except (ClearError, BackendUnavailable) as error:

@@ -1,7 +1,7 @@
 """Errors of images and gradients against float64.
 
-Each contender is compared twice: with float64 at its own cut-offs, which shows the rounding, and with float64 without
-cut-offs, which shows the cut-offs too.
+Each contender is compared twice: with float64 at its own cut-offs, which shows the rounding, and
+with float64 without cut-offs, which shows the cut-offs too.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def draw(render: Callable[[], Any], cotangent: Float[Tensor, "H W 3"]) -> Drawn:
 def errors(found: Drawn, truth: Drawn) -> dict[str, float]:
     """Table columns: absolute errors of the image, and relative L2 errors of each attribute's gradient.
 
-    `<attribute>_relative` is over all Gaussians, `<attribute>_median` the median over those with a gradient.
+    `<attribute>_relative` is over all Gaussians, `<attribute>_median` the median of their own.
     """
     difference = (found.image.double() - truth.image.double()).abs().numpy()
     columns = {

@@ -1,7 +1,7 @@
-"""All checks that need a GPU, one after the other: tests, tables, whole trainings, determinism, compute-sanitizer.
+"""All checks that need a GPU: tests, tables, whole trainings, determinism, compute-sanitizer.
 
-Each step is a command in a process of its own with a log of its own; a step that fails stops no other. With
-`--device cpu --quick` the same program runs tiny scenes without a GPU.
+Each step is a command in a process of its own with a log of its own; a step that fails stops no
+other. With `--device cpu --quick` the same program runs tiny scenes without a GPU.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Request:
     Args:
         out: a new folder for logs, tables and runs.
         quick: tiny scenes, to see that the steps run.
-        data_root: holds LLFF's fern. data: the garden's file. scene: .ply files to measure beside the generated scenes.
+        data_root: holds LLFF's fern. data: the garden's file. scene: more .ply files to measure.
     """
 
     out: Path
@@ -78,9 +78,6 @@ def measure(results: Results, request: Request, plan: Callable[[Request], Sequen
     require_device(request.device)
     if request.out.exists() and (not request.out.is_dir() or any(request.out.iterdir())):
         raise DataError("--out", str(request.out), "must be a new folder, or an empty one", "name another")
-    root, data = (path if path is None else path.resolve() for path in (request.data_root, request.data))
-    scene = tuple(path.resolve() for path in request.scene)
-    request = replace(request, out=request.out.resolve(), data_root=root, data=data, scene=scene)
     (request.out / "logs").mkdir(parents=True)
     rows = []
     for nth, step in enumerate((plan or steps)(request), 1):
@@ -94,7 +91,7 @@ def measure(results: Results, request: Request, plan: Callable[[Request], Sequen
 
 def steps(request: Request) -> list[Step]:
     """The steps in their order."""
-    return [*_tests(request), *_tables(request), *_trainings(request), *_checks(request)]
+    return [_tests(request), *_tables(request), *_trainings(request), *_checks(request)]
 
 
 def _run(step: Step, request: Request, log: Path) -> dict[str, Any]:
@@ -108,23 +105,22 @@ def _run(step: Step, request: Request, log: Path) -> dict[str, Any]:
     with log.open("wb") as output:
         try:
             code = subprocess.run(  # noqa: S603 - our own programs, and NVIDIA's
-                step.command, cwd=ROOT, env=environment, stdout=output, stderr=subprocess.STDOUT, check=False
+                step.command, env=environment, stdout=output, stderr=subprocess.STDOUT, check=False
             ).returncode
-            problem = step.problem() if code == 0 else f"exit code {code}: {_last_line(log)}"
+            last_line = (log.read_text("utf-8", "replace").strip().splitlines() or ["it printed nothing"])[-1]
+            problem = step.problem() if code == 0 else f"exit code {code}: {last_line[:200]}"
         except OSError as error:
             problem = str(error)
-    return {
-        "step": step.name, "result": PASSED if problem is None else FAILED,
-        "seconds": round(time.perf_counter() - began, 1), "reason": problem or "", "log": f"logs/{log.name}",
-    }  # fmt: skip
+    seconds, result = round(time.perf_counter() - began, 1), PASSED if problem is None else FAILED
+    return row | {"result": result, "seconds": seconds, "reason": problem or "", "log": f"logs/{log.name}"}
 
 
-def _tests(request: Request) -> list[Step]:
-    """With CUDA visible its tests run; `-rs` logs which did not, and why."""
+def _tests(request: Request) -> Step:
+    """`-rs` logs which tests did not run, and why."""
     tests = ROOT / "tests"
-    which = tests / "test_floors.py" if request.quick else tests
     why_not = None if tests.is_dir() else "the tests are in a checkout, not in an installed package"
-    return [Step("tests", (sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", str(which)), why_not)]
+    which = tests / "test_floors.py" if request.quick else tests
+    return Step("tests", (sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", str(which)), why_not)
 
 
 def _table(request: Request, name: str, *arguments: str, why_not: str | None = None) -> Step:
@@ -152,7 +148,7 @@ def _tables(request: Request) -> list[Step]:
 
 
 def _trainings(request: Request) -> list[Step]:
-    """CLEAR on fern with and without skips (seconds by stage are in timing.csv), then tables of the trained field."""
+    """CLEAR on fern with and without skips, then tables of the trained field."""
     if request.quick:
         trainings, folder, missing = [_training(request, "train, demo", "runs/demo", TINY)], "demo", None
     else:
@@ -190,7 +186,7 @@ def _training(request: Request, name: str, folder: str, overrides: Sequence[str]
 
 
 def _checks(request: Request) -> list[Step]:
-    """Seconds of a first use with and without compiled kernels in the cache, determinism, and compute-sanitizer."""
+    """First use with and without compiled kernels in the cache, determinism, compute-sanitizer."""
     needs_cuda = None if request.device == "cuda" else "it needs CUDA"
     cache = {"WARP_CACHE_PATH": str(request.out / "warp_cache")}
     first_use = [
@@ -216,8 +212,3 @@ def _checks(request: Request) -> list[Step]:
         command = (tool or "compute-sanitizer", "--tool", kind, "--error-exitcode", "9", *training.command)
         sanitized.append(replace(training, command=command, why_not=needs_cuda or missing))
     return [*first_use, once, twice, *sanitized]
-
-
-def _last_line(log: Path) -> str:
-    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    return lines[-1][:200] if lines else "it printed nothing"

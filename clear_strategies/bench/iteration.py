@@ -1,4 +1,4 @@
-"""One training iteration of CLEAR, stage by stage, and the same without L_HF and without the HR scale."""
+"""One training iteration of CLEAR, stage by stage, and the same without L_HF and without HR."""
 
 from __future__ import annotations
 
@@ -123,14 +123,10 @@ def field_of(splats: Splats) -> GaussianField:
     eps = torch.finfo(torch.float32).eps
     offset = splats.rgb_offset
     parameters: dict[str, Tensor] = {
-        "means": splats.means,
-        "quats": splats.quats,
-        "scales": splats.scales.log(),
-        "opacities": torch.logit(splats.opacities.clamp(eps, 1 - eps)),
-        "sh0": splats.sh0,
-        "shN": splats.shN,
+        "means": splats.means, "quats": splats.quats, "scales": splats.scales.log(),
+        "opacities": torch.logit(splats.opacities.clamp(eps, 1 - eps)), "sh0": splats.sh0, "shN": splats.shN,
         "detail": offset if offset is not None else torch.zeros_like(splats.means),
-    }
+    }  # fmt: skip
     field = GaussianField(parameters)
     field.degree = field.max_degree
     return field

@@ -18,8 +18,7 @@ from torch import Tensor
 from clear_strategies.bench import step
 from clear_strategies.bench.rasterizers import require_device
 from clear_strategies.bench.results import Results
-from clear_strategies.bench.timing import Contender, interleaved, medians, milliseconds
-from clear_strategies.core.work_log import WorkLog
+from clear_strategies.bench.timing import interleaved, medians, one_stage
 from clear_strategies.errors import DataError
 from clear_strategies.kernels import losses
 
@@ -63,7 +62,8 @@ def measure(
     for text, (width, height) in sizes.items():
         x, y = (image.to(device) for image in images(width, height))
         for loss, of_loss in competitors.items():
-            contenders = {c.name: _turn(c, x, y) for c in of_loss}
+            runs = {c.name: partial(c.gradient, c.prepare(x), c.prepare(y)) for c in of_loss}
+            contenders = {name: one_stage("gradient", device, run) for name, run in runs.items()}
             ms = interleaved(contenders, repeats, device=device, label=f"{loss} {text}")
             turns.append(ms.assign(loss=loss, size=text))
             median = medians(ms)["gradient"]
@@ -111,22 +111,21 @@ def batch(image: Image) -> Batch:
 
 
 def _ours(loss: str, device: str) -> list[Competitor]:
-    """Every implementation that the trainer has for images on the device; the torch reference is the truth."""
+    """The trainer's implementations for images on the device; the torch reference is the truth."""
     found = losses.implementations(device)
     gradients = {name: _gradient_of(implementation, loss) for name, implementation in found.items()}
     return [Competitor(f"ours, {name}", gradient, gradients["torch"]) for name, gradient in gradients.items()]
 
 
 def _gradient_of(implementation: Any, loss: str) -> Gradient:
-    if loss == SSIM:
-        return lambda x, y: implementation.ssim(x, y).gradient
-    if loss == HAAR:
-        return lambda x, y: implementation.haar_l1(x, y).gradient
-    return lambda x, y: implementation.photometric(x, y, _LAMBDA).gradient
+    if loss == PHOTOMETRIC:
+        return lambda x, y: implementation.photometric(x, y, _LAMBDA).gradient
+    function = implementation.ssim if loss == SSIM else implementation.haar_l1
+    return lambda x, y: function(x, y).gradient
 
 
 def _peers(device: str, note: Callable[[str], None]) -> Iterator[Competitor]:
-    """SSIM of the libraries that are installed. Those on CUDA share 3DGS's borders; the others have their own."""
+    """SSIM of the installed libraries. Those on CUDA have 3DGS's borders, the others their own."""
     reference = _ours(SSIM, device)[0].truth
     yield Competitor("torch, grouped conv 11x11", _by_autograd(grouped_convolution), reference, batch)
     peers: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -154,18 +153,6 @@ def _by_autograd(loss: Callable[[Tensor, Tensor], Tensor]) -> Gradient:
         return torch.autograd.grad(loss(leaf, y).mean(), leaf)[0]
 
     return gradient
-
-
-def _turn(c: Competitor, x: Image, y: Image) -> Contender:
-    prepared = c.prepare(x), c.prepare(y)
-
-    def turn() -> dict[str, float]:
-        work_log = WorkLog(x.device)
-        with work_log.stage("gradient"):
-            c.gradient(*prepared)
-        return milliseconds(work_log)
-
-    return turn
 
 
 def _error(c: Competitor, x: Image, y: Image) -> float:

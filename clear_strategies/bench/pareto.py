@@ -1,8 +1,9 @@
 """Seconds against PSNR and SSIM of whole trainings: what each second buys.
 
-The variants are everything that trades time for quality: strategies, inexact skips, cut-offs, and simply training for fewer
-iterations, which every skip must beat. Each training is one process. All variants are trained with one seed before any
-with the next, so that other work on the machine slows all of them alike; a finished training is kept.
+The variants are everything that trades time for quality: strategies, inexact skips, cut-offs, and
+simply training for fewer iterations, which every skip must beat. Each training is one process. All
+variants are trained with one seed before any with the next, so that other work on the machine slows
+all of them alike; a finished training is kept.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import torch
 
 from clear_strategies.bench import plots
 from clear_strategies.bench.results import Results
+from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
 from clear_strategies.report.runs import Run, history
 
@@ -69,7 +71,7 @@ VARIANTS: Final = (
     Variant("accurate", CUT_OFFS, (_CLEAR, "rasterizer.preset=accurate")),
 )
 
-# Hydra takes the last override of a setting, so a variant wins over these. Probes and checkpoints would count as training.
+# A variant wins over these: Hydra takes the last override. Probes and checkpoints would count as time.
 _COMMON: Final = (
     "skips=none", "rasterizer.preset=fast", "fit.probe_every=0", "fit.checkpoint_every=0", "fit.map_views=0",
 )  # fmt: skip
@@ -136,7 +138,7 @@ def measure(results: Results, request: Request, trainer: Callable[[Path, Sequenc
                 training = _read(folder, variant)
             except DataError as error:
                 failed.add(variant.name)
-                results.note(f"{variant.name}, seed {seed}: {error}".replace(str(folder), folder.name))
+                results.note(f"{variant.name}, seed {seed}: {error}".replace(str(folder.resolve()), folder.name))
                 continue
             trainings.append(training)
             score = f"{training['seconds']:.1f} s, {training['psnr']:.2f} dB, SSIM {training['ssim']:.4f}"
@@ -153,9 +155,10 @@ def measure(results: Results, request: Request, trainer: Callable[[Path, Sequenc
 
 
 def summary(trainings: pd.DataFrame) -> pd.DataFrame:
-    """One row per variant by seconds: means and standard deviations over seeds, and comparisons with `BASE`.
+    """One row per variant: means and standard deviations over seeds, and comparisons with `BASE`.
 
-    `time_over_clear` and `psnr_over_clear` (dB) are paired by seed. `front`: no variant has more PSNR in as little time.
+    `time_over_clear` and `psnr_over_clear` (dB) are paired by seed. `front`: no variant has as much
+    PSNR in as little time.
     """
     base = trainings[trainings["variant"] == BASE.name].set_index("seed")
     paired = trainings.join(base[["seconds", "psnr"]].add_suffix("_base"), on="seed").dropna(subset="psnr_base")
@@ -195,11 +198,12 @@ def _chosen(request: Request) -> list[Variant]:
 
 def _read(folder: Path, variant: Variant) -> dict[str, Any]:
     """One row of the trainings; seconds are those of the training loop."""
-    run, rows = Run.read(folder), history(folder)
+    run, rows, content = Run.read(folder), history(folder), read_object(folder / "metrics.json")
     if not rows or "seconds" not in rows[-1]:
         raise DataError(folder / "history.csv", "seconds", "are missing", "remove the folder to train again")
     return {
         "variant": variant.name, "kind": variant.kind, "scene": run.scene, "seed": run.seed,
         "iterations": run.iterations, "gaussians": run.facts["gaussians"], "seconds": rows[-1]["seconds"],
         "psnr": run.scores["ours"]["psnr"], "ssim": run.scores["ours"]["ssim"],
+        "git": content["provenance"].get("git", "unknown"),
     }  # fmt: skip

@@ -1,7 +1,7 @@
 """Other projects' rasterizers on CUDA, called as their users call them.
 
-Only what the benchmark needs is wrapped: an image, and one backward pass per cotangent. Each is compared with float64 by
-its own rules.
+Only what the benchmark needs is wrapped: an image, and one backward pass per cotangent. Each is
+compared with float64 by its own rules.
 """
 
 from __future__ import annotations
@@ -55,18 +55,22 @@ class Peer:
 
 
 def found(note: Callable[[str], None]) -> list[Peer]:
-    """The peers that draw on this machine's GPU, each tried on a tiny scene; a line for each that does not."""
-    builders: dict[str, Callable[[str], Peer]] = {"gsplat": _installed_gsplat, "gswarp": _installed_gswarp}
+    """The peers that draw on this GPU, each tried on a tiny scene; the others are noted."""
     peers: list[Peer] = []
-    for name, build in builders.items():
+    for name in ("gsplat", "gswarp"):
         try:
-            peer = build(metadata.version(name))
+            version, library = metadata.version(name), importlib.import_module(name)
+            if name == "gsplat":
+                peer = gsplat(library.rasterization, f"gsplat {version}")
+            else:
+                library.initialize_runtime_tuning(device="cuda:0", verbose=False)  # as its documentation recommends
+                peer = gswarp(library, f"gswarp {version}")
             tiny = scenes.load("tiny").to("cuda")
             peer.render(tiny).vjp(torch.ones(1, tiny.camera.height, tiny.camera.width, 3, device="cuda"))
             peers.append(peer)
         except metadata.PackageNotFoundError:
             note(f"{name}: not installed (pip install {name}).")
-        except Exception as error:  # other libraries raise anything, often when they compile themselves at first use
+        except Exception as error:  # a library may raise anything when it compiles itself
             note(f"{name}: cannot be used ({(str(error) or type(error).__name__).splitlines()[0]}).")
     return peers
 
@@ -112,16 +116,6 @@ def gswarp(library: Any, name: str) -> Peer:
         "0.99; also draws a depth map; not deterministic (atomic sums)."
     )
     return Peer(name, _by_autograd(draw), differences, {"antialiased": False, "alpha_max": 0.99, "near": 0.2})
-
-
-def _installed_gsplat(version: str) -> Peer:
-    return gsplat(importlib.import_module("gsplat.rendering").rasterization, f"gsplat {version}")
-
-
-def _installed_gswarp(version: str) -> Peer:
-    library = importlib.import_module("gswarp")
-    library.initialize_runtime_tuning(device="cuda:0", verbose=False)  # as its documentation recommends
-    return gswarp(library, f"gswarp {version}")
 
 
 def _by_autograd(draw: Callable[[Workload, Leaves], Tensor]) -> Callable[[Workload], PeerRendering]:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pandas as pd
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from matplotlib.figure import Figure
 
 
 def time_against_error(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
@@ -16,8 +12,6 @@ def time_against_error(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
     Args:
         time, error: the tables `rasterizers_time` and `rasterizers_error`.
     """
-    from matplotlib.figure import Figure
-
     without_cut_offs = error[error["truth"] == "no cut-offs"]
     rows = time.merge(without_cut_offs, on=["scene", "backend", "preset"])
     rows["ms"] = rows["forward_ms"] + rows["backward_k1_ms"]
@@ -44,8 +38,6 @@ def time_against_quality(pareto: pd.DataFrame, title: str) -> Figure:
     Args:
         pareto: the table `pareto`.
     """
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(9, 5.6), layout="constrained")
     axis = figure.subplots()
     front = pareto[pareto["front"]]

@@ -83,8 +83,7 @@ def measure(
     found_errors: list[dict[str, Any]] = []
     turns: list[pd.DataFrame] = []
     for workload in workloads:
-        size = f"{workload.camera.width}x{workload.camera.height}"
-        results.log(f"{workload.name}: {len(workload.splats):,} Gaussians, {size}")
+        results.log(f"{workload.name}: {len(workload.splats):,} Gaussians")
         affordable = [b for b in backends if _affordable(b, workload, b, results.note)]
         contestants = [backend_on(workload, b, p) for b in affordable for p in preset]
         contestants += [peer_on(workload, peer) for peer in others]
@@ -102,10 +101,9 @@ def measure(
     results.tables["rasterizers_time"] = pd.DataFrame(times)
     results.tables["rasterizers_turns"] = pd.concat(turns)
     if found_errors:
-        results.tables["rasterizers_error"] = pd.DataFrame(found_errors)
-        results.figures["time_against_error"] = plots.time_against_error(
-            results.tables["rasterizers_time"], results.tables["rasterizers_error"]
-        )
+        time, error = results.tables["rasterizers_time"], pd.DataFrame(found_errors)
+        results.tables["rasterizers_error"] = error
+        results.figures["time_against_error"] = plots.time_against_error(time, error)
     results.notes += [f"{peer.name}: {peer.differences}" for peer in others]
 
 
@@ -185,7 +183,7 @@ def _affordable(backend: str, workload: Workload, what: str, note: Callable[[str
 
 
 def backend_on(workload: Workload, backend: str, preset: str) -> Contestant:
-    """One of our backends on a scene, with the stages that only it has: demanded tiles, and both scales together."""
+    """One of our backends, with the stages that peers lack: demanded tiles, both scales together."""
     rasterizer, cotangents = rasterizers.load(backend, preset=preset, **SETTINGS), random_cotangents(workload)
     splats, camera, tiles = workload.splats, workload.camera, quarter_of_tiles(rasterizer, workload)
     lr = camera.scaled(1 / workload.lr_factor) if workload.lr_factor else None
@@ -208,7 +206,7 @@ def peer_on(workload: Workload, peer: Peer) -> Contestant:
 
 
 def peak_on_cuda(c: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> float:
-    """MiB that torch's allocator adds at the peak of a forward and a backward pass; the driver's own are not in it."""
+    """MiB that torch's allocator adds at the peak of a forward and a backward pass."""
     torch.cuda.synchronize()
     torch.cuda.reset_peak_memory_stats()
     before = torch.cuda.memory_allocated()

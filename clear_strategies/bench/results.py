@@ -6,17 +6,15 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pandas as pd
 import torch
+from matplotlib.figure import Figure
 from torch.utils import collect_env
 
 from clear_strategies import files
 from clear_strategies.outputs.provenance import provenance
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @dataclass(slots=True, eq=False)
@@ -26,12 +24,14 @@ class Results:
     Args:
         question: prefix of all file names.
         log: prints a line while measuring.
+        options: those of the command that a reader must know.
         notes: what was not measured and why, and what else a reader of the tables must know.
         failed: a step that should work did not.
     """
 
     question: str
     log: Callable[[str], None]
+    options: dict[str, Any] = field(default_factory=dict)
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
     figures: dict[str, Figure] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -51,10 +51,11 @@ class Results:
     def write(self, out: Path) -> None:
         """Write `<table>.csv`, `<figure>.png` and `<question>.json` into a folder."""
         for name, table in self.tables.items():
-            files.write_text(out / f"{name}.csv", table.to_csv(index=False, float_format="%.4g"))
+            files.write_text(out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
         for name, figure in self.figures.items():
             write_figure(out / f"{name}.png", figure)
-        files.write_json(out / f"{self.question}.json", {"machine": machine(), "notes": self.notes})
+        facts = {"options": self.options, "machine": machine(), "notes": self.notes}
+        files.write_json(out / f"{self.question}.json", facts)
 
 
 def write_figure(path: Path, figure: Figure) -> None:

@@ -1,4 +1,6 @@
-"""What the benchmark draws: generated scenes of known statistics, a real point cloud, or an exported field."""
+"""What the benchmark draws: generated scenes of known statistics, a real point cloud, or an
+exported field.
+"""
 
 from __future__ import annotations
 
@@ -49,24 +51,24 @@ class Workload:
 
 
 def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed: int = 0) -> Workload:
-    """A wall with relief, the ground, three spheres and some clutter, with the statistics of a trained field.
+    """A wall with relief, the ground, three spheres and some clutter, as in a trained field.
 
-    The Gaussians are discs aligned to the surfaces; their sizes are lognormal, most are either faint or opaque.
+    The Gaussians are discs aligned to the surfaces, of lognormal sizes, most either faint or opaque.
 
     Args:
         radius: median 3-sigma radius of the discs before the 2D kernel, px.
     """
     random = np.random.default_rng(seed)
     focal = _FOCAL * width
-    look = _Frustum(random, width, height, focal)
+    frustum = _Frustum(random, width, height, focal)
     counts = [round(n * share) for share in (0.30, 0.25, 0.15, 0.15, 0.10)]
     parts = [
-        look.wall(counts[0]),
-        look.ground(counts[1]),
-        look.sphere(counts[2], (0.35, 0.45, 4.0), 0.8),
-        look.sphere(counts[3], (0.70, 0.50, 3.0), 0.6),
-        look.sphere(counts[4], (0.50, 0.65, 2.0), 0.25),
-        look.clutter(n - sum(counts)),
+        frustum.wall(counts[0]),
+        frustum.ground(counts[1]),
+        frustum.sphere(counts[2], (0.35, 0.45, 4.0), 0.8),
+        frustum.sphere(counts[3], (0.70, 0.50, 3.0), 0.6),
+        frustum.sphere(counts[4], (0.50, 0.65, 2.0), 0.25),
+        frustum.clutter(n - sum(counts)),
     ]
     points, normals = (np.concatenate(x) for x in zip(*parts, strict=True))
 
@@ -213,14 +215,14 @@ def _at_lr(workload: Workload) -> Workload:
 
 
 def _splats(random: np.random.Generator, *parts: Array) -> Splats:
-    """Splats of means, quats, scales, opacities and colours, with a little view dependence in all bands."""
+    """Splats of means, quats, scales, opacities and colours, with a little view dependence."""
     means, quats, scales, opacities, colors = (torch.from_numpy(x).float().contiguous() for x in parts)
     higher = torch.from_numpy(random.normal(0, 0.02, (len(means), _BANDS, 3))).float()
     return Splats(means, quats, scales, opacities, ((colors - 0.5) / SH_C0)[:, None], higher)
 
 
 def _facing(normals: Float[Array, "n 3"], spin: Float[Array, " n"]) -> Float[Array, "n 4"]:
-    """Quaternions that turn the third axis along a normal or its opposite, after a rotation about it by `spin`."""
+    """Quaternions that rotate by `spin` about the third axis, then turn it along ±normal."""
     x, y, z = (normals * np.where(normals[:, 2:] < 0, -1, 1)).T
     half = np.stack((1 + z, -y, x), 1)  # the shortest rotation from +z to the normal
     w, i, j = (half / np.linalg.norm(half, axis=1, keepdims=True)).T

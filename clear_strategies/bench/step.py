@@ -1,7 +1,8 @@
-"""The per-Gaussian work of an iteration: activations, chain rule, correction, merge, Adam, constraints.
+"""The per-Gaussian work of an iteration: activations, chain rule, correction, merge, Adam,
+constraints.
 
-A rasterizer that repeats recorded gradients and a tiny image leave nothing else to time. Compared are the compiled step,
-the readable path, and torch's Adam alone.
+A rasterizer that repeats recorded gradients and a tiny image leave nothing else to time. Compared
+are the compiled step, the readable path, and torch's Adam alone.
 """
 
 from __future__ import annotations
@@ -16,8 +17,7 @@ from torch import Tensor
 import rasterizers
 from clear_strategies.bench.iteration import FROZEN, TOTAL, Training, field_of, view_of
 from clear_strategies.bench.scenes import SETTINGS, Workload, surfaces
-from clear_strategies.bench.timing import Contender, interleaved, medians, milliseconds
-from clear_strategies.core.work_log import WorkLog
+from clear_strategies.bench.timing import Contender, interleaved, medians, one_stage
 from clear_strategies.merging.objective import Objective
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats
 
@@ -37,29 +37,19 @@ def measure(n: int, repeats: int, device: str, note: Callable[[str], None]) -> p
     else:
         note(f"{COMPILED}: not available on {device}; the log above says why.")
     contenders[READABLE] = Training(workload, view, recorded, Objective(), "off")
-    contenders["torch, fused Adam"] = TorchAdam(workload, fused=True)
-    contenders["torch, foreach Adam"] = TorchAdam(workload, fused=False)
+    contenders["torch, fused Adam"] = one_stage(TOTAL, device, _torch_adam(workload).step)
     ms = medians(interleaved(contenders, repeats, device=device, label=workload.name))[TOTAL]
     return pd.DataFrame(
         {"gaussians": n, "implementation": ms.index, "ms": ms.to_numpy(), "over_first": ms / ms.iloc[0]}
     )
 
 
-class TorchAdam:
-    """torch.optim.Adam on given gradients."""
-
-    def __init__(self, workload: Workload, *, fused: bool) -> None:
-        leaves = [p.clone().requires_grad_() for p in field_of(workload.splats).raw().values()]
-        for p in leaves:
-            p.grad = 1e-5 * torch.randn_like(p)
-        self.optimizer = torch.optim.Adam(leaves, lr=0.0, eps=FROZEN.eps, fused=fused, foreach=not fused)
-        self.device = workload.splats.means.device
-
-    def __call__(self) -> dict[str, float]:
-        work_log = WorkLog(self.device)
-        with work_log.stage(TOTAL):
-            self.optimizer.step()
-        return milliseconds(work_log)
+def _torch_adam(workload: Workload) -> torch.optim.Adam:
+    """The fused Adam of torch, on given gradients."""
+    leaves = [p.clone().requires_grad_() for p in field_of(workload.splats).raw().values()]
+    for p in leaves:
+        p.grad = 1e-5 * torch.randn_like(p)
+    return torch.optim.Adam(leaves, lr=0.0, eps=FROZEN.eps, fused=True)
 
 
 class RecordedRasterizer:
