@@ -30,7 +30,7 @@ from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import Grads, conflict_columns, to_ndc
 from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
-from clear_strategies.merging.conductor import Conductor, HrGradients
+from clear_strategies.merging.conductor import Conductor, HrGradients, only
 from integration.autograd_shot import AutogradShot
 from integration.errors import HostError
 from integration.host_score import ScoreScaler, score_for_host
@@ -109,7 +109,7 @@ class Attachment:
         self._scaler = None if threshold is None else ScoreScaler(threshold)
         self._n = len(params()["means"])
         self._passes = 0  # backward passes of this iteration
-        self._pending: tuple[HostRendering, HrGradients] | None = None  # rendered; backward() has not reached it yet
+        self._pending: tuple[HostRendering, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
         self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
         self._logged: dict[str, Number] = {}
         conductor.on_fit_start(n_views, seed, params()["means"].device)
@@ -125,7 +125,7 @@ class Attachment:
         z = conductor.gate(t, self._n)
         if z is not None:
             z = z.to(self.params()["means"])
-        hr_grads = HrGradients()
+        hr_grads = None
         if conductor.wants_hr(t):
             self.counts["HR renders"] += 1
             hr_grads = conductor.hr_gradients(render_at("hr", z).shot, view)
@@ -201,21 +201,21 @@ class Attachment:
             name: self._grad_of_this_pass(name, p) * (1 / grad_scale) for name, p in trained.items() if p.grad is not None
         })  # fmt: skip
         values = {name: p.detach() for name, p in trained.items()}
-        g, conflict = self.conductor.merge(
-            values, g_lr, _only(hr_grads.base, trained), _only(hr_grads.hf, trained), hr_grads.m, hr_grads.evidence, self.t
-        )  # fmt: skip
+        hr_trained = None if hr_grads is None else only(hr_grads, trained)
+        merged = self.conductor.merge(values, g_lr, hr_trained, self.t)
         for name, p in trained.items():
             # Without HR the gradient of f_det is 0 and not None, so that its Adam counts every step.
-            merged = g[name] * grad_scale if name in g else torch.zeros_like(p)
-            p.grad = (merged + self._grads_before[name] if name in self._grads_before else merged).to(p)
-        if screen_gradient is not None:
+            g = merged.grads[name] * grad_scale if name in merged.grads else torch.zeros_like(p)
+            p.grad = (g + self._grads_before[name] if name in self._grads_before else g).to(p)
+        if screen_gradient is not None and hr_grads is not None:
             self._write_score(rendering.shot, screen_gradient / grad_scale, hr_grads, grad_scale)
         self._grads_before = {}
         self._passes += 1
         self.counts["merges"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
-        self._logged = {"t": float(self.t), "lambda_hr": λ, **hr_grads.losses, **self.conductor.readings()}
-        self._logged |= conflict_columns(conflict)
+        losses = {} if hr_grads is None else hr_grads.losses
+        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **self.conductor.logs()}
+        self._logged |= conflict_columns(merged.conflict)
 
     def _grad_of_this_pass(self, name: str, p: Tensor) -> Tensor:
         if p.grad is None or p.grad.is_sparse:
@@ -225,11 +225,13 @@ class Attachment:
             )
         return p.grad - self._grads_before[name] if name in self._grads_before else p.grad
 
-    def _write_score(self, shot: AutogradShot, gradient: Tensor, hr_grads: HrGradients, grad_scale: float) -> None:
+    def _write_score(
+        self, shot: AutogradShot, gradient: Tensor, hr_grads: HrGradients[Grads], grad_scale: float
+    ) -> None:
         """Write the score where the host's densifier reads the screen gradient, if it reads it."""
         slot = shot.gradient_slot
         retained = slot.tensor.is_leaf or slot.tensor.retains_grad
-        if hr_grads.base is None or not retained or slot.tensor.grad is None:
+        if not retained or slot.tensor.grad is None:
             return
         screen_lr = to_ndc(slot.per_gaussian(gradient, self._n), slot.size)
         score, ordinary = self.conductor.scores(screen_lr, hr_grads, self.t)
@@ -237,8 +239,3 @@ class Attachment:
         if written is not None:
             slot.write(grad_scale * written)
         self.counts["scores written"] += score is not ordinary
-
-
-def _only(g: Grads | None, names: Mapping[str, Tensor]) -> Grads | None:
-    """The gradients of these attributes alone."""
-    return None if g is None else Grads({name: value for name, value in g.items() if name in names}, screen=g.screen)

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.deferred import Scalar
-from clear_strategies.core.gradients import Shot
+from clear_strategies.core.gradients import Grads, Shot
 from clear_strategies.merging.conductor import Conductor, Update
 from integration.autograd_shot import AutogradShot
 from integration.host_score import ScoreScaler, score_for_host
@@ -57,8 +57,9 @@ def joint_update(
     value = objective.lambda_lr * losses["lr"] + λ * (
         losses.get("base", 0.0) + objective.lambda_hf * losses.get("hf", 0.0)
     )
-    merged = {name: p for name, p in params.items() if name in update.grads}
-    gradients = [update.grads[name].to(p) for name, p in merged.items()]
+    merged = update.grads or Grads()
+    trained = {name: p for name, p in params.items() if name in merged}
+    gradients = [merged[name].to(p) for name, p in trained.items()]
 
     slot = lr.gradient_slot if scaler is not None and isinstance(lr, AutogradShot) else None
     score = None if slot is None else score_for_host(slot, update.score, update.ordinary, lr.visible, scaler)
@@ -67,7 +68,7 @@ def joint_update(
         if slot is not None and score is not None:
             slot.write(loss_scale * score)
 
-    loss: Tensor = _GivenGradients.apply(value, gradients, write_score, *merged.values())  # type: ignore[no-untyped-call]
+    loss: Tensor = _GivenGradients.apply(value, gradients, write_score, *trained.values())  # type: ignore[no-untyped-call]
     return loss, update
 
 

@@ -280,7 +280,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         lr, hr = θ.render_scales(rasterizer, view, gate=z, tiles=tiles, **scales)  # Î_LR, Î_HR     Eq. 2, 3
     drawn = [shot for shot in (lr, hr) if shot is not None]
     u = ask.update(θ.raw(), lr, hr, view, t, s.compiled_step)
-    if s.compiled_step is None:  # else the same arithmetic has been done, step included
+    if u.grads is not None:  # else the compiled step has made the step
         with stage("optimizer"):
             s.optimizer.step(θ.raw(), u.grads, torch.stack([shot.visible for shot in drawn]).any(0))
             θ.constrain()
@@ -366,7 +366,7 @@ def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Nu
         "detail_abs": deferred.scalar(s.field.detail.data.abs().mean()),
     }
     row |= {f"loss_{name}": value for name, value in u.losses.items()}
-    return row | conflict_columns(u.conflict) | dict(u.readings)
+    return row | conflict_columns(u.conflict) | dict(u.logs)
 
 
 def _psnr(image: Tensor, target: Tensor) -> Number:

@@ -33,7 +33,7 @@ HR_FROM_START = WarmupDecay(start=0, full=1, decay_from=100, end=100)
 
 def subset(name):
     """New objects at every call, since strategies have state."""
-    anchored = SVS(anchor_weights={"means": 1e-4, "scales": 1e-4, "detail": 1e-6})
+    anchored = SVS(anchor_strength=0.01, anchor_weights={"means": 1e-4, "scales": 1e-4, "detail": 1e-6})
     made = {"gco": GCO(), "p2g": P2G(patch=4), "svs": scaled(anchored, STEPS / 10_000)}
     return tuple(s for key, s in made.items() if name in (key, "clear"))
 
@@ -73,7 +73,8 @@ def test_fifty_steps_equal_those_of_our_own_trainer(name, attached):
     scene = replace(scene, train=tuple(map(double, scene.train)))
     own = TrainState.start(
         scene, conductor(name), settings=FitSettings(iterations=STEPS, degree_every=1, fused="off", scale_schedule=False),
-        density=DensitySettings(start=1_000, stop=1_001), rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1), eps=EPS),
+        density=DensitySettings(start=1_000, stop=1_001),
+        rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1), detail_decay=0.0, eps=EPS),
         mip=MipFilter(variance=0),
     )  # fmt: skip
     own.field.double()
@@ -381,7 +382,7 @@ class TestWithGsplat:
 
     def test_densification_beyond_the_anchor_is_warned_of_at_the_start(self, attached, caplog):
         with caplog.at_level(logging.WARNING):
-            self.run(attached, (SVS(anchor_start=10),), steps=1)
+            self.run(attached, (SVS(anchor_start=10, anchor_strength=0.01),), steps=1)
         assert "densifies until refine_stop_iter=24" in caplog.text
 
     def test_clear_strategy_is_a_default_strategy_that_attaches_itself(self, caplog):

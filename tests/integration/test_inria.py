@@ -35,7 +35,7 @@ STEPS = 25
 def svs(**settings):
     """New objects at every call, since strategies have state."""
     weights = {"means": 1e-4, "scales": 1e-4, "detail": 1e-6}
-    return scaled(SVS(anchor_weights=weights, **settings), STEPS / 10_000)
+    return scaled(SVS(**{"anchor_strength": 0.01, "anchor_weights": weights} | settings), STEPS / 10_000)
 
 
 def trained(host, folder, strategies, objective=HR_FROM_START, **settings):
@@ -84,7 +84,8 @@ def test_its_steps_equal_those_of_our_own_trainer(inria_host, inria_capture):
     own = TrainState.start(
         replace(toy_scene, train=views), conductors[1],
         settings=FitSettings(iterations=STEPS, degree_every=1, fused="off", scale_schedule=False),
-        density=DensitySettings(start=1_000, stop=1_001), rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1)),
+        density=DensitySettings(start=1_000, stop=1_001),
+        rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1), detail_decay=0.0),
         mip=MipFilter(variance=0),
     )  # fmt: skip
     own.field.double()

@@ -181,7 +181,7 @@ def test_white_backgrounds_get_an_early_reset():
 
 
 def test_an_anchor_follows_a_reordering_of_its_gaussians():
-    svs = SVS(anchor_start=1)
+    svs = SVS(anchor_start=1, anchor_strength=0.01)
     conductor = Conductor(svs)
     conductor.on_fit_start(3, 0)
     field, _, _ = tagged()

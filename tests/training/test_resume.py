@@ -46,6 +46,7 @@ def start(names: tuple[str, ...], iterations: int = ITERATIONS) -> TrainState:
         "svs": lambda: SVS(
             dropout=Ramp(full=ITERATIONS),
             anchor_start=12,
+            anchor_strength=0.01,
             anchor_weights={"means": 1.0, "scales": 1.0, "sh0": 0.1, "detail": 0.1},
         ),
     }
