@@ -52,7 +52,7 @@ _AUTO: Final = "auto"
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
 def main(config: DictConfig) -> float | None:
     """One job: returns the mean PSNR of the test views, which a sweeper may optimize."""
-    from clear_strategies.training.loop import Interrupted
+    from clear_strategies.training.signals import Interrupted
     from rasterizers.interface import BackendUnavailable
 
     job, ours = HydraConfig.get(), _sweep()
@@ -160,7 +160,9 @@ def _run(config: DictConfig, folder: Path) -> float | None:
     from clear_strategies.data.prepare import save_lr
     from clear_strategies.outputs import plan, results
     from clear_strategies.schedules import scaled
-    from clear_strategies.training.loop import FitSettings, TrainState, fit
+    from clear_strategies.training.loop import fit
+    from clear_strategies.training.settings import FitSettings
+    from clear_strategies.training.state import TrainState
 
     if missing := [f"data.{key}" for key in config.data if OmegaConf.is_missing(config.data, key)]:
         raise DataError("config", missing[0], "is needed by this data set and missing", f"add {missing[0]}=…")

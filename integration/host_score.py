@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.gradients import to_ndc
+from clear_strategies.density.threshold import count_passing, topk_threshold
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
 from integration.autograd_shot import ScreenGradientSlot
@@ -58,12 +59,10 @@ class ScoreScaler:
         return score * self.factor
 
     def _fit_factor(self, score: Float[Tensor, " N"], ordinary: Float[Tensor, " N"]) -> float:
-        passing = int((ordinary >= self.threshold).sum())
-        best = score.topk(min(passing + 1, len(score))).values
-        # The threshold lies midway (geometrically) between the last score that passes and the first that does not.
-        last, next_one = best[max(passing - 1, 0)], best[-1]
-        middle = float((last * next_one).sqrt()) if passing else 2 * float(best[0])
-        return self.threshold / middle if middle > 0 else 1.0
+        passing = count_passing(ordinary, self.threshold)
+        # Without a passing Gaussian, the highest score becomes half the threshold.
+        equivalent = topk_threshold(score, passing) if passing else 2 * float(score.max())
+        return self.threshold / equivalent if equivalent > 0 else 1.0
 
 
 def score_for_host(

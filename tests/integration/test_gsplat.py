@@ -16,9 +16,11 @@ from clear_strategies.compose import conductor as compose_conductor
 from clear_strategies.core.view import Photo, View
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.schedules import LogLinear, WarmupDecay, scaled
-from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from integration import HostError
 from integration.gsplat import ROWS, attach
 from rasterizers import Splats, autograd

@@ -23,9 +23,11 @@ from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.strategies.base import describes
 from clear_strategies.training.compiled_step import CompiledStep, Factors, compiled_step_for
 from clear_strategies.training.field import GaussianField
-from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from rasterizers.interface import BackendUnavailable, SplatGradients
 from rasterizers.native import load_kernels
 from rasterizers.warp_backend.launch import require

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from clear_strategies import SVS, Conductor, Update
 from clear_strategies.core.gradients import Grads
 from clear_strategies.data.scene import PointCloud
-from clear_strategies.density.adaptive import Density, DensityError, DensitySettings, cameras_extent
+from clear_strategies.density.adaptive import Density, DensitySettings
+from clear_strategies.density.base import DensityError, cameras_extent
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import filter_std
