@@ -7,7 +7,6 @@ import inspect
 import logging
 import sys
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from types import TracebackType
 from typing import Any, Final
 
 import torch
@@ -36,21 +35,8 @@ _SAME_POSE: Final = 1e-3  # largest difference between the entries of two poses 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
 
-def attach(
-    params: MutableMapping[str, Any] | torch.nn.ParameterDict,
-    optimizers: MutableMapping[str, Any],
-    views: Sequence[View],
-    conductor: Conductor,
-    *,
-    strategy: Any = None,
-    state: dict[str, Any] | None = None,
-    detail: bool = True,
-    names: Mapping[str, str] | None = None,
-    seed: int = 0,
-    loss_scale: Callable[[], float] | None = None,
-    accumulation: int = 1,
-) -> Attached:
-    """Attach the strategies of a conductor to a gsplat-style loop.
+class Attached:
+    """The strategies of a conductor in a gsplat-style loop; `attach` makes one.
 
     Args:
         params: gsplat's dict of leaves. optimizers: one for each of them.
@@ -65,14 +51,6 @@ def attach(
     Raises:
         ValueError: there is no view, or a parameter is missing.
     """
-    return Attached(
-        params, optimizers, views, conductor, strategy=strategy, state=state, detail=detail, names=names or {},
-        seed=seed, loss_scale=loss_scale, accumulation=accumulation,
-    )  # fmt: skip
-
-
-class Attached:
-    """The result of `attach`: wraps `rasterization`, and can be removed."""
 
     def __init__(
         self,
@@ -81,19 +59,19 @@ class Attached:
         views: Sequence[View],
         conductor: Conductor,
         *,
-        strategy: Any,
-        state: dict[str, Any] | None,
-        detail: bool,
-        names: Mapping[str, str],
-        seed: int,
-        loss_scale: Callable[[], float] | None,
-        accumulation: int,
+        strategy: Any = None,
+        state: dict[str, Any] | None = None,
+        detail: bool = True,
+        names: Mapping[str, str] | None = None,
+        seed: int = 0,
+        loss_scale: Callable[[], float] | None = None,
+        accumulation: int = 1,
     ) -> None:
         if not views:
             raise ValueError(
                 "at least one view is needed; integration.views.view(...) makes one from an image and a camera."
             )
-        self._params, self._names, self._views = params, {**dict.fromkeys(_PARAMETERS), **names}, tuple(views)
+        self._params, self._names, self._views = params, {**dict.fromkeys(_PARAMETERS), **(names or {})}, tuple(views)
         host_names = [self._host_name(name) for name in _PARAMETERS]
         if missing := [name for name in host_names if name not in params]:
             raise ValueError(f"params must hold {', '.join(host_names)}; {missing[0]} is missing.")
@@ -176,12 +154,6 @@ class Attached:
         self._replaced.clear()
         if self._state is not None:
             self._state.pop(ROWS, None)
-
-    def __enter__(self) -> Attached:
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.remove()
 
     def _host_name(self, name: str) -> str:
         return self._names.get(name) or name
@@ -278,6 +250,9 @@ class Attached:
         else:
             call["colors"] = torch.cat((colors[..., :1, :] + detail[:, None] / SH_C0, colors[..., 1:, :]), -2)
         return call
+
+
+attach = Attached
 
 
 def _threshold(strategy: Any, conductor: Conductor) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final
 
 import torch
@@ -38,19 +37,8 @@ THRESHOLD: Final = 2e-4
 """3DGS's default of densify_grad_threshold."""
 
 
-def attach(
-    gaussians: Any,
-    cameras: Sequence[Any],
-    conductor: Conductor,
-    *,
-    sr: SuperResolve | str | Path | None = None,
-    factor: int = 4,
-    threshold: float | None = THRESHOLD,
-    densify_until: int | None = None,
-    detail: bool = True,
-    seed: int = 0,
-) -> Attached:
-    """Attach the strategies of a conductor to a 3DGS-style loop, after `gaussians.training_setup(opt)`.
+class Attached:
+    """The strategies of a conductor in a 3DGS-style loop; `attach` makes one, after `gaussians.training_setup(opt)`.
 
     Args:
         gaussians: the host's GaussianModel.
@@ -62,23 +50,14 @@ def attach(
         densify_until: opt.densify_until_iter, for a warning where a strategy ends densification earlier.
         detail: train the detail feature f_det beside the host's parameters.
 
+    Attributes:
+        views: the training views by the name of their photo.
+
     Raises:
         SettingError: HR is used, but there is no `sr`.
         ValueError: there is no camera, or two cameras have the same name.
         DataError: an SR image is missing, or is not `factor` times as large as its photo.
         HostError: `gaussians` is not a GaussianModel as in 3DGS.
-    """
-    return Attached(
-        gaussians, cameras, conductor, sr=sr, factor=factor, threshold=threshold, densify_until=densify_until,
-        detail=detail, seed=seed,
-    )  # fmt: skip
-
-
-class Attached:
-    """The result of `attach`: wraps `render`, and can be removed.
-
-    Attributes:
-        views: the training views by the name of their photo.
     """
 
     def __init__(
@@ -87,12 +66,12 @@ class Attached:
         cameras: Sequence[Any],
         conductor: Conductor,
         *,
-        sr: SuperResolve | str | Path | None,
-        factor: int,
-        threshold: float | None,
-        densify_until: int | None,
-        detail: bool,
-        seed: int,
+        sr: SuperResolve | str | Path | None = None,
+        factor: int = 4,
+        threshold: float | None = THRESHOLD,
+        densify_until: int | None = None,
+        detail: bool = True,
+        seed: int = 0,
     ) -> None:
         required = (*_ATTRIBUTES.values(), "optimizer")
         if missing := [attribute for attribute in required if getattr(gaussians, attribute, None) is None]:
@@ -162,12 +141,6 @@ class Attached:
         self._step_hook.remove()
         vars(self._model).pop("save_ply", None)  # the instance's replacement of its class's method
 
-    def __enter__(self) -> Attached:
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.remove()
-
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}
 
@@ -200,6 +173,9 @@ class Attached:
             return self._save_ply(*args, **kwargs)
         finally:
             self._model._features_dc = trained
+
+
+attach = Attached
 
 
 def intrinsics(camera: Any) -> Float[Tensor, "3 3"]:

@@ -18,12 +18,12 @@ def test_two_lines_and_none_give_the_same_file(inria_host, inria_capture, caplog
     settings = ["strategies.p2g.patch=4", "strategies.svs.anchor_strength=0"]
     opt = options(inria_host, inria_capture, iterations=12, densify_until_iter=9)
     gaussians, scene = inria_host.setup(opt)
-    with attach(
+    clear = attach(
         gaussians, scene.getTrainCameras(), conductor("clear", *settings, iterations=12), sr=inria_capture / "sr",
         threshold=opt.densify_grad_threshold, densify_until=opt.densify_until_iter,
-    ) as clear:  # fmt: skip
-        inria_host.training(opt, gaussians, scene, clear.wrap(inria_host.render))
-        gaussians.save_ply(inria_capture / "two.ply")
+    )  # fmt: skip
+    inria_host.training(opt, gaussians, scene, clear.wrap(inria_host.render))
+    gaussians.save_ply(inria_capture / "two.ply")
 
     command = [
         "--sr", str(inria_capture / "sr"), *(f"--set={s}" for s in settings),
