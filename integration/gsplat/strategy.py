@@ -1,4 +1,4 @@
-"""CLEAR as a gsplat strategy: passed where a trainer expects `DefaultStrategy`, with no other line changed.
+"""CLEAR as a gsplat strategy: passed where a trainer expects `DefaultStrategy`, without any other change.
 
 cfg.strategy = ClearStrategy(views=views, conductor=conductor("clear", iterations=30_000))
 """
@@ -14,19 +14,19 @@ from gsplat.strategy import DefaultStrategy
 
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
-from integration.gsplat import Attached, attach
+from integration.gsplat.attached import Attached, attach
 
 
 @dataclass
 class ClearStrategy(DefaultStrategy):  # type: ignore[misc]
-    """DefaultStrategy, driven by the strategies' score while they let the structure change.
+    """DefaultStrategy that attaches CLEAR, densifies by its score, and stops when a strategy ends densification.
 
-    It derives from DefaultStrategy because trainers ask for that class by name. When the trainer initializes its state,
-    CLEAR is attached to the parameters and `rasterization` is replaced in every module that holds it.
+    It derives from DefaultStrategy because trainers test for that class. When the trainer initializes the strategy's state,
+    CLEAR is attached to the parameters, and `rasterization` is replaced in every module that holds it.
 
     Args:
-        views, conductor: see `integration.gsplat.attach`. rasterization: the function that the trainer draws with.
-        detail, seed: likewise.
+        views, conductor, detail, seed: see `integration.gsplat.attach`.
+        rasterization: the function that the trainer renders with.
     """
 
     views: Sequence[View] = ()
@@ -36,8 +36,8 @@ class ClearStrategy(DefaultStrategy):  # type: ignore[misc]
     seed: int = 0
     attached: Attached | None = None
 
-    asks_the_conductor: ClassVar[bool] = True
-    """Densification ends where a strategy ends it, whatever refine_stop_iter says."""
+    follows_may_densify: ClassVar[bool] = True
+    """Densification ends when a strategy ends it, whatever refine_stop_iter is."""
 
     def check_sanity(self, params: Any, optimizers: Any) -> None:
         super().check_sanity(params, optimizers)
@@ -57,7 +57,7 @@ class ClearStrategy(DefaultStrategy):  # type: ignore[misc]
         return state
 
     def __getstate__(self) -> dict[str, Any]:
-        """Settings and names: trainers write their strategy into a configuration file, and photographs do not belong there."""
+        """Settings and names only: trainers write their strategy to a configuration file, which must not hold photos."""
         settings = {field.name: getattr(self, field.name) for field in fields(DefaultStrategy)}
         strategies = self.conductor.strategies if self.conductor is not None else ()
         return {**settings, "views": [view.name for view in self.views], "strategies": [repr(s) for s in strategies]}
@@ -65,7 +65,7 @@ class ClearStrategy(DefaultStrategy):  # type: ignore[misc]
     def step_post_backward(
         self, params: Any, optimizers: Any, state: dict[str, Any], step: int, info: dict[str, Any], **keywords: Any
     ) -> None:
-        """DefaultStrategy's, as long as every strategy lets the structure change."""
+        """DefaultStrategy's step, as long as every strategy allows densification."""
         attachment = self.attached.attachment if self.attached is not None else None
         if attachment is None or attachment.conductor.may_densify(attachment.t):
             super().step_post_backward(params, optimizers, state, step, info, **keywords)

@@ -1,9 +1,8 @@
-"""The nerfstudio method `clear-splatfacto`: splatfacto, its trainer and its viewer as they are, with the strategies attached.
+"""`clear-splatfacto`: splatfacto with the strategies attached; its trainer and viewer are nerfstudio's own.
 
     ns-train clear-splatfacto --data scene --pipeline.model.sr scene/sr
 
-nerfstudio finds `clear_splatfacto` by the entry point of this package, or by NERFSTUDIO_METHOD_CONFIGS (see docs/hosts.md).
-Its `TrainerConfig` is spelled out: the one of splatfacto cannot be imported while nerfstudio is collecting its methods.
+The `TrainerConfig` is written out, because splatfacto's cannot be imported while nerfstudio collects its methods.
 """
 
 from __future__ import annotations
@@ -30,57 +29,58 @@ from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from clear_strategies.errors import SettingError
+from integration.detail import sh0_offset
 from integration.gsplat import Attached, attach
-from integration.nerfstudio_data import prior, save_lr, views
-from rasterizers.geometry import SH_C0
+from integration.nerfstudio.data import prior, save_lr, views
 
 NAMES: Final = {"sh0": "features_dc", "shN": "features_rest"}
-"""gsplat's name -> splatfacto's, where they differ."""
+"""gsplat's parameter name -> splatfacto's, where they differ."""
 
 
 @dataclass
 class ClearSplatfactoModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
-    """splatfacto's settings, those of the strategies, and where the SR reference comes from.
+    """splatfacto's settings, the strategies' settings, and the source of the SR images.
 
     Raises:
-        ValueError: a setting of splatfacto's that the LR/HR pair cannot live with.
+        SettingError: a setting of splatfacto does not work with two scales.
     """
 
     _target: type = field(default_factory=lambda: ClearSplatfactoModel)
     clear: str = "clear"
-    """the strategies, as after +strategy= of our own trainer: clear, gco, gco,svs, baseline ..."""
+    """the strategies, as in +strategy= of clear-strategies: clear, gco, gco,svs, baseline ..."""
     overrides: tuple[str, ...] = ()
     """settings of the strategies and the objective: strategies.gco.tolerance=0.1 objective=paper ..."""
     sr: Path | None = None
-    """folder with one SR image a photo (same stem), or an ONNX network; none: bicubic, which adds no detail"""
+    """folder with one SR image per photo (same stem), or an ONNX network; none: bicubic, which adds no detail"""
     sr_factor: int = 4
-    """HR pixels per LR pixel, along an edge"""
+    """HR pixels per LR pixel along an edge"""
     save_lr: Path | None = None
-    """write the photos here as they are trained on, undistorted: what an SR tool must enlarge"""
+    """write the photos here as they are trained on, undistorted, for an SR tool to enlarge"""
     background_color: Literal["random", "black", "white"] = "black"
-    """black: what SR references are compared over"""
+    """black: the background of the SR images"""
     num_downscales: int = 0
-    """0: LR photos and SR references have one size each"""
+    """0: LR photos and SR images have one size each"""
 
     def __post_init__(self) -> None:
         for name, found, needed, why in (
-            ("num_downscales", self.num_downscales, 0, "LR photos and SR references have one size each"),
-            ("background_color", self.background_color, "black", "both scales are compared over one colour"),
+            ("num_downscales", self.num_downscales, 0, "LR photos and SR images have one size each"),
+            ("background_color", self.background_color, "black", "both scales are compared over the same colour"),
             ("camera_optimizer.mode", self.camera_optimizer.mode, "off", "a view is recognised by its pose"),
-            ("use_bilateral_grid", self.use_bilateral_grid, False, "it would recolour one scale only"),
+            ("use_bilateral_grid", self.use_bilateral_grid, False, "it changes the colours of one scale only"),
         ):
             if found != needed:
-                raise ValueError(f"clear-splatfacto needs {name}={needed}, got {found}: {why}.")
+                raise SettingError(f"{name}: clear-splatfacto needs {needed}, got {found}: {why}.")
         for name, least in (("sh_degree", 1), ("sr_factor", 2)):
             if getattr(self, name) < least:
-                raise ValueError(f"clear-splatfacto needs {name} of at least {least}, got {getattr(self, name)}.")
+                raise SettingError(f"{name}: clear-splatfacto needs at least {least}, got {getattr(self, name)}.")
 
 
 class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
-    """splatfacto with the detail feature f_det, and with the strategies beside its training.
+    """splatfacto with the detail feature f_det, trained with the strategies.
 
     Attributes:
-        attached: the handle, from the moment that the trainer asks for callbacks until training has ended.
+        attached: not None from the trainer's request for callbacks until training ends.
     """
 
     config: ClearSplatfactoModelConfig
@@ -92,9 +92,9 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
 
     @property
     def features_dc(self) -> Float[Tensor, "N 3"]:
-        """f_base while training, where the LR image is drawn; f_base + f_det for the viewer, evaluation and exports."""
+        """f_base in training, where LR is rendered; f_base + f_det for the viewer, evaluation and exports."""
         base: Tensor = self.gauss_params["features_dc"]
-        return base if self.training else base + self.gauss_params["detail"] / SH_C0
+        return base if self.training else base + sh0_offset(self.gauss_params["detail"], base)
 
     def get_gaussian_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
         groups: dict[str, list[torch.nn.Parameter]] = super().get_gaussian_param_groups()
@@ -106,14 +106,14 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         self.attached = self._attach(training_callback_attributes)
         return [
             *super().get_training_callbacks(training_callback_attributes),
-            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self._count),
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self._resume),
             TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._detach),
         ]
 
     def get_outputs(self, camera: Any) -> dict[str, Any]:
         if not self.training or self.attached is None:
             return super().get_outputs(camera)  # type: ignore[no-any-return]
-        with _drawing_with(self.attached.wrap(splatfacto.rasterization)):
+        with _rendering_with(self.attached.wrap(splatfacto.rasterization)):
             return super().get_outputs(camera)  # type: ignore[no-any-return]
 
     def get_metrics_dict(self, outputs: Any, batch: Any) -> dict[str, Any]:
@@ -126,21 +126,21 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         from clear_strategies.compose import conductor
 
         config, trainer, datamanager = self.config, host.trainer, host.pipeline.datamanager
-        if uneven := {group: n for group, n in trainer.gradient_accumulation_steps.items() if n != 1}:
-            raise ValueError(
-                f"clear-splatfacto merges the gradients of one view a step, got gradient_accumulation_steps={uneven}. "
+        if accumulated := {group: n for group, n in trainer.gradient_accumulation_steps.items() if n != 1}:
+            raise SettingError(
+                f"gradient_accumulation_steps: clear-splatfacto merges the gradients of one view per step, got {accumulated}. "
                 "Leave them at 1."
             )
         if config.save_lr is not None:
             save_lr(datamanager, config.save_lr)
             CONSOLE.log(
-                f"CLEAR: the LR photos are in {config.save_lr}; enlarge them x{config.sr_factor} for pipeline.model.sr."
+                f"CLEAR: wrote the LR photos to {config.save_lr}; enlarge them x{config.sr_factor} for pipeline.model.sr."
             )
         strategies = conductor(config.clear, *config.overrides, iterations=trainer.config.max_num_iterations)
         sr = prior(config.sr)
         CONSOLE.log(
             f"CLEAR: {', '.join(type(s).__name__ for s in strategies.strategies) or 'no strategy'}; "
-            f"x{config.sr_factor} reference: {sr.label}."
+            f"SR images x{config.sr_factor}: {sr.label}."
         )
         stop = self.strategy.refine_stop_iter
         end = next((step for step in range(stop) if not strategies.may_densify(step + 1)), stop)
@@ -153,13 +153,11 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
             loss_scale=host.grad_scaler.get_scale,
         )  # fmt: skip
 
-    def _count(self, step: int) -> None:
-        """A resumed training goes on where it was."""
+    def _resume(self, step: int) -> None:
+        """Continue a resumed training at its iteration."""
         attached = self.attached
         if attached is not None and not attached.attachment.counts and step > 0:
-            CONSOLE.log(
-                f"CLEAR: resumed at step {step}; what strategies remembered per Gaussian (SVS's anchor) is gone."
-            )
+            CONSOLE.log(f"CLEAR: resumed at step {step}; the strategies' per-Gaussian state (SVS's anchor) is lost.")
             attached.attachment.t = step + 1
 
     def _detach(self, step: int) -> None:
@@ -171,8 +169,8 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
 
 
 @contextmanager
-def _drawing_with(rasterization: Any) -> Iterator[None]:
-    """Have splatfacto call this for a moment, under the name that its module has for gsplat's function."""
+def _rendering_with(rasterization: Any) -> Iterator[None]:
+    """Replace gsplat's function in splatfacto's module."""
     own, splatfacto.rasterization = splatfacto.rasterization, rasterization
     try:
         yield
@@ -181,7 +179,7 @@ def _drawing_with(rasterization: Any) -> Iterator[None]:
 
 
 def _adam(lr: float, lr_final: float | None = None) -> dict[str, Any]:
-    """The optimizer that splatfacto gives a group, its rate constant or falling to `lr_final` at 30,000 steps."""
+    """The optimizer of splatfacto's group; its rate is constant, or decays to `lr_final` at 30,000 steps."""
     decay = None if lr_final is None else ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=30_000)
     return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay}
 
@@ -213,6 +211,6 @@ clear_splatfacto: Final = MethodSpecification(
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
         vis="viewer",
     ),
-    description="splatfacto on LR photos and SR references, joined by CLEAR's strategies",
+    description="splatfacto on LR photos and SR images, merged by CLEAR's strategies",
 )
-"""What nerfstudio's registry is told."""
+"""The method as nerfstudio's registry expects it."""

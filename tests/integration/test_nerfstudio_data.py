@@ -1,6 +1,6 @@
-"""The nerfstudio method, as far as it needs no nerfstudio: what is read from a data manager, and splatfacto's shapes.
+"""The parts of the nerfstudio method that need no nerfstudio: reading a data manager, and splatfacto's tensor shapes.
 
-The method itself: test_splatfacto.py, where nerfstudio is installed.
+test_nerfstudio_method.py tests the method itself, where nerfstudio is installed.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from clear_strategies.data.priors import Bicubic, Cached, Images
 from clear_strategies.errors import DataError
 from clear_strategies.schedules import WarmupDecay
 from integration.gsplat import attach
-from integration.nerfstudio_data import over_black, prior, save_lr, views, world_to_camera
+from integration.nerfstudio.data import over_black, prior, save_lr, views, world_to_camera
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
 
-AT_ONCE = WarmupDecay(start=0, full=1, decay_from=100, end=100)
+HR_FROM_START = WarmupDecay(start=0, full=1, decay_from=100, end=100)
 
 
 class Cameras:
-    """nerfstudio's, of two photos: at (0, 0, 4), looking at the origin; and the same, turned to look along +x."""
+    """nerfstudio's cameras of two photos: one at (0, 0, 4) looks at the origin, one at (4, 5, 6) along +x."""
 
     def __init__(self):
         straight = torch.eye(4)[:3]
@@ -42,7 +42,7 @@ class Cameras:
 
 
 class DataManager:
-    """nerfstudio's, as far as it is read: photos are undistorted when they are first asked for, and cameras with them."""
+    """nerfstudio's data manager, as far as it is read: the first access undistorts photos and corrects cameras."""
 
     def __init__(self, files=("a/one.jpg", "a/two.jpg"), **extra):
         self.train_dataset = SimpleNamespace(cameras=Cameras(), image_filenames=list(files))
@@ -57,10 +57,10 @@ class DataManager:
         return self.photos
 
 
-def test_cameras_turn_from_opengl_to_opencv():
+def test_poses_are_converted_from_opengl_to_opencv():
     straight, turned = world_to_camera(Cameras().camera_to_worlds)
     assert (straight @ torch.tensor([1.0, 2, 3, 1])).tolist() == [1, -2, 1, 1]  # y down, one unit in front
-    assert (turned @ torch.tensor([6.0, 5, 6, 1])).tolist() == [0, 0, 2, 1]  # it looks along +x
+    assert (turned @ torch.tensor([6.0, 5, 6, 1])).tolist() == [0, 0, 2, 1]  # the camera looks along +x
     for pose, given in zip((straight, turned), Cameras().camera_to_worlds, strict=True):
         assert torch.allclose(pose.double(), pose_from_opengl(Path("transforms.json"), "frame", given.tolist()))
 
@@ -85,25 +85,25 @@ def test_sr_images_are_found_by_the_photos_stem(tmp_path):
         views(DataManager(), prior(tmp_path), 2)
 
 
-def test_saved_photos_are_those_that_are_trained_on(tmp_path):
+def test_saved_lr_photos_are_the_training_photos(tmp_path):
     manager = DataManager()
     save_lr(manager, tmp_path)
     assert torch.equal((read_image(tmp_path / "two.png") * 255).round().byte(), manager.photos[1]["image"])
 
 
-def test_where_references_come_from(tmp_path):
+def test_the_sr_setting_chooses_the_prior(tmp_path):
     assert isinstance(prior(None), Bicubic)
     assert isinstance(prior(tmp_path), Images)
     assert isinstance(prior(tmp_path / "span.ONNX"), Cached)
 
 
-def test_what_would_be_wrong_is_refused():
+def test_masks_and_equal_stems_are_refused():
     with pytest.raises(DataError, match="mask"):
         views(DataManager(mask=torch.ones(16, 24, 1)), Bicubic(), 4)
     twins = DataManager(files=("a/one.jpg", "b/one.png"))
-    for ask in (lambda: views(twins, Bicubic(), 4), lambda: save_lr(twins, None)):
+    for call in (lambda: views(twins, Bicubic(), 4), lambda: save_lr(twins, None)):
         with pytest.raises(DataError, match="stem"):
-            ask()
+            call()
 
 
 def test_alpha_is_composited_over_black():
@@ -113,8 +113,8 @@ def test_alpha_is_composited_over_black():
 
 
 class Splatfacto(Host):
-    """splatfacto's shapes and names, its call by keyword, its densifier's statistic Σ|∂L/∂u|: here, as a stand-in for what
-    only CUDA computes, three times the absolute value of the sum.
+    """A host with splatfacto's shapes, names and keyword call. Its densifier reads Σ|∂L/∂u|, which only CUDA computes; three
+    times the absolute value of the sum takes its place.
     """
 
     names = {"sh0": "features_dc", "shN": "features_rest"}  # noqa: RUF012
@@ -138,52 +138,53 @@ class Splatfacto(Host):
         return renders, alphas, self.info
 
 
-def absolute(rasterization):
+def with_absgrad(rasterization):
     @functools.wraps(rasterization)
-    def drawn(*args, **kwargs):
+    def wrapped(*args, **kwargs):
         renders, alphas, info = rasterization(*args, **kwargs)
         info["means2d"].register_hook(lambda g: setattr(info["means2d"], "absgrad", 3 * g.abs()))
         return renders, alphas, info
 
-    return drawn
+    return wrapped
 
 
 def trained(host, scene, *strategies, threshold=None, monkeypatch=None):
     clear = attach(
-        host.splats, host.optimizers, scene.train, Conductor(*strategies, objective=Objective(lambda_hr=AT_ONCE)),
+        host.splats, host.optimizers, scene.train, Conductor(*strategies, objective=Objective(lambda_hr=HR_FROM_START)),
         names=getattr(host, "names", None), strategy=threshold and SimpleNamespace(grow_grad2d=threshold),
     )  # fmt: skip
     with monkeypatch.context() as patch:
-        kept = gsplat_host.rasterization
-        patch.setattr(gsplat_host, "rasterization", clear.wrap(absolute(kept) if hasattr(host, "names") else kept))
+        original = gsplat_host.rasterization
+        function = with_absgrad(original) if isinstance(host, Splatfacto) else original
+        patch.setattr(gsplat_host, "rasterization", clear.wrap(function))
         host.train([scene.train[0].name])
     clear.remove()
     return clear
 
 
-def test_splatfactos_shapes_give_the_gradients_of_gsplats(monkeypatch):
+def test_splatfactos_shapes_give_the_same_gradients_as_gsplats(monkeypatch):
     scene = toy.scene(30)
     scene = replace(scene, train=tuple(replace(v, hr=replace(v.hr, image=v.hr.image.flip(1))) for v in scene.train))
-    ours, theirs = Splatfacto(scene), Host(scene)
+    splatfacto, plain = Splatfacto(scene), Host(scene)
     strategies = GCO(), P2G(patch=4)
-    corrected = trained(ours, scene, *strategies, monkeypatch=monkeypatch).attachment.log["corrected"]
-    trained(theirs, scene, *strategies, monkeypatch=monkeypatch)
+    corrected = trained(splatfacto, scene, *strategies, monkeypatch=monkeypatch).attachment.log["corrected"]
+    trained(plain, scene, *strategies, monkeypatch=monkeypatch)
     assert corrected > 0
-    for name, expected in theirs.grads.items():
-        g = ours.grads[Splatfacto.names.get(name, name)]
+    for name, expected in plain.grads.items():
+        g = splatfacto.grads[Splatfacto.names.get(name, name)]
         assert torch.allclose(g.reshape(expected.shape), expected, atol=1e-5 * float(expected.abs().max())), name
 
 
-def test_the_absolute_gradient_is_left_alone_without_a_score(monkeypatch):
+def test_without_a_score_the_absolute_gradient_is_unchanged(monkeypatch):
     scene = toy.scene(30)
     host = Splatfacto(scene)
     clear = trained(host, scene, GCO(), threshold=1e-9, monkeypatch=monkeypatch)
     means2d = host.info["means2d"]
-    assert clear.attachment.counts["scores handed over"] == 0
+    assert clear.attachment.counts["scores written"] == 0
     assert torch.equal(means2d.absgrad, 3 * means2d.grad.abs())
 
 
-def test_a_score_lets_as_many_pass_as_the_absolute_gradient_would(monkeypatch):
+def test_as_many_pass_by_the_score_as_by_the_absolute_gradient(monkeypatch):
     scene = toy.scene(30)
     plain = Splatfacto(scene)
     trained(plain, scene, GCO(), threshold=1.0, monkeypatch=monkeypatch)
@@ -192,6 +193,6 @@ def test_a_score_lets_as_many_pass_as_the_absolute_gradient_would(monkeypatch):
     threshold = float(own.sort().values[-8] * (1 - 1e-3))  # eight pass
     host = Splatfacto(scene)
     clear = trained(host, scene, P2G(patch=4), threshold=threshold, monkeypatch=monkeypatch)
-    handed = (host.info["means2d"].absgrad[0] * ndc).norm(dim=-1)
-    assert clear.attachment.counts["scores handed over"] == 1
-    assert int((handed >= threshold).sum()) == 8
+    written = (host.info["means2d"].absgrad[0] * ndc).norm(dim=-1)
+    assert clear.attachment.counts["scores written"] == 1
+    assert int((written >= threshold).sum()) == 8

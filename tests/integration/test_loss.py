@@ -1,4 +1,4 @@
-"""The bridge in a host of the smallest kind: torch parameters, torch.optim, a renderer that speaks autograd."""
+"""`joint_loss` in the smallest host: torch parameters, torch.optim, and a renderer with autograd."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.field import GaussianField
-from integration.bridge import AutogradShot, joint_loss, joint_update
+from integration import AutogradShot, joint_loss, joint_update
 from rasterizers import Splats, autograd
 from tests.helpers import toy
 
@@ -16,7 +16,7 @@ OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end
 
 
 class Host:
-    """Somebody else's trainer."""
+    """A trainer that is not ours."""
 
     def __init__(self, scene):
         self.field = GaussianField.from_cloud(scene.cloud)
@@ -27,14 +27,14 @@ class Host:
         p = self.params
         opacities = p["opacities"].sigmoid() if z is None else p["opacities"].sigmoid() * z
         offset = p["detail"] if detail else torch.zeros_like(p["detail"])
-        drawn = (p["means"], p["quats"], p["scales"].exp(), opacities, p["sh0"], p["shN"], offset)
-        shot = autograd.draw(toy.RASTERIZER, Splats(*drawn), camera)
+        splats = Splats(p["means"], p["quats"], p["scales"].exp(), opacities, p["sh0"], p["shN"], offset)
+        shot = autograd.draw(toy.RASTERIZER, splats, camera)
         params = p if detail else {name: value for name, value in p.items() if name != "detail"}
         return AutogradShot(shot.image, shot.means2d, shot.visible, params)
 
 
 @pytest.mark.parametrize("strategies", [(), (GCO(),), (P2G(),), (SVS(),), (GCO(), P2G(), SVS())], ids=len)
-def test_backward_hands_out_the_conductors_gradient(strategies):
+def test_backward_gives_the_conductors_gradient(strategies):
     scene = toy.scene(20)
     host, view = Host(scene), scene.train[0]
     conductor = Conductor(*strategies, objective=OBJECTIVE)
@@ -52,7 +52,7 @@ def test_backward_hands_out_the_conductors_gradient(strategies):
         assert torch.allclose(p.grad, 2 * expected[name], atol=1e-4 * scale, rtol=1e-3), name
 
 
-def test_its_value_is_the_honest_loss():
+def test_its_value_is_the_sum_of_the_losses():
     scene = toy.scene(20)
     host, view = Host(scene), scene.train[0]
     conductor = Conductor(GCO(), objective=OBJECTIVE)
@@ -63,7 +63,7 @@ def test_its_value_is_the_honest_loss():
     assert update.score.shape == (20,)
 
 
-def test_an_unmodified_loop_trains():
+def test_a_loop_with_joint_loss_reduces_the_loss():
     scene = toy.scene(20)
     host = Host(scene)
     conductor = Conductor(GCO(), P2G(), SVS(), objective=OBJECTIVE)
