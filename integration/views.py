@@ -50,7 +50,7 @@ def view(
             f"{w * factor}x{h * factor}", "super-resolve the images that the host trains on",
         )  # fmt: skip
     return View(
-        name, Photo(camera, image), Photo(camera.scaled(factor), sr_image), reference=getattr(sr, "label", "unknown")
+        name, Photo(camera, image), Photo(camera.scaled(factor), sr_image), sr_source=getattr(sr, "label", "unknown")
     )
 
 
