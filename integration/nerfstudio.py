@@ -2,7 +2,8 @@
 
     ns-train clear-splatfacto --data scene --pipeline.model.sr scene/sr
 
-nerfstudio finds `clear_splatfacto` by the entry point of this package, or by NERFSTUDIO_METHOD_CONFIGS (see docs/hosts.md).
+nerfstudio finds `clear_splatfacto` by the entry point of this package, or by NERFSTUDIO_METHOD_CONFIGS
+(docs/how-to/host-nerfstudio.md).
 Its `TrainerConfig` is spelled out: the one of splatfacto cannot be imported while nerfstudio is collecting its methods.
 """
 

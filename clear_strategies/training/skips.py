@@ -2,7 +2,7 @@
 
 Exact skips (rows that do not move, tiles that nobody asked for, HR while λ_HR = 0) are always on, because nothing changes
 by them. Those here change the result a little, so each is a setting, its default is chosen by measurement
-(docs/evidence.md), the plan names those that are on, and the work_log counts the iterations and tiles that were left out.
+(docs/explanation/evidence.md), the plan names those that are on, and the work log counts what was left out.
 """
 
 from __future__ import annotations

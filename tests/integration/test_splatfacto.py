@@ -1,6 +1,6 @@
 """`clear-splatfacto` in the real nerfstudio: its registry, its command line, its trainer, on a CPU.
 
-nerfstudio brings 3.5 GB, so that this file is skipped where it is absent, as in CI; docs/hosts.md says how it is run.
+nerfstudio needs 3.5 GB, so this file is skipped where it is absent, as in CI. docs/how-to/host-nerfstudio.md shows the command.
 
 What is not nerfstudio's own here: gsplat's CUDA kernels are replaced by our rasterizer (with gsplat 1.4's shapes, and |∇_u|
 for `absgrad`, which it does not compute), `Tensor.cuda()` returns the tensor, and the LPIPS network, a download, is a constant.
@@ -22,7 +22,7 @@ import torch
 from tests.helpers import toy
 
 if importlib.util.find_spec("nerfstudio") is None:
-    pytest.skip("nerfstudio is not installed: docs/hosts.md", allow_module_level=True)
+    pytest.skip("nerfstudio is not installed: docs/how-to/host-nerfstudio.md", allow_module_level=True)
 
 os.environ["TORCHDYNAMO_DISABLE"] = "1"
 import yaml
