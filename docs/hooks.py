@@ -244,6 +244,8 @@ def _built(
             continue
         if not ours and parameter.name not in leaves:
             continue
+        if default is inspect.Parameter.empty and parameter.name not in leaves and (CONF / parameter.name).is_dir():
+            continue  # a group of its own
         kind = hints.get(parameter.name, "")
         if "milestone" in metadata.get(parameter.name, {}):
             kind = f"{kind}, milestone"
@@ -291,7 +293,7 @@ def _type(annotation: Any) -> str:
     if isinstance(annotation, type):
         return annotation.__name__
     text = annotation if isinstance(annotation, str) else repr(annotation)
-    return re.sub(r"\b(?:typing|collections\.abc|pathlib|\w+(?:\.\w+)+)\.(?=\w)", "", text)
+    return re.sub(r"\b(?:[A-Za-z_]\w*\.)+(?=\w)", "", text)
 
 
 def _shown(value: Any) -> str:
@@ -311,10 +313,17 @@ def _shown(value: Any) -> str:
 
 def _docstring(built: Any) -> tuple[str, dict[str, str]]:
     """The first paragraph, and the description of each argument."""
-    text = inspect.getdoc(built) or ""
-    summary = " ".join(text.split("\n\n")[0].split())
+    summary = " ".join((inspect.getdoc(built) or "").split("\n\n")[0].split())
     if summary.startswith(f"{built.__name__}("):  # a dataclass without a docstring
         summary = ""
+    described: dict[str, str] = {}
+    for owner in reversed(inspect.getmro(built)[:-1] if inspect.isclass(built) else (built,)):
+        described |= _arguments(inspect.cleandoc(owner.__doc__ or ""))
+    return summary, described
+
+
+def _arguments(text: str) -> dict[str, str]:
+    """What the `Args:` of a docstring say, by argument."""
     block = re.search(r"^Args:\n((?:[ \t]+.*\n?|\n)+)", text, re.MULTILINE)
     described: dict[str, str] = {}
     if block:
@@ -334,7 +343,7 @@ def _docstring(built: Any) -> tuple[str, dict[str, str]]:
                 names, colon, description = part.partition(":")
                 if colon:
                     described |= {n.strip().lstrip("*"): description.strip() for n in names.split(",")}
-    return summary, described
+    return described
 
 
 def _described(value: str, text: str) -> str:

@@ -8,6 +8,7 @@ import csv
 import fnmatch
 import importlib
 import importlib.util
+import inspect
 import itertools
 import re
 import runpy
@@ -29,10 +30,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import setup_globals
 from hydra.types import RunMode
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from clear_strategies.compose import build_conductor
-from clear_strategies.run import CONF
+from clear_strategies import Conductor, Strategy
+from clear_strategies.compose import CONF
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -89,12 +91,13 @@ def commands(block: str) -> Iterator[list[str]]:
                 words.append(word)
 
 
-COMMANDS = [
-    pytest.param(words, id=f"{name(page)}: {' '.join(words)[:60]}")
-    for page in PAGES
+# Each command once, by the first page that has it.
+COMMANDS = {
+    " ".join(words): pytest.param(words, id=f"{name(page)}: {' '.join(words)[:60]}")
+    for page in reversed(PAGES)
     for block in blocks(page, "sh", "bash")
     for words in commands(block)
-]
+}.values()
 PYTHON = [
     pytest.param(block, id=f"{name(page)}-{i}") for page in PAGES for i, block in enumerate(blocks(page, "python"))
 ]
@@ -128,27 +131,35 @@ def require_composable(arguments: list[str]) -> None:
     overrides = [word for word in arguments if "=" in word or word.startswith("~")]
     flags = [word for word in arguments if word not in overrides]
     assert set(flags) <= {"-m", "--cfg", "job", "--help"}, flags
-    setup_globals()
-    Plugins.instance()
-    loader = ConfigLoaderImpl(create_config_search_path(str(CONF)))
-    whole = loader.load_configuration("config", overrides, run_mode=RunMode.MULTIRUN, validate_sweep_overrides=False)
+    whole = loader().load_configuration("config", overrides, run_mode=RunMode.MULTIRUN, validate_sweep_overrides=False)
     if "-m" not in flags and whole.hydra.mode != RunMode.MULTIRUN:
-        require_conductor(loader.load_configuration("config", overrides, run_mode=RunMode.RUN))
+        require_conductor(loader().load_configuration("config", overrides, run_mode=RunMode.RUN))
         return
     swept = [f"{key}={value}" for key, value in (whole.hydra.sweeper.params or {}).items()]
-    parsed = OverridesParser.create(loader).parse_overrides([*swept, *overrides])
+    parsed = OverridesParser.create(loader()).parse_overrides([*swept, *overrides])
     (jobs,) = BasicSweeper.split_arguments(parsed, None)
-    seen: set[str] = set()
+    chosen: set[str] = set()
     for job in jobs:
-        if set(job) - seen:  # it has a value that no job before it had
-            seen |= set(job)
-            require_conductor(loader.load_sweep_config(whole, list(job)))
+        files = {word for word in job if (CONF / word.lstrip("+").split("=")[0]).is_dir()}
+        if not chosen or files - chosen:  # the first job, and each that takes a file that no job before it took
+            chosen |= {*files, ""}
+            require_conductor(loader().load_sweep_config(whole, list(job)))
+
+
+@cache
+def loader() -> ConfigLoaderImpl:
+    setup_globals()
+    Plugins.instance()
+    return ConfigLoaderImpl(create_config_search_path(str(CONF)))
 
 
 def require_conductor(config: DictConfig) -> None:
     targets = [str(node.get("_target_")) for node in config.strategies.values()]
     if all(target.startswith(OURS) for target in targets):
-        build_conductor(config, 1.0)
+        objective, *strategies = (
+            instantiate(node, _convert_="object") for node in (config.objective, *config.strategies.values())
+        )
+        Conductor(*strategies, objective=objective)
 
 
 def require_parsable(module: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,8 +252,7 @@ def test_the_readme_has_the_two_commands_of_the_gate():
 
 @cache
 def composed() -> DictConfig:
-    loader = ConfigLoaderImpl(create_config_search_path(str(CONF)))
-    return loader.load_configuration("config", ["+strategy=clear"], run_mode=RunMode.RUN)
+    return loader().load_configuration("config", ["+strategy=clear"], run_mode=RunMode.RUN)
 
 
 def test_the_readmes_first_run_leaves_the_files_that_the_reference_lists(tmp_path):
@@ -393,6 +403,16 @@ def test_the_architecture_page_shows_the_floors():
     assert floors == FLOORS
     assert list(floors) == list(FLOORS)
     assert {min(door): libraries for door, libraries in rows("| door |")} == DOORS
+
+
+def test_the_table_of_hooks_shows_the_hooks_of_a_strategy():
+    page = (DOCS / "how-to" / "own-strategy.md").read_text()
+    shown = {
+        hook: arguments.split(", ") for hook, arguments in re.findall(r"^\| `(\w+)\(([^)]*)\)`", page, re.MULTILINE)
+    }
+    hooks = {hook: list(inspect.signature(getattr(Strategy, hook)).parameters)[1:] for hook in shown}
+    assert shown == hooks
+    assert len(shown) == 10
 
 
 def test_pictures_are_drawn_from_the_tables(tmp_path):
