@@ -168,7 +168,7 @@ def _cell(text: str) -> str:
 
 
 def _code(text: str) -> str:
-    return f"`{text}`".replace("|", "\\|") if text else ""
+    return f"`{text}`" if text else ""  # a pipe inside backticks ends no cell
 
 
 def _heading(text: str) -> str:

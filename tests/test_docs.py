@@ -10,6 +10,7 @@ import importlib
 import importlib.util
 import inspect
 import itertools
+import os
 import re
 import runpy
 import shlex
@@ -255,11 +256,42 @@ def composed() -> DictConfig:
     return loader().load_configuration("config", ["+strategy=clear"], run_mode=RunMode.RUN)
 
 
+TINY = {"fit.iterations": "10", "data.reader.width": "96", "data.reader.height": "64"}
+
+
+def executed(words: list[str], folder: Path) -> None:
+    """Run a documented command in `folder`; a training is a tiny one."""
+    arguments = words[1:]
+    if words[2] == "clear_strategies.run":
+        own = [word for word in arguments[2:] if word.split("=")[0] not in TINY]
+        arguments = [*arguments[:2], *(f"{key}={value}" for key, value in TINY.items()), *own]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, f"{' '.join(words)}: {done.stderr}"
+
+
+@pytest.mark.slow
+def test_the_first_tutorial_works(tmp_path):
+    page = blocks(DOCS / "tutorial" / "first-scene.md", "sh")
+    followed = [words for block in page for words in commands(block) if words[:2] == ["python", "-m"]]
+    assert len(followed) > 5
+    for words in followed:
+        executed(words, tmp_path)
+    assert (tmp_path / "outputs" / "compared" / "report.html").is_file()
+
+
 def test_the_readmes_first_run_leaves_the_files_that_the_reference_lists(tmp_path):
     *_, first = commands(blocks(ROOT / "README.md", "bash")[0])
     assert first[:3] == ["python", "-m", "clear_strategies.run"]
-    tiny = ["fit.iterations=10", "data.reader.width=96", "data.reader.height=64", f"hydra.run.dir={tmp_path}"]
-    subprocess.run([sys.executable, *first[1:], *tiny], cwd=ROOT, check=True, capture_output=True, timeout=300)
+    executed([*first, f"hydra.run.dir={tmp_path}"], tmp_path)
     table = (DOCS / "reference" / "files.md").read_text().split("`run.lock`")[0]
     listed = [
         re.sub(r"NAME|N+", "*", path) + ("*" if path.endswith("/") else "")
