@@ -1,4 +1,4 @@
-"""Who may import whom: the picture in docs/architecture.md, kept true."""
+"""Who may import whom: the picture in docs/explanation/architecture.md, kept true."""
 
 from __future__ import annotations
 
