@@ -244,7 +244,7 @@ def _scene(config: DictConfig, seed: int) -> Any:
         _log.info("prior: auto chose %s.", prior.label)
         if name == "bicubic":
             _log.warning(
-                "A bicubic prior shows nothing that LR does not. For SR pictures: prior=images prior.path=FOLDER."
+                "A bicubic prior shows nothing that LR does not. For SR images: prior=images prior.path=FOLDER."
             )
     else:
         prior = _prior(config.prior, capture)
