@@ -46,7 +46,7 @@ class ConductorSettings:
 
     objective: Objective
     strategies: Mapping[str, Strategy] = field(default_factory=dict)
-    statistics_from: int = signature(Conductor).parameters["statistics_from"].default
+    statistics_from: int | None = signature(Conductor).parameters["statistics_from"].default
 
     def conductor(self, stretch: float) -> Conductor:
         """The conductor, its milestones times `stretch`.
@@ -57,7 +57,7 @@ class ConductorSettings:
         return Conductor(
             *(scaled(strategy, stretch) for strategy in self.strategies.values()),
             objective=scaled(self.objective, stretch),
-            statistics_from=round(self.statistics_from * stretch),
+            statistics_from=None if self.statistics_from is None else round(self.statistics_from * stretch),
         )
 
 

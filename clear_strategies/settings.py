@@ -110,7 +110,8 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
     except (ValueError, BackendUnavailable) as error:
         if isinstance(error, ClearError) and not isinstance(error, SettingError):
             raise
-        raise SettingError(f"{key}: {one_line(error)}" if key else one_line(error)) from error
+        message = one_line(error)
+        raise SettingError(f"{key}: {message}" if key and not message.startswith(key) else message) from error
 
 
 _VARIADIC: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
@@ -232,19 +233,19 @@ _WORDS: Final[Mapping[Any, str]] = {
 
 
 def _in_words(hint: Any) -> str:
+    """An annotation for somebody who knows YAML, not Python."""
     origin, inner = get_origin(hint), get_args(hint)
+    if hint in _WORDS:
+        return _WORDS[hint]
     if origin in (Union, types.UnionType):
         return " or ".join(dict.fromkeys(_in_words(part) for part in inner))
     if origin is Literal:
         return " or ".join(str(value) for value in inner)
-    if hint in _WORDS:
-        return _WORDS[hint]
     if origin is tuple:
-        return f"a list of {len(inner)} numbers" if set(inner) <= {int, float} else "a list"
-    if isinstance(origin, type) and issubclass(origin, Mapping):
-        return f"names with {_in_words(inner[1])} each"
-    if isinstance(origin, type):
-        return f"a list of which each is {_in_words(inner[0])}" if inner else "a list"
+        return f"a list of {len(inner)} numbers"
+    if isinstance(origin, type) and inner:
+        each = _in_words(inner[-1])
+        return f"names with {each} each" if issubclass(origin, Mapping) else f"a list, each entry {each}"
     return f"a {hint.__name__}" if isinstance(hint, type) else str(hint)
 
 

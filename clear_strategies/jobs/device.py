@@ -61,9 +61,6 @@ class RasterizerSettings:
         settings = {key: value for key, value in settings.items() if value is not None}
         if name == "auto":
             name = rasterizers.fastest(device)
-            for other, why_not in rasterizers.available().items():
-                if why_not is not None:
-                    _log.info("rasterizer %s is not available: %s", other, why_not)
         elif name == "warp" and device is not None:
             settings.setdefault("device", device)
         return name, functools.partial(rasterizers.load, name, **settings)
@@ -137,6 +134,14 @@ def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked:
         )
     device = drawn_on(rasterizer.traits.devices, name, asked)
     return Drawing(rasterizer, name if device == "cpu" else f"{name} on {device}", device, kernel, make)
+
+
+def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer]) -> None:
+    """For `auto`: log why the other backends were not chosen."""
+    if isinstance(settings, RasterizerSettings) and settings.name == "auto":
+        for name, reason in rasterizers.available().items():
+            if reason is not None:
+                _log.info("rasterizer %s is not available: %s", name, reason)
 
 
 def drawn_on(devices: frozenset[str], name: str, asked: Device | None) -> Device:

@@ -38,12 +38,12 @@ def describe(error: BaseException) -> Ending | None:
         return Ending(error.exit_code, one_line(error))
     if isinstance(error, KeyboardInterrupt):
         return Ending(SIGNALS + signal.SIGINT, "stopped by SIGINT before training began. Nothing was saved.")
+    if isinstance(error, BackendUnavailable | HydraException | OmegaConfBaseException):
+        return Ending(UNUSABLE, one_line(error))  # before OSError: Hydra's error for an option that is not there is one
     disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it where it cannot open its file
     if isinstance(disk, OSError):
         where = f"{disk.filename or 'output'}: {disk.strerror or disk}"
         return Ending(NO_DISK, f"{where}. Earlier checkpoints are untouched.")
-    if isinstance(error, BackendUnavailable | HydraException | OmegaConfBaseException):
-        return Ending(UNUSABLE, one_line(error))
     return None
 
 

@@ -127,6 +127,7 @@ def _run(
     if settings.data.save_lr is not None:
         save_lr(loaded, Path(settings.data.save_lr))
         return None
+    device.log_choice(settings.rasterizer)
     drawing, there = drawing.over(loaded.background), loaded.to(drawing.device)
     stretch = settings.fit.stretch
     state = TrainState.start(
