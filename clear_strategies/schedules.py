@@ -1,4 +1,4 @@
-"""Floor 0: numbers that change with the iteration, and the milestones that scale with a run's length.
+"""Numbers that change with the iteration, and the milestones that scale with a run's length.
 
 Every milestone of the method is written for 10,000 iterations (the paper's length). `scaled` stretches them to another
 length, so that a short run still passes through each phase: warm-up, densification, decay, anchor.
@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Final, Literal, TypeVar
+
+from clear_strategies.errors import SettingError
 
 REFERENCE_ITERATIONS: Final = 10_000
 _MILESTONE: Final = "milestone"
@@ -53,15 +55,20 @@ def milestones(settings: Any) -> dict[str, int]:
 class WarmupDecay:
     """λ(t): 0 until `start`, linear to `peak` at `full`, flat to `decay_from`, then down to `final` at `end`.
 
-    The paper: 0, warm-up 500 to 3,000, 1.0, decay after 5,000; neither the decay's shape nor its floor is given
-    (METHOD, F19).
+    The paper: 0, warm-up 500 to 3,000, 1.0, decay after 5,000. It gives neither the decay's shape nor where it ends
+    (F19); by default λ does not decay, which was measured to be better.
+
+    Args:
+        peak: weight between `full` and `decay_from`. final: weight from `end` on; equal to `peak`, there is no decay.
+        decay: shape of the decay.
+        start, full, decay_from, end: iterations of a 10,000-iteration run.
 
     Raises:
-        ValueError: the milestones are out of order, or a weight is negative.
+        SettingError: the milestones are out of order, or a weight is negative.
     """
 
     peak: float = 1.0
-    final: float = 0.1
+    final: float = 1.0
     decay: Literal["linear", "cosine", "exponential"] = "linear"
     start: int = milestone(500)
     full: int = milestone(3_000)
@@ -70,16 +77,16 @@ class WarmupDecay:
 
     def __post_init__(self) -> None:
         if not self.start <= self.full <= self.decay_from <= self.end:
-            raise ValueError(
+            raise SettingError(
                 "start <= full <= decay_from <= end must hold, got "
                 f"{self.start}, {self.full}, {self.decay_from}, {self.end}."
             )
-        if self.peak < 0 or self.final < 0:
-            raise ValueError(f"weights must be >= 0, got peak={self.peak}, final={self.final}.")
+        if not (self.peak >= 0 and self.final >= 0):
+            raise SettingError(f"weights must be >= 0, got peak={self.peak}, final={self.final}.")
         if self.decay not in ("linear", "cosine", "exponential"):
-            raise ValueError(f"decay must be linear, cosine or exponential, got {self.decay!r}.")
+            raise SettingError(f"decay must be linear, cosine or exponential, got {self.decay!r}.")
         if self.decay == "exponential" and not (self.final > 0 and self.peak > 0):
-            raise ValueError(f"exponential decay needs peak and final > 0, got {self.peak}, {self.final}.")
+            raise SettingError(f"exponential decay needs peak and final > 0, got {self.peak}, {self.final}.")
 
     def __call__(self, t: int) -> float:
         if t <= self.start:
@@ -103,7 +110,7 @@ class Ramp:
     """p_t: linear from 0 to `maximum` at iteration `full` (DropGaussian), or constant.
 
     Raises:
-        ValueError: `maximum` is outside [0, 1).
+        SettingError: `maximum` is outside [0, 1).
     """
 
     maximum: float = 0.2
@@ -112,9 +119,9 @@ class Ramp:
 
     def __post_init__(self) -> None:
         if not 0 <= self.maximum < 1:
-            raise ValueError(f"a dropout rate must lie in [0, 1), got {self.maximum}.")
+            raise SettingError(f"a dropout rate must lie in [0, 1), got {self.maximum}.")
         if self.shape not in ("linear", "constant"):
-            raise ValueError(f"shape must be linear or constant, got {self.shape!r}.")
+            raise SettingError(f"shape must be linear or constant, got {self.shape!r}.")
 
     def __call__(self, t: int) -> float:
         if self.shape == "constant" or t >= self.full:
@@ -132,7 +139,7 @@ class LogLinear:
 
     def __post_init__(self) -> None:
         if not (self.initial > 0 and self.final > 0):
-            raise ValueError(f"learning rates must be > 0, got {self.initial} and {self.final}.")
+            raise SettingError(f"learning rates must be > 0, got {self.initial} and {self.final}.")
 
     def __call__(self, t: int) -> float:
         share = min(max(t / max(self.end, 1), 0.0), 1.0)

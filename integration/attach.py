@@ -29,7 +29,7 @@ from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import Grads, conflict_columns, to_ndc
 from clear_strategies.core.view import View
 from clear_strategies.errors import ClearError
-from clear_strategies.merging.conductor import Conductor, HrGradients
+from clear_strategies.merging.conductor import Conductor, HrGradients, only
 from integration.bridge import AutogradShot
 from integration.densify import Scale, to_read
 
@@ -109,7 +109,7 @@ class Attachment:
         self._scale = None if threshold is None else Scale(threshold)
         self._n = len(params()["means"])
         self._passes = 0  # backward passes of this iteration
-        self._waiting: tuple[Drawing, HrGradients] | None = None  # drawn, not yet gone backward through
+        self._waiting: tuple[Drawing, HrGradients[Grads] | None] | None = None  # drawn, not yet gone backward through
         self._before: dict[str, Tensor] = {}  # .grad when backward began
         self.removed = False
         conductor.on_fit_start(n_views, seed, params()["means"].device)
@@ -125,7 +125,7 @@ class Attachment:
         z = conductor.gate(t, self._n)
         if z is not None:
             z = z.to(self._params()["means"])
-        hr_grads = HrGradients()
+        hr_grads = None
         if conductor.wants_hr(t):
             self.counts["HR renders"] += 1
             hr_grads = conductor.hr_gradients(draw("hr", z).shot, view)
@@ -200,9 +200,8 @@ class Attachment:
         moved = {name: p for name, p in self._params().items() if p.grad is not None or name == "detail"}
         g_lr = Grads({name: self._own(name, p) * (1 / times) for name, p in moved.items() if p.grad is not None})
         values = {name: p.detach() for name, p in moved.items()}
-        g, conflict = self.conductor.merge(
-            values, g_lr, _of(hr_grads.base, moved), _of(hr_grads.hf, moved), hr_grads.m, hr_grads.evidence, self.t
-        )
+        merged = self.conductor.merge(values, g_lr, None if hr_grads is None else only(hr_grads, moved), self.t)
+        g = merged.grads
         for (
             name,
             p,
@@ -215,8 +214,9 @@ class Attachment:
         self._passes += 1
         self.counts["merged"] += 1
         λ = self.conductor.objective.lambda_hr(self.t)
-        self._numbers = {"t": float(self.t), "lambda_hr": λ, **hr_grads.losses, **self.conductor.readings()}
-        self._numbers |= conflict_columns(conflict)
+        losses = {} if hr_grads is None else hr_grads.losses
+        self._numbers = {"t": float(self.t), "lambda_hr": λ, **losses, **self.conductor.logs()}
+        self._numbers |= conflict_columns(merged.conflict)
 
     def _own(self, name: str, p: Tensor) -> Tensor:
         """This pass's part of `.grad`."""
@@ -226,19 +226,14 @@ class Attachment:
             )
         return p.grad - self._before[name] if name in self._before else p.grad
 
-    def _densify(self, shot: AutogradShot, gradient: Tensor, hr_grads: HrGradients, times: float) -> None:
+    def _densify(self, shot: AutogradShot, gradient: Tensor, hr_grads: HrGradients[Grads] | None, times: float) -> None:
         """Leave the score where the host's densifier reads ∇_u, if it does."""
         kept = shot.kept
         held = kept.tensor.is_leaf or kept.tensor.retains_grad
-        if hr_grads.base is None or not held or kept.tensor.grad is None:
+        if hr_grads is None or not held or kept.tensor.grad is None:
             return
         score, ordinary = self.conductor.scores(to_ndc(kept.gradient(gradient, self._n), kept.size), hr_grads, self.t)
         read = to_read(kept, score, ordinary, shot.visible, self._scale, times)
         if read is not None:
             kept.hand_over(times * read)
         self.counts["scores handed over"] += score is not ordinary
-
-
-def _of(g: Grads | None, names: Mapping[str, Tensor]) -> Grads | None:
-    """The gradients that somebody waits for."""
-    return None if g is None else Grads({name: value for name, value in g.items() if name in names}, screen=g.screen)

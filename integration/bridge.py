@@ -92,8 +92,9 @@ def joint_update(
     value = objective.lambda_lr * losses["lr"] + λ * (
         losses.get("base", 0.0) + objective.lambda_hf * losses.get("hf", 0.0)
     )
-    touched = {name: p for name, p in params.items() if name in update.grads}
-    gradients = [update.grads[name].to(p) for name, p in touched.items()]
+    merged = update.grads or Grads()
+    touched = {name: p for name, p in params.items() if name in merged}
+    gradients = [merged[name].to(p) for name, p in touched.items()]
 
     kept = lr.kept if scale is not None and isinstance(lr, AutogradShot) else None
     read = None if kept is None else to_read(kept, update.score, update.ordinary, lr.visible, scale)

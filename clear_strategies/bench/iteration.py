@@ -34,9 +34,11 @@ from clear_strategies.strategies.p2g import P2G
 from clear_strategies.strategies.svs import SVS
 from clear_strategies.training.compiled_step import compiled_step_for
 from clear_strategies.training.field import GaussianField
-from clear_strategies.training.loop import FitSettings, TrainState, cores, iterate
+from clear_strategies.training.loop import iterate, kernel_threads
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from rasterizers.interface import PRESETS, Rasterizer, Splats
 
 # As conf/strategy has them.
@@ -151,7 +153,7 @@ def measure(request: Request, say: Callable[[str], None]) -> Findings:
             turns[_PEER] = _plain(peer, PRESETS[request.preset])
         warm_ups = WARM_UPS[request.device]
         progress_bar = bar(len(turns) * (request.repeats + warm_ups), request.strategy)
-        with progress_bar as progress, cores(trainings[full].state, rasterizer):
+        with progress_bar as progress, kernel_threads(trainings[full].state, rasterizer):
             ms = interleaved(turns, request.repeats, warm_ups=warm_ups, progress=progress)
     size = f"LR {view.lr.camera.width}x{view.lr.camera.height} + HR {view.hr.camera.width}x{view.hr.camera.height}"
     title = (

@@ -27,7 +27,7 @@ from clear_strategies.bench.rasterizers import usable
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
 from clear_strategies.report.runs import Run, history
-from clear_strategies.training.loop import PROBING
+from clear_strategies.training.evaluation import PROBING
 
 STRATEGIES, SKIPS, LENGTH, CUT_OFFS, BACKEND = "strategies", "skips", "run length", "cut-offs", "backend"
 KINDS: Final = (STRATEGIES, SKIPS, LENGTH, CUT_OFFS, BACKEND)

@@ -1,4 +1,4 @@
-"""Floor 0: what an SR reference is worth, Gaussian by Gaussian, and how a patch map reaches a Gaussian."""
+"""What the SR image of a view is worth: per patch, per Gaussian, and how a patch map reaches a Gaussian."""
 
 from __future__ import annotations
 
@@ -15,8 +15,22 @@ Outside = Literal["clamp", "neutral"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PatchMaps:
+    """R_p and A_p of one view, in [0, 1].  Eq. 9
+
+    Args:
+        reliability: agreement of the SR image with the LR photo. demand: share of detail that it adds.
+        patch: edge of a patch, LR pixels.
+    """
+
+    reliability: Float[Tensor, "ph pw"]
+    demand: Float[Tensor, "ph pw"]
+    patch: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """q_i and a_i of one view, in [0, 1]; both are 0 for a Gaussian that the view does not see (METHOD, F24)."""
+    """q_i and a_i of one view, in [0, 1]; both are 0 for a Gaussian that is not visible in the view (F24)."""
 
     reliability: Float[Tensor, " N"]
     demand: Float[Tensor, " N"]
@@ -36,14 +50,14 @@ def lift(
     lookup: Lookup = "nearest",
     outside: Outside = "clamp",
 ) -> Float[Tensor, " N"]:
-    """The value of the patch p(u_i) in which each projected centre lies.  Eq. 10
+    """Look up the patch p(u_i) that contains each projected centre.  Eq. 10
 
     Args:
-        centers: u_i in pixels of the image that the patches tile. patch: their edge in those pixels.
+        centers: u_i in pixels of the image that the patches tile. patch: edge of a patch in those pixels.
         size: (width, height) of that image.
         lookup: "nearest" patch, or "bilinear" between patch centres.
-        outside: a visible Gaussian whose centre lies outside the image takes the border patch ("clamp") or 0
-            ("neutral"). Invisible ones are 0 in any case.
+        outside: the value of a visible Gaussian whose centre lies outside the image: that of the border
+            patch ("clamp") or 0 ("neutral"). Invisible Gaussians are 0 in any case.
     """
     grid = centers / patch
     if lookup == "bilinear":

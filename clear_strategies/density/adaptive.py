@@ -1,6 +1,4 @@
-"""Floor 4: who decides the structure, and our own answer: adaptive density control (METHOD, A), where clone, split and
-prune are one gather map, driven by a score. `density_gsplat` lets another library's strategy answer instead.
-"""
+"""Adaptive density control of 3DGS, driven by the strategies' score. Clone, split and prune are one gather map."""
 
 from __future__ import annotations
 
@@ -8,14 +6,16 @@ import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal, Protocol, runtime_checkable
+from typing import Final, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from clear_strategies.core.gradients import Shot
-from clear_strategies.errors import ClearError
+from clear_strategies.density.base import DensityError, require_in_range
+from clear_strategies.density.threshold import count_passing, topk_mask
+from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Update
 from clear_strategies.schedules import milestone
 from clear_strategies.training.field import GaussianField
@@ -28,62 +28,6 @@ _CHILDREN: Final = 2  # a split Gaussian becomes two …
 _SHRINK: Final = 0.8 * _CHILDREN  # … each smaller by this factor
 _RESET_OPACITY: Final = 0.01
 _FEWEST_ROUNDS: Final = 10
-
-
-class DensityError(ClearError, RuntimeError):
-    """Pruning would leave too few Gaussians to go on."""
-
-
-@runtime_checkable
-class Densifier(Protocol):
-    """Who changes the structure while the trainer trains."""
-
-    @property
-    def name(self) -> str:
-        """For the printed plan."""
-        ...
-
-    @property
-    def settings(self) -> Any:
-        """A dataclass; its milestones are printed."""
-        ...
-
-    @property
-    def marks(self) -> Mapping[str, int]:
-        """The iterations worth a mark on a curve."""
-        ...
-
-    def accumulate(self, update: Update, shot: Shot, t: int) -> None:
-        """Note what iteration t says about each Gaussian; `shot` is the rendering that its scores are of."""
-        ...
-
-    def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
-        """Whatever falls on t, after the optimizer's step; whether the structure changed.
-
-        Args:
-            resized: told parents[M] once field and optimizer have followed; row i of everything else per Gaussian now
-                comes from row parents[i].
-        """
-        ...
-
-    def reset_due(self, t: int) -> bool:
-        """Whether opacities are lowered at t; what is drawn right after that says nothing about the field."""
-        ...
-
-    def state_dict(self) -> dict[str, Tensor]: ...
-
-    def load_state_dict(self, tensors: dict[str, Tensor]) -> None: ...
-
-
-@runtime_checkable
-class DensifierSettings(Protocol):
-    """What a configuration's `density` is: a frozen dataclass that makes its densifier once the scene is known."""
-
-    def densifier(
-        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
-    ) -> Densifier:
-        """For a field of n Gaussians on `device`; `extent` is 3DGS's cameras_extent, world units."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,12 +66,12 @@ class DensitySettings:
 
     def __post_init__(self) -> None:
         if not self.threshold > 0:
-            raise ValueError(f"threshold must be > 0, got {self.threshold}.")
+            raise SettingError(f"threshold must be > 0, got {self.threshold}.")
         require_in_range(self)
         if self.reduce not in ("mean", "max"):
-            raise ValueError(f"reduce must be mean or max, got {self.reduce!r}.")
+            raise SettingError(f"reduce must be mean or max, got {self.reduce!r}.")
         if not 0 <= self.prune_opacity < 1:
-            raise ValueError(f"prune_opacity must lie in [0, 1), got {self.prune_opacity}.")
+            raise SettingError(f"prune_opacity must lie in [0, 1), got {self.prune_opacity}.")
 
     @property
     def interval(self) -> int:
@@ -226,7 +170,7 @@ class Density:
         fresh = torch.arange(len(parents), device=parents.device) >= len(stay)
         field.take(parents, fresh)
         optimizer.take(parents, fresh)
-        self._spread(field, slice(len(stay) + len(clones), len(parents)), t)
+        self._place_children(field, slice(len(stay) + len(clones), len(parents)), t)
         self.score, self.ordinary, self.count = (self.score.new_zeros(len(parents)) for _ in range(3))
         _log.info(
             "t=%d: %d cloned, %d split, %d pruned: %d -> %d Gaussians.",
@@ -255,7 +199,7 @@ class Density:
         s = self.settings
         seen = self.count.clamp_min(1) if s.reduce == "mean" else torch.ones_like(self.count)
         score, ordinary = self.score / seen, self.ordinary / seen
-        wanted = int(((ordinary if s.mode == "quantile" else score) >= s.threshold).sum())
+        wanted = count_passing(ordinary if s.mode == "quantile" else score, s.threshold)
         room = max(0, s.max_gaussians - len(score))
         if wanted > room and not self._said_cap:
             _log.warning(
@@ -263,12 +207,9 @@ class Density:
                 "density.threshold.", s.max_gaussians, wanted, room,
             )  # fmt: skip
             self._said_cap = True
-        order = torch.argsort(score, descending=True, stable=True)[: min(wanted, room)]
-        chosen = torch.zeros_like(score, dtype=torch.bool)
-        chosen[order] = score[order] > 0
-        return chosen
+        return topk_mask(score, min(wanted, room))
 
-    def _spread(self, field: GaussianField, children: slice, t: int) -> None:
+    def _place_children(self, field: GaussianField, children: slice, t: int) -> None:
         """Place split children at random inside their parent, and make them smaller."""
         scales = field.scales.data[children]
         generator = torch.Generator(scales.device).manual_seed(self.seed * 1_000_003 + t)
@@ -276,21 +217,3 @@ class Density:
         rotation = rotation_matrix(field.quats.data[children])
         field.means.data[children] += (rotation @ offset[..., None])[..., 0]
         field.scales.data[children] = scales - math.log(_SHRINK)
-
-
-def cameras_extent(centers: Float[Tensor, "V 3"]) -> float:
-    """3DGS's scene size: 1.1 times the largest distance of a training camera from their mean, at least a little."""
-    radius = torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()
-    return max(1.1 * float(radius), 1e-6)
-
-
-def require_in_range(settings: Any) -> None:
-    """What every densifier's settings have in common.
-
-    Raises:
-        ValueError: one is outside its range.
-    """
-    if settings.mode not in ("quantile", "fixed"):
-        raise ValueError(f"mode must be quantile or fixed, got {settings.mode!r}.")
-    if min(settings.every, settings.max_gaussians, settings.min_gaussians) < 1 or settings.reset_every < 0:
-        raise ValueError("every, max_gaussians and min_gaussians must be at least 1, reset_every at least 0.")

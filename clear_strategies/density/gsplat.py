@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import logging
-import math
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
@@ -24,7 +23,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from clear_strategies.core.gradients import ATTRIBUTES, Shot
-from clear_strategies.density.adaptive import DensityError, require_in_range
+from clear_strategies.density.base import DensityError, require_in_range
+from clear_strategies.density.threshold import topk_threshold
 from clear_strategies.errors import DataError
 from clear_strategies.merging.conductor import Update
 from clear_strategies.schedules import milestone
@@ -409,15 +409,6 @@ def take_back(
         field.filter_3d = field.filter_3d[parents]
     field.constrain()
     return parents
-
-
-def topk_threshold(score: Float[Tensor, " N"], k: int) -> float:
-    """A threshold that the k highest scores exceed (fewer where scores are equal); scores of 0 never do."""
-    if k == 0:
-        return math.inf
-    ranked = score.double().sort(descending=True).values
-    following = float(ranked[k]) if k < len(ranked) else 0.0
-    return (float(ranked[k - 1]) + following) / 2
 
 
 def _info(seen: _Seen) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from clear_strategies.compose import ConductorSettings, tree
 from clear_strategies.data.prepare import save_lr
-from clear_strategies.density.adaptive import DensifierSettings
+from clear_strategies.density.base import DensifierSettings
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device, resume, scene
 from clear_strategies.jobs.device import Device, RasterizerSettings
@@ -24,10 +24,12 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import plan, results
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import build
-from clear_strategies.training.loop import FitSettings, TrainState, fit
+from clear_strategies.training.loop import fit
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import Skips
+from clear_strategies.training.state import TrainState
 
 _log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import Checkpoint
-from clear_strategies.training.loop import TrainState
+from clear_strategies.training.state import TrainState
 
 _log = logging.getLogger(__name__)
 

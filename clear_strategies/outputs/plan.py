@@ -16,7 +16,8 @@ import torch
 from clear_strategies.data.scene import Scene
 from clear_strategies.schedules import milestones
 from clear_strategies.strategies.svs import SVS
-from clear_strategies.training.loop import Progress, TrainState
+from clear_strategies.training.loop import Progress
+from clear_strategies.training.state import TrainState
 
 _log = logging.getLogger(__name__)
 

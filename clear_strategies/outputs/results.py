@@ -18,7 +18,7 @@ from clear_strategies.outputs.export import export_ply
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen, marks
 from clear_strategies.outputs.provenance import provenance
-from clear_strategies.training.loop import TrainState
+from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer
 
 _log = logging.getLogger(__name__)

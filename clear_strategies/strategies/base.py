@@ -1,22 +1,24 @@
-"""Floor 1: the contract. A strategy answers questions about the gradients of Gaussians; it knows no rasterizer.
+"""The contract of a strategy. A strategy answers questions about the gradients of Gaussians; it knows no rasterizer.
 
-Hooks are phases of the paper, so their order needs no configuration. A hook that nobody overrides is never called; of
-the hooks that give *the* answer (gate, observe, route, correct, score) exactly one strategy may override each.
+The hooks are phases of the paper, so their order needs no configuration. A hook that no strategy
+overrides is never called. Exactly one strategy may override each of the hooks that give *the*
+answer: gate, observe, route, correct, score.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from clear_strategies.core.compiled_rules import Anchor, CorrectionRule
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import Grads, Shot
 
 _DEVICE = "device"
@@ -28,7 +30,7 @@ class ScreenGradients:
 
     Args:
         base, hf: None while HR is not rendered; hf is also None when λ_HF = 0.
-        ordinary: ‖∇_u(L_LR + λ_HR(L_base + λ_HF L_HF))‖, what 3DGS would densify by.
+        ordinary: ‖∇_u(L_LR + λ_HR(L_base + λ_HF L_HF))‖, the statistic of 3DGS.
     """
 
     lr: Float[Tensor, "N 2"]
@@ -39,48 +41,27 @@ class ScreenGradients:
 
 @dataclass(frozen=True)
 class Strategy:
-    """A frozen dataclass of settings, plus what it remembers.
+    """A frozen dataclass of settings, plus its state.
 
     Args:
-        state: per-Gaussian tensors [N, …] and nothing else: saved in checkpoints, gathered by `on_resize`.
-        cache: whatever can be computed again (patch maps, keyed by view); never saved.
-        readings: numbers of the last iteration, for logs only; on a device they are read late (`late.number`).
+        state: per-Gaussian tensors [N, …] and nothing else; checkpoints save them, `on_resize` gathers them.
+        cache: values that can be computed again (patch maps, keyed by view); never saved.
+        logs: scalars of the last iteration, see `log`.
 
     Randomness must be a function of (seed, t), so that resuming needs no generator state.
     """
 
-    fused: ClassVar[str | None] = None
-    """The name under which the fused per-Gaussian pass knows this class's arithmetic, or None. It is not inherited by a
-    class that overrides any method: whoever changes what a strategy does gets the readable path, not the old kernel."""
-
     state: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
     cache: dict[Hashable, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    readings: dict[str, Number] = field(default_factory=dict, init=False, repr=False, compare=False)
+    logs: dict[str, Number] = field(default_factory=dict, init=False, repr=False, compare=False)
 
-    def __init_subclass__(cls, **keywords: Any) -> None:
-        super().__init_subclass__(**keywords)
-        declared_by = next(base for base in cls.__mro__ if "fused" in vars(base))
-        if declared_by is not cls and any(
-            getattr(cls, name) is not method for name, method in _methods(declared_by).items()
-        ):
-            cls.fused = None
+    # ---- hooks: the trainer or the host calls them in this order ----------------------------------------------------
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
-        """Once, before the first iteration, and again before a resumed one. Overriders call `super()`."""
+        """Start a run, or resume one. Overriders call `super()`."""
         self.state.clear()
         self.cache.clear()
-        self.readings.clear()
-
-    def to(self, device: torch.device | str) -> None:
-        """The field lies there: so do `state` from now on, and what is answered."""
-        self.cache[_DEVICE] = torch.device(device)
-        self.state.update({name: rows.to(device) for name, rows in self.state.items()})
-
-    @property
-    def device(self) -> torch.device:
-        """Where the field lies."""
-        device: torch.device = self.cache.get(_DEVICE, torch.device("cpu"))
-        return device
+        self.logs.clear()
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """Before render: which Gaussians take part? z >= 0 multiplies the opacity; None: all of them.  Eq. 15"""
@@ -95,14 +76,14 @@ class Strategy:
         raise NotImplementedError
 
     def correct(self, lr: Grads, hr: Grads, evidence: Evidence | None) -> Grads:
-        """How to reconcile the two? The corrected g_HR; g_LR is never changed.  Eq. 6, 7, 11"""
+        """How to reconcile the two? Returns the corrected g_HR; g_LR is never changed.  Eq. 6, 7, 11"""
         raise NotImplementedError
 
     def regularize(self, params: Mapping[str, Tensor], t: int) -> Grads | None:
-        """Before the optimizer step: any gradient of your own to add? Several strategies may.  Eq. 16"""
+        """Before the optimizer step: a gradient to add. Several strategies may answer.  Eq. 16"""
         raise NotImplementedError
 
-    def score(self, evidence: Evidence | None, screens: ScreenGradients) -> Float[Tensor, " N"] | None:
+    def score(self, evidence: Evidence | None, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
         """For densification: where is more structure needed? None: the ordinary statistic.  Eq. 14"""
         raise NotImplementedError
 
@@ -111,24 +92,84 @@ class Strategy:
         return True
 
     def after_step(self, params: Mapping[str, Tensor], t: int) -> None:
-        """After the optimizer step: own state, e.g. the anchor.  Eq. 16"""
+        """After the optimizer step: update `state`, e.g. take the anchor.  Eq. 16"""
 
     def on_resize(self, parents: Int[Tensor, " M"]) -> None:
         """After the structure changed: row i of every per-Gaussian tensor now comes from row parents[i]."""
         for name, rows in self.state.items():
             self.state[name] = rows[parents]
 
+    # ---- facts about the strategy: the plan, the pictures and the compiled step read them -----------------------------
+
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+        """Why the strategy changes nothing under these loss weights; None where it has an effect.
+
+        Args:
+            lambda_hr: the largest λ_HR(t) of the run.
+        """
+        return None
+
+    def skipped(self) -> Sequence[str]:
+        """The parts of the strategy that its settings switch off, a phrase each."""
+        return ()
+
+    def marks(self) -> Mapping[str, int]:
+        """Iterations worth a mark on a training curve, by name."""
+        return {}
+
+    def patch_maps(self, view: Any) -> PatchMaps | None:
+        """The patch evidence that the strategy works with for this view; None: it uses none.  Eq. 9"""
+        return None
+
+    def correction_rule(self) -> CorrectionRule | None:
+        """`correct` as data, for the compiled step; None: only the readable path computes it."""
+        return None
+
+    def anchor(self, n: int) -> Anchor | None:
+        """`regularize` for n Gaussians as data, for the compiled step; None: nothing is added now."""
+        return None
+
+    # ---- for subclasses ---------------------------------------------------------------------------------------------
+
+    def log(self, name: str, value: Number) -> None:
+        """Log a scalar of this iteration. A 0-dim tensor on a device is read later, see `core.deferred`."""
+        self.logs[name] = value
+
+    def to(self, device: torch.device | str) -> None:
+        """Move `state` to the device of the field; answers are expected there."""
+        self.cache[_DEVICE] = torch.device(device)
+        self.state.update({name: rows.to(device) for name, rows in self.state.items()})
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the field."""
+        device: torch.device = self.cache.get(_DEVICE, torch.device("cpu"))
+        return device
+
+
+def overrides(strategy: Strategy, hook: str) -> bool:
+    """Whether the strategy's class overrides `hook`."""
+    return getattr(type(strategy), hook) is not getattr(Strategy, hook)
+
+
+def describes(strategy: Strategy, fact: str) -> bool:
+    """Whether `fact` ("correction_rule", "anchor") describes what the strategy's class does.
+
+    A subclass that overrides any method of the class that states the fact no longer does the same:
+    it must state the fact itself, or takes the readable path.
+    """
+    cls = type(strategy)
+    stated_by = next(base for base in cls.__mro__ if fact in vars(base))
+    return stated_by is not Strategy and all(
+        getattr(cls, name) is method for name, method in _methods(stated_by).items()
+    )
+
 
 def _methods(cls: type) -> dict[str, Any]:
-    """A class's own and inherited functions, but for those that a dataclass decorator writes anew."""
+    """A class's own and inherited functions, except those that the dataclass decorator generates."""
     return {
         name: getattr(cls, name)
         for base in cls.__mro__
         for name, value in vars(base).items()
         if inspect.isfunction(value) and not (name.startswith("__") and name != "__post_init__")
     }
-
-
-def answers(strategy: Strategy, hook: str) -> bool:
-    """Whether the strategy's class overrides `hook`."""
-    return getattr(type(strategy), hook) is not getattr(Strategy, hook)

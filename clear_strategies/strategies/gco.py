@@ -1,32 +1,31 @@
-"""GCO: Gaussian-wise conflict-aware optimization. HR gradients that fight the authentic LR ones are corrected to the
-margin, Gaussian by Gaussian and group by group; LR gradients are never changed.  Eq. 6, 7, 11
+"""GCO: Gaussian-wise conflict-aware optimization.  Eq. 6, 7, 11
+
+An HR gradient that conflicts with the authentic LR gradient is corrected until the cosine of the two
+reaches the margin, for each Gaussian and each attribute group. LR gradients are never changed.
 """
 
 from __future__ import annotations
 
 import logging
 import math
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Final, Literal, overload
+from typing import Final, Literal, overload
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.deferred import Number, Scalar
+from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule, GroupReport, margin
+from clear_strategies.core.deferred import Scalar
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot, row_norm, scale_rows
+from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import Strategy
 
 _log = logging.getLogger(__name__)
-
-# A Gaussian whose axes are equally long does not change when it is turned: in exact arithmetic its rotation gradient
-# is 0, in floating point it is noise that would "conflict" one time in five (STRESS §2.3).
-ROTATION_NOISE: Final = 2.0**-18
 
 # ω at its lower bound in this share of the corrections means that the prior agrees with LR and GCO does nothing.
 _INACTIVE_SHARE: Final = 0.9
@@ -39,19 +38,17 @@ class GCO(Strategy):
     Args:
         tolerance: τ_c in [0, 1): cosines down to -τ_c are no conflict.
         weight_min, weight_max: bounds of ω where a conflict is corrected, 0 <= min <= max <= 1.
-        bound: what the bounds hold: "omega", or the "coefficient" ω|d|/‖g_LR‖² (the rival reading, METHOD F28).
+        bound: what the bounds limit: "omega", or the "coefficient" ω|d|/‖g_LR‖² (F28).
         eps: "relative:r" scales ε with the mean gradient norms of the group, so that no change of the losses' unit
-            changes a decision; "absolute:x" takes the paper's symbol literally (1e-8 finds almost nothing).
-        groups: the attributes that are compared and corrected, each on its own.
+            changes a decision; "absolute:x" takes the paper's symbol literally (1e-8 finds almost no conflict, F27).
+        groups: the attributes that are compared and corrected, each separately.
 
     The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
-    Without evidence q = 0: nothing speaks for the prior, the authentic gradient prevails (METHOD, F32).
+    Without evidence q = 0, and the LR gradient prevails (F32).
 
     Raises:
-        ValueError: a setting is outside its range.
+        SettingError: a setting is outside its range.
     """
-
-    fused: ClassVar[str | None] = "gco"
 
     tolerance: float = 0.05
     weight_min: float = 0.05
@@ -63,20 +60,31 @@ class GCO(Strategy):
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", tuple(self.groups))
         if not 0 <= self.tolerance < 1:
-            raise ValueError(f"tolerance must lie in [0, 1), got {self.tolerance}.")
+            raise SettingError(f"tolerance must lie in [0, 1), got {self.tolerance}.")
         if not 0 <= self.weight_min <= self.weight_max <= 1:
-            raise ValueError(
+            raise SettingError(
                 f"0 <= weight_min <= weight_max <= 1 must hold, got {self.weight_min} and {self.weight_max}."
             )
         if self.bound not in ("omega", "coefficient"):
-            raise ValueError(f"bound must be omega or coefficient, got {self.bound!r}.")
+            raise SettingError(f"bound must be omega or coefficient, got {self.bound!r}.")
         unknown = sorted(set(self.groups) - set(CONFLICT_GROUPS))
         if unknown:
-            raise ValueError(f"groups must be among {', '.join(CONFLICT_GROUPS)}, got {unknown[0]!r}.")
+            raise SettingError(f"groups must be among {', '.join(CONFLICT_GROUPS)}, got {unknown[0]!r}.")
         _parse_eps(self.eps)
 
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+        if lambda_lr == 0:
+            return "lambda_LR is 0, so nothing can conflict"
+        return "lambda_HR is 0 throughout" if lambda_hr == 0 else None
+
+    def correction_rule(self) -> CorrectionRule:
+        return CorrectionRule(
+            self.groups, self.tolerance, self.weight_min, self.weight_max, self.bound == "omega", self.epsilons,
+            self._absolute_eps, self.report,
+        )  # fmt: skip
+
     def correct(self, lr: Grads, hr: Grads, evidence: Evidence | None) -> Grads:
-        """g̃_HR for every group, and what was done in `readings`."""
+        """g̃_HR for every group; logs what was corrected."""
         corrected, done = Grads(hr), []
         for group in self.groups:
             if group in lr and group in hr:
@@ -85,7 +93,7 @@ class GCO(Strategy):
         self.report(done, evidence)
         return corrected
 
-    def _correct_group(self, group: str, lr: Grads, hr: Grads, evidence: Evidence | None) -> tuple[Tensor, Correction]:
+    def _correct_group(self, group: str, lr: Grads, hr: Grads, evidence: Evidence | None) -> tuple[Tensor, GroupReport]:
         g_lr, g_hr = lr[group], hr[group]
         dot, n_lr, n_hr = row_dot(g_lr, g_hr), row_norm(g_lr), row_norm(g_hr)
         both = (n_lr > 0) & (n_hr > 0)
@@ -96,8 +104,8 @@ class GCO(Strategy):
         if group == "quats":
             conflict &= ~(_turns_nothing(lr) | _turns_nothing(hr))
 
-        # Only the rows in conflict are touched; every other row is handed back bit for bit. They are picked out where that
-        # makes nobody wait; elsewhere all rows are corrected, and the others put back.
+        # Only the rows in conflict change; every other row keeps its bits. On the CPU these rows are gathered. On a device
+        # gathering would wait for their number, so all rows are corrected and the others restored.
         i = conflict.nonzero()[:, 0] if deferred.is_immediate(conflict) else slice(None)
         hit = conflict[i]
         q = evidence.reliability[i].double() if evidence is not None else 0.0
@@ -115,8 +123,13 @@ class GCO(Strategy):
         corrected[i] = torch.where(hit.view(-1, *[1] * (moved.dim() - 1)), moved, corrected[i])
         at_bound = hit & (omega <= self.weight_min)
         compared, touched, bound = (deferred.scalar(rows.sum()) for rows in (both, conflict, at_bound))
-        return corrected, Correction(
-            group, compared, touched, deferred.total(omega, hit), bound, self.margin(n, eps_cos)
+        return corrected, GroupReport(
+            group,
+            compared,
+            touched,
+            deferred.total(omega, hit),
+            bound,
+            margin(n, self._absolute_eps) if self._absolute_eps else None,
         )
 
     @overload
@@ -126,35 +139,34 @@ class GCO(Strategy):
     def epsilons(self, mean_lr: Scalar, mean_hr: Scalar) -> tuple[Scalar, Scalar]: ...
 
     def epsilons(self, mean_lr: Scalar, mean_hr: Scalar) -> tuple[Scalar, Scalar]:
-        """ε of the cosine and of the correction, both in the unit gradient², from the mean norms of what is compared."""
+        """ε of the cosine and of the correction, in gradient², from the mean norms over the compared Gaussians."""
         kind, value = _parse_eps(self.eps)
         if kind == "absolute":
             return value, value
         return value * mean_lr * mean_hr, value * mean_lr**2
 
-    def margin(self, product: Float[Tensor, " N"], eps: Scalar) -> Number | None:
-        """The median of ‖g_LR‖‖g_HR‖ over an absolute ε, NaN where nothing is compared; None where ε is relative, or 0."""
-        if _parse_eps(self.eps)[0] != "absolute" or eps == 0:
-            return None
-        return deferred.defer(operator.truediv, deferred.median(product, product > 0), eps)
-
-    def report(self, done: Sequence[Correction], evidence: Evidence | None) -> None:
-        """Put what was done into `readings`, and say what makes GCO idle."""
+    def report(self, done: Sequence[GroupReport], evidence: Evidence | None) -> None:
+        """Log what was corrected, and warn where ε or the prior makes GCO inactive."""
         compared, corrected, omega, at_bound = (
             deferred.defer(deferred.added, *(getattr(c, name) for c in done))
             for name in ("compared", "corrected", "omega", "at_lower_bound")
         )
-        self.readings["corrected"] = deferred.defer(deferred.ratio, corrected, compared)
-        self.readings["mean_omega"] = deferred.defer(deferred.ratio, omega, corrected)
+        self.log("corrected", deferred.defer(deferred.ratio, corrected, compared))
+        self.log("mean_omega", deferred.defer(deferred.ratio, omega, corrected))
         for c in done:
             margin = math.nan if c.margin is None else c.margin
             share = partial(self._share_of_group, c.group)
-            self.readings[f"corrected_{c.group}"] = deferred.defer(share, c.corrected, c.compared, margin)
+            self.log(f"corrected_{c.group}", deferred.defer(share, c.corrected, c.compared, margin))
         if corrected != 0 and evidence is not None and self.weight_min > 0:
-            self.readings["omega_at_lower_bound"] = deferred.defer(self._share_at_bound, at_bound, corrected)
+            self.log("omega_at_lower_bound", deferred.defer(self._share_at_bound, at_bound, corrected))
+
+    @property
+    def _absolute_eps(self) -> float | None:
+        kind, value = _parse_eps(self.eps)
+        return value if kind == "absolute" else None
 
     def _share_of_group(self, group: str, corrected: float, compared: float, margin: float) -> float:
-        """Below 20 ε a conflict loses strength; below τ/(1 - τ) ε none can be seen at all (STRESS §2.1)."""
+        """Warns where ε hides conflicts: below 20 ε a conflict is weakened; below τ/(1 - τ) ε none is found."""
         if margin < self.tolerance / (1 - self.tolerance) and self._first(f"eps cannot {group}"):
             _log.warning(
                 "GCO cannot fire for %s: the median of |g_LR||g_HR| is %.2g of eps=%s. Use eps=relative:1e-12.",
@@ -177,23 +189,9 @@ class GCO(Strategy):
         return share
 
     def _first(self, what: str) -> bool:
-        said = what in self.cache
+        known = what in self.cache
         self.cache[what] = True
-        return not said
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Correction:
-    """What was done to one group: Gaussians compared and corrected, the sum of their ω and how many sit at the lower
-    bound, and how far ‖g_LR‖‖g_HR‖ lies above an absolute ε.
-    """
-
-    group: str
-    compared: Number
-    corrected: Number
-    omega: Number
-    at_lower_bound: Number
-    margin: Number | None
+        return not known
 
 
 _TINY: Final = torch.finfo(torch.float64).tiny
@@ -212,5 +210,5 @@ def _parse_eps(eps: str) -> tuple[str, float]:
     except ValueError:
         value = -1.0
     if kind not in ("relative", "absolute") or not 0 <= value < float("inf"):
-        raise ValueError(f'eps must be "relative:<number >= 0>" or "absolute:<number >= 0>", got {eps!r}.')
+        raise SettingError(f'eps must be "relative:<number >= 0>" or "absolute:<number >= 0>", got {eps!r}.')
     return kind, value

@@ -1,6 +1,8 @@
-"""P2G: evidence-guided patch-to-Gaussian routing. Per patch, how far does the SR reference agree with the authentic LR
-image, and how much detail does it ask for? Lifted to Gaussians, that routes high-frequency gradients and densification.
-Eq. 9, 10, 12, 14
+"""P2G: evidence-guided patch-to-Gaussian routing.  Eq. 9, 10, 12, 14
+
+For each patch of a view, P2G estimates how well the SR image agrees with the authentic LR photo and how
+much detail it adds. Both are looked up at the projected Gaussians, where they weigh high-frequency
+gradients and densification.
 """
 
 from __future__ import annotations
@@ -8,20 +10,19 @@ from __future__ import annotations
 import logging
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.evidence import Evidence, Lookup, Outside, lift
+from clear_strategies.core.evidence import Evidence, Lookup, Outside, PatchMaps, lift
 from clear_strategies.core.gradients import Shot
 from clear_strategies.core.images import DownKernel, UpKernel, downsample, patch_means, upsample
+from clear_strategies.core.view import View
+from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import ScreenGradients, Strategy
-
-if TYPE_CHECKING:
-    from clear_strategies.core.view import View
 
 _log = logging.getLogger(__name__)
 
@@ -34,21 +35,19 @@ class P2G(Strategy):
 
     Args:
         reliability_scale: τ_r > 0, the mean |D(I_HR) - I_LR| (images in [0, 1]) at which R falls to 1/e; "relative:k" is k
-            times the view's own mean, so that R spreads whatever the prior (a fidelity network is near 1 at 0.05).
+            times the view's own mean, so that R covers its range whatever the prior is.
         floor: q_min in [0, 1], the share of its high-frequency gradient that every Gaussian keeps.
         patch: edge of a patch in LR pixels; in HR pixels it is that times the SR factor.
-        down, up: D and U. D should be the very operator that made the LR images.
-        lookup: "nearest" patch of the projected centre, or "bilinear" between patches.
-        outside: a visible Gaussian centred outside the image takes the border patch ("clamp"), or none ("neutral").
-        detail_eps: ε of Eq. 9, in image units; below it (1/40 of a grey level) differences are rounding, not detail.
-        score_by: what densification goes by: "evidence" S_i alone (the paper; starves large splats when the initial
-            cloud is sparse), the ordinary "gradient", or both at equal mean, their "sum" or "max".
+        down, up: D and U. D should be the operator that made the LR images (F21).
+        lookup: "nearest" patch of the projected centre, or "bilinear" between patches (F24).
+        outside: a visible Gaussian centred outside the image takes the border patch ("clamp"), or 0 ("neutral") (F24).
+        detail_eps: ε of Eq. 9, image units; below it (1/40 of a grey level) differences are rounding, not detail (F23).
+        score_by: the densification score: "evidence" S_i alone (the paper; large splats of a sparse initial cloud then
+            rarely split), the ordinary "gradient", or both at equal mean: their "sum" or "max" (F9).
 
     Raises:
-        ValueError: a setting is outside its range.
+        SettingError: a setting is outside its range.
     """
-
-    fused: ClassVar[str | None] = "p2g"
 
     reliability_scale: float | str = 0.05
     floor: float = 0.25
@@ -58,61 +57,71 @@ class P2G(Strategy):
     lookup: Lookup = "nearest"
     outside: Outside = "clamp"
     detail_eps: float = 1e-4
-    score_by: ScoreBy = "evidence"
+    score_by: ScoreBy = "sum"
 
     def __post_init__(self) -> None:
         _tau_r(self.reliability_scale, 1.0)
         if not 0 <= self.floor <= 1:
-            raise ValueError(f"floor must lie in [0, 1], got {self.floor}.")
+            raise SettingError(f"floor must lie in [0, 1], got {self.floor}.")
         if self.patch < 1:
-            raise ValueError(f"patch must be at least 1 LR pixel, got {self.patch}.")
+            raise SettingError(f"patch must be at least 1 LR pixel, got {self.patch}.")
         if not self.detail_eps > 0:
-            raise ValueError(f"detail_eps must be > 0, got {self.detail_eps}.")
+            raise SettingError(f"detail_eps must be > 0, got {self.detail_eps}.")
         for name, kind in (("down", DownKernel), ("up", UpKernel), ("lookup", Lookup), ("outside", Outside),
                            ("score_by", ScoreBy)):  # fmt: skip
             if getattr(self, name) not in get_args(kind):
-                raise ValueError(f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}.")
+                raise SettingError(f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}.")
 
     def observe(self, view: View, hr: Shot) -> Evidence:
-        """q_i and a_i of every Gaussian this view sees."""
-        key = (view.name, view.factor)
-        if key not in self.cache:
-            self.cache[key] = self._patch_evidence(view)
-        R, A = self.cache[key]
+        """q_i and a_i of every Gaussian that is visible in this view."""
+        R, A = self._cached_patches(view)
         size = (view.lr.camera.width, view.lr.camera.height)
         u = hr.means2d / view.factor  # patches live on the LR grid
         q = lift(R, u, hr.visible, self.patch, size, self.lookup, self.outside)
         a = lift(A, u, hr.visible, self.patch, size, self.lookup, self.outside)
-        self.readings["mean_q"] = deferred.mean(q, hr.visible)
-        self.readings["mean_w"] = deferred.mean(q * a, hr.visible)
+        self.log("mean_q", deferred.mean(q, hr.visible))
+        self.log("mean_w", deferred.mean(q * a, hr.visible))
         return Evidence(q, a)
 
     def route(self, evidence: Evidence | None) -> Float[Tensor, " N"]:
         """m_i = q_min + (1 - q_min) w_i."""
         if evidence is None:
-            raise ValueError("P2G routes by evidence, but nothing observed this view; let P2G.observe run first.")
+            raise ValueError("P2G routes by evidence, but there is none for this view; call P2G.observe first.")
         return self.floor + (1 - self.floor) * evidence.weight  # Eq. 12
 
-    def score(self, evidence: Evidence | None, screens: ScreenGradients) -> Float[Tensor, " N"] | None:
-        """S_i = w_i ‖∇_u L_HF‖, alone or joined with the ordinary statistic; None (ordinary) where HF is not there."""
-        if self.score_by == "gradient" or evidence is None or screens.hf is None:
+    def score(self, evidence: Evidence | None, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
+        """S_i = w_i ‖∇_u L_HF‖, alone or joined with the ordinary statistic; None (ordinary) where λ_HF = 0."""
+        if self.score_by == "gradient" or evidence is None or screen.hf is None:
             return None
-        S: Tensor = evidence.weight * torch.linalg.vector_norm(screens.hf, dim=-1)  # Eq. 14
+        S: Tensor = evidence.weight * torch.linalg.vector_norm(screen.hf, dim=-1)  # Eq. 14
         if self.score_by == "evidence":
             return S
-        S = S * (screens.ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny))
-        return torch.maximum(screens.ordinary, S) if self.score_by == "max" else screens.ordinary + S
+        S = S * (screen.ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny))
+        return torch.maximum(screen.ordinary, S) if self.score_by == "max" else screen.ordinary + S
 
-    def _patch_evidence(self, view: View) -> tuple[Tensor, Tensor]:
-        R, A = patch_evidence(
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+        return "lambda_HR is 0 throughout" if lambda_hr == 0 else None
+
+    def patch_maps(self, view: View) -> PatchMaps:
+        """R and A of this view."""
+        return PatchMaps(*self._patches(view), self.patch)
+
+    def _cached_patches(self, view: View) -> tuple[Tensor, Tensor]:
+        key = (view.name, view.factor)
+        if key not in self.cache:
+            R, A = self.cache[key] = self._patches(view)
+            _log.info(
+                "%s: reliability R %.2f..%.2f (mean %.3f), detail demand A mean %.3f over %dx%d patches.",
+                view.name, float(R.min()), float(R.max()), float(R.mean()), float(A.mean()), R.shape[1], R.shape[0],
+            )  # fmt: skip
+        R, A = self.cache[key]
+        return R, A
+
+    def _patches(self, view: View) -> tuple[Tensor, Tensor]:
+        return patch_evidence(
             view.lr.image, view.hr.image, view.factor, self.patch, self.reliability_scale, self.detail_eps, self.down,
             self.up,
         )  # fmt: skip
-        _log.info(
-            "%s: reliability R %.2f..%.2f (mean %.3f), detail demand A mean %.3f over %dx%d patches.",
-            view.name, float(R.min()), float(R.max()), float(R.mean()), float(A.mean()), R.shape[1], R.shape[0],
-        )  # fmt: skip
-        return R, A
 
 
 def patch_evidence(
@@ -125,9 +134,9 @@ def patch_evidence(
     down: DownKernel = "bicubic",
     up: UpKernel = "bicubic",
 ) -> tuple[Float[Tensor, "ph pw"], Float[Tensor, "ph pw"]]:
-    """R_p, agreement with the LR observation, and A_p, share of detail relative to twice the image's mean.  Eq. 9
+    """R_p, agreement with the LR photo, and A_p, share of detail relative to twice the image's mean.  Eq. 9
 
-    A flat image asks for nothing: A = 0. A patch with the image's mean detail has A = 1/2.
+    A is 0 in a flat image, and 1/2 in a patch with the image's mean detail.
 
     Raises:
         ValueError: an image lies outside [0, 1] (τ_r and ε are in that unit).
@@ -144,17 +153,17 @@ def patch_evidence(
     return R, A
 
 
-# An 8-bit image is off by a quarter of a grey level on average; to be relative to less would be to read rounding.
+# Rounding to 8 bits changes an image by a quarter of a grey level on average; a smaller scale would measure rounding.
 _ROUNDING: Final = 0.25 / 255
 
 
 def _tau_r(scale: float | str, mean: float) -> float:
-    """τ_r of a view whose mean disagreement is `mean`."""
+    """τ_r of a view with this mean disagreement."""
     kind, _, number = str(scale).rpartition(":")
     try:
         value = float(number)
     except ValueError:
         value = math.nan
     if kind not in ("", "relative") or not 0 < value < math.inf:
-        raise ValueError(f'reliability_scale must be a number > 0 or "relative:<number > 0>", got {scale!r}.')
+        raise SettingError(f'reliability_scale must be a number > 0 or "relative:<number > 0>", got {scale!r}.')
     return value * max(mean, _ROUNDING) if kind else value

@@ -1,13 +1,14 @@
-"""SplatSuRe's weighting, Gaussian-wise: SR detail goes where no other view shows more, authentic pixels do the rest.
+"""SplatSuRe's weighting, per Gaussian: SR detail is used where no other view samples the Gaussian better.
 
-A Gaussian that one view sees from near and another from far is sampled well by the near view's LR photo; the far view's
-SR reference can only guess what that photo shows. So its HR gradient is withheld in every view but the one that samples
-it best.
+A Gaussian that one view samples from near and another from far is covered well by the near view's LR
+photo, while the far view's SR image can only guess what that photo shows. Its HR gradient is therefore
+withheld in every view except the one that samples it best.
 
-SplatSuRe's: the ratio, the sigmoid, the exemptions, and the constants. Ours: it weighs pixels of each SR image by a map,
-1 - render(score) + render(best here), that a first field trained on LR has drawn once; we weigh each Gaussian's gradient
-while the one field trains. Its ratio is of screen radii; ours of f / z, their ratio for round Gaussians, which no scale
-that is still being learnt can fool. Densification goes by the unweighted gradient.
+From SplatSuRe: the ratio, the sigmoid, the exemptions, and the constants. Ours: SplatSuRe weighs the pixels
+of each SR image by a map, 1 - render(score) + render(best here), drawn once from a field that was first
+trained on LR; here each Gaussian's gradient is weighed while the one field trains. SplatSuRe's ratio is of
+screen radii; ours is of f / z, which equals it for round Gaussians and does not depend on scales that are
+still being learnt. Densification uses the unweighted gradient.
 """
 
 from __future__ import annotations
@@ -24,28 +25,29 @@ from torch import Tensor
 from clear_strategies.core import deferred
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import Grads, Shot
+from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import Strategy
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_NOW: Final = "what this iteration shows"
+_NOW: Final = "the view of this iteration"
 
 
 @dataclass(frozen=True)
 class SplatSuRe(Strategy):
     """Withhold HR gradients where another view samples the Gaussian better.
 
-    `state` holds, by view, every Gaussian's sampling rate f / z (HR pixels per world unit) when the view last showed it,
-    0 where it never did. A weight therefore needs all views to have been visited; until then it is 1.
+    `state` holds, by view, the sampling rate f / z of every Gaussian (HR pixels per world unit) when it was last visible
+    in the view, 0 where it never was. Weights are 1 until every view has been rendered.
 
     Args:
         ratio: τ, the ratio of the finest to the coarsest sampling rate at which half of the HR gradient is withheld.
         softness: of the sigmoid around τ, > 0.
-        min_views: Gaussians that fewer views have shown keep all of their HR gradient.
+        min_views: Gaussians that are visible in fewer views keep all of their HR gradient.
 
     Raises:
-        ValueError: a setting is outside its range.
+        SettingError: a setting is outside its range.
     """
 
     ratio: float = 1.1
@@ -54,11 +56,11 @@ class SplatSuRe(Strategy):
 
     def __post_init__(self) -> None:
         if not self.ratio >= 1:
-            raise ValueError(f"ratio must be >= 1 (finest over coarsest), got {self.ratio}.")
+            raise SettingError(f"ratio must be >= 1 (finest over coarsest), got {self.ratio}.")
         if not self.softness > 0:
-            raise ValueError(f"softness must be > 0, got {self.softness}.")
+            raise SettingError(f"softness must be > 0, got {self.softness}.")
         if self.min_views < 1:
-            raise ValueError(f"min_views must be at least 1, got {self.min_views}.")
+            raise SettingError(f"min_views must be at least 1, got {self.min_views}.")
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
@@ -69,7 +71,7 @@ class SplatSuRe(Strategy):
             )  # fmt: skip
 
     def observe(self, view: Any, hr: Shot) -> Evidence | None:
-        """Remembers which view this is, and whom it shows; gives no evidence of reliability."""
+        """Stores the view and its visible Gaussians for `correct`; gives no evidence."""
         self.cache[_NOW] = view.name, view.hr.camera, hr.visible
         return None
 
@@ -78,14 +80,14 @@ class SplatSuRe(Strategy):
         name, _, visible = self.cache[_NOW]
         rows = next(iter(hr.values()))
         w = self.weight(name).to(rows) if self.state else rows.new_ones(len(rows))
-        self.readings["mean_hr_weight"] = deferred.mean(w, visible)
+        self.log("mean_hr_weight", deferred.mean(w, visible))
         return hr * w
 
     def weight(self, name: str) -> Float[Tensor, " N"]:
         """1 - score in the view called `name`, and 1 where that view samples best.
 
-        The score is sigmoid((finest / coarsest - τ) / softness) over the views that have shown a Gaussian, 0 where they
-        are too few.
+        The score is sigmoid((finest / coarsest - τ) / softness) over the views in which a Gaussian has been visible; it is
+        0 where these are fewer than `min_views`.
         """
         rates = list(self.state.values())
         finest, coarsest, views = rates[0], rates[0].new_full(rates[0].shape, torch.inf), torch.zeros_like(rates[0])
@@ -100,7 +102,7 @@ class SplatSuRe(Strategy):
         return torch.where(exempt, 1.0, 1 - score)
 
     def after_step(self, params: Mapping[str, Tensor], t: int) -> None:
-        """This view's sampling rates of the Gaussians that it shows."""
+        """Store this view's sampling rates of its visible Gaussians."""
         if _NOW not in self.cache:
             return
         name, camera, visible = self.cache.pop(_NOW)
@@ -110,7 +112,7 @@ class SplatSuRe(Strategy):
         self.state[name] = torch.where(visible & (z > 0), camera.fx / z, before)
 
     def _pose(self, name: str, camera: Camera) -> Float[Tensor, "4 4"]:
-        """World to camera, where the field lies; sent there once, and again when the view has another camera."""
+        """World to camera on the device of the field, cached until the view has another camera."""
         sent: tuple[Camera, Tensor] | None = self.cache.get(("pose", name))
         if sent is None or sent[0] is not camera:
             sent = self.cache["pose", name] = camera, camera.world_to_camera.to(self.device)

@@ -1,28 +1,28 @@
-"""SVS: sparse-view stabilization. One dropout mask for both scales keeps Gaussians from co-adapting without making LR
-and HR disagree; once the structure has settled, an anchor holds the field near where it was.  Eq. 15, 16
+"""SVS: sparse-view stabilization.  Eq. 15, 16
+
+One dropout mask, shared by both scales, keeps Gaussians from co-adapting without making LR and HR
+disagree. Once the structure has settled, an anchor pulls the field towards its state at that moment.
 """
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Final, Literal
+from typing import Final, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core.compiled_rules import Anchor
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
-from clear_strategies.errors import AnchorError
+from clear_strategies.errors import AnchorError, SettingError
 from clear_strategies.schedules import Ramp, milestone
 from clear_strategies.strategies.base import Strategy
 
-_log = logging.getLogger(__name__)
-
-# Geometry is held, appearance may still be refined (METHOD, F40). Position in units of the scene's extent.
-PAPER_WEIGHTS: Final[Mapping[str, float]] = {
-    "means": 1.0, "scales": 1.0, "quats": 1.0, "opacities": 0.1, "sh0": 0.01, "shN": 0.01, "detail": 0.0,
+# Geometry is held, appearance may still be refined (F40). f_det is held wherever the base colour is, else it drifts (F35).
+ANCHOR_WEIGHTS: Final[Mapping[str, float]] = {
+    "means": 1e-4, "scales": 1e-4, "quats": 1e-4, "opacities": 1e-5, "sh0": 1e-6, "shN": 1e-6, "detail": 1e-6,
 }  # fmt: skip
 
 
@@ -31,47 +31,41 @@ class SVS(Strategy):
     """Shared dropout, then an anchor.
 
     Args:
-        dropout: p_t, the share of Gaussians left out at iteration t.
-        anchor_start: t_a, the iteration after which densification stops and the anchor is taken.
-        anchor_strength: λ_stab >= 0; 0 anchors nothing (densification still stops at t_a).
+        dropout: p_t, the share of Gaussians dropped at iteration t.
+        anchor_start: t_a, the iteration at which densification stops and the anchor is taken.
+        anchor_strength: λ_stab >= 0; 0 takes no anchor (densification still stops at t_a); the paper's is 0.01 (F40).
         anchor_weights: W by attribute, >= 0, on raw parameters; positions count in units of the extent of the anchored
             cloud (90th percentile of the distance from its median).
-        reduction: "sum" over Gaussians as printed, or their "mean" (with 1e5 of them, nothing).
+        reduction: "sum" over Gaussians as printed in the paper, or their "mean" (negligible for 1e5 Gaussians).
 
     Raises:
-        ValueError: a setting is outside its range.
+        SettingError: a setting is outside its range.
         AnchorError: (while training) the number of Gaussians changed after t_a.
     """
 
-    fused: ClassVar[str | None] = "svs"
-
     dropout: Ramp = field(default_factory=Ramp)
     anchor_start: int = milestone(5_000)
-    anchor_strength: float = 0.01
-    anchor_weights: Mapping[str, float] = field(default_factory=lambda: dict(PAPER_WEIGHTS))
+    anchor_strength: float = 0.0
+    anchor_weights: Mapping[str, float] = field(default_factory=lambda: dict(ANCHOR_WEIGHTS))
     reduction: Literal["sum", "mean"] = "sum"
 
     def __post_init__(self) -> None:
-        if self.anchor_strength < 0:
-            raise ValueError(f"anchor_strength must be >= 0, got {self.anchor_strength}.")
+        if not self.anchor_strength >= 0:
+            raise SettingError(f"anchor_strength must be >= 0, got {self.anchor_strength}.")
         if self.reduction not in ("sum", "mean"):
-            raise ValueError(f"reduction must be sum or mean, got {self.reduction!r}.")
+            raise SettingError(f"reduction must be sum or mean, got {self.reduction!r}.")
         for name, weight in self.anchor_weights.items():
             if name not in ATTRIBUTES or not weight >= 0:
-                raise ValueError(
+                raise SettingError(
                     f"anchor_weights must give numbers >= 0 for {', '.join(ATTRIBUTES)}, got {name}={weight}."
                 )
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
         self.cache["seed"] = seed
-        if self.dropout.maximum == 0 and (self.anchor_strength == 0 or not any(self.anchor_weights.values())):
-            _log.warning(
-                "SVS drops nothing and anchors nothing: it only ends densification at t=%d.", self.anchor_start
-            )
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
-        """zᵗ: 0 for the dropped, 1 / (1 - p_t) for the rest; a function of (seed, t)."""
+        """zᵗ: 0 for dropped Gaussians, 1 / (1 - p_t) for the others; a function of (seed, t)."""
         p = self.dropout(t)
         if p == 0:
             return None
@@ -79,22 +73,35 @@ class SVS(Strategy):
 
     def regularize(self, params: Mapping[str, Tensor], t: int) -> Grads | None:
         """∇ λ_stab Σ_i ‖θ_i - θ_i^a‖²_W, for every Gaussian, seen or not; None before the anchor."""
-        if not self.state:
+        anchor = self.anchor(next(iter(params.values())).shape[0])
+        if anchor is None:
             return None
-        stiffness = self.stiffness(next(iter(params.values())).shape[0])
         return Grads(
-            {name: (params[name] - self.state[name]) * k for name, k in stiffness.items() if name in params}
+            {name: (params[name] - anchor.targets[name]) * k for name, k in anchor.stiffness.items() if name in params}
         )  # Eq. 16
 
-    def stiffness(self, n: int) -> dict[str, float]:
-        """2 λ_stab W by anchored attribute: the anchor's vjp per unit of distance.
+    def anchor(self, n: int) -> Anchor | None:
+        """θ^a, and the stiffness 2 λ_stab W by attribute; None before the anchor is taken.
 
         Raises:
             AnchorError: `n` is not the number of Gaussians that were anchored.
         """
+        if not self.state:
+            return None
         self._require_same_number(n)
         strength = 2 * self.anchor_strength / (1 if self.reduction == "sum" else n)
-        return {name: strength * self._weight(name) for name in self.state}
+        return Anchor(self.state, {name: strength * self._weight(name) for name in self.state})
+
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+        if self.dropout.maximum == 0 and (self.anchor_strength == 0 or not any(self.anchor_weights.values())):
+            return f"it drops nothing and anchors nothing, and only ends densification at t={self.anchor_start}"
+        return None
+
+    def skipped(self) -> Sequence[str]:
+        return () if self.anchor_strength > 0 else ("anchor (anchor_strength = 0)",)
+
+    def marks(self) -> Mapping[str, int]:
+        return {"anchor": self.anchor_start} if self.anchor_strength > 0 else {}
 
     def may_densify(self, t: int) -> bool:
         return t < self.anchor_start
@@ -141,7 +148,7 @@ def dropout_mask(n: int, p: float, seed: int, t: int, device: torch.device | str
 
 
 def _mix(seed: int, t: int) -> int:
-    """Spread (seed, t) over 63 bits, so that neighbouring iterations start far apart."""
+    """Hash (seed, t) to 63 bits, so that neighbouring iterations get unrelated generators."""
     x = (seed * 0x9E3779B97F4A7C15 + t * 0xBF58476D1CE4E5B9) & (2**64 - 1)
     x = (x ^ (x >> 31)) * 0x94D049BB133111EB & (2**64 - 1)
     return (x ^ (x >> 29)) >> 1

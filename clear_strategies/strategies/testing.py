@@ -21,7 +21,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.view import Photo, View
-from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.conductor import Conductor, Update
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import WarmupDecay, scaled
 from clear_strategies.strategies.base import Strategy
@@ -90,7 +90,7 @@ def check_answers_have_their_shapes(make: Make) -> None:
         _require(z is None or (z.shape == (_N,) and bool((z >= 0).all())), "gate() must give [N] numbers >= 0, or None")
         update = conductor.update(params, lr, hr, view, t)
         _require(update.score.shape == (_N,), f"score() gave {tuple(update.score.shape)} for {_N} Gaussians")
-        for name, gradient in update.grads.items():
+        for name, gradient in _grads(update).items():
             _require(gradient.shape == params[name].shape, f"the gradient of {name} has shape {tuple(gradient.shape)}")
             _require(bool(gradient.isfinite().all()), f"the gradient of {name} is not finite")
         if update.evidence is not None:
@@ -105,7 +105,7 @@ def check_works_without_hr(make: Make) -> None:
     lr, _, view, params = _situation(2)
     update = conductor.update(params, lr, None, view, 1)
     for name in ("means", "opacities"):
-        _require(bool(update.grads[name].isfinite().all()), f"the gradient of {name} is not finite without HR")
+        _require(bool(_grads(update)[name].isfinite().all()), f"the gradient of {name} is not finite without HR")
 
 
 def check_is_reproducible(make: Make) -> None:
@@ -222,9 +222,14 @@ def _trace(conductor: Conductor, start: int, stop: int) -> Any:
         yield torch.ones(_N) if z is None else z
         update = conductor.update(params, lr, hr, view, t)
         yield update.score
-        for name in sorted(update.grads):
-            yield update.grads[name]
+        grads = _grads(update)
+        yield from (grads[name] for name in sorted(grads))
         conductor.after_step(params, t)
+
+
+def _grads(update: Update) -> Grads:
+    """The merged gradient, which is there as no `Stepper` is used."""
+    return update.grads or Grads()
 
 
 def _require(holds: bool, otherwise: str) -> None:

@@ -36,7 +36,7 @@ class LearningRates:
     sh0: float = 2.5e-3
     shN: float = 1.25e-4  # noqa: N815 - gsplat's name
     detail: float = 2.5e-3
-    detail_decay: float = 0.0
+    detail_decay: float = 0.002
     eps: float = 1e-15
     rows: Literal["all", "visible"] = "all"
 

@@ -16,16 +16,20 @@ from hydra.utils import instantiate
 from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, Strategy, Update
 from clear_strategies.core.gradients import Grads
 from clear_strategies.density import gsplat
-from clear_strategies.density.adaptive import Densifier, DensifierSettings, Density, DensityError, DensitySettings
-from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings, topk_threshold
+from clear_strategies.density.adaptive import Density, DensitySettings
+from clear_strategies.density.base import Densifier, DensifierSettings, DensityError
+from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings
+from clear_strategies.density.threshold import topk_threshold
 from clear_strategies.run import CONF
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, scaled
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import GaussianField
-from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 from tests.test_run import TINY, run
 from tests.training.test_lifecycle import cloud

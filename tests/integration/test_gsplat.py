@@ -15,9 +15,11 @@ from clear_strategies.compose import conductor as composed
 from clear_strategies.core.view import Photo, View
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.schedules import LogLinear, WarmupDecay, scaled
-from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from integration.attach import HostError
 from integration.gsplat import ROWS, attach
 from rasterizers import Splats, autograd
@@ -32,7 +34,7 @@ AT_ONCE = WarmupDecay(start=0, full=1, decay_from=100, end=100)
 
 def subset(name):
     """New objects each time: a strategy remembers."""
-    anchored = SVS(anchor_weights={"means": 1e-4, "scales": 1e-4, "detail": 1e-6})
+    anchored = SVS(anchor_strength=0.01, anchor_weights={"means": 1e-4, "scales": 1e-4, "detail": 1e-6})
     made = {"gco": GCO(), "p2g": P2G(patch=4), "svs": scaled(anchored, STEPS / 10_000)}
     return tuple(s for key, s in made.items() if name in (key, "clear"))
 
@@ -373,7 +375,7 @@ class TestWithGsplat:
 
     def test_too_long_a_densification_is_said_beforehand(self, attached, caplog):
         with caplog.at_level(logging.WARNING):
-            self.run(attached, (SVS(anchor_start=10),), steps=1)
+            self.run(attached, (SVS(anchor_start=10, anchor_strength=0.01),), steps=1)
         assert "densifies until refine_stop_iter=24" in caplog.text
 
     def test_clear_strategy_is_a_default_strategy_that_attaches_itself(self, caplog):

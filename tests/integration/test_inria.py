@@ -20,9 +20,11 @@ from clear_strategies.compose import conductor
 from clear_strategies.core.view import Photo, View
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, scaled
-from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from integration import launch
 from integration.attach import HostError
 from integration.inria import attach, enlarged, intrinsics
@@ -38,7 +40,7 @@ STEPS, N = 25, 24
 def svs(**settings):
     """Made anew each time: a strategy remembers."""
     weights = {"means": 1e-4, "scales": 1e-4, "detail": 1e-6}
-    return scaled(SVS(anchor_weights=weights, **settings), STEPS / 10_000)
+    return scaled(SVS(**{"anchor_strength": 0.01, "anchor_weights": weights} | settings), STEPS / 10_000)
 
 
 @pytest.fixture

@@ -24,8 +24,10 @@ from clear_strategies import Conductor
 from clear_strategies.data.prepare import ViewSettings
 from clear_strategies.run import CONF
 from clear_strategies.schedules import scaled
-from clear_strategies.training.loop import FitSettings, TrainState, fit, iterate
+from clear_strategies.training.loop import fit, iterate
 from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 from tests.test_run import TINY, run
 

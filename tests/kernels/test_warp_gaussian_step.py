@@ -34,15 +34,15 @@ def started(warp_step, **settings) -> tuple[Case, CompiledStep]:
     c = case(1000, degree=2, kind="sparse")
     _, conductor = conductors(lambda: GCO(**settings), P2G, SVS, anchored=c.fields[0])
     adam = Adam(c.fields[1].raw(), LearningRates(detail_decay=0.1, rows="visible"), 1.0)
-    return c, CompiledStep(conductor, adam, sweeps=warp_step.GaussianPass)
+    return c, CompiledStep(conductor, adam, passes=warp_step.GaussianPass)
 
 
 def two_steps(warp_step):
     """Parameters and moments, conflicts and readings, and the work_log's counts."""
     c, step = started(warp_step)
-    conflicts = [told(step.merge(c.fields[1].raw(), *c.factors(1), c.m, c.e, T + i)[1]) for i in range(2)]
+    conflicts = [told(step.step(c.fields[1].raw(), *c.factors(1), T + i)) for i in range(2)]
     state = [*c.fields[1].raw().values(), *step.optimizer.first.values(), *step.optimizer.second.values()]
-    numbers = told(step.conductor.readings())
+    numbers = told(step.conductor.logs())
     return state, conflicts, numbers, step.conductor.work_log.entries["optimizer rows"].skipped
 
 
@@ -84,9 +84,9 @@ class Asked(TorchDispatchMode):
 def test_nobody_waits_for_the_device(warp_step, eps):
     c, step = started(warp_step, eps=eps)
     factors = c.factors(1)
-    step.merge(c.fields[1].raw(), *factors, c.m, c.e, T)  # looks at what changes with the structure only
+    step.step(c.fields[1].raw(), *factors, T)  # looks at what changes with the structure only
     with Asked() as asked:
-        _, conflict = step.merge(c.fields[1].raw(), *factors, c.m, c.e, T + 1)
+        conflict = step.step(c.fields[1].raw(), *factors, T + 1)
     assert asked.found == []
     assert all(0 <= share <= 1 for share in told(conflict).values())
 
@@ -114,7 +114,7 @@ def test_on_cuda_without_warp_the_readable_path_is_taken_and_that_is_said(adam_o
     with caplog.at_level("INFO"):
         assert compiled_step_for(Conductor(), adam_on_cuda) is None
     assert caplog.messages == [
-        "The per-Gaussian pass takes the readable path: the compiled pass needs NVIDIA Warp, which is not installed."
+        "The per-Gaussian step takes the readable path: the compiled pass needs NVIDIA Warp, which is not installed."
     ]
 
 

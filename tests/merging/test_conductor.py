@@ -31,7 +31,7 @@ class Halve(Strategy):
 
 @pytest.mark.parametrize(
     "make",
-    [GCO, P2G, SVS, SplatSuRe, Halve, lambda: SVS(anchor_strength=0.0)],
+    [GCO, P2G, SVS, SplatSuRe, Halve, lambda: SVS(anchor_strength=0.01)],
     ids=["GCO", "P2G", "SVS", "SplatSuRe", "own", "loose"],
 )
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)

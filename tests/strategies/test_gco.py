@@ -148,8 +148,8 @@ def test_rotation_noise_of_isotropic_gaussians_is_gated():
     gco = GCO()
     found = gco.correct(lr, hr, None)
     assert torch.equal(found["quats"], hr["quats"])
-    assert gco.readings["corrected_quats"] == 0
-    assert gco.readings["corrected_scales"] > 0
+    assert gco.logs["corrected_quats"] == 0
+    assert gco.logs["corrected_scales"] > 0
 
 
 def test_the_detail_feature_is_never_touched():
@@ -175,7 +175,7 @@ def test_a_prior_that_agrees_with_lr_makes_it_inactive_and_says_so(caplog):
         gco.correct(lr, hr, evidence)
         gco.correct(lr, hr, evidence)
     assert caplog.text.count("GCO is inactive") == 1
-    assert gco.readings["mean_omega"] == pytest.approx(0.05, abs=1e-3)
+    assert gco.logs["mean_omega"] == pytest.approx(0.05, abs=1e-3)
 
 
 def test_the_rival_reading_bounds_the_coefficient():

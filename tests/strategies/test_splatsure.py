@@ -44,7 +44,7 @@ def test_far_views_yield_to_the_nearest_once_all_were_visited():
     withheld = 1 / (1 + math.exp(-(2 - 1.5) / 0.5))  # rates 10/2, 10/2.5, 10/4: ratio 2
     for name, expected in (("near", 1.0), ("middle", 1 - withheld), ("far", 1 - withheld)):
         assert visit(s, name, views[name], [True, True]).tolist() == pytest.approx([expected] * 2)
-    assert s.readings["mean_hr_weight"] == pytest.approx(1 - withheld)
+    assert s.logs["mean_hr_weight"] == pytest.approx(1 - withheld)
 
 
 def test_equal_sampling_keeps_nearly_everything_and_a_wide_range_leaves_nearly_nothing():

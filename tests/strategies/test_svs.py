@@ -9,9 +9,14 @@ from hypothesis import strategies as st
 
 from clear_strategies import SVS, AnchorError
 from clear_strategies.schedules import Ramp
-from clear_strategies.strategies.svs import PAPER_WEIGHTS, dropout_mask
+from clear_strategies.strategies.svs import dropout_mask
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
+
+# The paper's reading (conf/readings/literal.yaml).
+PAPER_WEIGHTS = {
+    "means": 1.0, "scales": 1.0, "quats": 1.0, "opacities": 0.1, "sh0": 0.01, "shN": 0.01, "detail": 0.0,
+}  # fmt: skip
 
 
 @given(p=st.floats(0, 0.95), seed=st.integers(0, 2**31), t=st.integers(1, 10_000))
@@ -69,7 +74,7 @@ def test_anchor_pulls_back_with_twice_the_weighted_distance():
 
 def test_anchored_positions_do_not_depend_on_the_unit_of_the_world():
     for unit in (1.0, 1000.0):
-        svs = SVS(anchor_start=1, anchor_weights=PAPER_WEIGHTS)
+        svs = SVS(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS)
         svs.on_fit_start(3, 0)
         theta = params()
         theta["means"] = theta["means"] * unit
@@ -84,7 +89,7 @@ def test_anchored_positions_do_not_depend_on_the_unit_of_the_world():
 def test_the_mean_reading_divides_by_the_number_of_gaussians():
     pulls = []
     for reduction in ("sum", "mean"):
-        svs = SVS(anchor_start=1, reduction=reduction)
+        svs = SVS(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS, reduction=reduction)
         svs.on_fit_start(3, 0)
         theta = params()
         svs.after_step(theta, 1)
@@ -94,13 +99,13 @@ def test_the_mean_reading_divides_by_the_number_of_gaussians():
 
 
 def test_densification_ends_when_the_anchor_is_taken():
-    svs = SVS(anchor_start=10)
+    svs = SVS(anchor_start=10, anchor_strength=0.01)
     assert svs.may_densify(9)
     assert not svs.may_densify(10)
 
 
 def test_a_changed_number_of_gaussians_under_an_anchor_is_an_error():
-    svs = SVS(anchor_start=5)
+    svs = SVS(anchor_start=5, anchor_strength=0.01)
     svs.on_fit_start(3, 0)
     svs.after_step(params(), 5)
     with pytest.raises(AnchorError, match="t=5 for 20 Gaussians, now there are 21"):

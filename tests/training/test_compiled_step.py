@@ -18,12 +18,16 @@ from clear_strategies import CONFLICT_GROUPS, GCO, P2G, SVS, Conductor, Evidence
 from clear_strategies.core import deferred
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.kernels.gaussian_step import cpp as kernel
+from clear_strategies.merging.conductor import HrGradients
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
+from clear_strategies.strategies.base import describes
 from clear_strategies.training.compiled_step import CompiledStep, Factors, compiled_step_for
 from clear_strategies.training.field import GaussianField
-from clear_strategies.training.loop import FitSettings, TrainState, iterate
+from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from rasterizers.interface import BackendUnavailable, SplatGradients
 from rasterizers.native import load_kernels
 from rasterizers.warp_backend.launch import require
@@ -103,14 +107,27 @@ class Case:
     def factors(self, use: int, hr: str = "both") -> tuple:
         a = self.fields[use]._activate(self.z)
         lr = Factors(self.lr, 0, a, self.visible)
-        return lr, *(Factors(self.hr, k, a, self.visible) if k < _K[hr] else None for k in (0, 1))
+        return lr, self._bundle(*(Factors(self.hr, k, a, self.visible) if k < _K[hr] else None for k in (0, 1)))
 
     def grads(self, use: int, hr: str = "both") -> tuple:
         a = self.fields[use]._activate(self.z)
         hf = (a.vjp(self.hr, k, detail=True) if k < _K[hr] else None for k in (0, 1))
-        return a.vjp(self.lr, 0, detail=False), *hf
+        return a.vjp(self.lr, 0, detail=False), self._bundle(*hf)
+
+    def _bundle(self, base, hf) -> HrGradients | None:
+        return None if base is None else HrGradients(base, hf, (1, 1), self.e, self.m)
 
 
+def readable_merge(conductor, params, g_lr, hr, t) -> tuple:
+    """The merged gradient and the conflict ratios of the readable path."""
+    merged = conductor.merge(params, g_lr, hr, t)
+    return merged.grads, merged.conflict
+
+
+ANCHORING = partial(
+    SVS, anchor_strength=0.01,
+    anchor_weights={"means": 1.0, "scales": 1.0, "quats": 1.0, "opacities": 0.1, "sh0": 0.01, "shN": 0.01, "detail": 0.0},
+)  # fmt: skip
 _K = {"none": 0, "base": 1, "both": 2}
 
 
@@ -169,6 +186,7 @@ ALWAYS = WarmupDecay(start=0, full=1, decay_from=10, end=10)
 
 def conductors(*makers, anchored=None, hf=0.2, λ=ALWAYS) -> tuple[Conductor, Conductor]:
     """Two of the same; with an anchor a little beside the field where one is given."""
+    makers = [ANCHORING if make is SVS else make for make in makers]
     both = tuple(Conductor(*(make() for make in makers), objective=Objective(lambda_hr=λ, lambda_hf=hf)) for _ in "ab")
     for conductor in both:
         conductor.on_fit_start(3, 0)
@@ -179,9 +197,10 @@ def conductors(*makers, anchored=None, hf=0.2, λ=ALWAYS) -> tuple[Conductor, Co
 
 
 def assert_same_gradient(c: Case, expected, found, λ=1.0, hr="both"):
-    lr, base, hf = c.grads(0, hr)
+    g_lr, from_hr = c.grads(0, hr)
+    parts = [g_lr] if from_hr is None else [g_lr, from_hr.base, from_hr.hf]
     for name, value in expected.items():
-        size = sum(abs(g[name]).double() for g in (lr, base, hf) if g is not None and name in g) + abs(value).double()
+        size = sum(abs(g[name]).double() for g in parts if g is not None and name in g) + abs(value).double()
         norm = size.flatten(1).norm(dim=1).view(-1, *[1] * (value.dim() - 1)) if value.dim() > 1 else size
         off = (found[name].double() - value.double()).abs()
         worst = (off - (4 * EPS * norm + 6e-45)).max() if off.numel() else torch.tensor(-1.0)
@@ -221,16 +240,16 @@ def test_the_merged_gradient_is_the_readable_one(sweeps, setting, kind, caplog):
         c = case(237, kind=kind, gate=gate, evidence=evidence)
         readable, compiled = conductors(lambda: GCO(**GCO_SETTINGS[setting]), SVS, anchored=c.fields[0])
         caplog.clear()
-        expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
+        expected, conflict = readable_merge(readable, c.fields[0].raw(), *c.grads(0), T)
         said = caplog.messages
         caplog.clear()
-        step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
+        step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), passes=sweeps)
         before = {name: p.clone() for name, p in c.fields[1].raw().items()}
-        found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
+        found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), T)
         assert_same_gradient(c, expected, found)
         assert all(torch.equal(before[name], p) for name, p in c.fields[1].raw().items())
         assert repr(told(found_conflict)) == repr(told(conflict))
-        same(told(readable.strategies[0].readings), told(compiled.strategies[0].readings))
+        same(told(readable.strategies[0].logs), told(compiled.strategies[0].logs))
         assert caplog.messages == said
 
 
@@ -239,10 +258,9 @@ def test_every_subset_of_strategies_with_and_without_hr(sweeps, names):
     for hr, anchored, hf in itertools.product(_K, (False, True), (0.2, 1.0)):
         c = case(100, kind="random", evidence=P2G in names)
         readable, compiled = conductors(*names, anchored=c.fields[0] if anchored else None, hf=hf)
-        e = c.e if hr != "none" else None
-        expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0, hr), c.m, e, T)
-        step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
-        found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1, hr), c.m, e, T)
+        expected, conflict = readable_merge(readable, c.fields[0].raw(), *c.grads(0, hr), T)
+        step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), passes=sweeps)
+        found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1, hr), T)
         assert_same_gradient(c, expected, found, hr=hr)
         assert repr(told(found_conflict)) == repr(told(conflict))
 
@@ -251,9 +269,9 @@ def test_hr_for_the_score_alone_is_neither_compared_nor_corrected(sweeps):
     later = WarmupDecay(start=T + 5, full=T + 10, decay_from=40, end=50)
     c = case(50)
     readable, compiled = conductors(GCO, λ=later)
-    expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
-    step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
-    found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
+    expected, conflict = readable_merge(readable, c.fields[0].raw(), *c.grads(0), T)
+    step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), passes=sweeps)
+    found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), T)
     assert conflict == found_conflict == {}
     assert all(torch.equal(expected[name], found[name]) for name in expected)
 
@@ -261,12 +279,12 @@ def test_hr_for_the_score_alone_is_neither_compared_nor_corrected(sweeps):
 def three_steps(sweeps, c: Case, both, rates: LearningRates, hr="both", skips=True, steps=3):
     """Three steps each way: readable parameters and moments, and compiled ones."""
     adams = [Adam(f.raw(), rates, 2.0) for f in c.fields]
-    step = CompiledStep(both[1], adams[1], skips=skips, sweeps=sweeps)
+    step = CompiledStep(both[1], adams[1], skips=skips, passes=sweeps)
     for i in range(steps):
-        g, _ = both[0].merge(c.fields[0].raw(), *c.grads(0, hr), c.m, c.e, T + i)
+        g, _ = readable_merge(both[0], c.fields[0].raw(), *c.grads(0, hr), T + i)
         adams[0].step(c.fields[0].raw(), g, c.visible)
         c.fields[0].constrain()
-        step.merge(c.fields[1].raw(), *c.factors(1, hr), c.m, c.e, T + i)
+        step.step(c.fields[1].raw(), *c.factors(1, hr), T + i)
         c.hr.means.neg_()  # another view: momentum and gradient disagree
     return adams
 
@@ -345,9 +363,9 @@ def test_bands_with_momentum_are_not_left_out(sweeps):
     adams = [Adam(f.raw(), LearningRates(), 1.0) for f in c.fields]
     for adam in adams:
         adam.first["shN"][:, 10], adam.second["shN"][:, 10] = 1e-3, 1e-6
-    g, _ = both[0].merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
+    g, _ = readable_merge(both[0], c.fields[0].raw(), *c.grads(0), T)
     adams[0].step(c.fields[0].raw(), g)
-    CompiledStep(both[1], adams[1], sweeps=sweeps).merge(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
+    CompiledStep(both[1], adams[1], passes=sweeps).step(c.fields[1].raw(), *c.factors(1), T)
     assert torch.allclose(c.fields[0].shN.data, c.fields[1].shN.data, rtol=1e-6, atol=1e-9)
     assert bool((c.fields[1].shN.data[:, 10] != 0).all())
 
@@ -361,11 +379,11 @@ def test_the_same_bits_for_any_number_of_threads(sweeps):
             c = case(5000, kind="mixed")
             _, conductor = conductors(GCO, SVS, anchored=c.fields[0])
             adam = Adam(c.fields[1].raw(), LearningRates(), 1.0)
-            step = CompiledStep(conductor, adam, sweeps=sweeps)
+            step = CompiledStep(conductor, adam, passes=sweeps)
             for i in range(3):
-                step.merge(c.fields[1].raw(), *c.factors(1), c.m, c.e, T + i)
+                step.step(c.fields[1].raw(), *c.factors(1), T + i)
             state = [*c.fields[1].raw().values(), *adam.first.values(), *adam.second.values()]
-            states.append((state, repr(told(conductor.strategies[0].readings))))
+            states.append((state, repr(told(conductor.strategies[0].logs))))
     finally:
         torch.set_num_threads(threads)
     for state, readings in states[1:]:
@@ -377,9 +395,9 @@ def test_bases_of_both_scales_may_differ(sweeps):
     c = case(64)
     c.hr = replace(c.hr, basis=c.hr.basis * 1.5 + 0.1)
     readable, compiled = conductors(GCO)
-    expected, conflict = readable.merge(c.fields[0].raw(), *c.grads(0), c.m, c.e, T)
-    step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), sweeps=sweeps)
-    found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), c.m, c.e, T)
+    expected, conflict = readable_merge(readable, c.fields[0].raw(), *c.grads(0), T)
+    step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), passes=sweeps)
+    found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), T)
     assert_same_gradient(c, expected, found)
     assert told(conflict) == told(found_conflict)
 
@@ -438,15 +456,19 @@ class Mixed(Doubling, GCO):
 
 @dataclass(frozen=True)
 class Known(GCO):
-    fused = "gco"
+    """States anew that its correction is that of the rule."""
 
     def correct(self, lr, hr, evidence):
         return super().correct(lr, hr, evidence)
 
+    def correction_rule(self):
+        return super().correction_rule()
+
 
 def test_a_class_that_changes_what_a_strategy_does_loses_its_kernel():
-    assert [c.fused for c in (GCO, P2G, SVS, Tuned, Known)] == ["gco", "p2g", "svs", "gco", "gco"]
-    assert [c.fused for c in (Bolder, OtherEps, Mixed)] == [None] * 3
+    assert all(describes(c(), "correction_rule") for c in (GCO, Tuned, Known))
+    assert not any(describes(c(), "correction_rule") for c in (Bolder, OtherEps, Mixed, P2G))
+    assert describes(SVS(), "anchor")
 
 
 class OwnAdam(Adam):
@@ -459,8 +481,8 @@ def test_the_readable_path_is_taken_where_it_must_be_and_that_is_said_once(caplo
     double = Adam(field.double().raw(), LearningRates(), 1.0)
     cases = [
         ((Conductor(GCO(), P2G()), adam, "off"), "fit.fused=off"),
-        ((Conductor(Bolder()), adam), "Bolder has no compiled arithmetic"),
-        ((Conductor(), OwnAdam(field.raw(), LearningRates(), 1.0)), "OwnAdam may do something else than Adam"),
+        ((Conductor(Bolder()), adam), "Bolder does not state its arithmetic as data"),
+        ((Conductor(), OwnAdam(field.raw(), LearningRates(), 1.0)), "OwnAdam may compute something else than Adam"),
         ((Conductor(), double), "means is torch.float64 on cpu, not float32"),
     ]
     for arguments, reason in cases:
@@ -476,14 +498,14 @@ def test_the_readable_path_is_taken_where_it_must_be_and_that_is_said_once(caplo
     caplog.clear()
     with caplog.at_level(logging.INFO):
         assert compiled_step_for(Conductor(), adam) is None
-    assert caplog.messages == ["The per-Gaussian pass takes the readable path: the compiled kernels are not installed."]
+    assert caplog.messages == ["The per-Gaussian step takes the readable path: the compiled kernels are not installed."]
 
 
 def test_thirty_iterations_are_those_of_the_readable_path(sweeps):
     scene = toy.scene(16, seed=2, train=3, test=1)
     states = {}
     for mode in ("off", "auto"):
-        svs = SVS(dropout=Ramp(full=30), anchor_start=20)
+        svs = ANCHORING(dropout=Ramp(full=30), anchor_start=20)
         objective = Objective(lambda_hr=WarmupDecay(start=3, full=10, decay_from=20, end=30))
         states[mode] = TrainState.start(
             scene,
@@ -494,7 +516,7 @@ def test_thirty_iterations_are_those_of_the_readable_path(sweeps):
             mip=MipFilter(every=7, last=1),
         )
         if mode == "auto":
-            states[mode].fused = CompiledStep(states[mode].conductor, states[mode].optimizer, sweeps=sweeps)
+            states[mode].compiled_step = CompiledStep(states[mode].conductor, states[mode].optimizer, passes=sweeps)
         for _ in range(30):
             iterate(states[mode], toy.RASTERIZER)
         deferred.resolve(states[mode].history)

@@ -26,8 +26,9 @@ from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings
 from clear_strategies.errors import DataError
 from clear_strategies.run import CONF, _comparable, _device, _drawn_on, _rasterizer, _restore
 from clear_strategies.training import checkpoint
-from clear_strategies.training.loop import TrainState, iterate
+from clear_strategies.training.loop import iterate
 from clear_strategies.training.skips import SkipPolicy, Skips
+from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rendering, SplatGradients, Traits
 from tests.helpers import toy
 from tests.training.test_resume import ITERATIONS, SCENE, SUBSETS, start, tensors

@@ -14,13 +14,16 @@ import pytest
 import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective
-from clear_strategies.density.adaptive import DensitySettings, cameras_extent
+from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.density.base import cameras_extent
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import GaussianField
-from clear_strategies.training.loop import FitSettings, TrainState, fit, iterate
+from clear_strategies.training.loop import fit, iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 
 ITERATIONS = 20
@@ -46,6 +49,7 @@ def start(names: tuple[str, ...], iterations: int = ITERATIONS) -> TrainState:
         "svs": lambda: SVS(
             dropout=Ramp(full=ITERATIONS),
             anchor_start=12,
+            anchor_strength=0.01,
             anchor_weights={"means": 1.0, "scales": 1.0, "sh0": 0.1, "detail": 0.1},
         ),
     }

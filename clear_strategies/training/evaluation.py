@@ -1,0 +1,46 @@
+"""PSNR of training and test views while training."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
+from clear_strategies.data.scene import Scene
+from clear_strategies.training.state import TrainState
+from rasterizers.interface import Rasterizer
+
+PROBING: Final = "probe test views"
+"""The stage of the work log in which test views are evaluated."""
+
+
+def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int) -> None:
+    """Add the mean PSNR of the test views to the last row of the history."""
+    work_log = state.conductor.work_log
+    if state.density.reset_due(done) and not state.ended:
+        work_log.skip(PROBING, "opacities were reset in this iteration")
+        return
+    with work_log.stage(PROBING):
+        psnr = _probe(state, scene, rasterizer)
+    if psnr is not None:
+        state.history[-1]["psnr_test"] = psnr
+
+
+def _probe(state: TrainState, scene: Scene, rasterizer: Rasterizer) -> float | None:
+    """Mean PSNR of the first few test views at HR; None where HR is unknown."""
+    values = []
+    for view in scene.test[: state.settings.probe_views]:
+        if view.truth is not None:
+            values.append(psnr_of(state.field.render(rasterizer, view.hr.camera), view.truth))
+    return sum(deferred.read(values)) / len(values) if values else None
+
+
+def psnr_of(image: Tensor, target: Tensor) -> Number:
+    return deferred.defer(_decibels, deferred.scalar((image.clamp(0, 1) - target).square().mean()))
+
+
+def _decibels(mse: float) -> float:
+    return -10 * math.log10(max(mse, 1e-10))

@@ -1,0 +1,60 @@
+"""How long a run is, and what it saves and evaluates on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import get_args
+
+from clear_strategies.errors import SettingError
+from clear_strategies.schedules import REFERENCE_ITERATIONS, milestone
+from clear_strategies.training.compiled_step import FusedMode
+
+
+@dataclass(frozen=True, slots=True)
+class FitSettings:
+    """Settings of the training loop. Milestones are iterations of a 10,000-iteration run.
+
+    Args:
+        iterations: optimizer steps, one view each.
+        scale_schedule: stretch every milestone from 10,000 iterations to `iterations`.
+        seed: of view order, dropout and splits.
+        max_degree: of spherical harmonics, 0 to 3.
+        degree_every: iterations after which one more degree becomes active.
+        probe_every: iterations between evaluations of the test views; 0: never.
+        probe_views: how many test views these evaluate.
+        checkpoint_every: iterations between checkpoints; 0: only when interrupted.
+        keep: how many checkpoints stay, at least 1.
+        fused: "auto" merges, corrects, anchors and steps in one compiled pass where it can, and skips rows that would
+            not move; "every_row" skips none (the same bits); "off" takes the readable path.
+
+    Raises:
+        SettingError: a setting is outside its range.
+    """
+
+    iterations: int = 10_000
+    scale_schedule: bool = True
+    seed: int = 0
+    max_degree: int = 3
+    degree_every: int = milestone(1_000)
+    probe_every: int = milestone(1_000)
+    probe_views: int = 3
+    checkpoint_every: int = milestone(2_500)
+    keep: int = 3
+    fused: FusedMode = "auto"
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise SettingError(f"iterations must be at least 1, got {self.iterations}.")
+        if self.max_degree not in (0, 1, 2, 3):
+            raise SettingError(f"max_degree must be 0, 1, 2 or 3, got {self.max_degree}.")
+        if self.keep < 1:
+            raise SettingError(f"keep must be at least 1 checkpoint, got {self.keep}.")
+        if self.fused not in get_args(FusedMode):
+            raise SettingError(
+                f"fused must be one of {', '.join(get_args(FusedMode))}, got {self.fused!r}. In a YAML file, off is quoted."
+            )
+
+    @property
+    def stretch(self) -> float:
+        """The factor on milestones."""
+        return self.iterations / REFERENCE_ITERATIONS if self.scale_schedule else 1.0

@@ -1,0 +1,68 @@
+"""Signals while training: the step in progress finishes, the run saves, and then it stops."""
+
+from __future__ import annotations
+
+import logging
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from clear_strategies.errors import ClearError
+
+_log = logging.getLogger(__name__)
+
+
+class Interrupted(ClearError):
+    """The run was asked to stop (Ctrl-C, SIGTERM, a cluster's own signal); it finished its step and saved."""
+
+    def __init__(self, signum: int, saved: Path | None, t: int) -> None:
+        self.signum = signum
+        where = f"Go on with fit.resume={saved}" if saved else "Nothing was saved: this run keeps no checkpoints"
+        super().__init__(f"stopped by {signal.Signals(signum).name} before iteration {t}. {where}.")
+
+    @property
+    def exit_code(self) -> int:
+        return 128 + self.signum
+
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+# A cluster announces the end of a job with these, if the job's launcher has set a handler.
+_ANNOUNCEMENTS: Final = tuple(getattr(signal, name) for name in ("SIGUSR1", "SIGUSR2") if hasattr(signal, name))
+
+
+@contextmanager
+def deferred_signals() -> Iterator[list[int]]:
+    """Collect the first SIGINT or SIGTERM instead of stopping in the middle of a step; a second one acts at once.
+
+    SIGUSR1 and SIGUSR2 are collected where they have a handler (one that resubmits the job, say), since that handler
+    would exit before anything is saved. All handlers are restored when `fit` raises Interrupted, so that the caller can
+    raise the signal again.
+    """
+    pending: list[int] = []
+
+    def note(signum: int, _frame: FrameType | None) -> None:
+        pending.append(signum)
+        again = " Once more to leave at once." if signum in _SIGNALS else ""
+        _log.warning("%s: finishing this step, then saving.%s", signal.Signals(signum).name, again)
+        for s in _SIGNALS:
+            signal.signal(s, before[s])
+
+    handled = [s for s in _ANNOUNCEMENTS if callable(signal.getsignal(s))]
+    try:
+        before = {s: signal.signal(s, note) for s in (*_SIGNALS, *handled)}
+    except ValueError:  # not the main thread, which alone may set handlers
+        yield pending
+        return
+    try:
+        yield pending
+    finally:
+        for s, handler in before.items():
+            signal.signal(s, handler)
+
+
+def foremost(pending: list[int]) -> int:
+    """The signal that decides how to stop: a cluster's announcement before a SIGTERM that comes with it."""
+    return next((s for s in pending if s in _ANNOUNCEMENTS), pending[0])

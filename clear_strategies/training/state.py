@@ -1,0 +1,208 @@
+"""Everything that changes while training, and what a checkpoint holds of it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.view import View
+from clear_strategies.data.scene import Scene
+from clear_strategies.density.base import Densifier, DensifierSettings, cameras_extent
+from clear_strategies.errors import ClearError, DataError
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.training.checkpoint import Checkpoint
+from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import Adam, LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.skips import SkipPolicy, Skips
+
+_log = logging.getLogger(__name__)
+
+
+class DivergedError(ClearError, FloatingPointError):
+    """A parameter is no longer a finite number; the last checkpoint is from before that."""
+
+
+@dataclass(slots=True)
+class TrainState:
+    """Everything that changes while training, on the device where the views lie.
+
+    Args:
+        t: the iteration to come, from 1.
+        history: one row per iteration; read it by `history_as_floats`, since on a device its numbers are deferred.
+    """
+
+    field: GaussianField
+    conductor: Conductor
+    optimizer: Adam
+    density: Densifier
+    settings: FitSettings
+    mip: MipFilter
+    views: tuple[View, ...]
+    t: int = 1
+    history: list[dict[str, Number]] = field(default_factory=list)
+    compiled_step: CompiledStep | None = None
+    skip_policy: SkipPolicy = field(default_factory=SkipPolicy)
+
+    @classmethod
+    def start(
+        cls,
+        scene: Scene,
+        conductor: Conductor,
+        *,
+        settings: FitSettings,
+        density: DensifierSettings,
+        rates: LearningRates,
+        mip: MipFilter,
+        skips: Skips | None = None,
+    ) -> TrainState:
+        """The state before the first iteration, on the device of the scene's views.
+
+        Args:
+            settings, density, rates, mip, skips: with milestones already scaled to this run.
+        """
+        device = scene.device
+        theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
+        extent = cameras_extent(torch.stack([view.hr.camera.center.float() for view in scene.train]))
+        white = all(c == 1.0 for c in scene.background)
+        control = density.densifier(
+            len(theta), extent=extent, seed=settings.seed, white_background=white, device=device
+        )
+        optimizer = Adam(theta.raw(), rates, extent)
+        conductor.on_fit_start(len(scene.train), settings.seed, device)
+        step = compiled_step_for(conductor, optimizer, settings.fused)
+        state = cls(
+            theta,
+            conductor,
+            optimizer,
+            control,
+            settings,
+            mip,
+            scene.train,
+            compiled_step=step,
+            skip_policy=SkipPolicy(skips),
+        )
+        state.refilter()
+        return state
+
+    def view(self) -> View:
+        """The view of this iteration: every view once, in random order, then again in another."""
+        epoch, position = divmod(self.t - 1, len(self.views))
+        generator = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + epoch)
+        order = torch.randperm(len(self.views), generator=generator, device=generator.device)
+        return self.views[int(order[position])]
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the field and of everything else per Gaussian or pixel."""
+        return self.field.means.device
+
+    def history_as_floats(self) -> Sequence[dict[str, float]]:
+        """The history with every number read."""
+        return deferred.resolve(self.history)
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of training until the last iteration, those before a resume included."""
+        return self.history_as_floats()[-1]["seconds"] if self.history else 0.0
+
+    @property
+    def ended(self) -> bool:
+        """Whether all iterations are done."""
+        return self.t > self.settings.iterations
+
+    def advance(self) -> None:
+        """Go to the next iteration, or from a plateau of the training views straight to its end."""
+        done, self.t = self.t, self.t + 1
+        if not self.skip_policy.settled(self.history, done):
+            return
+        to, skips = min(self.skip_policy.skips.plateau_to, self.settings.iterations), self.skip_policy.skips
+        left_out, self.t = to + 1 - self.t, to + 1
+        self.optimizer.steps += left_out  # the learning rates follow the iteration
+        self.conductor.work_log.skip(
+            "iterations", "the training views stopped improving (skips.plateau_gain)", left_out
+        )
+        _log.info(
+            "t=%d: the training views' loss fell by less than %.1f %% in %d iterations; training goes on at t=%d.",
+            done, 100 * skips.plateau_gain, skips.plateau_window, self.t,
+        )  # fmt: skip
+
+    def refilter(self) -> None:
+        """Recompute the 3D filter from the present means."""
+        cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]
+        self.field.update_filter(cameras, self.mip.variance)
+
+    def resized(self, parents: Int[Tensor, " M"]) -> None:
+        """Tell the conductor and the filter that row i now comes from row parents[i]; field and optimizer are done."""
+        self.conductor.on_resize(parents)
+        self.refilter()
+
+    def filter_due(self) -> bool:
+        """Whether the 3D filter is recomputed at t; every change of structure does so as well."""
+        return self.t % self.mip.every == 0 and self.t <= self.settings.iterations - self.mip.last
+
+    def checkpoint(self, config: Mapping[str, Any]) -> Checkpoint:
+        tensors: dict[str, Tensor] = {}
+        for prefix, table in (
+            ("field", {**self.field.raw(), "filter_3d": self.field.filter_3d}),
+            ("optimizer", self.optimizer.state_dict()),
+            ("density", self.density.state_dict()),
+            ("strategies", self.conductor.state_dict()),
+        ):
+            tensors |= {f"{prefix}/{name}": value for name, value in table.items()}
+        facts = {"optimizer_steps": float(self.optimizer.steps), "degree": float(self.field.degree)}
+        return Checkpoint(
+            self.t,
+            tensors,
+            config,
+            facts,
+            list(self.history_as_floats()),
+            self.conductor.work_log.state_dict(),
+            self.device.type,
+        )
+
+    def restore(self, saved: Checkpoint, source: Path) -> None:
+        """Go on from a checkpoint, whatever device it was made on.
+
+        Raises:
+            DataError: its tensors do not belong to this run.
+        """
+        tables: dict[str, dict[str, Tensor]] = {}
+        for name, value in saved.tensors.items():
+            prefix, _, rest = name.partition("/")
+            tables.setdefault(prefix, {})[rest] = value
+        try:
+            parameters, device = tables["field"], self.device
+            self.field = GaussianField(parameters, degree=int(saved.facts["degree"])).to(device)
+            self.field.filter_3d = parameters["filter_3d"].to(device, copy=True)
+            self.optimizer.load_state_dict(tables["optimizer"], int(saved.facts["optimizer_steps"]))
+            self.density.load_state_dict(tables["density"])
+            self.conductor.load_state_dict(tables.get("strategies", {}))
+            self.conductor.work_log.load_state_dict(saved.work_log)
+        except (KeyError, ValueError, TypeError) as error:
+            raise DataError(
+                source, "tensors", f"do not fit this run ({error})", "resume with the run's own config"
+            ) from error
+        self.t = saved.t
+        self.history = [dict(row) for row in saved.history]
+
+    def require_finite(self) -> None:
+        for name, value in self.field.raw().items():
+            finite = torch.isfinite(value)
+            if not bool(finite.all()):
+                bad = (~finite).flatten(1).any(1) if value.dim() > 1 else ~finite
+                raise DivergedError(
+                    f"t={self.t - 1}: {name} of {int(bad.sum())} Gaussians is not finite, first Gaussian "
+                    f"{int(bad.nonzero()[0])}. The last checkpoint is from before that; lower the learning rates."
+                )
