@@ -14,6 +14,7 @@ import inspect
 import math
 import types
 import typing
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
@@ -21,9 +22,9 @@ from typing import Any, Final, Literal, Union, get_args, get_origin
 
 from beartype import BeartypeConf
 from beartype.door import is_bearable
-from beartype.roar import BeartypeException
+from beartype.roar import BeartypeDecorHintPep585DeprecationWarning, BeartypeException
 
-from clear_strategies.errors import ClearError, SettingError
+from clear_strategies.errors import DataError, SettingError
 from rasterizers.interface import BackendUnavailable
 
 TARGET: Final = "_target_"
@@ -107,11 +108,17 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
         raise SettingError(f"{_joined(key, missing[0])}: is needed and missing. Add {_joined(key, missing[0])}=….")
     try:
         return partial()
+    except DataError:
+        raise
     except (ValueError, BackendUnavailable) as error:
-        if isinstance(error, ClearError) and not isinstance(error, SettingError):
-            raise
-        message = one_line(error)
-        raise SettingError(f"{key}: {message}" if key and not message.startswith(key) else message) from error
+        raise SettingError(_with_key(one_line(error), key, parameters)) from error
+
+
+def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
+    """The message with the key of the configuration in front, which is that of the field that the message begins with."""
+    if not key or message.startswith(key):
+        return message
+    return f"{key}.{message}" if message.partition(" ")[0] in parameters else f"{key}: {message}"
 
 
 _VARIADIC: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
@@ -185,9 +192,11 @@ def _merged(defaults: Mapping[str, Any], node: Mapping[str, Any]) -> dict[str, A
     merged = {**defaults}
     for key, value in node.items():
         default = merged.get(key)
-        both = isinstance(default, Mapping) and isinstance(value, Mapping)
-        same = both and value.get(TARGET, default.get(TARGET)) == default.get(TARGET)
-        merged[key] = _merged(default, value) if same else value
+        if isinstance(default, Mapping) and isinstance(value, Mapping):
+            same = value.get(TARGET, default.get(TARGET)) == default.get(TARGET)
+            merged[key] = _merged(default, value) if same else value
+        else:
+            merged[key] = value
     return merged
 
 
@@ -210,8 +219,10 @@ def _of_type(value: Any, hint: Any, key: str) -> Any:
         raise SettingError(f"{key}: must be {_in_words(hint)}, got {value}.")
     for candidate in (value, tuple(value)) if isinstance(value, list) else (value,):
         try:
-            if is_bearable(candidate, hint, conf=_NUMBERS):
-                return candidate
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", BeartypeDecorHintPep585DeprecationWarning)
+                if is_bearable(candidate, hint, conf=_NUMBERS):
+                    return candidate
         except BeartypeException:  # a hint that beartype does not know
             return value
     shown = repr(value) if isinstance(value, str | int | float | list | Mapping | None) else f"a {type(value).__name__}"

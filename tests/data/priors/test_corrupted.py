@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from clear_strategies.core import images
 from clear_strategies.data.priors.corrupted import Corrupted
 from clear_strategies.data.priors.upscale import Bicubic, Cached
 from clear_strategies.run import CONF
+from clear_strategies.settings import build
 
 
 def photo(seed: int = 0):
@@ -51,7 +52,7 @@ def test_its_label_names_the_prior_and_says_synthetic():
 def test_a_network_inside_is_cached_and_the_config_builds_it(tmp_path):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", ["prior=corrupted", "prior.prior.path=net.onnx", "prior.share=0.5"])
-    prior = instantiate(config.prior, _convert_="object")
+    prior = build(OmegaConf.to_container(config.prior))
     assert isinstance(prior.prior, Cached)
     assert (prior.prior.prior.path, prior.share) == ("net.onnx", 0.5)
 
