@@ -116,7 +116,7 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
 
 def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
     """The message with the key of the configuration in front, which is that of the field that the message begins with."""
-    if not key or message.startswith(key):
+    if not key or message.startswith((f"{key}.", f"{key}:")):
         return message
     return f"{key}.{message}" if message.partition(" ")[0] in parameters else f"{key}: {message}"
 
@@ -215,6 +215,9 @@ def _refuse_unknown(
 
 def _of_type(value: Any, hint: Any, key: str) -> Any:
     """The value, if it is of the annotated type; a list becomes the tuple that is asked for."""
+    origin = get_origin(hint)
+    if isinstance(value, dict) and isinstance(origin, type) and issubclass(origin, Mapping):
+        return {name: _of_type(entry, get_args(hint)[1], _joined(key, name)) for name, entry in value.items()}
     if isinstance(value, bool) and not _takes_bool(hint):
         raise SettingError(f"{key}: must be {_in_words(hint)}, got {value}.")
     for candidate in (value, tuple(value)) if isinstance(value, list) else (value,):
@@ -255,8 +258,7 @@ def _in_words(hint: Any) -> str:
     if origin is tuple:
         return f"a list of {len(inner)} numbers"
     if isinstance(origin, type) and inner:
-        each = _in_words(inner[-1])
-        return f"names with {each} each" if issubclass(origin, Mapping) else f"a list, each entry {each}"
+        return "a table of names" if issubclass(origin, Mapping) else f"a list, each entry {_in_words(inner[0])}"
     return f"a {hint.__name__}" if isinstance(hint, type) else str(hint)
 
 

@@ -214,14 +214,8 @@ REFUSED = {
 }
 OF_THE_DATA = {
     "data=demo data.views.shrink=200": "shrink",
-    "data=demo data.views.train=99": "99 training views are asked for",
-    "data=demo +data.path=here": "data.path is of no use",
-    "data=llff": "data.path: is needed and missing",
     "data=llff data.path=nowhere": "nowhere: folder: is not there",
-    "+scene=fern data=llff": "data.root: is needed and missing",
     "prior=onnx prior.path=nowhere.onnx": "nowhere.onnx",
-    "prior=images prior.path=nowhere": "nowhere",
-    "data.cloud.init=ply data.cloud.path=nowhere.ply": "nowhere.ply",
     "fit.resume=nowhere": "no checkpoint is here",
 }
 HEAVY = {"cv2", "scipy", "skimage", "kornia", "matplotlib", "open3d"}

@@ -101,7 +101,8 @@ REFUSED = {
     "inner: builtins.nothing cannot be imported": {"share": 1, "inner": {TARGET: "builtins.nothing"}},
     "names: must be a list, each entry text or null, got [1]": {"share": 1, "names": [1]},
     "color: must be a list of 2 numbers, got [1]": {"share": 1, "color": [1]},
-    "weights: must be names with a number each, got {'x': 'y'}": {"share": 1, "weights": {"x": "y"}},
+    "weights.x: must be a number, got 'y'": {"share": 1, "weights": {"x": "y"}},
+    "weights: must be a table of names, got 3": {"share": 1, "weights": 3},
     "weights.x: must be a finite number, got nan": {"share": 1, "weights": {"x": float("nan")}},
     "on: must be true or false or auto, got 1": {"share": 1, "on": 1},
 }
