@@ -1,4 +1,4 @@
-"""Writing results so that nothing is lost: a file is there whole, or as it was before."""
+"""Atomic writes: a file is either whole or as it was before."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write beside the target, flush to disk, then rename over it."""
+    """Write a file beside the target, flush it to disk, then rename it to the target."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
@@ -23,7 +23,7 @@ def write_bytes(path: Path, data: bytes) -> None:
             os.fsync(file.fileno())
         partial.replace(path)
     finally:
-        partial.unlink(missing_ok=True)  # there only if something, Ctrl-C too, went wrong above
+        partial.unlink(missing_ok=True)  # exists only after an exception or Ctrl-C above
 
 
 def write_text(path: Path, text: str) -> None:
@@ -32,12 +32,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """JSON, atomically; NaN and infinities become null, which JSON has no other word for."""
+    """JSON, atomically. NaN and infinities, which JSON does not have, become null."""
     write_text(path, json.dumps(_without_nan(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def write_csv(path: Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[str]) -> None:
-    """A table, atomically; a missing cell or a NaN is empty."""
+    """CSV, atomically. A missing cell or a NaN is empty; keys that are not in `columns` are ignored."""
     text = io.StringIO()
     writer = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
     writer.writeheader()

@@ -19,7 +19,7 @@ from typing import Any, Final
 
 import torch
 
-from clear_strategies.data.priors.upscale import Images
+from clear_strategies.data.priors import Images
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.merging.conductor import Conductor
 from integration.inria import THRESHOLD, Attached, Render, attach

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import View
-from clear_strategies.data.priors.upscale import Images
+from clear_strategies.data.priors import Images
 from clear_strategies.merging.conductor import Conductor
 from integration.attach import Attachment, Drawing, HostError, Which
 from integration.densify import warn_of_early_end, warn_of_unread_score

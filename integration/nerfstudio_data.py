@@ -15,7 +15,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.data.priors.upscale import Bicubic, Images, Onnx, Prior, cached
+from clear_strategies.data.priors import Bicubic, Images, Onnx, Prior, cached
 from clear_strategies.errors import DataError
 from integration.views import view
 

@@ -10,13 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import Photo, View
-from clear_strategies.data.priors.upscale import Images
+from clear_strategies.data.priors import Images
 from clear_strategies.errors import DataError
 from clear_strategies.merging.conductor import Conductor
 from rasterizers.interface import Camera
 
 SuperResolve = Callable[[str, Float[Tensor, "h w 3"], int], Float[Tensor, "H W 3"]]
-"""I_HR of the view of this name, from its LR image and the factor: any of `clear_strategies.data.priors.upscale`, or yours."""
+"""I_HR of the view of this name, from its LR image and the factor: any of `clear_strategies.data.priors`, or yours."""
 
 
 def view(
@@ -50,7 +50,7 @@ def view(
             name, "SR image", f"is {enlarged.shape[1]}x{enlarged.shape[0]}, but {factor} times {w}x{h} is "
             f"{w * factor}x{h * factor}", "super-resolve the very images that the host trains on",
         )  # fmt: skip
-    return View(name, Photo(low, image), Photo(low.scaled(factor), enlarged), reference=getattr(sr, "label", "unknown"))
+    return View(name, Photo(low, image), Photo(low.scaled(factor), enlarged), sr_source=getattr(sr, "label", "unknown"))
 
 
 def super_resolve(sr: SuperResolve | str | Path | None, conductor: Conductor, factor: int) -> tuple[SuperResolve, int]:

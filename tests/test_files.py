@@ -1,4 +1,4 @@
-"""A file is there whole or as it was before, and JSON and CSV say what cannot be said as a number."""
+"""A file is whole or as it was before; numbers that JSON and CSV do not have become null and empty."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_folders_are_made_and_a_file_is_replaced(tmp_path: Path) -> None:
+def test_missing_folders_are_made_and_an_old_file_is_replaced(tmp_path: Path) -> None:
     target = tmp_path / "a" / "b" / "ω.txt"
     files.write_text(target, "1")
     files.write_text(target, "ω̃ = 2")

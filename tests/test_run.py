@@ -75,7 +75,7 @@ def test_the_plan_is_printed_before_training(finished):
         "LR ",
         "HR ",
         "initial points",
-        "test views had a part in the points",
+        "points use test views",
         "rasterizer",
         "skipped",
     ):

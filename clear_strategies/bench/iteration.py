@@ -240,7 +240,7 @@ def view_of(workload: Workload, rasterizer: Rasterizer) -> View:
         return (image + _NOISE * torch.randn(image.shape, generator=generator).to(image.device)).clamp(0, 1)
 
     lr = Photo(camera.scaled(1 / factor), noisy(images.downsample(clean, factor)))
-    return View("bench", lr, Photo(camera, noisy(clean)), reference="render plus noise")
+    return View("bench", lr, Photo(camera, noisy(clean)), sr_source="render plus noise")
 
 
 def _plain(prototype: Prototype, cuts: Mapping[str, float]) -> Contender:

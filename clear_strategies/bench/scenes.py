@@ -197,7 +197,7 @@ def from_checkpoint(path: Path) -> Workload:
         raise DataError(path, "tensors", f"lack {', '.join(sorted(missing))}", "give the checkpoint of a training run")
     field = GaussianField(tensors, degree=int(saved.facts.get("degree", 3)))
     field.filter_3d = tensors["filter_3d"]
-    splats = replace(field.fused(), sh0=field.fused().sh0 + field.detail.data[:, None] / SH_C0, rgb_offset=None)
+    splats = replace(field.baked(), sh0=field.baked().sh0 + field.detail.data[:, None] / SH_C0, rgb_offset=None)
     return Workload(f"{path.resolve().parent.name}/{path.name}", splats, facing_all(splats))
 
 

@@ -1,12 +1,12 @@
-"""Floor 0: numbers that are read late.
+"""Scalars that stay on the device until somebody reads them.
 
-What a computation says in one number is a 0-dim tensor. In the CPU's memory it is read at once. On a device reading it would
-make the host wait for all that is under way there; so it stays a tensor, what is to be made of it stays a recipe, and whoever
-needs numbers reads all that have gathered, in one transfer. What becomes of a number is the same function in both cases:
+A scalar on the CPU is read at once. Reading a scalar from CUDA would make the host wait for all queued work. It therefore
+stays a 0-dim tensor, a function of such scalars stays a `Deferred`, and `read` or `resolve` fetch many of them in one
+transfer. The same code serves both cases:
 
-    error = late.scalar((image - target).square().mean())    # a float on the CPU, elsewhere the tensor itself
-    psnr = late.made(decibels, error)                        # decibels(error) on the CPU, elsewhere a recipe
-    late.settle(history)                                     # from here on floats, wherever they came from
+    error = deferred.scalar((image - target).square().mean())   # a float on the CPU, else the tensor itself
+    psnr = deferred.defer(decibels, error)                      # decibels(error) on the CPU, else a `Deferred`
+    deferred.resolve(history)                                   # every number becomes a float
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ from torch import Tensor
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deferred:
-    """What `recipe` makes of its parts once they are read; it may also say what it finds."""
+    """A function of scalars that have not been read yet. The function may log."""
 
     recipe: Callable[..., float]
     parts: tuple[Number, ...]
 
 
 Scalar = float | Tensor
-"""To reckon with: a float, or a 0-dim tensor on a device, which nobody writes to again."""
+"""For arithmetic: a float, or a 0-dim tensor on a device that is never written to again."""
 
 Number = Scalar | Deferred
-"""To be told: in a log, a table, a message."""
+"""For logs and tables: a scalar, or a function of scalars."""
 
 
 def is_immediate(x: Tensor) -> bool:
-    """Whether numbers made of x are read where they are made: nobody waits for the CPU's own memory."""
+    """Whether scalars computed from x are read at once: x is in the CPU's memory."""
     return x.device.type == "cpu"
 
 
 def scalar(x: Tensor) -> Scalar:
-    """A 0-dim tensor as a number."""
+    """A 0-dim tensor as a float where it is read at once, else itself."""
     return float(x) if is_immediate(x) else x
 
 
 def defer(recipe: Callable[..., float], *numbers: Number) -> Number:
-    """recipe(*numbers): now, if all of them are known."""
+    """recipe(*numbers), at once if all numbers are floats."""
     if any(isinstance(x, Tensor | Deferred) for x in numbers):
         return Deferred(recipe, numbers)
     return recipe(*numbers)
 
 
 def read(numbers: Sequence[Number]) -> list[float]:
-    """The numbers as floats; all that are on the device come in one transfer."""
+    """The numbers as floats; those on the device are fetched in one transfer."""
     values = _transferred([x for number in numbers for x in _tensors(number)])
 
     def value(x: Number) -> float:
@@ -68,7 +68,7 @@ def read(numbers: Sequence[Number]) -> list[float]:
 
 
 def resolve(rows: Sequence[dict[str, Number]]) -> Sequence[dict[str, float]]:
-    """Make every number of the rows a float, in place; before a row that has been read all have been."""
+    """Turn every number of the rows into a float, in place. Rows before a resolved one are resolved already."""
     unread = list(takewhile(_is_unread, reversed(rows)))
     values = iter(read([x for row in unread for x in row.values()]))
     for row in unread:
@@ -78,16 +78,16 @@ def resolve(rows: Sequence[dict[str, Number]]) -> Sequence[dict[str, float]]:
 
 
 def ratio(part: float, whole: float) -> float:
-    """A recipe: part / whole, NaN of nothing."""
+    """Part / whole; NaN where whole is 0."""
     return part / whole if whole else math.nan
 
 
 def added(*numbers: float) -> float:
-    """A recipe: the sum."""
+    """The sum."""
     return sum(numbers)
 
 
-# Statistics of chosen rows. On the CPU the rows are gathered; elsewhere that would mean to ask how many there are.
+# Statistics of chosen rows. On the CPU the rows are gathered; on a device gathering would wait for their number.
 
 
 def total(values: Float[Tensor, " N"], chosen: Bool[Tensor, " N"]) -> Scalar:
@@ -119,7 +119,7 @@ def _tensors(x: Number) -> Iterator[Tensor]:
 
 
 def _transferred(tensors: Sequence[Tensor]) -> dict[int, float]:
-    """Each tensor's number by its id. Those of one type are stacked first: few kernels serve many numbers."""
+    """Each tensor's number by its id. Tensors of one type are stacked first, so that few kernels fetch many numbers."""
     by_type: defaultdict[torch.dtype, list[Tensor]] = defaultdict(list)
     for x in {id(x): x for x in tensors}.values():
         by_type[x.dtype].append(x)

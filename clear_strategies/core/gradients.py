@@ -1,4 +1,4 @@
-"""Floor 0: per-Gaussian gradients by attribute, their row algebra, and what strategies see of a rendering."""
+"""Per-Gaussian gradients by attribute, their row algebra, and the rendering as strategies use it."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ CONFLICT_GROUPS: Final = ("means", "sh0", "shN", "opacities", "scales", "quats")
 class Grads(dict[str, Tensor]):
     """attribute -> gradient [N, …], with + and * by a number or by one number per Gaussian [N].
 
-    An attribute that is absent has gradient 0. `screen` is the gradient of the projected centre [N, 2], 1/pixel;
-    arithmetic drops it, since it is a statistic and no parameter's gradient.
+    An absent attribute has gradient 0. `screen` is the gradient of the projected centre [N, 2], 1/pixel; arithmetic
+    drops it, since it is a statistic and not the gradient of a parameter.
     """
 
     screen: Float[Tensor, "N 2"] | None
@@ -46,7 +46,7 @@ class Grads(dict[str, Tensor]):
 
 @runtime_checkable
 class Shot(Protocol):
-    """A rendering as strategies and hosts see it."""
+    """A rendering of one view, with its VJP; strategies, objective and hosts use no other type."""
 
     @property
     def image(self) -> Float[Tensor, "H W 3"]: ...
@@ -72,7 +72,7 @@ def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"
 
 
 def row_dot(a: Float[Tensor, "N ..."], b: Float[Tensor, "N ..."]) -> Float[Tensor, " N"]:
-    """⟨a_i, b_i⟩ in float64: no product of two finite float32 numbers over- or underflows there (STRESS §2)."""
+    """⟨a_i, b_i⟩ in float64: no product of two finite float32 numbers over- or underflows there."""
     return (a.double() * b.double()).flatten(1).sum(1) if a.dim() > 1 else a.double() * b.double()
 
 
@@ -84,7 +84,7 @@ def row_norm(a: Float[Tensor, "N ..."]) -> Float[Tensor, " N"]:
 def conflict_ratio(lr: Grads, hr: Grads) -> dict[str, Number]:
     """Share of Gaussians whose LR and HR gradients point apart (cosine < 0), by group and for the groups together.
 
-    Counted among Gaussians where neither gradient is zero: invisible and dropped ones have no say (METHOD, F38, F42).
+    Counted among Gaussians where neither gradient is zero: invisible and dropped ones do not count (F38, F42).
     "gaussian" is one decision per Gaussian over its concatenated groups. NaN where nothing could be compared.
     """
     shares: dict[str, Number] = {}
@@ -103,7 +103,7 @@ def conflict_ratio(lr: Grads, hr: Grads) -> dict[str, Number]:
 
 
 def conflict_columns(conflict: Mapping[str, Number]) -> dict[str, Number]:
-    """The shares as a history calls them: "conflict" of Gaussians, "conflict_means" … of groups."""
+    """The shares by their column in the history: "conflict" of Gaussians, "conflict_means" … of groups."""
     return {("conflict" if group == "gaussian" else f"conflict_{group}"): share for group, share in conflict.items()}
 
 

@@ -1,7 +1,8 @@
-"""Floor 0: operators on images. Every image is float, [H, W, C], in [0, 1] where it is a photograph.
+"""Operators on images. Every image is float [H, W, C]; photographs are in [0, 1].
 
-D and U are here once, for the data set that makes LR images, for P2G's evidence and for the evaluation:
-a reliability measured with another kernel than the one that made LR measures the kernel (METHOD, F21).
+D and U are defined here once, for the data sets that make LR images, for P2G's evidence and for the evaluation.
+Reliability must be measured with the kernel that made LR; another kernel would measure the difference of the kernels
+(reading F21 in docs/paper.md).
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ _PIL_FILTERS: Final = {
 def downsample(image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = "bicubic") -> Float[Tensor, "h w 3"]:
     """D: reduce by a whole factor, antialiased; the result lies in [0, 1].
 
-    "bicubic", "bilinear" and "lanczos" are PIL's resize, 8 bits per pass, as the published protocols make
-    their LR images; "area" is the mean of each block, not rounded. Not differentiable.
+    "bicubic", "bilinear" and "lanczos" are PIL's resize with 8 bits per pass, as in the published protocols. "area" is
+    the mean of each block, not rounded. Not differentiable.
 
     Raises:
         ValueError: unknown kernel, or a size that is not a multiple of `factor`.
@@ -44,7 +45,7 @@ def downsample(image: Float[Tensor, "H W 3"], factor: int, kernel: DownKernel = 
 def resize(
     image: Float[Tensor, "H W 3"], size: tuple[int, int], kernel: DownKernel = "bicubic"
 ) -> Float[Tensor, "h w 3"]:
-    """D to any size (width, height), by the same operators as `downsample`; the result lies in [0, 1].
+    """D to any size (width, height), by the operators of `downsample`; the result lies in [0, 1].
 
     Raises:
         ValueError: unknown kernel, or a size that is not positive.
@@ -68,12 +69,12 @@ def area_mean(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w 
 
 
 def area_mean_transposed(cotangents: Float[Tensor, "K h w C"], factor: int) -> Float[Tensor, "K H W C"]:
-    """What cotangents of `area_mean(image)` are to the image: each spread evenly over its block."""
+    """The VJP of `area_mean`: each cotangent, divided equally among the pixels of its block."""
     return cotangents.repeat_interleave(factor, 1).repeat_interleave(factor, 2) / factor**2
 
 
 def upsample(image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel = "bicubic") -> Float[Tensor, "H W C"]:
-    """U: enlarge by a whole factor, clamped to [0, 1]. "bicubic" is PIL's (a = -0.5).
+    """U: enlarge by a whole factor, clamped to [0, 1]. "bicubic" is PIL's kernel (a = -0.5).
 
     Raises:
         ValueError: unknown kernel.
@@ -84,7 +85,7 @@ def upsample(image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel = "bic
     size = (image.shape[0] * factor, image.shape[1] * factor)
     if kernel == "nearest":
         return _hwc(F.interpolate(_nchw(image), size=size, mode="nearest"))
-    # antialias selects PIL's cubic (a = -0.5); without it torch uses a = -0.75.
+    # With antialias torch uses PIL's cubic kernel (a = -0.5), without it a = -0.75.
     large = F.interpolate(_nchw(image), size=size, mode=kernel, antialias=True, align_corners=False)
     return _hwc(large).clamp(0, 1)
 
@@ -98,7 +99,7 @@ def crop_to_multiple(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor
 def patch_means(values: Float[Tensor, "H W C"], patch: int) -> Float[Tensor, "ph pw"]:
     """Avg_p: mean over pixels and channels of each patch × patch square, aligned at the top-left.
 
-    A partial patch at the right or bottom border is averaged over the pixels that exist (METHOD, F22).
+    A partial patch at the right or bottom border is averaged over its own pixels (reading F22 in docs/paper.md).
     """
     mean = values.mean(dim=2)[None, None]
     return F.avg_pool2d(mean, patch, ceil_mode=True, count_include_pad=False)[0, 0]

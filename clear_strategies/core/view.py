@@ -27,7 +27,7 @@ class Photo:
             )
 
     def to(self, device: torch.device | str) -> Photo:
-        """The same with its image on `device`; a camera stays on the CPU, whence kernels are told its numbers."""
+        """The same photo with its image on `device`. The camera stays on the CPU, where kernels read its numbers."""
         return replace(self, image=self.image.to(device))
 
 
@@ -36,17 +36,17 @@ class View:
     """One view v: I_LR^v, I_HR^v and C^v at both scales; HR is exactly an integer times LR.
 
     Args:
-        lr: the authentic low-resolution observation.
-        hr: the super-resolved reference. Never the truth.
-        truth: the real image at HR, for evaluation only; training never touches it.
-        reference: where `hr` came from, e.g. "onnx span_x4.onnx".
+        lr: the authentic low-resolution photo.
+        hr: the super-resolved (SR) image of the prior; never the truth.
+        truth: the real photo at HR, for evaluation only; training never uses it.
+        sr_source: the prior's label, e.g. "onnx span_x4.onnx".
     """
 
     name: str
     lr: Photo
     hr: Photo
     truth: Float[Tensor, "H W 3"] | None = None
-    reference: str = "unknown"
+    sr_source: str = "unknown"
 
     @property
     def factor(self) -> int:
@@ -54,6 +54,6 @@ class View:
         return self.hr.camera.width // self.lr.camera.width
 
     def to(self, device: torch.device | str) -> View:
-        """The same with its images on `device`."""
+        """The same view with its images on `device`."""
         truth = None if self.truth is None else self.truth.to(device)
         return replace(self, lr=self.lr.to(device), hr=self.hr.to(device), truth=truth)

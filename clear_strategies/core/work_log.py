@@ -1,7 +1,7 @@
-"""Floor 0: what was computed, what was skipped and why, and how long it took. Written as timing.csv after a run.
+"""How often each stage ran, how long it took, and what was skipped and why; a run writes it as timing.csv.
 
-On CUDA nothing is waited for while training: stages are stamped by events that the device passes, skips are summed there,
-and both are read when somebody looks, or once the device is past them.
+On CUDA nothing waits while training: stages are timed by CUDA events, skips on the device are summed there, and both are
+read when the log is read or once the device has passed them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
-_BATCH: Final = 1024  # stamps that are kept before a look at how far the device has come
+_BATCH: Final = 1024  # pairs of events that are kept before those that the device has passed are read
 
 
 @dataclass(slots=True)
@@ -33,8 +33,8 @@ class WorkLog:
     """Stages by name, in the order they first appeared.
 
     Args:
-        device: where the work is done; may be set until the first stage. On "cuda" a stage's seconds are those between the
-            moments at which torch's current stream of that time reached its beginning and its end.
+        device: where the work runs; may be set until the first stage. On "cuda" a stage's seconds are measured by events
+            on the stream that is current at its beginning and at its end.
     """
 
     def __init__(self, device: torch.device | str = "cpu") -> None:
@@ -45,17 +45,17 @@ class WorkLog:
 
     @property
     def entries(self) -> dict[str, Entry]:
-        """All that was noted; waits for the device where it has not come that far."""
+        """All stages; waits for the device to finish them."""
         self._read_stamps(wait=True)
         counted, self._counted = self._counted, {}
         for (name, reason), count in counted.items():
-            if (found := int(count)) > 0:  # who counts on the device cannot know whether there was anything to count
+            if (found := int(count)) > 0:  # a count on the device may turn out to be 0
                 self._add(name, reason, found)
         return self._entries
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Count and time a block; seconds are wall-clock, on CUDA the device's, and stages do not nest."""
+        """Count and time a block. Seconds are wall-clock on the CPU and device time on CUDA. Stages do not nest."""
         on_cuda = self.device.type == "cuda"
         start = _stamp() if on_cuda else time.perf_counter()
         try:
@@ -71,16 +71,16 @@ class WorkLog:
                 entry.seconds += time.perf_counter() - start
 
     def skip(self, name: str, reason: str, count: int | Shaped[Tensor, ""] = 1) -> None:
-        """Count a block that was not needed, or `count` rows of one; a number on the device is read late."""
+        """Count a skipped block, or `count` skipped rows of one; a count on the device is read later."""
         if not isinstance(count, Tensor):
             self._add(name, reason, count)
         elif (name, reason) in self._counted:
             self._counted[name, reason] += count
         else:
-            self._counted[name, reason] = count.to(torch.int64, copy=True)  # the caller may write over its own
+            self._counted[name, reason] = count.to(torch.int64, copy=True)  # the caller may overwrite its tensor
 
     def rows(self) -> list[dict[str, str | int | float]]:
-        """One row a stage: runs, ms each, seconds, and the skips with what they saved at that price."""
+        """One row per stage: runs, ms per run, seconds, skips, and the seconds that these saved at that rate."""
         table: list[dict[str, str | int | float]] = []
         for name, entry in self.entries.items():
             each = entry.seconds / entry.runs if entry.runs else 0.0
@@ -103,7 +103,7 @@ class WorkLog:
         return {name: asdict(entry) for name, entry in self.entries.items()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Count on from there."""
+        """Continue from a saved log."""
         self._stamped.clear()
         self._counted.clear()
         self._entries = {name: Entry(**entry) for name, entry in state.items()}
@@ -113,7 +113,7 @@ class WorkLog:
         skipped[reason] = skipped.get(reason, 0) + count
 
     def _read_stamps(self, *, wait: bool) -> None:
-        """Turn stamps into seconds: those that the device has passed, or, waiting, all."""
+        """Turn pairs of events into seconds: those that the device has passed, or all if `wait`."""
         while self._stamped and (wait or self._stamped[0][2].query()):
             entry, start, end = self._stamped.popleft()
             end.synchronize()
@@ -121,7 +121,7 @@ class WorkLog:
 
 
 def _stamp() -> Any:
-    """An event that CUDA will time when its current stream gets here."""
+    """A CUDA event, recorded on the current stream."""
     event: Any = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
     event.record()
     return event

@@ -1,12 +1,10 @@
-"""Lenses and poses as the readers find them, and the pinhole cameras they become."""
+"""Lenses and poses as files give them: intrinsics, their undistortion by OpenCV, and camera-to-world matrices."""
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -15,10 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.capture import Frame
-from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.errors import DataError
-from rasterizers.interface import Camera
 
 _LARGEST_SIDE: Final = 1 << 20
 _BORDER_SAMPLES: Final = 33
@@ -42,10 +37,10 @@ class Lens:
     fisheye: bool = False
 
     def check(self, file: Path, where: str) -> Lens:
-        """Itself.
+        """The lens itself, if its numbers are plausible.
 
         Raises:
-            DataError: a number is not finite, or lies where no camera's does.
+            DataError: a number is not finite, or no camera has it.
         """
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not all(math.isfinite(x) and abs(x) < 1e12 for x in numbers):
@@ -68,7 +63,7 @@ class Lens:
         """The same lens for an image scaled to another size, each axis by its own factor.
 
         Raises:
-            DataError: one factor, up to a pixel of rounding, does not explain both sizes: `file` is another image.
+            DataError: the two sizes have another aspect ratio, beyond a pixel of rounding: `file` is another image.
         """
         low = max((width - 1) / self.width, (height - 1) / self.height)
         high = min((width + 1) / self.width, (height + 1) / self.height)
@@ -83,10 +78,10 @@ class Lens:
         )
 
     def undistorted(self, file: Path) -> Lens:
-        """The pinhole of the undistorted image: the same size, zoomed until every pixel has data.
+        """The pinhole of the undistorted image: the same size, zoomed so that every pixel has data.
 
         Raises:
-            DataError: the distortion folds the image over itself, so that there is no such pinhole.
+            DataError: there is no such pinhole, because the distortion folds the image over itself.
         """
         if not self.distorts:
             return replace(self, distortion=())
@@ -99,7 +94,7 @@ class Lens:
         return pinhole
 
     def undistort(self, image: Float[Tensor, "H W 3"], pinhole: Lens) -> Float[Tensor, "H W 3"]:
-        """The image that `pinhole` sees; bicubic, in [0, 1]."""
+        """The image resampled for `pinhole`; bicubic, in [0, 1]."""
         import cv2
 
         x, y = _sampling_maps(self, pinhole)
@@ -107,55 +102,8 @@ class Lens:
         return torch.from_numpy(result).clamp(0, 1)
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """K as OpenCV has it: the first pixel is centred at (0, 0)."""
+        """K in OpenCV's convention: the first pixel is centred at (0, 0)."""
         return np.array([[self.fx, 0, self.cx - 0.5], [0, self.fy, self.cy - 0.5], [0, 0, 1.0]])
-
-
-def make_frame(
-    name: str,
-    image: Path,
-    lens: Lens,
-    pose: Float[Tensor, "4 4"],
-    *,
-    background: tuple[float, float, float] | None = None,
-    split: str | None = None,
-    sfm_id: int | None = None,
-) -> Frame:
-    """A frame whose lens is fitted to the image's real size; only the image's header is read now.
-
-    Args:
-        lens: for the image at any size. pose: world to camera, OpenCV axes.
-        background: RGB in [0, 1] behind transparent pixels; None: black, logged.
-
-    Raises:
-        DataError: the image is not there, or its shape is not the lens's.
-    """
-    width, height = image_size(image)
-    fitted = lens.resized(width, height, image)
-    pinhole = fitted.undistorted(image)
-    camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
-    return Frame(name, camera, partial(_load, image, fitted, pinhole, background), split=split, sfm_id=sfm_id)
-
-
-def lens_notes(lenses: Sequence[Lens], frames: Sequence[Frame]) -> dict[str, str]:
-    """What became of each frame's lens, for the printed plan."""
-    notes = {}
-    pairs = [(lens, frame.camera) for lens, frame in zip(lenses, frames, strict=True)]
-    scaled = [(a, b) for a, b in pairs if (a.width, a.height) != (b.width, b.height)]
-    if scaled:
-        lens, camera = scaled[0]
-        notes["cameras"] = (
-            f"{len(scaled)} of {len(frames)} rescaled to their photos, e.g. {lens.width}x{lens.height} to "
-            f"{camera.width}x{camera.height}: x {camera.width / lens.width:.5g}, y {camera.height / lens.height:.5g}"
-        )
-    bent = [(a, b) for a, b in pairs if a.distorts]
-    if bent:
-        lens, camera = bent[0]
-        notes["lens"] = (
-            f"{len(bent)} of {len(frames)} photos undistorted by OpenCV (bicubic, no borders), "
-            f"e.g. fx {lens.fx * camera.width / lens.width:.5g} to {camera.fx:.5g} px"
-        )
-    return notes
 
 
 def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4 4"]:
@@ -172,7 +120,7 @@ def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4
     full[: len(rows)] = np.array(rows, float)
     if np.abs(full[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise DataError(file, where, f"has the last row {full[3].tolist()}", remedy)
-    rotation = full[:3, :3] * np.array([1.0, -1.0, -1.0])  # OpenGL's y and z point the other way
+    rotation = full[:3, :3] * np.array([1.0, -1.0, -1.0])  # OpenGL's y and z axes are opposite
     return rigid_inverse(file, where, rotation, full[:3, 3])
 
 
@@ -187,36 +135,14 @@ def rigid_inverse(file: Path, where: str, rotation: np.ndarray, center: np.ndarr
             file, where, f"holds no rotation (determinant {np.linalg.det(rotation):.4g})",
             "remove scale and reflection from the camera-to-world matrices",
         )  # fmt: skip
-    left, _, right = np.linalg.svd(rotation)  # the nearest exact rotation: files keep six digits
+    left, _, right = np.linalg.svd(rotation)  # the nearest exact rotation, because files keep six digits
     pose = np.eye(4)
     pose[:3, :3] = (left @ right).T
     pose[:3, 3] = -pose[:3, :3] @ center
     return torch.from_numpy(pose)
 
 
-def by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:
-    """Frames in order of names.
-
-    Raises:
-        DataError: two have the same name, or there is none.
-    """
-    if not frames:
-        raise DataError(file, "frames", "there is none", "give a capture with at least one posed photo")
-    ordered = tuple(sorted(frames, key=lambda f: f.name))
-    for frame, following in itertools.pairwise(ordered):
-        if frame.name == following.name:
-            raise DataError(file, "file name", f"{frame.name!r} belongs to two frames", "give each photo one pose")
-    return ordered
-
-
-def _load(
-    path: Path, lens: Lens, pinhole: Lens, background: tuple[float, float, float] | None
-) -> Float[Tensor, "H W 3"]:
-    image = read_image(path, background=background, expect=(lens.width, lens.height))
-    return lens.undistort(image, pinhole) if lens.distorts else image
-
-
-@lru_cache(maxsize=64)  # the frames of a capture share few lenses
+@lru_cache(maxsize=64)  # a capture has few lenses
 def _filled_pinhole(lens: Lens) -> Lens | None:
     import cv2
 
@@ -236,7 +162,7 @@ def _filled_pinhole(lens: Lens) -> Lens | None:
 
 
 def _covers(lens: Lens, pinhole: Lens) -> bool:
-    """Whether the border of the new image comes from inside the old one, up to OpenCV's approximation of it."""
+    """Whether the border of the new image lies inside the old one, up to OpenCV's approximation."""
     import cv2
 
     t = np.linspace(0, 1, _BORDER_SAMPLES)
@@ -255,7 +181,7 @@ def _covers(lens: Lens, pinhole: Lens) -> bool:
 
 @lru_cache(maxsize=1)
 def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
-    """Where in the distorted image each pixel of the new one lies."""
+    """The position of each new pixel in the distorted image."""
     import cv2
 
     maps = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap

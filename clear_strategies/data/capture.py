@@ -1,17 +1,25 @@
-"""What a reader hands over: posed photos at their own size, and the points a structure-from-motion found.
+"""Posed photos, as readers return them: frames, the capture that holds them, and its structure-from-motion points.
 
-Readers know files; they know nothing of splits, scales, priors or training. `scene.py` makes a `Scene` of it.
+Readers know files. They know nothing of splits, scales, priors or training; `prepare.py` makes a `Scene` of a capture.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from clear_strategies.data.cameras import Lens
+from clear_strategies.data.photo_files import image_size, read_image
+from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
+
+Color = tuple[float, float, float]  # RGB in [0, 1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,10 +28,10 @@ class Frame:
 
     Args:
         name: unique in its capture, e.g. the file's name.
-        camera: pinhole (already undistorted), on the pixel grid of the image that `load` returns.
-        load: reads the image, float32 [H, W, 3] in [0, 1]; called when needed, so unused views cost nothing.
-        split: "train" or "test" where the data set itself says so (Blender), else None.
-        sfm_id: the id by which `SfmPoints.seen_by` speaks of this frame, or None.
+        camera: pinhole (undistorted), on the pixel grid of the image that `load` returns.
+        load: decodes the image, float32 [H, W, 3] in [0, 1]. Readers never call it; the size is in `camera`.
+        split: "train" or "test" where the data set itself defines the split (Blender), else None.
+        sfm_id: the frame's id in `SfmPoints.track_image`, or None.
     """
 
     name: str
@@ -32,29 +40,97 @@ class Frame:
     split: str | None = None
     sfm_id: int | None = None
 
+    @staticmethod
+    def of_photo(
+        name: str,
+        path: Path,
+        lens: Lens,
+        pose: Float[Tensor, "4 4"],
+        *,
+        background: Color | None = None,
+        split: str | None = None,
+        sfm_id: int | None = None,
+    ) -> Frame:
+        """The frame of a file, with the lens fitted to the photo's real size. Reads the file's header only.
+
+        Args:
+            lens: for the photo at any size.
+            pose: world to camera, OpenCV axes.
+            background: behind transparent pixels; None: black, logged.
+
+        Raises:
+            DataError: the photo is not there, or has another aspect ratio than the lens.
+        """
+        width, height = image_size(path)
+        fitted = lens.resized(width, height, path)
+        pinhole = fitted.undistorted(path)
+        camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
+        return Frame(name, camera, partial(_load, path, fitted, pinhole, background), split=split, sfm_id=sfm_id)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SfmPoints:
-    """Triangulated points with their tracks, flattened: frame `seen_by[j]` saw point number `point[j]`."""
+    """Triangulated points with their tracks, flattened: point `track_point[j]` is observed in frame `track_image[j]`."""
 
     means: Float[Tensor, "N 3"]
     colors: Float[Tensor, "N 3"]
-    point: Int[Tensor, " M"]
-    seen_by: Int[Tensor, " M"]
+    track_point: Int[Tensor, " M"]
+    track_image: Int[Tensor, " M"]
     source: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capture:
-    """A set of posed photos, sorted by name, and what is known of the scene's structure.
+    """A set of posed photos, sorted by name unless the data set has an order of its own, and its points.
 
     Args:
-        background: what lies behind (white for Blender's RGBA), RGB in [0, 1].
+        background: the colour behind the scene (white for Blender's RGBA).
         notes: label -> fact for the printed plan (where poses came from, what was undistorted …).
     """
 
     name: str
     frames: tuple[Frame, ...]
     points: SfmPoints | None = None
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Color = (0.0, 0.0, 0.0)
     notes: dict[str, str] = field(default_factory=dict)
+
+
+def sorted_by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:
+    """Frames in order of names.
+
+    Raises:
+        DataError: two have the same name, or there is none.
+    """
+    if not frames:
+        raise DataError(file, "frames", "there is none", "give a capture with at least one posed photo")
+    ordered = tuple(sorted(frames, key=lambda f: f.name))
+    for frame, following in itertools.pairwise(ordered):
+        if frame.name == following.name:
+            raise DataError(file, "file name", f"{frame.name!r} belongs to two frames", "give each photo one pose")
+    return ordered
+
+
+def lens_notes(lenses: Sequence[Lens], frames: Sequence[Frame]) -> dict[str, str]:
+    """How each frame's lens was changed, for the printed plan."""
+    notes = {}
+    pairs = [(lens, frame.camera) for lens, frame in zip(lenses, frames, strict=True)]
+    scaled = [(a, b) for a, b in pairs if (a.width, a.height) != (b.width, b.height)]
+    if scaled:
+        lens, camera = scaled[0]
+        notes["cameras"] = (
+            f"{len(scaled)} of {len(frames)} rescaled to their photos, e.g. {lens.width}x{lens.height} to "
+            f"{camera.width}x{camera.height}: x {camera.width / lens.width:.5g}, y {camera.height / lens.height:.5g}"
+        )
+    bent = [(a, b) for a, b in pairs if a.distorts]
+    if bent:
+        lens, camera = bent[0]
+        notes["lens"] = (
+            f"{len(bent)} of {len(frames)} photos undistorted by OpenCV (bicubic, no borders), "
+            f"e.g. fx {lens.fx * camera.width / lens.width:.5g} to {camera.fx:.5g} px"
+        )
+    return notes
+
+
+def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None) -> Float[Tensor, "H W 3"]:
+    image = read_image(path, background=background, expect=(lens.width, lens.height))
+    return lens.undistort(image, pinhole) if lens.distorts else image

@@ -1,7 +1,8 @@
-"""The one image reader: what cannot be read exactly is refused, with what to do about it.
+"""Image files, read and written. What cannot be read exactly is refused, with a remedy.
 
-The kind of file is decided by its content; a truncated file is an error and not a picture with a grey bottom; 16 bits
-stay 16 bits; alpha is composited by a stated rule; a photo that must be turned is refused, for readers disagree on it.
+The content of a file decides its kind. A truncated file is an error, not an image with a grey bottom. 16 bits stay 16
+bits. Alpha is composited over a stated background. A photo with an EXIF rotation is refused, because programs disagree
+on whether the camera's pose includes it.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ from __future__ import annotations
 import io
 import logging
 import os
-import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -47,11 +47,11 @@ def read_image(
     Args:
         background: RGB in [0, 1] behind (straight) alpha: rgb · alpha + background · (1 - alpha). None: black, logged.
         expect: (width, height) the image must have.
-        max_pixels: refused above it, before anything is decoded.
+        max_pixels: a larger image is refused before it is decoded.
 
     Raises:
-        DataError: not a PNG, JPEG, WebP or TIFF, damaged, too large, turned by EXIF, of an unknown colour mode, or of
-            another size.
+        DataError: the file is no PNG, JPEG, WebP or TIFF, is damaged or too large, or the image is rotated by EXIF, has
+            an unknown colour mode, or has another size.
     """
     with _opened(path, max_pixels) as image:
         if expect is not None and image.size != expect:
@@ -61,14 +61,12 @@ def read_image(
                 f"is {image.width}x{image.height} where {expect[0]}x{expect[1]} is expected",
                 "use images of the size the cameras were made for",
             )
-        sixteen_bits = ";16" in str(
-            getattr(image, "tile", "")
-        )  # how the file's bytes are laid out; decoding forgets it
+        sixteen_bits = ";16" in str(getattr(image, "tile", ""))  # the layout in the file, unknown after decoding
         try:
             image.load()
-        except Exception as error:  # damaged bytes make PIL's decoders raise nearly anything
+        except Exception as error:  # PIL's decoders raise many types of error on damaged bytes
             raise DataError(path, "pixels", f"cannot be decoded ({error})", "replace the damaged file") from error
-        _refuse_turned(path, image)
+        _refuse_rotated(path, image)
         pixels = _to_float(path, image, sixteen_bits)
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
     if alpha.size and alpha.min() < 1:
@@ -110,7 +108,7 @@ def image_folder(root: Path, name: str | None = None) -> Path:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder by name, decided by suffix; anything else is not looked at.
+    """The image files of a folder, by their suffix, in order of names. Other files are ignored.
 
     Raises:
         DataError: the folder is not there, or holds no image.
@@ -123,14 +121,8 @@ def list_images(folder: Path) -> list[Path]:
     return found
 
 
-def frame_number(name: str) -> int | None:
-    """The last number in a file's name: 26 of "train/r_26.png"; None where there is none."""
-    digits = re.findall(r"[0-9]+", Path(name).stem)
-    return int(digits[-1]) if digits else None
-
-
 def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> None:
-    """8-bit PNG, atomically, grey of one number a pixel; values outside [0, 1] are clamped."""
+    """8-bit PNG, written atomically; a [H, W] image is grey. Values outside [0, 1] are clamped."""
     pixels = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="PNG")
@@ -138,7 +130,7 @@ def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) 
 
 
 def jpeg(image: Float[Tensor, "H W 3"], quality: int = 90) -> bytes:
-    """A small file of an image in [0, 1], for looking at and not for measuring."""
+    """A small file of an image in [0, 1], for display and not for measurements."""
     pixels = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="JPEG", quality=quality, subsampling=0)
@@ -146,11 +138,11 @@ def jpeg(image: Float[Tensor, "H W 3"], quality: int = 90) -> bytes:
 
 
 def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) -> Path:
-    """`root / name`, if that is inside `root` after symbolic links are followed.
+    """`root / name`, if that is inside `root` once symbolic links are resolved.
 
     Args:
         file: where the name was read, for the message.
-        allow_outside: accept absolute names and links out of `root`: for data sets that one trusts.
+        allow_outside: accept absolute names and links out of `root`, for trusted data sets.
 
     Raises:
         DataError: the name is absolute or leads out of `root`.
@@ -163,10 +155,9 @@ def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) ->
         return root / name
     try:
         within = not os.path.isabs(name) and (root / name).resolve().is_relative_to(root.resolve())  # noqa: PTH117
-    except (OSError, RuntimeError, ValueError) as error:  # links in a circle, names no system can have
-        raise DataError(
-            file, "file name", f"{name[:80]!r} cannot be followed ({type(error).__name__})", "rename the file"
-        ) from error
+    except (OSError, RuntimeError, ValueError) as error:  # circular links, names that no system allows
+        problem = f"{name[:80]!r} cannot be resolved ({type(error).__name__})"
+        raise DataError(file, "file name", problem, "rename the file") from error
     if not within:
         raise DataError(
             file,
@@ -181,11 +172,11 @@ def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) ->
 def _opened(path: Path, max_pixels: int) -> Iterator[Image.Image]:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # our own limit follows, and what PIL doubts fails when it is decoded
+            warnings.simplefilter("ignore")  # PIL's warnings: our own size limit follows, and damage fails on decoding
             image = Image.open(path, formats=_FORMATS)
     except FileNotFoundError as error:
         raise DataError(path, "file", "is not there", "check the path") from error
-    except Exception as error:  # damaged headers make PIL raise nearly anything
+    except Exception as error:  # PIL raises many types of error on damaged headers
         raise DataError(
             path, "file", f"is no readable image ({type(error).__name__})", f"use one of {', '.join(_FORMATS)}"
         ) from error
@@ -197,13 +188,13 @@ def _opened(path: Path, max_pixels: int) -> Iterator[Image.Image]:
                 f"{image.width}x{image.height} is more than {max_pixels:,} pixels",
                 "downsample the images before training",
             )
-        # Only a PNG may keep its EXIF block behind the pixels; `read_image` asks again when those are decoded.
+        # A PNG may keep its EXIF block behind the pixels; `read_image` checks again after decoding them.
         if image.format != "PNG" or "exif" in image.info:
-            _refuse_turned(path, image)
+            _refuse_rotated(path, image)
         yield image
 
 
-def _refuse_turned(path: Path, image: Image.Image) -> None:
+def _refuse_rotated(path: Path, image: Image.Image) -> None:
     try:
         orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
     except Exception as error:  # as above
@@ -213,15 +204,15 @@ def _refuse_turned(path: Path, image: Image.Image) -> None:
         raise DataError(
             path,
             "EXIF orientation",
-            f"is {orientation}: the photo is stored turned, and its camera may not be",
-            "turn the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result",
+            f"is {orientation}: the photo is stored rotated, and its pose may not include that",
+            "rotate the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result",
         )
 
 
 def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.ndarray, "H W C"]:
     """[H, W, 3 or 4] in [0, 1]."""
     if image.format in ("PNG", "TIFF", "WEBP") and getattr(image, "n_frames", 1) > 1:
-        raise DataError(path, "pages", "are several in one file", "save each picture as a file of its own")
+        raise DataError(path, "pages", "are several in one file", "save each image as a file of its own")
     if image.mode in ("I;16", "I;16B", "I;16L", "I;16N"):
         grey = np.asarray(image).astype(np.float32) / 65535
         return np.repeat(grey[..., None], 3, axis=2)

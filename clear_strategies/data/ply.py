@@ -1,7 +1,7 @@
-"""PLY files: point clouds in and out, Gaussians in and out in the layout that 3DGS made the standard.
+"""PLY files: Gaussians in and out in the standard layout of 3DGS, and point clouds in.
 
-The reader believes nothing: a header is bounded, and its counts are held against the bytes that are there before a
-single one is allocated.
+The reader is strict: the header has a largest size, and its counts are compared with the file's size before anything is
+allocated.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ _ROTATION: Final = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaussianPly:
-    """Gaussians as the standard layout stores them: raw parameters, everything view-dependent included.
+    """Gaussians in the standard layout: raw parameters, view-dependent colour included.
 
     Args:
         sh0, shN: colour as spherical harmonics; B in {0, 3, 8, 15} bands in `shN`.
         opacities: logit. scales: natural logarithm. quats: wxyz, any norm.
 
     Raises:
-        ValueError: the shapes do not belong together.
+        ValueError: the shapes do not match.
     """
 
     means: Float[Tensor, "N 3"]
@@ -97,14 +97,17 @@ def write_gaussians(path: Path, g: GaussianPly, *, comments: Sequence[str] = ("S
     if not finite.all():
         i, k = np.argwhere(~finite)[0]
         raise ValueError(f"Gaussians must be finite, got {names[k]} = {columns[i, k]} in number {i}.")
-    _write(path, columns.astype("<f4", copy=False).view([(name, "<f4") for name in names])[:, 0], comments)
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(c.split())}" for c in comments)]
+    lines += [f"element vertex {len(g)}", *(f"property float {name}" for name in names), "end_header\n"]
+    # Some readers expect ASCII headers.
+    write_bytes(path, "\n".join(lines).encode("ascii", "replace") + columns.astype("<f4").tobytes())
 
 
 def read_gaussians(path: Path) -> GaussianPly:
-    """Read the standard layout; properties outside it are named in a warning and left out.
+    """Read the standard layout. Other properties are ignored, with a warning that names them.
 
     Raises:
-        DataError: not such a file: damaged, truncated, or a property is missing or not finite.
+        DataError: the file is damaged or truncated, or a property is missing or not finite.
     """
     table = _read_vertices(path)
     rest = _rest_names(sum(name.startswith("f_rest_") for name in _names(table)))
@@ -124,26 +127,11 @@ def read_gaussians(path: Path) -> GaussianPly:
     )
 
 
-def write_points(path: Path, cloud: PointCloud) -> None:
-    """Positions (float) and colours (8 bits), binary little-endian, atomically.
-
-    Raises:
-        ValueError: a number is not finite.
-    """
-    if not bool(cloud.means.isfinite().all() and cloud.colors.isfinite().all()):
-        raise ValueError("points must be finite, got NaN or infinity. Remove them first.")
-    table = np.zeros(len(cloud), [*((name, "<f4") for name in _XYZ), *((name, "u1") for name in _RGB)])
-    shades = (cloud.colors.detach().cpu().clamp(0, 1) * 255).round().to(torch.uint8)
-    for name, column in zip((*_XYZ, *_RGB), (*cloud.means.detach().cpu().T, *shades.T), strict=True):
-        table[name] = column.numpy()
-    _write(path, table, (cloud.source,))
-
-
 def read_points(path: Path) -> PointCloud:
-    """Positions and colours: red, green, blue (8 or 16 bits, or floats in [0, 1]), or f_dc of a Gaussian file, else grey.
+    """Read positions and colours: red, green, blue (8 or 16 bits, or floats in [0, 1]), or f_dc of Gaussians, else grey.
 
     Raises:
-        DataError: not a PLY, damaged, truncated, not finite, or with colours out of range.
+        DataError: the file is no PLY, is damaged or truncated, is not finite, or has colours out of range.
     """
     table = _read_vertices(path)
     names = set(_names(table))
@@ -154,13 +142,13 @@ def read_points(path: Path) -> PointCloud:
         colors, how = (_columns(path, table, _DC) * SH_C0 + 0.5).clamp(0, 1), ", the centres of Gaussians"
     else:
         colors, how = torch.full_like(means, 0.5), ", without colours"
-        _log.warning("%s: has no colours, its points are grey.", path)
-    return PointCloud(means, colors, f"{len(means):,} points of {path.name}{how}", saw_test_views="unknown")
+        _log.warning("%s: no colours, so its points are grey.", path)
+    return PointCloud(means, colors, f"{len(means):,} points of {path.name}{how}", uses_test_views="unknown")
 
 
 @dataclass(frozen=True, slots=True)
 class _Element:
-    """`element name count`, and the names and types of its row; None where a list makes rows uneven."""
+    """`element name count`, and the names and types of its row; None if a list makes rows of unequal length."""
 
     name: str
     count: int
@@ -181,7 +169,7 @@ class _Element:
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    """What a file says of itself: elements before the vertices (all even), the vertices, elements after them.
+    """A file's header: elements before the vertices (all of fixed length), the vertices, elements after them.
 
     Args:
         body: offset of the first byte after the header.
@@ -192,15 +180,6 @@ class _Header:
     vertex: _Element
     after: tuple[_Element, ...]
     body: int
-
-
-def _write(path: Path, table: np.ndarray, comments: Sequence[str]) -> None:
-    kinds = {"f4": "float", "u1": "uchar"}
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(c.split())}" for c in comments)]
-    lines += [f"element vertex {len(table)}"]
-    lines += [f"property {kinds[table.dtype[name].str[1:]]} {name}" for name in _names(table)]
-    header = "\n".join([*lines, "end_header\n"])
-    write_bytes(path, header.encode("ascii", "replace") + table.tobytes())  # some readers take headers for ASCII
 
 
 def _read_vertices(path: Path) -> np.ndarray:
@@ -225,7 +204,7 @@ def _read_binary(path: Path, header: _Header, file: BinaryIO, left: int) -> np.n
 
 
 def _read_ascii(path: Path, header: _Header, body: bytes) -> np.ndarray:
-    """Values are counted, not lines: that is what tells where a vertex ends."""
+    """By number of values, because line breaks in ASCII PLY files have no meaning."""
     vertex, skipped, words = header.vertex, sum(e.values for e in header.before), body.split()
     _check_length(path, header, skipped + vertex.values, sum(e.values for e in header.after), len(words), "values")
     try:
@@ -233,7 +212,7 @@ def _read_ascii(path: Path, header: _Header, body: bytes) -> np.ndarray:
     except ValueError as error:
         raise DataError(path, "element vertex", f"is not numeric ({error})", "export it again") from error
     table = np.zeros(vertex.count, vertex.dtype)
-    for name, column in zip(_names(table), numbers.reshape(vertex.count, -1).T, strict=True):
+    for name, column in zip(_names(table), numbers.reshape(vertex.count, len(_names(table))).T, strict=True):
         kind = table.dtype[name]
         if kind.kind in "iu":
             limits = np.iinfo(kind)
@@ -241,18 +220,18 @@ def _read_ascii(path: Path, header: _Header, body: bytes) -> np.ndarray:
             if wrong.any():
                 problem = f"must be whole and in [{limits.min}, {limits.max}], is {column[wrong][0]:g}"
                 raise DataError(path, name, problem, "export it again")
-        with np.errstate(over="ignore"):  # what overflows becomes infinite, and is found by _columns
+        with np.errstate(over="ignore"):  # overflow gives infinity, which `_columns` refuses
             table[name] = column
     return table
 
 
 def _check_length(path: Path, header: _Header, needed: int, after: int, left: int, unit: str) -> None:
-    """Hold the header's counts against what follows it."""
+    """Compare the header's counts with the data that follow it."""
     if needed > left:
-        problem = f"says {header.vertex.count} vertices, which need {needed} {unit}, but {left} are left"
+        problem = f"has a count of {header.vertex.count}, which needs {needed} {unit}, but {left} are left"
         raise DataError(path, "element vertex", problem, "the file is truncated; write it again")
     if all(e.row is not None for e in header.after) and needed + after != left:
-        problem = f"says that {needed + after} {unit} follow, but {left} do"
+        problem = f"needs {needed + after} {unit} after it, but {left} follow"
         raise DataError(path, "header", problem, "the file is damaged; write it again")
 
 
@@ -289,7 +268,7 @@ def _header_lines(path: Path, head: bytes) -> tuple[list[str], int]:
     if head.split(b"\n", 1)[0].strip() != b"ply":
         raise DataError(path, "header", "does not begin with a line `ply`", "give a .ply file")
     lines, body = list[str](), 0
-    for line in head.split(b"\n")[:-1]:  # what follows the last newline is no whole line
+    for line in head.split(b"\n")[:-1]:  # the rest after the last newline is no whole line
         body += len(line) + 1
         lines.append(line.decode("latin-1").strip())
         if lines[-1] == "end_header":
@@ -300,7 +279,7 @@ def _header_lines(path: Path, head: bytes) -> tuple[list[str], int]:
 
 def _count(path: Path, element: str, text: str) -> int:
     if not (text.isascii() and text.isdecimal() and len(text) <= _LONGEST_COUNT):
-        problem = f"must say a whole number >= 0, says {text[:40]!r}"
+        problem = f"must have a whole number >= 0 as its count, has {text[:40]!r}"
         raise DataError(path, f"element {element}", problem, "export it again")
     return int(text)
 
@@ -314,7 +293,7 @@ def _rest_names(count: int) -> tuple[str, ...]:
 
 
 def _rgb(path: Path, table: np.ndarray) -> Float[Tensor, "N 3"]:
-    """Colours in [0, 1]. Unsigned integers of 8 or 16 bits fill their range."""
+    """Colours in [0, 1]; the full range of 8-bit or 16-bit unsigned integers is mapped to it."""
     colors = _columns(path, table, _RGB)
     kinds = {table.dtype[name].str[1:] for name in _RGB}
     if kinds <= {"u1"} or kinds <= {"u2"}:
@@ -328,12 +307,12 @@ def _rgb(path: Path, table: np.ndarray) -> Float[Tensor, "N 3"]:
 
 
 def _columns(path: Path, table: np.ndarray, names: Sequence[str]) -> Float[Tensor, "N C"]:
-    """Properties as float32, all of them there and finite."""
+    """Properties as float32; each must exist and be finite."""
     missing = [name for name in names if name not in _names(table)]
     if missing:
         problem = f"is missing from the vertices, which have {', '.join(_names(table))}"
         raise DataError(path, missing[0], problem, "export it again, with this property")
-    with np.errstate(over="ignore"):  # what overflows becomes infinite
+    with np.errstate(over="ignore"):  # overflow gives infinity
         columns = np.array(structured_to_unstructured(table[list(names)], np.float32))
     finite = np.isfinite(columns)
     if not finite.all():

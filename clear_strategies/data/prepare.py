@@ -1,36 +1,37 @@
-"""From a capture to a scene: which views train, how large they are, how LR was made, what the reference is.
+"""From a capture to a scene: which views train and test, their sizes, their LR photos, SR images and initial points.
 
-Every choice here changes published numbers, so every choice is written into the scene's notes and printed as the plan.
+Every choice here changes published numbers. Therefore every choice is written into the scene's notes, which the plan
+prints.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float
-from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.photo_files import inside, list_images, read_image
-from clear_strategies.data.points.cloud import CloudSettings, initial_cloud
-from clear_strategies.data.priors.upscale import Bicubic, Prior
+from clear_strategies.data.checks import refuse, require_choice, require_whole
+from clear_strategies.data.photo_files import image_size, inside, list_images, read_image, write_png
+from clear_strategies.data.points import CloudSettings, initial_cloud, require_source
+from clear_strategies.data.priors import Bicubic, Prior
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_NOTHING_ADDED: Final = 0.5  # grey levels: what rounding to 8 bits may do
+_ROUNDING: Final = 0.5  # grey levels: the largest difference that rounding to 8 bits makes
 
 Sizes = Literal["crop", "round"]
+PhotosAre = Literal["hr", "lr"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,18 +39,21 @@ class ViewSettings:
     """Which views, at which sizes.
 
     Args:
-        train: how many training views, spread evenly over those that are not for testing; None: all of them.
-        train_names: exactly these instead, by file name without its ending.
-        test_every: every such view, in order of names, is for testing (where the data set has no split of its own).
-        test_limit: at most this many test views, evenly spread; None: all.
+        train: the number of training views, evenly spaced among those that are not for testing; None: all of them.
+        train_names: exactly these training views instead, by file name without its ending.
+        test_every: every view of this number, in order of names, is for testing, unless the data set has its own split.
+        test_limit: at most this many test views, evenly spaced; None: all.
         sr_scale: HR pixels per LR pixel.
-        shrink: the photos are first reduced by this whole factor (LLFF at 1/8 -> 1/2 of its full size: 2).
-        sizes: photos whose sizes are no multiple of shrink · sr_scale lose a few pixels at the right and the bottom
-            ("crop"), or are resized to sr_scale · round(size / (shrink · sr_scale)) and keep their border ("round").
-        photos_are: "hr": the photos are the truth at HR and LR is made from them, as in the papers; "lr": they are the
-            observations, and nobody knows HR.
+        shrink: the photos are first reduced by this whole factor (LLFF at 1/8 and 1/2 of its full size: 2).
+        sizes: what happens to photos whose sizes are no multiples of shrink · sr_scale. "crop": they lose a few pixels
+            at the right and the bottom. "round": they are resized to sr_scale · round(size / (shrink · sr_scale)).
+        photos_are: "hr": the photos are the truth at HR, and LR is made from them, as in the papers. "lr": they are the
+            LR observations, and HR is unknown.
         downsample: D, the operator that makes LR.
         lr_folder: ready-made LR images by the photos' names, instead of making them.
+
+    Raises:
+        SettingError: a value is outside its range, or contradicts another.
     """
 
     train: int | None = 3
@@ -59,36 +63,46 @@ class ViewSettings:
     sr_scale: int = 4
     shrink: int = 1
     sizes: Sizes = "crop"
-    photos_are: str = "hr"
+    photos_are: PhotosAre = "hr"
     downsample: DownKernel = "bicubic"
     lr_folder: str | None = None
 
     def __post_init__(self) -> None:
         if self.train_names is not None:
-            object.__setattr__(self, "train_names", tuple(self.train_names))
-        if self.train is not None and self.train < 1:
-            raise ValueError(f"train must be at least 1 view, got {self.train}.")
-        if self.sr_scale < 1 or self.shrink < 1:
-            raise ValueError(f"sr_scale and shrink must be at least 1, got {self.sr_scale} and {self.shrink}.")
-        if self.test_every < 2:
-            raise ValueError(f"test_every must be at least 2, got {self.test_every}.")
-        if self.sizes not in get_args(Sizes):
-            raise ValueError(f"sizes must be crop or round, got {self.sizes!r}.")
-        if self.photos_are not in ("hr", "lr"):
-            raise ValueError(f"photos_are must be hr or lr, got {self.photos_are!r}.")
+            names = [] if isinstance(self.train_names, str) else list(self.train_names)
+            if not names or not all(isinstance(name, str) for name in names):
+                rule = "must be null or a list of names"
+                refuse("data.views.train_names", rule, self.train_names, "data.views.train_names=[r_2,r_16]")
+            object.__setattr__(self, "train_names", tuple(names))
+        if self.train is not None:
+            require_whole("data.views.train", self.train, least=1)
+        if self.test_limit is not None:
+            require_whole("data.views.test_limit", self.test_limit, least=0)
+        require_whole("data.views.test_every", self.test_every, least=2)
+        require_whole("data.views.sr_scale", self.sr_scale, least=1)
+        require_whole("data.views.shrink", self.shrink, least=1)
+        require_choice("data.views.sizes", self.sizes, get_args(Sizes))
+        require_choice("data.views.photos_are", self.photos_are, get_args(PhotosAre))
+        require_choice("data.views.downsample", self.downsample, get_args(DownKernel))
         if self.photos_are == "lr" and self.lr_folder:
-            raise ValueError("with photos_are=lr the photos are the LR images; lr_folder has no use. Leave it null.")
+            rule = "must be null with photos_are=lr, because the photos are the LR images"
+            refuse("data.views.lr_folder", rule, self.lr_folder, "data.views.lr_folder=null")
 
 
 def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSettings, *, seed: int = 0) -> Scene:
-    """Split, scale, super-resolve and find the initial points.
+    """Split the frames, make LR and HR of each view, and find the initial points.
+
+    What the photos' headers tell is checked before any photo is decoded.
 
     Raises:
+        SettingError: a photo is too small for `shrink` and `sr_scale`.
         DataError: the capture cannot give what the settings ask for.
     """
     train_frames, test_frames = split(capture, views)
-    train = tuple(_view(frame, capture, views, prior, required=True) for frame in train_frames)
-    test = tuple(_view(frame, capture, views, prior, required=False) for frame in test_frames)
+    lr_files = check_headers(train_frames + test_frames, views)
+    require_source(cloud, capture.points)
+    train = tuple(_view(frame, capture, views, prior, lr_files, required=True) for frame in train_frames)
+    test = tuple(_view(frame, capture, views, prior, lr_files, required=False) for frame in test_frames)
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
     points = initial_cloud(
         cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, background=capture.background, seed=seed
@@ -106,12 +120,12 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         "test views": _names(test),
         "sizes": f"photos of {_size(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
         "LR": f"{_size(sample.lr.camera)}, {made}",
-        "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), reference: {sample.reference}",
-        "the reference adds": f"{_added_detail(train):.1f} grey levels to bicubic, on average",
+        "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), SR images: {sample.sr_source}",
+        "the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic, on average",
         "initial points": f"{len(points):,}: {points.source}",
-        "test views had a part in the points": points.saw_test_views,
+        "points use test views": points.uses_test_views,
     }
-    synthetic = "synthetic" in sample.reference
+    synthetic = "synthetic" in sample.sr_source
     return Scene(capture.name, train, test, points, capture.background, synthetic, notes)
 
 
@@ -143,18 +157,57 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
                 capture.name, "views", f"{views.train} training views are asked for, there are {len(pool)}",
                 "lower data.views.train",
             )  # fmt: skip
-        pool = [pool[i] for i in _spread(len(pool), views.train)]
+        pool = _evenly_spaced(pool, views.train)
     if not pool:
         raise DataError(capture.name, "views", "none is left for training", "give more photos")
     if views.test_limit is not None and len(test) > views.test_limit:
-        test = [test[i] for i in _spread(len(test), views.test_limit)]
+        test = _evenly_spaced(test, views.test_limit)
     return pool, test
+
+
+def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Path]:
+    """Whether these frames can be prepared, as far as headers tell. No photo is decoded.
+
+    Returns:
+        The ready-made LR image of each frame, by its name; empty without `lr_folder`.
+
+    Raises:
+        SettingError: a photo is too small for `shrink` and `sr_scale`.
+        DataError: a ready-made LR image is missing, or has another size.
+    """
+    for frame in frames:
+        if min(lr_size(frame.camera, views)) < 1:
+            rule = f"must leave a whole LR pixel of the photo {frame.name} of {_size(frame.camera)}"
+            if views.photos_are == "hr":
+                rule += f" at sr_scale={views.sr_scale}"
+            refuse("data.views.shrink", rule, views.shrink, "lower data.views.shrink")
+    if views.lr_folder is None:
+        return {}
+    folder = Path(views.lr_folder)
+    by_stem = {file.stem: file for file in reversed(list_images(folder))}
+    found = {}
+    for frame in frames:
+        stem, (width, height) = Path(frame.name).stem, lr_size(frame.camera, views)
+        if stem not in by_stem:
+            raise DataError(folder, stem, "has no LR image of this name", "name the LR images like the photos")
+        file = found[frame.name] = inside(folder, by_stem[stem].name, file=folder)
+        if image_size(file) != (width, height):
+            found_size = "{}x{}".format(*image_size(file))
+            raise DataError(
+                file, "size", f"is {found_size} where {width}x{height} is expected", "see data.views for the LR size"
+            )
+    return found
+
+
+def lr_size(camera: Camera, views: ViewSettings) -> tuple[int, int]:
+    """(width, height) of the LR photo of a camera whose photo has its own size."""
+    step = views.shrink * (views.sr_scale if views.photos_are == "hr" else 1)
+    width, height = (round(s / step) if views.sizes == "round" else s // step for s in (camera.width, camera.height))
+    return width, height
 
 
 def save_lr(scene: Scene, folder: Path) -> None:
     """Write the training and test LR images as PNG for an external SR model; prior=images reads its results."""
-    from clear_strategies.data.photo_files import write_png
-
     for view in (*scene.train, *scene.test):
         write_png(folder / f"{Path(view.name).stem}.png", view.lr.image)
     _log.info(
@@ -164,83 +217,79 @@ def save_lr(scene: Scene, folder: Path) -> None:
     )
 
 
-def _spread(n: int, count: int) -> list[int]:
-    """`count` of n indices, evenly, by the papers' rule: round(linspace), halves to even."""
-    return [round(float(x)) for x in np.linspace(0, n - 1, count)]
+def _evenly_spaced(frames: Sequence[Frame], count: int) -> list[Frame]:
+    """`count` of the frames by the papers' rule: round(linspace), halves to even."""
+    return [frames[round(float(x))] for x in np.linspace(0, len(frames) - 1, count)]
 
 
-def _view(frame: Frame, capture: Capture, views: ViewSettings, prior: Prior, *, required: bool) -> View:
-    image, camera = frame.load(), frame.camera
+def _view(
+    frame: Frame,
+    capture: Capture,
+    views: ViewSettings,
+    prior: Prior,
+    lr_files: Mapping[str, Path],
+    *,
+    required: bool,
+) -> View:
+    """The view of a frame. Without `required`, bicubic replaces an SR image that the prior does not have."""
+    photo = _reduced(frame, views)
     if views.photos_are == "lr":
-        image, camera = _reduced(image, camera, views, 1)
-        lr, hr_camera, truth = Photo(camera, image), camera.scaled(views.sr_scale), None
+        lr, hr_camera, truth = photo, photo.camera.scaled(views.sr_scale), None
     else:
-        truth, hr_camera = _reduced(image, camera, views, views.sr_scale)
+        hr_camera, truth = photo.camera, photo.image
         lr_camera = hr_camera.scaled(1 / views.sr_scale)
-        if views.lr_folder is None:
-            lr = Photo(lr_camera, images.downsample(truth, views.sr_scale, views.downsample))
+        if frame.name in lr_files:
+            size = (lr_camera.width, lr_camera.height)
+            lr = Photo(lr_camera, read_image(lr_files[frame.name], background=capture.background, expect=size))
         else:
-            lr = Photo(lr_camera, _ready_made(frame, Path(views.lr_folder), lr_camera, capture))
-    label = prior.label
+            lr = Photo(lr_camera, images.downsample(truth, views.sr_scale, views.downsample))
     try:
-        reference = prior(frame.name, lr.image, views.sr_scale)
+        sr, sr_source = prior(frame.name, lr.image, views.sr_scale), prior.label
     except DataError as missing:
         if required:
             raise
-        _log.info("%s: no SR image for this test view (%s); bicubic stands in for it.", frame.name, missing.problem)
-        reference, label = Bicubic()(frame.name, lr.image, views.sr_scale), Bicubic().label
-    return View(frame.name, lr, Photo(hr_camera, reference), truth=truth, reference=label)
+        _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", frame.name, missing.problem)
+        bicubic = Bicubic()
+        sr, sr_source = bicubic(frame.name, lr.image, views.sr_scale), bicubic.label
+    return View(frame.name, lr, Photo(hr_camera, sr), truth=truth, sr_source=sr_source)
 
 
-def _reduced(
-    image: Float[Tensor, "H W 3"], camera: Camera, views: ViewSettings, multiple: int
-) -> tuple[Float[Tensor, "h w 3"], Camera]:
-    """The photo reduced by `shrink`, its sizes whole multiples of `multiple`; see `ViewSettings.sizes`."""
+def _reduced(frame: Frame, views: ViewSettings) -> Photo:
+    """The photo reduced by `shrink`, with sizes that are whole at both scales; see `ViewSettings.sizes`."""
+    image, camera = frame.load(), frame.camera
+    multiple = views.sr_scale if views.photos_are == "hr" else 1
     if views.sizes == "round":
-        camera = rounded(camera, views.shrink, multiple)
-        return images.resize(image, (camera.width, camera.height), views.downsample), camera
+        width, height = (multiple * size for size in lr_size(camera, views))
+        camera = resized(camera, width, height)
+        return Photo(camera, images.resize(image, (width, height), views.downsample))
     image = images.crop_to_multiple(image, views.shrink * multiple)
     camera = replace(camera, width=image.shape[1], height=image.shape[0])
-    return images.downsample(image, views.shrink, views.downsample), camera.scaled(1 / views.shrink)
+    return Photo(camera.scaled(1 / views.shrink), images.downsample(image, views.shrink, views.downsample))
 
 
-def rounded(camera: Camera, shrink: int, multiple: int) -> Camera:
-    """The same rays through `multiple · round(size / (shrink · multiple))` pixels, each axis by its own ratio.
-
-    Raises:
-        ValueError: no pixel would be left.
-    """
-    width, height = (multiple * round(size / (shrink * multiple)) for size in (camera.width, camera.height))
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """The same rays through width × height pixels, each axis scaled by its own ratio."""
     x, y = width / camera.width, height / camera.height
     return replace(
         camera, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y, width=width, height=height
     )
 
 
-def _ready_made(frame: Frame, folder: Path, camera: Camera, capture: Capture) -> Float[Tensor, "h w 3"]:
-    stem = Path(frame.name).stem
-    for file in list_images(folder):
-        if file.stem == stem:
-            path = inside(folder, file.name, file=folder)
-            return read_image(path, background=capture.background, expect=(camera.width, camera.height))
-    raise DataError(folder, stem, "has no LR image of this name", "name the LR images like the photos")
-
-
 def _added_detail(views: Sequence[View]) -> float:
-    """Mean |I_HR - U(I_LR)| in grey levels of 255; where it is next to nothing, the log says what follows from that."""
+    """Mean |I_HR - U(I_LR)| in grey levels of 255. Logs a warning if there is no detail."""
     means = [float((v.hr.image - images.upsample(v.lr.image, v.factor)).abs().mean()) for v in views]
     added = 255 * sum(means) / len(means)
-    if added < _NOTHING_ADDED:
+    if added < _ROUNDING:
         _log.warning(
-            "the reference adds %.2f grey levels to bicubic: HR still holds the field in place between LR pixels, but "
-            "there is no detail to route, and no strategy can find any.", added,
+            "the SR images add %.2f grey levels to bicubic: HR still constrains the field between LR pixels, but there "
+            "is no detail to route, and no strategy can find any.", added,
         )  # fmt: skip
     return added
 
 
 def _names(views: Sequence[View]) -> str:
-    shown = ", ".join(v.name for v in views[:8]) + (", …" if len(views) > 8 else "")
-    return f"{len(views)}: {shown}" if views else "none"
+    first = ", ".join(v.name for v in views[:8]) + (", …" if len(views) > 8 else "")
+    return f"{len(views)}: {first}" if views else "none"
 
 
 def _size(camera: Camera) -> str:

@@ -1,11 +1,11 @@
-"""A scene as training takes it: views at two scales, the points it starts from, and where each came from."""
+"""A scene as training takes it: views at two scales, the initial points, and where each came from."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.view import View
@@ -13,30 +13,34 @@ from clear_strategies.core.view import View
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud:
-    """Initial points: positions in world units, colours in [0, 1].
+    """Points: positions in world units, colours in [0, 1].
 
     Args:
-        source: one phrase for the printed plan: which points, how many images made them.
-        saw_test_views: whether test views had a part in them ("no", "yes", "unknown").
+        source: one phrase for the printed plan: which points, from how many images.
+        uses_test_views: whether test views were used for the points ("no", "yes", "unknown").
     """
 
     means: Float[Tensor, "N 3"]
     colors: Float[Tensor, "N 3"]
     source: str
-    saw_test_views: str = "no"
+    uses_test_views: str = "no"
 
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def __getitem__(self, index: Int[Tensor, " K"]) -> PointCloud:
+        """The points with these indices."""
+        return replace(self, means=self.means[index], colors=self.colors[index])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Everything a run needs to know about its input.
+    """The input of a run.
 
     Args:
         background: the colour behind the Gaussians, RGB in [0, 1].
-        synthetic_prior: the references were made from the truth (the demo); reports say so.
-        notes: label -> fact, in the order they are printed in the plan and saved as provenance.
+        synthetic_prior: the SR images contain errors made on purpose, or the truth (the demo); reports say so.
+        notes: label -> fact, in the order in which the plan prints them and the provenance keeps them.
     """
 
     name: str
@@ -49,9 +53,9 @@ class Scene:
 
     @property
     def device(self) -> torch.device:
-        """Where the training views' images lie, and whatever is trained on them."""
+        """The device of the training views' images, and of what is trained on them."""
         return self.train[0].lr.image.device
 
     def to(self, device: torch.device | str) -> Scene:
-        """The same with all views on `device`; the cloud stays, for it is looked at once, on the CPU."""
+        """The same scene with all views on `device`; the cloud, which is read once, stays on the CPU."""
         return replace(self, train=tuple(v.to(device) for v in self.train), test=tuple(v.to(device) for v in self.test))

@@ -1,4 +1,4 @@
-"""JSON from strangers: no NaN, no key twice, no bottomless nesting, no number too long to be one."""
+"""JSON files read strictly: NaN, duplicate keys, deep nesting and numbers beyond a float are refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def read_object(path: Path) -> dict[str, Any]:
     """The JSON object in a file.
 
     Raises:
-        DataError: it cannot be read, is not JSON in the strict sense, or is no object.
+        DataError: it cannot be read, is no strict JSON, or is no object.
     """
 
     def refuse_constant(name: str) -> Any:
@@ -28,7 +28,7 @@ def read_object(path: Path) -> dict[str, Any]:
             raise ValueError(f"{digits[:40]} is beyond the range of a float")
         return value
 
-    def refuse_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    def refuse_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         value = dict(pairs)
         if len(value) != len(pairs):
             keys = [key for key, _ in pairs]
@@ -42,7 +42,7 @@ def read_object(path: Path) -> dict[str, Any]:
             path.read_text("utf-8"),
             parse_constant=refuse_constant,
             parse_float=finite,
-            object_pairs_hook=refuse_twice,
+            object_pairs_hook=refuse_duplicates,
         )
     except OSError as error:
         raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
@@ -59,7 +59,7 @@ def number(path: Path, where: str, value: Any) -> float:
     """A finite number.
 
     Raises:
-        DataError: it is none.
+        DataError: it is no number, or missing.
     """
     if value is None:
         raise DataError(path, where, "is missing", "give a number")

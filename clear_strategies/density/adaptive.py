@@ -46,8 +46,8 @@ class DensitySettings:
             never.
         reset_every: opacities are lowered to 0.01 this often inside the window; 0: never. White backgrounds get one
             more reset at `start`.
-        max_gaussians: the cap; said when it binds.
-        min_gaussians: pruning below it is an error.
+        max_gaussians: the cap; a warning says when it binds.
+        min_gaussians: pruning to fewer is an error.
     """
 
     threshold: float = 5e-4
@@ -85,11 +85,11 @@ class DensitySettings:
 
 
 class Density:
-    """Statistics per Gaussian, and the change of structure that follows from them.
+    """Accumulates statistics per Gaussian, and changes the structure by them.
 
     Args:
         extent: 3DGS's cameras_extent, world units. white_background: adds the early opacity reset.
-        device: where the field lies.
+        device: that of the field.
     """
 
     name: Final = "density control"
@@ -106,7 +106,7 @@ class Density:
     ) -> None:
         self.settings, self.extent, self.seed, self.white_background = settings, extent, seed, white_background
         self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
-        self._said_cap = False
+        self._warned_of_cap = False
 
     @property
     def marks(self) -> Mapping[str, int]:
@@ -115,16 +115,16 @@ class Density:
         return {"densify until": s.stop, **reset}
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
-        """Add this view's scores for the Gaussians it saw (dropped ones are not seen)."""
+        """Add the scores of this view's visible Gaussians; dropped ones are not visible."""
         if not self.settings.statistics_from < t < self.settings.stop:
             return
-        seen = shot.visible
+        visible = shot.visible
         for total, value in ((self.score, update.score), (self.ordinary, update.ordinary)):
             if self.settings.reduce == "max":
-                torch.maximum(total, torch.where(seen, value, total), out=total)
+                torch.maximum(total, torch.where(visible, value, total), out=total)
             else:
-                total.add_(torch.where(seen, value, 0.0))
-        self.count += seen
+                total.add_(torch.where(visible, value, 0.0))
+        self.count += visible
 
     def due(self, t: int) -> bool:
         """Whether a round of densification and pruning falls on t."""
@@ -179,7 +179,7 @@ class Density:
         return parents
 
     def reset_opacity(self, field: GaussianField, optimizer: Adam) -> None:
-        """Lower what is drawn to 0.01, so that only what the views confirm comes back (Mip-Splatting's form)."""
+        """Lower every rendered opacity to at most 0.01 (the form of Mip-Splatting)."""
         coefficient = field.opacity_coefficient().clamp_min(torch.finfo(torch.float32).tiny)
         target = field.filtered_opacities().clamp_max(_RESET_OPACITY) / coefficient
         field.opacities.data = torch.minimum(field.opacities.data, torch.logit(target.clamp(1e-6, 1 - 1e-6)))
@@ -195,18 +195,18 @@ class Density:
         )
 
     def _chosen(self) -> Bool[Tensor, " N"]:
-        """Which Gaussians get more structure: the top by score, as many as the threshold and the cap allow."""
+        """Which Gaussians are cloned or split: the top by score, as many as the threshold and the cap allow."""
         s = self.settings
-        seen = self.count.clamp_min(1) if s.reduce == "mean" else torch.ones_like(self.count)
-        score, ordinary = self.score / seen, self.ordinary / seen
+        views = self.count.clamp_min(1) if s.reduce == "mean" else torch.ones_like(self.count)
+        score, ordinary = self.score / views, self.ordinary / views
         wanted = count_passing(ordinary if s.mode == "quantile" else score, s.threshold)
         room = max(0, s.max_gaussians - len(score))
-        if wanted > room and not self._said_cap:
+        if wanted > room and not self._warned_of_cap:
             _log.warning(
                 "the cap of %d Gaussians binds: %d want to densify, %d may. Raise density.max_gaussians, or "
                 "density.threshold.", s.max_gaussians, wanted, room,
             )  # fmt: skip
-            self._said_cap = True
+            self._warned_of_cap = True
         return topk_mask(score, min(wanted, room))
 
     def _place_children(self, field: GaussianField, children: slice, t: int) -> None:

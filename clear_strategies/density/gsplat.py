@@ -1,8 +1,8 @@
-"""Floor 4: another library's answer to who decides the structure: any strategy of gsplat's shape, over our field.
+"""Density control by a strategy of gsplat's interface, over our field.
 
 gsplat's strategies rewrite dicts of parameters and of optimizers by gathering rows, and read the gradient of the projected
-centres. Here they get our parameters, our Adam's moments and our score in that shape, and what they leave is taken back.
-Which row became which is not guessed: the row numbers travel as one more parameter, and are gathered with the others.
+centres. They receive our parameters, our Adam's moments and our score in that form, and their result is copied back. Row
+numbers are passed as one more parameter and gathered with the others, which gives parents[M] exactly.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from clear_strategies.core.gradients import ATTRIBUTES, Shot
 from clear_strategies.density.base import DensityError, require_in_range
 from clear_strategies.density.threshold import topk_threshold
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, SettingError
 from clear_strategies.merging.conductor import Update
 from clear_strategies.schedules import milestone
 from clear_strategies.training.field import GaussianField
@@ -34,7 +34,7 @@ from clear_strategies.training.optim import Adam
 _log = logging.getLogger(__name__)
 
 _ROWS: Final = "rows"  # the parameter that holds the row numbers
-# gsplat's names of what every densifier of ours has, and ours.
+# gsplat's name of a setting -> ours.
 _OURS: Final = {
     "refine_start_iter": "start",
     "refine_stop_iter": "stop",
@@ -44,7 +44,7 @@ _OURS: Final = {
     "cap_max": "max_gaussians",
 }
 _NEEDS_CUDA: Final = "gsplat.strategy.mcmc.MCMCStrategy"
-# Settings that ask for what a view of this trainer does not report, and the value that does not ask.
+# Settings that need statistics which this trainer does not report -> the value that needs none, and what they need.
 _NOT_REPORTED: Final = {
     "absgrad": (False, "absolute screen gradients"),
     "refine_scale2d_stop_iter": (0, "screen radii"),
@@ -54,22 +54,22 @@ _NOT_REPORTED: Final = {
 
 @dataclass(frozen=True, slots=True)
 class GsplatSettings:
-    """Which strategy, and what it shares with `DensitySettings`, by the names there; start < t < stop here as well.
+    """The strategy, and the settings that it shares with `DensitySettings`, by the names there; start < t < stop.
 
     Args:
-        strategy: `_target_`, the dotted name of a class of gsplat's shape, and its other settings by their own names. It
+        strategy: `_target_`, the dotted name of a class of gsplat's interface, and its other settings by their own names. It
             is imported when training starts.
         threshold: gsplat's grow_grad2d, on the mean over views of ‖∇_u‖ in NDC units; None: the strategy's own.
         mode: "quantile" moves the threshold so that as many Gaussians pass it by the score as would by the ordinary
             statistic; "fixed" leaves it. The same where the score is the ordinary one.
         start, stop, every: gsplat's refine_start_iter, refine_stop_iter and refine_every.
-        reset_every: 0: never (then DefaultStrategy never prunes by size either).
-        statistics_from: before it no Gaussian counts as seen.
-        max_gaussians: gsplat's cap_max; DefaultStrategy has none, there the threshold rises until it holds.
+        reset_every: iterations between opacity resets; 0: never (DefaultStrategy then never prunes by size either).
+        statistics_from: iteration before which no Gaussian counts as visible.
+        max_gaussians: gsplat's cap_max; DefaultStrategy has none, so its threshold rises until the cap holds.
         min_gaussians: fewer are an error.
 
     Raises:
-        ValueError: a setting is outside its range, or written in `strategy` although it stands beside it.
+        SettingError: a setting is outside its range, or given in `strategy` instead of beside it.
     """
 
     strategy: Mapping[str, Any]
@@ -86,9 +86,9 @@ class GsplatSettings:
     def __post_init__(self) -> None:
         for theirs, ours in _OURS.items():
             if theirs in self.strategy:
-                raise ValueError(f"strategy.{theirs} must stand beside the strategy, not in it: density.{ours}.")
+                raise SettingError(f"strategy.{theirs} must stand beside the strategy, not in it: density.{ours}.")
         if self.threshold is not None and not self.threshold > 0:
-            raise ValueError(f"threshold must be > 0, got {self.threshold}.")
+            raise SettingError(f"threshold must be > 0, got {self.threshold}.")
         require_in_range(self)
 
     def densifier(
@@ -123,8 +123,8 @@ class GsplatSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """What one view says; `score` is `ordinary` itself where no strategy of ours gave another."""
+class _ViewScores:
+    """The scores of one view; `score` is the same tensor as `ordinary` where no strategy gives another."""
 
     score: Float[Tensor, " N"]
     ordinary: Float[Tensor, " N"]
@@ -135,13 +135,13 @@ class _Seen:
 
 
 class GsplatDensifier:
-    """Drives a strategy of gsplat's shape over our field and our Adam.
+    """Runs a strategy of gsplat's interface on our field and our Adam.
 
     Args:
-        strategy: has check_sanity, initialize_state, step_pre_backward and step_post_backward. It and its `state` dict
-            are its own; tensors and numbers in the dict are saved with the run.
-        extent: 3DGS's cameras_extent, world units: gsplat's scene_scale. seed: of whatever the strategy draws.
-        device: where the field lies.
+        strategy: has check_sanity, initialize_state, step_pre_backward and step_post_backward. Tensors and numbers in
+            its `state` dict are saved with the run.
+        extent: 3DGS's cameras_extent, world units: gsplat's scene_scale. seed: of the strategy's random numbers.
+        device: that of the field.
     """
 
     def __init__(
@@ -158,9 +158,9 @@ class GsplatDensifier:
         self.kind = type(strategy).__name__
         self.state = self._initial_state()
         self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
-        self._seen: _Seen | None = None
+        self._view_scores: _ViewScores | None = None
         self._checked = False
-        self._said: set[str] = set()
+        self._warned: set[str] = set()
 
     @property
     def name(self) -> str:
@@ -174,18 +174,18 @@ class GsplatDensifier:
         return {"densify until": s.stop, **reset}
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
-        """Hold this view's score ready for `step`."""
+        """Keep this view's scores for `step`."""
         height, width = shot.image.shape[:2]
         visible = shot.visible if t > self.settings.statistics_from else torch.zeros_like(shot.visible)
-        self._seen = _Seen(update.score, update.ordinary, visible, shot.means2d.detach(), width, height)
+        self._view_scores = _ViewScores(update.score, update.ordinary, visible, shot.means2d.detach(), width, height)
 
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
-        """Let the strategy do what falls on t.
+        """Run the strategy for iteration t.
 
         Raises:
             DensityError: it left too few Gaussians, or rows that do not belong together.
         """
-        seen, self._seen = self._seen, None
+        seen, self._view_scores = self._view_scores, None
         if seen is None:
             raise ValueError(f"t={t}: step() must follow accumulate() of the same iteration.")
         n = len(field)
@@ -199,11 +199,11 @@ class GsplatDensifier:
         info = _Info(_info(seen))
         accepted = inspect.signature(self.strategy.step_post_backward).parameters
         rest = {"lr": rates["means"]} if "lr" in accepted else {}
-        lent = _Lent(params[_ROWS])
+        lent = _RowNumbers(params[_ROWS])
         with torch.no_grad(), _seeded(self.seed * 1_000_003 + t, lent.rows.device), self._threshold(t):
             self.strategy.step_pre_backward(params, optimizers, self.state, t, info)
             self.strategy.step_post_backward(params, optimizers, self.state, t, info, **rest)
-        moved = not lent.untouched(params[_ROWS])
+        moved = not lent.unchanged(params[_ROWS])
         parents = take_back(field, optimizer, params, optimizers, self.kind, moved=moved)
         self._remark(t, seen, info, optimizer)
         changed = moved and not torch.equal(parents, torch.arange(n, device=parents.device))
@@ -255,7 +255,7 @@ class GsplatDensifier:
 
     @contextmanager
     def _threshold(self, t: int) -> Iterator[None]:
-        """While the strategy may grow, its threshold is one that the right number of Gaussians pass."""
+        """Set a threshold that the right number of Gaussians pass, while the strategy may grow."""
         own = getattr(self.strategy, "grow_grad2d", None)
         if own is None or t % getattr(self.strategy, "refine_every", 1) != 0:
             yield
@@ -267,7 +267,7 @@ class GsplatDensifier:
             self.strategy.grow_grad2d = own
 
     def _selective(self, threshold: float) -> float:
-        """`threshold` where it picks as many by the score as are wanted and the cap allows, else one that does."""
+        """A threshold that as many Gaussians pass by the score as by the ordinary statistic, within the cap."""
         s, seen = self.settings, self.count.clamp_min(1)
         score, ordinary = self.score / seen, self.ordinary / seen
         wanted = int(((ordinary if s.mode == "quantile" else score) > threshold).sum())
@@ -282,7 +282,7 @@ class GsplatDensifier:
         return threshold if allowed == int((score > threshold).sum()) else topk_threshold(score, allowed)
 
     def _begin_anew(self) -> None:
-        """Our sums are set to 0 when the strategy's own are."""
+        """Set our sums to 0 when the strategy has set its own to 0."""
         count = self.state.get("count")
         if isinstance(count, Tensor):
             begun = ~count.any()
@@ -302,11 +302,11 @@ class GsplatDensifier:
     def reset_due(self, t: int) -> bool:
         return t < self.settings.stop and t % getattr(self.strategy, "reset_every", sys.maxsize) == 0
 
-    def _remark(self, t: int, seen: _Seen, info: _Info, optimizer: Adam) -> None:
-        """Say once what was set and had no effect."""
+    def _remark(self, t: int, seen: _ViewScores, info: _Info, optimizer: Adam) -> None:
+        """Warn once of settings that have no effect."""
         if seen.score is not seen.ordinary and "means2d" not in info.read:
             self._warn_once(
-                "score", f"{self.kind} reads no screen gradient: P2G's score has no effect on the structure."
+                "score", f"{self.kind} reads no screen gradient: the strategies' score has no effect on the structure."
             )
         if self.reset_due(t) and bool(optimizer.second["opacities"].any()):  # a reset leaves no momentum
             self._warn_once(
@@ -316,8 +316,8 @@ class GsplatDensifier:
             )
 
     def _warn_once(self, about: str, message: str) -> None:
-        if about not in self._said:
-            self._said.add(about)
+        if about not in self._warned:
+            self._warned.add(about)
             _log.warning("%s", message)
 
 
@@ -329,18 +329,18 @@ class Optimizer:
         self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict, {parameter: dict(moments)})
 
 
-class _Lent:
-    """The row numbers as they were lent. Whether they were gathered is seen from outside, without reading them."""
+class _RowNumbers:
+    """The row numbers as they were passed in; whether they were gathered is known without reading them."""
 
     def __init__(self, rows: nn.Parameter) -> None:
         self.rows, self._version = rows, rows._version
 
-    def untouched(self, now: Tensor) -> bool:
+    def unchanged(self, now: Tensor) -> bool:
         return now is self.rows and now._version == self._version
 
 
 class _Info(dict[str, Any]):
-    """gsplat's `info`, which notes what of it was read."""
+    """gsplat's `info`, which records the keys that are read."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         super().__init__(values)
@@ -381,10 +381,10 @@ def take_back(
     *,
     moved: bool = True,
 ) -> Int[Tensor, " M"]:
-    """Put what a strategy left into field and moments; returns parents[M].
+    """Copy a strategy's result into field and moments; returns parents[M].
 
     Args:
-        moved: whether the row numbers may be others than were lent.
+        moved: whether the row numbers may have changed.
 
     Raises:
         DensityError: the rows of parameters, moments and row numbers do not belong together.
@@ -411,7 +411,7 @@ def take_back(
     return parents
 
 
-def _info(seen: _Seen) -> dict[str, Any]:
+def _info(seen: _ViewScores) -> dict[str, Any]:
     """One camera's `info`, not packed; the screen gradient is the score, along x.
 
     gsplat takes the gradient in pixels to NDC by W/2 times the number of cameras; so its statistic is the score itself.
@@ -436,14 +436,14 @@ def _gsplat_version() -> str | None:
 
 
 def _radii_by_axis() -> bool:
-    """Since gsplat 1.5 radii are [C, N, 2], before it [C, N]."""
+    """Whether radii are [C, N, 2], as since gsplat 1.5; before they are [C, N]."""
     version = _gsplat_version()
     return version is None or tuple(int(part) for part in version.split(".")[:2]) >= (1, 5)
 
 
 @contextmanager
 def _seeded(seed: int, device: torch.device) -> Iterator[None]:
-    """What torch draws globally, as gsplat does, is here a function of (seed, t), and as before afterwards."""
+    """Seed torch's global generators, which gsplat uses, and restore them afterwards."""
     on_cuda = device.type == "cuda"
     with torch.random.fork_rng(devices=[device] if on_cuda else []):
         torch.default_generator.manual_seed(seed)  # torch.manual_seed would look for other devices, every time
@@ -453,7 +453,7 @@ def _seeded(seed: int, device: torch.device) -> Iterator[None]:
 
 
 def _imported(target: str | None, device: torch.device) -> Any:
-    """The class of that dotted name."""
+    """The class with this dotted name."""
     if target is None:
         example = "density.strategy._target_=your_package.YourStrategy"
         raise _unusable("_target_", "no strategy is named", f"{example}, or density=gsplat_default")

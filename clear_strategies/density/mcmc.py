@@ -1,6 +1,7 @@
-"""Floor 4: gsplat's MCMCStrategy where there is no CUDA (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain
-Monte Carlo"). Settings, schedule and state are gsplat's; the computations that gsplat has as CUDA kernels only, and the
-operations around them, are written here in torch. Imported by its dotted name, when a run is configured with it.
+"""gsplat's MCMCStrategy without CUDA (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
+
+Settings, schedule and state are gsplat's. The computations that gsplat has as CUDA kernels only, and the operations around
+them, are written here in torch. conf/density/gsplat_mcmc.yaml names this class.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _GROWTH: Final = 1.05  # per round
 _BINOMIALS: Final = torch.tensor(
     [[math.comb(n, j) for j in range(_MOST_COPIES + 1)] for n in range(_MOST_COPIES + 1)], dtype=torch.float64
 )
-# Only what is faint wanders: the noise is weighted by σ(100 ((1 - o) - 0.995)).
+# The noise is weighted by σ(100 ((1 - o) - 0.995)): only Gaussians of low opacity move.
 _NOISE_SLOPE: Final = 100.0
 _NOISE_FROM: Final = 0.995
 
@@ -29,7 +30,7 @@ Params = dict[str, nn.Parameter]
 
 
 class MCMC(MCMCStrategy):  # type: ignore[misc, unused-ignore]  # gsplat has no types
-    """gsplat's MCMCStrategy in torch: dead Gaussians move to live ones, new ones are added, and all wander."""
+    """gsplat's MCMCStrategy in torch: dead Gaussians move to live ones, new ones are added, and noise moves all."""
 
     def step_post_backward(
         self,
@@ -51,7 +52,7 @@ class MCMC(MCMCStrategy):  # type: ignore[misc, unused-ignore]  # gsplat has no 
 def relocation(
     opacities: Float[Tensor, " N"], scales: Float[Tensor, "N 3"], copies: Int[Tensor, " N"]
 ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N 3"]]:
-    """Opacity and scale of each of `copies` Gaussians in one place that together look like the one that was.  Eq. 9
+    """Opacity and scale of each of `copies` Gaussians that together replace one.  Eq. 9 of that paper
 
     o' = 1 - (1 - o)^(1/n), s' = s · o / Σ_j C(n, j) (-1)^(j-1) o'^j / √j: the paper's double sum, its inner binomials
     added up.
@@ -66,7 +67,7 @@ def relocation(
 
 
 def relocate(params: Params, optimizers: dict[str, Any], min_opacity: float) -> None:
-    """Dead Gaussians become copies of live ones, drawn by opacity."""
+    """Replace dead Gaussians by copies of live ones, sampled by opacity."""
     opacities = params["opacities"].sigmoid()
     dead = opacities <= min_opacity
     if not bool(dead.any()) or bool(dead.all()):
@@ -85,7 +86,7 @@ def relocate(params: Params, optimizers: dict[str, Any], min_opacity: float) -> 
 
 
 def add(params: Params, optimizers: dict[str, Any], cap: int, min_opacity: float) -> None:
-    """A twentieth more Gaussians, up to the cap: copies of those drawn by opacity."""
+    """Add a twentieth more Gaussians, up to the cap: copies of Gaussians sampled by opacity."""
     n = len(params["means"])
     more = min(cap, int(_GROWTH * n)) - n
     if more <= 0:
@@ -103,7 +104,7 @@ def add(params: Params, optimizers: dict[str, Any], cap: int, min_opacity: float
 
 
 def share(params: Params, sources: Int[Tensor, " K"], min_opacity: float) -> None:
-    """Make each source as faint and small as it and its copies to come have to be."""
+    """Lower each source's opacity and scale to those of its copies to come."""
     opacities, scales = relocation(
         params["opacities"].sigmoid()[sources], params["scales"].exp()[sources], torch.bincount(sources)[sources] + 1
     )
@@ -112,7 +113,7 @@ def share(params: Params, sources: Int[Tensor, " K"], min_opacity: float) -> Non
 
 
 def noise(params: Params, strength: float) -> Float[Tensor, "N 3"]:
-    """A random offset within each Gaussian's own covariance, the larger the fainter it is."""
+    """A random offset within each Gaussian's covariance, larger for lower opacity."""
     faint = torch.sigmoid(_NOISE_SLOPE * (1 - params["opacities"].sigmoid() - _NOISE_FROM))
     offset = torch.randn_like(params["means"]) * (faint * strength)[:, None]
     R = rotation_matrix(params["quats"])
@@ -126,7 +127,7 @@ def _rewrite(
     of_parameter: Callable[[Tensor], Tensor],
     of_moments: Callable[[Tensor], Tensor],
 ) -> None:
-    """Replace every parameter, and what its optimizer remembers of it."""
+    """Replace every parameter and its moments."""
     for name, old in list(params.items()):
         new = nn.Parameter(of_parameter(old), requires_grad=old.requires_grad)
         moments = optimizers[name].state.pop(old, {})

@@ -22,6 +22,7 @@ from clear_strategies.jobs.device import Device, RasterizerSettings
 from clear_strategies.jobs.lock import hold
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import plan, results
+from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import build
 from clear_strategies.training.loop import fit
@@ -150,11 +151,11 @@ def _run(
         _log.warning("%s: of an earlier run; removed, because its presence says that a run is finished.", metrics)
         metrics.unlink()
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
-    with plan.progress(state, watch) as progress:
+    with progress_bar(state, watch) as progress:
         fit(
             state, there, drawing.rasterizer, checkpoints=folder / "checkpoints", config=compared, progress=progress
         )  # fmt: skip
-    return results.leave(
+    return results.write_results(
         folder,
         loaded,
         state,

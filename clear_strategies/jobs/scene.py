@@ -9,10 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any, cast
 
 from clear_strategies.data.capture import Capture
-from clear_strategies.data.points.cloud import CloudSettings
+from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import ViewSettings, prepare
-from clear_strategies.data.priors.upscale import Bicubic, Prior, cached
-from clear_strategies.data.readers.demo import DemoPrior
+from clear_strategies.data.priors import Bicubic, DemoPrior, Prior, cached
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import SettingError
 from clear_strategies.settings import LISTED

@@ -1,6 +1,4 @@
-"""Floor 3: what the images should look like. Images in, losses and image-space cotangents out; knows no Gaussian.
-Eq. 4, 5
-"""
+"""The losses. Images in, losses and image-space cotangents out; the objective knows no Gaussian.  Eq. 4, 5"""
 
 from __future__ import annotations
 
@@ -13,6 +11,7 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Scalar
+from clear_strategies.errors import SettingError
 from clear_strategies.kernels import losses as kernels
 from clear_strategies.kernels.losses import Choice, LossAndGradient
 from clear_strategies.schedules import WarmupDecay
@@ -21,7 +20,7 @@ LowFrom = Literal["lr", "hr"]
 
 
 class Losses(NamedTuple):
-    """Scalars by name, and the cotangents of one image in the order of the names."""
+    """Losses by name, and their cotangents of one image in the same order."""
 
     values: Mapping[str, Scalar]
     cotangents: Float[Tensor, "K H W 3"]
@@ -34,15 +33,16 @@ class Objective:
     Args:
         lambda_hr: λ_HR(t).
         lambda_hf: λ_HF >= 0; 0 skips the high-frequency loss altogether.
-        lambda_lr: λ_LR >= 0; at 0 the LR photos take no part: nothing is drawn at LR, L_LR is for the log alone.
-        lr_from: where Î_LR comes from: drawn at "lr"; or the area mean of Î_HR, "hr", which then is all that is drawn.
+        lambda_lr: λ_LR >= 0; at 0 the LR photos are not trained on: nothing is rendered at LR, L_LR is only logged.
+        lr_from: where Î_LR comes from: rendered at "lr", or the area mean of Î_HR, "hr", which is then all that is
+            rendered.
         lambda_ssim, lambda_ssim_hr: share of 1 - SSIM in L_LR and L_base, in [0, 1]; the rest is L1.
-        haar_levels: levels of the Haar transform; 1 is the top octave, 2 is exactly the band that 4x SR adds.
+        haar_levels: levels of the Haar transform, at least 1; 1 is the top octave, 2 is the band that 4x SR adds (F18).
         clamp_render: compare renders clamped to [0, 1] (DropGaussian); 3DGS clamps for metrics only.
-        kernels: what computes the losses: "cpp", "warp", "torch", or "auto", the fastest for images where they lie.
+        kernels: what computes the losses: "cpp", "warp", "torch", or "auto", the fastest on the images' device.
 
     Raises:
-        ValueError: a setting is outside its range, or nothing would move the Gaussians at the first iteration.
+        SettingError: a setting is outside its range, or no loss acts at the first iteration.
         BackendUnavailable: kernels="cpp" was not built, or "warp" is not installed.
     """
 
@@ -60,27 +60,27 @@ class Objective:
         kernels.require(self.kernels)
         for name in ("lambda_ssim", "lambda_ssim_hr"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}.")
+                raise SettingError(f"{name} must lie in [0, 1], got {getattr(self, name)}.")
         for name in ("lambda_lr", "lambda_hf"):
             if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}.")
+                raise SettingError(f"{name} must be >= 0, got {getattr(self, name)}.")
         if self.lr_from not in get_args(LowFrom):
-            raise ValueError(f"lr_from must be lr or hr, got {self.lr_from!r}.")
+            raise SettingError(f"lr_from must be lr or hr, got {self.lr_from!r}.")
         if self.lambda_lr == 0 and not self.lambda_hr(1) > 0:
-            raise ValueError(
+            raise SettingError(
                 "without L_LR (lambda_lr=0) L_base must act from the first iteration, got "
                 f"lambda_hr.peak={self.lambda_hr.peak}, start={self.lambda_hr.start}. Set lambda_hr.start=0 and full=0."
             )
         if self.haar_levels < 1:
-            raise ValueError(f"haar_levels must be at least 1, got {self.haar_levels}.")
+            raise SettingError(f"haar_levels must be at least 1, got {self.haar_levels}.")
 
     @property
     def draws_lr(self) -> bool:
-        """Whether Î_LR is drawn; else it is the area mean of Î_HR, which is then needed at every iteration."""
+        """Whether Î_LR is rendered; else it is the area mean of Î_HR, which is then needed at every iteration."""
         return self.lr_from == "lr" and self.lambda_lr > 0
 
     def lr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:
-        """L_LR by value, and one cotangent: that of λ_LR L_LR."""
+        """L_LR, and the cotangent of λ_LR L_LR."""
         shown = self._shown(image)
         cotangents = shown.new_empty(1, *shown.shape)
         loss = kernels.photometric(shown, target, self.lambda_ssim, kernels=self.kernels, out=cotangents[0])  # Eq. 4

@@ -1,4 +1,4 @@
-"""What leaves a run: the field as a PLY that viewers show as it was measured."""
+"""point_cloud.ply: the trained field for any viewer of 3DGS files, looking as it was evaluated."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from rasterizers.geometry import SH_C0
 
 
 def export_ply(path: Path, field: GaussianField) -> None:
-    """The standard 3DGS layout with f_det folded into the colour, and the 3D filter into scales and opacities.
+    """Write the standard 3DGS layout; f_det is folded into the colour, the 3D filter into scales and opacities.
 
-    Viewers that honour the header's `SplatRenderMode: mip` draw it with opacity compensation, as it was trained.
+    A viewer that honours the header's `SplatRenderMode: mip` draws the file with opacity compensation, as in training.
     """
-    splats = field.fused()
+    splats = field.baked()
     tiny = torch.finfo(torch.float32).eps
     offset = splats.rgb_offset if splats.rgb_offset is not None else torch.zeros_like(splats.means)
     higher = torch.zeros_like(field.shN.data)
-    higher[:, : splats.shN.shape[1]] = splats.shN  # bands above the active degree were never drawn
+    higher[:, : splats.shN.shape[1]] = splats.shN  # bands above the active degree were never rendered
     write_gaussians(
         path,
         GaussianPly(

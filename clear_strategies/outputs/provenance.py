@@ -1,4 +1,4 @@
-"""Where a result came from: versions, machine, source, settings. Never fails; what cannot be known is "unknown"."""
+"""Where a result came from: versions, machine, source and settings. It never fails; a fact that cannot be found is "unknown"."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PACKAGES: Final = (
 
 
 def provenance(**facts: Any) -> dict[str, Any]:
-    """What to write beside every number; `facts` are the run's own (seed, backend, kernels, notes)."""
+    """The facts to keep with every result; `facts` are those of the run (seed, backend, plan)."""
     from rasterizers import native
 
     return {
@@ -48,7 +48,7 @@ def _processor() -> str:
 
 
 def _git() -> str:
-    """Commit of the checkout this package runs from, "+dirty" with uncommitted changes."""
+    """The commit of the checkout that this package is imported from; "+dirty" with uncommitted changes."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return "no checkout"
@@ -60,6 +60,6 @@ def _git() -> str:
 
 
 def _run(root: Path, *arguments: str) -> str:
-    # Looking must not take the lock of a checkout that someone is working in.
+    # Reading must not take the lock of a checkout that someone is working in.
     command = ["git", "--no-optional-locks", "-C", str(root), *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=10, check=True).stdout  # noqa: S603

@@ -1,20 +1,25 @@
-"""Floor 5: what a run leaves: scores, curves, pictures, maps and a PLY; metrics.json last, for it says "finished"."""
+"""The files of a finished run. metrics.json is written last: where it exists, the run is finished."""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
+from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
-from clear_strategies.outputs import maps, metrics, pictures
+from clear_strategies.outputs import metrics
+from clear_strategies.outputs.contact_sheet import SheetRow, write_contact_sheet
+from clear_strategies.outputs.curves import write_curves
 from clear_strategies.outputs.export import export_ply
+from clear_strategies.outputs.figures import spaced
+from clear_strategies.outputs.maps import write_maps
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen, marks
 from clear_strategies.outputs.provenance import provenance
@@ -23,10 +28,27 @@ from rasterizers.interface import Rasterizer
 
 _log = logging.getLogger(__name__)
 
-_SHEET_VIEWS: Final = 4  # test views on the contact sheet, and left as pictures
+# What a run writes into its folder, in this order.
+FILES: Final[Mapping[str, str]] = {
+    ".hydra/": "the configuration and the overrides that the run was started with",
+    "run.log": "what the run printed",
+    "checkpoints/": "states to resume from (`fit.resume`), the newest `fit.keep` of them",
+    "maps/": "where the prior was trusted, and where the photos overruled it, for `fit.map_views` training views",
+    "point_cloud.ply": "the field, for any viewer of 3DGS files",
+    "renders/": "every test view as rendered, at HR",
+    "views/": "LR photo, prior and truth of a few test views",
+    "contact_sheet.png": "a few test views: LR photo, prior, render, truth and error side by side",
+    "curves.png": "losses, PSNR, number of Gaussians, conflict and correction over iterations",
+    "history.csv": "one row per iteration: every number that was measured, empty where there was none",
+    "conflict.csv": "of history.csv, the iterations that compared LR with HR gradients, and their columns on conflict",
+    "timing.csv": "one row per stage: how often it ran, how long it took, what was skipped, why, and what that saved",
+    "metrics.json": "scores of every view and their means, configuration and provenance; written last",
+}
+
+_SHEET_VIEWS: Final = 4  # test views on the contact sheet and in views/, at most
 
 
-def leave(
+def write_results(
     folder: Path,
     scene: Scene,
     state: TrainState,
@@ -39,50 +61,30 @@ def leave(
     seconds: float,
     config: Mapping[str, Any],
 ) -> float | None:
-    """Evaluate, write everything, say the scores; returns the mean PSNR of the test views.
+    """Evaluate a finished run, write its files and log its scores; returns the mean PSNR of the test views, of the training
+    views where there are no test views.
 
     Args:
-        scene: on the CPU, wherever the field is. down: D, which made the LR images.
-        map_views: training views of which maps are left, at most.
-        seconds: of training. config: kept in metrics.json, for whoever finds the finished run.
+        scene: on the CPU, wherever the field is.
+        down: D, by which the LR images were made.
+        map_views: how many training views get maps, at most.
+        seconds: training time.
+        config: the run's configuration, kept in metrics.json.
     """
     field, work_log, history = state.field, state.conductor.work_log, state.history_as_floats()
     with work_log.stage("evaluate"):
         evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera).cpu(), down=down)
     with work_log.stage("maps"):
-        mapped = pictures.evenly(state.views, map_views)
-        if mapped:
-            maps.leave(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
+        if mapped := spaced(state.views, map_views):
+            write_maps(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
     export_ply(folder / "point_cloud.ply", field)
-    for name, image in evaluation.renders.items():
-        write_png(folder / "renders" / f"{Path(name).stem}.png", image)
-    for view in pictures.evenly(scene.test, _SHEET_VIEWS):
-        for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
-            if shown is not None:
-                write_png(folder / "views" / f"{Path(view.name).stem}_{kind}.png", shown)
-    length = f"{state.t - 1} iterations · seed {state.settings.seed}"
-    title = f"{scene.name} · {chosen.title} · {length}"
+
+    title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}"
     if scene.synthetic_prior:
         title += " · SYNTHETIC prior"
-    pictures.contact_sheet(folder / "contact_sheet.png", _sheet(scene, evaluation), title)
-    pictures.curves(folder / "curves.png", history, marks(state), title)
-
-    columns = list(dict.fromkeys(key for row in history for key in row))
-    files.write_csv(folder / "history.csv", history, columns)
-    shares = [
-        "conflict",
-        *(c for c in columns if c.startswith("conflict_")),
-        *(c for c in columns if c.startswith("corrected")),
-    ]
-    readings = [c for c in ("mean_q", "mean_w", "mean_omega") if c in columns]
-    compared = [row for row in history if "conflict" in row]
-    files.write_csv(folder / "conflict.csv", compared, ["t", *dict.fromkeys(shares), *readings])
-    files.write_csv(
-        folder / "timing.csv",
-        work_log.rows(),
-        ["stage", "runs", "ms_each", "seconds", "skipped", "seconds_saved", "why"],
-    )
-    mean = evaluation.mean("test") or evaluation.mean("train")
+    _write_images(folder, scene, evaluation, title)
+    write_curves(folder / "curves.png", history, marks(state), title)
+    _write_tables(folder, history, work_log)
     files.write_json(
         folder / "metrics.json",
         metrics.to_json(
@@ -94,45 +96,65 @@ def leave(
             iterations=state.t - 1,
             gaussians=len(field),
             seconds=seconds,
-            conflict=_mean_conflict(compared),
+            conflict=_mean_conflict(history),
             synthetic_prior=scene.synthetic_prior,
             config=config,
             provenance=provenance(seed=state.settings.seed, backend=backend, plan=scene.notes),
         ),
     )
-    _say(folder, evaluation, seconds)
+    _log_scores(folder, evaluation, seconds)
+    mean = evaluation.mean("test") or evaluation.mean("train")
     return None if mean is None else mean.psnr
 
 
-def _sheet(scene: Scene, evaluation: Evaluation) -> list[pictures.SheetRow]:
+def _write_images(folder: Path, scene: Scene, evaluation: Evaluation, title: str) -> None:
+    for name, image in evaluation.renders.items():
+        write_png(folder / "renders" / f"{Path(name).stem}.png", image)
     rows = []
-    for view in pictures.evenly(scene.test, _SHEET_VIEWS):
-        scores = evaluation.test[view.name]["ours"]
-        shown = {
+    for view in spaced(scene.test, _SHEET_VIEWS):
+        for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
+            if shown is not None:
+                write_png(folder / "views" / f"{Path(view.name).stem}_{kind}.png", shown)
+        columns = {
             "LR, enlarged": images.upsample(view.lr.image, view.factor, "nearest"),
             "SR prior": view.hr.image,
             "ours": evaluation.renders[view.name],
         }
-        rows.append(pictures.SheetRow(view.name, shown, view.truth, f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}"))
-    return rows
+        scores = evaluation.test[view.name]["ours"]
+        rows.append(SheetRow(view.name, columns, view.truth, f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}"))
+    write_contact_sheet(folder / "contact_sheet.png", rows, title)
 
 
-def _mean_conflict(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Mean over the iterations with λ_HR > 0, by group and for the Gaussian as a whole."""
+def _write_tables(folder: Path, history: Sequence[Mapping[str, float]], work_log: WorkLog) -> None:
+    columns = list(dict.fromkeys(key for row in history for key in row))
+    files.write_csv(folder / "history.csv", history, columns)
+    shares = [c for prefix in ("conflict_", "corrected") for c in columns if c.startswith(prefix)]
+    means = [c for c in ("mean_q", "mean_w", "mean_omega") if c in columns]
+    compared = [row for row in history if "conflict" in row]
+    files.write_csv(folder / "conflict.csv", compared, ["t", "conflict", *shares, *means])
+    stages = work_log.rows()
+    files.write_csv(
+        folder / "timing.csv", stages, ["stage", "runs", "ms_each", "seconds", "skipped", "seconds_saved", "why"]
+    )
+
+
+def _mean_conflict(history: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Mean over the iterations that compared gradients, by group and, as "gaussian", for the Gaussian as a whole."""
+    rows = [row for row in history if "conflict" in row]
     means = {}
     for key in dict.fromkeys(k for row in rows for k in row if k == "conflict" or k.startswith("conflict_")):
         values = [row[key] for row in rows if key in row and not math.isnan(row[key])]
         if values:
-            means[key.removeprefix("conflict_").replace("conflict", "gaussian")] = sum(values) / len(values)
+            means["gaussian" if key == "conflict" else key.removeprefix("conflict_")] = sum(values) / len(values)
     return means
 
 
-def _say(folder: Path, evaluation: Evaluation, seconds: float) -> None:
+def _log_scores(folder: Path, evaluation: Evaluation, seconds: float) -> None:
     lines = [f"done in {seconds:.0f} s: {folder}"]
     for part in ("test", "train"):
-        for method in ("ours", "bicubic", "prior"):
-            if (m := evaluation.mean(part, method)) is not None:
+        for image in ("ours", "bicubic", "prior"):
+            if (m := evaluation.mean(part, image)) is not None:
                 lines.append(
-                    f"  {part:<5} {method:<8} PSNR {m.psnr:6.2f} dB   SSIM {m.ssim:.4f}   GMSD {m.gmsd:.4f}   blur {m.blur:+.4f}"
+                    f"  {part:<5} {image:<8} PSNR {m.psnr:6.2f} dB   SSIM {m.ssim:.4f}   GMSD {m.gmsd:.4f}   blur {m.blur:+.4f}"
                 )
     _log.info("\n".join(lines))

@@ -1,7 +1,11 @@
-"""`python -m clear_strategies.report DIR …`: a run, or a sweep, as a table (Markdown and CSV), pictures, and a page.
+"""`python -m clear_strategies.report DIR …`: runs as a table, comparisons and a page.
 
-Every folder below DIR with a metrics.json is a run. Runs of a scene that differ in nothing but their seed share a row:
-mean ± standard deviation, and the best beside it. What all runs of a scene have in common is said once, below the table.
+Every folder at or below DIR with a metrics.json is a run. Runs of a scene that differ only in their seed share a row. Files:
+
+- report.md, report.csv: the table
+- report.html: the table, images, maps and charts, in one file that needs no network
+- comparison_SCENE.png: one test view of all methods, enlarged where they differ most
+- curves_SCENE.png: PSNR, conflict and number of Gaussians over iterations, and PSNR over training time
 """
 
 from __future__ import annotations
@@ -18,13 +22,15 @@ import numpy as np
 from clear_strategies import files
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
-from clear_strategies.outputs import pictures
-from clear_strategies.report import page
-from clear_strategies.report.published import PAPER, Beside, beside
+from clear_strategies.outputs.figures import save_png
+from clear_strategies.report import charts, page
+from clear_strategies.report.comparison import write_comparison
+from clear_strategies.report.published import PAPER
+from clear_strategies.report.rows import Row, compare
 from clear_strategies.report.runs import Run, collect, history
-from clear_strategies.report.table import Row, aligned, columns, markdown, record, table
+from clear_strategies.report.table import Table, aligned, layout, record
 
-__all__ = ["Row", "Run", "aligned", "collect", "main", "markdown", "table", "write"]
+__all__ = ["Row", "Run", "Table", "aligned", "collect", "compare", "layout", "main", "write"]
 
 _log = logging.getLogger(__name__)
 
@@ -36,9 +42,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("folders", nargs="+", type=Path, metavar="DIR", help="a run's folder, or a folder of runs")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="where the report goes (default: the first DIR)")
-    parser.add_argument("--paper", choices=sorted(PAPER), help="set the paper's numbers of this table beside ours")
     parser.add_argument(
-        "--page-mb", type=float, default=page.BUDGET_MB, metavar="MB", help="what report.html may weigh (%(default)s)"
+        "--paper", choices=sorted(PAPER), help="show the numbers of this table of the paper beside ours"
+    )
+    parser.add_argument(
+        "--page-mb", type=float, default=page.BUDGET_MB, metavar="MB", help="size limit of report.html (%(default)s)"
     )
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
@@ -49,64 +57,65 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _log.error("%s", error)
         return 2
     encoding = sys.stdout.encoding or "utf-8"
-    sys.stdout.write(text.encode(encoding, "replace").decode(encoding))  # a terminal may not know ↑
+    sys.stdout.write(text.encode(encoding, "replace").decode(encoding))  # a terminal may lack ↑
     return 0
 
 
 def write(runs: Sequence[Run], out: Path, *, paper: str | None = None, page_mb: float = page.BUDGET_MB) -> str:
-    """Leave report.md, report.csv, report.html and each scene's comparison_*.png, curves_*.png and
-    psnr_over_seconds_*.png in `out`; returns report.md.
+    """Write the files of a report into `out`; returns the text of report.md.
 
     Args:
-        paper: which of `PAPER`'s tables stands beside ours.
-        page_mb: what report.html may weigh, 10⁶ bytes; where it does not fit it shows fewer views, and says so.
+        paper: the key in `PAPER` of the table to show beside ours.
+        page_mb: size limit of report.html, 10⁶ bytes; the page shows fewer views where not all fit.
     """
-    rows = table(runs)
+    published = None if paper is None else PAPER[paper]
 
-    def papers(some: Sequence[Row], of: Sequence[Run]) -> Beside | None:
-        return None if paper is None else beside(some, of, PAPER[paper])
+    rows = compare(runs)
 
-    published = papers(rows, runs)
-    text = markdown(rows, published)
+    def table(some: Sequence[Row], of: Sequence[Row] = rows) -> Table:
+        if published is None:
+            return layout(some)
+        return layout(some, beside=published.columns(some), notes=published.notes(of))
+
+    text = table(rows).markdown
     files.write_text(out / "report.md", text)
     records = [record(row) for row in rows]
     if published is not None:
-        records = [{**known, **numbers} for known, numbers in zip(records, published.records(rows), strict=True)]
+        records = [ours | theirs for ours, theirs in zip(records, published.records(rows), strict=True)]
     files.write_csv(out / "report.csv", records, list(dict.fromkeys(key for line in records for key in line)))
+
     sections = []
+    if averages := [row for row in rows if row.is_average]:
+        sections.append(page.Section("average over scenes", table(averages)))
     for scene in dict.fromkeys(run.scene for run in runs):
-        # Of several seeds the first is shown.
-        shown = {row.method: row.runs[0] for row in rows if row.scene == scene and not row.baseline}
-        name = re.sub(r"\W+", "_", scene).strip("_")
-        _compare(out / f"comparison_{name}.png", scene, shown)
-        histories = {method: history(run.folder) for method, run in shown.items()}
-        pictures.overlay(out / f"curves_{name}.png", histories, scene)
-        pictures.over_seconds(out / f"psnr_over_seconds_{name}.png", histories, scene)
         of_scene = [row for row in rows if row.scene == scene]
-        own = papers(of_scene, [run for run in runs if run.scene == scene])
-        sections.append(page.Section(scene, *columns(of_scene, own), shown, histories))
-    if averages := [row for row in rows if not row.runs]:
-        sections.insert(0, page.Section("average over scenes", *columns(averages, published), {}, {}))
-    size = page.write(out / "report.html", sections, budget_mb=page_mb)
+        shown = {row.method: row.runs[0] for row in of_scene if not row.is_baseline}  # of several seeds the first
+        name = re.sub(r"\W+", "_", scene).strip("_")
+        _compare_renders(out / f"comparison_{name}.png", scene, shown)
+        figure = charts.draw_runs({method: history(run.folder) for method, run in shown.items()}, scene)
+        save_png(figure, out / f"curves_{name}.png")
+        skipped = page.skipped_work(shown)
+        sections.append(page.Section(scene, table(of_scene, of_scene), shown, charts.as_svg(figure), skipped))
+    size = page.write_page(out / "report.html", sections, budget_mb=page_mb)
     _log.info("report of %d runs: %s (report.html, %.1f MB, opens in any browser)", len(runs), out, size / 1e6)
     return text
 
 
-def _compare(path: Path, scene: str, runs: Mapping[str, Run]) -> None:
-    """A test view that all runs rendered, side by side."""
+def _compare_renders(path: Path, scene: str, runs: Mapping[str, Run]) -> None:
+    """The comparison of a test view that all runs rendered."""
     names = [{file.name for file in (run.folder / "renders").glob("*.png")} for run in runs.values()]
     shared = sorted(set.intersection(*names))
     if not shared:
-        _log.warning("%s: no render is common to all runs; there is no comparison picture.", scene)
+        _log.warning("%s: no render is common to all runs, so there is no comparison image.", scene)
         return
     view = shared[len(shared) // 2]
     try:
         tiles = {method: np.asarray(read_image(run.folder / "renders" / view)) for method, run in runs.items()}
     except DataError as error:
-        _log.warning("%s; there is no comparison picture.", error)
+        _log.warning("%s; there is no comparison image.", error)
         return
     if len({tile.shape for tile in tiles.values()}) > 1:
-        _log.warning("%s: the runs rendered at different sizes; there is no comparison picture.", scene)
+        _log.warning("%s: the runs rendered at different sizes, so there is no comparison image.", scene)
         return
     captions = {method: f"mean of its views: {run.scores['ours']['psnr']:.2f} dB" for method, run in runs.items()}
-    pictures.comparison(path, tiles, captions, f"{scene} · {Path(view).stem}")
+    write_comparison(path, tiles, captions, f"{scene} · {Path(view).stem}")

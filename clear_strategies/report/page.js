@@ -1,19 +1,19 @@
 "use strict";
-// The two viewers of report.html: pictures of test views (slide, flip, side by side), and maps over training views.
-// Both draw on a canvas, pixel for pixel once enlarged, with one zoom for everything that they show. What the viewer of a
-// scene shows is kept in the address after "#", so that a link leads back to it.
+// The two viewers of report.html: images of test views (slide, flip, side by side), and maps over training views. Both
+// draw on a canvas with one zoom for all images; enlarged pixels stay squares. The address after "#" holds the state of a
+// viewer of test views, so that a link restores it.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const magma = data.magma.map((hex) => [0, 2, 4].map((i) => parseInt(hex.slice(i, i + 2), 16)));
 const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
 
-// Pictures are decoded when they are first looked at; `then` draws anew once they are there.
+// The embedded image, or null until it is decoded; `redraw` is then called.
 const decoded = new Map();
-function picture(key, then) {
+function embedded(key, redraw) {
   if (!decoded.has(key)) {
     const image = new Image();
     decoded.set(key, null);
-    image.onload = () => { decoded.set(key, image); then(); };
+    image.onload = () => { decoded.set(key, image); redraw(); };
     image.src = data.images[key];
   }
   return decoded.get(key);
@@ -29,9 +29,8 @@ function pixels(image, width, height) {
   return { canvas, context, content: context.getImageData(0, 0, width, height) };
 }
 
-// A picture whose every pixel is the colour of a number in [0, 1].
-function coloured(target, number) {
-  const { canvas, context, content } = target;
+// Replace every pixel by the colour of number(pixels, index), which lies in [0, 1].
+function coloured({ canvas, context, content }, number) {
   for (let i = 0; i < content.data.length; i += 4) {
     const rgb = magma[Math.round(255 * clamp(number(content.data, i), 0, 1))];
     [content.data[i], content.data[i + 1], content.data[i + 2]] = rgb;
@@ -40,36 +39,35 @@ function coloured(target, number) {
   return canvas;
 }
 
-const made = new Map();
-function once(name, make) {
-  if (!made.has(name)) made.set(name, make());
-  return made.get(name);
+const cache = new Map();
+function cached(name, compute) {
+  if (!cache.has(name)) cache.set(name, compute());
+  return cache.get(name);
 }
 
-// Mean over RGB of |picture - truth|, its colours ending at errorMax.
+// Mean over RGB of |image - truth|; the colours end at errorMax.
 function errorMap(image, truth, view, name) {
-  return once(name, () => {
-    const reference = pixels(truth, view.width, view.height).content.data;
-    const difference = (a, i) =>
-      (Math.abs(a[i] - reference[i]) + Math.abs(a[i + 1] - reference[i + 1]) + Math.abs(a[i + 2] - reference[i + 2])) / 765;
-    return coloured(pixels(image, view.width, view.height), (a, i) => difference(a, i) / data.errorMax);
+  return cached(name, () => {
+    const t = pixels(truth, view.width, view.height).content.data;
+    const error = (a, i) =>
+      (Math.abs(a[i] - t[i]) + Math.abs(a[i + 1] - t[i + 1]) + Math.abs(a[i + 2] - t[i + 2])) / 765;
+    return coloured(pixels(image, view.width, view.height), (a, i) => error(a, i) / data.errorMax);
   });
 }
 
 function element(tag, attributes = {}, ...children) {
-  const made = document.createElement(tag);
+  const node = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
-    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
-    else made.setAttribute(name, value);
+    if (name.startsWith("on")) node.addEventListener(name.slice(2), value);
+    else node.setAttribute(name, value);
   }
-  made.append(...children);
-  return made;
+  node.append(...children);
+  return node;
 }
 
-function choice(label, options, chosen, onChoice) {
+function dropdown(label, options, onChoice) {
   const select = element("select", { onchange: () => onChoice(select.selectedIndex) });
   options.forEach((option) => select.append(element("option", {}, option)));
-  select.selectedIndex = chosen;
   return { node: element("label", {}, label, select), show: (i) => { select.selectedIndex = i; } };
 }
 
@@ -86,7 +84,8 @@ function colourScale() {
   return { node, show: (visible, text) => { node.hidden = !visible; high.textContent = text; } };
 }
 
-// A canvas to look through: wheel or +/- zooms, drag or Shift+arrows pans.
+// A canvas with zoom (wheel, + and -) and pan (drag, Shift + arrows). `paint` draws it; `onDrag` and `onKey` return whether
+// they used the event.
 class Stage {
   constructor(name, paint, onDrag, onKey) {
     this.zoom = 1;
@@ -100,9 +99,9 @@ class Stage {
     this.canvas.addEventListener("pointerdown", (down) => {
       this.canvas.setPointerCapture(down.pointerId);
       let last = [down.offsetX, down.offsetY];
-      const divider = onDrag(down.offsetX / this.canvas.clientWidth, true);
+      const used = onDrag(down.offsetX / this.canvas.clientWidth, true);
       const move = (event) => {
-        if (divider) onDrag(event.offsetX / this.canvas.clientWidth, false);
+        if (used) onDrag(event.offsetX / this.canvas.clientWidth, false);
         else this.pan(last[0] - event.offsetX, last[1] - event.offsetY);
         last = [event.offsetX, event.offsetY];
       };
@@ -130,18 +129,17 @@ class Stage {
     this.draw();
   }
 
-  // `abreast` panels of one picture's size beside each other.
-  show(size, abreast) { this.size = size; this.abreast = abreast; this.draw(); }
+  // Show `panels` images of one size beside each other.
+  show(size, panels) { this.size = size; this.panels = panels; this.draw(); }
 
   draw() {
     if (!this.size || !this.canvas.clientWidth) return;
-    const ratio = window.devicePixelRatio || 1, width = this.canvas.clientWidth / this.abreast;
+    const ratio = window.devicePixelRatio || 1, width = this.canvas.clientWidth / this.panels;
     const height = Math.min(width * this.size.height / this.size.width, window.innerHeight * 0.8);
     this.canvas.style.height = `${height}px`;
     this.canvas.width = Math.round(this.canvas.clientWidth * ratio);
     this.canvas.height = Math.round(height * ratio);
-    this.fitted = Math.min(width / this.size.width, height / this.size.height);
-    this.scale = this.fitted * this.zoom;  // CSS pixels a picture's pixel
+    this.scale = Math.min(width / this.size.width, height / this.size.height) * this.zoom;  // CSS px per image pixel
     for (const [k, extent] of [[0, width / this.size.width], [1, height / this.size.height]]) {
       const half = Math.min(0.5, extent / this.scale / 2);
       this.centre[k] = clamp(this.centre[k], half, 1 - half);
@@ -152,7 +150,7 @@ class Stage {
     this.paint(this);
   }
 
-  // Draw one picture into panel `k`, only between the shares `from` and `to` of its width.
+  // Draw an image into panel `k`, clipped to the shares `from` to `to` of the panel's width.
   put(image, k = 0, from = 0, to = 1, alpha = 1) {
     if (!image) return;
     const c = this.context, { width, height } = this.panel, left = k * width;
@@ -191,8 +189,8 @@ function viewer(holder, number) {
   const names = layers().map((layer) => layer.label);
   const controls = {
     view: segments("view", scene.views.map((view) => view.name), (i) => set({ view: i })),
-    left: choice("left", names, state.left, (i) => set({ left: i })),
-    right: choice("right", names, state.right, (i) => set({ right: i })),
+    left: dropdown("left", names, (i) => set({ left: i })),
+    right: dropdown("right", names, (i) => set({ right: i })),
     mode: segments("mode", MODES, (i) => set({ mode: i })),
   };
   const error = element("input", { type: "checkbox", onchange: () => set({ error: Number(error.checked) }) });
@@ -203,14 +201,14 @@ function viewer(holder, number) {
     element("div", { class: "controls" }, controls.view.node, controls.left.node, controls.right.node, controls.mode.node,
       zoom.node, element("label", {}, error, "error map")),
     stage.canvas, captions,
-    element("p", { class: "hint" }, "Drag the line; wheel zooms, drag pans. Keys on the picture: ",
+    element("p", { class: "hint" }, "Drag the line; wheel zooms, drag pans. Keys on the image: ",
       ...["←", "→"].map((k) => element("kbd", {}, k)), " line, ", element("kbd", {}, "space"), " flip, ",
       element("kbd", {}, "1"), "–", element("kbd", {}, "9"), " right, ", element("kbd", {}, "Shift"), " + digit left, ",
       element("kbd", {}, "v"), " next view, ", element("kbd", {}, "m"), " mode, ", element("kbd", {}, "e"), " error, ",
       element("kbd", {}, "+"), " ", element("kbd", {}, "−"), " ", element("kbd", {}, "0"), " zoom."),
   );
   if (truth < 0) error.disabled = true;
-  restore();
+  restoreState();
   set({});
 
   function set(change) {
@@ -219,33 +217,33 @@ function viewer(holder, number) {
     error.checked = Boolean(state.error);
     scale.show(Boolean(state.error), `${data.errorMax} mean |difference| over RGB`);
     const [left, right] = [state.left, state.right].map((i) => layers()[i]);
-    const said = (layer) => [element("b", {}, layer.label), layer.note ? ` ${layer.note}` : ""];
-    const both = [element("span", {}, ...said(left)), element("span", {}, ...said(right))];
+    const caption = (layer) => [element("b", {}, layer.label), layer.note ? ` ${layer.note}` : ""];
+    const both = [element("span", {}, ...caption(left)), element("span", {}, ...caption(right))];
     captions.replaceChildren(both[state.mode === 1 ? state.flipped : 0], scale.node, state.mode === 1 ? "" : both[1]);
     const view = scene.views[state.view];
     stage.show(view, state.mode === 2 ? 2 : 1);
   }
 
-  function shown(i) {
+  function layerImage(i) {
     const view = scene.views[state.view], layer = layers()[i];
-    const image = picture(layer.image, () => stage.draw());
+    const image = embedded(layer.image, () => stage.draw());
     if (!state.error || layer.kind === "truth") return image;
-    const reference = picture(layers()[truth].image, () => stage.draw());
-    return image && reference && errorMap(image, reference, view, `error ${layer.image} ${layers()[truth].image}`);
+    const target = embedded(layers()[truth].image, () => stage.draw());
+    return image && target && errorMap(image, target, view, `error ${layer.image} ${layers()[truth].image}`);
   }
 
   function paint() {
     if (state.mode === 2) {
-      stage.put(shown(state.left), 0);
-      stage.put(shown(state.right), 1);
+      stage.put(layerImage(state.left), 0);
+      stage.put(layerImage(state.right), 1);
     } else if (state.mode === 1) {
-      stage.put(shown(state.flipped ? state.right : state.left));
+      stage.put(layerImage(state.flipped ? state.right : state.left));
     } else {
-      stage.put(shown(state.left), 0, 0, state.split);
-      stage.put(shown(state.right), 0, state.split, 1);
+      stage.put(layerImage(state.left), 0, 0, state.split);
+      stage.put(layerImage(state.right), 0, state.split, 1);
       stage.divider(state.split);
     }
-    remember();
+    saveState();
   }
 
   function drag(share, starts) {
@@ -267,31 +265,31 @@ function viewer(holder, number) {
     return true;
   }
 
-  function restore() {
-    const asked = new URLSearchParams(location.hash.slice(1));
-    if (Number(asked.get("scene") ?? -1) !== number) return;
+  function restoreState() {
+    const saved = new URLSearchParams(location.hash.slice(1));
+    if (Number(saved.get("scene") ?? -1) !== number) return;
     const limits = { view: scene.views.length - 1, left: last, right: last, mode: 2, split: 1, flipped: 1, error: truth < 0 ? 0 : 1 };
     for (const [name, high] of Object.entries(limits)) {
-      const value = Number(asked.get(name) ?? NaN);
+      const value = Number(saved.get(name) ?? NaN);
       if (Number.isFinite(value)) state[name] = name === "split" ? clamp(value, 0, 1) : Math.round(clamp(value, 0, high));
     }
-    const [zoom, x, y] = ["zoom", "x", "y"].map((name) => Number(asked.get(name) ?? NaN));
+    const [zoom, x, y] = ["zoom", "x", "y"].map((name) => Number(saved.get(name) ?? NaN));
     if (zoom >= 1) [stage.zoom, stage.centre] = [Math.min(zoom, 64), [x || 0.5, y || 0.5]];
   }
 
-  function remember() {
+  function saveState() {
     if (document.activeElement !== stage.canvas && !holder.contains(document.activeElement)) return;
-    const words = { scene: number, ...state, split: state.split.toFixed(3), zoom: stage.zoom.toFixed(2),
+    const saved = { scene: number, ...state, split: state.split.toFixed(3), zoom: stage.zoom.toFixed(2),
       x: stage.centre[0].toFixed(3), y: stage.centre[1].toFixed(3) };
-    history.replaceState(null, "", `#${new URLSearchParams(words)}`);
+    history.replaceState(null, "", `#${new URLSearchParams(saved)}`);
   }
 }
 
 const MAPS = {
-  reliability: "R, reliability of the prior: does it agree with the LR photo?",
+  reliability: "R, reliability: does the prior agree with the LR photo?",
   demand: "A, demand: how much detail does the prior add here?",
-  weight: "w = R·A, what high-frequency gradients are routed by",
-  corrected: "corrected: share of the HR gradient taken away, drawn on the Gaussians",
+  weight: "w = R·A: routes high-frequency gradients",
+  corrected: "corrected: share of its HR gradient that a Gaussian lost",
   conflict: "conflict: Gaussians whose LR and HR gradients point apart",
 };
 
@@ -303,8 +301,8 @@ function maps(holder, number) {
   const controls = {
     view: segments("view", scene.maps.map((view) => view.name), (i) => set({ view: i })),
     map: segments("map", kinds, (i) => set({ map: i })),
-    method: choice("of", methods, 0, (i) => set({ method: i })),
-    under: choice("over", scene.maps[0].under.map((u) => u.label), 0, (i) => set({ under: i })),
+    method: dropdown("of", methods, (i) => set({ method: i })),
+    under: dropdown("over", scene.maps[0].under.map((u) => u.label), (i) => set({ under: i })),
   };
   const opacity = element("input", { type: "range", min: "0", max: "1", step: "0.05", value: String(state.opacity),
     oninput: () => set({ opacity: Number(opacity.value) }) });
@@ -314,8 +312,6 @@ function maps(holder, number) {
       element("label", {}, "opacity", opacity)),
     stage.canvas, caption,
   );
-  const asked = new URLSearchParams(location.hash.slice(1));
-  if (Number(asked.get("scene") ?? -1) === number && kinds.includes(asked.get("map"))) state.map = kinds.indexOf(asked.get("map"));
   state.method = scene.maps[0].methods.findLastIndex((method) => "corrected" in method.maps);
   if (state.method < 0) state.method = methods.length - 1;
   set({});
@@ -326,19 +322,19 @@ function maps(holder, number) {
     const view = scene.maps[state.view], method = view.methods[state.method], kind = kinds[state.map];
     const mean = method && method.means[kind];
     scale.show(true, String(view.tops[kind]));
-    const there = method && kind in method.maps;
+    const known = method && kind in method.maps;
     caption.replaceChildren(element("span", {}, element("b", {}, MAPS[kind])), scale.node,
-      element("span", {}, there ? (mean == null ? "" : `mean ${mean.toFixed(3)}`) : "this method corrects nothing"));
+      element("span", {}, known ? (mean == null ? "" : `mean ${mean.toFixed(3)}`) : "this method corrects nothing"));
     stage.show(view, 1);
   }
 
   function paint() {
     const view = scene.maps[state.view], kind = kinds[state.map], top = view.tops[kind];
-    stage.put(picture(view.under[state.under].image, () => stage.draw()));
+    stage.put(embedded(view.under[state.under].image, () => stage.draw()));
     const key = view.methods[state.method]?.maps[kind];
-    const grey = key && picture(key, () => stage.draw());
+    const grey = key && embedded(key, () => stage.draw());
     if (!grey) return;
-    const overlay = once(`map ${key} ${top}`, () =>
+    const overlay = cached(`map ${key} ${top}`, () =>
       coloured(pixels(grey, grey.width, grey.height), (a, i) => a[i] / 255 / top));
     stage.put(overlay, 0, 0, 1, state.opacity);
   }

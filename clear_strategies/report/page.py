@@ -1,7 +1,7 @@
-"""report.html: one file that opens in any browser without a network, to look at what the table's numbers mean.
+"""report.html: one file that opens in any browser without a network.
 
-Tables and curves are there as they are written; the pictures' viewer and the maps' are page.js. Every picture is stored
-once, however many methods share it.
+The template is page.html.j2; page.js draws the test views and the maps. Every image is embedded once, however many methods
+share it.
 """
 
 from __future__ import annotations
@@ -9,10 +9,9 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
-import json
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -21,152 +20,164 @@ from clear_strategies import files
 from clear_strategies.data.photo_files import image_size, jpeg, read_image
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
+from clear_strategies.outputs.figures import ERROR_MAX, spaced
 from clear_strategies.outputs.maps import MAPS
-from clear_strategies.outputs.pictures import evenly
-from clear_strategies.report import charts
 from clear_strategies.report.runs import Run, skips
-from clear_strategies.report.table import Columns
+from clear_strategies.report.table import Columns, Table
 
 _log = logging.getLogger(__name__)
 
 BUDGET_MB: Final = 20.0
 _VIEWS: Final = 4  # test views of a scene, at most
-_ERROR_MAX: Final = 0.25  # where the colours of an error map end
-_TOPS: Final = (0.05, 0.1, 0.25, 0.5, 1.0)  # where those of an evidence map may end
+_TOPS: Final = (0.05, 0.1, 0.25, 0.5, 1.0)  # values at which the colours of a map may end
 _FOLDER: Final = Path(__file__).resolve().parent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Section:
-    """A scene on the page.
+    """A scene on the page, or the average over scenes, which has a table only.
 
     Args:
-        columns, notes: its table. runs, histories: by method, of several seeds the first.
+        runs: method -> run; of several seeds the first.
+        chart: an <svg> element.
+        skipped: as from `skipped_work`.
     """
 
     title: str
-    columns: Columns
-    notes: Sequence[str]
-    runs: Mapping[str, Run]
-    histories: Mapping[str, charts.History]
+    table: Table
+    runs: Mapping[str, Run] = field(default_factory=dict)
+    chart: str = ""
+    skipped: Columns = field(default_factory=dict)
+
+    @property
+    def columns(self) -> Columns:
+        """The table without the column that repeats the title."""
+        return {name: cells for name, cells in self.table.columns.items() if name != "scene" or len(set(cells)) > 1}
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
-    """Data URIs by content; `lossy`: photos are JPEGs, maps never are."""
+class Images:
+    """Data URIs by a hash of their content. `lossy` embeds photos as JPEG, but never maps."""
 
     lossy: bool
-    known: dict[str, str] = field(default_factory=dict)
+    uris: dict[str, str] = field(default_factory=dict)
 
     def add(self, path: Path, *, exact: bool = False) -> str:
-        """The key of a picture."""
+        """Embed an image file; returns its key."""
         as_jpeg = self.lossy and not exact
         content = jpeg(read_image(path)) if as_jpeg else path.read_bytes()
         key = hashlib.sha256(content).hexdigest()[:12]
         kind = "jpeg" if as_jpeg else "png"
-        self.known.setdefault(key, f"data:image/{kind};base64,{base64.b64encode(content).decode()}")
+        self.uris.setdefault(key, f"data:image/{kind};base64,{base64.b64encode(content).decode()}")
         return key
 
-    @property
-    def size(self) -> int:
-        return sum(map(len, self.known.values()))
+
+def skipped_work(runs: Mapping[str, Run]) -> Columns:
+    """What each method skipped, why, and what that saved; empty where nothing was skipped."""
+    lines = [(method, line) for method, run in runs.items() for line in skips(run.folder)]
+    columns: Columns = {
+        "method": [method for method, _ in lines],
+        "stage": [line.get("stage", "") for _, line in lines],
+        "skipped because": [line["why"] for _, line in lines],
+        # A stage that never ran has no measured time to save.
+        "seconds saved": ["" if (s := line.get("seconds_saved", "")) == "0.0" else s for _, line in lines],
+    }
+    return columns if lines else {}
 
 
-def write(path: Path, sections: Sequence[Section], *, budget_mb: float = BUDGET_MB) -> int:
-    """Leave the page; returns its size in bytes.
+def write_page(path: Path, sections: Sequence[Section], *, budget_mb: float = BUDGET_MB) -> int:
+    """Write the page; returns its size in bytes.
 
-    PNG where everything fits into the budget, else JPEG, else JPEG of fewer views; one view a scene is always shown.
+    Images are embedded as PNG where they fit into the budget, else as JPEG, else as JPEG of fewer views; at least one view
+    per scene is shown.
     """
-    page = ""
     for lossy, views in ((False, _VIEWS), *((True, n) for n in range(_VIEWS, 0, -1))):
-        pictures = Pictures(lossy)
-        scenes = [_scene(section, pictures, views) for section in sections]
-        said = _said(scenes, lossy=lossy, views=views)
-        page = _page(sections, scenes, pictures, said)
-        if len(page.encode()) <= budget_mb * 1e6:
+        images = Images(lossy)
+        scenes = [_scene(section, images, views) for section in sections]
+        limits = _limits(scenes, lossy=lossy, views=views)
+        page = _render(sections, scenes, images, limits).encode()
+        if len(page) <= budget_mb * 1e6:
             break
     else:
-        _log.warning("report.html is larger than %g MB with one view a scene; raise --page-mb.", budget_mb)
-    if said:
-        _log.info("report.html: %s", said)
-    files.write_text(path, page)
-    return len(page.encode())
+        _log.warning("report.html is larger than %g MB with one view per scene; raise --page-mb.", budget_mb)
+    if limits:
+        _log.info("report.html: %s", limits)
+    files.write_bytes(path, page)
+    return len(page)
 
 
-def _said(scenes: Sequence[Mapping[str, Any]], *, lossy: bool, views: int) -> str:
-    """What the budget took away."""
-    said = "Photos are JPEGs, so error maps are exact to about 0.01 only." if lossy else ""
-    if any(scene["offered"] > views for scene in scenes) and views < _VIEWS:
-        said += f" Only {views} of the test views fit into --page-mb."
-    return said.strip()
+def _limits(scenes: Sequence[Mapping[str, Any]], *, lossy: bool, views: int) -> str:
+    """What the budget cost."""
+    limits = ["Photos are JPEGs, so error maps are exact to about 0.01 only."] if lossy else []
+    if views < _VIEWS and any(scene["offered"] > views for scene in scenes):
+        limits.append(f"Only {views} of the test views fit into --page-mb.")
+    return " ".join(limits)
 
 
-def _scene(section: Section, pictures: Pictures, views: int) -> dict[str, Any]:
+def _scene(section: Section, images: Images, views: int) -> dict[str, Any]:
     """What page.js needs to know about a scene."""
     offered = _test_views(section)
-    chosen = evenly(offered, min(views, _VIEWS))
-    shown = [view for name in chosen if (view := _view(section, name, pictures)) is not None]
-    return {"name": section.title, "offered": len(offered), "views": shown, "maps": _maps(section, pictures, views)}
+    shown = [view for name in spaced(offered, views) if (view := _view(section, name, images)) is not None]
+    return {"name": section.title, "offered": len(offered), "views": shown, "maps": _maps(section, images, views)}
 
 
 def _test_views(section: Section) -> list[str]:
-    """Test views that every run rendered; those with LR, prior and truth at hand come alone, if there are any."""
+    """The test views that all runs rendered; only those with photos in views/, if there are any."""
     if not section.runs:
         return []
     rendered = [{file.stem for file in (run.folder / "renders").glob("*.png")} for run in section.runs.values()]
     names = sorted(set.intersection(*rendered))
-    whole = [name for name in names if _source(section, name, "lr") is not None]
-    if names and not whole:
-        _log.warning("%s: no run left views/; the page has no truth to compare renders with.", section.title)
-    return whole or names
+    with_photos = [name for name in names if _photo(section, name, "lr") is not None]
+    if names and not with_photos:
+        _log.warning("%s: no run has views/, so the page has no truth to compare renders with.", section.title)
+    return with_photos or names
 
 
-def _source(section: Section, view: str, kind: str) -> Path | None:
-    """What a render is judged by; the same for all runs of a scene, so the first that has it."""
+def _photo(section: Section, view: str, kind: str) -> Path | None:
+    """LR photo, prior or truth of a view. All runs of a scene have the same, so the first that is found serves."""
     paths = (run.folder / "views" / f"{view}_{kind}.png" for run in section.runs.values())
     return next((path for path in paths if path.is_file()), None)
 
 
-def _view(section: Section, name: str, pictures: Pictures) -> dict[str, Any] | None:
+def _view(section: Section, name: str, images: Images) -> dict[str, Any] | None:
     layers = []
     try:
         for kind, label in (("lr", "LR, enlarged"), ("prior", "SR prior"), ("truth", "truth")):
-            if (path := _source(section, name, kind)) is not None:
-                layers.append({"label": label, "kind": kind, "note": "", "image": pictures.add(path)})
+            if (path := _photo(section, name, kind)) is not None:
+                layers.append({"label": label, "kind": kind, "note": "", "image": images.add(path)})
         for method, run in section.runs.items():
             path = run.folder / "renders" / f"{name}.png"
             width, height = image_size(path)
             note = f"{run.views[name]:.2f} dB" if name in run.views else ""
-            layers.append({"label": method, "kind": "method", "note": note, "image": pictures.add(path)})
+            layers.append({"label": method, "kind": "method", "note": note, "image": images.add(path)})
     except DataError as error:
-        _log.warning("%s; the page leaves this view out.", error)
+        _log.warning("%s; this view is not on the page.", error)
         return None
     return {"name": name, "width": width, "height": height, "layers": layers}
 
 
-def _maps(section: Section, pictures: Pictures, views: int) -> list[dict[str, Any]]:
-    """Training views with their evidence, by method."""
+def _maps(section: Section, images: Images, views: int) -> list[dict[str, Any]]:
+    """Training views with the maps of every method."""
     found: dict[str, dict[str, Any]] = {}
     for method, run in section.runs.items():
         folder = run.folder / "maps"
         try:
-            of_views = read_object(folder / "maps.json")["views"] if folder.is_dir() else {}
-            for name in evenly(list(of_views), views):
+            means = read_object(folder / "maps.json")["views"] if folder.is_dir() else {}
+            for name in spaced(list(means), views):
                 own = folder / Path(name).stem
-                width, height = image_size(own / "prior.png")
-                view = found.setdefault(
-                    name, {"name": Path(name).stem, "width": width, "height": height, "methods": []}
-                )
-                if "under" not in view:
-                    view["under"] = [
-                        {"label": label, "image": pictures.add(own / f"{kind}.png")}
+                if name not in found:
+                    width, height = image_size(own / "prior.png")
+                    under = [
+                        {"label": label, "image": images.add(own / f"{kind}.png")}
                         for kind, label in (("prior", "SR prior"), ("lr", "LR, enlarged"))
                     ]
+                    size = {"width": width, "height": height}
+                    found[name] = {"name": Path(name).stem, **size, "under": under, "methods": []}
                 maps = {kind: own / f"{kind}.png" for kind in MAPS if (own / f"{kind}.png").is_file()}
-                view["methods"].append({
+                found[name]["methods"].append({
                     "label": method,
-                    "maps": {kind: pictures.add(path, exact=True) for kind, path in maps.items()},
-                    "means": of_views[name],
+                    "maps": {kind: images.add(path, exact=True) for kind, path in maps.items()},
+                    "means": means[name],
                     "peaks": {kind: float(read_image(path)[..., 0].flatten().quantile(0.995)) for kind, path in maps.items()},
                 })  # fmt: skip
         except (DataError, KeyError, TypeError) as error:
@@ -177,101 +188,47 @@ def _maps(section: Section, pictures: Pictures, views: int) -> list[dict[str, An
     return list(found.values())
 
 
-def _page(sections: Sequence[Section], scenes: Sequence[Mapping[str, Any]], pictures: Pictures, said: str) -> str:
-    data = {"images": pictures.known, "scenes": scenes, "magma": _magma(), "errorMax": _ERROR_MAX}
-    # No text in the data can end the element that holds it.
-    content = json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
+def _render(sections: Sequence[Section], scenes: Sequence[Mapping[str, Any]], images: Images, limits: str) -> str:
+    from jinja2 import Environment, FileSystemLoader
+
+    environment = Environment(loader=FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= {"rows": _transposed, "cell": _cell, "code": _code}
     style, script = ((_FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js"))
-    links = "".join(f'<a href="#scene-{i}">{html.escape(s.title)}</a>' for i, s in enumerate(sections))
-    links = f"<nav>{links}</nav>" if len(sections) > 1 else ""
-    body = "".join(_section(i, s, scene) for i, (s, scene) in enumerate(zip(sections, scenes, strict=True)))
-    said = f"<p>{html.escape(said)}</p>" if said else ""
-    return (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{html.escape(_title(sections))}</title>\n<style>\n{style}</style>\n</head>\n<body>\n"
-        f"<header><h1>{html.escape(_title(sections))}</h1>{links}</header>\n<main>\n{body}</main>\n"
-        f'<footer>{said}</footer>\n<script type="application/json" id="data">{content}</script>\n'
-        f"<script>\n{script}</script>\n</body>\n</html>\n"
+    names = [section.title for section in sections if section.runs]
+    return environment.get_template("page.html.j2").render(
+        title=f"Report: {', '.join(names) if len(names) < 4 else f'{len(names)} scenes'}",
+        sections=sections,
+        data={"images": images.uris, "scenes": scenes, "magma": _magma(), "errorMax": ERROR_MAX},
+        limits=limits,
+        style=style,
+        script=script,
     )
 
 
-def _title(sections: Sequence[Section]) -> str:
-    scenes = [section.title for section in sections if section.runs]
-    return f"Report: {', '.join(scenes)}" if len(scenes) < 4 else f"Report: {len(scenes)} scenes"
+def _transposed(columns: Iterable[Sequence[str]]) -> Iterable[tuple[str, ...]]:
+    return zip(*columns, strict=True)
 
 
-def _section(number: int, section: Section, scene: Mapping[str, Any]) -> str:
-    parts = [f'<section id="scene-{number}">\n<h2>{html.escape(section.title)}</h2>', _table(section.columns)]
-    parts.append('<ul class="notes">' + "".join(f"<li>{_inline(note)}</li>" for note in section.notes) + "</ul>")
-    if scene["views"]:
-        parts.append(f'<h3>Test views</h3>\n<div class="viewer" data-scene="{number}"></div>')
-    if scene["maps"]:
-        parts.append(
-            f'<h3>Where the prior was believed, and corrected</h3>\n<div class="maps" data-scene="{number}"></div>'
-        )
-    if section.runs:
-        parts.append("<h3>Curves</h3>" + charts.legend(list(section.histories)) + _charts(section.histories))
-        parts.append(_skipped(section.runs))
-    return "\n".join((*parts, "</section>\n"))
+def _cell(text: str) -> Any:
+    """A table cell; what follows ± in a number is small."""
+    from markupsafe import Markup
 
-
-def _table(columns: Columns) -> str:
-    shown = {name: cells for name, cells in columns.items() if name != "scene" or len(set(cells)) > 1}
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in shown)
-    lines = []
-    for cells in zip(*shown.values(), strict=True):
-        lines.append("<tr>" + "".join(_cell(text) for text in cells) + "</tr>")
-    return f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
-
-
-def _cell(text: str) -> str:
-    """Of a number, what it varies by recedes."""
     if re.match(r"[+\-]?\d", text) is None:
-        return f"<td>{html.escape(text)}</td>"
-    number, _, spread = text.partition(" ± ")
-    return f'<td class="number">{number}' + (f" <small>± {spread}</small></td>" if spread else "</td>")
+        return Markup("<td>{}</td>").format(text)
+    number, _, deviation = text.partition(" ± ")
+    small = Markup(" <small>± {}</small>").format(deviation) if deviation else ""
+    return Markup('<td class="number">{}{}</td>').format(number, small)
 
 
-def _charts(histories: Mapping[str, charts.History]) -> str:
-    step, seconds = "iteration", "training time, s"
-    drawn = (
-        charts.chart("PSNR of test views, dB", step, histories, x="t", y="psnr_test", dots=True),
-        charts.chart("PSNR of test views, dB", seconds, histories, x="seconds", y="psnr_test", dots=True),
-        charts.chart(
-            "share of Gaussians in conflict (running mean)", step, histories, x="t", y="conflict", smooth=True
-        ),
-        charts.chart("number of Gaussians", step, histories, x="t", y="n_gaussians"),
-    )
-    return f'<div class="charts">{"".join(drawn)}</div>'
+def _code(note: str) -> Any:
+    """A note with its `code` as HTML."""
+    from markupsafe import Markup
 
-
-def _skipped(runs: Mapping[str, Run]) -> str:
-    """What each method left out, why, and what that saved."""
-    lines = [(method, line) for method, run in runs.items() for line in skips(run.folder)]
-    if not lines:
-        return ""
-    cells: Columns = {
-        "method": [method for method, _ in lines],
-        "stage": [line.get("stage", "") for _, line in lines],
-        "skipped because": [line["why"] for _, line in lines],
-        "seconds saved": [_saved(line.get("seconds_saved", "")) for _, line in lines],
-    }
-    return f"<h3>What was skipped</h3>{_table(cells)}"
-
-
-def _saved(text: str) -> str:
-    """Where a stage never ran its price is not known."""
-    return text if text not in ("", "0.0") else ""
-
-
-def _inline(note: str) -> str:
-    """A note's Markdown: code, and nothing else."""
-    return re.sub(r"`([^`]*)`", r"<code>\1</code>", html.escape(note))
+    return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", html.escape(note)))  # noqa: S704 - escaped
 
 
 def _magma() -> list[str]:
-    """The colour map of errors and evidence, dark to light, as 256 hex colours."""
+    """The colour map of errors and maps, dark to light, as 256 hex colours."""
     import matplotlib as mpl
     from matplotlib.colors import to_hex
 

@@ -1,33 +1,37 @@
-"""The paper's tables, to stand beside ours, and what has to be said before anybody compares the two.
+"""The paper's tables, to stand beside our runs, and what a reader has to know before comparing the two.
 
 Numbers as printed in CLEAR: PSNR in dB, SSIM, LPIPS, each a mean over all scenes of the data set; the ablation also gives
-the share of Gaussians in conflict. A run of ours finds its line by its name (`+method=`, `+strategy=`), whatever its other
-settings are; published methods that have no run here are listed below the table.
+the share of Gaussians in conflict. A run finds its line by its name (`+method=`, `+strategy=`), whatever its other
+settings are. Published methods that no run matches are listed below the table.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from clear_strategies.report.rows import Row
 from clear_strategies.report.runs import Run
-from clear_strategies.report.table import Columns, Row
+from clear_strategies.report.table import Columns
 
-# In the order of the numbers below: what its column is called, and how they are written.
+# Header of the column, and how its numbers are written; in the order of the numbers below.
 _MEASURES: Final = {
     "psnr": ("PSNR", ".2f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".3f"), "conflict": ("conflict", ".3f"),
 }  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
-class Published:
+class PaperTable:
     """One table of the paper.
 
     Args:
-        source: where it is printed. pixels: HR sizes, width x height, that the protocol may mean.
-        scenes: how many the numbers average.
+        source: where it is printed.
+        scenes: how many scenes the numbers average.
+        views: training views per scene.
+        pixels: HR sizes, width x height, that the protocol may mean.
         numbers: the paper's name of a method -> PSNR, SSIM, LPIPS and, in the ablation, conflict.
         ours: our name of a method -> the paper's.
     """
@@ -39,6 +43,62 @@ class Published:
     numbers: Mapping[str, tuple[float, ...]]
     ours: Mapping[str, str]
     iterations: int = 10_000
+
+    def columns(self, rows: Sequence[Row]) -> dict[str, Columns]:
+        """The paper's numbers, each right of ours; LPIPS, which we do not measure, right of SSIM."""
+        found = [self._numbers(row) for row in rows]
+        cells = {
+            measure: {f"{name}, paper": [format(of[measure], form) if measure in of else "" for of in found]}
+            for measure, (name, form) in _MEASURES.items()
+        }
+        cells["ssim"] |= {"LPIPS": ["–" for _ in rows], **cells.pop("lpips")}
+        return cells
+
+    def records(self, rows: Sequence[Row]) -> list[dict[str, float]]:
+        """Plain numbers for report.csv."""
+        return [{f"paper_{m}": self._numbers(row).get(m, math.nan) for m in _MEASURES} for row in rows]
+
+    def notes(self, rows: Sequence[Row]) -> list[str]:
+        """What the numbers are means of, how our runs differ from the protocol, and what else was published."""
+        runs = [run for row in rows for run in row.runs]
+        scenes = len({run.scene for run in runs})
+        ours = f"each of our {scenes} scenes" if scenes > 1 else "our one scene"
+        lines = [
+            f"In the paper: CLEAR, {self.source}; the mean of {self.scenes} scenes after {self.iterations:,} iterations, "
+            f"here beside {ours}. LPIPS is not measured here."
+        ]
+        if differences := self._differences(runs):
+            lines.append(f"Ours differs: {'; '.join(differences)}.")
+        matched = {self.ours.get(row.name) for row in rows}
+        if missing := [name for name in self.numbers if name not in matched]:
+            forms = [form for _, form in _MEASURES.values()]
+            listed = [f"{name} {' / '.join(map(format, self.numbers[name], forms))}" for name in missing]
+            head = "PSNR / SSIM / LPIPS" + " / conflict" * any(len(n) > 3 for n in self.numbers.values())
+            lines.append(f"Published, and not run here ({head}): {'; '.join(listed)}.")
+        return lines
+
+    def _numbers(self, row: Row) -> dict[str, float]:
+        return dict(zip(_MEASURES, self.numbers.get(self.ours.get(row.name, ""), ()), strict=False))
+
+    def _differences(self, runs: Sequence[Run]) -> list[str]:
+        """Where our runs departed from the protocol, as far as the paper states it."""
+
+        def planned(label: str) -> list[str]:
+            return list(dict.fromkeys(run.plan[label] for run in runs if label in run.plan))
+
+        found = []
+        if iterations := sorted({run.iterations for run in runs} - {self.iterations}):
+            found.append(f"{', '.join(f'{n:,}' for n in iterations)} iterations")
+        if counts := sorted({text.split(":")[0] for text in planned("train views")} - {str(self.views)}):
+            found.append(f"{', '.join(counts)} training views")
+        inputs = [re.split(", (?:SR images|reference): ", text, maxsplit=1) for text in planned("HR")]
+        if sizes := dict.fromkeys(size for size, *_ in inputs if size.partition(" ")[0] not in self.pixels):
+            found.append(f"HR {', '.join(sizes)} (protocol: {' or '.join(self.pixels)})")
+        if priors := dict.fromkeys(prior for _, *rest in inputs for prior in rest if "resshift" not in prior.lower()):
+            found.append(f"prior {', '.join(priors)} (paper: ResShift)")
+        if clouds := planned("initial points"):
+            found.append(f"initial points {' | '.join(clouds)} (the paper does not say where its own come from)")
+        return found
 
 
 _OURS: Final = {
@@ -55,7 +115,7 @@ _OURS: Final = {
 }
 
 PAPER: Final = {
-    "llff": Published(
+    "llff": PaperTable(
         "Table 1, LLFF ×4, 3 views",
         scenes=8,
         views=3,
@@ -75,7 +135,7 @@ PAPER: Final = {
         },
         ours=_OURS,
     ),
-    "blender": Published(
+    "blender": PaperTable(
         "Table 2, Blender ×4, 8 views",
         scenes=8,
         views=8,
@@ -95,7 +155,7 @@ PAPER: Final = {
         },
         ours=_OURS,
     ),
-    "mip360": Published(
+    "mip360": PaperTable(
         "Table 3, Mip-NeRF 360 ×4, 24 views",
         scenes=7,
         views=24,
@@ -117,7 +177,7 @@ PAPER: Final = {
         },
         ours=_OURS,
     ),
-    "ablation": Published(
+    "ablation": PaperTable(
         "Table 4, cumulative ablation, LLFF ×4, 3 views",
         scenes=8,
         views=3,
@@ -138,75 +198,3 @@ PAPER: Final = {
         },
     ),
 }  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Beside:
-    """One published table beside runs of ours."""
-
-    table: Published
-    runs: Sequence[Run]
-    names: frozenset[str]
-
-    def columns(self, rows: Sequence[Row]) -> dict[str, Columns]:
-        """The paper's numbers, each right of ours; LPIPS, which we do not measure, right of SSIM."""
-        found = [self._numbers(row) for row in rows]
-        cells = {
-            measure: {f"{name}, paper": [format(of[measure], form) if measure in of else "" for of in found]}
-            for measure, (name, form) in _MEASURES.items()
-        }
-        cells["ssim"] |= {"LPIPS": ["–" for _ in rows], **cells.pop("lpips")}
-        return cells
-
-    def records(self, rows: Sequence[Row]) -> list[dict[str, float]]:
-        """Plain numbers for report.csv."""
-        return [{f"paper_{m}": self._numbers(row).get(m, math.nan) for m in _MEASURES} for row in rows]
-
-    def notes(self) -> list[str]:
-        scenes = len({run.scene for run in self.runs})
-        facts = self.table
-        lines = [
-            f"In the paper: CLEAR, {facts.source}; the mean of {facts.scenes} scenes after {facts.iterations:,} iterations, "
-            f"here beside {f'each of our {scenes} scenes' if scenes > 1 else 'our one scene'}. LPIPS is not measured here."
-        ]
-        if differences := self._differences():
-            lines.append(f"Ours differs: {'; '.join(differences)}.")
-        missing = [name for name in facts.numbers if name not in {facts.ours.get(n) for n in self.names}]
-        if missing:
-            forms = [form for _, form in _MEASURES.values()]
-            listed = [f"{name} {' / '.join(map(format, facts.numbers[name], forms))}" for name in missing]
-            head = "PSNR / SSIM / LPIPS" + " / conflict" * any(len(n) > 3 for n in facts.numbers.values())
-            lines.append(f"Published, and not run here ({head}): {'; '.join(listed)}.")
-        return lines
-
-    def _numbers(self, row: Row) -> dict[str, float]:
-        name = self.table.ours.get(row.name, "")
-        return dict(zip(_MEASURES, self.table.numbers.get(name, ()), strict=False))
-
-    def _differences(self) -> list[str]:
-        """What our runs did otherwise than the protocol, as far as it is printed; silent where they agree."""
-
-        def each(label: str) -> list[str]:
-            return list(dict.fromkeys(run.plan[label] for run in self.runs if label in run.plan))
-
-        facts = self.table
-        found = []
-        if iterations := sorted({run.iterations for run in self.runs} - {facts.iterations}):
-            found.append(f"{', '.join(f'{n:,}' for n in iterations)} iterations")
-        if counts := sorted({text.split(":")[0] for text in each("train views")} - {str(facts.views)}):
-            found.append(f"{', '.join(counts)} training views")
-        inputs = [text.partition(", reference: ") for text in each("HR")]
-        sizes = dict.fromkeys(size for size, _, _ in inputs if size.partition(" ")[0] not in facts.pixels)
-        if sizes:
-            found.append(f"HR {', '.join(sizes)} (protocol: {' or '.join(facts.pixels)})")
-        priors = dict.fromkeys(prior for _, _, prior in inputs if prior and "resshift" not in prior.lower())
-        if priors:
-            found.append(f"prior {', '.join(priors)} (paper: ResShift)")
-        if clouds := each("initial points"):
-            found.append(f"initial points {' | '.join(clouds)} (the paper does not say where its own come from)")
-        return found
-
-
-def beside(rows: Sequence[Row], runs: Sequence[Run], table: Published) -> Beside:
-    """This table beside the runs that these rows are made of."""
-    return Beside(table, runs, frozenset(row.name for row in rows))

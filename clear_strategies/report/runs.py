@@ -1,4 +1,4 @@
-"""A finished run as a report reads it: its name, its scores, its history and what it skipped."""
+"""A finished run as a report reads it: name, settings, scores, history and skipped work."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 SCORES: Final = ("psnr", "ssim", "gmsd", "blur")
+FACTS: Final = ("conflict", "gaussians", "seconds")
 BASELINES: Final = ("bicubic", "prior")
 
 _SEED: Final = "fit.seed="
-# What names a run; the rest of the overrides are its settings.
+# The overrides that name a run; the others are its settings.
 _METHOD, _STRATEGY = "method=", "strategy="
-# Overrides that change no result, and paths: what a scene is, its name says.
+# Overrides that change no result. So do paths: the scene has a name.
 _NEUTRAL: Final = (
     "hydra", "fit.resume=", "fit.threads=", "fit.keep=", "fit.checkpoint_every=", "fit.probe_", "fit.map_views=", "scene=",
     "data.root=",
@@ -35,15 +36,15 @@ class Run:
     """A finished run.
 
     Args:
-        scene: its name, with its marks.
-        marks: said where the prior is synthetic or the scores are not those of HR.
-        name: method or strategies as they were asked for ("clear"), else as metrics.json lists them ("gco + p2g").
-        settings: Hydra's overrides but for seed and name, without what changes no result.
-        scores: method ("ours", "bicubic", "prior") -> measure -> mean over the test views; over the training views
-            where there are no test views.
-        views: view -> PSNR of ours, dB; the views are named as their pictures are.
-        facts: "conflict", "gaussians", "seconds"; NaN where unknown.
-        plan: label -> fact about the input, as the run printed it.
+        scene: its name, followed by the marks in parentheses.
+        marks: that the prior is synthetic, that the scores are of training views, that they are against LR photos.
+        name: method or strategies as given on the command line ("clear"), else as metrics.json lists them ("gco + p2g").
+        settings: the other overrides, without the seed and those that change no result.
+        scores: image ("ours", "bicubic", "prior") -> score -> mean over the test views; over the training views where
+            there are no test views.
+        views: view -> PSNR of ours, dB, by the names of the files in renders/.
+        facts: the numbers in `FACTS`; NaN where unknown.
+        plan: what the run printed about its input, by label.
     """
 
     folder: Path
@@ -60,7 +61,7 @@ class Run:
 
     @classmethod
     def read(cls, folder: Path) -> Run:
-        """Of the folder that the run left.
+        """Read a run's folder.
 
         Raises:
             DataError: metrics.json or .hydra/overrides.yaml is damaged.
@@ -93,15 +94,15 @@ class Run:
         except KeyError as error:
             raise DataError(path, str(error), "is missing", "train the run again") from error
         except (TypeError, ValueError, AttributeError) as error:
-            raise DataError(path, "content", f"is not what a run leaves ({error})", "train the run again") from error
+            raise DataError(path, "content", f"is not that of a run ({error})", "train the run again") from error
 
 
 def collect(folders: Iterable[Path]) -> list[Run]:
-    """Every finished run at or below the folders, a sweep's in the order in which it was asked for, others by path; what is
-    unfinished or damaged is named and left out.
+    """Every finished run at or below the folders: the jobs of a sweep by number, other runs by path. Unfinished and
+    damaged runs are logged and left out.
 
     Raises:
-        DataError: there is none.
+        DataError: there is no finished run.
     """
     folders = list(folders)
     found: dict[Path, None] = {}
@@ -126,7 +127,7 @@ def collect(folders: Iterable[Path]) -> list[Run]:
 
 
 def history(folder: Path) -> list[dict[str, float]]:
-    """One row an iteration; empty, and said so, where it cannot be read."""
+    """history.csv, one row per iteration; empty, with a warning, where it cannot be read."""
     try:
         with (folder / "history.csv").open(newline="", encoding="utf-8") as file:
             return [{key: float(cell) for key, cell in row.items() if cell} for row in csv.DictReader(file)]
@@ -136,17 +137,17 @@ def history(folder: Path) -> list[dict[str, float]]:
 
 
 def skips(folder: Path) -> list[dict[str, str]]:
-    """The lines of timing.csv that say what was skipped and why; empty where there is no such table."""
+    """The rows of timing.csv about skipped work; empty, with a message, where it cannot be read."""
     try:
         with (folder / "timing.csv").open(newline="", encoding="utf-8") as file:
             return [row for row in csv.DictReader(file) if row.get("why")]
     except (OSError, ValueError, csv.Error) as error:
-        _log.info("%s: what it skipped is not known (%s).", folder, error)
+        _log.info("%s: its skipped work cannot be shown (%s).", folder, error)
         return []
 
 
 def _overrides(folder: Path) -> tuple[str, ...]:
-    """What the run was started with, as Hydra keeps it; empty where it does not."""
+    """The overrides of the command line, from Hydra's file; empty where there is no such file."""
     import yaml  # comes with Hydra
 
     path = folder / ".hydra" / "overrides.yaml"
@@ -164,18 +165,18 @@ def _is_setting(override: str) -> bool:
 
 
 def _name(overrides: Sequence[str], strategies: Sequence[str]) -> str:
-    asked: list[str] = []
+    given: list[str] = []
     for override in overrides:
         key, value = override.lstrip("+"), override.partition("=")[2].strip("[]").replace(",", " + ")
-        if key.startswith(_METHOD):  # takes the place of what was named before it
-            asked = [value]
+        if key.startswith(_METHOD):  # replaces the strategies before it
+            given = [value]
         elif key.startswith(_STRATEGY):
-            asked.append(value)
-    return " + ".join(asked or strategies) or "baseline"
+            given.append(value)
+    return " + ".join(given or strategies) or "baseline"
 
 
 def _sorted(paths: Iterable[Path]) -> list[Path]:
-    """By name, numbers by value: Hydra calls the jobs of a sweep 0, 1, … 10."""
+    """Sort by path, numbers by value: the folders of a sweep are 0, 1, … 10."""
 
     def key(path: Path) -> list[tuple[int, int, str]]:
         words = re.split(r"(\d+)", str(path))
@@ -185,7 +186,7 @@ def _sorted(paths: Iterable[Path]) -> list[Path]:
 
 
 def _job(folder: Path) -> int:
-    """Its number in the sweep that it was a job of; 0 where it was of none, which leaves its place to its name."""
+    """The run's number in its sweep; 0 for a single run, which then sorts by path."""
     try:
         content = (folder / ".hydra" / "hydra.yaml").read_text(encoding="utf-8")
     except (OSError, ValueError):
@@ -195,5 +196,5 @@ def _job(folder: Path) -> int:
 
 
 def _number(value: Any) -> float:
-    """JSON has null for what was not finite."""
+    """A number from JSON, where null stands for one that was not finite."""
     return math.nan if value is None else float(value)

@@ -1,8 +1,8 @@
-"""Floor 4: checkpoints that are either whole or not there, and that are checked before they are believed.
+"""Checkpoints: written whole or not at all, and verified before they are used.
 
 A checkpoint is a folder: `tensors.safetensors`, `history.json`, and `manifest.json` with the SHA-256 of both. It is
-written beside its final place, flushed, then renamed; the oldest beyond `keep` are removed only after that. Nothing is
-ever unpickled.
+written under another name, flushed, then renamed; older checkpoints beyond `keep` are removed only after that. Nothing is
+unpickled.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _PREFIX: Final = "step_"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Checkpoint:
-    """What a run needs to go on.
+    """What a run needs to continue.
 
     Args:
         t: the next iteration. config: the run's composed configuration, to refuse another one on resume.
-        facts: small numbers (Adam's step count, the active SH degree …). history: one row an iteration.
-        work_log: what was computed and skipped until then, `WorkLog.state_dict`.
-        device: "cpu" or "cuda", where it was made; tensors are saved from and loaded to the CPU.
+        facts: small numbers (Adam's step count, the active SH degree …). history: one row per iteration.
+        work_log: `WorkLog.state_dict` until then.
+        device: "cpu" or "cuda", where the run was; tensors are saved from and loaded to the CPU.
     """
 
     t: int
@@ -85,7 +85,7 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
         shutil.rmtree(partial, ignore_errors=True)
         raise
     all_of_them = saved(folder)
-    # What is beyond this one is of another run, or of a try that this one does not go on from.
+    # Checkpoints of later iterations belong to another run, or to a try that this run does not continue.
     until, beyond = [p for p in all_of_them if p <= target], [p for p in all_of_them if p > target]
     for old in (*until[:-keep], *beyond):
         shutil.rmtree(old, ignore_errors=True)
@@ -126,7 +126,7 @@ def load(path: Path) -> Checkpoint:
     )
 
 
-_USE_ANOTHER: Final = "resume from another checkpoint of the run, or start anew"
+_USE_ANOTHER: Final = "resume from another checkpoint of the run, or start a new run"
 
 
 def _manifest(path: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Floor 4: the Gaussian field: raw parameters, their activations, and the two renderings of one view.  Eq. 1-3"""
+"""The Gaussian field: raw parameters, their activations, and the two renderings of one view.  Eq. 1-3"""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats
 
 _INITIAL_OPACITY: Final = 0.1
-_NEIGHBOURS: Final = 3  # 3DGS: a point's first size is the root mean square distance to its 3 nearest neighbours
+_NEIGHBOURS: Final = 3  # 3DGS: a point's initial size is the root mean square distance to its 3 nearest neighbours
 _SMALLEST_SQUARED_DISTANCE: Final = 1e-7
 
-# Beyond these a parameter can no longer move: sigmoid(17) is 1 in float32, exp(45)² is infinite (STRESS rows 10, 16).
+# Beyond these a parameter has no gradient: sigmoid(17) is 1 in float32, exp(45)² is infinite.
 LOGIT_LIMIT: Final = 15.0
 LOG_SCALE_LIMIT: Final = 20.0
 
@@ -57,7 +57,7 @@ class GaussianField(nn.Module):
 
     @classmethod
     def from_cloud(cls, cloud: PointCloud, *, max_degree: int = 3) -> GaussianField:
-        """3DGS's start: isotropic, as large as the gap to the neighbours, opacity 0.1, the points' colours.
+        """The initial field of 3DGS: isotropic, as large as the distance to the neighbours, opacity 0.1, the points' colours.
 
         Raises:
             ValueError: the cloud holds no point, or `max_degree` is not 0 to 3.
@@ -103,10 +103,10 @@ class GaussianField(nn.Module):
         hr: bool = True,
         tiles: Bool[Tensor, "th tw"] | None = None,
     ) -> tuple[FieldShot | None, FieldShot | None]:
-        """Î_LR without f_det and Î_HR with it, of the same gated geometry; None for one that is not wanted.  Eq. 2, 3
+        """Î_LR without f_det and Î_HR with it, of the same gated geometry; None for a scale that is not wanted.  Eq. 2, 3
 
         Args:
-            tiles: those of Î_HR that are drawn, see `Rasterizer.tile`; the others show I_HR, so that no loss sees them.
+            tiles: the tiles of Î_HR that are rendered, see `Rasterizer.tile`; the others show I_HR and have no loss.
         """
         active = self._activate(gate)
         wanted = [
@@ -123,34 +123,34 @@ class GaussianField(nn.Module):
         return shots.get(False), shots.get(True)
 
     def render(self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True) -> Float[Tensor, "H W 3"]:
-        """An image for looking at: no dropout, f = base + det, not clamped."""
+        """An image for evaluation: no dropout, f = base + det, not clamped."""
         return rasterizer(self._activate(None).splats(detail=detail), camera).image
 
     def update_filter(self, cameras: Sequence[Camera], variance: float) -> None:
-        """Recompute the 3D filter; after every change of structure, and now and then as the means move."""
+        """Recompute the 3D filter from the present means."""
         self.filter_3d = filter_std(self.means.data, cameras, variance)
 
     def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
-        """Every change of structure is one gather: row i becomes a copy of row parents[i]."""
+        """Change the structure by one gather: row i becomes a copy of row parents[i]."""
         for name in ATTRIBUTES:
             getattr(self, name).data = getattr(self, name).data[parents]
         self.filter_3d = self.filter_3d[parents]
 
     def constrain(self) -> None:
-        """Project parameters back to where they can still move: logits to ±15, log scales to ±20."""
+        """Clamp parameters to where they have a gradient: logits to ±15, log scales to ±20."""
         self.opacities.data.clamp_(-LOGIT_LIMIT, LOGIT_LIMIT)
         self.scales.data.clamp_(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
 
     def filtered_opacities(self) -> Float[Tensor, " N"]:
-        """σ(opacity) times the 3D filter's coefficient: what is drawn, and what pruning looks at."""
+        """σ(opacity) times the 3D filter's coefficient, the opacity that is rendered; pruning uses it."""
         return self._activate(None).opacities
 
     def opacity_coefficient(self) -> Float[Tensor, " N"]:
-        """Π_k s_k / √(s_k² + f²): a filtered Gaussian is larger, and as much fainter."""
+        """Π_k s_k / √(s_k² + f²): a filtered Gaussian is larger, and its opacity lower by this factor."""
         return self._activate(None).coefficient
 
-    def fused(self) -> Splats:
-        """Everything folded in: filter in scales and opacities, f_det in the colour; what exports and viewers need."""
+    def baked(self) -> Splats:
+        """Splats for exports and viewers: the filter in scales and opacities, f_det in the colour."""
         return self._activate(None).splats(detail=True)
 
     def _activate(self, gate: Tensor | None) -> Activation:
@@ -167,7 +167,7 @@ class GaussianField(nn.Module):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Activation:
-    """The field as it is drawn, with what the chain rule needs to get back to the raw parameters.
+    """The activated field, with what the chain rule to the raw parameters needs.
 
     Args:
         scales: s = exp(raw). filtered: √(s² + f²). sigmoid: σ(raw). factor: coefficient · z, so opacity = factor · σ.
@@ -195,7 +195,7 @@ class Activation:
     def vjp(self, g: SplatGradients, k: int, *, detail: bool) -> Grads:
         """Chain rule through the filter, exp and sigmoid, for cotangent k."""
         d_opacity = g.opacities[k]
-        # log(coefficient) = Σ log(s / √(s² + f²)) grows with log(s) by f² / (s² + f²): opacity pulls on scale.
+        # ∂ log(coefficient) / ∂ log(s) = f² / (s² + f²): the opacity's gradient reaches the scales.
         share = (self.filter_3d[:, None] / self.filtered).square()
         d_scales = g.scales[k] * self.scales.square() / self.filtered
         d_scales = d_scales + (d_opacity * self.opacities)[:, None] * share
@@ -218,7 +218,7 @@ class FieldShot:
     """A rendering of the field; see `gradients.Shot`.
 
     Attributes:
-        gradients: K cotangents to gradients of the drawn splats, before the chain rule of `activation`.
+        gradients: maps K cotangents to gradients of the rendered splats, before the chain rule of `activation`.
     """
 
     def __init__(self, rendering: Rendering, activation: Activation, *, detail: bool) -> None:
@@ -233,12 +233,12 @@ class FieldShot:
 
 
 def filled(
-    image: Float[Tensor, "H W 3"], tiles: Bool[Tensor, "th tw"], reference: Float[Tensor, "H W 3"], tile: int
+    image: Float[Tensor, "H W 3"], tiles: Bool[Tensor, "th tw"], elsewhere: Float[Tensor, "H W 3"], tile: int
 ) -> Float[Tensor, "H W 3"]:
-    """`image` where its tiles were drawn, `reference` elsewhere: no residual there, and no edge in an SSIM window."""
+    """`image` where its tiles were rendered, else the other image: no residual there, and no edge in an SSIM window."""
     height, width = image.shape[:2]
     drawn = images.upsample(tiles[..., None].to(image), tile, "nearest")[:height, :width]
-    return torch.where(drawn > 0, image, reference)
+    return torch.where(drawn > 0, image, elsewhere)
 
 
 def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:

@@ -1,4 +1,4 @@
-"""Floor 4: the 3D smoothing filter of Mip-Splatting: no Gaussian is thinner than the cameras can sample (METHOD, B)."""
+"""The 3D smoothing filter of Mip-Splatting: no Gaussian is thinner than the cameras can sample."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.errors import SettingError
 from clear_strategies.schedules import milestone
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_NEAR: Final = 0.2  # Mip-Splatting's: a camera samples what lies farther in front of it than this …
+_NEAR: Final = 0.2  # Mip-Splatting: a camera samples what is farther in front of it than this …
 _MARGIN: Final = 0.15  # … and projects into its image enlarged by this share on each side
 
 
 @dataclass(frozen=True, slots=True)
 class MipFilter:
-    """When and how the 3D filter is made.
+    """When the 3D filter is computed, and from which cameras.
 
     Args:
         variance: of the filter, in squared sampling intervals (px² at the finest camera); 0 switches it off.
         cameras: which training cameras set the sampling rate; the finer ones are "hr".
-        every: iterations between updates once densification has stopped (it is also updated with every change).
+        every: iterations between updates; every change of structure updates the filter as well.
         last: no update in this many last iterations of a run.
     """
 
@@ -39,11 +40,11 @@ class MipFilter:
 
     def __post_init__(self) -> None:
         if not self.variance >= 0:
-            raise ValueError(f"variance must be >= 0, got {self.variance}.")
+            raise SettingError(f"variance must be >= 0, got {self.variance}.")
         if self.cameras not in ("hr", "lr"):
-            raise ValueError(f"cameras must be hr or lr, got {self.cameras!r}.")
+            raise SettingError(f"cameras must be hr or lr, got {self.cameras!r}.")
         if self.every < 1:
-            raise ValueError(f"every must be at least 1 iteration, got {self.every}.")
+            raise SettingError(f"every must be at least 1 iteration, got {self.every}.")
 
 
 @torch.no_grad()
@@ -51,7 +52,7 @@ def filter_std(means: Float[Tensor, "N 3"], cameras: Sequence[Camera], variance:
     """f_i = √variance · z_min / f_max: the filter's standard deviation in world units.
 
     z_min is the smallest depth among the cameras that see the centre, f_max the largest focal length of all. A
-    Gaussian that none sees takes the largest z_min of the others; if none is seen at all there is no filter.
+    Gaussian that no camera sees takes the largest z_min of the others; if no Gaussian is seen, there is no filter.
     """
     if variance == 0 or not len(means):
         return means.new_zeros(len(means))

@@ -1,4 +1,4 @@
-"""Floor 4: 3DGS's learning rates, and Adam over the field's attributes (METHOD, A and F8)."""
+"""The learning rates of 3DGS, and Adam over the field's attributes (F8)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from clear_strategies.core.gradients import ATTRIBUTES
+from clear_strategies.errors import SettingError
 from clear_strategies.schedules import LogLinear
 
 BETA1: Final = 0.9
@@ -19,14 +20,19 @@ BETA2: Final = 0.999
 
 @dataclass(frozen=True, slots=True)
 class LearningRates:
-    """Per step, by attribute.
+    """Learning rates per step, by attribute; those of 3DGS's first release, which sparse-view forks use (F8).
 
     Args:
         means: log-linear decay, in units of the scene's extent.
-        detail_decay: f_det is multiplied by 1 minus this at every step in which HR takes part. L_HF cannot see a
-            constant colour, so nothing else holds f_det near 0.
-        eps: Adam's; gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
-        rows: "all", or only the rows "visible" in this step (faster; not exact, the others' momentum waits).
+        quats, scales, opacities, sh0, shN: of the raw parameters (any norm, log, logit, SH coefficients).
+        detail: of f_det (F34).
+        detail_decay: share of f_det, in [0, 1), that is lost at every step in which HR takes part. L_HF does not change
+            with a constant colour, so nothing else keeps f_det near 0; the paper has none, 0 (F35).
+        eps: Adam's. Gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
+        rows: "all", or only the rows "visible" in this step (faster but not exact: the others' momentum waits).
+
+    Raises:
+        SettingError: a setting is outside its range.
     """
 
     means: LogLinear = field(default_factory=LogLinear)
@@ -43,11 +49,11 @@ class LearningRates:
     def __post_init__(self) -> None:
         for name in ("quats", "scales", "opacities", "sh0", "shN", "detail", "eps"):
             if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}.")
+                raise SettingError(f"{name} must be >= 0, got {getattr(self, name)}.")
         if not 0 <= self.detail_decay < 1:
-            raise ValueError(f"detail_decay must lie in [0, 1), got {self.detail_decay}.")
+            raise SettingError(f"detail_decay must lie in [0, 1), got {self.detail_decay}.")
         if self.rows not in ("all", "visible"):
-            raise ValueError(f"rows must be all or visible, got {self.rows!r}.")
+            raise SettingError(f"rows must be all or visible, got {self.rows!r}.")
 
     def at(self, t: int, extent: float) -> dict[str, float]:
         """Every attribute's rate at iteration t, in its own unit."""
@@ -92,13 +98,13 @@ class Adam:
                     torch.where(stepped, now, then, out=now)
 
     def advance(self) -> tuple[dict[str, float], float]:
-        """Count a step: every attribute's rate over the bias of the first moment, and the bias of the second."""
+        """Count a step. Returns each attribute's rate over the bias of the first moment, and the bias of the second."""
         self.steps += 1
         bias1, bias2 = 1 - BETA1**self.steps, 1 - BETA2**self.steps
         return {name: rate / bias1 for name, rate in self.rates.at(self.steps, self.extent).items()}, bias2
 
     def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
-        """Follow a change of structure; fresh rows start without momentum."""
+        """Gather the moments after a change of structure; fresh rows start without momentum."""
         for moments in (self.first, self.second):
             for name, rows in moments.items():
                 gathered = rows[parents]

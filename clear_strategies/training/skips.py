@@ -1,8 +1,8 @@
-"""Floor 4: what a scene does not need, decided from the scene itself while it trains.
+"""Work that a scene does not need, decided from the scene itself while it trains.
 
-Exact skips (rows that do not move, tiles that nobody asked for, HR while λ_HR = 0) are always on, because nothing changes
-by them. Those here change the result a little, so each is a setting, its default is chosen by measurement
-(docs/evidence.md), the plan names those that are on, and the work_log counts the iterations and tiles that were left out.
+Exact skips (rows that do not move, tiles that are not requested, HR while λ_HR = 0) are always on, because they change
+nothing. The skips here change the result a little. Each is a setting whose default was chosen by measurement
+(docs/explanation/evidence.md); the plan lists those that are on, and the work log counts the iterations and tiles skipped.
 """
 
 from __future__ import annotations
@@ -20,29 +20,32 @@ from clear_strategies.core import deferred, images
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import Photo, View
 from clear_strategies.core.work_log import WorkLog
+from clear_strategies.errors import SettingError
 from clear_strategies.schedules import milestone
 
 _log = logging.getLogger(__name__)
 
-_REDUCED: Final = 2  # the coarse reference has half the size of the fine one
+_REDUCED: Final = 2  # the coarse SR image has half the size of the fine one
 
 
 @dataclass(frozen=True, slots=True)
 class Skips:
-    """Which work is left out. The defaults leave out nothing.
+    """Which work is skipped. The defaults skip nothing.
 
     Args:
-        coarse_until: until this iteration HR is drawn and compared at half its size: structure comes before detail.
-        hr_every: from `hr_every_from` on, HR takes part in every n-th iteration only.
-        flat: HR tiles are not drawn where the reference adds less than this to U(I_LR), mean over the tile, image units;
-            LR looks after them. 0: all tiles are drawn.
-        plateau_gain: once the training views' loss, mean over `plateau_window` iterations, is not at least this share below
-            that of the window before, the rest of the plateau is left out: training goes on at `plateau_to`, where the
-            learning rates have nearly fallen and test views still gain; 0: never. Not before `plateau_from`, when the
-            structure has settled.
+        coarse_until: until this iteration HR is rendered and compared at half its size; 0: never.
+        hr_every: from `hr_every_from` on, HR is rendered in every n-th iteration only.
+        hr_every_from: iteration, see `hr_every`.
+        flat: HR tiles are not rendered where the SR image adds less than this to U(I_LR), mean over the tile, image units
+            in [0, 1); only LR trains there. 0: all tiles are rendered.
+        plateau_gain: once the mean loss of the training views over `plateau_window` iterations is not at least this share
+            below that of the window before, training continues at iteration `plateau_to`; 0: never.
+        plateau_window: iterations.
+        plateau_from: iteration two windows before the earliest plateau.
+        plateau_to: iteration from which every run trains: the learning rates fall, and HR is at full size.
 
     Raises:
-        ValueError: a setting is outside its range.
+        SettingError: a setting is outside its range.
     """
 
     coarse_until: int = milestone(0)
@@ -56,33 +59,33 @@ class Skips:
 
     def __post_init__(self) -> None:
         if self.hr_every < 1:
-            raise ValueError(f"hr_every must be at least 1 iteration, got {self.hr_every}.")
+            raise SettingError(f"hr_every must be at least 1 iteration, got {self.hr_every}.")
         if not 0 <= self.flat < 1:
-            raise ValueError(f"flat must lie in [0, 1) image units, got {self.flat}.")
+            raise SettingError(f"flat must lie in [0, 1) image units, got {self.flat}.")
         if not 0 <= self.plateau_gain < 1:
-            raise ValueError(f"plateau_gain must lie in [0, 1), got {self.plateau_gain}.")
+            raise SettingError(f"plateau_gain must lie in [0, 1), got {self.plateau_gain}.")
         if self.coarse_until < 0:
-            raise ValueError(f"coarse_until must be at least 0 iterations, got {self.coarse_until}.")
+            raise SettingError(f"coarse_until must be at least 0 iterations, got {self.coarse_until}.")
 
     def says(self) -> list[str]:
-        """One phrase for each that is on, for the plan."""
+        """A phrase for each skip that is on, for the plan."""
         phrases = []
         if self.coarse_until > 0:
             phrases.append(f"HR at half its size until iteration {self.coarse_until}")
         if self.hr_every > 1:
-            phrases.append(f"HR but every {self.hr_every} iterations from {self.hr_every_from}")
+            phrases.append(f"HR except every {self.hr_every} iterations from {self.hr_every_from}")
         if self.flat > 0:
-            phrases.append(f"HR tiles to which the reference adds less than {self.flat:.4f}")
+            phrases.append(f"HR tiles to which the SR image adds less than {self.flat:.4f}")
         if self.plateau_gain > 0:
             phrases.append(
-                f"what is left until {self.plateau_to} once {self.plateau_window} iterations gain less than "
+                f"the iterations until {self.plateau_to} once {self.plateau_window} iterations gain less than "
                 f"{self.plateau_gain:.1%}"
             )
         return phrases
 
 
 class SkipPolicy:
-    """The skips of one run. Nothing here changes with time but caches, so that resuming needs nothing of it."""
+    """Applies the skips of one run. It holds caches only, so a checkpoint needs nothing of it."""
 
     def __init__(self, skips: Skips | None = None) -> None:
         self.skips = skips if skips is not None else Skips()
@@ -90,7 +93,7 @@ class SkipPolicy:
         self._wanted: dict[tuple[str, int], tuple[Bool[Tensor, "_ _"], int]] = {}  # and how many are not
 
     def view(self, view: View, t: int) -> View:
-        """The view as it is looked at in iteration t: with a coarse reference first, where LR divides evenly."""
+        """The view of iteration t: with a coarse SR image at first, where the factor is even."""
         if t > self.skips.coarse_until or view.factor % _REDUCED:
             return view
         if view.name not in self._coarse:
@@ -99,7 +102,7 @@ class SkipPolicy:
         return self._coarse[view.name]
 
     def hr_due(self, t: int, work_log: WorkLog) -> bool:
-        """Whether iteration t looks at HR at all."""
+        """Whether HR is rendered in iteration t."""
         s = self.skips
         if t <= s.hr_every_from or t % s.hr_every == 0:
             return True
@@ -107,7 +110,7 @@ class SkipPolicy:
         return False
 
     def wanted(self, view: View, tile: int, work_log: WorkLog) -> Bool[Tensor, "th tw"] | None:
-        """The HR tiles, `tile` px wide, worth drawing; None: all of them."""
+        """The HR tiles, `tile` px wide, that are rendered; None: all of them."""
         if self.skips.flat == 0:
             return None
         key = (view.name, view.factor)
@@ -116,11 +119,11 @@ class SkipPolicy:
         wanted, flat = self._wanted[key]
         if not flat:
             return None
-        work_log.skip("HR tiles", "flat reference (skips.flat)", flat)
+        work_log.skip("HR tiles", "flat SR image (skips.flat)", flat)
         return wanted
 
     def settled(self, history: Sequence[dict[str, Number]], t: int) -> bool:
-        """Whether the training views have stopped improving by iteration t, which then is followed by `plateau_to`."""
+        """Whether the training views have stopped improving by iteration t; `plateau_to` then follows."""
         s, window = self.skips, self.skips.plateau_window
         if s.plateau_gain == 0 or window < 1 or t % window or not s.plateau_from + 2 * window <= t < s.plateau_to:
             return False
@@ -136,7 +139,7 @@ class SkipPolicy:
         wanted = images.patch_means(added, tile) >= self.skips.flat
         flat = int((~wanted).sum())
         _log.info(
-            "%s: %d of %d HR tiles (%d px) are flat: LR alone looks after them.",
+            "%s: %d of %d HR tiles (%d px) are flat and trained on LR alone.",
             view.name, flat, wanted.numel(), tile,
         )  # fmt: skip
         return wanted, flat

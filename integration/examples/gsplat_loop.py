@@ -18,8 +18,9 @@ from torch import Tensor
 
 from clear_strategies.compose import conductor
 from clear_strategies.core import images
-from clear_strategies.data.points.cloud import CloudSettings
+from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import ViewSettings, prepare
+from clear_strategies.data.priors import DemoPrior
 from clear_strategies.data.readers import demo
 from clear_strategies.data.scene import Scene
 from clear_strategies.kernels import losses
@@ -36,7 +37,7 @@ RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0
 def main(iterations: int, strategies: str | None) -> float:
     """Train the demo for so many steps; returns the PSNR of its test views at HR, dB."""
     capture = demo.read(width=256, height=192, views=12, train=3)
-    sr = demo.DemoPrior(truth={frame.name: frame.load for frame in capture.frames})
+    sr = DemoPrior(truth={frame.name: frame.load for frame in capture.frames})
     scene = prepare(capture, ViewSettings(), sr, CloudSettings())
     photos = {v.name: v.lr for v in scene.train}  # what a host has: LR photographs and their cameras
 

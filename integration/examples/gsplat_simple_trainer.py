@@ -20,7 +20,7 @@ import torch
 
 from clear_strategies.compose import conductor
 from clear_strategies.core.view import View
-from clear_strategies.data.priors.upscale import Images, Onnx
+from clear_strategies.data.priors import Images, Onnx
 from integration.gsplat_strategy import ClearStrategy
 from integration.views import SuperResolve, view
 

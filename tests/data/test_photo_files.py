@@ -57,7 +57,7 @@ def test_straight_alpha_is_composited_over_the_background(tmp_path: Path) -> Non
     torch.testing.assert_close(found, torch.tensor([[[1.0, 0.8, 0.4], [1.0, 1.0, 0.5]]]))
 
 
-def test_without_a_background_alpha_lies_over_black_and_is_told(
+def test_without_a_background_alpha_is_composited_over_black_and_logged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = save(tmp_path / "a.png", np.array([[[255, 0, 0, 51]]], np.uint8))
@@ -84,7 +84,7 @@ def test_the_header_tells_the_size(ending: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("orientation", [3, 6])
-def test_a_photo_to_be_turned_is_refused(ending: str, orientation: int, tmp_path: Path) -> None:
+def test_a_photo_rotated_by_exif_is_refused(ending: str, orientation: int, tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = orientation
     path = save(tmp_path / f"a{ending}", np.zeros((12, 16, 3), np.uint8), exif=exif)
@@ -156,8 +156,3 @@ def test_names_that_lead_out_are_refused(name: str, tmp_path: Path) -> None:
 def test_names_inside_are_kept_and_outside_ones_can_be_allowed(tmp_path: Path) -> None:
     assert photo_files.inside(tmp_path, "a/../b.png", file=tmp_path) == tmp_path / "a/../b.png"
     assert photo_files.inside(tmp_path, "/x.png", file=tmp_path, allow_outside=True) == Path("/x.png")
-
-
-def test_frame_numbers_are_the_last_of_the_name() -> None:
-    names = ("train/r_26.png", "image007.png", "r_2", "view.png")
-    assert [photo_files.frame_number(name) for name in names] == [26, 7, 2, None]

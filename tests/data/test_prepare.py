@@ -1,33 +1,214 @@
-"""From a capture to a scene: what the plan says of the reference."""
+"""Splits and sizes: the papers' view indices and pixel counts; what is refused before a photo is decoded; SR detail."""
 
 from __future__ import annotations
 
 import logging
+import math
+from dataclasses import replace
 
 import pytest
+import torch
 
-from clear_strategies.data.points.cloud import CloudSettings
-from clear_strategies.data.prepare import ViewSettings, prepare
-from clear_strategies.data.priors.upscale import Bicubic
+from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.points import CloudSettings
+from clear_strategies.data.prepare import ViewSettings, check_headers, lr_size, prepare, resized, split
+from clear_strategies.data.priors import Bicubic, DemoPrior
 from clear_strategies.data.readers import demo
+from clear_strategies.errors import DataError, SettingError
+from rasterizers import Camera
+
+# Training indices among the n photos of each LLFF scene, and the number of test views: the 3-view protocol of RegNeRF,
+# FSGS, CoR-GS and DropGaussian.
+LLFF = {
+    "fern": (20, [1, 10, 19], 3), "flower": (34, [1, 17, 33], 5), "fortress": (42, [1, 21, 41], 6),
+    "horns": (62, [1, 30, 61], 8), "leaves": (26, [1, 12, 25], 4), "orchids": (25, [1, 12, 23], 4),
+    "room": (41, [1, 20, 39], 6), "trex": (55, [1, 28, 54], 7),
+}  # fmt: skip
+# Photos, those that are not for testing, test views.
+MIP360 = {
+    "bicycle": (194, 169, 25), "bonsai": (292, 255, 37), "counter": (240, 210, 30), "garden": (185, 161, 24),
+    "kitchen": (279, 244, 35), "room": (311, 272, 39), "stump": (125, 109, 16),
+}  # fmt: skip
+# Full size, LR = round(full / 8), HR = 4 LR.
+SIZES = {
+    "LLFF": ((4032, 3024), (504, 378), (2016, 1512)),
+    "bicycle": ((4946, 3286), (618, 411), (2472, 1644)),
+    "garden": ((5187, 3361), (648, 420), (2592, 1680)),
+    "stump": ((4978, 3300), (622, 412), (2488, 1648)),
+    "room": ((3114, 2075), (389, 259), (1556, 1036)),
+    "counter": ((3115, 2076), (389, 260), (1556, 1040)),
+    "kitchen": ((3115, 2078), (389, 260), (1556, 1040)),
+    "bonsai": ((3118, 2078), (390, 260), (1560, 1040)),
+    "flowers": ((5025, 3312), (628, 414), (2512, 1656)),
+    "treehill": ((5068, 3326), (634, 416), (2536, 1664)),
+}
+
 
 POINTS = CloudSettings(init="random", random_points=50)
+
+
+def capture(n: int = 3, width: int = 16, height: int = 16, image: torch.Tensor | None = None) -> Capture:
+    """N photos side by side; gradients unless an image is given."""
+    if image is None:
+        image = torch.linspace(0, 1, width)[None, :, None].expand(height, width, 3).contiguous()
+    frames = []
+    for i in range(n):
+        pose = torch.eye(4)
+        pose[0, 3] = -i
+        camera = Camera(pose, 1.2 * width, 1.2 * width, 0.45 * width, 0.55 * height, width, height)
+        frames.append(Frame(f"{i:04d}.png", camera, lambda: image))
+    return Capture("made up", tuple(frames))
+
+
+def indices(frames: list[Frame]) -> list[int]:
+    return [int(frame.name[:4]) for frame in frames]
+
+
+@pytest.mark.parametrize("scene", LLFF)
+def test_llff_trains_and_tests_on_the_papers_views(scene):
+    n, expected, n_test = LLFF[scene]
+    train, test = split(capture(n), ViewSettings(train=3))
+    assert indices(train) == expected
+    assert indices(test) == list(range(0, n, 8))
+    assert len(test) == n_test
+
+
+@pytest.mark.parametrize("scene", MIP360)
+def test_mip360_trains_on_24_views_evenly_spaced_in_the_pool(scene):
+    n, n_pool, n_test = MIP360[scene]
+    train, test = split(capture(n), ViewSettings(train=24))
+    pool = [i for i in range(n) if i % 8]
+    assert (len(pool), len(test), len(train)) == (n_pool, n_test, 24)
+    assert indices(train)[0] == pool[0]
+    assert indices(train)[-1] == pool[-1]
+    steps = [pool.index(b) - pool.index(a) for a, b in zip(indices(train), indices(train)[1:], strict=False)]
+    assert max(steps) - min(steps) <= 1
+
+
+@pytest.mark.parametrize("scene", SIZES)
+def test_photos_get_the_published_sizes(scene):
+    full, lr, hr = SIZES[scene]
+    photo = Camera(torch.eye(4), 1.0, 1.0, 1.0, 1.0, *full)
+    assert lr_size(photo, ViewSettings(shrink=2, sizes="round")) == lr
+    camera = resized(photo, *hr)
+    assert (camera.scaled(1 / 4).width, camera.scaled(1 / 4).height) == lr
+
+
+def made(sizes: str, width: int = 57, height: int = 43, **settings):
+    views = ViewSettings(train=1, sizes=sizes, **settings)
+    return prepare(capture(2, width, height), views, Bicubic(), CloudSettings(init="random", random_points=20)).train[0]
+
+
+def test_rounded_sizes_keep_the_border_and_the_rays_through_it():
+    """57x43 at shrink 2, x4: 57/8 = 7.125 -> 7, 43/8 = 5.375 -> 5."""
+    view, photo = made("round", shrink=2), capture(2, 57, 43).frames[1].camera
+    assert (view.lr.camera.width, view.lr.camera.height, view.hr.camera.width, view.hr.camera.height) == (7, 5, 28, 20)
+    for camera in (view.lr.camera, view.hr.camera):
+        for k, size in (("x", "width"), ("y", "height")):  # the same field of view, each axis by its own ratio
+            ratio = getattr(camera, size) / getattr(photo, size)
+            assert getattr(camera, f"f{k}") == pytest.approx(getattr(photo, f"f{k}") * ratio)
+            assert getattr(camera, f"c{k}") == pytest.approx(getattr(photo, f"c{k}") * ratio)
+    last = float(view.truth[0, -1, 0])
+    assert last > 0.97  # the photo ends at 1
+
+
+def test_cropped_sizes_lose_the_border_and_keep_the_focal_length():
+    view, photo = made("crop", shrink=2), capture(2, 57, 43).frames[1].camera
+    assert (view.hr.camera.width, view.hr.camera.height) == (28, 20)
+    assert (view.hr.camera.fx, view.hr.camera.cy) == pytest.approx((photo.fx / 2, photo.cy / 2))
+
+
+def test_where_nothing_is_left_over_both_rules_agree():
+    crop, rounded = (made(sizes, 64, 48, shrink=2) for sizes in ("crop", "round"))
+    assert torch.equal(crop.truth, rounded.truth)
+    assert torch.equal(crop.lr.image, rounded.lr.image)
+    for name in ("fx", "fy", "cx", "cy", "width", "height"):
+        assert getattr(crop.hr.camera, name) == getattr(rounded.hr.camera, name)
+
+
+def never() -> torch.Tensor:
+    raise AssertionError("a photo was decoded")
+
+
+def undecodable(n: int = 2, width: int = 57, height: int = 43) -> Capture:
+    """Frames whose photos must not be decoded."""
+    return Capture("headers", tuple(replace(f, load=never) for f in capture(n, width, height).frames))
+
+
+@pytest.mark.parametrize("sizes", ["crop", "round"])
+@pytest.mark.parametrize("photos_are", ["hr", "lr"])
+def test_a_photo_that_becomes_smaller_than_an_lr_pixel_is_refused_by_its_header(sizes, photos_are):
+    views = ViewSettings(train=1, shrink=200, sizes=sizes, photos_are=photos_are)
+    with pytest.raises(
+        SettingError, match=r"data\.views\.shrink: must leave a whole LR pixel .* of 57x43.*, got 200: "
+    ):
+        prepare(undecodable(), views, Bicubic(), POINTS)
+
+
+def test_the_largest_shrink_leaves_one_lr_pixel():
+    views = ViewSettings(train=1, shrink=10)
+    check_headers(undecodable().frames, views)
+    assert lr_size(undecodable().frames[0].camera, views) == (1, 1)
+
+
+@pytest.mark.parametrize("size", [None, (5, 5)])
+def test_ready_made_lr_images_are_checked_by_their_headers(size, tmp_path):
+    write_png(tmp_path / "0000.png", torch.zeros(10, 14, 3))  # of a test view
+    if size is not None:
+        write_png(tmp_path / "0001.png", torch.zeros(size[1], size[0], 3))
+    with pytest.raises(DataError, match="has no LR image" if size is None else "is 5x5 where 14x10 is expected"):
+        prepare(undecodable(), ViewSettings(train=1, lr_folder=str(tmp_path)), Bicubic(), POINTS)
+
+
+def test_ready_made_lr_images_are_used(tmp_path):
+    for name in ("0000", "0001"):
+        write_png(tmp_path / f"{name}.png", torch.full((10, 14, 3), 0.2))
+    view = made("crop", lr_folder=str(tmp_path))
+    assert torch.allclose(view.lr.image, torch.tensor(0.2))
+
+
+@pytest.mark.parametrize("init", ["sfm", "sfm_train", "ply"])
+def test_points_that_do_not_exist_are_refused_before_a_photo_is_decoded(init):
+    with pytest.raises(DataError, match=r"there are none|is not there"):
+        prepare(undecodable(), ViewSettings(train=1), Bicubic(), CloudSettings(init=init, path="nowhere.ply"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "value"),
+    [
+        ("sr_scale", 2.5), ("sr_scale", 4.0), ("sr_scale", True), ("sr_scale", 0), ("sr_scale", math.nan),
+        ("shrink", 2.5), ("shrink", 0), ("train", 0), ("train", 1.5), ("test_every", 1), ("test_limit", -1),
+        ("sizes", "pad"), ("photos_are", "sr"), ("downsample", "nearest"), ("train_names", "r_2"), ("train_names", [3]),
+        ("train_names", []),
+    ],
+)  # fmt: skip
+def test_view_settings_out_of_range_are_refused_by_name(wrong, value):
+    settings = ViewSettings()
+    object.__setattr__(settings, wrong, value)  # past the type checks, which only tests have
+    with pytest.raises(SettingError, match=rf"data\.views\.{wrong}: must .*, got .*: "):
+        settings.__post_init__()
+
+
+def test_lr_photos_and_an_lr_folder_contradict_each_other():
+    with pytest.raises(SettingError, match=r"data\.views\.lr_folder: must be null"):
+        ViewSettings(photos_are="lr", lr_folder="here")
 
 
 def added(prior, caplog) -> tuple[float, str]:
     capture = demo.read(width=64, height=48, views=5, train=2)
     with caplog.at_level(logging.WARNING):
         scene = prepare(capture, ViewSettings(train=2), prior(capture), POINTS)
-    return float(scene.notes["the reference adds"].split()[0]), caplog.text
+    return float(scene.notes["the SR images add"].split()[0]), caplog.text
 
 
-def test_a_reference_without_detail_is_said_to_have_none(caplog):
-    levels, said = added(lambda capture: Bicubic(), caplog)
+def test_sr_images_without_detail_are_reported(caplog):
+    levels, log = added(lambda capture: Bicubic(), caplog)
     assert levels == pytest.approx(0.2, abs=0.2)  # rounding to 8 bits
-    assert "there is no detail to route" in said
+    assert "there is no detail to route" in log
 
 
-def test_a_reference_with_detail_is_measured(caplog):
-    levels, said = added(lambda capture: demo.DemoPrior({f.name: f.load for f in capture.frames}), caplog)
+def test_the_detail_of_sr_images_is_measured(caplog):
+    levels, log = added(lambda capture: DemoPrior({f.name: f.load for f in capture.frames}), caplog)
     assert levels > 1
-    assert "no detail" not in said
+    assert "no detail" not in log

@@ -1,6 +1,6 @@
-"""Malformed inputs: tiny good scenes with one thing spoilt. Each must be refused in one line that names the file.
+"""Malformed inputs: tiny valid scenes with one defect each. Each must be refused in one line that names the file.
 
-`CASES` serves the readers' tests and the command line's: a case builds its scene and says which `data=` reads it.
+`CASES` is for the tests of the readers and of the command line: a case builds its scene and names the `data=` for it.
 """
 
 from __future__ import annotations
@@ -34,8 +34,9 @@ class Case:
     """One malformed scene.
 
     Args:
-        good: which tiny scene it is made from. spoil: what is done to the scene's folder.
-        pattern: regular expression that the message must match, from the file's name on.
+        good: the tiny scene it is made from.
+        spoil: the change to the scene's folder.
+        pattern: regular expression that the message must match.
     """
 
     name: str
@@ -63,7 +64,7 @@ def bomb(width: int, height: int) -> bytes:
 
 
 class Canary:
-    """Unpickling it leaves a file behind: whoever reads the scene must not."""
+    """Unpickling it creates a folder, which a test can detect."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -131,7 +132,7 @@ def edit_frame(name: str, **values: object) -> Spoil:
 
 
 def save_image(name: str, **options: Any) -> Spoil:
-    """A photo of another kind in the place of a good one."""
+    """Replace a photo by another kind of image."""
     size = options.pop("size", (tiny.WIDTH, tiny.HEIGHT))
     mode = options.pop("mode", "RGB")
     return lambda root: Image.new(mode, size).save(root / name, **options)
@@ -156,7 +157,7 @@ def raw_pickle(root: Path) -> None:
 
 
 def link_outside(name: str) -> Spoil:
-    """The photo becomes a link to a file beside the scene's folder."""
+    """Replace a photo by a link to a file outside the scene's folder."""
 
     def spoil(root: Path) -> None:
         outside = root.parent / "outside.png"
@@ -206,14 +207,14 @@ TRAIN, SHARED = "transforms_train.json", "transforms.json"
 CASES = [
     # COLMAP, binary
     Case("no model", "colmap", remove(CAMERAS), r"cameras\.bin: file"),
-    Case("no photos", "colmap", lambda root: (root / "images").rename(root / "photos"), r"scene: images: has none"),
+    Case("no photos", "colmap", lambda root: (root / "images").rename(root / "photos"), r"scene/images: images: is no folder"),
     Case("photo absent", "colmap", remove("images/b.png"), r"images\.bin: b\.png: is not in"),
     Case("empty file", "colmap", write(IMAGES, b""), r"images\.bin: number of images: .*truncated"),
     Case("cameras truncated", "colmap", cut(CAMERAS, -1), r"cameras\.bin: .*bytes"),
     Case("images truncated", "colmap", cut(IMAGES, -9), r"images\.bin: .*left"),
     Case("points truncated", "colmap", cut(POINTS, -3), r"points3D\.bin: .*left"),
     Case("trailing bytes", "colmap", append(POINTS, b"\0" * 5), r"points3D\.bin: end: 5 bytes"),
-    Case("count beyond file", "colmap", patch(IMAGES, 0, "<Q", 2**61), r"images\.bin: number of images: says 23058"),
+    Case("count beyond file", "colmap", patch(IMAGES, 0, "<Q", 2**61), r"images\.bin: number of images: is 23058"),
     Case("2D count beyond file", "colmap", patch(IMAGES, NAME_AT + 6, "<Q", 2**60), r"images\.bin: 2D points of 'a"),
     Case("track beyond file", "colmap", patch(POINTS, 8 + 8 + 24 + 3 + 8, "<Q", 2**59), r"points3D\.bin: track of"),
     Case("zero quaternion", "colmap", patch(IMAGES, QUATERNION_AT, "<4d", 0, 0, 0, 0), r"images\.bin: a\.png: .*leng"),

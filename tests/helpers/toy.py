@@ -51,7 +51,7 @@ def scene(n: int = 40, seed: int = 0, train: int = 3, test: int = 1) -> Scene:
         noise = torch.randn(image.shape, generator=torch.Generator().manual_seed(100 * seed + i)) * 0.03
         lr = Photo(hr_camera.scaled(1 / FACTOR), images.downsample(image, FACTOR))
         hr = Photo(hr_camera, images.quantize(image + noise))
-        views.append(View(f"view{i}", lr, hr, truth=image, reference="truth with noise"))
+        views.append(View(f"view{i}", lr, hr, truth=image, sr_source="truth with noise"))
     g = torch.Generator().manual_seed(seed + 7)
     means = truth.means + torch.randn(n, 3, generator=g) * 0.05
     cloud = PointCloud(means, torch.rand(n, 3, generator=g), source="toy")

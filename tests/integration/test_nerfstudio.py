@@ -16,7 +16,7 @@ import torch
 from clear_strategies import GCO, P2G, Conductor, Objective
 from clear_strategies.data.cameras import pose_from_opengl
 from clear_strategies.data.photo_files import read_image, write_png
-from clear_strategies.data.priors.upscale import Bicubic, Cached, Images
+from clear_strategies.data.priors import Bicubic, Cached, Images
 from clear_strategies.errors import DataError
 from clear_strategies.schedules import WarmupDecay
 from integration.gsplat import attach

@@ -1,4 +1,4 @@
-"""Maps of a run show what its strategies decide, and asking for them decides nothing."""
+"""Maps show what the strategies of a run decide, and making them does not change the run."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ import torch
 from torch import Tensor
 
 from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads, conflict_ratio
+from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
-from clear_strategies.outputs.maps import MAPS, diagnose, leave
+from clear_strategies.outputs.maps import MAPS, view_maps, write_maps
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.strategies.p2g import patch_evidence
@@ -51,26 +53,26 @@ def everything(state: TrainState) -> dict[str, Tensor]:
     return {name: value.clone() for name, value in state.checkpoint({}).tensors.items()}
 
 
-def test_asking_changes_nothing() -> None:
+def test_making_maps_does_not_change_the_run() -> None:
     strategies = (GCO(), P2G(), SVS(anchor_start=2))
     state = trained(*strategies)
-    before, readings = everything(state), [dict(s.readings) for s in strategies]
+    before, logs = everything(state), [dict(s.logs) for s in strategies]
     caches, entries = [set(s.cache) for s in strategies], dict(state.conductor.work_log.entries)
     for view in state.views:
-        diagnose(state.field, state.conductor, toy.RASTERIZER, view)
+        view_maps(state.field, state.conductor, toy.RASTERIZER, view)
     after = everything(state)
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
-    assert [dict(s.readings) for s in strategies] == readings
+    assert [dict(s.logs) for s in strategies] == logs
     assert [set(s.cache) for s in strategies] == caches
     assert state.conductor.work_log.entries == entries
 
 
-def test_patch_maps_are_those_that_p2g_routes_by_enlarged_to_hr() -> None:
+def test_patch_maps_are_p2gs_evidence_enlarged_to_hr() -> None:
     p2g = P2G(patch=8, reliability_scale=0.02)
     state = trained(p2g)
     view = state.views[0]
-    maps = diagnose(state.field, state.conductor, toy.RASTERIZER, view).maps
+    maps = view_maps(state.field, state.conductor, toy.RASTERIZER, view).maps
     R, A = patch_evidence(view.lr.image, view.hr.image, 4, patch=8, reliability_scale=0.02)
     assert maps["reliability"].shape == (64, 96)
     assert maps["reliability"][31, 32] == R[0, 1]  # patches of 32 HR pixels
@@ -78,19 +80,19 @@ def test_patch_maps_are_those_that_p2g_routes_by_enlarged_to_hr() -> None:
     assert torch.equal(maps["weight"], maps["reliability"] * maps["demand"])
 
 
-def test_without_p2g_the_evidence_is_its_default() -> None:
+def test_without_patch_evidence_of_its_own_a_run_shows_p2gs_default() -> None:
     state = trained()
     view = state.views[0]
     R, _ = patch_evidence(view.lr.image, view.hr.image, 4)
-    assert diagnose(state.field, state.conductor, toy.RASTERIZER, view).means["reliability"] == pytest.approx(
+    assert view_maps(state.field, state.conductor, toy.RASTERIZER, view).means["reliability"] == pytest.approx(
         float(R[0].repeat_interleave(64)[:96].mean()), rel=1e-6
     )
 
 
-def test_conflict_is_the_share_that_training_reports() -> None:
+def test_conflict_is_the_ratio_that_training_logs() -> None:
     state = trained()
     view = state.views[0]
-    found = diagnose(state.field, state.conductor, toy.RASTERIZER, view)
+    found = view_maps(state.field, state.conductor, toy.RASTERIZER, view)
     lr, hr = state.field.render_scales(toy.RASTERIZER, view)
     assert hr is not None
     (g_lr,) = lr.vjp(OBJECTIVE.lr(lr.image, view.lr.image).cotangents)
@@ -100,6 +102,32 @@ def test_conflict_is_the_share_that_training_reports() -> None:
     assert "corrected" not in found.maps
 
 
+class OwnPatches(Strategy):
+    """Has patch evidence, and is no P2G."""
+
+    def observe(self, view: View, hr: object) -> None:
+        return None
+
+    def patch_maps(self, view: View) -> PatchMaps:
+        return PatchMaps(torch.full((2, 3), 0.5), torch.full((2, 3), 0.25), patch=8)
+
+
+def test_any_strategy_can_have_patch_maps(tmp_path: Path) -> None:
+    state = trained(OwnPatches())
+    write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER)
+    content = json.loads((tmp_path / "maps.json").read_text())
+    assert content["evidence"] == "this run's OwnPatches"
+    means = content["views"][state.views[0].name]
+    assert (means["reliability"], means["demand"], means["weight"]) == (0.5, 0.25, 0.125)
+
+
+def test_corrections_are_shown_although_lambda_hr_has_fallen_to_0() -> None:
+    state = trained(Halve())
+    state.conductor.objective = replace(OBJECTIVE, lambda_hr=WarmupDecay(peak=0, final=0))
+    found = view_maps(state.field, state.conductor, toy.RASTERIZER, state.views[0])
+    assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
+
+
 class Halve(Strategy):
     """Every Gaussian loses half of its HR gradient."""
 
@@ -107,29 +135,29 @@ class Halve(Strategy):
         return hr * 0.5
 
 
-def test_correction_is_the_share_of_the_hr_gradient_that_was_taken_away() -> None:
+def test_corrected_is_the_share_of_the_hr_gradient_that_was_taken_away() -> None:
     state = trained(Halve())
-    found = diagnose(state.field, state.conductor, toy.RASTERIZER, state.views[0])
+    found = view_maps(state.field, state.conductor, toy.RASTERIZER, state.views[0])
     assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
     # Drawn over black: nowhere more than the number itself, and nearly that where Gaussians cover the pixel.
     assert float(found.maps["corrected"].max()) == pytest.approx(0.5, abs=0.1)
     assert float(found.maps["corrected"].max()) <= 0.5 + 1e-5
 
 
-def test_maps_lie_over_black_whatever_the_background_is() -> None:
+def test_maps_are_drawn_over_black_whatever_the_background() -> None:
     import rasterizers
 
     state = trained(Halve())
     white = rasterizers.load("torch", tile=8, background=(1.0, 1.0, 1.0))
     state.field.opacities.data[:] = -4.0  # little is drawn
-    found = diagnose(state.field, state.conductor, white, state.views[0])
+    found = view_maps(state.field, state.conductor, white, state.views[0])
     assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
     assert 0 < float(found.maps["corrected"].max()) < 0.4
 
 
-def test_a_folder_of_maps_is_complete_and_says_what_it_holds(tmp_path: Path) -> None:
+def test_a_folder_of_maps_is_complete(tmp_path: Path) -> None:
     state = trained(GCO(), P2G())
-    leave(tmp_path, state.views[:2], state.field, state.conductor, toy.RASTERIZER)
+    write_maps(tmp_path, state.views[:2], state.field, state.conductor, toy.RASTERIZER)
     content = json.loads((tmp_path / "maps.json").read_text())
     assert (content["corrector"], content["evidence"]) == ("GCO", "this run's P2G")
     assert set(content["views"]) == {view.name for view in state.views[:2]}
@@ -137,16 +165,18 @@ def test_a_folder_of_maps_is_complete_and_says_what_it_holds(tmp_path: Path) -> 
         own = tmp_path / view.name
         assert {path.name for path in own.iterdir()} == {f"{name}.png" for name in (*MAPS, "lr", "prior")}
         assert set(content["views"][view.name]) == set(MAPS)
-        found = diagnose(state.field, state.conductor, toy.RASTERIZER, view).maps
+        found = view_maps(state.field, state.conductor, toy.RASTERIZER, view).maps
         for name in MAPS:
             assert float((read_image(own / f"{name}.png")[..., 0] - found[name]).abs().max()) <= 0.5 / 255 + 1e-6
 
 
-def test_without_a_corrector_no_correction_is_claimed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_without_a_strategy_that_corrects_there_is_no_corrected_map(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level("INFO")
     state = trained()
-    leave(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER)
+    write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER)
     content = json.loads((tmp_path / "maps.json").read_text())
     assert (content["corrector"], content["evidence"]) == (None, "P2G's defaults")
     assert not (tmp_path / state.views[0].name / "corrected.png").exists()
-    assert "no strategy corrects" in caplog.text
+    assert "no strategy of this run corrects" in caplog.text

@@ -1,4 +1,4 @@
-"""Provenance says what it can and never stands in the way of a result."""
+"""Provenance holds what can be found out, and never fails."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 from clear_strategies.outputs.provenance import provenance
 
 
-def test_it_names_versions_machine_and_the_facts_of_the_run() -> None:
+def test_provenance_holds_versions_machine_and_the_facts_of_the_run() -> None:
     found = provenance(seed=3, backend="torch")
     assert found["versions"]["torch"] == torch.__version__
     assert found["threads"] == torch.get_num_threads()

@@ -53,7 +53,7 @@ def start(names: tuple[str, ...], iterations: int = ITERATIONS) -> TrainState:
             anchor_weights={"means": 1.0, "scales": 1.0, "sh0": 0.1, "detail": 0.1},
         ),
     }
-    objective = Objective(lambda_hr=WarmupDecay(start=3, full=8, decay_from=14, end=ITERATIONS))
+    objective = Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
     return TrainState.start(
         SCENE,
         Conductor(*(make[name]() for name in names), objective=objective, statistics_from=1),

@@ -1,0 +1,196 @@
+"""The initial cloud: the points that training starts from. `CloudSettings` lists the choices, `initial_cloud` makes it.
+
+Every cloud says where its points came from, and whether test views were used for them.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import torch
+
+from clear_strategies.core.view import Photo
+from clear_strategies.data.capture import SfmPoints
+from clear_strategies.data.checks import refuse, require_choice, require_number, require_whole
+from clear_strategies.data.points.cleaning import remove_outliers, voxel_grid
+from clear_strategies.data.points.files import from_ply, from_sfm, from_tracks
+from clear_strategies.data.points.interpolation import densify, pixel_grid
+from clear_strategies.data.points.random import random_cloud
+from clear_strategies.data.points.sift import TriangulationSettings, triangulate
+from clear_strategies.data.scene import PointCloud
+from clear_strategies.errors import DataError
+
+__all__ = ["CloudSettings", "TriangulationSettings", "initial_cloud", "require_source"]
+
+_log = logging.getLogger(__name__)
+
+Init = Literal["auto", "triangulated", "sfm_train", "sfm", "ply", "random"]
+
+
+@dataclass(frozen=True, slots=True)
+class CloudSettings:
+    """Which points, and how they are processed.
+
+    Args:
+        init: "triangulated" from the training LR images under their known poses; "sfm_train": the scene's SfM points
+            that at least `min_views` training views observe (their positions still come from all views); "sfm": all of
+            the scene's SfM points; "ply": a file; "random" in a box; "auto": triangulated if that gives at least
+            `enough` points, else random. Auto never takes points that test views were used for.
+        path: the PLY file for init=ply.
+        min_views: training views that must observe a point, for init=sfm_train.
+        enough: the fewest triangulated points that init=auto takes.
+        densify: add points between those found, at interpolated inverse depth, one every `stride` LR px of each view;
+            "auto": if the cloud has fewer points than those grids. Random points are never densified.
+        stride: see `densify`, LR px.
+        random_points: how many for init=random.
+        box: half-edge of their box around the origin, world units; None: the box that the cameras have in common.
+        outlier_neighbours, outlier_ratio: a point is removed if the mean distance to its nearest `outlier_neighbours`
+            points (itself included) exceeds the average by more than `outlier_ratio` standard deviations; 0
+            neighbours: no point is removed.
+        voxel: points are averaged in cubes of this edge, world units; None: they are not.
+        max_points: a larger cloud is reduced to this many points, chosen at random.
+        triangulation: for init=triangulated and auto.
+
+    Raises:
+        SettingError: a value is outside its range, or init=ply comes without a path.
+    """
+
+    init: Init = "auto"
+    path: str | None = None
+    min_views: int = 2
+    enough: int = 50
+    densify: bool | Literal["auto"] = "auto"
+    stride: int = 2
+    random_points: int = 10_000
+    box: float | None = None
+    outlier_neighbours: int = 16
+    outlier_ratio: float = 3.0
+    voxel: float | None = None
+    max_points: int = 200_000
+    triangulation: TriangulationSettings = field(default_factory=TriangulationSettings)
+
+    def __post_init__(self) -> None:
+        require_choice("data.cloud.init", self.init, get_args(Init))
+        if self.init == "ply" and not self.path:
+            refuse("data.cloud.path", "init=ply needs a PLY file", self.path, "add data.cloud.path=…")
+        require_choice("data.cloud.densify", self.densify, (True, False, "auto"))
+        for name in ("min_views", "enough", "stride", "random_points", "max_points"):
+            require_whole(f"data.cloud.{name}", getattr(self, name), least=1)
+        require_whole("data.cloud.outlier_neighbours", self.outlier_neighbours, least=0)
+        if self.outlier_neighbours == 1:
+            rule = "must be 0 or at least 2, since a point is the first of its own neighbours"
+            refuse("data.cloud.outlier_neighbours", rule, 1, "0 keeps outliers")
+        for name in ("box", "outlier_ratio", "voxel"):
+            if name == "outlier_ratio" or getattr(self, name) is not None:
+                require_number(f"data.cloud.{name}", getattr(self, name), above=0)
+
+
+def require_source(settings: CloudSettings, sfm: SfmPoints | None) -> None:
+    """What `settings.init` reads exists. This can be asked before any photo is decoded.
+
+    Args:
+        sfm: the scene's SfM points, if it has some.
+
+    Raises:
+        DataError: it does not.
+    """
+    if settings.init in ("sfm", "sfm_train") and (sfm is None or len(sfm.means) == 0):
+        problem = f"there are none, but init={settings.init} asks for them"
+        raise DataError("scene", "points", problem, "use init=triangulated or init=random")
+    if settings.init == "ply" and not Path(str(settings.path)).is_file():
+        raise DataError(str(settings.path), "file", "is not there", "set data.cloud.path to a PLY file")
+
+
+def initial_cloud(
+    settings: CloudSettings,
+    photos: Sequence[Photo],
+    *,
+    sfm: SfmPoints | None = None,
+    train_ids: Sequence[int] = (),
+    background: tuple[float, float, float] | None = None,
+    seed: int = 0,
+) -> PointCloud:
+    """The cloud a run starts from.
+
+    Args:
+        photos: the training views at LR.
+        sfm: the scene's SfM points, if it has some.
+        train_ids: their ids of the training frames.
+        background: the colour of pixels without a surface (Blender's white), RGB in [0, 1].
+
+    Raises:
+        DataError: the scene cannot give this cloud.
+    """
+    require_source(settings, sfm)
+    match settings.init:
+        case "random":
+            cloud = None
+        case "ply":
+            cloud = from_ply(Path(str(settings.path)))
+        case "sfm" if sfm is not None:
+            cloud = from_sfm(sfm)
+        case "sfm_train" if sfm is not None:
+            cloud = from_tracks(sfm, train_ids, settings.min_views)
+        case _:
+            cloud = _triangulated(settings, photos, sfm)
+    if cloud is None:
+        cloud = random_cloud(photos, settings.random_points, seed, settings.box)
+    else:
+        cloud = _densified(settings, _without_outliers(settings, cloud), photos, background)
+    if settings.voxel is not None:
+        means, colors = voxel_grid(cloud.means, cloud.colors, settings.voxel)
+        cloud = replace(cloud, means=means, colors=colors, source=f"{cloud.source}, in voxels of {settings.voxel:g}")
+    if len(cloud) > settings.max_points:
+        chosen = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(seed))[: settings.max_points]
+        _log.info("%d of %d points chosen at random (max_points).", settings.max_points, len(cloud))
+        cloud = cloud[chosen.sort().values]
+    return cloud
+
+
+def _triangulated(settings: CloudSettings, photos: Sequence[Photo], sfm: SfmPoints | None) -> PointCloud | None:
+    """Points from the training LR images; None where init=auto finds too few."""
+    cloud = triangulate(photos, settings.triangulation)
+    if settings.init == "triangulated":
+        if len(cloud) == 0:
+            problem = f"none could be triangulated from the {len(photos)} training LR images"
+            raise DataError("scene", "points", problem, "use init=random, or more or closer views")
+        return cloud
+    if sfm is not None:
+        _log.info("init: auto does not use the scene's own points, because test views were used for them.")
+    if len(cloud) >= settings.enough:
+        _log.info("init: auto chose %s.", cloud.source)
+        return cloud
+    message = "init: auto chose random points: the training LR images give only %d (data.cloud.enough: %d)."
+    _log.warning(message, len(cloud), settings.enough)
+    return None
+
+
+def _without_outliers(settings: CloudSettings, cloud: PointCloud) -> PointCloud:
+    if settings.outlier_neighbours == 0:
+        return cloud
+    if len(cloud) <= settings.outlier_neighbours:
+        _log.info("outliers are kept: %d points are too few to tell them.", len(cloud))
+        return cloud
+    kept = remove_outliers(cloud.means, settings.outlier_neighbours, settings.outlier_ratio)
+    if len(kept) == 0:
+        _log.warning("outliers are kept: the points coincide, so all of them would be removed.")
+        return cloud
+    _log.info("%d of %d points removed as outliers.", len(cloud) - len(kept), len(cloud))
+    return cloud[kept]
+
+
+def _densified(
+    settings: CloudSettings,
+    cloud: PointCloud,
+    photos: Sequence[Photo],
+    background: tuple[float, float, float] | None,
+) -> PointCloud:
+    grid = sum(len(pixel_grid(photo, settings.stride)) for photo in photos)
+    if settings.densify == "auto" and len(cloud) >= grid:
+        _log.info("densify: auto adds nothing: the cloud has %d points, the views' grids %d.", len(cloud), grid)
+        return cloud
+    return densify(cloud, photos, settings.stride, background) if settings.densify else cloud

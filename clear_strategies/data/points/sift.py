@@ -1,8 +1,9 @@
-"""Points from the training LR images alone, under their known poses: no test view and no HR pixel has a part in them.
+"""Triangulation of SIFT matches between the training LR images, under their known poses. No test view or HR pixel is used.
 
-SIFT finds features, each pair of views matches them both ways, the known epipolar geometry throws out what cannot be
-the same point, and what is triangulated must lie in front of both cameras, reproject closely, and be seen under an angle.
-Matches that share features are one point seen by several views; the pair that saw it under the widest angle places it.
+SIFT finds features, and each pair of views matches them in both directions. A match is rejected if it violates the
+epipolar geometry of the known poses, or if its triangulated point lies behind a camera, reprojects too far away, or has
+too small an angle between its rays. Matches that share features form a track, which is one point; the pair with the
+widest angle gives its position.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
+from clear_strategies.data.checks import require_number, require_whole
+from clear_strategies.data.points.projection import project, projection_matrix, sample_colors
 from clear_strategies.data.scene import PointCloud
 from rasterizers.interface import Camera
 
@@ -27,18 +30,18 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class TriangulationSettings:
-    """What counts as the same point.
+    """When two features are the same point.
 
     Args:
-        enlarge: images are enlarged this often before features are sought; small images have few otherwise.
-        contrast: SIFT's contrast threshold; lower finds more and weaker features.
-        ratio: a match must be this much closer than the second best (Lowe).
+        enlarge: factor by which images are enlarged before SIFT runs; small images give few features otherwise.
+        contrast: SIFT's contrast threshold; a lower one gives more and weaker features.
+        ratio: largest distance of a match, relative to that of the second best (Lowe's ratio test).
         epipolar: largest distance from the epipolar lines, root mean square over both views, LR px.
-        reprojection: largest error in either view, LR px.
+        reprojection: largest reprojection error in either view, LR px.
         angle: smallest angle between the two rays, degrees.
 
     Raises:
-        ValueError: a number is outside its range.
+        SettingError: a number is outside its range.
     """
 
     enlarge: int = 2
@@ -49,13 +52,10 @@ class TriangulationSettings:
     angle: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.enlarge < 1:
-            raise ValueError(f"enlarge must be at least 1, got {self.enlarge}.")
+        require_whole("data.cloud.triangulation.enlarge", self.enlarge, least=1)
+        require_number("data.cloud.triangulation.ratio", self.ratio, above=0, most=1)
         for name in ("contrast", "epipolar", "reprojection", "angle"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be > 0, got {getattr(self, name)}.")
-        if not 0 < self.ratio <= 1:
-            raise ValueError(f"ratio must lie in (0, 1], got {self.ratio}.")
+            require_number(f"data.cloud.triangulation.{name}", getattr(self, name), above=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +68,7 @@ class Features:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """Points that two views agree on: where, from which two features (numbered over all views), under which angle."""
+    """Points of two views: position, the two features (numbered over all views), angle between the rays (degrees)."""
 
     means: Float[Tensor, "P 3"]
     features: Int[Tensor, "P 2"]
@@ -76,7 +76,7 @@ class Pairs:
 
 
 def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None = None) -> PointCloud:
-    """A cloud of what at least two photos agree on; empty where nothing matches."""
+    """The points that at least two photos have in common; an empty cloud if nothing matches."""
     settings = settings or TriangulationSettings()
     features = [find_features(photo, settings) for photo in photos]
     view = torch.repeat_interleave(torch.arange(len(photos)), torch.tensor([len(f.pixels) for f in features]))
@@ -91,11 +91,11 @@ def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None 
     pairs = Pairs(*(torch.cat([getattr(p, name) for p in found]) for name in ("means", "features", "angles")))
     chosen = one_per_track(pairs, view)
 
-    shades = [sample_colors(photo.image, f.pixels) for photo, f in zip(photos, features, strict=True)]
-    colors = torch.cat(shades)[pairs.features[chosen]].mean(dim=1) if len(chosen) else torch.zeros(0, 3)
+    sampled = [sample_colors(photo.image, f.pixels) for photo, f in zip(photos, features, strict=True)]
+    colors = torch.cat(sampled)[pairs.features[chosen]].mean(dim=1) if len(chosen) else torch.zeros(0, 3)
     _log.info("%d features, %d pairs of them, %d points.", len(view), len(pairs.means), len(chosen))
     source = f"{len(chosen):,} points triangulated from the {len(photos)} training LR images"
-    return PointCloud(pairs.means[chosen].float(), colors, source, saw_test_views="no")
+    return PointCloud(pairs.means[chosen].float(), colors, source)
 
 
 def find_features(photo: Photo, settings: TriangulationSettings) -> Features:
@@ -106,19 +106,19 @@ def find_features(photo: Photo, settings: TriangulationSettings) -> Features:
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     size = (grey.shape[1] * settings.enlarge, grey.shape[0] * settings.enlarge)
     large = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)
-    # Without the precise upscale every keypoint lies a quarter of a pixel too far to the right and down.
+    # Without the precise upscale every keypoint is a quarter of a pixel too far right and down.
     sift: Any = cv2.SIFT_create(contrastThreshold=settings.contrast, enable_precise_upscale=True)  # type: ignore[attr-defined]
     keypoints, descriptors = sift.detectAndCompute(large, None)
     if descriptors is None:
         return Features(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128))
-    # OpenCV's pixel (0, 0) has its centre at (0, 0), ours at (0.5, 0.5).
+    # OpenCV's first pixel is centred at (0, 0), ours at (0.5, 0.5).
     points = (np.array([k.pt for k in keypoints], np.float64) + 0.5) / settings.enlarge
     relative = torch.nn.functional.normalize(torch.from_numpy(descriptors), p=1, dim=1)
     return Features(torch.from_numpy(points), relative.sqrt())
 
 
 def match(a: Features, b: Features, ratio: float) -> Int[Tensor, "M 2"]:
-    """Indices of features that are each other's nearest, and nearer by `ratio` than the second nearest in b."""
+    """Indices of mutual nearest neighbours that pass Lowe's ratio test against the second nearest in b."""
     if len(a.pixels) < 1 or len(b.pixels) < 2:
         return torch.zeros(0, 2, dtype=torch.long)
     # |x - y|² = 2 - 2 x·y: descriptors have length 1.
@@ -133,12 +133,12 @@ def match(a: Features, b: Features, ratio: float) -> Int[Tensor, "M 2"]:
 def triangulate_pair(
     a: Camera, b: Camera, x: Float[Tensor, "M 2"], y: Float[Tensor, "M 2"], settings: TriangulationSettings
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"], Bool[Tensor, " M"]]:
-    """Where the rays through pixels x of a and y of b meet, under which angle (degrees), and whether to believe it."""
+    """(point, angle in degrees, accepted) of the rays through pixels x of a and y of b."""
     from kornia.geometry import epipolar
 
     if len(x) == 0:  # kornia refuses empty batches
         return x.new_zeros(0, 3), x.new_zeros(0), torch.zeros(0, dtype=torch.bool)
-    P, Q = _projection(a)[None], _projection(b)[None]
+    P, Q = projection_matrix(a)[None], projection_matrix(b)[None]
     F = epipolar.fundamental_from_projections(P, Q)
     squares: Tensor = epipolar.symmetrical_epipolar_distance(x[None], y[None], F)[0]
     points: Tensor = epipolar.triangulate_points(P, Q, x[None], y[None])[0]
@@ -146,7 +146,7 @@ def triangulate_pair(
     (u, depth_a), (v, depth_b) = project(a, points), project(b, points)
     error = torch.maximum(torch.linalg.vector_norm(u - x, dim=-1), torch.linalg.vector_norm(v - y, dim=-1))
     rays = points - a.center.double(), points - b.center.double()
-    # The tangent, since a cosine cannot tell small angles from zero.
+    # The tangent, because a cosine cannot tell small angles from zero.
     sine = torch.linalg.vector_norm(torch.linalg.cross(*rays), dim=-1)
     angle = torch.rad2deg(torch.atan2(sine, (rays[0] * rays[1]).sum(-1)))
 
@@ -157,35 +157,15 @@ def triangulate_pair(
 
 
 def one_per_track(pairs: Pairs, view: Int[Tensor, " F"]) -> Int[Tensor, " T"]:
-    """For each set of connected features the pair with the widest angle; none if it holds two features of one view."""
+    """The pair with the widest angle of each track. A track with two features of one view is contradictory and dropped."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     a, b = pairs.features.numpy().T
     graph = coo_array((np.ones(len(a)), (a, b)), shape=(len(view), len(view)))
     count, track = connected_components(graph, directed=False)
-    seen = np.unique(np.stack((track, view.numpy())), axis=1)[0]  # each track once per view that saw it
-    contradictory = np.bincount(track, minlength=count) != np.bincount(seen, minlength=count)
+    views_of_tracks = np.unique(np.stack((track, view.numpy())), axis=1)[0]  # each track once per view
+    contradictory = np.bincount(track, minlength=count) != np.bincount(views_of_tracks, minlength=count)
     order = np.argsort(-pairs.angles.numpy(), kind="stable")
     tracks, widest = np.unique(track[a[order]], return_index=True)
     return torch.from_numpy(order[widest[~contradictory[tracks]]])
-
-
-def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
-    """(pixels, depths in world units), float64; pixels mean something where depth > 0."""
-    homogeneous = points.double() @ _projection(camera)[:, :3].T + _projection(camera)[:, 3]
-    return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
-
-
-def sample_colors(image: Float[Tensor, "H W 3"], pixels: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-    """Bilinear samples; beyond the centres of the outermost pixels, their colour."""
-    height, width = image.shape[:2]
-    grid = (2 * pixels / torch.tensor([width, height]) - 1).to(image)[None, None]
-    batch = image.permute(2, 0, 1)[None]
-    samples = torch.nn.functional.grid_sample(batch, grid, padding_mode="border", align_corners=False)
-    return samples[0, :, 0].T.cpu()
-
-
-def _projection(camera: Camera) -> Float[Tensor, "3 4"]:
-    K = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]], dtype=torch.float64)
-    return K @ camera.world_to_camera.double().cpu()[:3]

@@ -1,0 +1,14 @@
+"""Priors: where the super-resolved (SR) image of each view comes from. One file per prior; `cache` keeps results."""
+
+from clear_strategies.data.priors.bicubic import Bicubic
+from clear_strategies.data.priors.cache import Cached, cache_folder, cached
+from clear_strategies.data.priors.corrupted import Corrupted, DemoPrior
+from clear_strategies.data.priors.dnn_superres import DnnSuperres
+from clear_strategies.data.priors.images import Images
+from clear_strategies.data.priors.interface import Network, Prior
+from clear_strategies.data.priors.onnx import Onnx
+
+__all__ = [
+    "Bicubic", "Cached", "Corrupted", "DemoPrior", "DnnSuperres", "Images", "Network", "Onnx", "Prior", "cache_folder",
+    "cached",
+]  # fmt: skip

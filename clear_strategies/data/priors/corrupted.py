@@ -1,13 +1,14 @@
-"""Wrong detail on purpose: what a hallucinating SR model does, with a seed, so that it can be studied.
+"""Priors with seeded wrong detail, to study what a hallucinating SR model does.
 
-A fidelity network agrees with its LR image nearly everywhere, so reliability has nothing to find there. Generative ones
-invent: differently in each view, plausibly in themselves. `corrupted` puts such errors into a share of the patches of any
-reference; `Corrupted` does it to the pictures of another prior.
+A fidelity network agrees with its LR image nearly everywhere, so P2G's reliability finds nothing there. A generative
+network invents detail: plausible in each view, different between views. `SeededErrors` puts such errors into a share of
+an image's patches; `Corrupted` applies them to another prior's SR images, `DemoPrior` to the true HR photos.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,29 +17,77 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.data.priors.upscale import Prior, cached
+from clear_strategies.data.checks import require_number, require_whole
+from clear_strategies.data.priors.cache import cached
+from clear_strategies.data.priors.interface import Prior
+from clear_strategies.errors import DataError
 
 
-@dataclass(frozen=True, slots=True)
-class Corrupted:
-    """Another prior's pictures with seeded errors that differ from view to view. Reports call it synthetic.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeededErrors:
+    """Errors that are a function of (seed, name of the view).
 
     Args:
-        prior: whose pictures. share: of the patches with errors, in [0, 1]. strength: of the errors, >= 0.
-        patch: edge of a patch, HR px; 64 is what P2G's reliability looks at.
+        share: of the patches with errors, in [0, 1].
+        strength: of the errors, >= 0; 0: none.
+        patch: edge of a patch, HR px; 64 is the patch of P2G's reliability.
+        seed: of the errors; not the run's.
 
     Raises:
-        ValueError: a number is outside its range.
+        SettingError: a number is outside its range.
     """
 
-    prior: Prior
     share: float = 0.3
     strength: float = 1.0
     patch: int = 64
     seed: int = 0
 
     def __post_init__(self) -> None:
-        require_errors(self.share, self.strength, self.patch)
+        require_number("prior.share", self.share, least=0, most=1)
+        require_number("prior.strength", self.strength, least=0)
+        require_whole("prior.patch", self.patch, least=1)
+        require_whole("prior.seed", self.seed, least=0)
+
+    def corrupt(
+        self, image: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int, name: str
+    ) -> Float[Tensor, "H W 3"]:
+        """`image` with errors in `share` of its patches.
+
+        Two kinds of error nearly agree with LR and contradict the other views: negated detail, and detail from
+        elsewhere in the image. The other two disagree with LR, which reliability measures: doubled content, and
+        sharpened content of another shade.
+        """
+        rng = np.random.default_rng([self.seed, *name.encode()])
+        detail = image - images.upsample(lr, factor)
+        shift = rng.integers(2, max(factor, 2) + 1, 2) * rng.choice((-1, 1), 2)
+        errors = (
+            -1.4 * detail,
+            detail.flip(0, 1) - detail,
+            0.6 * (image.roll(shift.tolist(), (0, 1)) - image),
+            0.8 * detail,  # and a shade, different in each patch, below
+        )
+        corners = list(itertools.product(*(range(0, size, self.patch) for size in image.shape[:2])))
+        result = image.clone()
+        for which in rng.permutation(len(corners))[: round(self.share * len(corners))]:
+            top, left = corners[which]
+            box = (slice(top, top + self.patch), slice(left, left + self.patch))
+            kind, shade = rng.integers(len(errors)), torch.from_numpy(rng.uniform(-0.12, 0.12, 3)).to(image)
+            result[box] += self.strength * (errors[kind][box] + (shade if kind == len(errors) - 1 else 0))
+        return images.quantize(result)
+
+
+@dataclass(frozen=True, slots=True)
+class Corrupted(SeededErrors):
+    """Another prior's SR images with seeded errors. Reports call it synthetic.
+
+    Args:
+        prior: any other prior.
+    """
+
+    prior: Prior
+
+    def __post_init__(self) -> None:
+        SeededErrors.__post_init__(self)
         object.__setattr__(self, "prior", cached(self.prior))
 
     @property
@@ -46,51 +95,33 @@ class Corrupted:
         return f"{self.prior.label} (synthetic: seeded errors in {self.share:.0%} of the patches)"
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-        honest = self.prior(name, lr, factor)
-        return corrupted(honest, lr, factor, name, self.share, self.strength, self.patch, self.seed)
+        return self.corrupt(self.prior(name, lr, factor), lr, factor, name)
 
 
-def require_errors(share: float, strength: float, patch: int) -> None:
-    """The ranges of `corrupted`'s numbers.
+@dataclass(frozen=True, slots=True, eq=False)
+class DemoPrior(SeededErrors):
+    """The true HR photos with seeded errors: the demo's prior, for any scene whose photos are HR.
 
-    Raises:
-        ValueError: a number is outside its range.
+    Args:
+        truth: loads the HR photo of each view, by name.
     """
-    if not 0 <= share <= 1:
-        raise ValueError(f"share must lie in [0, 1], got {share}.")
-    if not strength >= 0 or patch < 1:
-        raise ValueError(f"strength must be >= 0 and patch >= 1, got {strength} and {patch}.")
 
+    truth: Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]
 
-def corrupted(
-    reference: Float[Tensor, "H W 3"],
-    lr: Float[Tensor, "h w 3"],
-    factor: int,
-    name: str,
-    share: float,
-    strength: float,
-    patch: int,
-    seed: int,
-) -> Float[Tensor, "H W 3"]:
-    """`reference` with errors in `share` of its patches; a function of (seed, name).
+    @property
+    def label(self) -> str:
+        return f"demo (synthetic: truth with seeded errors in {self.share:.0%} of the patches)"
 
-    The detail is turned over, or taken from elsewhere in the picture (both nearly agree with LR and fight the other
-    views); or the content is doubled, or sharpened and of another shade (both disagree with LR, which reliability sees).
-    """
-    rng = np.random.default_rng([seed, *name.encode()])
-    detail = reference - images.upsample(lr, factor)
-    shift = rng.integers(2, max(factor, 2) + 1, 2) * rng.choice((-1, 1), 2)
-    errors = (
-        -1.4 * detail,
-        detail.flip(0, 1) - detail,
-        0.6 * (reference.roll(shift.tolist(), (0, 1)) - reference),
-        0.8 * detail,  # and a shade of its own in each patch, below
-    )
-    corners = list(itertools.product(*(range(0, size, patch) for size in reference.shape[:2])))
-    result = reference.clone()
-    for which in rng.permutation(len(corners))[: round(share * len(corners))]:
-        top, left = corners[which]
-        box = (slice(top, top + patch), slice(left, left + patch))
-        kind, shade = rng.integers(len(errors)), torch.from_numpy(rng.uniform(-0.12, 0.12, 3)).to(reference)
-        result[box] += strength * (errors[kind][box] + (shade if kind == len(errors) - 1 else 0))
-    return images.quantize(result)
+    def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
+        return self.corrupt(self._truth(name, lr.shape[1] * factor, lr.shape[0] * factor, factor), lr, factor, name)
+
+    def _truth(self, name: str, width: int, height: int, factor: int) -> Float[Tensor, "H W 3"]:
+        """Cropped at the right and the bottom to a multiple of the factor, as the HR photo is."""
+        truth = self.truth[name]()
+        spare = (truth.shape[1] - width, truth.shape[0] - height)
+        if not all(0 <= pixels < factor for pixels in spare):
+            raise DataError(
+                name, "truth", f"is {truth.shape[1]}x{truth.shape[0]} where HR is {width}x{height}",
+                "use the photos at their own size (shrink=1, photos_are=hr), or another prior",
+            )  # fmt: skip
+        return truth[:height, :width]

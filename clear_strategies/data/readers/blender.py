@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Final
 
 from clear_strategies.data import strict_json
-from clear_strategies.data.cameras import Lens, by_name, make_frame, pose_from_opengl
-from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.cameras import Lens, pose_from_opengl
+from clear_strategies.data.capture import Capture, Color, Frame, sorted_by_name
+from clear_strategies.data.checks import as_color
 from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
 from clear_strategies.errors import DataError
 
@@ -18,18 +19,19 @@ _log = logging.getLogger(__name__)
 _WHITE: Final = (1.0, 1.0, 1.0)
 
 
-def read(root: str | Path, *, background: tuple[float, float, float] = _WHITE) -> Capture:
-    """A scene folder; frames are named by their file (r_2), test frames get "test/" before it.
+def read(root: str | Path, *, background: Color = _WHITE) -> Capture:
+    """Read a scene folder. Frames are named by their file (r_2), test frames with the prefix "test/".
 
-    Frames keep the order of the files, which is the protocols' numbering: by name, r_10 would come before r_2.
+    Frames keep the order of the JSON files, which is the protocols' numbering. By name, r_10 would come before r_2.
 
     Args:
-        background: RGB in [0, 1], under the images' alpha.
+        background: RGB in [0, 1], behind transparent pixels.
 
     Raises:
+        SettingError: the background is no colour.
         DataError: something is missing or not what it should be.
     """
-    root = Path(root)
+    root, background = Path(root), as_color("data.reader.background", background)
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     frames = _frames(root, root / "transforms_train.json", "train", background)
@@ -39,13 +41,13 @@ def read(root: str | Path, *, background: tuple[float, float, float] = _WHITE) -
         files.append("transforms_test.json")
     else:
         _log.warning("%s has no transforms_test.json: there are no test views.", root)
-    by_name(frames, root)  # refuses two frames of one name
+    sorted_by_name(frames, root)  # only to refuse two frames of one name
     color = "white" if background == _WHITE else f"RGB {background}"
-    notes = {"poses": ", ".join(files), "order": "of the files", "background": f"{color} under the images' alpha"}
+    notes = {"poses": ", ".join(files), "order": "of the files", "background": f"{color} behind transparent pixels"}
     return Capture(root.resolve().name, tuple(frames), None, background, notes)
 
 
-def _frames(root: Path, file: Path, split: str, background: tuple[float, float, float]) -> list[Frame]:
+def _frames(root: Path, file: Path, split: str, background: Color) -> list[Frame]:
     content = strict_json.read_object(file)
     angle = strict_json.number(file, "camera_angle_x", content.get("camera_angle_x"))
     if not 0 < angle < math.pi:
@@ -59,5 +61,5 @@ def _frames(root: Path, file: Path, split: str, background: tuple[float, float, 
         focal = width / (2 * math.tan(angle / 2))
         lens = Lens(width, height, focal, focal, width / 2, height / 2).check(file, "camera_angle_x")
         label = path.stem if split == "train" else f"{split}/{path.stem}"
-        frames.append(make_frame(label, path, lens, pose, background=background, split=split))
+        frames.append(Frame.of_photo(label, path, lens, pose, background=background, split=split))
     return frames

@@ -1,5 +1,7 @@
-"""COLMAP's sparse models, binary and text, read strictly: every count is held against the bytes that are left before
-anything is allocated, every number must be finite, every id known, and every byte accounted for.
+"""COLMAP's sparse models, binary and text, read strictly.
+
+Every count is compared with the bytes that are left before anything is allocated. Every number must be finite, every id
+known, and no byte may be left over.
 """
 
 from __future__ import annotations
@@ -18,8 +20,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.cameras import Lens, by_name, lens_notes, make_frame
-from clear_strategies.data.capture import Capture, SfmPoints
+from clear_strategies.data.cameras import Lens
+from clear_strategies.data.capture import Capture, Color, Frame, SfmPoints, lens_notes, sorted_by_name
+from clear_strategies.data.checks import as_color
 from clear_strategies.data.photo_files import image_folder, inside, list_images
 from clear_strategies.errors import DataError
 from rasterizers.geometry import rotation_matrix
@@ -36,8 +39,8 @@ _WRITE_AGAIN: Final = "export the model again"
 _LONGEST_NAME: Final = 4096
 _NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
 _WHOLE: Final = re.compile(r"-?[0-9]{1,18}")
-_FARTHEST: Final = 1e12  # from the origin, world units; beyond it float32 keeps nothing of a scene
-_UNEVEN: Final = 1e-6  # lengths of quaternions further from 1 are told
+_FARTHEST: Final = 1e12  # from the origin, world units; float32 cannot resolve a scene beyond it
+_UNEVEN: Final = 1e-6  # a quaternion's length may differ from 1 by this much without a note
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +56,7 @@ class Image:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """Positions, 8-bit colours, and the track: point `track[j, 0]` was seen by image `track[j, 1]`."""
+    """Positions, 8-bit colours, and the tracks: point `track[j, 0]` is observed in image `track[j, 1]`."""
 
     means: np.ndarray
     colors: np.ndarray
@@ -62,7 +65,7 @@ class Points:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """A sparse model as its files tell it; `ending` of those files is .bin or .txt."""
+    """The content of a sparse model's files, whose `ending` is .bin or .txt."""
 
     folder: Path
     ending: str
@@ -73,23 +76,26 @@ class Model:
 
 def read(
     root: str | Path,
-    images: str | None = None,
+    images: str | None = "images",
     *,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
     allow_outside: bool = False,
 ) -> Capture:
-    """A capture from `root` with its sparse model in sparse/0, sparse, colmap/sparse/0 or root itself.
+    """Read a scene folder with a sparse model in sparse/0, sparse, colmap/sparse/0 or the folder itself.
 
     Args:
-        images: folder of the photos below root; where their size is another than the model's, cameras are rescaled.
-            None: images, images_2, images_4, images_8, the first that is there.
+        images: folder of the photos below root. Cameras are rescaled if the photos have another size than the model's.
+            None: the first that exists of images, images_2, images_4, images_8.
         background: RGB in [0, 1] behind transparent pixels; None: black.
         allow_outside: follow file names and links that lead out of that folder.
 
     Raises:
+        SettingError: the background is no colour.
         DataError: the model or an image cannot be used.
     """
     root = Path(root)
+    if background is not None:
+        background = as_color("data.reader.background", background)
     model = read_model(find_model(root))
     folder = image_folder(root, images)
     listing = model.folder / f"images{model.ending}"
@@ -103,15 +109,15 @@ def capture(
     folder: Path,
     paths: Mapping[str, Path],
     *,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
 ) -> Capture:
-    """A capture of a model whose photos have been found: `paths` by the model's names, below `folder`.
+    """The capture of a model and its photos: `paths` by the model's names, below `folder`.
 
     Raises:
         DataError: an image cannot be used.
     """
     frames = [
-        make_frame(
+        Frame.of_photo(
             paths[image.name].relative_to(folder).as_posix(), paths[image.name], model.lenses[image.camera],
             pose_of(image), background=background, sfm_id=image.id,
         )
@@ -129,7 +135,9 @@ def capture(
     points = sfm_points(model, _label(root, model))
     if points is None:
         notes["points"] = "the model has none"
-    return Capture(root.resolve().name, by_name(frames, model.folder), points, background or (0.0, 0.0, 0.0), notes)
+    return Capture(
+        root.resolve().name, sorted_by_name(frames, model.folder), points, background or (0.0, 0.0, 0.0), notes
+    )
 
 
 def find_model(root: Path) -> Path:
@@ -153,7 +161,7 @@ def find_model(root: Path) -> Path:
 
 
 def read_model(folder: Path) -> Model:
-    """Cameras, images and points of a model folder; binary files come first and never give way to text silently.
+    """Cameras, images and points of a model folder. If there is any binary file, text files are ignored.
 
     Raises:
         DataError: a file is missing or not what it should be.
@@ -191,21 +199,21 @@ def pose_of(image: Image) -> Float[Tensor, "4 4"]:
 
 
 def sfm_points(model: Model, label: str) -> SfmPoints | None:
-    """The model's points with their tracks, `label` for the printed plan; None where it has none."""
+    """The model's points with their tracks, or None if it has none. `label` is for the printed plan."""
     p = model.points
     if not len(p.means):
         return None
     return SfmPoints(
         means=torch.from_numpy(p.means).float(),
         colors=torch.from_numpy(p.colors).float() / 255,
-        point=torch.from_numpy(np.ascontiguousarray(p.track[:, 0])),
-        seen_by=torch.from_numpy(np.ascontiguousarray(p.track[:, 1])),
+        track_point=torch.from_numpy(np.ascontiguousarray(p.track[:, 0])),
+        track_image=torch.from_numpy(np.ascontiguousarray(p.track[:, 1])),
         source=f"COLMAP {label}, {len(p.means):,} points, triangulated from all {len(model.images)} images",
     )
 
 
 def _label(root: Path, model: Model) -> str:
-    """The model's place in the scene, sparse/0."""
+    """The model's folder relative to the scene's, e.g. sparse/0."""
     return model.folder.relative_to(root).as_posix() if model.folder.is_relative_to(root) else model.folder.name
 
 
@@ -214,7 +222,7 @@ def _is_model(folder: Path) -> bool:
 
 
 def _photo(folder: Path, name: str, listing: Path, allow_outside: bool) -> Path:
-    """The photo of this name, or the only one that differs in its ending alone: images_4 often holds PNG for JPG."""
+    """The photo of this name, else the only one of the same stem: images_4 often holds PNG files for JPG names."""
     path = inside(folder, name, file=listing, allow_outside=allow_outside)
     if path.is_file():
         return path
@@ -227,7 +235,7 @@ def _photo(folder: Path, name: str, listing: Path, allow_outside: bool) -> Path:
 
 
 class _Bytes:
-    """A cursor that never reads, and never promises to read, past the end."""
+    """A file's bytes, read from front to back; reading past the end is an error."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -253,7 +261,10 @@ class _Bytes:
         (n,) = self.take("<Q", field)
         if n * record > self.left:
             raise DataError(
-                self.path, field, f"says {n} records of {record} bytes, {self.left} bytes are left", _WRITE_AGAIN
+                self.path,
+                field,
+                f"is {n}, of {record} bytes or more each, but {self.left} bytes are left",
+                _WRITE_AGAIN,
             )
         return int(n)
 
@@ -304,17 +315,17 @@ def _images_bin(path: Path) -> list[Image]:
 def _points_bin(path: Path) -> Points:
     file = _Bytes(path)
     n = file.count("number of points", 8 + 24 + 3 + 8 + 8)
-    means, colors, track, seen = np.zeros((n, 3)), np.zeros((n, 3), np.uint8), [], set()
+    means, colors, track, ids = np.zeros((n, 3)), np.zeros((n, 3), np.uint8), [], set()
     for i in range(n):
         number, x, y, z, r, g, b, _ = file.take("<Q3d3Bd", f"point {i}")
         means[i], colors[i] = (x, y, z), (r, g, b)
-        seen.add(number)
+        ids.add(number)
         length = file.count(f"track of point {i}", 8)
         entries = np.frombuffer(file.data, "<i4", 2 * length, file.at).reshape(-1, 2)[:, 0]
         file.skip(8 * length)
         track.append(np.stack((np.full(length, i), entries), axis=1).astype(np.int64))
     file.finish()
-    if len(seen) != n:
+    if len(ids) != n:
         raise DataError(path, "point id", "occurs twice", _WRITE_AGAIN)
     return _checked_points(path, means, colors, track)
 
@@ -337,7 +348,7 @@ def _cameras_txt(path: Path) -> dict[int, Lens]:
 
 
 def _images_txt(path: Path) -> list[Image]:
-    """Two lines an image: its pose, and its 2D points, which are not used and may be none."""
+    """Two lines per image: its pose, then its 2D points, which are not used and may be none."""
     found: dict[int, Image] = {}
     lines = iter(_raw_lines(path))
     for line, text in lines:
@@ -359,7 +370,7 @@ def _images_txt(path: Path) -> list[Image]:
 
 
 def _points_txt(path: Path) -> Points:
-    means, colors, track, seen = [], [], [], set()
+    means, colors, track, ids = [], [], [], set()
     for line, cells in _lines(path):
         if len(cells) < 8 or len(cells) % 2:
             raise DataError(path, f"line {line}", f"has {len(cells)} columns where 8 and pairs belong", _WRITE_AGAIN)
@@ -368,10 +379,10 @@ def _points_txt(path: Path) -> Points:
         if not all(0 <= c <= 255 for c in rgb):
             raise DataError(path, f"line {line}", f"has the colour {rgb}", "colours lie in 0..255")
         colors.append(rgb)
-        seen.add(_integer(path, line, cells[0]))
+        ids.add(_integer(path, line, cells[0]))
         images = [_integer(path, line, c) for c in cells[8::2]]
         track.append(np.array([(len(means) - 1, image) for image in images], np.int64).reshape(-1, 2))
-    if len(seen) != len(means):
+    if len(ids) != len(means):
         raise DataError(path, "point id", "occurs twice", _WRITE_AGAIN)
     return _checked_points(path, np.array(means).reshape(-1, 3), np.array(colors, np.uint8).reshape(-1, 3), track)
 
@@ -395,7 +406,7 @@ def _parameters(path: Path, model: str) -> int:
 def _lens(path: Path, where: str, model: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
     fisheye = model.endswith("_FISHEYE")
     if model not in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"):
-        f, cx, cy, *radial = p  # one focal length; k1 and k2 as far as given; the further terms are 0
+        f, cx, cy, *radial = p  # one focal length, and k1, k2 if the model has them; the other terms are 0
         distortion = (*radial, *[0.0] * (4 - len(radial))) if radial else ()
         return Lens(width, height, f, f, cx, cy, distortion, fisheye).check(path, where)
     fx, fy, cx, cy, *rest = p

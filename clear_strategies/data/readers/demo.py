@@ -1,14 +1,12 @@
-"""The embedded default: a procedural room, so that a bare machine runs the main job with nothing else.
+"""The demo, the default data set: a procedural room, which needs no download.
 
-Pictures, boxes and balls at several depths, textured with photographs that scikit-image ships inside its wheel, ray-cast
-with anti-aliasing from exact poses. Its prior is the truth with seeded errors that differ from view to view, so that
-reliability means something; every report calls it synthetic.
+It holds pictures, boxes and balls at several depths, textured with photographs that scikit-image ships inside its wheel,
+and is ray-cast with anti-aliasing from exact poses. Its prior, `priors.DemoPrior`, is synthetic.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -22,40 +20,45 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.priors.corrupted import corrupted, require_errors
-from clear_strategies.errors import DataError
+from clear_strategies.data.checks import require_whole
+from clear_strategies.errors import DataError, SettingError
 from rasterizers.interface import Camera
 
 Array = np.ndarray
 Vector = tuple[float, float, float]
 
 _RAYS: Final = 4  # per pixel and axis
-_BAND: Final = 16  # image rows cast at once: small enough for the caches
+_BAND: Final = 16  # image rows cast at once, few enough for the CPU's caches
 _FIELD_OF_VIEW: Final = math.radians(58)
-_ARC: Final = 0.75  # the cameras' way to the left and right, world units
+_ARC: Final = 0.75  # the cameras' largest offset to the left and right, world units
 _TARGET: Final = np.array([0.0, 0.15, 5.0])
 
 _FLOOR: Final = 1.35  # y; y points down
 _WALL: Final = 7.5  # z
 _LAMP: Final = np.array([-4.0, -2.9, 1.2])
-_LAMP_SIZE: Final = 0.9  # edge of the square lamp, which makes shadows soft
-_LAMP_REACH: Final = 8.5  # distance at which its light has halved
+_LAMP_SIZE: Final = 0.9  # edge of the square lamp; an extended lamp has soft shadows
+_LAMP_REACH: Final = 8.5  # distance at which its light is halved
 _AMBIENT: Final = 0.3
 _EXPOSURE: Final = 1.9
 _LIGHT_TEXEL: Final = 0.08  # of the baked light, world units
 
 
 def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3) -> Capture:
-    """The room, seen from an arc; `train` views spread over it are for training, the others for testing.
+    """The room from cameras on an arc. `train` evenly spaced views are for training, the others for testing.
 
     Args:
         width, height: of the HR images, px.
+        views: how many, training views included.
 
     Raises:
-        ValueError: fewer views than training views, or fewer than two of those.
+        SettingError: a number is outside its range.
     """
+    for name, value in (("width", width), ("height", height), ("views", views), ("train", train)):
+        require_whole(f"data.reader.{name}", value, least=1)
     if not 2 <= train < views:
-        raise ValueError(f"2 <= train < views must hold, got train={train}, views={views}.")
+        raise SettingError(
+            f"data.reader.train: 2 <= train < views must hold, got train={train}, views={views}: lower data.reader.train"
+        )
     chosen = {round((i + 0.5) * views / train - 0.5) for i in range(train)}
     frames = []
     for i in range(views):
@@ -69,46 +72,6 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DemoPrior:
-    """Ground-truth detail with seeded errors that differ from view to view: see `corrupt.corrupted`.
-
-    Args:
-        truth: HR image of each view by name. share, strength, patch: as in `corrupt.Corrupted`.
-
-    Raises:
-        ValueError: a number is outside its range.
-    """
-
-    truth: Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]
-    share: float = 0.3
-    strength: float = 1.0
-    patch: int = 64
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        require_errors(self.share, self.strength, self.patch)
-
-    @property
-    def label(self) -> str:
-        return f"demo (synthetic: truth with seeded errors in {self.share:.0%} of the patches)"
-
-    def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-        truth = self._truth(name, lr.shape[1] * factor, lr.shape[0] * factor, factor)
-        return corrupted(truth, lr, factor, name, self.share, self.strength, self.patch, self.seed)
-
-    def _truth(self, name: str, width: int, height: int, factor: int) -> Float[Tensor, "H W 3"]:
-        """Cropped as the HR photo is, at the right and at the bottom, to a multiple of the factor."""
-        truth = self.truth[name]()
-        spare = (truth.shape[1] - width, truth.shape[0] - height)
-        if not all(0 <= pixels < factor for pixels in spare):
-            raise DataError(
-                name, "truth", f"is {truth.shape[1]}x{truth.shape[0]} where HR is {width}x{height}",
-                "use the photos at their own size (shrink=1, photos_are=hr), or another prior",
-            )  # fmt: skip
-        return truth[:height, :width]
-
-
 def render(camera: Camera) -> Float[Tensor, "H W 3"]:
     """Ray-cast with 4 × 4 rays a pixel and prefiltered textures; 8-bit values, as a photo would have."""
     bands = []
@@ -120,17 +83,17 @@ def render(camera: Camera) -> Float[Tensor, "H W 3"]:
 
 
 def depth(camera: Camera) -> Float[Tensor, "H W"]:
-    """Depth (z) through each pixel's centre, infinite where nothing is; the truth that tests compare with."""
+    """Depth (z) through each pixel's centre, infinite where there is no surface: the ground truth."""
     rays = _Rays.through(camera, 0, camera.height, 1)
     return torch.from_numpy(np.min([surface.depth(rays) for surface in _room()], axis=0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rays:
-    """The rays of a pixel grid, origin + t · (x · right + y · down + forward): t is the depth.
+    """The rays of a pixel grid, origin + t · (x · right + y · down + forward), where t is the depth.
 
-    Being linear in x and y, their dot product with anything fixed is a sum of a row and a column, which makes planes and
-    spheres cheap.
+    They are linear in x and y, so their dot product with a fixed vector is the sum of a row and a column. That makes
+    intersections with planes and spheres cheap.
     """
 
     origin: Float[Array, " 3"]
@@ -141,7 +104,7 @@ class _Rays:
 
     @staticmethod
     def through(camera: Camera, first: int, last: int, per_pixel: int) -> _Rays:
-        """Of the image rows from `first` up to `last`, `per_pixel`² through each pixel."""
+        """The rays of the image rows from `first` up to `last`, `per_pixel`² per pixel."""
         x = (np.arange(camera.width * per_pixel) + 0.5) / per_pixel
         y = (np.arange(first * per_pixel, last * per_pixel) + 0.5) / per_pixel
         return _Rays(
@@ -157,7 +120,7 @@ class _Rays:
         return np.asarray(self.x * right + (self.y * down + forward))
 
     def directions(self, which: Int[Array, " n"]) -> Float[Array, "n 3"]:
-        """Of the rays with these places in the grid, counted row by row."""
+        """Of the rays with these indices into the grid, counted row by row."""
         right, down, forward = _f32(self.axes)
         row, column = np.divmod(which, self.x.size)
         return np.asarray(self.x[0, column, None] * right + (self.y * down + forward)[row])
@@ -184,7 +147,7 @@ def _cast(rays: _Rays) -> Float[Array, "h w 3"]:
 def _color(
     surface: Surface, points: Float[Array, "n 3"], directions: Float[Array, "n 3"], spacing: Float[Array, " n"]
 ) -> Float[Array, "n 3"]:
-    """Photograph × light, and the lamp's reflection where the surface is glossy. `spacing`: of the rays, world units."""
+    """Photograph × light, plus the lamp's reflection on a glossy surface. `spacing`: of the rays, world units."""
     finish, chart = surface.finish, surface.chart(points)
     picture = _texture(finish.texture)
     at = chart * _f32(finish.repeat) + _f32(finish.shift)
@@ -202,8 +165,11 @@ class Finish:
     """How a surface looks.
 
     Args:
-        texture: a photograph of scikit-image. tint: times its colour. repeat, shift: where it lies on the surface's
-            chart; it is mirrored where it is repeated, so that it has no seam. gloss: strength of the lamp's reflection.
+        texture: a photograph of scikit-image.
+        tint: factor of its colour.
+        repeat, shift: its scale and offset on the surface's chart. Every second repetition is mirrored, so that there
+            is no seam.
+        gloss: strength of the lamp's reflection.
     """
 
     texture: str
@@ -215,7 +181,7 @@ class Finish:
 
 @runtime_checkable
 class Surface(Protocol):
-    """A shape with a chart: coordinates in [0, 1]² for its picture and its light."""
+    """A shape with a chart: coordinates in [0, 1]² for its texture and its light."""
 
     def __hash__(self) -> int: ...
 
@@ -228,7 +194,7 @@ class Surface(Protocol):
         ...
 
     def depth(self, rays: _Rays) -> Float[Array, "h w"]:
-        """Along each ray; infinite where it misses."""
+        """Along each ray; infinite if the ray misses the shape."""
         ...
 
     def chart(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]: ...
@@ -242,13 +208,13 @@ class Surface(Protocol):
         ...
 
     def blocks(self, points: Float[Array, "n 3"], lamp: Float[Array, " 3"]) -> Bool[Array, " n"]:
-        """Does it stand between the points and the lamp?"""
+        """Whether the shape is between the points and the lamp."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A rectangle: its centre, and half its sides as vectors; it faces down × right."""
+    """A rectangle: its centre, and half its sides as vectors. Its normal is down × right."""
 
     finish: Finish
     center: Vector
@@ -264,7 +230,7 @@ class Panel:
         right, down = _dual(self.right), _dual(self.down)
         normal = self._normal
         facing = rays.dot(normal)
-        # A ray along the plane divides by zero, and misses.
+        # A ray parallel to the plane divides by zero, and misses.
         with np.errstate(divide="ignore", invalid="ignore"):
             t = np.float32(-offset @ normal) / facing
             u = np.float32(offset @ right) + t * rays.dot(right)
@@ -296,7 +262,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Ball:
-    """A sphere, its chart longitude and latitude."""
+    """A sphere. Its chart is longitude and latitude."""
 
     finish: Finish
     center: Vector
@@ -338,13 +304,13 @@ def _room() -> tuple[Surface, ...]:
     """A yard: pictures on the wall and leaning before it, a box, and balls on the ground."""
     brick = Finish("brick", (1.12, 0.80, 0.66), repeat=(2.0, 3.0), shift=(0.1, 0.35))
     gravel = Finish("gravel", (0.78, 0.74, 0.68), repeat=(4.0, 3.0))
-    # On a ball, repeat (2, 1) shows the whole photograph from the front; less enlarges its middle.
+    # On a ball, repeat (2, 1) shows the whole photograph from the front; smaller values enlarge its middle.
     marble = Finish("ihc", repeat=(2.0, 1.0), shift=(-0.5, 0.0), gloss=0.3)
     moss = Finish("grass", (0.62, 0.95, 0.42), repeat=(2.0, 1.0), shift=(-0.5, 0.0))
     retina = Finish("retina", (1.1, 1.1, 1.1), repeat=(1.2, 0.6), shift=(-0.1, 0.2), gloss=0.35)
     rainbow = Finish("color", (1.1, 1.1, 1.1), repeat=(1.2, 0.6), shift=(-0.1, 0.2), gloss=0.35)
     return (
-        # The photograph's courses of bricks stand upright; turned by a right angle they lie.
+        # The photograph shows the courses of bricks vertically; the panel is turned by a right angle.
         Panel(brick, center=(0.0, -1.2, _WALL), right=(0.0, -4.2, 0.0), down=(7.0, 0.0, 0.0)),
         Panel(gravel, center=(0.0, _FLOOR, 3.75), right=(7.0, 0.0, 0.0), down=(0.0, 0.0, -4.75)),
         *_hung("rocket", x=-1.75, y=-1.05, width=2.1),
@@ -372,7 +338,7 @@ def _hung(texture: str, *, x: float, y: float, width: float) -> tuple[Panel, Pan
 
 
 def _leaning(texture: str, *, x: float, z: float, width: float, turn: float, lean: float = 0.16) -> Panel:
-    """A picture that stands on the ground, turned about the vertical, leaning back; angles in radians."""
+    """A picture on the ground, turned about the vertical and leaning back; angles in radians."""
     half = width / 2
     tall = half / _texture(texture).aspect
     right, back = _turned(turn)
@@ -382,7 +348,7 @@ def _leaning(texture: str, *, x: float, z: float, width: float, turn: float, lea
 
 
 def _box(texture: str, *, x: float, z: float, size: Vector, turn: float) -> tuple[Panel, ...]:
-    """The five faces of a box on the ground that one may see; `size`: width, height, length."""
+    """The five visible faces of a box on the ground; `size`: width, height, length."""
     right, back = (side * length / 2 for side, length in zip(_turned(turn), size[::2], strict=True))
     down, finish = np.array([0, size[1] / 2, 0]), Finish(texture)
     center = np.array([x, _FLOOR - size[1] / 2, z])
@@ -404,7 +370,7 @@ def _turned(angle: float) -> tuple[Float[Array, " 3"], Float[Array, " 3"]]:
 
 @cache
 def _light(surface: Surface) -> _Texture:
-    """What the lamp and the sky give to each place of a surface, with soft shadows; the same from everywhere, so baked."""
+    """The light of the lamp and the sky on a surface, with soft shadows. It does not depend on the view, so it is baked."""
     width, height = (max(math.ceil(side / _LIGHT_TEXEL), 4) for side in surface.extent)
     u, v = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
     points = surface.points(np.stack((u.ravel(), v.ravel()), -1))
@@ -425,7 +391,7 @@ def _light(surface: Surface) -> _Texture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Texture:
-    """An image and its halvings (area means), one after the other in one table."""
+    """A mipmap: an image and its halvings (area means), one after the other in one table."""
 
     texels: Float[Array, "T C"]
     starts: Int[Array, " L"]
@@ -447,7 +413,7 @@ class _Texture:
         return float(self.widths[0] / self.heights[0])
 
     def sample(self, at: Float[Array, "n 2"], footprint: Float[Array, " n"]) -> Float[Array, "n C"]:
-        """Bilinear, in the level whose texels are about as large as the ray spacing (`footprint`, texels of the first)."""
+        """Bilinear, in the level whose texels are about as large as the ray spacing (`footprint`, texels of level 0)."""
         level = np.log2(np.maximum(footprint, 1)).round().astype(int).clip(0, len(self.widths) - 1)
         start, width, height = self.starts[level], self.widths[level], self.heights[level]
         folded = np.abs(at - 2 * np.round(at / 2))  # mirrored at every whole number
@@ -476,7 +442,7 @@ def _texture(name: str) -> _Texture:
 
 
 def _camera(position: float, width: int, height: int) -> Camera:
-    """On the arc, `position` in [-1, 1] from left to right, looking at the room's middle."""
+    """On the arc, `position` in [-1, 1] from left to right, looking at the middle of the room."""
     center = np.array([_ARC * position, -0.15 + 0.12 * math.cos(2.2 * position), 0.35 * position**2])
     forward = _unit(_TARGET - center)
     right = _unit(np.cross([0.0, 1.0, 0.0], forward))
@@ -497,5 +463,5 @@ def _dual(side: Vector) -> Float[Array, " 3"]:
 
 
 def _f32(values: Array | tuple[float, ...]) -> Float[Array, "*shape"]:
-    """Casting is done in single precision: it is twice as fast, and a texel is far larger than its error."""
+    """In single precision: rays are cast twice as fast, and the error is far below a texel."""
     return np.asarray(values, np.float32)

@@ -12,15 +12,14 @@ from typing import Final
 import numpy as np
 from numpy.lib import format as npy_format
 
-from clear_strategies.data.cameras import Lens, by_name, lens_notes, make_frame, rigid_inverse
-from clear_strategies.data.capture import Capture
+from clear_strategies.data.cameras import Lens, rigid_inverse
+from clear_strategies.data.capture import Capture, Color, Frame, lens_notes, sorted_by_name
+from clear_strategies.data.checks import as_color, require_choice
 from clear_strategies.data.photo_files import image_folder, inside, list_images
 from clear_strategies.data.readers import colmap
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
-
-Color = tuple[float, float, float]
 
 _COLUMNS: Final = 17  # a 3 x 5 matrix [R | t | height width focal], then the near and far bounds
 # What numpy's parser of the header's Python literal raises on damaged ones.
@@ -44,19 +43,21 @@ def read(
     *,
     background: Color | None = None,
 ) -> Capture:
-    """An LLFF scene.
+    """Read an LLFF scene folder.
 
     Args:
-        images: folder of the photos below root; None: images, images_2, images_4, images_8, the first that is there.
-        poses: "colmap" (sparse/0), "poses_bounds", or "auto": COLMAP's where they are.
+        images: folder of the photos below root; None: the first that exists of images, images_2, images_4, images_8.
+        poses: "colmap" (sparse/0), "poses_bounds", or "auto": COLMAP's if it has a model.
         background: RGB in [0, 1] behind transparent pixels; None: black.
 
     Raises:
+        SettingError: `poses` or the background is none of these.
         DataError: something is missing or not what it should be.
     """
     root = Path(root)
-    if poses not in ("auto", "colmap", "poses_bounds"):
-        raise DataError("config", "data.reader.poses", f"is {poses!r}", "use auto, colmap or poses_bounds")
+    require_choice("data.reader.poses", poses, ("auto", "colmap", "poses_bounds"))
+    if background is not None:
+        background = as_color("data.reader.background", background)
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     folder = image_folder(root, images)
@@ -72,7 +73,7 @@ def _from_colmap(root: Path, folder: Path, background: Color | None) -> Capture:
     files = {p.name: inside(folder, p.name, file=folder) for p in list_images(folder)}
     if all(name in files for name in registered):
         return colmap.capture(root, model, folder, {name: files[name] for name in registered}, background=background)
-    # images_4 and the like were renamed by LLFF's scripts, in the order of the originals.
+    # LLFF's scripts rename the photos of images_4 and the like, in the order of the originals.
     if len(files) != len(registered):
         raise DataError(
             folder, "images", f"holds {len(files)} images, the model {len(registered)} under other names",
@@ -107,24 +108,26 @@ def _from_bounds(root: Path, folder: Path, has_model: bool, background: Color | 
         world_to_camera = rigid_inverse(file, f"row {i}", rotation, pose[:, 3])
         inside(folder, path.name, file=folder)
         lenses.append(lens)
-        frames.append(make_frame(path.name, path, lens, world_to_camera, background=background, sfm_id=ids[i]))
+        frames.append(Frame.of_photo(path.name, path, lens, world_to_camera, background=background, sfm_id=ids[i]))
     near, far = table[:, 15].min(), table[:, 16].max()
     if not 0 < near < far:
         raise DataError(file, "bounds", f"are {near:g} and {far:g}; 0 < near < far must hold", _REMEDY)
     notes = {
         "poses": f"poses_bounds.npy, {len(frames)} images",
         "photos": folder.name,
-        "depths": f"{near:.4g} to {far:.4g} world units, says poses_bounds.npy",
+        "depths": f"{near:.4g} to {far:.4g} world units, from poses_bounds.npy",
         **lens_notes(lenses, frames),
     }
     points = None
-    if model is not None and ids[0] is not None:  # LLFF's poses stand in the frame of the COLMAP model they came from
+    if (
+        model is not None and ids[0] is not None
+    ):  # LLFF's poses are in the coordinates of the COLMAP model they were made from
         points = colmap.sfm_points(model, model.folder.relative_to(root).as_posix())
-    return Capture(root.resolve().name, by_name(frames, folder), points, background or (0.0, 0.0, 0.0), notes)
+    return Capture(root.resolve().name, sorted_by_name(frames, folder), points, background or (0.0, 0.0, 0.0), notes)
 
 
 def _ids_by_order(model: colmap.Model | None, n: int) -> list[int | None]:
-    """The model's ids of the n photos: both in order of names."""
+    """The model's ids of the n photos, matched in order of names."""
     if model is None:
         return [None] * n
     registered = sorted(model.images, key=lambda image: image.name)

@@ -12,8 +12,9 @@ from typing import Any, Final
 import torch
 
 from clear_strategies.data import strict_json
-from clear_strategies.data.cameras import Lens, by_name, lens_notes, make_frame, pose_from_opengl
-from clear_strategies.data.capture import Capture, SfmPoints
+from clear_strategies.data.cameras import Lens, pose_from_opengl
+from clear_strategies.data.capture import Capture, Color, Frame, SfmPoints, lens_notes, sorted_by_name
+from clear_strategies.data.checks import as_color
 from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
 from clear_strategies.data.ply import read_points
 from clear_strategies.errors import DataError
@@ -36,18 +37,19 @@ _INTRINSICS: Final = (
 _SPLITS: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
 
 
-def read(
-    root: str | Path, *, background: tuple[float, float, float] | None = None, allow_outside: bool = False
-) -> Capture:
-    """A folder with transforms.json, or that file. Poses stay as they are, `applied_transform` included.
+def read(root: str | Path, *, background: Color | None = None, allow_outside: bool = False) -> Capture:
+    """Read a folder with transforms.json, or that file. Poses are taken as they are, `applied_transform` included.
 
     Args:
         background: RGB in [0, 1] behind transparent pixels; None: black.
         allow_outside: follow file names and links that lead out of the folder.
 
     Raises:
+        SettingError: the background is no colour.
         DataError: something is missing or not what it should be.
     """
+    if background is not None:
+        background = as_color("data.reader.background", background)
     given = Path(root)
     file = given if given.suffix == ".json" else given / "transforms.json"
     folder = file.parent
@@ -64,7 +66,7 @@ def read(
         pose = pose_from_opengl(file, f"{where}.transform_matrix", entry.get("transform_matrix"))
         lens = _lens(file, where, {**shared, **entry}, path)
         lenses.append(lens)
-        frames.append(make_frame(short[i], path, lens, pose, background=background, split=splits.get(name)))
+        frames.append(Frame.of_photo(short[i], path, lens, pose, background=background, split=splits.get(name)))
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(lenses, frames)}
     if splits:
         notes["split"] = _split_note(file, names, splits)
@@ -73,19 +75,19 @@ def read(
         _log.warning("%s: masks (of %d frames) are not used.", file, masked)
         notes["masks"] = f"not used ({masked} frames have one)"
     points = _points(folder, file, content, allow_outside)
-    return Capture(folder.resolve().name, by_name(frames, file), points, background or (0.0, 0.0, 0.0), notes)
+    return Capture(folder.resolve().name, sorted_by_name(frames, file), points, background or (0.0, 0.0, 0.0), notes)
 
 
 def _short_names(names: Sequence[str]) -> list[str]:
     """Names without the folders that all of them share."""
     parts = [PurePosixPath(name).parts for name in names]
-    first, last = min(part[:-1] for part in parts), max(part[:-1] for part in parts)  # what these share, all share
+    first, last = min(part[:-1] for part in parts), max(part[:-1] for part in parts)  # all share what these two share
     shared = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(first, last, strict=False))))
     return ["/".join(part[shared:]) for part in parts]
 
 
 def _photo(folder: Path, name: str, file: Path, allow_outside: bool) -> Path:
-    """instant-ngp leaves out the ending where it is .png."""
+    """The photo of this name; instant-ngp omits the ending .png."""
     path = inside(folder, name, file=file, allow_outside=allow_outside)
     if name.lower().endswith(SUFFIXES) or path.is_file():
         return path
@@ -146,7 +148,7 @@ def _splits(file: Path, content: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _split_note(file: Path, names: Sequence[str], splits: Mapping[str, str]) -> str:
-    """How many frames the file's own lists give to each side; what they leave out is said aloud."""
+    """How many frames the file's own lists assign to each side. Frames in none of them are logged."""
     missing = sorted(set(splits) - set(names))
     if missing:
         raise DataError(file, "split", f"lists {missing[0]!r}, which is no frame's file_path", "correct the lists")

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from clear_strategies.data.capture import Capture
+from clear_strategies.data.checks import require_whole
 from clear_strategies.data.photo_files import image_size, inside, list_images
-from clear_strategies.data.priors.upscale import cache_folder
+from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap
 from clear_strategies.errors import DataError
 
@@ -24,22 +25,26 @@ _MORE: Final = "take more photos that overlap by two thirds, with the same camer
 def read(
     root: str | Path, cache: str | Path | None = None, *, max_side: int = 3200, threads: int = -1, seed: int = 0
 ) -> Capture:
-    """A folder of photos of one scene; poses are estimated once, from all of them, and kept.
+    """Read a folder of photos of one scene. Poses are estimated from all of them and kept in a cache.
 
     Args:
-        cache: where poses are kept; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Never the photos' folder.
-        max_side: features are found on photos reduced to this many pixels.
-        threads: of COLMAP; -1: all. More than one may change the poses' last digits from run to run.
+        cache: folder of the poses; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Not in the photos' folder.
+        max_side: features are extracted from photos reduced to this many pixels.
+        threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
         seed: of COLMAP's random samples.
 
     Raises:
+        SettingError: a number is outside its range.
         DataError: too few photos, none can be related to each other, or pycolmap is not installed.
     """
+    require_whole("data.reader.max_side", max_side, least=1)
+    require_whole("data.reader.threads", threads, least=-1)
+    require_whole("data.reader.seed", seed, least=0)
     root = Path(root)
     paths = list_images(root)
     if len(paths) < _FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {_FEWEST}", _MORE)
-    sizes = [image_size(inside(root, path.name, file=root)) for path in paths]  # refuse bad ones before the long work
+    sizes = [image_size(inside(root, path.name, file=root)) for path in paths]  # refuses bad ones before the long work
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
@@ -64,10 +69,12 @@ def read(
 def _reconstruct(
     root: Path, paths: list[Path], folder: Path, *, same_camera: bool, max_side: int, threads: int, seed: int
 ) -> None:
-    """Run SfM in a scratch folder beside the result, then move the largest model to its place."""
+    """Run SfM in a temporary folder beside the result, then move the largest model there."""
     pycolmap = _pycolmap()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    _log.info("%s: the poses of %d photos are estimated; seconds to minutes a pair of photos.", root, len(paths))
+    _log.info(
+        "%s: estimating the poses of %d photos. This takes seconds to minutes per pair of photos.", root, len(paths)
+    )
     try:
         with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work:
             best = _map(pycolmap, root, paths, Path(work), same_camera, max_side, threads, seed)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 
-import cv2
-import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies.core.view import Photo
+from clear_strategies.data.points.projection import project, sample_colors
 from clear_strategies.data.points.sift import (
     Features,
     Pairs,
@@ -19,29 +18,12 @@ from clear_strategies.data.points.sift import (
     find_features,
     match,
     one_per_track,
-    project,
-    sample_colors,
     triangulate,
     triangulate_pair,
 )
+from clear_strategies.errors import SettingError
 from rasterizers.interface import Camera
-
-
-def camera(x: float, width: int = 100, height: int = 100, focal: float = 100.0) -> Camera:
-    """At (x, 0, 0), looking along z."""
-    pose = torch.eye(4)
-    pose[0, 3] = -x
-    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
-
-
-def plane_photos(count: int, width: int = 120, height: int = 90) -> list[Photo]:
-    """A plane at z = 4: cameras 0.4 apart with f = 100 px see it shifted by whole 10 px."""
-    noise = np.random.default_rng(0).random((height, width + 10 * count, 3)).astype(np.float32)
-    texture = cv2.GaussianBlur(noise, (0, 0), 2)
-    texture = torch.from_numpy((texture - texture.min()) / np.ptp(texture))
-    return [
-        Photo(camera(0.4 * i, width, height), texture[:, 10 * i : 10 * i + width].contiguous()) for i in range(count)
-    ]
+from tests.helpers.planes import camera, plane_photos
 
 
 @pytest.mark.parametrize("count", [2, 3])
@@ -51,7 +33,7 @@ def test_a_plane_is_found_where_it_is(count: int) -> None:
     assert len(cloud) > 100
     assert (cloud.means[:, 2] - 4).abs().median() < 0.02
     assert (cloud.means[:, 2] - 4).abs().quantile(0.95) < 0.15
-    assert cloud.saw_test_views == "no"
+    assert cloud.uses_test_views == "no"
     assert f"the {count} training LR images" in cloud.source
     # The colour is the texture's at that place.
     pixels, _ = project(photos[0].camera, cloud.means)
@@ -80,8 +62,8 @@ def test_one_photo_gives_an_empty_cloud() -> None:
     assert len(triangulate(plane_photos(1))) == 0
 
 
-def judged(x: tuple[float, float], y: tuple[float, float], **limits: float) -> tuple[list[float], float, bool]:
-    """Cameras at x = 0 and x = 1; (point, angle, believed)."""
+def triangulated(x: tuple[float, float], y: tuple[float, float], **limits: float) -> tuple[list[float], float, bool]:
+    """Cameras at x = 0 and x = 1; (point, angle, accepted)."""
     settings = TriangulationSettings(**limits)  # type: ignore[arg-type]
     pixels = (torch.tensor([p], dtype=torch.float64) for p in (x, y))
     points, angle, good = triangulate_pair(camera(0), camera(1), *pixels, settings)
@@ -90,7 +72,7 @@ def judged(x: tuple[float, float], y: tuple[float, float], **limits: float) -> t
 
 def test_two_rays_meet_where_they_should() -> None:
     # (0.5, 0, 5) lies at 50 + 100 · 0.5 / 5 = 60 and at 50 - 10 = 40; half the angle is atan(0.5 / 5).
-    point, angle, good = judged((60, 50), (40, 50))
+    point, angle, good = triangulated((60, 50), (40, 50))
     assert point == pytest.approx([0.5, 0, 5], abs=1e-9)
     assert angle == pytest.approx(2 * math.degrees(math.atan(0.1)))
     assert good
@@ -106,12 +88,12 @@ def test_two_rays_meet_where_they_should() -> None:
     ],
 )
 def test_each_filter_alone_rejects(x: tuple[float, float], y: tuple[float, float], limits: dict[str, float]) -> None:
-    assert not judged(x, y, **limits)[2]
+    assert not triangulated(x, y, **limits)[2]
     loose = {"epipolar": 9.0, "reprojection": 9.0, "angle": 0.1}
-    assert judged(x, y, **loose)[2] == (x[0] > y[0])
+    assert triangulated(x, y, **loose)[2] == (x[0] > y[0])
 
 
-def test_rays_from_one_centre_are_not_believed() -> None:
+def test_rays_from_one_centre_are_rejected() -> None:
     pixel = torch.tensor([[60.0, 50.0]], dtype=torch.float64)
     assert not triangulate_pair(camera(0), camera(0), pixel, pixel, TriangulationSettings())[2].any()
 
@@ -171,16 +153,10 @@ def test_tracks_keep_their_widest_pair_and_contradictions_go() -> None:
     assert sorted(one_per_track(separate, view).tolist()) == [0, 1]
 
 
-def test_colours_are_sampled_between_pixel_centres() -> None:
-    image = torch.tensor([[[0.0, 0, 0], [1.0, 1, 1]]])
-    at = torch.tensor([[0.5, 0.5], [1.0, 0.5], [1.25, 0.5], [1.5, 0.5], [0.1, 0.2]])
-    assert torch.allclose(sample_colors(image, at)[:, 0], torch.tensor([0, 0.5, 0.75, 1, 0]))
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [("enlarge", 0), ("contrast", 0.0), ("ratio", 1.1), ("epipolar", -1.0), ("reprojection", math.nan), ("angle", 0.0)],
 )
 def test_settings_out_of_range_are_named(field: str, value: float) -> None:
-    with pytest.raises(ValueError, match=f"{field} must .* got {value}"):
+    with pytest.raises(SettingError, match=f"data.cloud.triangulation.{field}: must .* got {value}"):
         TriangulationSettings(**{field: value})  # type: ignore[arg-type]

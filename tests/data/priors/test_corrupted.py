@@ -1,21 +1,39 @@
-"""Wrong detail on purpose: seeded, different in every view, in exactly the share of the patches that was asked for."""
+"""Seeded errors: in exactly the given share of the patches, different in every view; on other priors and on the truth."""
 
 from __future__ import annotations
 
+import math
+from functools import cache
+
 import numpy as np
+import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from omegaconf import OmegaConf
+from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.data.priors.corrupted import Corrupted
-from clear_strategies.data.priors.upscale import Bicubic, Cached
+from clear_strategies.data.priors import Bicubic, Cached, Corrupted, DemoPrior
+from clear_strategies.data.readers import demo
+from clear_strategies.errors import DataError, SettingError
 from clear_strategies.run import CONF
 from clear_strategies.settings import build
 
 
-def photo(seed: int = 0):
-    """LR with structure at every scale; its bicubic enlargement has some detail left to corrupt."""
+class Sharp:
+    """Bicubic, sharpened: an SR image with detail beyond U(I_LR)."""
+
+    label = "sharp"
+
+    def __call__(self, name, lr, factor):
+        large = images.upsample(lr, factor)
+        return images.quantize(large + 0.5 * (large - images.upsample(images.downsample(large, 8, "area"), 8)))
+
+
+def random_lr(seed: int = 0) -> Tensor:
+    """LR with structure at every scale."""
     rng = np.random.default_rng(seed)
     return torch.from_numpy(rng.random((24, 32, 3), dtype=np.float32))
 
@@ -25,18 +43,18 @@ def wrong_patches(prior: Corrupted, name: str, lr) -> torch.Tensor:
 
 
 def test_the_share_of_patches_is_wrong_and_the_others_are_the_priors():
-    lr, prior = photo(), Corrupted(Sharp(), share=0.25, patch=32)  # 96x128: 3 x 4 patches
+    lr, prior = random_lr(), Corrupted(Sharp(), share=0.25, patch=32)  # 96x128: 3 x 4 patches
     assert int(wrong_patches(prior, "a", lr).sum()) == 3
 
 
-def test_without_share_or_strength_it_is_the_prior():
-    lr = photo()
-    for settings in ({"share": 0.0}, {"strength": 0.0}):
-        assert torch.equal(Corrupted(Sharp(), **settings)("a", lr, 4), Sharp()("a", lr, 4))
+def test_without_share_or_strength_it_equals_the_prior():
+    lr = random_lr()
+    for none in ({"share": 0.0}, {"strength": 0.0}):
+        assert torch.equal(Corrupted(Sharp(), **none)("a", lr, 4), Sharp()("a", lr, 4))
 
 
-def test_views_and_seeds_have_errors_of_their_own():
-    lr = photo()
+def test_errors_differ_between_views_and_seeds():
+    lr = random_lr()
     one = Corrupted(Sharp(), patch=16)
     assert torch.equal(one("a", lr, 4), Corrupted(Sharp(), patch=16)("a", lr, 4))
     assert not torch.equal(wrong_patches(one, "a", lr), wrong_patches(one, "b", lr))
@@ -57,11 +75,99 @@ def test_a_network_inside_is_cached_and_the_config_builds_it(tmp_path):
     assert (prior.prior.prior.path, prior.share) == ("net.onnx", 0.5)
 
 
-class Sharp:
-    """Bicubic, sharpened: a reference with detail beyond U(I_LR)."""
+@pytest.mark.parametrize(
+    ("wrong", "value"),
+    [
+        ("share", 1.5), ("share", -0.1), ("share", math.nan), ("strength", -1.0), ("strength", math.nan), ("patch", 0),
+        ("patch", 2.5), ("seed", -1),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("kind", [Corrupted, DemoPrior])
+def test_settings_out_of_range_are_refused_by_name(kind, wrong, value):
+    prior = Corrupted(Sharp()) if kind is Corrupted else DemoPrior({})
+    object.__setattr__(prior, wrong, value)  # past the type checks, which only tests have
+    with pytest.raises(SettingError, match=rf"prior\.{wrong}: must .*, got "):
+        prior.__post_init__()
 
-    label = "sharp"
 
-    def __call__(self, name, lr, factor):
-        large = images.upsample(lr, factor)
-        return images.quantize(large + 0.5 * (large - images.upsample(images.downsample(large, 8, "area"), 8)))
+# --- the demo's prior ------------------------------------------------------------------------------------------------
+
+WIDTH, HEIGHT, FACTOR = 128, 96, 4
+
+
+@cache
+def frames():
+    return demo.read(width=WIDTH, height=HEIGHT).frames
+
+
+def prior(**settings: float) -> DemoPrior:
+    return DemoPrior({f.name: f.load for f in frames()}, patch=32, **settings)  # type: ignore[arg-type]
+
+
+def lr_of(i: int) -> tuple[str, Tensor, Tensor]:
+    frame = frames()[i]
+    return frame.name, images.downsample(frame.load(), FACTOR), frame.load()
+
+
+@given(share=st.floats(0, 1))
+@settings(max_examples=12, deadline=None)
+def test_exactly_the_given_share_of_the_patches_is_wrong(share: float) -> None:
+    name, lr, truth = lr_of(2)
+    difference = images.patch_means((prior(share=share)(name, lr, FACTOR) - truth).abs(), 32)
+    assert int((difference > 0).sum()) == round(share * 12)  # 128x96: 4 x 3 patches
+
+
+def test_without_strength_or_share_the_demo_prior_is_the_truth() -> None:
+    name, lr, truth = lr_of(2)
+    assert torch.equal(prior(strength=0.0)(name, lr, FACTOR), truth)
+    assert torch.equal(prior(share=0.0)(name, lr, FACTOR), truth)
+
+
+def test_the_demo_priors_errors_repeat_with_the_seed_and_differ_between_views_and_seeds() -> None:
+    name, lr, truth = lr_of(2)
+    first = prior(seed=1)(name, lr, FACTOR)
+    assert torch.equal(first, prior(seed=1)(name, lr, FACTOR))
+    assert not torch.equal(first, prior(seed=2)(name, lr, FACTOR))
+    other, other_lr, other_truth = lr_of(3)
+    wrong = images.patch_means((first - truth).abs(), 32) > 0
+    other_wrong = images.patch_means((prior(seed=1)(other, other_lr, FACTOR) - other_truth).abs(), 32) > 0
+    assert not torch.equal(wrong, other_wrong)
+
+
+def test_some_errors_agree_with_lr_and_some_do_not_so_that_reliability_spreads() -> None:
+    reliability = []
+    for i in range(12):
+        name, lr, _ = lr_of(i)
+        residual = (images.downsample(prior()(name, lr, FACTOR), FACTOR) - lr).abs()
+        reliability.append(torch.exp(-images.patch_means(residual, 8) / 0.05).flatten())
+    found = torch.cat(reliability)
+    assert found.median() > 0.95
+    assert found.quantile(0.02) < 0.4
+    assert ((found > 0.4) & (found < 0.9)).float().mean() > 0.1
+
+
+def test_the_demo_prior_is_better_than_bicubic_and_worse_than_the_truth() -> None:
+    errors = []
+    for i in range(12):
+        name, lr, truth = lr_of(i)
+        sr, smooth = prior()(name, lr, FACTOR), images.upsample(lr, FACTOR)
+        errors.append([float((sr - truth).square().mean()), float((smooth - truth).square().mean())])
+    ours, bicubic = np.mean(errors, axis=0)
+    assert 0 < 10 * math.log10(bicubic / ours) < 6
+
+
+def test_the_demo_priors_label_says_that_it_is_synthetic() -> None:
+    assert prior().label == "demo (synthetic: truth with seeded errors in 30% of the patches)"
+
+
+def test_the_demo_prior_does_not_change_the_truth_and_crops_it_as_hr_is_cropped() -> None:
+    whole = torch.rand(34, 35, 3)
+    before = whole.clone()
+    made = DemoPrior({"a": lambda: whole}, share=1.0, patch=8)("a", images.downsample(whole[:32, :32], 4), 4)
+    assert made.shape == (32, 32, 3)
+    assert torch.equal(whole, before)
+
+
+def test_a_truth_of_another_size_is_refused_in_one_line() -> None:
+    with pytest.raises(DataError, match=r"a: truth: is 64x64 where HR is 32x32: use the photos at their own size"):
+        DemoPrior({"a": lambda: torch.rand(64, 64, 3)})("a", torch.rand(8, 8, 3), 4)

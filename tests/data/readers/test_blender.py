@@ -9,7 +9,6 @@ import pytest
 import torch
 from PIL import Image
 
-from clear_strategies.data.photo_files import frame_number
 from clear_strategies.data.readers import blender
 from tests.helpers import captures as tiny
 
@@ -44,7 +43,7 @@ def test_the_order_is_that_of_the_file_and_endings_may_be_given(tmp_path: Path) 
     assert [frame.name for frame in blender.read(tmp_path).frames] == ["r_2", "r_10", "test/c"]
 
 
-def test_a_scene_without_test_views_is_read_and_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_scene_without_test_views_is_read_and_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tiny.blender(tmp_path) / "transforms_test.json").unlink()
     assert [frame.split for frame in blender.read(tmp_path).frames] == ["train", "train"]
     assert "no test views" in caplog.text
@@ -52,10 +51,10 @@ def test_a_scene_without_test_views_is_read_and_told(tmp_path: Path, caplog: pyt
 
 def test_the_protocols_frames_of_lego_are_found_by_number(shared_data: Path) -> None:
     capture = blender.read(shared_data / "lego")
-    train = {frame_number(frame.name): frame for frame in capture.frames if frame.split == "train"}
+    train = {int(frame.name.removeprefix("r_")): frame for frame in capture.frames if frame.split == "train"}
     assert set(train) >= PROTOCOL
     assert len(train) == 25
-    assert [frame_number(f.name) for f in capture.frames if f.split == "test"] == list(range(0, 200, 8))
+    assert [f.name for f in capture.frames if f.split == "test"] == [f"test/r_{i}" for i in range(0, 200, 8)]
     for number in sorted(PROTOCOL):
         camera = train[number].camera
         assert camera.center.norm() == pytest.approx(4.031, abs=1e-3)  # on NeRF's sphere around the scene

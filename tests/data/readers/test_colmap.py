@@ -35,7 +35,7 @@ def test_cameras_photos_and_points_are_those_of_the_files(layout: str, tmp_path:
     assert points is not None
     assert points.means.tolist() == [list(p) for p in tiny.POINTS]
     torch.testing.assert_close(points.colors, torch.tensor([[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]]))
-    pairs = sorted(zip(points.point.tolist(), points.seen_by.tolist(), strict=True))
+    pairs = sorted(zip(points.track_point.tolist(), points.track_image.tolist(), strict=True))
     assert pairs == [(0, 1), (0, 2), (1, 2), (1, 3)]
     assert points.source == "COLMAP sparse/0, 2 points, triangulated from all 3 images"
     assert capture.notes["poses"] == f"COLMAP sparse/0 ({layout}), 3 images"
@@ -66,7 +66,7 @@ def test_photos_may_differ_from_the_model_in_their_ending(tmp_path: Path) -> Non
     assert [frame.name for frame in colmap.read(tmp_path).frames] == ["a.png", "b.jpg", "c.png"]
 
 
-def test_photos_without_a_pose_and_further_models_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_photos_without_a_pose_and_further_models_are_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     shutil.copy(tiny.colmap_bin(tmp_path) / "images/a.png", tmp_path / "images/d.png")
     shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
     with caplog.at_level("INFO"):
@@ -82,7 +82,7 @@ def test_a_model_without_points_is_a_capture_without_points(tmp_path: Path) -> N
     assert capture.notes["points"] == "the model has none"
 
 
-def test_a_quaternion_of_another_length_is_normalised_and_told(tmp_path: Path) -> None:
+def test_a_quaternion_of_another_length_is_normalised_and_noted(tmp_path: Path) -> None:
     file = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
     file.write_text(file.read_text().replace("1 1.0 0.0 0.0 0.0", "1 1.5 0.0 0.0 0.0"))
     capture = colmap.read(tmp_path)
@@ -152,7 +152,9 @@ def test_undistortion_is_the_lens_formula_and_leaves_no_border(lens: Lens) -> No
         ("OPENCV_FISHEYE", (20.0, 20.0, 8.0, 6.0, 0.1, 0.0, 0.0, 0.0)),
     ],
 )
-def test_distorted_models_become_pinholes_and_say_so(model: str, parameters: tuple[float, ...], tmp_path: Path) -> None:
+def test_distorted_models_become_pinholes_and_are_noted(
+    model: str, parameters: tuple[float, ...], tmp_path: Path
+) -> None:
     capture = colmap.read(tiny.colmap_bin(tmp_path, model, parameters))
     assert capture.notes["lens"].startswith("3 of 3 photos undistorted by OpenCV")
     raw = photo_files.read_image(tmp_path / "images/a.png")
@@ -168,17 +170,17 @@ def test_a_lens_that_opencv_lacks_is_refused_with_what_to_do(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("scene", ["kitchen360", "real_room", "strecha_fountain"])
-def test_real_points_project_into_the_photos_that_saw_them(scene: str, shared_data: Path) -> None:
+def test_real_points_project_into_the_photos_that_observe_them(scene: str, shared_data: Path) -> None:
     capture = colmap.read(shared_data / scene)
     points = capture.points
     assert points is not None
     for frame in capture.frames:
         camera = frame.camera
-        seen = points.means[points.point[points.seen_by == frame.sfm_id]].double()
-        local = seen @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        observed = points.means[points.track_point[points.track_image == frame.sfm_id]].double()
+        local = observed @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         x, y = camera.fx * local[:, 0] / local[:, 2] + camera.cx, camera.fy * local[:, 1] / local[:, 2] + camera.cy
         inside = (local[:, 2] > 0) & (x > -3) & (x < camera.width + 3) & (y > -3) & (y < camera.height + 3)
-        assert len(seen) > 0
+        assert len(observed) > 0
         assert inside.float().mean() > 0.99
     assert cv2.imread(str(shared_data / scene / "images" / capture.frames[0].name)).shape == tuple(
         capture.frames[0].load().shape

@@ -1,8 +1,7 @@
-"""The demo room: exact, anti-aliased, deterministic, with features at LR scale, and a prior that lies where it says."""
+"""The demo room: exact, anti-aliased, deterministic, with features at LR scale."""
 
 from __future__ import annotations
 
-import math
 from functools import cache
 
 import numpy as np
@@ -15,8 +14,8 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import demo
-from clear_strategies.data.readers.demo import Ball, DemoPrior, Finish, Panel
-from clear_strategies.errors import DataError
+from clear_strategies.data.readers.demo import Ball, Finish, Panel
+from clear_strategies.errors import SettingError
 from rasterizers import Camera
 
 WIDTH, HEIGHT, FACTOR = 128, 96, 4
@@ -48,7 +47,7 @@ def test_as_many_views_train_as_were_asked_for(train: int, more: int) -> None:
 
 @pytest.mark.parametrize(("views", "train"), [(3, 3), (12, 1), (2, 4)])
 def test_impossible_splits_are_refused(views: int, train: int) -> None:
-    with pytest.raises(ValueError, match=r"2 <= train < views must hold"):
+    with pytest.raises(SettingError, match=r"data\.reader\.train: 2 <= train < views must hold"):
         demo.read(views=views, train=train)
 
 
@@ -210,87 +209,3 @@ def test_textures_are_means_at_coarser_levels_and_mirrored_when_repeated() -> No
     assert texture.sample(middle, np.array([2.0], np.float32)) == pytest.approx(31.5)
     corner = np.array([[1 / 16, 1 / 16], [2 - 1 / 16, 1 / 16], [-1 / 16, 2 + 1 / 16]], np.float32)
     assert np.allclose(texture.sample(corner, np.ones(3, np.float32)), 0)
-
-
-# --- the prior -------------------------------------------------------------------------------------------------------
-
-
-def prior(**settings: float) -> DemoPrior:
-    return DemoPrior({f.name: f.load for f in capture().frames}, patch=32, **settings)  # type: ignore[arg-type]
-
-
-def lr_of(i: int) -> tuple[str, Tensor, Tensor]:
-    frame = capture().frames[i]
-    return frame.name, images.downsample(frame.load(), FACTOR), frame.load()
-
-
-@given(share=st.floats(0, 1))
-@settings(max_examples=12, deadline=None)
-def test_exactly_that_share_of_the_patches_is_wrong(share: float) -> None:
-    name, lr, truth = lr_of(2)
-    difference = images.patch_means((prior(share=share)(name, lr, FACTOR) - truth).abs(), 32)
-    assert int((difference > 0).sum()) == round(share * 12)  # 128x96: 4 x 3 patches
-
-
-def test_without_strength_or_share_it_is_the_truth() -> None:
-    name, lr, truth = lr_of(2)
-    assert torch.equal(prior(strength=0.0)(name, lr, FACTOR), truth)
-    assert torch.equal(prior(share=0.0)(name, lr, FACTOR), truth)
-
-
-def test_errors_repeat_with_the_seed_and_differ_between_views_and_seeds() -> None:
-    name, lr, truth = lr_of(2)
-    first = prior(seed=1)(name, lr, FACTOR)
-    assert torch.equal(first, prior(seed=1)(name, lr, FACTOR))
-    assert not torch.equal(first, prior(seed=2)(name, lr, FACTOR))
-    other, other_lr, other_truth = lr_of(3)
-    wrong = images.patch_means((first - truth).abs(), 32) > 0
-    other_wrong = images.patch_means((prior(seed=1)(other, other_lr, FACTOR) - other_truth).abs(), 32) > 0
-    assert not torch.equal(wrong, other_wrong)
-
-
-def test_some_errors_agree_with_lr_and_some_do_not_so_that_reliability_spreads() -> None:
-    reliability = []
-    for i in range(12):
-        name, lr, _ = lr_of(i)
-        residual = (images.downsample(prior()(name, lr, FACTOR), FACTOR) - lr).abs()
-        reliability.append(torch.exp(-images.patch_means(residual, 8) / 0.05).flatten())
-    found = torch.cat(reliability)
-    assert found.median() > 0.95
-    assert found.quantile(0.02) < 0.4
-    assert ((found > 0.4) & (found < 0.9)).float().mean() > 0.1
-
-
-def test_it_is_better_than_bicubic_and_worse_than_the_truth() -> None:
-    errors = []
-    for i in range(12):
-        name, lr, truth = lr_of(i)
-        sr, smooth = prior()(name, lr, FACTOR), images.upsample(lr, FACTOR)
-        errors.append([float((sr - truth).square().mean()), float((smooth - truth).square().mean())])
-    ours, bicubic = np.mean(errors, axis=0)
-    assert 0 < 10 * math.log10(bicubic / ours) < 6
-
-
-def test_its_label_says_that_it_is_synthetic() -> None:
-    assert prior().label == "demo (synthetic: truth with seeded errors in 30% of the patches)"
-
-
-def test_it_leaves_the_truth_as_it_was_and_crops_it_as_hr_is_cropped() -> None:
-    whole = torch.rand(34, 35, 3)
-    before = whole.clone()
-    made = DemoPrior({"a": lambda: whole}, share=1.0, patch=8)("a", images.downsample(whole[:32, :32], 4), 4)
-    assert made.shape == (32, 32, 3)
-    assert torch.equal(whole, before)
-
-
-def test_a_truth_of_another_size_is_refused_in_one_line() -> None:
-    with pytest.raises(DataError, match=r"a: truth: is 64x64 where HR is 32x32: use the photos at their own size"):
-        DemoPrior({"a": lambda: torch.rand(64, 64, 3)})("a", torch.rand(8, 8, 3), 4)
-
-
-@pytest.mark.parametrize(
-    "bad", [{"share": 1.5}, {"share": -0.1}, {"strength": -1.0}, {"strength": math.nan}, {"patch": 0}]
-)
-def test_settings_out_of_range_are_refused(bad: dict[str, float]) -> None:
-    with pytest.raises(ValueError, match="must"):
-        DemoPrior({}, **bad)  # type: ignore[arg-type]

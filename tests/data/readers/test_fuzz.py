@@ -27,7 +27,7 @@ FUZZED = [
 
 @pytest.fixture
 def bounded_memory() -> Iterator[None]:
-    """A reader that believes a damaged count fails here instead of filling the machine."""
+    """Limit the memory, so that a reader that allocates by a damaged count fails here."""
     before = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + 2**30, before[1]))
@@ -57,7 +57,7 @@ def test_random_damage_gives_a_sound_capture_or_a_data_error(
             assert (rotation @ rotation.T - rotation.new_ones(3).diag()).abs().max() < 1e-6
         if capture.points is not None:
             assert capture.points.means.isfinite().all()
-            assert set(capture.points.seen_by.tolist()) <= {frame.sfm_id for frame in capture.frames}
+            assert set(capture.points.track_image.tolist()) <= {frame.sfm_id for frame in capture.frames}
     assert refused > 50
 
 

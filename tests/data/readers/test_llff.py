@@ -11,7 +11,7 @@ import torch
 
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import llff
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, SettingError
 from tests.helpers import captures as tiny
 
 
@@ -50,7 +50,9 @@ def test_colmap_is_preferred_and_renamed_photos_are_matched_by_order(tmp_path: P
 
 
 def test_an_unknown_source_of_poses_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="use auto, colmap or poses_bounds"):
+    with pytest.raises(
+        SettingError, match=r"data\.reader\.poses: must be one of auto, colmap, poses_bounds, got 'best'"
+    ):
         llff.read(tiny.llff(tmp_path), poses="best")
 
 

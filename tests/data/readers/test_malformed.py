@@ -1,4 +1,4 @@
-"""Every malformed scene of the table is refused in one line that names the file."""
+"""Every malformed scene is refused in one line that names the file."""
 
 from __future__ import annotations
 
@@ -22,9 +22,22 @@ READERS: dict[str, Callable[[Path], Capture]] = {
 
 
 @pytest.mark.parametrize("kind", GOOD)
-def test_the_scenes_before_they_are_spoilt_are_good(kind: str, tmp_path: Path) -> None:
+def test_the_scenes_without_defect_are_valid(kind: str, tmp_path: Path) -> None:
     capture = READERS[kind.removesuffix("_txt")](GOOD[kind](tmp_path))
     assert [frame.load().shape for frame in capture.frames] == [(12, 16, 3)] * 3
+
+
+@pytest.mark.parametrize("kind", GOOD)
+def test_reading_poses_decodes_no_photo(kind: str, tmp_path: Path) -> None:
+    """Truncated photos still have their headers: they are read, and refused when they are loaded."""
+    root = GOOD[kind](tmp_path)
+    for path in root.rglob("*.png"):
+        path.write_bytes(path.read_bytes()[:-60])
+    frames = READERS[kind.removesuffix("_txt")](root).frames
+    assert len(frames) == 3
+    for frame in frames:
+        with pytest.raises(DataError, match="pixels: cannot be decoded"):
+            frame.load()
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

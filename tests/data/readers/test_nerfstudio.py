@@ -56,13 +56,13 @@ def test_sizes_that_differ_from_the_photos_rescale_the_cameras(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "SIMPLE_RADIAL"])
-def test_distortion_is_removed_and_told(model: str, tmp_path: Path) -> None:
+def test_distortion_is_removed_and_noted(model: str, tmp_path: Path) -> None:
     capture = nerfstudio.read(changed(tmp_path, lambda value: value.update(camera_model=model, k1=0.05)))
     assert capture.notes["lens"].startswith("3 of 3 photos undistorted")
     assert capture.frames[0].load().shape == (12, 16, 3)
 
 
-def test_the_files_lists_split_the_frames_and_the_rest_is_told(
+def test_the_files_lists_split_the_frames_and_the_rest_is_logged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     lists = {"train_filenames": ["images/b.png"], "val_filenames": ["images/a.png"], "test_filenames": []}
@@ -71,7 +71,7 @@ def test_the_files_lists_split_the_frames_and_the_rest_is_told(
     assert "1 frames are in none" in caplog.text
 
 
-def test_masks_are_ignored_aloud(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_masks_are_ignored_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     capture = nerfstudio.read(changed(tmp_path, lambda v: v["frames"][0].update(mask_path="m.png")))
     assert "masks" in caplog.text
     assert capture.notes["masks"].startswith("not used (1")
@@ -87,7 +87,7 @@ def test_points_of_a_ply_have_no_tracks(tmp_path: Path) -> None:
     assert points is not None
     assert points.means.tolist() == [[1, 2, 3]]
     assert points.colors[0].tolist() == pytest.approx([1, 0, 0.2])
-    assert len(points.point) == len(points.seen_by) == 0
+    assert len(points.track_point) == len(points.track_image) == 0
     assert points.source == "points.ply, 1 points without tracks"
 
 

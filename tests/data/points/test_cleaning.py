@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 
 import numpy as np
 import pytest
@@ -11,13 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clear_strategies.data.points import neighbours
-from clear_strategies.data.points.neighbours import remove_outliers, voxel_grid
+from clear_strategies.data.points.cleaning import remove_outliers, voxel_grid
 
 
 @pytest.fixture
 def scipy_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(neighbours, "_open3d", lambda _: None)
+    without_open3d(monkeypatch)
+
+
+def without_open3d(patch: pytest.MonkeyPatch) -> None:
+    patch.setitem(sys.modules, "open3d", None)  # makes its import fail
 
 
 def require_open3d() -> None:
@@ -35,7 +39,7 @@ def both_ways(monkeypatch: pytest.MonkeyPatch, function: object, *arguments: obj
     require_open3d()
     one = function(*arguments)  # type: ignore[operator]
     with monkeypatch.context() as patch:
-        patch.setattr(neighbours, "_open3d", lambda _: None)
+        without_open3d(patch)
         return one, function(*arguments)  # type: ignore[operator]
 
 
@@ -96,7 +100,7 @@ def test_a_voxel_grid_keeps_the_cloud_in_place(n: int, edge: float, seed: int) -
     """No more points than before, in the box they came from, at most one per cube."""
     means = torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(neighbours, "_open3d", lambda _: None)
+        without_open3d(patch)
         averages, _ = voxel_grid(means, means.clone(), edge)
     assert 1 <= len(averages) <= n
     assert bool((averages >= means.amin(0) - 1e-12).all() and (averages <= means.amax(0) + 1e-12).all())
@@ -112,9 +116,9 @@ def test_tiny_clouds_are_left_alone() -> None:
 
 def test_the_log_says_which_library_ran(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    monkeypatch.setitem(__import__("sys").modules, "open3d", None)  # makes its import fail
+    without_open3d(monkeypatch)
     remove_outliers(room(100), 16, 3.0)
-    assert "SciPy does outlier removal: open3d (extra [open3d]) cannot be imported" in caplog.text
+    assert "outlier removal by SciPy: open3d (extra [open3d]) cannot be imported" in caplog.text
 
 
 def test_bad_arguments_name_the_rule_and_the_value() -> None:

@@ -1,6 +1,6 @@
-"""Cleaning a cloud by looking at neighbours: outliers go, crowds are averaged. Open3D where it is installed, else SciPy.
+"""Cleaning a cloud: outliers are removed, voxels averaged. By Open3D where it is installed, else by SciPy and numpy.
 
-Both paths follow Open3D's definitions to the letter, so a cloud does not depend on which of them ran.
+Both paths follow Open3D's definitions exactly, so a cloud does not depend on which of them ran.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ _LARGEST_CELL: Final = np.iinfo(np.int32).max  # Open3D counts voxels along an a
 
 
 def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) -> Int[Tensor, " K"]:
-    """Indices, ascending, of the points that lie as close to their neighbours as the others do.
+    """Indices, ascending, of the points that are no outliers.
 
-    A point's measure is the mean distance to its `neighbours` nearest points, itself included; it stays if that is below
-    the average by at most `ratio` standard deviations. A point whose nearest ones all coincide with it (measure 0) goes.
+    A point's measure is the mean distance to its `neighbours` nearest points, itself included. The point is kept if its
+    measure is below the average plus `ratio` standard deviations. A point whose measure is 0, because its neighbours
+    coincide with it, is removed.
 
     Args:
-        neighbours: at least 2, since the first is the point itself.
+        neighbours: at least 2, because the first is the point itself.
 
     Raises:
         ValueError: neighbours below 2, or a ratio that is not positive.
@@ -46,7 +47,7 @@ def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) 
     distances, _ = cKDTree(points).query(points, k=min(neighbours, len(points)))
     measure = np.mean(distances, axis=1)
     apart = measure > 0
-    # Coinciding points count in n, though not in the sums: Open3D's average, not that of the points apart.
+    # As in Open3D, coinciding points count in n, although not in the deviation's sum.
     n = len(points)
     average = measure.sum() / n
     deviation = np.sqrt(np.square(measure[apart] - average).sum() / (n - 1))
@@ -59,10 +60,10 @@ def voxel_grid(
     """One point per occupied cube: the averages of its positions and colours, ordered by cube.
 
     Args:
-        edge: of a cube, world units. The grid begins half a cube below the smallest coordinates.
+        edge: of a cube, world units. The grid starts half a cube below the smallest coordinates.
 
     Raises:
-        ValueError: edge is not positive, or so small that cubes cannot be counted.
+        ValueError: edge is not positive, or so small that the number of cubes overflows.
     """
     if not edge > 0:
         raise ValueError(f"edge must be > 0 world units, got {edge}.")
@@ -73,13 +74,13 @@ def voxel_grid(
     if float(np.ptp(points, axis=0).max()) >= edge * _LARGEST_CELL:
         raise ValueError(f"edge must be at least the cloud's extent / {_LARGEST_CELL}, got {edge}. Enlarge the voxel.")
     shades = colors.detach().double().cpu().numpy()
-    open3d = _open3d("the voxel grid")
+    open3d = _open3d("voxel grid")
     if open3d is not None:
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
         cloud.colors = open3d.utility.Vector3dVector(shades)
         merged = cloud.voxel_down_sample(edge)
         both = np.concatenate((np.asarray(merged.points), np.asarray(merged.colors)), axis=1)
-        # Open3D's order is that of a hash map; ours is that of the cubes.
+        # Open3D returns the order of a hash map; here it is that of the cubes.
         both = both[np.lexsort(np.floor((both[:, 2::-1] - origin[::-1]) / edge).T)]
     else:
         cubes = np.floor((points - origin) / edge).astype(np.int64)
@@ -95,9 +96,7 @@ def _open3d(task: str) -> Any:
     try:
         import open3d
     except (ImportError, OSError) as reason:
-        _log.info(
-            "SciPy does %s: open3d (extra [open3d]) cannot be imported (%s).", task, " ".join(str(reason).split())
-        )
+        _log.info("%s by SciPy: open3d (extra [open3d]) cannot be imported (%s).", task, " ".join(str(reason).split()))
         return None
-    _log.info("open3d %s does %s.", open3d.__version__, task)
+    _log.info("%s by open3d %s.", task, open3d.__version__)
     return open3d

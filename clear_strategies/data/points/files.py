@@ -1,0 +1,50 @@
+"""Points that exist already: a PLY file, or the structure-from-motion (SfM) points of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from clear_strategies.data.capture import SfmPoints
+from clear_strategies.data.ply import read_points
+from clear_strategies.data.scene import PointCloud
+from clear_strategies.errors import DataError
+
+
+def from_ply(path: Path) -> PointCloud:
+    """The points of a PLY file.
+
+    Raises:
+        DataError: it cannot be read, or has no points.
+    """
+    cloud = read_points(path)
+    if len(cloud) == 0:
+        raise DataError(path, "element vertex", "has no points", "give another file, or use another init")
+    return cloud
+
+
+def from_sfm(sfm: SfmPoints) -> PointCloud:
+    """All of the scene's SfM points. They were triangulated from all views, test views included."""
+    return PointCloud(sfm.means.float(), sfm.colors.float(), sfm.source, uses_test_views="yes")
+
+
+def from_tracks(sfm: SfmPoints, train_ids: Sequence[int], min_views: int) -> PointCloud:
+    """The scene's SfM points that at least `min_views` of the frames `train_ids` observe.
+
+    Their positions still come from all views, test views included: no filter changes that, and the cloud says so.
+
+    Raises:
+        DataError: there is no such point, or the points have no tracks.
+    """
+    if len(sfm.track_point) == 0:
+        raise DataError("scene", "points", "come without tracks", "use init=triangulated, or init=sfm for all of them")
+    observed = torch.isin(sfm.track_image, torch.tensor(list(train_ids), dtype=sfm.track_image.dtype))
+    pairs = torch.unique(torch.stack((sfm.track_point[observed], sfm.track_image[observed]), dim=1), dim=0)
+    kept = torch.nonzero(torch.bincount(pairs[:, 0], minlength=len(sfm.means)) >= min_views)[:, 0]
+    if len(kept) == 0:
+        problem = f"none is observed by {min_views} of the {len(train_ids)} training views"
+        raise DataError("scene", "points", problem, "lower min_views, or use init=triangulated")
+    source = f"{len(kept):,} points observed by >= {min_views} training views, of {sfm.source}"
+    return PointCloud(sfm.means.float(), sfm.colors.float(), source, uses_test_views="yes")[kept]

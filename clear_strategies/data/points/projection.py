@@ -1,0 +1,39 @@
+"""From points to pixels and back, and an image's colours between pixel centres. Pixel (0, 0) spans [0, 1)²."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rasterizers.interface import Camera
+
+
+def projection_matrix(camera: Camera) -> Float[Tensor, "3 4"]:
+    """K [R | t], float64 on the CPU."""
+    K = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]], dtype=torch.float64)
+    return K @ camera.world_to_camera.double().cpu()[:3]
+
+
+def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
+    """(pixels, depths in world units), float64; pixels are meaningful where depth > 0."""
+    matrix = projection_matrix(camera)
+    homogeneous = points.double() @ matrix[:, :3].T + matrix[:, 3]
+    return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
+
+
+def back_project(camera: Camera, pixels: Float[Tensor, "G 2"], depth: Float[Tensor, " G"]) -> Float[Tensor, "G 3"]:
+    """The points at these depths (z, world units) behind these pixels."""
+    pose = camera.world_to_camera.double().cpu()
+    x = (pixels[:, 0] - camera.cx) / camera.fx * depth
+    y = (pixels[:, 1] - camera.cy) / camera.fy * depth
+    return ((torch.stack((x, y, depth), dim=1) - pose[:3, 3]) @ pose[:3, :3]).float()
+
+
+def sample_colors(image: Float[Tensor, "H W 3"], pixels: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
+    """Bilinear samples; outside the centres of the border pixels, the border's colour."""
+    height, width = image.shape[:2]
+    grid = (2 * pixels / torch.tensor([width, height]) - 1).to(image)[None, None]
+    batch = image.permute(2, 0, 1)[None]
+    samples = torch.nn.functional.grid_sample(batch, grid, padding_mode="border", align_corners=False)
+    return samples[0, :, 0].T.cpu()

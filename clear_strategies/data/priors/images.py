@@ -1,0 +1,63 @@
+"""SR images made by another program, e.g. ResShift, read from a folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core import images
+from clear_strategies.data.photo_files import SUFFIXES, image_size, list_images, read_image
+from clear_strategies.data.priors.interface import require_path, warn_if_far_from_lr
+from clear_strategies.errors import DataError
+
+
+@dataclass(frozen=True, slots=True)
+class Images:
+    """A folder with one file per view: `<the view's name without its ending>[suffix].<png, jpg …>`.
+
+    Args:
+        path: the folder.
+        suffix: what the SR program appended to the file names, e.g. "_x4".
+
+    Raises:
+        SettingError: no path is given.
+    """
+
+    path: str = ""
+    suffix: str = ""
+
+    def __post_init__(self) -> None:
+        require_path(self.path, "the folder of the SR images")
+
+    @property
+    def label(self) -> str:
+        return f"images {self.path}"
+
+    def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
+        file = self._file(name)
+        expected = (lr.shape[1] * factor, lr.shape[0] * factor)
+        found = image_size(file)
+        if found != expected:
+            raise DataError(
+                file, "size", f"is {found[0]}x{found[1]}, but {factor} times the LR image is {expected[0]}x{expected[1]}",
+                "super-resolve the very LR images that this run trains on (data.save_lr writes them)",
+            )  # fmt: skip
+        result = images.quantize(read_image(file))
+        warn_if_far_from_lr(file.name, result, lr, factor)
+        return result
+
+    def _file(self, name: str) -> Path:
+        folder, stem = Path(self.path), Path(name).stem + self.suffix
+        found = [file for file in list_images(folder) if file.stem == stem]
+        if not found:
+            raise DataError(
+                folder, Path(name).stem, f"has no SR image {stem} ({', '.join(SUFFIXES)})",
+                "name the SR images like the views, or set prior.suffix",
+            )  # fmt: skip
+        if len(found) > 1:
+            twins = " and ".join(file.name for file in found)
+            raise DataError(folder, Path(name).stem, f"has {twins} for one view", "keep one of them")
+        return found[0]

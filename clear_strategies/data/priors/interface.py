@@ -1,0 +1,82 @@
+"""What a prior is: the source of the super-resolved image (SR image) of each view, and the checks that priors share."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from pathlib import Path
+from typing import Final, Protocol, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core import images
+from clear_strategies.errors import DataError, SettingError
+
+_log = logging.getLogger(__name__)
+
+_USUAL_DISTANCE: Final = 0.03  # mean |D(SR) - LR|; bicubic and the small networks stay near 0.01 on real photos
+
+
+@runtime_checkable
+class Prior(Protocol):
+    """A frozen image super-resolution model."""
+
+    @property
+    def label(self) -> str:
+        """One phrase for the plan and the tables."""
+        ...
+
+    def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
+        """The SR image of the view called `name`: `factor` times as large as `lr`, in [0, 1], on 8-bit steps."""
+        ...
+
+
+@runtime_checkable
+class Network(Prior, Protocol):
+    """A prior whose result depends only on the LR image, the bytes of `files` and its own fields. It can be cached."""
+
+    @property
+    def files(self) -> tuple[Path, ...]: ...
+
+
+def require_path(path: object, what: str) -> None:
+    """A path has been given.
+
+    Raises:
+        SettingError: it has not.
+    """
+    if not isinstance(path, str) or not path:
+        raise SettingError(f"prior.path: must be {what}, got {path!r}: add prior.path=…")
+
+
+def require_file(path: Path, what: str) -> None:
+    """The file exists and can be read.
+
+    Raises:
+        DataError: it does not, or cannot.
+    """
+    if not path.is_file():
+        raise DataError(path, "file", "is not there", f"set prior.path to {what}")
+    if not os.access(path, os.R_OK):
+        raise DataError(path, "file", "cannot be read", "check its permissions")
+
+
+def warn_if_far_from_lr(what: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int) -> None:
+    """Warn where the SR image, reduced again, differs from its LR image.
+
+    That happens with the image of another view, and with a network that expects BGR or values in [0, 255].
+    """
+    distance = float((images.downsample(sr, factor, "area") - lr).abs().mean())
+    if distance > _USUAL_DISTANCE:
+        _log.warning(
+            "%s: the SR image, reduced again, differs from its LR image by %.3f on average (usual: below %.2f); check "
+            "that it shows this view, and is RGB in [0, 1].", what, distance, _USUAL_DISTANCE,
+        )  # fmt: skip
+
+
+def log_result(name: str, label: str, sr: Float[Tensor, "H W 3"], began: float) -> None:
+    """Log the size of an SR image and the seconds since `began` (time.perf_counter)."""
+    seconds = time.perf_counter() - began
+    _log.info("%s: %s made %dx%d in %.1f s.", name, label, sr.shape[1], sr.shape[0], seconds)

@@ -1,0 +1,97 @@
+"""Super-resolution in tiles, joined without seams, for images that a network cannot take at once."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+import time
+from collections.abc import Callable
+from typing import Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.data.checks import require_whole
+from clear_strategies.errors import SettingError
+
+_log = logging.getLogger(__name__)
+
+_SECONDS_BETWEEN_REPORTS: Final = 10.0
+
+
+def tiled(
+    upscale: Callable[[Float[Tensor, "h w 3"]], Float[Tensor, "H W 3"]],
+    lr: Float[Tensor, "h w 3"],
+    factor: int,
+    tile: int,
+    overlap: int,
+) -> Float[Tensor, "H W 3"]:
+    """Apply `upscale` to tiles of at most `tile` × `tile` LR pixels, and join the results.
+
+    The tiles' shares partition the image. A tile contributes `overlap` LR pixels beyond its share on each side, blended
+    with its neighbour, and its input reaches `overlap` further. The result equals that of the whole image if `overlap`
+    is at least the network's receptive radius. It has no edges even if that is unbounded (global pooling).
+
+    Raises:
+        SettingError: the tiles would be all overlap.
+    """
+    require_tiles(tile, overlap)
+    height, width = lr.shape[:2]
+    if max(height, width) <= tile:
+        return upscale(lr)
+    rows, columns = (_shares(size, tile, overlap) for size in (height, width))
+    out = lr.new_zeros(height * factor, width * factor, 3)
+    weight = lr.new_zeros(height * factor, width * factor, 1)
+    total, began = len(rows) * len(columns), time.perf_counter()
+    for done, (row, column) in enumerate((r, c) for r in rows for c in columns):
+        part = tuple(
+            slice(max(a - 2 * overlap, 0), min(b + 2 * overlap, size))
+            for (a, b), size in ((row, height), (column, width))
+        )
+        fade_y, fade_x = (
+            _fade(share, along, size, factor, overlap).to(lr)
+            for share, along, size in ((row, part[0], height), (column, part[1], width))
+        )
+        fade = (fade_y[:, None] * fade_x)[..., None]
+        enlarged = tuple(slice(along.start * factor, along.stop * factor) for along in part)
+        out[enlarged] += fade * upscale(lr[part])
+        weight[enlarged] += fade
+        if time.perf_counter() - began > _SECONDS_BETWEEN_REPORTS:
+            _log.info("super-resolution: %d of %d tiles.", done + 1, total)
+            began = time.perf_counter()
+    return out / weight
+
+
+def require_tiles(tile: int, overlap: int) -> None:
+    """Whole numbers with 0 <= 4 overlap < tile.
+
+    Raises:
+        SettingError: they are not.
+    """
+    if not 0 <= 4 * overlap < tile:
+        raise SettingError(
+            f"prior.tile: 0 <= 4 overlap < tile must hold, got overlap={overlap}, tile={tile}: enlarge prior.tile"
+        )
+    require_whole("prior.tile", tile, least=1)
+    require_whole("prior.overlap", overlap, least=0)
+
+
+def _shares(size: int, tile: int, overlap: int) -> list[tuple[int, int]]:
+    """[0, size) in nearly equal intervals, short enough for `2 overlap` more pixels on both sides of each."""
+    count = math.ceil(size / (tile - 4 * overlap)) if size > tile else 1
+    ends = [size * i // count for i in range(count + 1)]
+    return list(itertools.pairwise(ends))
+
+
+def _fade(share: tuple[int, int], part: slice, size: int, factor: int, overlap: int) -> Float[Tensor, " n"]:
+    """A tile's weight per HR pixel along one axis: 1 inside its share, a ramp of 2 `overlap` at inner borders, then 0."""
+    at = torch.arange(part.start * factor, part.stop * factor) + 0.5
+    ramp = max(2 * overlap * factor, 1)  # without overlap: a sharp cut between two pixels
+    weight = torch.ones_like(at)
+    if share[0] > 0:
+        weight = weight * ((at - share[0] * factor) / ramp + 0.5).clamp(0, 1)
+    if share[1] < size:
+        weight = weight * ((share[1] * factor - at) / ramp + 0.5).clamp(0, 1)
+    return weight

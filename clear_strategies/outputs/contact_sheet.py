@@ -1,0 +1,80 @@
+"""contact_sheet.png: a few test views of one run beside the LR photo, the prior, the truth and the error.
+
+Images are laid out in whole pixels: a render is shown pixel for pixel, a small one at a whole multiple, because a resized
+image does not show the detail that this library is about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.outputs.figures import FAINT, GAP, LINE, PixelPage, error_map, magnification, save_png
+
+if TYPE_CHECKING:
+    from matplotlib.image import AxesImage
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SheetRow:
+    """One view.
+
+    Args:
+        images: column -> image at HR size; "ours" is among them.
+        caption: written below ours.
+    """
+
+    name: str
+    images: Mapping[str, Float[Tensor, "H W 3"]]
+    truth: Float[Tensor, "H W 3"] | None
+    caption: str
+
+
+def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str) -> None:
+    """Draw one row per view: its images and, where the truth is known, the truth and the error of ours. Without rows no
+    file is written.
+    """
+    if not rows:
+        return
+    columns = list(rows[0].images)
+    if any(row.truth is not None for row in rows):
+        columns += ["ground truth", "error of ours"]
+    height = max(image.shape[0] for row in rows for image in row.images.values())
+    width = max(image.shape[1] for row in rows for image in row.images.values())
+    times = magnification(width)
+    cell_w, cell_h = round(width * times), round(height * times)
+    left, top = 2 * LINE, 5 * LINE
+    right = left + len(columns) * (cell_w + GAP)
+    with_bar = "error of ours" in columns
+    page = PixelPage(right + 5 * LINE * with_bar, top + len(rows) * (cell_h + 2 * LINE + GAP), title)
+    for i, column in enumerate(columns):
+        page.text(left + i * (cell_w + GAP) + cell_w / 2, top - LINE / 2, column, size=10, ha="center")
+
+    error: AxesImage | None = None
+    for j, row in enumerate(rows):
+        y = top + j * (cell_h + 2 * LINE + GAP)
+        page.text(LINE, y + cell_h / 2, row.name, rotation=90, ha="center", va="center", color=FAINT)
+        shown = {name: _pixels(image) for name, image in row.images.items()}
+        if row.truth is not None:
+            shown["ground truth"] = _pixels(row.truth)
+            shown["error of ours"] = error_map(shown["ours"], shown["ground truth"])
+        for i, column in enumerate(columns):
+            x = left + i * (cell_w + GAP)
+            if column in shown:
+                _, drawn = page.image(x, y, shown[column], times)
+                error = drawn if column == "error of ours" else error
+            if column == "ours":
+                page.text(x + cell_w / 2, y + cell_h + LINE, row.caption, ha="center")
+    if error is not None:
+        page.colour_bar(right, top, cell_h, error, "mean |difference| over RGB")
+    save_png(page.figure, path)
+
+
+def _pixels(image: Float[Tensor, "H W 3"]) -> Float[np.ndarray, "H W 3"]:
+    return np.asarray(image.detach().clamp(0, 1).cpu().numpy())

@@ -1,0 +1,146 @@
+"""What all figures share: colours, matplotlib figures that need no display, and pages laid out in whole pixels."""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from clear_strategies.files import write_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+History = Sequence[Mapping[str, float]]
+"""One row per iteration, as in history.csv. A cell may be missing or NaN."""
+
+ERROR_MAX: Final = 0.25  # the colours of an error map end here
+GAP: Final = 8  # px
+LINE: Final = 16  # height of a line of small print, px
+_DPI: Final = 100
+_NARROW, _WIDE = 240, 640  # the least and the greatest width at which an image is shown, px
+
+INK, FAINT, RULE = "#222222", "#888888", "#cccccc"
+# Paul Tol's bright scheme, which colour-blind readers can tell apart too.
+BLUE, RED, GREEN, YELLOW, CYAN, PURPLE, GREY = (
+    "#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#aaaaaa",
+)  # fmt: skip
+
+
+Item = TypeVar("Item")
+
+
+def spaced(items: Sequence[Item], count: int) -> Sequence[Item]:
+    """Every n-th item, at most `count` in all: the views that a figure shows of many."""
+    return items[:: math.ceil(len(items) / count) or 1] if count else ()
+
+
+# ── charts ───────────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def new_figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure, Any]:
+    """A figure of `width` x `height` inches and its axes [rows, columns], without pyplot's global state."""
+    from matplotlib.figure import Figure as NewFigure
+
+    figure = NewFigure(figsize=(width, height), dpi=_DPI, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def curve(
+    history: History, column: str, *, over: str = "t", smooth: bool = False
+) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
+    """The rows where `column` is finite, as x and y; `smooth` is a running mean over a 50th of them."""
+    points = [(row[over], row[column]) for row in history if over in row and math.isfinite(row.get(column, math.nan))]
+    x, y = np.array(points, dtype=float).reshape(-1, 2).T
+    if smooth and len(y):
+        window = max(1, len(y) // 50)
+        x, y = x[window - 1 :], np.convolve(y, np.ones(window) / window, mode="valid")
+    return x, y
+
+
+def finish(axis: Axes, *, legend: Literal["best", "upper right"] | None = "best") -> None:
+    """Style the axes so that the data stands out; axes without data say "not measured"."""
+    axis.title.set_fontsize(10)
+    axis.title.set_color(INK)
+    axis.tick_params(which="both", labelsize=8, colors=FAINT)
+    axis.spines[["top", "right"]].set_visible(False)
+    axis.spines[["left", "bottom"]].set_color(RULE)
+    if not axis.lines:
+        axis.text(0.5, 0.5, "not measured", fontsize=9, color=FAINT, ha="center", transform=axis.transAxes)
+        axis.set_xticks([])
+        axis.set_yticks([])
+        return
+    axis.grid(alpha=0.25, linewidth=0.5)
+    if legend is not None and axis.get_legend_handles_labels()[0]:
+        axis.legend(fontsize=8, loc=legend, framealpha=0.8, edgecolor="none")
+
+
+def set_title(figure: Figure, title: str) -> None:
+    figure.suptitle(title, fontsize=12, color=INK, x=0.01, ha="left")
+
+
+def save_png(figure: Figure, path: Path) -> None:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI)
+    write_bytes(path, buffer.getvalue())
+
+
+# ── images in whole pixels ───────────────────────────────────────────────────────────────────────────────────────────
+
+
+def error_map(image: Float[np.ndarray, "H W 3"], truth: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
+    """Mean absolute difference over RGB, in [0, 1]."""
+    return np.asarray(np.abs(image - truth).mean(axis=-1))
+
+
+def magnification(width: int) -> float:
+    """How many times larger an image of this width is shown: a whole number, so that pixels stay squares, or less than 1
+    for an image that is too wide.
+    """
+    return math.ceil(_NARROW / width) if width <= _WIDE else _WIDE / width
+
+
+class PixelPage:
+    """A figure whose coordinates are pixels from the top left."""
+
+    def __init__(self, width: int, height: int, title: str) -> None:
+        from matplotlib.figure import Figure as NewFigure
+
+        self.width, self.height = width, height
+        self.figure = NewFigure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
+        self.text(GAP, 1.5 * LINE, title, size=12)
+
+    def image(self, x: int, y: int, pixels: np.ndarray, times: float) -> tuple[Axes, AxesImage]:
+        """Draw RGB, or an error map in its colours, `times` larger, with the top left corner at (x, y)."""
+        height, width = (round(size * times) for size in pixels.shape[:2])
+        axis = self._axes(x, y, width, height)
+        axis.set_axis_off()
+        drawn = axis.imshow(
+            pixels, aspect="auto", cmap="magma", vmin=0, vmax=ERROR_MAX,
+            interpolation="nearest" if times >= 1 else "antialiased", interpolation_stage="rgba",
+        )  # fmt: skip
+        return axis, drawn
+
+    def colour_bar(self, x: int, y: int, height: int, error: AxesImage, label: str) -> None:
+        """The colours of an error map, 12 px wide, with its numbers to the right."""
+        bar = self.figure.colorbar(error, cax=self._axes(x, y, 12, height), extend="max", extendfrac=0.03)
+        bar.set_label(label, fontsize=8, color=INK)
+        bar.ax.tick_params(labelsize=8, colors=INK)
+        bar.outline.set_visible(False)
+
+    def text(self, x: float, y: float, words: str, *, size: float = 8.5, **style: Any) -> None:
+        """Write words at (x, y), centred vertically unless `va` says otherwise."""
+        place = {"ha": "left", "va": "center", "color": INK, **style}
+        self.figure.text(x / self.width, 1 - y / self.height, words, fontsize=size, **place)
+
+    def _axes(self, x: int, y: int, width: int, height: int) -> Axes:
+        return self.figure.add_axes(
+            (x / self.width, 1 - (y + height) / self.height, width / self.width, height / self.height)
+        )

@@ -1,0 +1,97 @@
+"""How close an image is to the truth, in four numbers that need no trained network.
+
+- **PSNR**, dB, and **SSIM**, as scikit-image defines them with data range 1; SSIM with the window of the paper (Wang et
+  al. 2004: Gaussian, σ = 1.5, population covariance). Other definitions differ by as much as a row of an ablation.
+- **GMSD**, gradient magnitude similarity deviation (Xue et al. 2014), 0 is perfect: how unevenly edges are preserved. It
+  responds to wrong structure (ghosts, warped edges, floaters) that a mean over pixels hides.
+- **Blur**, scikit-image's `blur_effect` (Crete et al. 2007) minus that of the truth, 0 is perfect: a positive number says
+  that the image is blurrier than the truth, a negative one that it has more fine contrast, such as invented texture.
+
+On photographs of six real scenes each of the four ranks the truth first, then a ×4 network, bicubic ×4 and bicubic ×8.
+Only PSNR, SSIM and GMSD respond to a shift by two pixels: blur ignores where contrast is. Noise on a blurred image brings
+blur back to 0 while GMSD rises, so read the two together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+PSNR_CAP: Final = 100.0  # dB, the PSNR of identical images
+_SMALLEST: Final = 12  # px; GMSD halves the image and SSIM needs room for its window
+_GMSD_C: Final = 170 / 255**2
+
+
+@dataclass(frozen=True, slots=True)
+class ImageScores:
+    """PSNR in dB, at most `PSNR_CAP`, and SSIM: more is better. GMSD: less is better. Blur: closer to 0 is better."""
+
+    psnr: float
+    ssim: float
+    gmsd: float
+    blur: float
+
+
+def score(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> ImageScores:
+    """Compare an image, clamped to [0, 1], with the truth. All scores of an image that is not finite are NaN.
+
+    Raises:
+        ValueError: the sizes differ or are too small.
+    """
+    from skimage.metrics import structural_similarity
+
+    if image.shape != truth.shape:
+        raise ValueError(f"images must have the same size, got {tuple(image.shape)} and {tuple(truth.shape)}.")
+    if min(image.shape[:2]) < _SMALLEST:
+        raise ValueError(f"images must be at least {_SMALLEST} pixels on each side, got {tuple(image.shape)}.")
+    if not bool(image.isfinite().all()):
+        return ImageScores(math.nan, math.nan, math.nan, math.nan)
+    x, y = (photo.detach().clamp(0, 1).double().cpu().numpy() for photo in (image, truth))
+    mse = float(np.mean((x - y) ** 2))
+    ssim = structural_similarity(
+        x, y, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2
+    )
+    grey_x, grey_y = _luminance(x), _luminance(y)
+    psnr = min(PSNR_CAP, 10 * math.log10(1 / mse)) if mse > 0 else PSNR_CAP
+    return ImageScores(psnr, float(ssim), _gmsd(grey_x, grey_y), _blur(grey_x) - _blur(grey_y))
+
+
+def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
+    """The mean of each number; None for an empty sequence."""
+    if not scores:
+        return None
+    return ImageScores(*(sum(getattr(s, f.name) for s in scores) / len(scores) for f in fields(ImageScores)))
+
+
+def _luminance(rgb: np.ndarray) -> np.ndarray:
+    return np.asarray(rgb @ np.array([0.299, 0.587, 0.114]))
+
+
+def _gmsd(x: np.ndarray, y: np.ndarray) -> float:
+    """Standard deviation of the similarity of Prewitt gradient magnitudes, at half size."""
+    gx, gy = _gradient(_halved(x)), _gradient(_halved(y))
+    similarity = (2 * gx * gy + _GMSD_C) / (gx**2 + gy**2 + _GMSD_C)
+    return float(similarity.std())
+
+
+def _halved(image: np.ndarray) -> np.ndarray:
+    h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    return np.asarray(image[:h, :w].reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3)))
+
+
+def _gradient(image: np.ndarray) -> np.ndarray:
+    from skimage.filters import prewitt_h, prewitt_v
+
+    return np.asarray(np.hypot(prewitt_h(image), prewitt_v(image)))
+
+
+def _blur(image: np.ndarray) -> float:
+    from skimage.measure import blur_effect
+
+    return float(blur_effect(image))

@@ -1,0 +1,57 @@
+"""The progress bar of a run."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Final
+
+from clear_strategies.training.loop import Progress
+from clear_strategies.training.state import TrainState
+
+_READ_EVERY: Final = 0.25  # seconds; reading the history's numbers waits for the device
+
+
+@contextmanager
+def progress_bar(state: TrainState, after_step: Callable[[], None] | None = None) -> Iterator[Progress]:
+    """A bar with loss, PSNR, number of Gaussians, conflict ratio and remaining time.
+
+    Args:
+        after_step: called after each iteration.
+    """
+    from tqdm import tqdm
+    from tqdm.contrib.logging import logging_redirect_tqdm
+
+    shown: dict[str, str] = {}
+    redraw_every = 0.5 if sys.stderr.isatty() else 15  # seconds; a log file needs no animation
+    total, done = state.settings.iterations, state.t - 1
+    with (
+        logging_redirect_tqdm(),
+        tqdm(total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=redraw_every) as bar,
+    ):
+        last_read = -math.inf
+
+        def show(row: Mapping[str, float]) -> None:
+            λ_lr, λ_hr = state.conductor.objective.lambda_lr, row["lambda_hr"]
+            shown["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
+            shown["N"] = f"{int(row['n_gaussians']):,}"
+            if not math.isnan(row.get("conflict", math.nan)):
+                shown["conflict"] = f"{row['conflict']:.2f}"
+            if "psnr_test" in row:
+                shown["psnr"] = f"{row['psnr_test']:.2f} dB"
+            bar.set_postfix(shown, refresh=False)
+
+        def update(state: TrainState) -> None:
+            nonlocal last_read
+            at_once = state.ended or "psnr_test" in state.history[-1]
+            if at_once or time.monotonic() - last_read >= _READ_EVERY:
+                show(state.history_as_floats()[-1])
+                last_read = time.monotonic()
+            bar.update(1)
+            if after_step is not None:
+                after_step()
+
+        yield update

@@ -1,0 +1,131 @@
+"""Initial clouds: every choice of `init`, the order of the steps, and refused settings."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from clear_strategies.core import images
+from clear_strategies.core.view import Photo
+from clear_strategies.data.points import CloudSettings, initial_cloud
+from clear_strategies.data.points.projection import project
+from clear_strategies.data.prepare import ViewSettings, split
+from clear_strategies.data.readers import llff
+from clear_strategies.errors import DataError, SettingError
+from tests.helpers.captures import write_points
+from tests.helpers.planes import cloud_of, photo, plane_photos, sfm
+
+
+def flat_photos() -> list[Photo]:
+    return [replace(p, image=torch.full_like(p.image, 0.5)) for p in (photo(0.0), photo(0.5))]
+
+
+def test_auto_triangulates_where_it_can(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    cloud = initial_cloud(CloudSettings(densify=False), plane_photos(3), sfm=sfm(), train_ids=[1, 2, 3])
+    assert len(cloud) > 50
+    assert cloud.uses_test_views == "no"
+    assert "init: auto chose" in caplog.text
+    assert "does not use the scene's own points" in caplog.text
+
+
+def test_auto_falls_back_to_random_and_logs_it(caplog: pytest.LogCaptureFixture) -> None:
+    cloud = initial_cloud(CloudSettings(random_points=99), flat_photos(), sfm=sfm())
+    assert len(cloud) == 99
+    assert cloud.source.startswith("random")
+    assert cloud.uses_test_views == "no"
+    assert "auto chose random points: the training LR images give only 0 (data.cloud.enough: 50)" in caplog.text
+
+
+def test_triangulated_does_not_fall_back() -> None:
+    with pytest.raises(DataError, match="none could be triangulated from the 2 training LR images"):
+        initial_cloud(CloudSettings(init="triangulated"), flat_photos())
+
+
+def test_the_same_seed_gives_the_same_cloud() -> None:
+    one, two = (initial_cloud(CloudSettings(max_points=300), plane_photos(2), seed=3) for _ in range(2))
+    assert len(one) == 300
+    assert torch.equal(one.means, two.means)
+    assert torch.equal(one.colors, two.colors)
+
+
+def test_a_given_file_is_read(tmp_path: Path) -> None:
+    write_points(tmp_path / "fused.ply", cloud_of(torch.rand(5, 3)))
+    cloud = initial_cloud(CloudSettings(init="ply", path=str(tmp_path / "fused.ply"), densify=False), [photo()])
+    assert len(cloud) == 5
+    assert cloud.source == "5 points of fused.ply"
+    assert cloud.uses_test_views == "unknown"
+
+
+def test_an_empty_file_is_refused(tmp_path: Path) -> None:
+    write_points(tmp_path / "empty.ply", cloud_of(torch.zeros(0, 3)))
+    with pytest.raises(DataError, match="has no points"):
+        initial_cloud(CloudSettings(init="ply", path=str(tmp_path / "empty.ply")), [photo()])
+
+
+def test_auto_densifies_only_what_is_sparser_than_the_pixel_grid(tmp_path: Path) -> None:
+    view, file = photo(), tmp_path / "p.ply"
+    for count, grows in ((390, True), (410, False)):  # the grid has 20 · 20 = 400
+        write_points(file, cloud_of(torch.rand(count, 3) + torch.tensor([-0.5, -0.5, 5])))
+        chosen = CloudSettings(init="ply", path=str(file), outlier_neighbours=0)
+        assert (len(initial_cloud(chosen, [view])) > count) == grows
+        assert len(initial_cloud(replace(chosen, densify=True), [view])) > count
+        assert len(initial_cloud(replace(chosen, densify=False), [view])) == count
+
+
+def test_outliers_are_removed_before_densification_and_voxels_averaged_after(tmp_path: Path) -> None:
+    stray = torch.cat((torch.rand(50, 3) * 0.1 + torch.tensor([0, 0, 5.0]), torch.tensor([[0, 0, 500.0]])))
+    write_points(tmp_path / "p.ply", cloud_of(stray))
+    chosen = CloudSettings(init="ply", path=str(tmp_path / "p.ply"))
+    assert initial_cloud(chosen, [photo()]).means[:, 2].max() < 6
+    assert len(initial_cloud(replace(chosen, voxel=1000.0), [photo()])) == 1
+
+
+@pytest.mark.parametrize(
+    ("wrong", "value", "rule"),
+    [
+        ("init", "dense", "must be one of auto, triangulated, sfm_train, sfm, ply, random"),
+        ("densify", "maybe", "must be one of True, False, auto"),
+        ("stride", 0, "must be a whole number of at least 1"),
+        ("stride", 1.5, "must be a whole number of at least 1"),
+        ("max_points", -1, "must be a whole number of at least 1"),
+        ("outlier_neighbours", 1, "must be 0 or at least 2"),
+        ("outlier_ratio", math.nan, "must be a finite number and > 0"),
+        ("outlier_ratio", None, "must be a finite number and > 0"),
+        ("voxel", 0.0, "must be a finite number and > 0"),
+        ("box", math.inf, "must be a finite number and > 0"),
+    ],
+)
+def test_settings_out_of_range_are_refused_by_name(wrong: str, value: object, rule: str) -> None:
+    chosen = CloudSettings()
+    object.__setattr__(chosen, wrong, value)  # past the type checks, which only tests have
+    with pytest.raises(SettingError, match=rf"data\.cloud\.{wrong}: {rule}.*, got {value!r}: "):
+        chosen.__post_init__()
+
+
+def test_a_file_must_be_named() -> None:
+    with pytest.raises(SettingError, match=r"data\.cloud\.path: init=ply needs a PLY file, got None"):
+        CloudSettings(init="ply")
+
+
+def test_fern_is_triangulated_from_three_lr_images(shared_data: Path) -> None:
+    """Half the triangulated points lie within 2 % of their depth of one that COLMAP found in all views."""
+    capture = llff.read(shared_data / "fern")
+    train, _ = split(capture, ViewSettings())
+    photos = []
+    for frame in train:
+        image = images.downsample(images.crop_to_multiple(frame.load(), 8), 8)
+        full = replace(frame.camera, width=image.shape[1] * 8, height=image.shape[0] * 8)
+        photos.append(Photo(full.scaled(1 / 8), image))
+    cloud = initial_cloud(CloudSettings(densify=False), photos, sfm=capture.points)
+    assert len(cloud) > 200
+    assert cloud.uses_test_views == "no"
+    assert capture.points is not None
+    distance = torch.cdist(cloud.means, capture.points.means.float()).amin(dim=1)
+    depth = project(photos[1].camera, cloud.means)[1]
+    assert (distance / depth).median() < 0.02
+    assert (distance / depth).quantile(0.9) < 0.06

@@ -1,0 +1,49 @@
+"""SR images from a folder: found by name, refused if missing, ambiguous or of another size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from clear_strategies.core import images
+from clear_strategies.data.photo_files import read_image, write_png
+from clear_strategies.data.priors import Images
+from clear_strategies.errors import DataError
+from tests.helpers.networks import photo
+
+
+def test_images_are_found_by_the_views_stem_and_the_suffix(tmp_path: Path) -> None:
+    lr = photo(6, 8)
+    for name, seed in (("a.png", 1), ("a_x4.png", 2), ("b.png", 3)):
+        write_png(tmp_path / name, images.upsample(photo(6, 8, seed), 4))
+    assert torch.equal(Images(str(tmp_path))("a.JPG", lr, 4), read_image(tmp_path / "a.png"))
+    assert torch.equal(Images(str(tmp_path), suffix="_x4")("train/a", lr, 4), read_image(tmp_path / "a_x4.png"))
+
+
+def test_images_of_another_size_are_refused_naming_both(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", photo(12, 16))
+    with pytest.raises(DataError, match=r"a\.png: size: is 16x12, but 4 times the LR image is 32x24"):
+        Images(str(tmp_path))("a.jpg", photo(6, 8), 4)
+
+
+def test_images_that_are_missing_or_ambiguous_are_refused(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", photo(24, 32))
+    with pytest.raises(DataError, match=r"b: has no SR image b_x4"):
+        Images(str(tmp_path), suffix="_x4")("b.png", photo(6, 8), 4)
+    (tmp_path / "a.jpg").write_bytes(b"a twin")
+    with pytest.raises(DataError, match=r"a: has a\.jpg and a\.png for one view: keep one of them"):
+        Images(str(tmp_path))("a.png", photo(6, 8), 4)
+    with pytest.raises(DataError, match=r"folder: is not there"):
+        Images(str(tmp_path / "absent"))("a.png", photo(6, 8), 4)
+
+
+def test_images_of_another_view_give_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    lr = photo(16, 16, seed=1)
+    write_png(tmp_path / "right.png", images.upsample(lr, 4))
+    write_png(tmp_path / "wrong.png", images.upsample(photo(16, 16, seed=2), 4))
+    Images(str(tmp_path))("right", lr, 4)
+    assert not caplog.text
+    Images(str(tmp_path))("wrong", lr, 4)
+    assert "wrong.png: the SR image, reduced again, differs" in caplog.text

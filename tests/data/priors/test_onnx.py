@@ -1,0 +1,119 @@
+"""ONNX networks: computed as torch computes them; files that cannot be used are refused."""
+
+from __future__ import annotations
+
+import logging
+import math
+import shutil
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from clear_strategies.core import images
+from clear_strategies.data.priors import Onnx
+from clear_strategies.errors import DataError
+from tests.helpers.networks import onnx_bytes, photo, psnr, upscaling_weight
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny_x4.onnx"
+    path.write_bytes(onnx_bytes(upscaling_weight()))
+    return path
+
+
+def by_torch(lr: Tensor, weight: Tensor) -> Tensor:
+    out = F.pixel_shuffle(F.conv2d(lr.permute(2, 0, 1)[None], weight, padding=weight.shape[-1] // 2), 4)
+    return images.quantize(out[0].permute(1, 2, 0))
+
+
+def test_onnx_computes_what_torch_computes(network: Path) -> None:
+    lr = photo(20, 31)
+    sr = Onnx(str(network))("view", lr, 4)
+    assert sr.shape == (80, 124, 3)
+    assert (sr - by_torch(lr, upscaling_weight())).abs().max() <= 1.001 / 255
+    assert torch.equal(sr, images.quantize(sr))
+
+
+def test_onnx_in_tiles_equals_onnx_at_once(network: Path) -> None:
+    lr = photo(50, 61)
+    whole = Onnx(str(network), tile=100)("view", lr, 4)
+    parts = Onnx(str(network), tile=24, overlap=4)("view", lr, 4)
+    assert (whole - parts).abs().max() <= 1.001 / 255
+    assert ((whole - parts) != 0).float().mean() < 1e-3
+
+
+def test_onnx_of_another_scale_is_refused_naming_both_shapes(tmp_path: Path) -> None:
+    path = tmp_path / "x2.onnx"
+    path.write_bytes(onnx_bytes(upscaling_weight(scale=2), scale=2))
+    with pytest.raises(DataError, match=r"\(1, 3, 16, 24\) where \(1, 3, 32, 48\) is expected: use a x4 network"):
+        Onnx(str(path))("view", photo(8, 12), 4)
+
+
+def test_onnx_that_makes_nan_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "nan.onnx"
+    path.write_bytes(onnx_bytes(upscaling_weight() * math.nan))
+    with pytest.raises(DataError, match=r"nan\.onnx: output: is not finite"):
+        Onnx(str(path))("view", photo(8, 12), 4)
+
+
+def test_onnx_weights_outside_the_file_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weight = upscaling_weight()
+    (tmp_path / "secret.bin").write_bytes(weight.numpy().astype("<f4").tobytes())
+    (tmp_path / "models").mkdir()
+    shutil.copy(tmp_path / "secret.bin", tmp_path / "models" / "beside.bin")
+    monkeypatch.chdir(tmp_path / "models")  # from where OpenCV would follow relative paths
+    path = tmp_path / "models" / "external.onnx"
+    for location in ("../secret.bin", str(tmp_path / "secret.bin"), "beside.bin"):
+        path.write_bytes(onnx_bytes(weight, external=location))
+        with pytest.raises(DataError, match=r"external\.onnx: weights: lie in other files"):
+            Onnx(str(path))("view", photo(8, 12), 4)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\0", b"not a network at all", struct.pack("<64Q", *range(64)), onnx_bytes(upscaling_weight())[:500]],
+)
+def test_onnx_that_is_garbage_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "garbage.onnx"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"garbage\.onnx: ") as error:
+        Onnx(str(path))("view", photo(8, 12), 4)
+    assert "\n" not in str(error.value)
+
+
+def test_a_network_with_another_channel_order_gives_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "bgr.onnx"
+    path.write_bytes(onnx_bytes(upscaling_weight().flip(1)))
+    Onnx(str(path))("view", photo(8, 12), 4)
+    assert "check that it shows this view, and is RGB in [0, 1]" in caplog.text
+
+
+def test_a_good_network_logs_model_size_and_time_and_no_warning(
+    network: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO):
+        Onnx(str(network))("view", photo(8, 12), 4)
+    assert "view: onnx tiny_x4.onnx made 48x32 in" in caplog.text
+    assert not [record for record in caplog.records if record.levelno > logging.INFO]
+
+
+def test_a_real_network_has_no_seams(shared_data: Path) -> None:
+    path = str(shared_data / "sr_weights" / "span_x4.onnx")
+    lr = photo(70, 90)
+    assert psnr(Onnx(path, tile=80)("view", lr, 4), Onnx(path, tile=1000)("view", lr, 4)) > 60
+
+
+def test_no_array_is_shared_with_the_network(network: Path) -> None:
+    """OpenCV writes its output buffer again at the next run."""
+    prior, lr = Onnx(str(network)), photo(8, 12)
+    first = prior("a", lr, 4)
+    kept = first.clone()
+    prior("b", 1 - lr, 4)
+    assert torch.equal(first, kept)
+    assert not np.shares_memory(first.numpy(), prior("a", lr, 4).numpy())

@@ -1,0 +1,50 @@
+"""What holds for several priors: paths, missing models, and the quality of real networks on a real photo."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+
+from clear_strategies.core import images
+from clear_strategies.data.photo_files import read_image
+from clear_strategies.data.priors import Bicubic, DnnSuperres, Images, Onnx
+from clear_strategies.errors import DataError, SettingError
+from tests.helpers.networks import photo, psnr
+
+
+@pytest.mark.parametrize("prior", [Images, Onnx, DnnSuperres])
+def test_a_prior_without_its_path_is_refused_at_construction(prior: type[Images | Onnx | DnnSuperres]) -> None:
+    with pytest.raises(SettingError, match=r"prior\.path: must be .*, got ''"):
+        prior()
+
+
+@pytest.mark.parametrize("prior", [Onnx, DnnSuperres])
+def test_a_model_that_is_not_there_is_refused(prior: type[Onnx | DnnSuperres], tmp_path: Path) -> None:
+    for path in (tmp_path / "absent", tmp_path):
+        with pytest.raises(DataError, match=r"file: is not there: set prior\.path"):
+            prior(str(path))("view", photo(8, 12), 4)
+
+
+def test_bicubic_is_u_on_eight_bits() -> None:
+    lr = photo(9, 7)
+    assert torch.equal(Bicubic()("view", lr, 3), images.quantize(images.upsample(lr, 3)))
+
+
+def test_real_networks_do_on_fern_what_is_known_of_them(shared_data: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """504x376 from 126x94, a training view. ONNX comes after dnn_superres: in one process they must not disturb each other."""
+    weights, photos = shared_data / "sr_weights", sorted((shared_data / "fern" / "images_4").iterdir())
+    hr = images.downsample(images.crop_to_multiple(read_image(photos[10]), 8), 2)[:376, :504]
+    lr = images.downsample(hr, 4)
+    expected = {
+        Bicubic(): 23.51,
+        DnnSuperres(str(weights / "ESPCN_x4.pb"), "espcn"): 23.42,
+        DnnSuperres(str(weights / "FSRCNN_x4.pb"), "fsrcnn"): 23.44,
+        Onnx(str(weights / "span_x4.onnx")): 25.24,
+        Onnx(str(weights / "imdn_x4.onnx")): 25.38,
+    }
+    found = {prior: psnr(prior("fern", lr, 4), hr) for prior in expected}
+    assert found == pytest.approx(expected, abs=0.03)
+    assert not [record for record in caplog.records if record.levelno > logging.INFO]

@@ -1,0 +1,60 @@
+"""Settings are refused with name, rule, value and remedy: whole numbers, ranges, choices, colours, reader arguments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from clear_strategies.data.checks import as_color, require_choice, require_number, require_whole
+from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio, photos
+from clear_strategies.errors import SettingError
+
+
+@pytest.mark.parametrize("value", [2.5, 4.0, True, None, "4", math.nan, 0])
+def test_only_whole_numbers_in_range_are_whole_numbers(value: object) -> None:
+    require_whole("a.b", 1, least=1)
+    with pytest.raises(SettingError) as refusal:
+        require_whole("a.b", value, least=1)
+    assert str(refusal.value) == f"a.b: must be a whole number of at least 1, got {value!r}: a.b=1"
+
+
+@pytest.mark.parametrize("value", [0, 1.5, math.nan, math.inf, True, None, "1"])
+def test_numbers_are_finite_and_in_range(value: object) -> None:
+    for fine in (0.1, 1):
+        require_number("a.b", fine, above=0, most=1)
+    with pytest.raises(SettingError, match=r"^a\.b: must be a finite number and > 0 and <= 1, got .*: a\.b=1$"):
+        require_number("a.b", value, above=0, most=1)
+
+
+def test_choices_are_listed() -> None:
+    require_choice("a.b", "x", ("x", "y"))
+    with pytest.raises(SettingError, match=r"^a\.b: must be one of x, y, got 'z': a\.b=x$"):
+        require_choice("a.b", "z", ("x", "y"))
+
+
+@pytest.mark.parametrize("value", [(1, 1), (1, 1, 2), (math.nan, 0, 0), "white", None, ("1", 0, 0), (1, 1, 1, 1)])
+def test_colours_are_three_numbers_between_0_and_1(value: object) -> None:
+    assert as_color("a.b", [1, 0.5, 0]) == (1.0, 0.5, 0.0)
+    with pytest.raises(SettingError, match=r"^a\.b: must be three numbers in \[0, 1\]"):
+        as_color("a.b", value)
+
+
+@pytest.mark.parametrize(
+    ("read", "named"),
+    [
+        (lambda: demo.read(width=0), "width"),
+        (lambda: demo.read(views=-3), "views"),
+        (lambda: photos.read("nowhere", max_side=0), "max_side"),
+        (lambda: photos.read("nowhere", threads=-2), "threads"),
+        (lambda: blender.read("nowhere", background=(2.0, 0.0, 0.0)), "background"),
+        (lambda: colmap.read(Path("nowhere"), background=(-1.0, 0.0, 0.0)), "background"),
+        (lambda: llff.read("nowhere", background=(0.0, math.nan, 0.0)), "background"),
+        (lambda: nerfstudio.read("nowhere", background=(0.0, 0.0, 1.5)), "background"),
+    ],
+)
+def test_readers_refuse_their_arguments_before_files(read: Callable[[], object], named: str) -> None:
+    with pytest.raises(SettingError, match=rf"^data\.reader\.{named}: "):
+        read()

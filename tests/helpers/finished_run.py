@@ -1,0 +1,59 @@
+"""The folder of a finished run, as far as a report reads it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from clear_strategies import files, report
+from clear_strategies.data.photo_files import write_png
+
+
+def scores(psnr: float | None) -> dict[str, float | None]:
+    return {"psnr": psnr, "ssim": 0.5, "gmsd": 0.1, "blur": 0.2}
+
+
+def make_run(
+    folder: Path, *overrides: str, psnr: float | None = 20.0, seed: int = 0, scene: str = "demo", bicubic: float = 18.0,
+    **facts: Any,
+) -> Path:  # fmt: skip
+    """Write the files that run.py would."""
+    mean = {"ours": scores(psnr), "bicubic": scores(bicubic), "prior": scores(bicubic + 1)}
+    content = {
+        "scene": scene, "strategies": ["gco"], "seed": seed, "iterations": 100, "gaussians": 1200, "seconds": 61.7,
+        "conflict": {"gaussian": 0.25, "means": 0.3}, "synthetic_prior": False,
+        "test": {"against": "HR photos", "views": {"view.png": {"ours": scores(psnr)}}, "mean": mean},
+        "train": {"against": "HR photos", "views": {}, "mean": mean}, "provenance": {}, **facts,
+    }  # fmt: skip
+    files.write_json(folder / "metrics.json", content)
+    overrides = (*overrides, f"fit.seed={seed}")
+    files.write_text(folder / ".hydra" / "overrides.yaml", "".join(f"- {o!r}\n" for o in overrides))
+    rows = [{"t": t, "psnr_test": 15 + t, "n_gaussians": 1000 + t, "seconds": t / 2} for t in range(1, 6)]
+    files.write_csv(folder / "history.csv", rows, ["t", "psnr_test", "n_gaussians", "seconds", "conflict"])
+    write_png(folder / "renders" / "view.png", torch.rand(24, 32, 3, generator=torch.Generator().manual_seed(seed)))
+    shade = torch.linspace(0, 1, 32).expand(24, 32)
+    for kind, image in {
+        "lr": shade[::4, ::4, None].expand(6, 8, 3),
+        "prior": shade[..., None].expand(24, 32, 3),
+    }.items():
+        write_png(folder / "views" / f"view_{kind}.png", image)
+        write_png(folder / "maps" / "train" / f"{kind}.png", image)
+    write_png(folder / "views" / "view_truth.png", torch.full((24, 32, 3), 0.5))
+    for name in ("reliability", "demand", "weight", "corrected", "conflict"):
+        write_png(folder / "maps" / "train" / f"{name}.png", shade * 0.2)
+    files.write_json(folder / "maps" / "maps.json", {"views": {"train.png": {"reliability": 0.75}}})
+    timing = {"stage": "backward HR", "seconds_saved": 1.5, "why": "lambda_HR = 0 (75x)"}
+    files.write_csv(folder / "timing.csv", [timing], list(timing))
+    return folder
+
+
+def rows_of(*folders: Path) -> dict[str, report.Row]:
+    return {row.method: row for row in report.compare(report.collect(folders))}
+
+
+def cells(text: str) -> list[dict[str, str]]:
+    """The lines of a Markdown table."""
+    header, _, *lines = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("|")]
+    return [{name.strip(): cell.strip() for name, cell in zip(header, line, strict=True)} for line in lines]

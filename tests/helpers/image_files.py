@@ -1,0 +1,32 @@
+"""Random images that a PNG holds exactly, and finding one inside a larger image."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+
+def random_image(seed: int, height: int = 40, width: int = 60) -> Tensor:
+    """8-bit levels, so that a PNG holds it exactly."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randint(0, 256, (height, width, 3), generator=generator).float() / 255
+
+
+def array(seed: int, height: int = 40, width: int = 60) -> np.ndarray:
+    return random_image(seed, height, width).numpy()
+
+
+def read(path: Path) -> np.ndarray:
+    return np.asarray(Image.open(path).convert("RGB"))
+
+
+def holds(page: np.ndarray, image: np.ndarray, times: int = 1) -> bool:
+    """Whether the image, every pixel `times` larger, is somewhere on the page, exactly."""
+    pixels = (image * 255).round().astype(np.uint8).repeat(times, axis=0).repeat(times, axis=1)
+    height, width = pixels.shape[:2]
+    corners = np.argwhere((page[: -height + 1, : -width + 1] == pixels[0, 0]).all(axis=-1))
+    return any(np.array_equal(page[y : y + height, x : x + width], pixels) for y, x in corners)

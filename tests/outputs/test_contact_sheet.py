@@ -1,0 +1,61 @@
+"""The contact sheet shows what it is given, pixel for pixel."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from clear_strategies.outputs.contact_sheet import SheetRow, write_contact_sheet
+from tests.helpers.image_files import holds, random_image, read
+
+
+def row(name: str, seed: int, *, truth: bool = True, size: tuple[int, int] = (40, 60)) -> SheetRow:
+    shown = {"LR, enlarged": random_image(seed, *size), "ours": random_image(seed + 1, *size)}
+    return SheetRow(name, shown, random_image(seed + 2, *size) if truth else None, "20.00 dB, SSIM 0.500")
+
+
+def test_large_images_are_shown_pixel_for_pixel(tmp_path: Path) -> None:
+    rows = [row("a", 0, size=(30, 250)), row("b", 10, size=(30, 250))]
+    write_contact_sheet(tmp_path / "sheet.png", rows, "scene · strategy")
+    sheet = read(tmp_path / "sheet.png")
+    for shown in rows:
+        assert shown.truth is not None
+        for image in (*shown.images.values(), shown.truth):
+            assert holds(sheet, image.numpy())
+
+
+def test_small_images_are_shown_at_a_whole_multiple(tmp_path: Path) -> None:
+    shown = row("a", 0)  # 60 pixels wide: four times, to reach 240
+    write_contact_sheet(tmp_path / "sheet.png", [shown], "scene · strategy")
+    sheet = read(tmp_path / "sheet.png")
+    assert all(holds(sheet, image.numpy(), times=4) for image in shown.images.values())
+
+
+def test_huge_images_are_reduced(tmp_path: Path) -> None:
+    write_contact_sheet(tmp_path / "sheet.png", [row("a", 0, size=(90, 2000))], "scene")
+    assert read(tmp_path / "sheet.png").shape[1] < 4 * 700
+
+
+def test_truth_and_error_are_shown_where_they_are_known(tmp_path: Path) -> None:
+    for name, rows in {
+        "none": [row("a", 0, truth=False)],
+        "some": [row("a", 0, truth=False), row("b", 10)],
+        "all": [row("a", 0), row("b", 10)],
+    }.items():
+        write_contact_sheet(tmp_path / f"{name}.png", rows, "scene")
+    none, some, both = (read(tmp_path / f"{name}.png") for name in ("none", "some", "all"))
+    assert none.shape[1] < some.shape[1] == both.shape[1]
+    truth = row("b", 10).truth
+    assert truth is not None
+    assert holds(some, truth.numpy(), times=4)
+
+
+def test_views_of_different_sizes_stand_in_one_sheet(tmp_path: Path) -> None:
+    rows = [row("wide", 0, size=(30, 250)), row("tall", 10, size=(80, 100))]
+    write_contact_sheet(tmp_path / "sheet.png", rows, "scene")
+    sheet = read(tmp_path / "sheet.png")
+    assert all(holds(sheet, image.numpy()) for shown in rows for image in shown.images.values())
+
+
+def test_no_rows_make_no_sheet(tmp_path: Path) -> None:
+    write_contact_sheet(tmp_path / "sheet.png", [], "scene")
+    assert not (tmp_path / "sheet.png").exists()

@@ -1,0 +1,163 @@
+"""The four numbers: by hand, against other implementations, and on photographs that everyone would rank alike."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from clear_strategies.core import images
+from clear_strategies.data.photo_files import read_image
+from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, score
+
+
+def grey(level: float, height: int = 16, width: int = 16) -> Tensor:
+    return torch.full((height, width, 3), level)
+
+
+def noise(seed: int, height: int = 24, width: int = 20) -> Tensor:
+    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.fixture(scope="module")
+def photograph() -> Tensor:
+    from skimage import data
+
+    return torch.from_numpy(data.astronaut()[:256, 128:384] / np.float32(255))
+
+
+def enlarged(truth: Tensor, factor: int) -> Tensor:
+    return images.upsample(images.downsample(truth, factor), factor)
+
+
+# ── the numbers ──────────────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_an_image_is_perfect_to_itself() -> None:
+    assert score(noise(0), noise(0)) == ImageScores(psnr=PSNR_CAP, ssim=1.0, gmsd=0.0, blur=0.0)
+
+
+def test_psnr_and_ssim_of_two_greys_by_hand() -> None:
+    scores = score(grey(0.6).double(), grey(0.5).double())
+    assert scores.psnr == pytest.approx(20.0)  # -10 log10(0.1²)
+    assert scores.ssim == pytest.approx((2 * 0.6 * 0.5 + 1e-4) / (0.6**2 + 0.5**2 + 1e-4))  # no contrast is left
+    assert (scores.gmsd, scores.blur) == (0.0, 0.0)  # nor an edge
+
+
+def test_black_for_white_has_zero_decibels() -> None:
+    assert score(grey(0.0), grey(1.0)).psnr == 0.0
+
+
+def test_gmsd_of_one_edge_by_hand() -> None:
+    edge = torch.cat([grey(0.4, 16, 8), grey(0.5, 16, 8)], dim=1).double()
+    # At half size 2 of 8 columns feel the step of 0.1, with gradient 0.1; elsewhere both images are flat.
+    similarity = (170 / 255**2) / (0.1**2 + 170 / 255**2)
+    expected = math.sqrt(0.25 * 0.75) * (1 - similarity)
+    assert score(edge, grey(0.4).double()).gmsd == pytest.approx(expected)
+
+
+def test_gmsd_agrees_with_opencv(photograph: Tensor) -> None:
+    cv2 = pytest.importorskip("cv2")
+    blurred = enlarged(photograph, 4)
+    x, y = ((image.mean(dim=2, keepdim=True) * 255).numpy() for image in (blurred, photograph))
+    (theirs, *_), _ = cv2.quality.QualityGMSD_compute(x, y)
+    ours = score(*(torch.from_numpy(image / 255).expand(-1, -1, 3) for image in (x, y))).gmsd
+    assert ours == pytest.approx(theirs, rel=0.05)  # their 2x2 blocks begin at another pixel
+
+
+@given(seed=st.integers(0, 1000), amount=st.floats(0.01, 1))
+@settings(max_examples=15, deadline=None)
+def test_psnr_is_that_of_scikit_image(seed: int, amount: float) -> None:
+    from skimage.metrics import peak_signal_noise_ratio
+
+    truth = noise(seed)
+    image = truth + amount * (noise(seed + 1) - truth)
+    expected = peak_signal_noise_ratio(truth.double().numpy(), image.double().numpy(), data_range=1)
+    assert score(image, truth).psnr == pytest.approx(expected)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=15, deadline=None)
+def test_exchanging_image_and_truth_changes_nothing_but_the_sign_of_blur(seed: int) -> None:
+    there, back = score(noise(seed), noise(seed + 1)), score(noise(seed + 1), noise(seed))
+    assert (there.psnr, there.ssim, there.gmsd, there.blur) == pytest.approx(
+        (back.psnr, back.ssim, back.gmsd, -back.blur)
+    )
+
+
+def test_what_exceeds_the_range_is_clamped() -> None:
+    assert score(noise(0) * 3 - 1, noise(1)) == score((noise(0) * 3 - 1).clamp(0, 1), noise(1))
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf])
+def test_an_image_that_is_not_finite_has_no_score(poison: float) -> None:
+    image = noise(0)
+    image[3, 4, 1] = poison
+    scores = score(image, noise(0))
+    assert all(map(math.isnan, (scores.psnr, scores.ssim, scores.gmsd, scores.blur)))
+
+
+def test_images_of_different_or_tiny_size_are_refused() -> None:
+    unchecked = inspect.unwrap(score)  # else the annotations, checked in tests only, speak first
+    with pytest.raises(ValueError, match=r"the same size, got \(16, 16, 3\) and \(16, 18, 3\)"):
+        unchecked(grey(0.5), grey(0.5, 16, 18))
+    with pytest.raises(ValueError, match=r"at least 12 pixels on each side, got \(11, 16, 3\)"):
+        score(grey(0.5, 11), grey(0.5, 11))
+
+
+# ── what the measures notice ─────────────────────────────────────────────────────────────────────────────────────────
+
+
+def assert_ranked(*scores: ImageScores) -> None:
+    """Best first, by each of the four."""
+    for better, worse in pairwise(scores):
+        assert better.psnr > worse.psnr
+        assert better.ssim > worse.ssim
+        assert better.gmsd < worse.gmsd
+        assert abs(better.blur) < abs(worse.blur)
+
+
+def test_all_four_rank_truth_then_x2_then_x4_then_x8(photograph: Tensor) -> None:
+    assert_ranked(*(score(enlarged(photograph, factor), photograph) for factor in (1, 2, 4, 8)))
+
+
+def test_blur_and_invented_texture_are_distinguished_by_sign(photograph: Tensor) -> None:
+    textured = photograph + 0.08 * (noise(0, 256, 256) - 0.5)
+    assert score(enlarged(photograph, 4), photograph).blur > 0.1
+    assert score(textured, photograph).blur < -0.02
+
+
+def test_texture_on_a_blurred_image_mends_blur_but_not_gmsd(photograph: Tensor) -> None:
+    blurred = enlarged(photograph, 4)
+    textured = blurred + 0.15 * (noise(0, 256, 256) - 0.5)
+    without, with_it = score(blurred, photograph), score(textured, photograph)
+    assert abs(with_it.blur) < abs(without.blur)
+    assert with_it.gmsd > without.gmsd
+
+
+def test_gmsd_notices_displaced_structure_that_blur_cannot_see(photograph: Tensor) -> None:
+    scores = score(photograph.roll(2, dims=1), photograph)
+    assert abs(scores.blur) < 0.01
+    assert scores.gmsd > score(enlarged(photograph, 2), photograph).gmsd
+
+
+@pytest.mark.parametrize("capture", ["fern", "kitchen360", "strecha_fountain", "real_room"])
+def test_real_photographs_rank_truth_network_bicubic_x4_bicubic_x8(shared_data: Path, capture: str) -> None:
+    cv2 = pytest.importorskip("cv2")
+    photos = sorted(p for p in (shared_data / capture).rglob("*") if p.suffix.lower() in {".png", ".jpg"})
+    image = read_image(photos[len(photos) // 2])
+    top, left = (image.shape[0] - 256) // 2, (image.shape[1] - 256) // 2
+    truth = image[top : top + 256, left : left + 256]
+    network = cv2.dnn.readNetFromONNX(str(shared_data / "sr_weights" / "span_x4.onnx"))
+    network.setInput(images.downsample(truth, 4).permute(2, 0, 1)[None].numpy())
+    enhanced = torch.from_numpy(network.forward()[0]).permute(1, 2, 0)
+    candidates = (truth, enhanced, enlarged(truth, 4), enlarged(truth, 8))
+    assert_ranked(*(score(candidate, truth) for candidate in candidates))

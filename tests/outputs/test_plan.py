@@ -1,0 +1,89 @@
+"""The plan names what a run does and skips, from what its strategies say of themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import pytest
+
+from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
+from clear_strategies.core.gradients import Grads
+from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.merging.objective import Objective
+from clear_strategies.outputs import plan
+from clear_strategies.outputs.progress import progress_bar
+from clear_strategies.schedules import WarmupDecay
+from clear_strategies.training.loop import iterate
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
+from tests.helpers import toy
+
+SCENE = toy.scene()
+
+
+def started(*strategies: Strategy, **objective: Any) -> TrainState:
+    return TrainState.start(
+        SCENE, Conductor(*strategies, objective=Objective(kernels="torch", **objective)),
+        settings=FitSettings(iterations=10, fused="off", probe_every=0), density=DensitySettings(),
+        rates=LearningRates(), mip=MipFilter(),
+    )  # fmt: skip
+
+
+def lines(state: TrainState, *names: str, method: str | None = None) -> dict[str, str]:
+    text = plan.describe(SCENE, state, plan.Chosen(method, names), rasterizer="torch", threads="1")
+    split = (line.strip().partition("  ") for line in text.splitlines())
+    return {label: words for label, _, words in split}
+
+
+def test_the_plan_names_strategies_and_their_milestones() -> None:
+    found = lines(started(GCO(), SVS(anchor_start=7)), "gco", "svs")
+    assert found["strategies"].strip() == "gco (GCO), svs (SVS)"
+    assert "anchor_start 7" in found["milestones of SVS"]
+    assert "(the paper's baseline)" in lines(started())["strategies"]
+    assert "(the paper's baseline)" not in lines(started(), method="srgs")["strategies"]
+
+
+class Quiet(Strategy):
+    """States everything that a plan asks for."""
+
+    def correct(self, lr: Grads, hr: Grads, evidence: object) -> Grads:
+        return hr
+
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+        return f"lambda_HR is at most {lambda_hr:g}" if lambda_hr < 2 else None
+
+    def skipped(self) -> Sequence[str]:
+        return ("the loud part",)
+
+    def marks(self) -> Mapping[str, int]:
+        return {"silence": 5}
+
+
+def test_any_strategy_states_what_it_skips_marks_and_warns_of(caplog: pytest.LogCaptureFixture) -> None:
+    state = started(Quiet())
+    assert "the loud part" in lines(state, "quiet")["skipped"]
+    assert plan.marks(state)["silence"] == 5
+    assert "Quiet has no effect: lambda_HR is at most 1." in caplog.text
+    caplog.clear()
+    lines(started(Quiet(), lambda_hr=WarmupDecay(peak=2, final=0)), "quiet")
+    assert "no effect" not in caplog.text
+
+
+def test_strategies_without_hr_are_idle(caplog: pytest.LogCaptureFixture) -> None:
+    found = lines(started(GCO(), P2G(), lambda_hr=WarmupDecay(peak=0, final=0)), "gco", "p2g")
+    assert "HR scale throughout (lambda_HR = 0)" in found["skipped"]
+    for name in ("GCO", "P2G"):
+        assert f"{name} has no effect: lambda_HR is 0 throughout." in caplog.text
+
+
+def test_the_progress_bar_counts_iterations(capsys: pytest.CaptureFixture[str]) -> None:
+    state, steps = started(), []
+    with progress_bar(state, lambda: steps.append(state.t)) as update:
+        for _ in range(10):
+            iterate(state, toy.RASTERIZER)
+            update(state)
+    assert steps == list(range(2, 12))
+    assert "10/10" in capsys.readouterr().err

@@ -1,0 +1,87 @@
+"""A finished run writes the files that `FILES` lists, and metrics.json last."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from clear_strategies import GCO, P2G, Conductor, files
+from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.merging.objective import Objective
+from clear_strategies.outputs.plan import Chosen
+from clear_strategies.outputs.results import FILES, write_results
+from clear_strategies.schedules import WarmupDecay
+from clear_strategies.training.loop import iterate
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
+from tests.helpers import toy
+
+WRITTEN_BY_OTHERS = {".hydra/", "run.log", "checkpoints/"}
+OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
+SCENE = toy.scene()
+
+
+@pytest.fixture(scope="module")
+def state() -> TrainState:
+    state = TrainState.start(
+        SCENE, Conductor(GCO(), P2G(), objective=OBJECTIVE), settings=FitSettings(iterations=3, fused="off"),
+        density=DensitySettings(), rates=LearningRates(), mip=MipFilter(),
+    )  # fmt: skip
+    for _ in range(3):
+        iterate(state, toy.RASTERIZER)
+    return state
+
+
+def write(folder: Path, state: TrainState, map_views: int = 1) -> float | None:
+    return write_results(
+        folder, SCENE, state, toy.RASTERIZER, Chosen(None, ["gco", "p2g"]), backend="torch", down="bicubic",
+        map_views=map_views, seconds=1.5, config={"fit": {"seed": 0}},
+    )  # fmt: skip
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name + "/" * path.is_dir() for path in folder.iterdir()}
+
+
+def test_every_file_of_a_run_is_listed(tmp_path: Path, state: TrainState) -> None:
+    psnr = write(tmp_path, state)
+    assert names(tmp_path) == set(FILES) - WRITTEN_BY_OTHERS
+    content = json.loads((tmp_path / "metrics.json").read_text())
+    assert psnr == pytest.approx(content["test"]["mean"]["ours"]["psnr"])
+    assert (content["scene"], content["strategies"], content["config"]) == ("toy", ["gco", "p2g"], {"fit": {"seed": 0}})
+    (view,) = SCENE.test
+    assert names(tmp_path / "views") == {f"{view.name}_{kind}.png" for kind in ("lr", "prior", "truth")}
+    assert names(tmp_path / "renders") == {f"{view.name}.png"}
+
+
+def test_conflict_csv_holds_columns_of_history_csv(tmp_path: Path, state: TrainState) -> None:
+    write(tmp_path, state)
+    history, conflict = (
+        list(csv.DictReader((tmp_path / f"{name}.csv").open(newline=""))) for name in ("history", "conflict")
+    )
+    assert conflict == [{column: row[column] for column in conflict[0]} for row in history]
+    assert {"t", "conflict", "conflict_means", "corrected", "mean_q", "mean_w"} <= set(conflict[0])
+    mean = sum(float(row["conflict"]) for row in conflict) / len(conflict)
+    assert json.loads((tmp_path / "metrics.json").read_text())["conflict"]["gaussian"] == pytest.approx(mean)
+
+
+def test_no_map_views_means_no_maps(tmp_path: Path, state: TrainState) -> None:
+    write(tmp_path, state, map_views=0)
+    assert not (tmp_path / "maps").exists()
+
+
+def test_metrics_json_is_missing_where_another_file_could_not_be_written(
+    tmp_path: Path, state: TrainState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files, "write_csv", full)
+    with pytest.raises(OSError, match="No space left"):
+        write(tmp_path, state)
+    assert not (tmp_path / "metrics.json").exists()

@@ -1,0 +1,135 @@
+"""Seeds are averaged, settings are distinguished, and differences are paired."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clear_strategies import report
+from tests.helpers.finished_run import cells, make_run, rows_of, scores
+
+
+def test_runs_that_differ_in_their_seed_share_a_row(tmp_path: Path) -> None:
+    for seed, psnr in enumerate((20.0, 21.0, 25.0)):
+        make_run(tmp_path / str(seed), "+strategy=clear", seed=seed, psnr=psnr)
+    row = rows_of(tmp_path)["clear"]
+    assert row.values["psnr"] == [20.0, 21.0, 25.0]
+    (line,) = (c for c in cells(report.layout([row]).markdown) if c["method"] == "clear")
+    assert line["PSNR (dB) ↑"] == "22.00 ± 2.65"  # deviations -2, -1, 3: sqrt(14 / 2)
+    assert (line["best"], line["seeds"], line["Gaussians"]) == ("25.00", "0, 1, 2", "1,200 ± 0")
+
+
+@pytest.mark.parametrize(
+    "setting", ["prior=onnx", "strategies.gco.tolerance=0.1", "~strategies.p2g", "fit.iterations=9"]
+)
+def test_runs_that_differ_in_a_setting_have_rows_that_name_it(tmp_path: Path, setting: str) -> None:
+    make_run(tmp_path / "0", "+strategy=clear", "data=llff")
+    make_run(tmp_path / "1", "+strategy=clear", "data=llff", setting)
+    assert {"clear", f"clear, {setting}"} <= set(rows_of(tmp_path))
+
+
+def test_settings_without_influence_on_results_do_not_separate_runs(tmp_path: Path) -> None:
+    make_run(tmp_path / "0", "+strategy=clear", "fit.threads=1", "hydra.run.dir=here")
+    make_run(tmp_path / "1", "+strategy=clear", "fit.threads=2", "fit.probe_every=7", seed=1)
+    assert len(rows_of(tmp_path)["clear"].runs) == 2
+
+
+def test_paths_and_scenes_do_not_separate_runs_of_a_method(tmp_path: Path) -> None:
+    make_run(tmp_path / "0", "+method=srgs", "+scene=fern", strategies=["hr_only"])
+    make_run(tmp_path / "1", "+method=srgs", "data.path=elsewhere/fern", "data.reader.path=x", seed=1)
+    assert rows_of(tmp_path)["srgs"].seeds == "0, 1"
+
+
+def test_several_runs_with_one_seed_in_a_row_give_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    make_run(tmp_path / "0", "+strategy=clear")
+    make_run(tmp_path / "1", "+strategy=clear")
+    rows_of(tmp_path)
+    assert "demo, clear: a row holds several runs with the same seed" in caplog.text
+
+
+def test_a_run_without_a_finite_score_is_left_out_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    make_run(tmp_path / "0", "+strategy=gco", psnr=20.0)
+    make_run(tmp_path / "1", "+strategy=gco", psnr=None, seed=1)
+    assert rows_of(tmp_path)["gco"].values["psnr"] == [20.0]
+    assert "demo, gco: runs without a finite PSNR are left out of its mean" in caplog.text
+
+
+def test_baselines_of_different_inputs_have_rows_of_their_own(tmp_path: Path) -> None:
+    make_run(tmp_path / "0", "+strategy=gco", "prior=onnx")
+    make_run(tmp_path / "1", "+strategy=clear", "prior=onnx")
+    make_run(tmp_path / "2", "+strategy=gco", "prior=bicubic", bicubic=17.0)
+    rows = rows_of(tmp_path)
+    assert rows["prior, prior=onnx"].values["psnr"] == [19.0]
+    assert rows["prior, prior=bicubic"].values["psnr"] == [18.0]
+
+
+def test_scores_of_training_views_or_against_lr_photos_are_marked(tmp_path: Path) -> None:
+    lr = {"against": "LR photos", "views": {}, "mean": {"ours": scores(20.0), "prior": scores(21.0)}}
+    nothing: dict[str, Any] = {"against": "nothing", "views": {}, "mean": {}}
+    make_run(tmp_path / "a", test=lr, scene="a")
+    make_run(tmp_path / "b", test=nothing, train=lr, scene="b")
+    scenes = {row.scene for row in report.compare(report.collect([tmp_path]))}
+    assert scenes == {"a (against LR photos)", "b (training views, against LR photos)"}
+
+
+def test_methods_are_compared_with_the_first_and_baselines_appear_once(tmp_path: Path) -> None:
+    for job, (strategy, psnr) in enumerate([("baseline", 20.0), *[("gco", 20.5)] * 9, ("clear", 19.25)]):
+        make_run(tmp_path / str(job), f"+strategy={strategy}", psnr=psnr, seed=job)
+    lines = cells(report.layout(report.compare(report.collect([tmp_path]))).markdown)
+    assert [line["method"] for line in lines] == ["bicubic", "prior", "baseline", "gco", "clear"]
+    assert [line["Δ"] for line in lines] == ["", "", "+0.00", "+0.50", "-0.75"]
+    assert lines[0]["PSNR (dB) ↑"] == "18.00"
+
+
+def test_each_scene_has_its_own_first_method_and_marks(tmp_path: Path) -> None:
+    make_run(tmp_path / "a", "+strategy=gco", psnr=20.0, synthetic_prior=True)
+    make_run(tmp_path / "b", "+strategy=gco", psnr=25.0, scene="fern")
+    make_run(tmp_path / "c", "+strategy=clear", psnr=26.0, scene="fern")
+    lines = cells(report.layout(report.compare(report.collect([tmp_path]))).markdown)
+    found = {(line["scene"], line["method"]): line["Δ"] for line in lines}
+    assert found["demo (synthetic prior)", "gco"] == "+0.00"
+    assert found["fern", "clear"] == "+1.00"
+
+
+def test_differences_are_paired_by_seed(tmp_path: Path) -> None:
+    for seed, (first, second) in enumerate(((20.0, 20.5), (22.0, 22.25), (21.0, 22.5))):
+        make_run(tmp_path / f"a{seed}", "+strategy=baseline", seed=seed, psnr=first)
+        make_run(tmp_path / f"b{seed}", "+strategy=gco", seed=seed, psnr=second)
+    delta = rows_of(tmp_path)["gco"].delta
+    # Differences 0.5, 0.25, 1.5: mean 0.75, deviations -0.25, -0.5, 0.75, so √(0.875 / 2) / √3.
+    assert delta is not None
+    assert (delta.mean, delta.pairs) == (0.75, 3)
+    assert delta.error == pytest.approx((0.875 / 2 / 3) ** 0.5)
+    lines = {line["method"]: line for line in cells(report.layout(report.compare(report.collect([tmp_path]))).markdown)}
+    assert (lines["baseline"]["Δ"], lines["gco"]["Δ"]) == ("+0.00", "+0.75 ± 0.38")
+
+
+def test_averages_are_means_of_scene_means_with_paired_differences(tmp_path: Path) -> None:
+    for scene, offset in (("fern", 0.0), ("horns", 4.0)):
+        for seed in (0, 1, 2)[: 3 if scene == "fern" else 1]:
+            psnr = 20.0 + offset + seed
+            make_run(tmp_path / f"{scene}a{seed}", "+strategy=baseline", seed=seed, psnr=psnr, scene=scene)
+            make_run(tmp_path / f"{scene}b{seed}", "+strategy=gco", seed=seed, psnr=psnr + 1 + offset, scene=scene)
+    rows = [row for row in report.compare(report.collect([tmp_path])) if not row.runs]
+    assert {row.scene for row in rows} == {"average of 2 scenes"}
+    assert [row.method for row in rows] == ["bicubic", "prior", "baseline", "gco"]
+    baseline, gco = rows[2:]
+    assert baseline.values["psnr"] == [21.0, 24.0]  # each scene counts once, however many seeds it has
+    assert gco.delta is not None
+    assert (gco.delta.mean, gco.delta.pairs) == (2.0, 4)  # 1, 1, 1, 5
+    assert gco.delta.error == pytest.approx(1.0)  # s = 2
+    line = cells(report.layout(rows).markdown)[3]
+    assert (line["PSNR (dB) ↑"], line["Δ"]) == ("25.50", "+2.00 ± 1.00")
+
+
+def test_scenes_with_different_data_settings_are_averaged(tmp_path: Path) -> None:
+    for scene, shrink in (("fern", 2), ("horns", 4)):
+        for job, strategy in enumerate(("baseline", "gco")):
+            make_run(tmp_path / f"{scene}{job}", f"+strategy={strategy}", f"data.views.shrink={shrink}", scene=scene)
+    make_run(tmp_path / "only_here", "+strategy=gco", "density.threshold=1", "data.views.shrink=2", scene="fern")
+    averages = [row.method for row in report.compare(report.collect([tmp_path])) if not row.runs]
+    assert averages == ["bicubic", "prior", "baseline", "gco"]

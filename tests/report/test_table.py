@@ -1,0 +1,29 @@
+"""The table leaves out what is empty and notes what a reader has to know."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from clear_strategies import report
+from tests.helpers.finished_run import cells, make_run
+
+
+def test_empty_columns_are_left_out(tmp_path: Path) -> None:
+    make_run(tmp_path, "+strategy=gco", conflict={})
+    (line,) = (
+        c for c in cells(report.layout(report.compare(report.collect([tmp_path]))).markdown) if c["method"] == "gco"
+    )
+    assert not {"conflict", "Δ", "best"} & set(line)
+
+
+def test_settings_that_all_runs_share_are_noted_once(tmp_path: Path) -> None:
+    make_run(tmp_path / "0", "+strategy=gco", "data=llff", "fit.iterations=600")
+    make_run(tmp_path / "1", "+strategy=clear", "data=llff", "fit.iterations=600")
+    text = report.layout(report.compare(report.collect([tmp_path]))).markdown
+    assert "All runs of demo: `data=llff fit.iterations=600`." in text
+    assert text.count("data=llff") == 1
+
+
+def test_a_bar_in_a_name_does_not_break_the_table(tmp_path: Path) -> None:
+    make_run(tmp_path, "+strategy=gco", scene="a|b")
+    assert "a\\|b" in report.layout(report.compare(report.collect([tmp_path]))).markdown
