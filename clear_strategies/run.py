@@ -38,7 +38,7 @@ def main() -> None:
     except (Exception, KeyboardInterrupt) as error:
         if (ending := exit_codes.describe(error)) is None:
             raise
-        print(ending.message, file=sys.stderr)  # noqa: T201 - before Hydra has set up logging, or after
+        sys.stderr.write(f"{ending.message}\n")  # logging is set up for jobs only
         sys.exit(ending.code)
 
 
