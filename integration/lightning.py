@@ -5,8 +5,8 @@
         class_path: integration.lightning.ClearDensityController
         init_args: {clear: clear, sr: data/fern/sr_x4}
 
-The controller that it wraps (`base`) is built as it would be without, and stays what the host sees: names in checkpoints
-are the same. Imported by that host only, for it derives from its `DensityController`.
+The wrapped controller (`base`) is the one that the host would build, so names in checkpoints stay the same. Only that host
+can import this module, which derives from its `DensityController`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import View
-from clear_strategies.data.priors import Images
 from clear_strategies.merging.conductor import Conductor
-from integration.attach import Attachment, Drawing, HostError, Which
-from integration.densify import warn_of_early_end, warn_of_unread_score
-from integration.lineage import Detail
-from integration.seen import Eye, Role, enlarged
-from integration.views import super_resolve, view
+from integration.attachment import Attachment, HostRendering, Resolution
+from integration.detail import DetailFeature
+from integration.errors import HostError
+from integration.host_score import warn_if_densification_outlasts, warn_if_score_is_unused
+from integration.model_proxy import ModelRenderer, Role, enlarged_camera
+from integration.views import SuperResolve, sr_source, view
 
 _log = logging.getLogger(__name__)
 
@@ -46,13 +46,15 @@ _ROLES: Final[tuple[tuple[str, Role], ...]] = (
 
 @dataclass
 class ClearDensityController(DensityController):  # type: ignore[misc]
-    """A density controller, and CLEAR in the module that it is set up for.
+    """A density controller that also attaches CLEAR to the module it is set up for.
+
+    The controller that the host gets has the attachment as its attribute `clear` after `setup("fit", …)`.
 
     Args:
-        base: what controls density; None: the host's VanillaDensityController.
+        base: the controller that densifies; None: the host's VanillaDensityController.
         clear: strategies of conf/: "clear", "gco", "gco,svs" …
         overrides: settings, e.g. "strategies.gco.tolerance=0.1".
-        sr: folder of SR pictures, named like the photographs; None: HR takes no part.
+        sr: folder of SR images, named like the photos; None: HR is not used.
         suffix: what the SR tool appended to the names, e.g. "_x4".
         factor: HR pixels per LR pixel.
         detail: train the detail feature f_det.
@@ -77,17 +79,21 @@ class ClearDensityController(DensityController):  # type: ignore[misc]
         setup = controller.setup
 
         @functools.wraps(setup)
-        def with_clear(stage: str, pl_module: Any) -> None:
+        def setup_and_attach(stage: str, pl_module: Any) -> None:
             setup(stage, pl_module)
             if stage == "fit":
-                Attached(self, base, pl_module)
+                controller.clear = Attached(self, base, pl_module)
 
-        controller.setup = with_clear
+        controller.setup = setup_and_attach
         return controller
 
 
 class Attached:
-    """CLEAR in one LightningModule; it begins with the first training step, when parameters and optimizers are in place."""
+    """CLEAR in one LightningModule.
+
+    Attributes:
+        attachment: None before the first training step, which is the first to have parameters and optimizers.
+    """
 
     def __init__(self, settings: ClearDensityController, density: Any, module: Any) -> None:
         from clear_strategies.compose import conductor
@@ -97,48 +103,51 @@ class Attached:
                 f"schedules need the number of steps, got max_steps={module.trainer.max_steps}. Set trainer.max_steps."
             )
         self._settings, self._density, self._module = settings, density, module
-        sr = None if settings.sr is None else Images(settings.sr, settings.suffix)
         self._conductor: Conductor = conductor(settings.clear, *settings.overrides, iterations=module.trainer.max_steps)
-        self._sr, self._factor = super_resolve(sr, self._conductor, settings.factor)
+        self._sr, self._factor = sr_source(_sr_images(settings), self._conductor, settings.factor)
         self._views: dict[str, View] = {}
-        self._image: tuple[str, Tensor] | None = None  # of the step that is under way
+        self._photo: tuple[str, Tensor] | None = None  # name and pixels of the current step's photo
         self.attachment: Attachment | None = None
-        renderer = module.renderer
         _replace(module, "training_step", self._training_step)
-        _replace(module, "save_gaussians", self._saving_detail)
-        _replace(renderer, "training_forward", self._training_forward)
-        _replace(renderer, "forward", self._shown)
+        _replace(module, "save_gaussians", self._save_with_detail)
+        _replace(module.renderer, "training_forward", self._training_forward)
+        _replace(module.renderer, "forward", self._forward_with_detail)
         module.on_train_batch_end_hooks.append(lambda *_: self._detail.step())
 
-    def _begin(self) -> Attachment:
-        done, settings = self._module.trainer.global_step, self._settings
+    def _attach(self) -> Attachment:
+        steps_done, settings = self._module.trainer.global_step, self._settings
         threshold = getattr(self._density, "densify_grad_threshold", None)
-        warn_of_unread_score(self._conductor, self._density, threshold)
-        warn_of_early_end(self._conductor, getattr(self._density, "densify_until_iter", None), "densify_until_iter")
-        model = self._module.gaussian_model
-        self._detail = Detail(self._leaves)
-        self._eye = Eye(model, _ROLES, self._leaves, self._detail if settings.detail else None, self._conductor)
+        warn_if_score_is_unused(self._conductor, self._density, threshold)
+        until = getattr(self._density, "densify_until_iter", None)
+        warn_if_densification_outlasts(self._conductor, until, "densify_until_iter")
+        self._detail = DetailFeature(self._host_params)
+        self._renderer = ModelRenderer(
+            self._module.gaussian_model, _ROLES, self._host_params, self._detail if settings.detail else None,
+            self._conductor,
+        )  # fmt: skip
         names = self._module.trainer.datamodule.dataparser_outputs.train_set.image_names
         attachment = Attachment(
-            self._conductor, self._eye.params, n_views=len(names), seed=settings.seed, threshold=threshold,
-            rows=lambda: self._detail.rows(self._conductor.state_dict),
+            self._conductor, self._renderer.params, n_views=len(names), seed=settings.seed, threshold=threshold,
+            poll_parents=lambda: self._detail.poll_parents(self._conductor.state_dict),
         )  # fmt: skip
-        if done:
-            _log.warning("resumed at step %d: f_det and what strategies remember of Gaussians begin anew.", done)
-            attachment.t = done + 1
+        if steps_done:
+            _log.warning(
+                "resumed at step %d: f_det and the strategies' per-Gaussian state start again from zero.", steps_done
+            )
+            attachment.t = steps_done + 1
         return attachment
 
-    def _leaves(self) -> dict[str, Tensor]:
+    def _host_params(self) -> dict[str, Tensor]:
         gaussians = self._module.gaussian_model.gaussians
-        return {name: gaussians[own] for name, own in _NAMES.items()}
+        return {name: gaussians[host_name] for name, host_name in _NAMES.items()}
 
     def _training_step(self, original: Callable[..., Any], batch: Any, *args: Any, **kwargs: Any) -> Any:
-        _, (name, image, masked), _ = batch
-        self._image = name, image
+        _, (name, image, mask), _ = batch
+        self._photo = name, image
         if self.attachment is None:
-            self.attachment = self._begin()
-        if masked is not None:
-            self._eye.say("masks are for the photographs alone: SR pictures are compared as a whole.")
+            self.attachment = self._attach()
+        if mask is not None:
+            self._renderer.warn_once("masks apply to the photos only: SR images are compared as a whole.")
         return original(batch, *args, **kwargs)
 
     def _training_forward(
@@ -151,36 +160,42 @@ class Attached:
         *args: Any,
         **kwargs: Any,
     ) -> Any:
-        if self.attachment is None or self._image is None:
+        if self.attachment is None or self._photo is None:
             return original(step, module, viewpoint_camera, pc, *args, **kwargs)
-        of = self._view(viewpoint_camera, *self._image)
+        current = self._view(viewpoint_camera, *self._photo)
 
-        def draw(which: Which, gate: Tensor | None) -> Drawing:
-            camera = enlarged(viewpoint_camera, of.factor) if which == "hr" else viewpoint_camera
-            return self._eye.draw(
-                lambda model: original(step, module, camera, model, *args, **kwargs), of, which, gate, _unit
+        def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
+            camera = enlarged_camera(viewpoint_camera, current.factor) if resolution == "hr" else viewpoint_camera
+            return self._renderer.render(
+                lambda model: original(step, module, camera, model, *args, **kwargs),
+                current,
+                resolution,
+                gate,
+                _to_pixels,
             )
 
-        return self.attachment.draw(of, draw)
+        return self.attachment.render_view(current, render_at)
 
-    def _shown(self, original: Callable[..., Any], viewpoint_camera: Any, pc: Any, *args: Any, **kwargs: Any) -> Any:
-        """`forward`, with f_det where nothing is trained."""
-        looked_at = pc is self._module.gaussian_model and not torch.is_grad_enabled()
-        model = self._eye.whole() if looked_at and self.attachment is not None else pc
+    def _forward_with_detail(
+        self, original: Callable[..., Any], viewpoint_camera: Any, pc: Any, *args: Any, **kwargs: Any
+    ) -> Any:
+        """`forward`, with f_det in renderings without gradients."""
+        evaluated = pc is self._module.gaussian_model and not torch.is_grad_enabled()
+        model = self._renderer.with_detail() if evaluated and self.attachment is not None else pc
         return original(viewpoint_camera, model, *args, **kwargs)
 
     @torch.no_grad()
-    def _saving_detail(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """`save_gaussians`, with f_det in the colours of its files."""
+    def _save_with_detail(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """`save_gaussians` with f_det in the colours of its files."""
         if self.attachment is None:
             return original(*args, **kwargs)
-        colours = self._leaves()["sh0"]
-        trained = colours.clone()
-        colours += self._detail.offset(colours)
+        sh0 = self._host_params()["sh0"]
+        trained = sh0.clone()
+        sh0 += self._detail.offset(sh0)
         try:
             return original(*args, **kwargs)
         finally:
-            colours.copy_(trained)
+            sh0.copy_(trained)
 
     def _view(self, camera: Any, name: str, image: Float[Tensor, "3 h w"]) -> View:
         if name not in self._views:
@@ -191,12 +206,18 @@ class Attached:
         return self._views[name]
 
 
-def _unit(result: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Gsplat's renderers keep centres in pixels, and say so by giving the way to NDC."""
+def _sr_images(settings: ClearDensityController) -> SuperResolve | None:
+    from clear_strategies.data.priors import Images
+
+    return None if settings.sr is None else Images(settings.sr, settings.suffix)
+
+
+def _to_pixels(result: Mapping[str, Any]) -> tuple[float, float] | None:
+    """The host's gsplat renderers keep centres in pixels; their results then hold a factor from pixels to NDC."""
     return (1.0, 1.0) if result.get("viewspace_points_grad_scale") is not None else None
 
 
 def _replace(owner: Any, name: str, replacement: Callable[..., Any]) -> None:
-    """The method of this object, by one that is given the original first."""
+    """Replace a method of this object; the replacement gets the original as its first argument."""
     original = getattr(owner, name)
     setattr(owner, name, functools.wraps(original)(functools.partial(replacement, original)))

@@ -1,10 +1,19 @@
-"""Splats and a camera in, an image and its transpose out. Usable alone: knows nothing of strategies."""
+"""Rasterizers for Gaussian splats: an image from splats and a camera, and the splats' gradients from the image's.
+
+`load(name)` builds one of the backends of this package. A third party's rasterizer needs no registration: it implements
+`interface.Rasterizer`, passes `testing.check_rasterizer`, and is configured by its path like a strategy,
+`rasterizer._target_=my_package.MyRasterizer`. `rasterizers.interface` lists the steps. The same works for the classes of
+this package: `_target_: rasterizers.cpp.CppRasterizer`.
+
+This package does not depend on `clear_strategies`.
+"""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import fields
+from typing import Any, Final
 
 import torch
 
@@ -35,26 +44,27 @@ __all__ = [
     "load",
 ]
 
-# name -> module that defines `create(**settings)`. A backend imports its library only when it is created, so listing one
-# here costs nothing.
-_BACKENDS: dict[str, str] = {
-    "cpp": "rasterizers.cpp",
-    "torch": "rasterizers.reference",
-    "warp": "rasterizers.warp_backend",
-    "gsplat": "rasterizers.gsplat_backend",
+# The module and the class of each backend. A backend imports its library only when it is constructed.
+_BACKENDS: Final[dict[str, tuple[str, str]]] = {
+    "cpp": ("rasterizers.cpp", "CppRasterizer"),
+    "torch": ("rasterizers.reference", "ReferenceRasterizer"),
+    "warp": ("rasterizers.warp_backend", "WarpRasterizer"),
+    "gsplat": ("rasterizers.gsplat_backend", "GsplatRasterizer"),
 }
-_ON_CUDA = ("warp", "gsplat")
+_ON_CUDA: Final = ("warp", "gsplat")
 
 
 def load(name: str = "auto", *, preset: str | None = None, **settings: Any) -> Rasterizer:
-    """The rasterizer called `name` ("auto": the fastest that runs here).
+    """One of this package's backends.
 
-    `settings` are the fields of `RasterSettings`, plus whatever a backend documents of its own; they win over those of
-    the `preset`, see `PRESETS`.
+    Args:
+        name: "cpp", "torch", "warp", "gsplat", or "auto" for the fastest that runs on this machine.
+        preset: cut-offs by name, see `PRESETS`.
+        settings: the fields of `RasterSettings`, and those that the backend adds. They override the preset.
 
     Raises:
-        BackendUnavailable: it cannot run here; the message says why and what to do.
-        ValueError: no backend, or no preset, has that name.
+        BackendUnavailable: the backend cannot run on this machine; the message says why and what to do.
+        ValueError: there is no such backend, preset or setting, or a setting is out of range.
     """
     if preset is not None:
         if preset not in PRESETS:
@@ -64,21 +74,27 @@ def load(name: str = "auto", *, preset: str | None = None, **settings: Any) -> R
         name = fastest()
     if name not in _BACKENDS:
         raise ValueError(f"unknown rasterizer {name!r}; choose one of auto, {', '.join(_BACKENDS)}.")
-    rasterizer: Rasterizer = importlib.import_module(_BACKENDS[name]).create(**settings)
+    module, kind = _BACKENDS[name]
+    backend = getattr(importlib.import_module(module), kind)
+    known = [f.name for f in fields(backend) if f.init]
+    unknown = sorted(set(settings) - set(known))
+    if unknown:
+        raise ValueError(f"unknown rasterizer setting {unknown[0]!r}; known are {', '.join(known)}.")
+    rasterizer: Rasterizer = backend(**settings)
     return rasterizer
 
 
 def fastest(device: str | None = None) -> str:
-    """The name that "auto" stands for here.
+    """The name of the fastest backend on this machine.
 
     Args:
-        device: "cpu" or "cuda", where the splats lie; None: wherever drawing is fastest.
+        device: "cpu" or "cuda", where the splats' tensors are; None: any.
     """
-    return next(name for name, drawing in _running() if device is None or device in drawing.traits.devices)
+    return next(name for name, backend in _runnable() if device is None or device in backend.traits.devices)
 
 
-def _running() -> Iterator[tuple[str, Rasterizer]]:
-    """Those that run here, fastest first; none is loaded before it is asked for."""
+def _runnable() -> Iterator[tuple[str, Rasterizer]]:
+    """The backends that run on this machine, fastest first; each is loaded when the iterator reaches it."""
     for name in _fastest_first():
         try:
             yield name, load(name)
@@ -87,7 +103,7 @@ def _running() -> Iterator[tuple[str, Rasterizer]]:
 
 
 def available() -> dict[str, str | None]:
-    """Every backend by name, fastest first; the value is None, or the reason why it cannot run here."""
+    """Every backend by name, fastest first; the value is None, or why the backend cannot run on this machine."""
     reasons: dict[str, str | None] = {}
     for name in _fastest_first():
         try:
@@ -99,5 +115,5 @@ def available() -> dict[str, str | None]:
 
 
 def _fastest_first() -> list[str]:
-    """Those that draw on CUDA win where there is CUDA; without it they can at most be checked, and come last."""
+    """The CUDA backends come first where there is CUDA; without it they run slowly or not at all, and come last."""
     return sorted(_BACKENDS, key=lambda name: (name in _ON_CUDA) != torch.cuda.is_available())

@@ -1,7 +1,7 @@
-"""Rasterizers as torch functions: for trainers that speak autograd, and for gsplat's, whose own kernels need CUDA.
+"""Rasterizers as differentiable torch functions.
 
-`draw` is a rendering in the graph of its splats; `rasterization` is that behind gsplat's signature, so that a loop
-written for gsplat runs on a CPU. One cotangent a backward pass: whoever wants several at once calls `Rendering.vjp`.
+`draw` returns a rendering that is part of the autograd graph. `rasterization` has the signature of gsplat's function, so
+that a loop written for gsplat runs on a CPU. Each backward pass handles one cotangent; `Rendering.vjp` handles several.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from rasterizers.interface import Camera, Rasterizer, Splats
 
 
 class Drawn(NamedTuple):
-    """A picture in the graph of its splats.
+    """An image in the autograd graph of its splats.
 
     Args:
-        means2d: projected centres, pixels. Beside the way that gradients take: after `backward()` its `.grad` is ∇_u in
-            1/pixel, and nothing flows on from it (the positions' gradient is whole without it).
+        means2d: projected centres, pixels. After `backward()` its `.grad` is the screen gradient in 1/pixel; the gradient
+            of the positions does not pass through it.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -33,10 +33,10 @@ class Drawn(NamedTuple):
 
 
 def draw(rasterizer: Rasterizer, splats: Splats, camera: Camera, means2d: Tensor | None = None) -> Drawn:
-    """Draw the splats; the gradient of the image, not that of alpha, reaches their tensors.
+    """Draw the splats. Gradients flow from the image to the splats' tensors; alpha is not differentiable.
 
     Args:
-        means2d: where to put the projected centres and to collect their gradient; None makes a leaf for it.
+        means2d: a tensor that receives the projected centres and whose `.grad` will be the screen gradient; None makes one.
     """
     if means2d is None:
         means2d = splats.means.new_zeros(len(splats), 2).requires_grad_()
@@ -61,8 +61,8 @@ class _Draw(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> Any:
         g = ctx.rendering.vjp(cotangents[0][None])
-        pulled = (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN)
-        return None, None, g.screen[0], g.rgb[0] if ctx.offset else None, *(x[0] for x in pulled)
+        gradients = (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN)
+        return None, None, g.screen[0], g.rgb[0] if ctx.offset else None, *(x[0] for x in gradients)
 
 
 def rasterization(
@@ -86,20 +86,20 @@ def rasterization(
     backend: str = "auto",
     **ignored: Any,
 ) -> tuple[Float[Tensor, "C H W 3"], Float[Tensor, "C H W 1"], dict[str, Any]]:
-    """The `rasterization` of gsplat, drawn by ours: pinhole cameras, RGB, on the CPU.
+    """Stands in for gsplat's `rasterization` with a backend of this package: pinhole cameras, RGB.
 
     Args:
-        colors: [N, K, 3] spherical harmonics of which `sh_degree` says how many are active, or [N, 3] RGB where it is None.
-        packed: no effect, `info` is always the unpacked one (a strategy is told `packed=False`). ignored: whatever else
-            gsplat takes (sparse_grad, tile_size, far_plane …), without effect.
-        backend: a name that `rasterizers.load` knows.
+        colors: [N, K, 3] spherical harmonics with `sh_degree` the active degree, or [N, 3] RGB if `sh_degree` is None.
+        packed: has no effect; `info` is always unpacked.
+        ignored: gsplat's other arguments (sparse_grad, tile_size, far_plane …) have no effect.
+        backend: a name of `rasterizers.load`.
 
     Returns:
-        images, alphas (not differentiable), and what gsplat's strategies read: `means2d` [C, N, 2] (`retain_grad` works,
-        as there), `radii` [C, N, 2] (1 for the visible, 0 for the others), `width`, `height`, `n_cameras`, `gaussian_ids`.
+        images, alphas (not differentiable), and what gsplat's strategies read: `means2d` [C, N, 2] (`retain_grad` works),
+        `radii` [C, N, 2] (1 for the visible, 0 for the others), `width`, `height`, `n_cameras`, `gaussian_ids`.
 
     Raises:
-        ValueError: a mode that only gsplat has.
+        ValueError: a mode that only gsplat supports.
     """
     if render_mode != "RGB" or rasterize_mode not in ("classic", "antialiased") or absgrad:
         raise ValueError(

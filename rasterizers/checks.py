@@ -1,41 +1,21 @@
-"""What every backend asks of its input, said in the same words, and what several do with it."""
+"""Checks and helpers that several backends share, so that all refuse bad input with the same messages."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.interface import Camera, RasterSettings, Splats
-
-Settings = TypeVar("Settings", bound=RasterSettings)
-
-
-def build(kind: type[Settings], settings: Mapping[str, Any]) -> Settings:
-    """A backend from its settings, the fields of `kind`.
-
-    Raises:
-        ValueError: a setting that it does not have, or that is out of range.
-    """
-    known = [f.name for f in fields(kind) if f.init]
-    unknown = sorted(set(settings) - set(known))
-    if unknown:
-        raise ValueError(f"unknown rasterizer setting {unknown[0]!r}; known are {', '.join(known)}.")
-    chosen = dict(settings)
-    if "background" in chosen:
-        chosen["background"] = tuple(float(c) for c in chosen["background"])
-    return kind(**chosen)
+from rasterizers.interface import Camera, Splats
 
 
 def require_finite(splats: Splats) -> None:
-    """NaN or infinity is named here, not found later as a hole in the picture. One reduction a tensor.
+    """Refuse NaN and infinity, which would leave holes in the image. Costs one reduction per tensor.
 
     Raises:
-        ValueError: names the tensor and the first Gaussian.
+        ValueError: names the tensor and the first such Gaussian.
     """
     for field in fields(splats):
         value = getattr(splats, field.name)
@@ -48,10 +28,10 @@ def require_finite(splats: Splats) -> None:
 
 
 def require_cotangents(cotangents: Tensor, image: Tensor) -> None:
-    """Cotangents are [K, H, W, 3] for the image they belong to.
+    """Refuse cotangents that are not [K, H, W, 3] for an image [H, W, 3].
 
     Raises:
-        ValueError: they are not.
+        ValueError: they have another shape.
     """
     expected = tuple(image.shape)
     if cotangents.dim() != 4 or tuple(cotangents.shape[1:]) != expected:
@@ -59,10 +39,10 @@ def require_cotangents(cotangents: Tensor, image: Tensor) -> None:
 
 
 def require_tiles(tiles: Tensor, width: int, height: int, tile: int) -> None:
-    """A demand mask has one entry per tile.
+    """Refuse a tile mask that does not have one entry per tile.
 
     Raises:
-        ValueError: it has not.
+        ValueError: it has another shape.
     """
     rows, columns = -(-height // tile), -(-width // tile)
     if tuple(tiles.shape) != (rows, columns):
@@ -72,18 +52,18 @@ def require_tiles(tiles: Tensor, width: int, height: int, tile: int) -> None:
         )
 
 
-def shares(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
-    """Whether two jobs see the same Gaussians from the same pose; opacities and offsets may differ."""
+def same_gaussians_and_pose(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
+    """Whether two jobs draw the same tensor objects from the same pose; opacities and offsets may differ."""
     (a, from_a), (b, from_b) = first, other
     same = all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
     return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
 
 
-def spread(mask: Bool[Tensor, "h w"], times: int, height: int, width: int) -> Bool[Tensor, "H W"]:
-    """A mask on a grid `times` as fine, which ends where the image does."""
-    return mask.repeat_interleave(times, 0).repeat_interleave(times, 1)[:height, :width]
+def refine_mask(mask: Bool[Tensor, "h w"], factor: int, height: int, width: int) -> Bool[Tensor, "H W"]:
+    """The mask on a grid that is `factor` times finer, cropped to `height` by `width`."""
+    return mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)[:height, :width]
 
 
 def packed_rows(shN: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
-    """Rows may lie apart (a view of the active bands), but each must be contiguous."""
+    """The tensor with contiguous rows. A view of the active bands has gaps between its rows, and is returned as it is."""
     return shN if shN.numel() == 0 or shN.stride()[1:] == (3, 1) else shN.contiguous()

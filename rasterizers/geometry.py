@@ -1,4 +1,4 @@
-"""What every backend and every trainer agrees on: rotations from quaternions, and spherical harmonics."""
+"""Conventions that all backends and the trainer share: rotations from quaternions, and spherical harmonics."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ SH_C0: Final = 0.28209479177387814
 
 
 def rotation_matrix(quats: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
-    """Quaternions (wxyz, any length) to rotations; the zero quaternion is the identity, with zero gradient."""
+    """Rotation matrices of quaternions (wxyz, any norm); the zero quaternion gives the identity and zero gradient."""
     largest = quats.detach().abs().amax(-1, keepdim=True)
     identity = torch.zeros_like(quats)
     identity[:, 0] = 1
-    # Scaled by the largest component first: |q|² neither overflows nor underflows (STRESS row 16).
+    # Divided by the largest component first, so that |q|² neither overflows nor underflows.
     q = torch.where(largest > 0, quats / largest.clamp_min(torch.finfo(quats.dtype).tiny), identity)
     w, x, y, z = (q / torch.linalg.vector_norm(q, dim=-1, keepdim=True)).unbind(-1)
     return torch.stack(
@@ -31,7 +31,7 @@ def rotation_matrix(quats: Float[Tensor, "M 4"]) -> Float[Tensor, "M 3 3"]:
 
 
 def spherical_harmonics(directions: Float[Tensor, "M 3"], bands: int) -> Float[Tensor, "M B1"]:
-    """Y: the constant band and `bands` more (0, 3, 8 or 15), real, with the signs that 3DGS stores.
+    """Real spherical harmonics Y: the constant band and `bands` more (0, 3, 8 or 15), with the signs of 3DGS.
 
     Raises:
         ValueError: `bands` is none of these.

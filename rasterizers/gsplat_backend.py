@@ -1,26 +1,25 @@
-"""gsplat's CUDA kernels behind the interface: to train on what the ecosystem trains on, and to measure against it.
+"""The backend "gsplat": gsplat's CUDA kernels, for training with them and for comparison.
 
-Its own autograd does the transpose, one pass for each cotangent, and its cut-offs are its own (alpha 1/255 to 0.999,
-transmittance 1e-4); sums are made by atomics, so two runs differ in their last bits. Not yet run on a GPU here.
+The VJP is gsplat's autograd, one pass per cotangent. gsplat's cut-offs are fixed (alpha 1/255 to 0.999, transmittance
+1e-4). It sums by atomics, so two runs differ in their last bits. Not yet tested on a GPU.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Final
+from dataclasses import dataclass
+from typing import Any, Final
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import build, require_cotangents, require_finite, require_tiles, spread
+from rasterizers.checks import refine_mask, require_cotangents, require_finite, require_tiles
 from rasterizers.geometry import SH_C0, spherical_harmonics
 from rasterizers.interface import (
     BackendUnavailable,
     Camera,
-    Rasterizer,
     RasterSettings,
     Rendering,
     SplatGradients,
@@ -28,16 +27,10 @@ from rasterizers.interface import (
     Traits,
 )
 
-_OWN: Final = {"alpha_min": 1 / 255, "alpha_max": 0.99, "transmittance_min": 1e-4}  # what "default" is called here
+_FIXED: Final = {"alpha_min": 1 / 255, "alpha_max": 0.99, "transmittance_min": 1e-4}  # the defaults of RasterSettings
 
 
-def create(**settings: Any) -> Rasterizer:
-    """The backend called "gsplat"; `settings` are the fields of `RasterSettings`.
-
-    Raises:
-        BackendUnavailable: gsplat is not installed, or there is no CUDA.
-        ValueError: a cut-off other than the default, which gsplat does not let one choose.
-    """
+def _gsplat_rasterization() -> Callable[..., Any]:
     try:
         from gsplat.rendering import rasterization
     except ImportError as error:
@@ -48,41 +41,45 @@ def create(**settings: Any) -> Rasterizer:
         raise BackendUnavailable(
             "the gsplat rasterizer draws on CUDA only, and torch finds no CUDA device; cpp draws on a CPU."
         )
-    return build(GsplatRasterizer, {"rasterization": rasterization, **settings})
+    found: Callable[..., Any] = rasterization
+    return found
 
 
 @dataclass(frozen=True, slots=True)
 class GsplatRasterizer(RasterSettings):
-    """gsplat's `rasterization`, or a function of its shape.
+    """gsplat's `rasterization` as a rasterizer.
 
     Args:
-        device: where the splats' tensors lie.
+        device: where the splats' tensors are.
+        rasterization: a function with the signature of gsplat's, for tests; None: gsplat's own.
+
+    Raises:
+        BackendUnavailable: gsplat is not installed, or there is no CUDA.
+        ValueError: a setting is out of range, or a cut-off is not the default, which gsplat cannot change.
     """
 
-    rasterization: Callable[..., Any] = field(kw_only=True)
     device: str = "cuda"
-
-    dtypes: ClassVar[frozenset[torch.dtype]] = frozenset({torch.float32})
+    rasterization: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:
         RasterSettings.__post_init__(self)
-        for name, own in _OWN.items():
-            if getattr(self, name) != own:
+        for name, fixed in _FIXED.items():
+            if getattr(self, name) != fixed:
                 raise ValueError(
-                    f"gsplat's cut-offs cannot be chosen; {name} must stay {own:g}, got {getattr(self, name):g}."
+                    f"gsplat's cut-offs cannot be chosen; {name} must stay {fixed:g}, got {getattr(self, name):g}."
                 )
+        if self.rasterization is None:
+            _gsplat_rasterization()
 
     @property
     def traits(self) -> Traits:
-        return Traits(
-            frozenset({self.device}), self.dtypes, shared_pass=False, shared_scales=False, deterministic=False
-        )
+        return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}))
 
     def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> GsplatRendering:
         """Draw.
 
         Raises:
-            ValueError: the splats lie elsewhere, are not float32 or not finite; or the tile mask has another shape.
+            ValueError: the splats are on another device, not float32 or not finite, or the tile mask has a wrong shape.
         """
         if tiles is not None:
             require_tiles(tiles, camera.width, camera.height, self.tile)
@@ -96,12 +93,12 @@ class GsplatRasterizer(RasterSettings):
             leaves = {name: getattr(splats, name).detach().requires_grad_() for name in names}
             offset = splats.means.new_zeros(len(splats), 3) if splats.rgb_offset is None else splats.rgb_offset.detach()
             leaves["rgb"] = offset.clone().requires_grad_()
-            still = torch.zeros_like(leaves["quats"])
-            still[:, 0] = 1  # a zero quaternion is the identity and gets no gradient
-            quats = torch.where(leaves["quats"].abs().amax(-1, keepdim=True) > 0, leaves["quats"], still)
+            identity = torch.zeros_like(leaves["quats"])
+            identity[:, 0] = 1  # a zero quaternion is the identity and gets no gradient
+            quats = torch.where(leaves["quats"].abs().amax(-1, keepdim=True) > 0, leaves["quats"], identity)
             base = leaves["sh0"] + leaves["rgb"][:, None] / SH_C0
             K = splats.means.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-            images, alphas, info = self.rasterization(
+            images, alphas, info = (self.rasterization or _gsplat_rasterization())(
                 leaves["means"], quats, leaves["scales"], leaves["opacities"], torch.cat((base, leaves["shN"]), 1),
                 camera.world_to_camera.to(splats.means)[None], K[None], camera.width, camera.height,
                 near_plane=self.near, eps2d=self.kernel, sh_degree=math.isqrt(splats.shN.shape[1] + 1) - 1, packed=False,
@@ -110,31 +107,34 @@ class GsplatRasterizer(RasterSettings):
             )  # fmt: skip
         radii = info["radii"][0]
         visible = (radii > 0).all(-1) if radii.dim() == 2 else radii > 0
-        asked = None if tiles is None else spread(tiles, self.tile, camera.height, camera.width)[..., None]
-        image = images[0] if asked is None else torch.where(asked, images[0], images[0].new_tensor(self.background))
+        requested = None if tiles is None else refine_mask(tiles, self.tile, camera.height, camera.width)[..., None]
+        image = (
+            images[0] if requested is None else torch.where(requested, images[0], images[0].new_tensor(self.background))
+        )
         direction = torch.nn.functional.normalize(splats.means.detach() - camera.center.to(splats.means), dim=-1)
         basis = spherical_harmonics(direction, splats.shN.shape[1])
         alpha = alphas[0, ..., 0].detach()
-        alpha = alpha if asked is None else alpha * asked[..., 0]
+        alpha = alpha if requested is None else alpha * requested[..., 0]
         return GsplatRendering(
             image.detach(), alpha, info["means2d"].detach()[0], visible, images, {**leaves, "screen": info["means2d"]},
-            basis, asked,
+            basis, requested,
         )  # fmt: skip
 
     def render_scales(
         self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
     ) -> list[Rendering]:
-        """One after the other: nothing is shared."""
+        """Draws the jobs one after the other; nothing is shared."""
         masks = [None] * len(jobs) if tiles is None else tiles
         return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GsplatRendering:
-    """A picture and its transpose, by gsplat's graph.
+    """An image, and its VJP through gsplat's autograd graph.
 
     Args:
-        drawn: [1, H, W, 3], in the graph of `leaves`. asked: pixels of the demand mask, None: all.
+        drawn: [1, H, W, 3], in the graph of `leaves`.
+        requested: the pixels of the tile mask; None: all.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -144,19 +144,19 @@ class GsplatRendering:
     drawn: Float[Tensor, "1 H W 3"]
     leaves: dict[str, Tensor]
     basis: Float[Tensor, "N B1"]
-    asked: Bool[Tensor, "H W 1"] | None
+    requested: Bool[Tensor, "H W 1"] | None
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         require_cotangents(cotangents, self.image)
-        pulled = []
-        for cotangent in cotangents if self.asked is None else cotangents * self.asked:
-            gradients = torch.autograd.grad(
+        gradients = []
+        for cotangent in cotangents if self.requested is None else cotangents * self.requested:
+            found = torch.autograd.grad(
                 self.drawn, list(self.leaves.values()), cotangent[None], retain_graph=True, materialize_grads=True
             )
-            pulled.append(dict(zip(self.leaves, gradients, strict=True)))
+            gradients.append(dict(zip(self.leaves, found, strict=True)))
 
         def of(name: str) -> Tensor:
-            return torch.stack([g[name] for g in pulled])
+            return torch.stack([g[name] for g in gradients])
 
         return SplatGradients(
             of("means"), of("quats"), of("scales"), of("opacities"), of("screen")[:, 0], of("rgb"), self.basis

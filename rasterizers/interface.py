@@ -1,7 +1,15 @@
-"""The contract between splats and pictures: what goes in, what comes out, and how gradients come back.
+"""The interface of a rasterizer: its inputs, its output, and how gradients come back.
 
-Everything else in this package implements it; nothing here knows an implementation. A rasterizer maps
-`Splats` and a `Camera` to a `Rendering`, and the rendering carries its own transpose: `rendering.vjp`.
+A `Rasterizer` maps `Splats` and a `Camera` to a `Rendering`; `rendering.vjp` maps gradients of the image to gradients of
+the splats. Every backend in this package implements this interface, and so can a third party:
+
+1. Write a class whose constructor takes the fields of `RasterSettings` by keyword. A frozen dataclass that inherits from
+   `RasterSettings` gets them, their defaults and their checks; it may add settings of its own. Raise `BackendUnavailable`
+   in the constructor if the class cannot run on this machine.
+2. Implement the members of `Rasterizer`, and return objects with the members of `Rendering`.
+3. Run `rasterizers.testing.check_rasterizer(MyRasterizer)`.
+4. Use it by its path, like a strategy: `rasterizer._target_=my_package.MyRasterizer`, or a file `rasterizer/mine.yaml` in
+   a Hydra config folder with `_target_` and the settings that differ from the class's defaults.
 """
 
 from __future__ import annotations
@@ -18,7 +26,7 @@ from torch import Tensor
 
 
 class BackendUnavailable(RuntimeError):
-    """A rasterizer that cannot run here. The message says why, and what would make it run."""
+    """A backend that cannot run on this machine. The message says why, and what to install."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +70,7 @@ class Camera:
         return -rotation.T @ translation
 
     def scaled(self, factor: float) -> Camera:
-        """The same ray bundle on another pixel grid: C^v at LR is C^v at HR, `scaled(1 / 4)`.
+        """The same camera with `factor` times the resolution: the LR camera is the HR camera, `scaled(1 / 4)`.
 
         Raises:
             ValueError: the image size times `factor` is not a whole number of pixels.
@@ -86,7 +94,7 @@ class Camera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Splats:
-    """Gaussians ready to be drawn: activations applied, nothing learnable left.
+    """Gaussians after their activations, as rasterizers draw them.
 
     Args:
         quats: wxyz, any norm > 0 (a zero quaternion is drawn as the identity and gets no gradient).
@@ -112,10 +120,11 @@ class Splats:
 class SplatGradients:
     """K gradients with respect to the tensors of `Splats`, and to the projected centres.
 
-    A view's colour gradient is rank one, ∇_SH = Y ⊗ ∇_rgb: the factors are kept, `sh0` and `shN` expand.
+    A view's gradient of the spherical harmonics has rank one, ∇_SH = Y ⊗ ∇_rgb. The factors are stored, and `sh0` and `shN`
+    multiply them.
 
     Args:
-        screen: with respect to the projected centre, in 1/pixel.
+        screen: the screen gradient, with respect to the projected centre, in 1/pixel.
         rgb: with respect to the colour before its clamp; also the gradient of `rgb_offset`.
         basis: Y, the spherical harmonics of this view's directions.
     """
@@ -139,7 +148,7 @@ class SplatGradients:
 
 @runtime_checkable
 class Rendering(Protocol):
-    """A picture and its transpose."""
+    """An image, and the VJP that maps its gradients to those of the splats."""
 
     @property
     def image(self) -> Float[Tensor, "H W 3"]: ...
@@ -149,74 +158,80 @@ class Rendering(Protocol):
 
     @property
     def means2d(self) -> Float[Tensor, "N 2"]:
-        """u_i = π(μ_i), in pixels; finite for every Gaussian, meaningful for the visible ones."""
+        """Projected centres, in pixels: finite for every Gaussian, meaningful for the visible ones."""
         ...
 
     @property
     def visible(self) -> Bool[Tensor, " N"]:
-        """Could touch at least one pixel of the image."""
+        """Whether the Gaussian may contribute to a pixel of the image."""
         ...
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
-        """Pull K image cotangents back to the splats, in one traversal where the backend can."""
+        """The gradients of the splats for K gradients of the image (cotangents), in one pass where the backend can.
+
+        Backends may read the splats' tensors again: call this before they are changed in place.
+        """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Traits:
-    """What a backend can do, as data: tests, configuration and the trainer read it.
+    """What a backend supports, for the trainer, the benchmark and the tests.
 
     Args:
-        shared_pass: K cotangents cost one traversal (else a loop, still correct).
-        shared_scales: `render_scales` reuses projection, colours and depth order.
-        deterministic: bitwise equal on repetition.
-        own_threads: computes on threads of its own (`rasterizers.native`), not on torch's.
+        devices: "cpu", "cuda" or both: where the splats' tensors may be.
+        dtypes: the types that the splats' tensors may have.
+        native_threads: it computes on the threads of `rasterizers.native`, not on torch's.
     """
 
     devices: frozenset[str]
     dtypes: frozenset[torch.dtype]
-    shared_pass: bool
-    shared_scales: bool
-    deterministic: bool
-    own_threads: bool = False
+    native_threads: bool = False
 
 
 @runtime_checkable
 class Rasterizer(Protocol):
-    """Draws splats. Implementations share the names of their settings, see `RasterSettings`."""
+    """Draws splats. All backends share the settings of `RasterSettings`."""
 
     @property
     def traits(self) -> Traits: ...
 
     def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
-        """Draw; tiles not asked for show the background, and `vjp` honours the mask."""
+        """Draw the splats.
+
+        Args:
+            tiles: the mask of requested tiles; the others show the background and send no gradient. None requests all.
+        """
         ...
 
     @property
     def tile(self) -> int:
-        """Edge of the demand mask's square tiles, px."""
+        """Edge of the square tiles of the tile mask, px."""
         ...
 
     def render_scales(
         self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
     ) -> list[Rendering]:
-        """Draw several pixel grids of one camera centre, sharing whatever `is` the same tensor; a demand mask for each."""
+        """Draw several resolutions from one pose, each with its tile mask.
+
+        Backends may share work between jobs whose splats hold the same tensor objects.
+        """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class RasterSettings:
-    """The numbers every backend understands.
+    """The settings of every backend.
 
     Args:
         kernel: variance of the 2D Mip kernel, px² (Mip-Splatting: 0.1).
-        near: Gaussians are drawn from this depth on, world units.
-        alpha_min: a contribution below it is not blended (1/255: everyone's default).
+        near: smallest depth at which a Gaussian is drawn, world units.
+        alpha_min: a contribution below it is not blended (1/255: the usual default).
         alpha_max: cap on a single contribution, in (0, 1).
-        transmittance_min: a pixel is finished before its transmittance falls below it.
-        tile: edge of the square tiles of the demand mask, px.
+        transmittance_min: a pixel ends before its transmittance falls below it.
+        tile: edge of the square tiles of the tile mask, px.
         background: RGB in [0, 1].
-        antialiased: scale the opacity so that the 2D kernel keeps a splat's total (Mip-Splatting).
+        antialiased: scale the opacity to make up for the blur of the 2D kernel (Mip-Splatting).
 
     Raises:
         ValueError: a number is outside the range above.
@@ -244,6 +259,7 @@ class RasterSettings:
             raise ValueError(f"transmittance_min must lie in [0, 1), got {self.transmittance_min}.")
         if self.tile < 1:
             raise ValueError(f"tile must be at least 1 pixel, got {self.tile}.")
+        object.__setattr__(self, "background", tuple(float(c) for c in self.background))  # any sequence, e.g. Hydra's
         if len(self.background) != 3 or not all(0 <= c <= 1 for c in self.background):
             raise ValueError(f"background must be three numbers in [0, 1], got {self.background}.")
 
@@ -255,8 +271,8 @@ PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
         "exact": MappingProxyType({"alpha_min": 1e-7, "transmittance_min": 1e-9}),
     }
 )
-"""Cut-offs by name, coarsest first. They, not the arithmetic, decide how far gradients are from those without cut-offs.
+"""Cut-offs by name, coarsest first. The error of the gradients is due to the cut-offs, not to the arithmetic.
 
-"fast" is everyone's default: gradients are off by some 3 %. "accurate" is ten times closer for a fifth more time. At
-"exact" float32 itself is what remains, for numeric tests.
+"fast", the default, has gradients that are off by about 3 %. "accurate" has a tenth of that error for a fifth more time.
+At "exact", for numeric tests, only the rounding of float32 remains.
 """

@@ -1,9 +1,10 @@
-"""The contract of a rasterizer, as checks that any implementation can run, ours or a third party's.
+"""Checks of the `Rasterizer` interface for any implementation, this package's or a third party's.
 
     from rasterizers.testing import check_rasterizer
-    check_rasterizer(lambda **settings: MyRasterizer(**settings))
+    check_rasterizer(MyRasterizer)
 
-Each check raises `ContractError` with what was expected and what was found.
+`check_rasterizer` builds it with fields of `RasterSettings` by keyword, as `_target_` does. Each check raises
+`ContractError` with the expected and the found value.
 """
 
 from __future__ import annotations
@@ -22,29 +23,29 @@ from rasterizers.reference import ReferenceRasterizer
 Make = Callable[..., Rasterizer]
 
 _ATTRIBUTES: Final = ("means", "quats", "scales", "opacities", "sh0", "shN", "rgb_offset")
-# Finite differences need a picture without cut-offs: each is a step.
+# Finite differences need an image without cut-offs, which are discontinuous.
 _SMOOTH: Final = {"alpha_min": 1e-9, "transmittance_min": 0.0, "alpha_max": 1 - 1e-6}
 
 
 class ContractError(AssertionError):
-    """An implementation does not do what the interface promises."""
+    """An implementation violates the interface."""
 
 
 def check_rasterizer(make: Make) -> None:
     """Run every check.
 
     Args:
-        make: builds the rasterizer from the fields of `RasterSettings`.
+        make: the class, or a function that builds the rasterizer from fields of `RasterSettings`.
 
     Raises:
-        ContractError: the first promise that does not hold.
+        ContractError: from the first check that fails.
     """
     for check in CHECKS:
         check(make)
 
 
 def check_gradients_are_finite_differences(make: Make) -> None:
-    """The transpose is the transpose: directional derivatives of every attribute."""
+    """The VJP agrees with finite differences along random directions, for every attribute."""
     rasterizer = make(background=(0.2, 0.5, 0.9), **_SMOOTH)
     dtype = _widest(rasterizer)
     splats, camera = scene(24, dtype=dtype, seed=1), _camera(40, 30)
@@ -69,7 +70,7 @@ def check_gradients_are_finite_differences(make: Make) -> None:
 
 
 def check_cotangents_together_equal_one_by_one(make: Make) -> None:
-    """K cotangents in one call are K calls with one."""
+    """One call with K cotangents equals K calls with one."""
     rasterizer = make()
     dtype = _widest(rasterizer)
     splats, camera = scene(60, dtype=dtype), _camera(48, 33)
@@ -83,14 +84,14 @@ def check_cotangents_together_equal_one_by_one(make: Make) -> None:
 
 
 def check_dropped_equals_absent(make: Make) -> None:
-    """Opacity 0: the same picture as without the Gaussian, invisible, and no gradient."""
+    """A Gaussian with opacity 0 is invisible and has no gradient, and the image is as without it."""
     rasterizer = make()
     dtype = _widest(rasterizer)
     splats, camera = scene(50, dtype=dtype), _camera(48, 33)
     kept = torch.arange(50) % 3 != 0
     gated = replace(splats, opacities=splats.opacities * kept)
     rendering, without = rasterizer(gated, camera), rasterizer(select(splats, kept), camera)
-    _close(rendering.image, without.image, 1e-6, "the picture")
+    _close(rendering.image, without.image, 1e-6, "the image")
     _require(not bool(rendering.visible[~kept].any()), "a dropped Gaussian counts as visible")
     v = torch.ones(1, 33, 48, 3, dtype=dtype)
     gradients, expected = rendering.vjp(v), without.vjp(v)
@@ -101,7 +102,7 @@ def check_dropped_equals_absent(make: Make) -> None:
 
 
 def check_nothing_to_draw(make: Make) -> None:
-    """No Gaussian, or none in view: the background, alpha 0, gradients of the right shape and 0."""
+    """With no Gaussian, or none in view: the background, alpha 0, and zero gradients of the right shape."""
     background = (0.1, 0.6, 0.3)
     rasterizer = make(background=background)
     dtype, camera = _widest(rasterizer), _camera(19, 11)
@@ -119,26 +120,31 @@ def check_nothing_to_draw(make: Make) -> None:
 
 
 def check_tile_mask(make: Make) -> None:
-    """Tiles asked for are as without a mask, the others show the background and send no gradient."""
+    """Requested tiles are as without a mask; the others show the background and send no gradient."""
     rasterizer = make(tile=8)
     dtype = _widest(rasterizer)
     splats, camera = scene(60, dtype=dtype), _camera(48, 33)
     mask = torch.rand(5, 6, generator=torch.Generator().manual_seed(4)) < 0.5
     pixels = mask.repeat_interleave(8, 0).repeat_interleave(8, 1)[:33, :48]
     full, partial = rasterizer(splats, camera), rasterizer(splats, camera, tiles=mask)
-    _close(partial.image[pixels], full.image[pixels], 1e-6, "pixels asked for")
-    _require(float(partial.image[~pixels].abs().max()) == 0, "pixels not asked for are not background")
+    _close(partial.image[pixels], full.image[pixels], 1e-6, "requested pixels")
+    _require(float(partial.image[~pixels].abs().max()) == 0, "pixels that were not requested are not background")
     v = torch.randn(1, 33, 48, 3, generator=torch.Generator().manual_seed(5)).to(dtype)
     found, expected = partial.vjp(v), full.vjp(v * pixels[None, :, :, None])
     for name in _ATTRIBUTES:
         _close(gradient_of(found, name), gradient_of(expected, name), 1e-5, f"the gradient of {name} under a mask")
     whole, masked = rasterizer.render_scales([(splats, camera.scaled(1 / 3)), (splats, camera)], [None, mask])
-    _close(whole.image, rasterizer(splats, camera.scaled(1 / 3)).image, 1e-6, "a scale drawn whole beside a masked one")
-    _close(masked.image, partial.image, 1e-6, "a scale under a mask of its own")
+    _close(
+        whole.image,
+        rasterizer(splats, camera.scaled(1 / 3)).image,
+        1e-6,
+        "an image without a mask, drawn together with a masked one",
+    )
+    _close(masked.image, partial.image, 1e-6, "an image with a mask, drawn together with another")
 
 
 def check_equal_depths_have_an_order(make: Make) -> None:
-    """Coincident depths are drawn by index, whatever the number of threads: the same picture, bit for bit."""
+    """Two renderings of Gaussians at one depth have the same bits."""
     rasterizer = make()
     dtype = _widest(rasterizer)
     splats = scene(40, dtype=dtype)
@@ -148,7 +154,7 @@ def check_equal_depths_have_an_order(make: Make) -> None:
 
 
 def check_agrees_with_the_reference(make: Make) -> None:
-    """Picture and gradients of the float64 reference, at the default cut-offs, for SH degrees 0 to 3."""
+    """Image and gradients agree with the reference in float64, at the default cut-offs, for SH degrees 0 to 3."""
     rasterizer = make()
     for bands in (0, 3, 8, 15):
         splats, camera = scene(300, bands=bands), _camera(65, 47)
@@ -159,11 +165,10 @@ def check_agrees_with_the_reference(make: Make) -> None:
         _require(float((error <= 5e-6).double().mean()) >= 0.999, f"{bands} bands: more than 0.1 % of values are off")
         _require(float(error.max()) <= 8e-3, f"{bands} bands: a value is off by {float(error.max()):.2g}")
         v = torch.randn(1, 47, 65, 3, generator=torch.Generator().manual_seed(6))
-        ours, truth = found.vjp(v.to(dtype)), exact.vjp(v.double())
+        gradients, expected = found.vjp(v.to(dtype)), exact.vjp(v.double())
         for name in (*_ATTRIBUTES, "screen"):
-            _close(
-                gradient_of(ours, name).double(), gradient_of(truth, name), 1e-3, f"{bands} bands: gradient of {name}"
-            )
+            a, b = gradient_of(gradients, name).double(), gradient_of(expected, name)
+            _close(a, b, 1e-3, f"{bands} bands: gradient of {name}")
 
 
 CHECKS: Final[Sequence[Callable[[Make], None]]] = (
@@ -178,7 +183,7 @@ CHECKS: Final[Sequence[Callable[[Make], None]]] = (
 
 
 def scene(n: int, *, seed: int = 0, bands: int = 3, dtype: torch.dtype = torch.float32) -> Splats:
-    """Anisotropic Gaussians of mixed size and opacity in front of `_camera`, some off-screen."""
+    """Anisotropic Gaussians of mixed size and opacity in front of `_camera`, some outside its image."""
     g = torch.Generator().manual_seed(seed)
     z = 2 + 4 * torch.rand(n, 1, generator=g)
     means = torch.cat(((torch.rand(n, 2, generator=g) - 0.5) * 1.6 * z, z), dim=1)
@@ -205,7 +210,7 @@ def select(splats: Splats, rows: Tensor) -> Splats:
 
 
 def gradient_of(gradients: SplatGradients, name: str) -> Tensor:
-    """A gradient by the attribute's name; `rgb_offset` has the colour's."""
+    """The gradient of an attribute by name; that of `rgb_offset` is the colour's."""
     found: Tensor = getattr(gradients, "rgb" if name == "rgb_offset" else name)
     return found
 
@@ -226,7 +231,7 @@ def _widest(rasterizer: Rasterizer) -> torch.dtype:
 
 
 def _close(found: Tensor, expected: Tensor, tolerance: float, what: str) -> None:
-    """Relative in the L2 norm, so that rounding of tiny entries does not count."""
+    """Compare relative to the L2 norm, so that the rounding of tiny entries does not count."""
     scale = float(torch.linalg.vector_norm(expected)) or 1.0
     error = float(torch.linalg.vector_norm(found - expected)) / scale
     _require(math.isfinite(error) and error <= tolerance, f"{what}: relative error {error:.3g}, allowed {tolerance:g}")

@@ -1,13 +1,13 @@
-"""Error against float64: of the picture, and of each attribute's gradient.
+"""Errors of images and gradients against float64.
 
-Twice: against float64 at the same cut-offs, which is what the arithmetic loses, and against float64 without any, which
-is what the cut-offs lose too.
+Each contender is compared twice: with float64 at its own cut-offs, which shows the rounding, and
+with float64 without cut-offs, which shows the cut-offs too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -16,75 +16,64 @@ from jaxtyping import Float
 from torch import Tensor
 
 import rasterizers
-from clear_strategies.bench.scenes import SETTINGS
-from rasterizers.interface import Camera, Rasterizer, Splats
+from clear_strategies.bench.scenes import SETTINGS, Workload
 
 ATTRIBUTES: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
 NO_CUT_OFFS: Final = {"alpha_min": 1e-9, "transmittance_min": 0.0}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
-    """A rendering and its gradient for one cotangent, by attribute; in main memory."""
+class Drawn:
+    """An image and the gradients of one cotangent by attribute, in main memory."""
 
     image: Float[Tensor, "H W 3"]
     gradients: Mapping[str, Tensor]
 
 
-@dataclass(frozen=True, slots=True)
-class Errors:
-    """How far a picture is from the truth.
+def draw(render: Callable[[], Any], cotangent: Float[Tensor, "H W 3"]) -> Drawn:
+    """`render` returns an object with `image`, and `vjp` of K cotangents."""
+    rendering = render()
+    g = rendering.vjp(cotangent[None])
+    return Drawn(rendering.image.detach().cpu(), {name: getattr(g, name)[0].cpu() for name in ATTRIBUTES})
 
-    Args:
-        image: "max", "mean" and "p99.99" of the absolute difference of its values.
-        relative: by attribute, ‖g - g*‖ / ‖g*‖ over all Gaussians.
-        median: by attribute, the same of one Gaussian, median over those with a gradient.
+
+def errors(found: Drawn, truth: Drawn) -> dict[str, float]:
+    """Table columns: absolute errors of the image, and relative L2 errors of each attribute's gradient.
+
+    `<attribute>_relative` is over all Gaussians, `<attribute>_median` the median of their own.
     """
-
-    image: Mapping[str, float]
-    relative: Mapping[str, float]
-    median: Mapping[str, float]
-
-
-def draw(rasterizer: Rasterizer, splats: Splats, camera: Camera, cotangent: Float[Tensor, "H W 3"]) -> Picture:
-    rendering = rasterizer(splats, camera)
-    g = rendering.vjp(cotangent.to(rendering.image)[None])
-    return Picture(rendering.image.cpu(), {name: getattr(g, name)[0].cpu() for name in ATTRIBUTES})
-
-
-def compare(found: Picture, truth: Picture) -> Errors:
     difference = (found.image.double() - truth.image.double()).abs().numpy()
-    image = {
-        "max": float(difference.max()),
-        "mean": float(difference.mean()),
-        "p99.99": float(np.quantile(difference, 0.9999)),
+    columns = {
+        "image_max": float(difference.max()),
+        "image_p99.99": float(np.quantile(difference, 0.9999)),
+        "image_mean": float(difference.mean()),
     }
-    relative, median = {}, {}
     for name in ATTRIBUTES:
-        expected = truth.gradients[name].double().flatten(1) if truth.gradients[name].dim() > 1 else (
-            truth.gradients[name].double()[:, None]
-        )  # fmt: skip
-        off = torch.linalg.vector_norm(found.gradients[name].double().view(expected.shape) - expected, dim=1)
-        size = torch.linalg.vector_norm(expected, dim=1)
-        has = size > 0
-        relative[name] = float(off.norm() / size.norm()) if bool(has.any()) else float(off.norm())
-        median[name] = float((off[has] / size[has]).median()) if bool(has.any()) else 0.0
-    return Errors(image, relative, median)
+        expected = truth.gradients[name].double().reshape(len(truth.gradients[name]), -1)
+        error = (found.gradients[name].double().reshape(expected.shape) - expected).norm(dim=1)
+        size = expected.norm(dim=1)
+        has_gradient = size > 0
+        any_gradient = bool(has_gradient.any())
+        columns[f"{name}_relative"] = float(error.norm() / size.norm()) if any_gradient else float(error.norm())
+        columns[f"{name}_median"] = float((error / size)[has_gradient].median()) if any_gradient else 0.0
+    return columns
 
 
-def oracle_backend() -> str | None:
-    """The fastest backend here that computes in float64, on whichever device."""
+def truth_backend() -> str | None:
+    """The fastest backend here that computes in float64, on any device."""
     for name, why_not in rasterizers.available().items():
         if why_not is None and torch.float64 in rasterizers.load(name).traits.dtypes:
             return name
     return None
 
 
-def oracle(backend: str, splats: Splats, camera: Camera, cotangent: Tensor, rules: Mapping[str, Any]) -> Picture:
-    """The truth by some rules: cut-offs, and whatever else is not as in `SETTINGS`."""
+def truth(backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]) -> Drawn:
+    """Draw in float64.
+
+    Args:
+        rules: the cut-offs, and settings that differ from `SETTINGS`.
+    """
     rasterizer = rasterizers.load(backend, **{**SETTINGS, **rules})
-    here = splats.means.device.type
-    device = here if here in rasterizer.traits.devices else "cpu"
-    tensors = {f.name: getattr(splats, f.name) for f in fields(splats)}
-    wide = replace(splats, **{name: t.to(device, torch.float64) for name, t in tensors.items() if t is not None})
-    return draw(rasterizer, wide, camera, cotangent.double())
+    device = workload.splats.means.device.type
+    wide = workload.to(device if device in rasterizer.traits.devices else "cpu", torch.float64)
+    return draw(lambda: rasterizer(wide.splats, wide.camera), cotangent.to(wide.splats.means))

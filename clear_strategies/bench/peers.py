@@ -1,7 +1,7 @@
-"""Peers on CUDA: other people's rasterizers as other people use them, to be timed and judged beside ours.
+"""Other projects' rasterizers on CUDA, called as their users call them.
 
-They take part in this benchmark and nowhere else, so no more of them is wrapped than it needs: a picture, and one backward
-pass for each cotangent. Each draws by its own rules, which are said beside the table, and is judged by them.
+Only what the benchmark needs is wrapped: an image, and one backward pass per cotangent. Each is
+compared with float64 by its own rules.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import metadata
-from types import MappingProxyType
+from types import SimpleNamespace
 from typing import Any, Final
 
 import torch
@@ -19,67 +19,64 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-import rasterizers
 from clear_strategies.bench import scenes
-from clear_strategies.bench.accuracy import Picture
+from clear_strategies.bench.accuracy import ATTRIBUTES
 from clear_strategies.bench.scenes import SETTINGS, Workload
 
 PRESET: Final = "fast"
-"""The cut-offs that all of them have, alpha 1/255 and transmittance 1e-4, and cannot change."""
+"""The cut-offs that all peers have built in: alpha 1/255 and transmittance 1e-4."""
 
-_FAR: Final = 100.0  # gswarp's matrix wants a far plane; nothing is cut there
-_LEAVES: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
+_FAR: Final = 100.0  # the far plane of gswarp's projection matrix; nothing is cut there
 
 Leaves = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawing:
-    """A picture, and what pulls one cotangent back to the tensors of `accuracy.ATTRIBUTES`."""
+class PeerRendering:
+    """An image and its `vjp`: K gradients, each attribute a list of K tensors, by K backward passes."""
 
     image: Float[Tensor, "H W 3"]
-    vjp: Callable[[Float[Tensor, "H W 3"]], Mapping[str, Tensor]]
+    vjp: Callable[[Float[Tensor, "K H W 3"]], SimpleNamespace]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Peer:
-    """A rasterizer that is not ours.
+    """A rasterizer of another project.
 
     Args:
-        says: what it computes that we do not, and the other way round.
-        differs: its rules where they are not `scenes.SETTINGS`; the truth that it is held against follows them.
+        differences: what it computes and ours does not, and the other way round.
+        rules: its settings where they differ from `scenes.SETTINGS`.
     """
 
     name: str
-    draw: Callable[[Workload], Drawing]
-    says: str
-    differs: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-
-    def picture(self, workload: Workload, cotangent: Float[Tensor, "H W 3"]) -> Picture:
-        """The image, and the gradients for one cotangent; in main memory."""
-        drawing = self.draw(workload)
-        gradients = drawing.vjp(cotangent)
-        return Picture(drawing.image.detach().cpu(), {name: gradients[name].cpu() for name in _LEAVES})
+    render: Callable[[Workload], PeerRendering]
+    differences: str
+    rules: Mapping[str, Any] = field(default_factory=dict)
 
 
-def found(skip: Callable[[str], None]) -> list[Peer]:
-    """Those that draw on this machine's GPU, each tried on a tiny scene; one line for each that does not."""
+def found(note: Callable[[str], None]) -> list[Peer]:
+    """The peers that draw on this GPU, each tried on a tiny scene; the others are noted."""
     peers: list[Peer] = []
-    for name, build in _PEERS.items():
+    for name in ("gsplat", "gswarp"):
         try:
-            candidates = build(metadata.version(name))
-            for peer in candidates:
-                _try(peer)
-            peers += candidates
+            version, library = metadata.version(name), importlib.import_module(name)
+            if name == "gsplat":
+                peer = gsplat(library.rasterization, f"gsplat {version}")
+            else:
+                library.initialize_runtime_tuning(device="cuda:0", verbose=False)  # as its documentation recommends
+                peer = gswarp(library, f"gswarp {version}")
+            tiny = scenes.load("tiny").to("cuda")
+            peer.render(tiny).vjp(torch.ones(1, tiny.camera.height, tiny.camera.width, 3, device="cuda"))
+            peers.append(peer)
         except metadata.PackageNotFoundError:
-            skip(f"{name}: not installed (pip install {name}).")
-        except Exception as error:  # another's library fails as it likes, often when it compiles itself at first use
-            skip(f"{name}: it cannot be used ({(str(error) or type(error).__name__).splitlines()[0]}).")
+            note(f"{name}: not installed (pip install {name}).")
+        except Exception as error:  # a library may raise anything when it compiles itself
+            note(f"{name}: cannot be used ({(str(error) or type(error).__name__).splitlines()[0]}).")
     return peers
 
 
 def gsplat(rasterization: Callable[..., Any], name: str) -> Peer:
-    """The `rasterization` of gsplat, or a function of its shape, called as its example trainer does."""
+    """The `rasterization` of gsplat, called as its example trainer does."""
 
     def draw(workload: Workload, g: Leaves) -> Tensor:
         camera, like = workload.camera, workload.splats.means
@@ -92,11 +89,11 @@ def gsplat(rasterization: Callable[..., Any], name: str) -> Peer:
         image: Tensor = images[0]
         return image
 
-    return Peer(name, _taped(draw), "antialiased, as ours; sums by atomics, so not deterministic.")
+    return Peer(name, _by_autograd(draw), "antialiased, as ours; not deterministic (atomic sums).")
 
 
 def gswarp(library: Any, name: str) -> Peer:
-    """The `GaussianRasterizer` of gswarp, or a library of its shape, called as an Inria-style trainer does."""
+    """The `GaussianRasterizer` of gswarp, called as an Inria-style trainer does."""
 
     def draw(workload: Workload, g: Leaves) -> Tensor:
         camera, like = workload.camera, workload.splats.means
@@ -114,70 +111,32 @@ def gswarp(library: Any, name: str) -> Peer:
         )[0]  # fmt: skip
         return image.movedim(0, -1)
 
-    says = (
-        "no antialiasing, so the compensation of each Gaussian and its gradient are work that it does not do; Gaussians "
-        "end at 3 sigma, its near plane is 0.2 and alpha at most 0.99; draws a depth, too; sums by atomics, so not "
-        "deterministic."
+    differences = (
+        "no antialiasing, so it does less work per Gaussian; Gaussians end at 3 sigma, near plane 0.2, alpha at most "
+        "0.99; also draws a depth map; not deterministic (atomic sums)."
     )
-    return Peer(name, _taped(draw), says, MappingProxyType({"antialiased": False, "alpha_max": 0.99, "near": 0.2}))
+    return Peer(name, _by_autograd(draw), differences, {"antialiased": False, "alpha_max": 0.99, "near": 0.2})
 
 
-def _behind_our_interface(version: str) -> Peer:
-    """`rasterizer=gsplat` of a run."""
-    own = {name: value for name, value in SETTINGS.items() if name != "alpha_max"}  # 0.999 there, and no choice
-    rasterizer = rasterizers.load("gsplat", preset=PRESET, **own)
+def _by_autograd(draw: Callable[[Workload, Leaves], Tensor]) -> Callable[[Workload], PeerRendering]:
+    """One backward pass per cotangent; the graph is kept for the next."""
 
-    def draw(workload: Workload) -> Drawing:
-        rendering = rasterizer(workload.splats, workload.camera)
-
-        def vjp(cotangent: Tensor) -> Mapping[str, Tensor]:
-            g = rendering.vjp(cotangent[None])
-            return {name: getattr(g, name)[0] for name in _LEAVES}
-
-        return Drawing(rendering.image, vjp)
-
-    return Peer(
-        f"gsplat {version}, rasterizer=gsplat", draw, "the same kernels in our trainer, with all that it asks for."
-    )
-
-
-def _installed_gsplat(version: str) -> list[Peer]:
-    wrapped = _behind_our_interface(version)  # says why where it cannot run
-    return [gsplat(importlib.import_module("gsplat.rendering").rasterization, f"gsplat {version}"), wrapped]
-
-
-def _installed_gswarp(version: str) -> list[Peer]:
-    library = importlib.import_module("gswarp")
-    library.initialize_runtime_tuning(device="cuda:0", verbose=False)  # as its page recommends
-    return [gswarp(library, f"gswarp {version}")]
-
-
-_PEERS: Final[Mapping[str, Callable[[str], list[Peer]]]] = {"gsplat": _installed_gsplat, "gswarp": _installed_gswarp}
-
-
-def _try(peer: Peer) -> None:
-    tiny = scenes.load("tiny")
-    if isinstance(tiny, scenes.Workload):
-        tiny = tiny.to("cuda")
-        peer.picture(tiny, torch.ones(tiny.camera.height, tiny.camera.width, 3, device="cuda"))
-
-
-def _taped(draw: Callable[[Workload, Leaves], Tensor]) -> Callable[[Workload], Drawing]:
-    """By autograd: a backward pass for each cotangent, the graph kept for the next."""
-
-    def drawing(workload: Workload) -> Drawing:
-        leaves = {name: getattr(workload.splats, name).detach().requires_grad_() for name in _LEAVES}
+    def render(workload: Workload) -> PeerRendering:
+        leaves = {name: getattr(workload.splats, name).detach().requires_grad_() for name in ATTRIBUTES}
         with torch.enable_grad():
             image = draw(workload, leaves)
 
-        def vjp(cotangent: Tensor) -> Mapping[str, Tensor]:
+        def vjp(cotangents: Float[Tensor, "K H W 3"]) -> SimpleNamespace:
             tensors = list(leaves.values())
-            gradients = torch.autograd.grad(image, tensors, cotangent, retain_graph=True, materialize_grads=True)
-            return dict(zip(leaves, gradients, strict=True))
+            gradients = [
+                torch.autograd.grad(image, tensors, cotangent, retain_graph=True, materialize_grads=True)
+                for cotangent in cotangents
+            ]
+            return SimpleNamespace(**dict(zip(leaves, zip(*gradients, strict=True), strict=True)))
 
-        return Drawing(image, vjp)
+        return PeerRendering(image, vjp)
 
-    return drawing
+    return render
 
 
 def _degree(workload: Workload) -> int:
@@ -185,7 +144,7 @@ def _degree(workload: Workload) -> int:
 
 
 def _clip(workload: Workload) -> Float[Tensor, "4 4"]:
-    """Camera to clip space as Inria's trainer has it, with the principal point where it is."""
+    """Camera space to clip space as in Inria's trainer, with the camera's own principal point."""
     camera, near = workload.camera, SETTINGS["near"]
     rows = [
         [2 * camera.fx / camera.width, 0, 2 * camera.cx / camera.width - 1, 0],

@@ -1,4 +1,6 @@
-"""What the benchmark draws: generated scenes of known statistics, a real point cloud, or the user's own Gaussians."""
+"""What the benchmark draws: generated scenes of known statistics, a real point cloud, or an
+exported field.
+"""
 
 from __future__ import annotations
 
@@ -12,30 +14,24 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from clear_strategies.core.gradients import ATTRIBUTES
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import DataError
-from clear_strategies.training import checkpoint
-from clear_strategies.training.field import GaussianField
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Splats
 
-# What all contenders draw with, so that they draw the same picture. Cut-offs come from the preset.
 SETTINGS: Final = {"kernel": 0.3, "near": 0.01, "alpha_max": 0.999, "antialiased": True}
+"""The settings all contenders draw with; their cut-offs come from the preset."""
 
-GARDEN_FILE: Final = "test_garden.npz"
 _BANDS: Final = 15  # SH degree 3
-_FOCAL: Final = 0.8  # of the image's width
-_SEEN: Final = 0.65  # of the image's size, from its middle
-_PIXELS_A_GAUSSIAN: Final = 64  # projecting and sorting one costs about as much as blending it there
+_FOCAL: Final = 0.8  # in units of the image's width
 
 Array = np.ndarray
-Surface = tuple[Float[Array, "n 3"], Float[Array, "n 3"]]  # points, and normals of length 1
+Surface = tuple[Float[Array, "n 3"], Float[Array, "n 3"]]  # points and unit normals
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Workload:
-    """Gaussians and the camera that sees them, float32."""
+    """Gaussians and a camera that sees them, in float32."""
 
     name: str
     splats: Splats
@@ -43,74 +39,58 @@ class Workload:
 
     @property
     def lr_factor(self) -> int | None:
-        """The largest of 4, 3 and 2 that divides the image; None where there is no LR grid."""
+        """The largest of 4, 3 and 2 that divides the image size; None: the image has no LR grid."""
         sizes = self.camera.width, self.camera.height
         return next((factor for factor in (4, 3, 2) if not any(size % factor for size in sizes)), None)
 
-    def work(self) -> float:
-        """Pixels under the 3-sigma discs of what is seen, and a share per Gaussian: what rendering costs, roughly."""
-        camera = self.camera
-        pose = camera.world_to_camera.to(self.splats.means)
-        x, y, z = (self.splats.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
-        depth = z.clamp_min(SETTINGS["near"])
-        u, v = camera.fx * x / depth / camera.width, camera.fy * y / depth / camera.height
-        seen = (z > SETTINGS["near"]) & (u.abs() < _SEEN) & (v.abs() < _SEEN)
-        large, medium = self.splats.scales.topk(2, dim=-1).values.unbind(-1)
-        variances = [(sigma * camera.fx / depth).square() + SETTINGS["kernel"] for sigma in (large, medium)]
-        area = (9 * math.pi * (variances[0] * variances[1]).sqrt()).clamp_max(camera.width * camera.height)
-        return float(area[seen].double().sum()) + _PIXELS_A_GAUSSIAN * len(self.splats)
-
-    def to(self, device: str) -> Workload:
-        """The Gaussians on another device; cameras stay where they are."""
+    def to(self, device: str, dtype: torch.dtype = torch.float32) -> Workload:
+        """The Gaussians on another device; cameras stay on the CPU."""
         tensors = {f.name: getattr(self.splats, f.name) for f in fields(self.splats)}
-        moved = {name: t.to(device) for name, t in tensors.items() if t is not None}
+        moved = {name: t.to(device, dtype) for name, t in tensors.items() if t is not None}
         return replace(self, splats=replace(self.splats, **moved))
-
-    def says(self) -> str:
-        return f"{self.name}: {len(self.splats):,} Gaussians, {self.camera.width}x{self.camera.height}"
 
 
 def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed: int = 0) -> Workload:
-    """A wall with relief, the ground, three spheres and some clutter, as a capture looks after training.
+    """A wall with relief, the ground, three spheres and some clutter, as in a trained field.
 
-    Discs aligned to the surfaces, lognormal in size, mostly faint or opaque.
+    The Gaussians are discs aligned to the surfaces, of lognormal sizes, most either faint or opaque.
 
     Args:
-        radius: median of the discs' 3-sigma radius before the 2D kernel, px.
+        radius: median 3-sigma radius of the discs before the 2D kernel, px.
     """
     random = np.random.default_rng(seed)
     focal = _FOCAL * width
-    look = _Frustum(random, width, height, focal)
+    frustum = _Frustum(random, width, height, focal)
     counts = [round(n * share) for share in (0.30, 0.25, 0.15, 0.15, 0.10)]
     parts = [
-        look.wall(counts[0]),
-        look.ground(counts[1]),
-        look.sphere(counts[2], (0.35, 0.45, 4.0), 0.8),
-        look.sphere(counts[3], (0.70, 0.50, 3.0), 0.6),
-        look.sphere(counts[4], (0.50, 0.65, 2.0), 0.25),
-        look.clutter(n - sum(counts)),
+        frustum.wall(counts[0]),
+        frustum.ground(counts[1]),
+        frustum.sphere(counts[2], (0.35, 0.45, 4.0), 0.8),
+        frustum.sphere(counts[3], (0.70, 0.50, 3.0), 0.6),
+        frustum.sphere(counts[4], (0.50, 0.65, 2.0), 0.25),
+        frustum.clutter(n - sum(counts)),
     ]
     points, normals = (np.concatenate(x) for x in zip(*parts, strict=True))
 
-    # A disc: two axes along the surface, the third thin.
+    # Two axes of a disc lie in the surface, the third is thin.
     longest = radius / 3 / focal * points[:, 2] * np.exp(random.normal(0, 0.8, n))
     shorter, thickness = np.exp(random.normal(-0.5, 0.4, n)), 0.12 * np.exp(random.normal(0, 0.5, n))
     scales = longest[:, None] * np.stack((np.ones(n), shorter, thickness), 1)
     quats = _facing(normals, random.uniform(0, 2 * np.pi, n)) * random.uniform(0.7, 1.4, (n, 1))
     texture = 0.5 + 0.3 * np.sin(points * (7, 9, 5)) * np.cos(points[:, [1, 2, 0]] * 11)
     colors = texture + random.normal(0, 0.05, (n, 3))
-    shuffled = random.permutation(n)  # a trained field is in no order
+    shuffled = random.permutation(n)  # a trained field has no order
     splats = _splats(random, points, quats, scales, _sigmoid(random.normal(0.8, 2.2, n)), colors)
     splats = Splats(*(getattr(splats, a)[shuffled] for a in ("means", "quats", "scales", "opacities", "sh0", "shN")))
     return Workload(name, splats, Camera(_pose(), focal, focal, width / 2, height / 2, width, height))
 
 
 class _Frustum:
-    """Points on surfaces that the camera sees, with a margin of a tenth of the image around it."""
+    """Samples points on surfaces that the camera sees, with a margin of a tenth of the image around it."""
 
     def __init__(self, random: np.random.Generator, width: int, height: int, focal: float) -> None:
         self.random, self.width, self.height, self.focal = random, width, height, focal
-        self.unit = width / 1008  # the relief is stated in pixels of a 1008-pixel image
+        self.unit = width / 1008  # the relief is given in pixels of a 1008-pixel image
 
     def wall(self, n: int) -> Surface:
         u, v = self._pixels(n)
@@ -124,7 +104,7 @@ class _Frustum:
         return self._at(u, v, np.minimum(1.2 * self.focal / horizon, 7.5)), np.tile((0.0, 1, 0), (n, 1))
 
     def sphere(self, n: int, center: tuple[float, float, float], radius: float) -> Surface:
-        """`center`: share of the image's width and height, and depth."""
+        """`center` is a share of the image's width and height, and a depth."""
         normals = self._directions(n)
         in_front = np.where(self.random.random(n) < 0.85, -1, 1)
         normals[:, 2] = in_front * np.abs(normals[:, 2])
@@ -148,10 +128,10 @@ class _Frustum:
 
 
 def garden(path: Path) -> Workload:
-    """The real points of a garden as Gaussians: sizes from the gaps to three neighbours, random orientations.
+    """The points of gsplat's test_garden.npz as Gaussians: sizes from the distances to three neighbours.
 
     Raises:
-        DataError: the file is not what it should be.
+        DataError: the file is missing or is not the garden.
     """
     from scipy.spatial import cKDTree
 
@@ -161,7 +141,9 @@ def garden(path: Path) -> Workload:
             pose, K = file["viewmats"][0], file["Ks"][0]
             width, height = int(file["width"]), int(file["height"])
     except (OSError, ValueError, KeyError) as error:
-        raise DataError(path, "content", f"is not the garden ({error})", "give another with --data") from error
+        raise DataError(
+            path, "content", f"is not the garden ({error})", "give gsplat's test_garden.npz with --data"
+        ) from error
     random, n = np.random.default_rng(0), len(points)
     gaps = np.asarray(cKDTree(points).query(points, k=4)[0])[:, 1:]
     size = np.sqrt(np.square(gaps).mean(1)).clip(1e-4)
@@ -177,32 +159,15 @@ def from_ply(path: Path) -> Workload:
     """Gaussians as a run exports them.
 
     Raises:
-        DataError: not such a file.
+        DataError: the file is no such export.
     """
     g = read_gaussians(path)
     splats = Splats(g.means, g.quats, g.scales.exp(), g.opacities.sigmoid(), g.sh0, g.shN)
     return Workload(path.stem, splats, facing_all(splats))
 
 
-def from_checkpoint(path: Path) -> Workload:
-    """The field of a run's checkpoint.
-
-    Raises:
-        DataError: not such a folder.
-    """
-    saved = checkpoint.load(path)
-    tensors = {name.removeprefix("field/"): t for name, t in saved.tensors.items() if name.startswith("field/")}
-    missing = {*ATTRIBUTES, "filter_3d"} - set(tensors)
-    if missing:
-        raise DataError(path, "tensors", f"lack {', '.join(sorted(missing))}", "give the checkpoint of a training run")
-    field = GaussianField(tensors, degree=int(saved.facts.get("degree", 3)))
-    field.filter_3d = tensors["filter_3d"]
-    splats = replace(field.baked(), sh0=field.baked().sh0 + field.detail.data[:, None] / SH_C0, rgb_offset=None)
-    return Workload(f"{path.resolve().parent.name}/{path.name}", splats, facing_all(splats))
-
-
 def facing_all(splats: Splats, width: int = 1008, height: int = 756) -> Camera:
-    """A camera along +z that sees the middle nine tenths of the Gaussians: files of Gaussians name no camera."""
+    """A camera along +z that sees the middle nine tenths of the Gaussians; a .ply file holds no camera."""
     low, high = (np.quantile(splats.means.numpy(), q, axis=0) for q in (0.05, 0.95))
     center, half = (low + high) / 2, (high - low) / 2
     focal = _FOCAL * width
@@ -212,69 +177,61 @@ def facing_all(splats: Splats, width: int = 1008, height: int = 756) -> Camera:
     return Camera(pose, focal, focal, width / 2, height / 2, width, height)
 
 
-def to_lr(workload: Workload, name: str) -> Workload:
-    """The same Gaussians at a quarter of the image size."""
-    return Workload(name, workload.splats, workload.camera.scaled(1 / 4))
-
-
-# Sizes that fall as the number grows, as densification makes them: 5.5 px at 100k.
-_MADE: Final[dict[str, Callable[[], Workload]]] = {
+# Gaussians shrink as their number grows, as under densification: the radius is 5.5 px at 100k.
+_GENERATED: Final[dict[str, Callable[[], Workload]]] = {
     "tiny": lambda: surfaces("tiny", 600, 96, 72, radius=4.0),
     "small": lambda: surfaces("small", 5_000, 252, 189, radius=5.5),
     "s100k": lambda: surfaces("s100k", 100_000, 1008, 756, radius=5.5),
-    "s100k-lr": lambda: to_lr(_MADE["s100k"](), "s100k-lr"),
+    "s100k-lr": lambda: _at_lr(_GENERATED["s100k"]()),
     "s300k-2016": lambda: surfaces("s300k-2016", 300_000, 2016, 1512, radius=2 * 5.5 * 3**-0.3),
     "s500k": lambda: surfaces("s500k", 500_000, 1008, 756, radius=5.5 * 5**-0.3),
 }
-NAMES: Final = (*_MADE, "garden")
+NAMES: Final = (*_GENERATED, "garden")
 
 
-def load(name: str, data: Path | None = None) -> Workload | str:
-    """A scene by name, .ply file or checkpoint folder; the reason instead where its data set is not here.
+def load(name: str, data: Path | None = None) -> Workload:
+    """A scene by name, or a .ply file.
 
     Args:
-        data: the garden's file or its folder.
+        data: the garden's file.
 
     Raises:
-        DataError: nothing has that name, or the file cannot be used.
+        DataError: no scene or file has that name, or the file cannot be used.
     """
-    if name in _MADE:
-        return _MADE[name]()
+    if name in _GENERATED:
+        return _GENERATED[name]()
     if name == "garden":
-        path = find_garden(data)
-        return garden(path) if path is not None else f"{GARDEN_FILE} is not here; give its path with --data"
-    path = Path(name)
-    if path.is_dir():
-        return from_checkpoint(path)
-    if path.is_file():
-        return from_ply(path)
-    raise DataError("--scene", name, "is no scene, file or folder", f"choose of {', '.join(NAMES)}, or give a path")
+        if data is None:
+            raise DataError("--scene", name, "has no file", "give gsplat's test_garden.npz with --data")
+        return garden(data)
+    if Path(name).is_file():
+        return from_ply(Path(name))
+    raise DataError("--scene", name, "is no scene and no file", f"choose one of {', '.join(NAMES)}, or give a .ply")
 
 
-def find_garden(data: Path | None) -> Path | None:
-    folders = [data] if data is not None else [Path(__file__).resolve().parents[2].parent / "shared" / "data"]
-    candidates = [folder / GARDEN_FILE if folder.is_dir() else folder for folder in folders]
-    return next((path for path in candidates if path.is_file()), None)
+def _at_lr(workload: Workload) -> Workload:
+    """The same Gaussians at a quarter of the image size."""
+    return Workload(f"{workload.name}-lr", workload.splats, workload.camera.scaled(1 / 4))
 
 
 def _splats(random: np.random.Generator, *parts: Array) -> Splats:
-    """Means, quats, scales, opacities, colours; a little view dependence in all bands of degree 3."""
+    """Splats of means, quats, scales, opacities and colours, with a little view dependence."""
     means, quats, scales, opacities, colors = (torch.from_numpy(x).float().contiguous() for x in parts)
     higher = torch.from_numpy(random.normal(0, 0.02, (len(means), _BANDS, 3))).float()
     return Splats(means, quats, scales, opacities, ((colors - 0.5) / SH_C0)[:, None], higher)
 
 
 def _facing(normals: Float[Array, "n 3"], spin: Float[Array, " n"]) -> Float[Array, "n 4"]:
-    """Quaternions that turn the third axis along a normal, or against it (a disc has no front), after a spin on it."""
+    """Quaternions that rotate by `spin` about the third axis, then turn it along ±normal."""
     x, y, z = (normals * np.where(normals[:, 2:] < 0, -1, 1)).T
-    half = np.stack((1 + z, -y, x), 1)  # the shortest turn from +z to the normal: (1 + n_z, -n_y, n_x, 0)
+    half = np.stack((1 + z, -y, x), 1)  # the shortest rotation from +z to the normal
     w, i, j = (half / np.linalg.norm(half, axis=1, keepdims=True)).T
     c, s = np.cos(spin / 2), np.sin(spin / 2)
     return np.stack((w * c, i * c + j * s, j * c - i * s, w * s), 1)
 
 
 def _pose() -> Float[torch.Tensor, "4 4"]:
-    """Slightly turned and moved, so that nothing is aligned with the pixel grid."""
+    """A camera pose slightly off the axes, so that nothing is aligned with the pixel grid."""
     yaw, pitch = 0.03, -0.02
     about_y = np.array([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]])
     about_x = np.array([[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)]])

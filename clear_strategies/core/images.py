@@ -2,7 +2,7 @@
 
 D and U are defined here once, for the data sets that make LR images, for P2G's evidence and for the evaluation.
 Reliability must be measured with the kernel that made LR; another kernel would measure the difference of the kernels
-(reading F21 in docs/paper.md).
+(reading F21 in docs/explanation/paper.md).
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def crop_to_multiple(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor
 def patch_means(values: Float[Tensor, "H W C"], patch: int) -> Float[Tensor, "ph pw"]:
     """Avg_p: mean over pixels and channels of each patch × patch square, aligned at the top-left.
 
-    A partial patch at the right or bottom border is averaged over its own pixels (reading F22 in docs/paper.md).
+    A partial patch at the right or bottom border is averaged over its own pixels (reading F22 in docs/explanation/paper.md).
     """
     mean = values.mean(dim=2)[None, None]
     return F.avg_pool2d(mean, patch, ceil_mode=True, count_include_pad=False)[0, 0]

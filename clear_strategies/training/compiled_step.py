@@ -24,21 +24,22 @@ from clear_strategies.core.compiled_rules import ROTATION_NOISE, Anchor, Correct
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
-from clear_strategies.kernels.gaussian_step import cpp as kernel
+from clear_strategies.kernels import gaussian_step as kernel
+from clear_strategies.kernels.gaussian_step import cpp
 from clear_strategies.merging.conductor import Conductor, HrGradients
 from clear_strategies.strategies.base import Strategy, describes, overrides
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
 from rasterizers.interface import BackendUnavailable, SplatGradients
 from rasterizers.native import load_kernels
-from rasterizers.warp_backend.launch import require
+from rasterizers.warp_runtime import require_warp
 
 _log = logging.getLogger(__name__)
 
 FusedMode = Literal["auto", "every_row", "off"]
 
-GaussianPass = Callable[..., kernel.Sweeps]
-"""`kernels.step.GaussianPass`, or another class of its signature."""
+GaussianPass = Callable[..., kernel.GaussianStep]
+"""`gaussian_step.cpp.CppGaussianStep`, or another class of its signature."""
 
 # A hook that the pass computes, and the fact that states it as data.
 _STATED_BY: Final = {"correct": "correction_rule", "regularize": "anchor"}
@@ -84,11 +85,11 @@ def gaussian_pass(optimizer: Adam) -> GaussianPass:
     device = optimizer.first["means"].device.type
     if device == "cpu":
         load_kernels("clear_strategies.kernels")
-        return kernel.GaussianPass
-    require("the compiled pass", device, "it runs in C++ for a field in the CPU's memory")
-    from clear_strategies.kernels.gaussian_step import warp as warp_step
+        return cpp.CppGaussianStep
+    require_warp("the compiled pass", device, "it runs in C++ for a field in the CPU's memory")
+    from clear_strategies.kernels.gaussian_step import warp
 
-    return warp_step.GaussianPass
+    return warp.WarpGaussianStep
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,7 +210,7 @@ class CompiledStep:
         bands = active if skips and self._above_is_quiet(shN, active, anchor.targets.get("shN")) else shN.shape[1]
         stepped = gaussians.step(
             attributes, correction,
-            kernel.Step(
+            kernel.StepSettings(
                 BETA1, BETA2, bias2, self.optimizer.rates.eps, λ,
                 None if visible is None else visible.contiguous().view(torch.uint8), skips, 3 * bands,
             ),
@@ -256,7 +257,7 @@ class CompiledStep:
         return anchor
 
     def _above_is_quiet(self, shN: Tensor, active: int, anchor: Tensor | None) -> bool:
-        """Whether bands above the active degree have no momentum and no vjp. Looked at again when a tensor is another
+        """Whether bands above the active degree have no momentum and no pull. Looked at again when a tensor is another
         one (densification, resuming, the anchor); while it is the same, a pass that left them alone left them quiet, and
         momentum that is there does not end.
         """
@@ -271,10 +272,10 @@ class CompiledStep:
         self._examined, self._quiet = (active, tensors), not (moved or pulled)
         return self._quiet
 
-    def _note_skips(self, stepped: kernel.Stepped, bands: int, all_bands: int) -> None:
+    def _note_skips(self, stepped: kernel.StepCounts, bands: int, all_bands: int) -> None:
         skip = self.conductor.work_log.skip
         for reason, rows in (
-            ("gradient, moments and anchor's vjp are 0", stepped.still),
+            ("gradient, moments and anchor's pull are 0", stepped.still),
             ("not visible (optim.rows=visible)", stepped.invisible),
         ):
             if isinstance(rows, Tensor) or rows:  # a number on the device is not read here
@@ -296,7 +297,7 @@ def _epsilons(rule: CorrectionRule, c: kernel.Comparison) -> tuple[Sequence[floa
 
 
 def _reports(
-    rule: CorrectionRule, compared: kernel.Comparison, margins: Sequence[Number | None], stepped: kernel.Stepped
+    rule: CorrectionRule, compared: kernel.Comparison, margins: Sequence[Number | None], stepped: kernel.StepCounts
 ) -> list[GroupReport]:
     index = {group: k for k, group in enumerate(CONFLICT_GROUPS)}
     return [

@@ -60,8 +60,8 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
 
 def kernel_threads(state: TrainState, rasterizer: Rasterizer) -> AbstractContextManager[None]:
     """A context to train in: all threads go to the compiled kernels where these do nearly all of the work."""
-    if rasterizer.traits.own_threads and state.compiled_step is not None:
-        return native.own_threads(native.threads())
+    if rasterizer.traits.native_threads and state.compiled_step is not None:
+        return native.kernel_threads(native.threads())
     return nullcontext()
 
 

@@ -1,7 +1,7 @@
-"""gsplat's documented loop with CLEAR beside it, on the embedded demo, on a CPU: `python -m integration.examples.gsplat_loop`.
+"""gsplat's documented loop with CLEAR, on the built-in demo and a CPU: `python -m integration.examples.gsplat_loop`.
 
-The loop is gsplat's own, DefaultStrategy included; what was added is marked. On a GPU, take gsplat's `rasterization` instead
-of the stand-in (`from gsplat import rasterization`) and put the tensors on the device; nothing else changes.
+The loop and DefaultStrategy are gsplat's; `# +` marks the added lines. On a GPU, use gsplat's own function (`from gsplat
+import rasterization`) and put the tensors on the device. Nothing else changes.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from clear_strategies.training.field import GaussianField
 from integration.gsplat import attach
 from integration.views import view
 from rasterizers import native
-from rasterizers.autograd import rasterization as stand_in
+from rasterizers.autograd import rasterization as cpu_rasterization
 from rasterizers.interface import Camera
 
 RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 
 
 def main(iterations: int, strategies: str | None) -> float:
-    """Train the demo for so many steps; returns the PSNR of its test views at HR, dB."""
+    """Train on the demo; returns the mean PSNR of its test views at HR in dB."""
     capture = demo.read(width=256, height=192, views=12, train=3)
     sr = DemoPrior(truth={frame.name: frame.load for frame in capture.frames})
     scene = prepare(capture, ViewSettings(), sr, CloudSettings())
-    photos = {v.name: v.lr for v in scene.train}  # what a host has: LR photographs and their cameras
+    photos = {v.name: v.lr for v in scene.train}  # what a host has: LR photos and their cameras
 
     start = GaussianField.from_cloud(scene.cloud).raw()
     splats = {name: torch.nn.Parameter(start[name].clone()) for name in RATES}
@@ -51,14 +51,13 @@ def main(iterations: int, strategies: str | None) -> float:
     strategy.check_sanity(splats, optimizers)
     state = strategy.initialize_state(scene_scale=1.0)
 
-    rasterization = stand_in
+    rasterization = cpu_rasterization
     if strategies is not None:
+        clear_conductor = conductor(strategies, iterations=iterations)  # +
         views = [
-            view(name, p.image, p.camera.world_to_camera, intrinsics(p.camera)[0], sr) for name, p in photos.items()
+            view(n, p.image, p.camera.world_to_camera, intrinsics(p.camera)[0], sr) for n, p in photos.items()
         ]  # +
-        clear = attach(
-            splats, optimizers, views, conductor(strategies, iterations=iterations), strategy=strategy, state=state
-        )  # +
+        clear = attach(splats, optimizers, views, clear_conductor, strategy=strategy, state=state)  # +
         rasterization = clear.wrap(rasterization)  # +
 
     def render(camera: Camera) -> tuple[Tensor, dict[str, Any]]:
@@ -109,18 +108,20 @@ def psnr(scene: Scene, render: Callable[[Camera], tuple[Tensor, Any]]) -> float:
     values = []
     for test in scene.test:
         if test.truth is not None:
-            shown, _ = render(test.hr.camera)
-            values.append(-10 * float((images.quantize(shown.clamp(0, 1)) - test.truth).square().mean().log10()))
+            image, _ = render(test.hr.camera)
+            values.append(-10 * float((images.quantize(image.clamp(0, 1)) - test.truth).square().mean().log10()))
     return sum(values) / len(values)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--iterations", type=int, default=500)
-    parser.add_argument("--strategies", default="clear", help="as after +strategy=; none: the loop alone")
-    chosen = parser.parse_args()
+    parser.add_argument("--strategies", default="clear", help="as in +strategy=; none: the loop alone")
+    options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    torch.manual_seed(0)  # gsplat splits by torch's global generator
-    with native.own_threads(native.threads()):  # else torch's threads keep the cores that the kernels need
-        found = main(chosen.iterations, None if chosen.strategies == "none" else chosen.strategies)
-    sys.stdout.write(f"{chosen.strategies}: {found:.2f} dB on the test views at HR\n")
+    torch.manual_seed(0)  # gsplat splits Gaussians with torch's global generator
+    with native.kernel_threads(
+        native.threads()
+    ):  # torch's threads would otherwise occupy the cores that the kernels use
+        result = main(options.iterations, None if options.strategies == "none" else options.strategies)
+    sys.stdout.write(f"{options.strategies}: {result:.2f} dB on the test views at HR\n")

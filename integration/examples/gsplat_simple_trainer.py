@@ -1,10 +1,10 @@
-"""gsplat's own `examples/simple_trainer.py` with CLEAR attached, and what a step costs: needs CUDA and gsplat's examples.
+"""gsplat's own `examples/simple_trainer.py` with and without CLEAR. Needs CUDA and gsplat's examples.
 
     python -m integration.examples.gsplat_simple_trainer --examples GSPLAT/examples --data-dir data/360_v2/garden \
         --data-factor 16 --sr span_x4.onnx --steps 2000
 
-Trains the scene twice, without and with the strategies, and prints milliseconds a step and PSNR of both. Not yet run: no
-machine with CUDA has been at hand.
+Trains the scene without and with the strategies, and prints milliseconds per step and the PSNR of both. This script has not
+been run yet, for lack of a GPU.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import torch
 from clear_strategies.compose import conductor
 from clear_strategies.core.view import View
 from clear_strategies.data.priors import Images, Onnx
-from integration.gsplat_strategy import ClearStrategy
+from integration.gsplat import ClearStrategy
 from integration.views import SuperResolve, view
 
 
 def training_views(trainer: Any, config: Any, sr: SuperResolve) -> list[View]:
-    """The trainer's own photographs and cameras, in its normalized world."""
+    """The trainer's photos and cameras, in its normalized world."""
     parser = trainer.Parser(
         data_dir=config.data_dir, factor=config.data_factor, normalize=config.normalize_world_space,
         test_every=config.test_every,
@@ -42,52 +42,52 @@ def training_views(trainer: Any, config: Any, sr: SuperResolve) -> list[View]:
 
 
 def train(trainer: Any, config: Any) -> tuple[float, float]:
-    """Milliseconds a step, and PSNR of the held-out photographs at the photographs' own size."""
+    """Milliseconds per step, and the PSNR of the held-out photos at their own size."""
     runner = trainer.Runner(0, 0, 1, config)
     torch.cuda.synchronize()
-    began = time.perf_counter()
+    start = time.perf_counter()
     runner.train()
     torch.cuda.synchronize()
-    took = time.perf_counter() - began
+    seconds = time.perf_counter() - start
     stats = sorted(Path(config.result_dir, "stats").glob("val_step*.json"))
-    return 1000 * took / config.max_steps, float(json.loads(stats[-1].read_text())["psnr"])
+    return 1000 * seconds / config.max_steps, float(json.loads(stats[-1].read_text())["psnr"])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--examples", required=True, help="the folder examples/ of gsplat's repository")
     parser.add_argument("--data-dir", required=True)
+    parser.add_argument("--data-factor", type=int, default=4, help="divisor of the photos' size; the results are LR")
     parser.add_argument(
-        "--data-factor", type=int, default=4, help="photographs are made so many times smaller: these are LR"
+        "--sr", required=True, help="a folder of SR images four times as large as LR, or an ONNX network"
     )
-    parser.add_argument("--sr", required=True, help="a folder of SR pictures four times as large, or an ONNX network")
-    parser.add_argument("--strategies", default="clear", help="as after +strategy=")
+    parser.add_argument("--strategies", default="clear", help="as in +strategy=")
     parser.add_argument("--steps", type=int, default=2_000)
     parser.add_argument("--result-dir", default="results/clear")
-    chosen = parser.parse_args()
+    options = parser.parse_args()
     if not torch.cuda.is_available():
         parser.error(
-            "gsplat's rasterizer needs CUDA, and torch sees no device; on a CPU: integration.examples.gsplat_loop."
+            "gsplat's rasterizer needs CUDA, and torch finds no device. On a CPU, run integration.examples.gsplat_loop."
         )
-    sys.path.insert(0, chosen.examples)
+    sys.path.insert(0, options.examples)
     import simple_trainer as trainer
 
-    sr: SuperResolve = Onnx(chosen.sr) if chosen.sr.endswith(".onnx") else Images(chosen.sr)
+    sr: SuperResolve = Onnx(options.sr) if options.sr.endswith(".onnx") else Images(options.sr)
 
     def config(name: str, strategy: Any) -> Any:
         return trainer.Config(
-            disable_viewer=True, disable_video=True, data_dir=chosen.data_dir, data_factor=chosen.data_factor,
-            result_dir=f"{chosen.result_dir}/{name}", max_steps=chosen.steps, eval_steps=[chosen.steps],
+            disable_viewer=True, disable_video=True, data_dir=options.data_dir, data_factor=options.data_factor,
+            result_dir=f"{options.result_dir}/{name}", max_steps=options.steps, eval_steps=[options.steps],
             save_steps=[], strategy=strategy,
         )  # fmt: skip
 
-    window = {"refine_start_iter": chosen.steps // 20, "refine_stop_iter": chosen.steps // 2}
+    window = {"refine_start_iter": options.steps // 20, "refine_stop_iter": options.steps // 2}
     alone = config("alone", trainer.DefaultStrategy(**window))
     views = training_views(trainer, alone, sr)
-    clear = ClearStrategy(views=views, conductor=conductor(chosen.strategies, iterations=chosen.steps), **window)
-    for name, settings in (("alone", alone), (chosen.strategies, config("clear", clear))):
+    clear = ClearStrategy(views=views, conductor=conductor(options.strategies, iterations=options.steps), **window)
+    for name, settings in (("alone", alone), (options.strategies, config("clear", clear))):
         ms, psnr = train(trainer, settings)
-        sys.stdout.write(f"{name}: {ms:.2f} ms a step, PSNR {psnr:.2f} dB\n")
+        sys.stdout.write(f"{name}: {ms:.2f} ms per step, PSNR {psnr:.2f} dB\n")
 
 
 if __name__ == "__main__":

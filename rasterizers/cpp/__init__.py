@@ -1,47 +1,52 @@
-"""The fastest rasterizer without a GPU: compiled kernels behind the interface, in float32, and in float64 for checking.
+"""The backend "cpp": compiled kernels for the CPU, in float32, and in float64 for checks.
 
-The stages are those of `rasterizers.reference`, and so are their names: project, bin, blend, and back. The sources in
-`src/` know no Python; `bindings.cpp` knows both. Which of the modules here runs is decided by `rasterizers.native`.
+The stages have the names of `rasterizers.reference`: project, bin, blend, and their VJPs. The headers in `src/` do not
+depend on Python; `src/bindings.cpp` wraps them. `rasterizers.native` loads the module for this processor.
 
-Deterministic: the same bits for any number of threads, and for any memory budget.
+Results have the same bits for any number of threads and any memory budget.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import build, packed_rows, require_cotangents, require_finite, require_tiles, shares
+from rasterizers.checks import (
+    packed_rows,
+    require_cotangents,
+    require_finite,
+    require_tiles,
+    same_gaussians_and_pose,
+)
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.native import load_kernels, threads
 
 _TRAITS: Final = Traits(
     devices=frozenset({"cpu"}),
     dtypes=frozenset({torch.float32, torch.float64}),
-    shared_pass=True,
-    shared_scales=True,
-    deterministic=True,
-    own_threads=True,
+    native_threads=True,
 )
-_BLOCK: Final = 4  # px: what one register blends, so what a tile must be a multiple of
+_BLOCK: Final = 4  # px, the block that the kernels blend at once; tiles are a multiple of it
 _FRAMES: Final = {torch.float32: "Frame32", torch.float64: "Frame64"}
 
 
 @dataclass(frozen=True, slots=True)
 class CppRasterizer(RasterSettings):
-    """Compiled kernels for CPUs.
+    """Compiled kernels for the CPU.
 
     Args:
-        tile: edge of the demand mask's tiles, px, a multiple of 4; at 32 a tile is a bin, and skipping it is free.
-        memory: MiB that the lists of one picture may take; beyond it the picture is drawn in bands, bit for bit the same.
-        threads: None: as many as torch uses, see `native.threads`.
+        tile: edge of the tile mask's tiles, px, a multiple of 4. Tiles of 32 px are skipped at no cost.
+        memory: MiB that the lists of one image may take; beyond it the image is drawn in bands, with the same bits.
+        threads: None: `rasterizers.native.threads()`.
 
-    A rendering's `vjp` reads the splats' tensors again: pull before they are changed in place.
+    Raises:
+        BackendUnavailable: the kernels were not compiled.
+        ValueError: a setting is out of range.
     """
 
     tile: int = 32
@@ -56,6 +61,7 @@ class CppRasterizer(RasterSettings):
             raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}.")
+        load_kernels(__name__)
 
     @property
     def traits(self) -> Traits:
@@ -67,16 +73,16 @@ class CppRasterizer(RasterSettings):
     def render_scales(
         self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
     ) -> list[Rendering]:
-        """Screens of one pose share projection, colour and depth order where their tensors are the same objects."""
+        """Jobs with the same pose and tensor objects share projection, colour and depth order."""
         masks = [None] * len(jobs) if tiles is None else tiles
-        if len(jobs) > 1 and all(shares(jobs[0], job) for job in jobs[1:]):
+        if len(jobs) > 1 and all(same_gaussians_and_pose(jobs[0], job) for job in jobs[1:]):
             frame = _Frame(self, jobs, masks)
             return [CppRendering(frame, i) for i in range(len(jobs))]
         return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
 
 
 class _Frame:
-    """One projection for several screens: the native frame, and the tensors that it reads again on the way back."""
+    """One projection for several pixel grids: the native frame, and the tensors that its VJP reads again."""
 
     def __init__(
         self,
@@ -86,9 +92,9 @@ class _Frame:
     ) -> None:
         splats, camera = jobs[0]
         masks = [None if mask is None else mask.to("cpu", torch.bool).contiguous() for mask in tiles]
-        for mask, (_, screen) in zip(masks, jobs, strict=True):
+        for mask, (_, view) in zip(masks, jobs, strict=True):
             if mask is not None:
-                require_tiles(mask, screen.width, screen.height, settings.tile)
+                require_tiles(mask, view.width, view.height, settings.tile)
         n, like = len(splats), splats.means
         dtype = like.dtype
         if dtype not in _FRAMES or like.device.type != "cpu":
@@ -98,7 +104,7 @@ class _Frame:
         self.cameras = [camera for _, camera in jobs]
         shared = (splats.means, splats.quats, splats.scales, splats.sh0)
         self.shared = (*(x.detach().contiguous() for x in shared), packed_rows(splats.shN.detach()))
-        # Kept here because the native frame only borrows them.
+        # Referenced here because the native frame does not keep them alive.
         self.opacities = [job.opacities.detach().contiguous() for job, _ in jobs]
         self.offsets = [None if job.rgb_offset is None else job.rgb_offset.detach().contiguous() for job, _ in jobs]
         self.native = getattr(load_kernels(__name__), _FRAMES[dtype])(
@@ -132,12 +138,12 @@ class _Frame:
                 require_finite(job)
 
     def empty(self, *shape: int) -> Tensor:
-        """A tensor to be filled, of memory that a picture before it has used: fresh pages cost more than the filling."""
+        """An uninitialised tensor in recycled memory, because fresh pages cost more than filling them."""
         fresh: Tensor = self.native.empty(shape)
         return fresh
 
     def basis(self) -> Float[Tensor, "N B1"]:
-        """Y of this pose's directions, the same for all screens; made when first asked for."""
+        """Y of this pose's directions, computed once for all grids."""
         if self._basis is None:
             means, shN = self.shared[0], self.shared[4]
             self._basis = self.empty(len(means), shN.shape[1] + 1)
@@ -146,35 +152,25 @@ class _Frame:
 
 
 class CppRendering:
-    """A picture on one screen of a frame."""
+    """An image on one pixel grid of a frame."""
 
-    def __init__(self, frame: _Frame, screen: int) -> None:
-        self._frame, self._screen = frame, screen
-        camera = frame.cameras[screen]
+    def __init__(self, frame: _Frame, grid: int) -> None:
+        self._frame, self._grid = frame, grid
+        camera = frame.cameras[grid]
         self.image: Float[Tensor, "H W 3"] = frame.empty(camera.height, camera.width, 3)
         self.alpha: Float[Tensor, "H W"] = frame.empty(camera.height, camera.width)
-        self.means2d: Float[Tensor, "N 2"] = frame.means2d[screen]
-        self.visible: Bool[Tensor, " N"] = frame.visible[screen]
-        frame.native.draw(screen, self.image, self.alpha, frame.threads)
+        self.means2d: Float[Tensor, "N 2"] = frame.means2d[grid]
+        self.visible: Bool[Tensor, " N"] = frame.visible[grid]
+        frame.native.draw(grid, self.image, self.alpha, frame.threads)
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
-        """One traversal for up to three cotangents; see `Rendering.vjp`."""
+        """One pass for up to three cotangents; see `Rendering.vjp`."""
         require_cotangents(cotangents, self.image)
         k, n, frame = len(cotangents), len(self.visible), self._frame
         means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
         opacities = frame.empty(k, n)
         frame.native.vjp(
-            self._screen, cotangents.detach().to(self.image).contiguous(), *frame.shared,
+            self._grid, cotangents.detach().to(self.image).contiguous(), *frame.shared,
             means, quats, scales, opacities, screen, rgb, frame.threads,
         )  # fmt: skip
         return SplatGradients(means, quats, scales, opacities, screen, rgb, frame.basis())
-
-
-def create(**settings: Any) -> CppRasterizer:
-    """The backend called "cpp"; `settings` are the fields of `CppRasterizer`.
-
-    Raises:
-        BackendUnavailable: the kernels were not built.
-    """
-    load_kernels(__name__)
-    return build(CppRasterizer, settings)

@@ -1,23 +1,23 @@
-"""The specification: a rasterizer in pure torch, float32 and float64, written to be read.
+"""The backend "torch": the reference implementation in pure torch, float32 and float64, written to be read.
 
-Three steps, each a file: `projection` (Gaussians to screen-space ellipses), `tiles` (which ellipse may touch which
-tile, front to back) and `blend` (compositing, and its transpose). Projection is differentiated by autograd, blending
-by hand: autograd would keep a dozen tensors per pixel-Gaussian pair, the hand-written transpose keeps none.
+It has three steps, each in its file: `projection` (Gaussians to ellipses on the image), `tiles` (the ellipses that may
+touch each tile, front to back) and `blend` (compositing, and its VJP). Autograd differentiates the projection. The VJP of
+blending is written by hand, because autograd would keep a dozen tensors per pair of pixel and Gaussian.
 
-Every other backend is judged against this one. It is also usable: memory is bounded by `lanes`, not by the scene.
+The other backends are tested against this one. It can also train: `lanes` bounds its memory independently of the scene.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import build, require_cotangents, require_finite
+from rasterizers.checks import require_cotangents, require_finite
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.reference.blend import blend, blend_vjp
 from rasterizers.reference.projection import Projection, project
@@ -26,17 +26,18 @@ from rasterizers.reference.tiles import TileGrid, TileLists, list_tiles
 _TRAITS: Final = Traits(
     devices=frozenset({"cpu", "cuda"}),
     dtypes=frozenset({torch.float32, torch.float64}),
-    shared_pass=True,
-    shared_scales=False,
-    deterministic=True,  # on the CPU; index_add_ on CUDA is not
 )
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceRasterizer(RasterSettings):
-    """Pure torch. `lanes` bounds the working set: pixel-Gaussian pairs blended at a time (16 bytes to 100 each)."""
+    """Pure torch. Deterministic on the CPU only, because index_add_ on CUDA is not.
 
-    tile: int = 8  # half the work of 16 in torch
+    Args:
+        lanes: pairs of pixel and Gaussian that are blended at a time, 16 to 100 bytes each.
+    """
+
+    tile: int = 8  # takes half the time of 16 in torch
     lanes: int = 1 << 19
 
     def __post_init__(self) -> None:
@@ -63,7 +64,7 @@ class ReferenceRasterizer(RasterSettings):
 
 
 class ReferenceRendering:
-    """The picture, and the lists that its transpose walks again."""
+    """The image, and the tile lists that its VJP reads again."""
 
     def __init__(self, settings: ReferenceRasterizer, grid: TileGrid, projection: Projection, lists: TileLists) -> None:
         self._settings, self._grid, self._projection = settings, grid, projection
@@ -75,13 +76,8 @@ class ReferenceRendering:
         self.alpha: Float[Tensor, "H W"] = 1 - grid.to_image(transmittance[..., None])[..., 0]
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
-        """One traversal for all K; see `Rendering.vjp`."""
+        """One pass for all K; see `Rendering.vjp`."""
         require_cotangents(cotangents, self.image)
         v = torch.stack([self._grid.to_tiles(c.to(self.image)) for c in cotangents])
         table = self._projection.table()
         return self._projection.vjp(blend_vjp(table, self._passes, self._grid, self._settings, v))
-
-
-def create(**settings: Any) -> ReferenceRasterizer:
-    """The backend called "torch"; `settings` are the fields of `ReferenceRasterizer`."""
-    return build(ReferenceRasterizer, settings)

@@ -1,9 +1,9 @@
-"""Front-to-back compositing of tile lists, and its transpose for K image cotangents in one walk.
+"""Front-to-back compositing of tile lists, and its VJP for K image cotangents in one pass.
 
     α_i = min(α_max, o_i exp(-½ dᵀ Σ'⁻¹ d)),   T_i = Π_{j<i} (1 - α_j),   I = Σ_i T_i α_i c_i + T_end·background
 
-A pair with α_i < α_min is passed over; a pixel ends *before* the Gaussian that would take its transmittance below
-`transmittance_min`. The work is done in batches of tiles × slabs of their lists: [B tiles, L pairs, P pixels].
+A pair with α_i < α_min is skipped; a pixel ends *before* the Gaussian that would take its transmittance below
+`transmittance_min`. The work is split into batches of tiles and slabs of their lists: [B tiles, L pairs, P pixels].
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rasterizers.reference.tiles import TileGrid, TileLists
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pass:
-    """What the transpose needs of a batch: its tiles, each slab's pairs with the T on entering it, and T_end."""
+    """What the VJP needs of a batch: its tiles, each slab's pairs with the T in front of it, and T_end."""
 
     tiles: Int[Tensor, " B"]
     slabs: list[tuple[Int[Tensor, "B _"], Float[Tensor, "B P"]]]
@@ -32,12 +32,11 @@ class Pass:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Slab:
-    """One slab composited: the rows of the table, and per pair and pixel α, T before and after it, and its weight.
+    """A composited slab: rows of the table, and for each pair and pixel α, T before and after it, and its weight.
 
     Args:
-        splat: o·exp(…), before the cap and the cut.
-        kept: 1 where the pixel has not ended, 0 after; None if none of these pixels ends in this slab.
-        dx, dy: pixel centre minus Gaussian centre.
+        splat: o·exp(…), before the cap and the cut-off.
+        kept: 1 where the pixel has not ended, else 0; None if no pixel ends in this slab.
     """
 
     rows: Float[Tensor, "B L 9"]
@@ -53,7 +52,7 @@ class Slab:
         return weights if self.kept is None else weights * self.kept
 
     def end(self, so_far: Float[Tensor, "B P"]) -> Float[Tensor, "B P"]:
-        """T of the pixels as they end: the last T that was kept."""
+        """The final T of the pixels: the last one that was kept."""
         if self.kept is None:
             return self.after[:, -1]
         return torch.minimum(so_far, torch.where(self.kept > 0, self.after, 1.0).amin(1))
@@ -71,7 +70,7 @@ def blend(
     passes = []
     for tiles in lists.batches(pixels, lanes):
         color = table.new_zeros(len(tiles), pixels, 3)
-        through = end = table.new_ones(len(tiles), pixels)  # `through` falls on after a pixel has ended
+        through = end = table.new_ones(len(tiles), pixels)  # `through` keeps falling after a pixel has ended
         slabs = []
         for pairs in lists.slabs(tiles):
             if bool((through < settings.transmittance_min).all()):
@@ -107,7 +106,7 @@ def blend_vjp(
         for pairs, through in reversed(batch.slabs):
             slab = _composite(table[pairs], batch.tiles, grid, settings, through)
             weights = slab.weights
-            # Where the cap binds, or α was cut to 0, the picture does not depend on the ellipse.
+            # Where α is capped or cut to 0, the image does not depend on the ellipse.
             sensitivity = slab.alpha * _at_least(settings.alpha_max - slab.splat, 0)
             if slab.kept is not None:
                 sensitivity *= slab.kept
@@ -155,8 +154,8 @@ def _table_gradient(
     grid: TileGrid,
     monomials: Float[Tensor, "P 6"],
 ) -> Float[Tensor, "B L 9"]:
-    """From q = ∂L/∂(log splat) per pixel to the row's gradient, by way of q's moments about the Gaussian's centre."""
-    # Moments about the tile's centre first: one product serves all tiles.
+    """The gradient of the table's rows from q = ∂L/∂(log splat) per pixel, by q's moments about the Gaussian's centre."""
+    # Moments about the tile's centre first, because one matrix product then serves all tiles.
     m, mx, my, mxx, mxy, myy = (q @ monomials).unbind(-1)
     u, v = rows[..., MEAN].unbind(-1)
     A, B, C = rows[..., CONIC].unbind(-1)
@@ -178,7 +177,7 @@ def _monomials(tile: int, like: Tensor) -> Float[Tensor, "P 6"]:
     return torch.stack((torch.ones_like(x), x, y, x * x, x * y, y * y), dim=-1)
 
 
-# torch.where with a scalar is ten times slower on a CPU than these.
+# These are ten times faster on a CPU than torch.where with a scalar.
 def _cut_below(x: Tensor, limit: float) -> Tensor:
     """X where x >= limit, else 0."""
     return F.threshold(x, _just_below(limit, x.dtype), 0.0)

@@ -1,8 +1,7 @@
-"""Gaussians to screen: EWA projection with the 2D Mip kernel, view-dependent colour, and the way back.
+"""EWA projection of Gaussians with the 2D Mip kernel, their view-dependent colour, and the VJP of both.
 
-Only Gaussians that can contribute (in front of the near plane, opaque enough) are projected at all.
-Determinants come from the factor T of Σ = T Tᵀ, as sums of squared minors (Cauchy-Binet): `a c - b²` loses
-every digit of a needle (STRESS row 6), this form has only positive terms.
+Only Gaussians that can contribute (beyond the near plane, opaque enough) are projected. Determinants are sums of squared
+minors of the factor T of Σ = T Tᵀ (Cauchy-Binet), which has only positive terms; `a c - b²` loses all digits for a needle.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from torch import Tensor
 from rasterizers.geometry import rotation_matrix, spherical_harmonics
 from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
 
-# A projected centre may lie outside the image by this share of the half field of view before the Jacobian is clamped.
+# The Jacobian is clamped beyond this share of the half field of view outside the image.
 _FRUSTUM_MARGIN = 0.3
 
 # Columns of the table that blending reads, one row per projected Gaussian.
@@ -26,7 +25,7 @@ TABLE_WIDTH = 9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """M of N Gaussians on the screen, with the graph that leads back to their attributes.
+    """M of N Gaussians projected onto the image, with the autograd graph of the projection.
 
     Args:
         rows: which of the N splats each row is.
@@ -34,7 +33,7 @@ class Projection:
         opacities: after the Mip compensation.
         half_extents: half the bounding box of the region where alpha may reach alpha_min, px.
         power_max: the exponent at which alpha has fallen to alpha_min.
-        leaves: copies of the splats' rows (means, quats, scales, opacities) that the graph starts from.
+        leaves: copies of the splats' rows (means, quats, scales, opacities), the inputs of the graph.
         raw_rgb: colour before its clamp at 0. basis: Y of this view's directions.
     """
 
@@ -52,28 +51,29 @@ class Projection:
     basis: Float[Tensor, "M B1"]
 
     def table(self) -> Float[Tensor, "M1 9"]:
-        """What blending reads, plus one empty row that pads the tile lists."""
+        """The columns that blending reads, plus an empty row that pads the tile lists."""
         columns = (self.means2d, self.conics, self.opacities[:, None], self.rgb)
         table = torch.cat(columns, dim=1).detach()
         return torch.cat((table, table.new_zeros(1, TABLE_WIDTH)))
 
     def scatter(self, values: Tensor, n: int) -> Tensor:
-        """Rows back to all N splats, zeros (or False) elsewhere."""
+        """The values at their rows among all N splats; zeros (or False) elsewhere."""
         out = values.new_zeros(n, *values.shape[1:])
         out[self.rows] = values
         return out
 
     def vjp(self, table_gradients: Float[Tensor, "K M1 9"]) -> SplatGradients:
-        """From gradients of the table to gradients of the splats."""
+        """The splats' gradients from those of the table."""
         outputs = (self.means2d, self.conics, self.opacities, self.rgb)
         inputs = (*self.leaves, self.raw_rgb)
-        pulled = []
+        by_cotangent = []
         for g in table_gradients[:, : self.rows.shape[0]]:
             cotangents = (g[:, MEAN], g[:, CONIC], g[:, OPACITY][:, 0], g[:, RGB])
             gradients = torch.autograd.grad(outputs, inputs, cotangents, retain_graph=True, materialize_grads=True)
-            pulled.append([*gradients, g[:, MEAN]])
+            by_cotangent.append([*gradients, g[:, MEAN]])
         means, quats, scales, opacities, rgb, screen = (
-            torch.stack([self.scatter(g, self.n_splats) for g in attribute]) for attribute in zip(*pulled, strict=True)
+            torch.stack([self.scatter(g, self.n_splats) for g in attribute])
+            for attribute in zip(*by_cotangent, strict=True)
         )
         return SplatGradients(
             means, quats, scales, opacities, screen, rgb, basis=self.scatter(self.basis, self.n_splats)
@@ -114,11 +114,11 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings) -> Project
         if splats.rgb_offset is not None:
             raw_rgb = raw_rgb + splats.rgb_offset.detach()[rows]
         if not raw_rgb.requires_grad:
-            raw_rgb.requires_grad_()  # without higher bands colour hangs on no direction, and nothing else made a graph
+            raw_rgb.requires_grad_()  # without higher bands the colour depends on no leaf
         rgb = raw_rgb.clamp_min(0)
 
     with torch.no_grad():
-        # alpha >= alpha_min  <=>  exponent <= power_max. A little generous: only the pixel decides (see blend).
+        # alpha >= alpha_min  <=>  exponent <= power_max, with a margin; `blend` applies the exact cut-off per pixel.
         power_max = (opacities / settings.alpha_min).log() * (1 + 1e-3) + 1e-3
         half = torch.sqrt(2 * power_max.clamp_min(0)[:, None] * torch.stack((a + k, c + k), dim=-1))
     return Projection(
@@ -138,14 +138,14 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings) -> Project
 
 
 def _candidates(splats: Splats, pose: Float[Tensor, "4 4"], settings: RasterSettings) -> Int[Tensor, " M"]:
-    """Conditions to keep, not to cull: NaN fails each of them."""
+    """The Gaussians to project. The conditions say which are kept, because NaN fails each of them."""
     depth = splats.means.detach() @ pose[2, :3] + pose[2, 3]
     keep: Tensor = (depth > settings.near) & (splats.opacities.detach() >= settings.alpha_min)
     return torch.nonzero(keep)[:, 0]
 
 
 def _jacobian(tan_x: Tensor, tan_y: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The off-axis entries of J, times z. Clamped far outside the image, where the affine approximation explodes."""
+    """The off-axis entries of J, times z. Clamped far outside the image, where the affine approximation diverges."""
     margin_x = _FRUSTUM_MARGIN * camera.width / (2 * camera.fx)
     margin_y = _FRUSTUM_MARGIN * camera.height / (2 * camera.fy)
     left, right = -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x

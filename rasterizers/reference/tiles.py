@@ -1,7 +1,7 @@
-"""Which Gaussian may touch which tile, front to back, without touching a pixel.
+"""The lists of Gaussians that may touch each tile, front to back.
 
-The lists are generous and exact decisions are left to `blend`: a pair listed in vain costs time, a pair missing
-would cost correctness. Ties in depth are broken by index (stable sorts), so the order is total.
+The lists may hold too many pairs, which only costs time; `blend` decides per pixel. Equal depths keep the order of their
+indices (stable sorts).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rasterizers.reference.projection import Projection
 
 @dataclass(frozen=True, slots=True)
 class TileGrid:
-    """An image cut into squares of `tile` pixels; the last row and column may hang over."""
+    """An image divided into squares of `tile` pixels; the last row and column may extend beyond it."""
 
     width: int
     height: int
@@ -53,7 +53,7 @@ class TileLists:
     Args:
         gaussians: row of the projection table of each pair.
         starts, lengths: the pairs of tile i are `gaussians[starts[i] : starts[i] + lengths[i]]`.
-        visible: rows that may touch at least one tile of the image, asked for or not.
+        visible: rows that may touch at least one tile of the image, requested or not.
     """
 
     gaussians: Int[Tensor, " pairs"]
@@ -62,14 +62,14 @@ class TileLists:
     visible: Bool[Tensor, " M"]
 
     def batches(self, lanes_per_pair: int, lanes: int) -> list[Int[Tensor, " _"]]:
-        """Non-empty tiles, those with similarly long lists together, each batch one pair deep within `lanes`."""
+        """The non-empty tiles in batches of at most `lanes` lanes per slab, sorted by the length of their lists."""
         order = torch.argsort(self.lengths, descending=True, stable=True)
         order = order[: int((self.lengths > 0).sum())]
         per_batch = max(1, lanes // (lanes_per_pair * _SLAB))
         return list(torch.split(order, per_batch)) if len(order) else []
 
     def slabs(self, tiles: Int[Tensor, " B"]) -> list[Int[Tensor, "B _"]]:
-        """The lists of some tiles, side by side and cut across into slabs; short lists end in the table's empty row."""
+        """The lists of some tiles, stacked and split into slabs; short lists are padded with the table's empty row."""
         depth = int(self.lengths[tiles].max())
         return [self._slab(tiles, first, min(_SLAB, depth - first)) for first in range(0, depth, _SLAB)]
 
@@ -80,19 +80,19 @@ class TileLists:
         return torch.where(inside, self.gaussians[pairs], len(self.visible))
 
 
-_SLAB = 64  # pairs of one tile that are blended at a time; saturated tiles stop between slabs
+_SLAB = 64  # pairs of a tile that are blended at a time; opaque tiles stop between slabs
 
 
 @torch.no_grad()
-def list_tiles(projection: Projection, grid: TileGrid, demand: Bool[Tensor, "th tw"] | None) -> TileLists:
+def list_tiles(projection: Projection, grid: TileGrid, mask: Bool[Tensor, "th tw"] | None) -> TileLists:
     """Pair each projected Gaussian with the tiles its ellipse of alpha >= alpha_min may reach.
 
     Raises:
-        ValueError: the demand mask has not one entry per tile.
+        ValueError: the tile mask does not have one entry per tile.
     """
     n_tiles = grid.rows * grid.columns
-    if demand is not None:
-        require_tiles(demand, grid.width, grid.height, grid.tile)
+    if mask is not None:
+        require_tiles(mask, grid.width, grid.height, grid.tile)
     rows = torch.argsort(projection.depths, stable=True)
     means, half = projection.means2d.detach()[rows], projection.half_extents[rows]
     first, last = _tile_range(means - half, grid), _tile_range(means + half, grid)
@@ -110,9 +110,9 @@ def list_tiles(projection: Projection, grid: TileGrid, demand: Bool[Tensor, "th 
 
     visible = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     visible[rows[owner]] = True
-    if demand is not None:
-        asked = demand.to(tile.device).flatten()[tile]
-        owner, tile = owner[asked], tile[asked]
+    if mask is not None:
+        requested = mask.to(tile.device).flatten()[tile]
+        owner, tile = owner[requested], tile[requested]
 
     by_tile = torch.argsort(tile, stable=True)  # keeps the depth order within each tile
     lengths = torch.bincount(tile, minlength=n_tiles)
@@ -121,7 +121,7 @@ def list_tiles(projection: Projection, grid: TileGrid, demand: Bool[Tensor, "th 
 
 def _tile_range(corner: Float[Tensor, "M 2"], grid: TileGrid) -> Int[Tensor, "M 2"]:
     limit = corner.new_tensor((grid.columns - 1, grid.rows - 1))
-    # Clamped as float: a huge splat's corner does not fit an integer.
+    # Clamped as float, because a huge splat's corner does not fit an integer.
     return (corner / grid.tile).floor().clamp(min=torch.zeros_like(limit), max=limit).long()
 
 
@@ -133,15 +133,15 @@ def _overlaps(means: Tensor, half: Tensor, grid: TileGrid) -> Bool[Tensor, " M"]
 def _ellipse_reaches(
     projection: Projection, row: Tensor, tile_x: Tensor, tile_y: Tensor, grid: TileGrid
 ) -> Bool[Tensor, " pairs"]:
-    """Whether the smallest exponent over a tile's pixel centres' box is within power_max: exact, not a bounding box.
+    """Whether the smallest exponent over the box of a tile's pixel centres is at most power_max; exact.
 
-    A convex quadratic over a box is smallest at its centre if that is inside, else on one of the (at most two) sides
-    that face it; on a side the minimiser is the clamped vertex of a parabola.
+    A convex quadratic has its minimum over a box at its centre if that is inside, else on one of the (at most two) sides
+    that face the centre; on a side it is at the clamped vertex of a parabola.
     """
     u, v = projection.means2d.detach()[row].unbind(-1)
     A, B, C = projection.conics.detach()[row].unbind(-1)
     left, top = tile_x * grid.tile + 0.5 - u, tile_y * grid.tile + 0.5 - v
-    # The last column's and row's tiles hang over the image; what lies there is nobody's pixel.
+    # The tiles of the last column and row may extend beyond the image, where there are no pixels.
     right = torch.minimum(left + grid.tile - 1, grid.width - 0.5 - u)
     bottom = torch.minimum(top + grid.tile - 1, grid.height - 0.5 - v)
     near_x, near_y = _nearest_to_zero(left, right), _nearest_to_zero(top, bottom)

@@ -1,9 +1,9 @@
-"""Blend: the pixels of a tile, front to back, and the transpose for K image cotangents, back to front.
+"""Blend: composites the pixels of a tile front to back; its VJP for K image cotangents runs back to front.
 
     α_i = min(α_max, o_i exp(…)),   T_i = Π_{j<i} (1 - α_j),   I = Σ T_i α_i c_i + T_end · background
 
-A Gaussian with α_i < α_min is passed over; a pixel ends before the one that would take its T below transmittance_min.
-T at the end is stored, never rebuilt from alpha.
+A Gaussian with α_i < α_min is skipped; a pixel ends before the Gaussian that would take its T below transmittance_min.
+The final T is stored, because 1 - alpha would lose its digits.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from typing import Any
 import warp as wp
 
 from rasterizers.warp_backend.bins import exponent
-from rasterizers.warp_backend.types import PIXELS, TILE, Cuts, Ellipse, Row, Screen, ellipse_of
+from rasterizers.warp_backend.types import PIXELS, TILE, Cuts, Ellipse, Grid, Row, ellipse_of
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def pixel_of(tile: wp.int32, within: wp.int32, screen: Screen) -> wp.vec2i:
-    """Column and row in the image of a tile's pixel."""
-    column, row = tile % screen.tiles[0], tile / screen.tiles[0]
+def pixel_of(tile: wp.int32, within: wp.int32, grid: Grid) -> wp.vec2i:
+    """Column and row of a tile's pixel in the image."""
+    column, row = tile % grid.tiles[0], tile / grid.tiles[0]
     return wp.vec2i(column * TILE + within % TILE, row * TILE + within / TILE)
 
 
 @wp.func
-def inside(pixel: wp.vec2i, screen: Screen) -> wp.bool:
-    """Tiles may hang over the image."""
-    return pixel[0] < screen.size[0] and pixel[1] < screen.size[1]
+def inside(pixel: wp.vec2i, grid: Grid) -> wp.bool:
+    """Whether the pixel lies in the image; tiles may extend beyond it."""
+    return pixel[0] < grid.size[0] and pixel[1] < grid.size[1]
 
 
 @wp.func
 def offset_of(pixel: wp.vec2i, ellipse: Ellipse) -> wp.vec2:
-    """From the ellipse's centre to the pixel's."""
+    """The vector from the ellipse's centre to the pixel's."""
     return wp.vec2(wp.float32(pixel[0]), wp.float32(pixel[1])) - ellipse.whole + (wp.vec2(0.5, 0.5) - ellipse.rest)
 
 
@@ -45,7 +45,7 @@ def colour(ellipse: Ellipse) -> wp.vec3:
 
 @wp.kernel
 def blend(
-    screen: Screen,
+    grid: Grid,
     cuts: Cuts,
     rows: wp.array[Row],
     listed: wp.array[wp.int32],
@@ -57,11 +57,11 @@ def blend(
     ended: wp.array2d[wp.int32],
     reached: wp.array[wp.int32],
 ) -> None:
-    """A thread per pixel. `ended`: the first pair it did not take; `reached`: the last such of the tile's pixels."""
+    """One thread per pixel. `ended`: the first pair that it did not blend; `reached`: the largest such of the tile."""
     thread = wp.tid()
     tile = thread / PIXELS
-    pixel = pixel_of(tile, thread % PIXELS, screen)
-    if not inside(pixel, screen):
+    pixel = pixel_of(tile, thread % PIXELS, grid)
+    if not inside(pixel, grid):
         return
     through, rgb = wp.float32(1.0), wp.vec3(0.0, 0.0, 0.0)
     at = wp.int32(starts[tile])
@@ -86,13 +86,13 @@ def blend(
 
 @cache
 def blend_vjp(K: int, lanes: int) -> Any:
-    """The kernel that walks back for K cotangents, with `lanes` threads a tile.
+    """The VJP kernel for K cotangents, with `lanes` threads per tile.
 
-    Each lane owns `64 / lanes` pixels. For every pair it adds up its pixels' part, the lanes' parts are reduced together,
-    and the pair's place gets the sum: no atomics, one order. A warp a tile suits a GPU; on a CPU one lane owns them all.
+    Each lane has `64 / lanes` pixels. For every pair it sums over its pixels, the lanes' sums are reduced, and the result is
+    stored at the pair's place: no atomics, a fixed order. A GPU uses a warp per tile, a CPU one thread.
     """
     own = PIXELS // lanes
-    Sent = wp.types.vector(length=9 * K, dtype=wp.float32)
+    PairSums = wp.types.vector(length=9 * K, dtype=wp.float32)
     Pixels = wp.types.vector(length=own, dtype=wp.float32)
     Ends = wp.types.vector(length=own, dtype=wp.int32)
     Behind = wp.types.matrix(shape=(own, K), dtype=wp.float32)
@@ -100,7 +100,7 @@ def blend_vjp(K: int, lanes: int) -> Any:
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend_vjp(
-        screen: Screen,
+        grid: Grid,
         cuts: Cuts,
         rows: wp.array[Row],
         listed: wp.array[wp.int32],
@@ -111,29 +111,29 @@ def blend_vjp(K: int, lanes: int) -> Any:
         ended: wp.array2d[wp.int32],
         reached: wp.array[wp.int32],
         cotangents: wp.array3d[wp.vec3],
-        sent: wp.array[Sent],
+        pair_sums: wp.array[PairSums],
     ) -> None:
         tile, lane = wp.tid()
         begin, last = starts[tile], wp.max(starts[tile], reached[tile])
         through, stop, behind, v = Pixels(), Ends(), Behind(), Cotangents()
         for j in range(own):
-            pixel = pixel_of(tile, j * lanes + lane, screen)
-            if inside(pixel, screen):
+            pixel = pixel_of(tile, j * lanes + lane, grid)
+            if inside(pixel, grid):
                 through[j] = transmittance[pixel[1], pixel[0]]
                 stop[j] = ended[pixel[1], pixel[0]]
                 for k in range(K):
                     w = cotangents[k, pixel[1], pixel[0]]
                     v[j * K + k] = w
-                    # Σ_{j>i} T_j α_j (c_j·v) + T_end background·v: the light from behind, here from behind them all.
+                    # Σ_{j>i} T_j α_j (c_j·v) + T_end background·v, here with i the last Gaussian.
                     behind[j, k] = through[j] * wp.dot(w, cuts.background)
 
         for back in range(last - begin):
             at = last - 1 - back
             ellipse = ellipse_of(rows[listed[at]])
             rgb = colour(ellipse)
-            part = Sent()
+            part = PairSums()
             for j in range(own):
-                d = offset_of(pixel_of(tile, j * lanes + lane, screen), ellipse)
+                d = offset_of(pixel_of(tile, j * lanes + lane, grid), ellipse)
                 free = ellipse.opacity * wp.exp(-exponent(ellipse, d[0], d[1]))
                 if at < stop[j] and free >= cuts.alpha_min:
                     share = wp.min(free, cuts.alpha_max)
@@ -142,7 +142,7 @@ def blend_vjp(K: int, lanes: int) -> Any:
                     weight = through[j] * share
                     for k in range(K):
                         light = wp.dot(v[j * K + k], rgb)
-                        if free <= cuts.alpha_max:  # where the cap binds the picture does not depend on the ellipse
+                        if free <= cuts.alpha_max:  # where α is capped, the image does not depend on the ellipse
                             q = share * (through[j] * light - behind[j, k] * over)
                             part[9 * k] += q
                             part[9 * k + 1] += q * d[0]
@@ -154,9 +154,9 @@ def blend_vjp(K: int, lanes: int) -> Any:
                         part[9 * k + 7] += weight * v[j * K + k, 1]
                         part[9 * k + 8] += weight * v[j * K + k, 2]
                         behind[j, k] = behind[j, k] + weight * light
-            wp.tile_store(sent, wp.tile_sum(wp.tile(part, preserve_type=True)), offset=(pairs[at],))
-        # Every pair's place is read, also of those that no pixel came to.
+            wp.tile_store(pair_sums, wp.tile_sum(wp.tile(part, preserve_type=True)), offset=(pairs[at],))
+        # The places of pairs that no pixel blended are read, too.
         for at in range(last + lane, ends[tile], lanes):
-            sent[pairs[at]] = Sent()
+            pair_sums[pairs[at]] = PairSums()
 
     return blend_vjp

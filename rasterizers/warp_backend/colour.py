@@ -1,7 +1,7 @@
-"""Colour: spherical harmonics of a direction, and the slope of the colour along the Gaussian's position.
+"""Colour from spherical harmonics, and its derivative along the Gaussian's position (`slope`).
 
-A pose sees a Gaussian from one direction whatever the resolution, so colour and slope are computed once for all screens;
-and since the slope is kept (nine numbers), the way back never reads the coefficients again.
+The direction does not depend on the resolution, so colour and slope are computed once for all grids. The slope (nine
+numbers) is kept, so the VJP does not read the coefficients again.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def band(k: wp.int32, d: wp.vec3) -> wp.vec4:  # noqa: PLR0911, PLR0912 - a table
-    """Y_k(d), and its derivatives along the coordinates of d; the signs are those that 3DGS stores."""
+    """Y_k(d) and its derivatives with respect to d, with the signs of 3DGS."""
     x, y, z = d[0], d[1], d[2]
     xx, yy, zz = x * x, y * y, z * z
     c1, a, b, c = 0.4886025119029199, 1.0925484305920792, 0.31539156525252005, 0.5462742152960396
@@ -69,13 +69,13 @@ def colour_of(
         y = band(k + 1, direction)
         rgb += y[0] * higher[i, k]
         slope += wp.outer(higher[i, k], wp.vec3(y[1], y[2], y[3]))
-    # A direction only turns: (I - d dᵀ) / distance.
+    # The derivative of the unit direction: (I - d dᵀ) / distance.
     return rgb, (slope - wp.outer(slope * direction, direction)) / distance
 
 
 @wp.kernel
 def basis(pose: Pose, means: wp.array[wp.vec3], visible: wp.array[wp.bool], Y: wp.array2d[wp.float32]) -> None:
-    """Y of every Gaussian that some screen shows; the others' rows stay as they are."""
+    """Y of the visible Gaussians; the other rows are not written."""
     i = wp.tid()
     if visible[i]:
         direction = wp.normalize(means[i] - pose.center)

@@ -1,24 +1,22 @@
-"""Gaussians to ellipses, and the way back. Mathematics on one Gaussian; touches no memory.
+"""Projection of one Gaussian to an ellipse, and its VJP. Arithmetic only; no arrays.
 
     Σ' = T Tᵀ + kernel·I,   T = J W R(q) diag(s)   (2 × 3)
 
-Determinants come from the factor T as sums of squared minors (Cauchy-Binet): ac - b² loses every digit of a needle.
+Determinants are sums of squared minors of the factor T (Cauchy-Binet), because ac - b² loses all digits for a needle.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from rasterizers.warp_backend.types import Cuts, Pose, Screen
+from rasterizers.warp_backend.types import Cuts, Grid, Pose
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
 class Centre:
-    """Camera coordinates and tangents in float64 whatever else is not: a screen coordinate of 1,000 px that is wrong by
-    one part in 10^7 moves a needle by a tenth of its width in a thousand.
-    """
+    """Depth and tangents in float64: in float32, an image coordinate of 1,000 px is off by 1e-4 px, which shifts thin needles."""
 
     z: wp.float64
     tan: wp.vec2d
@@ -26,11 +24,11 @@ class Centre:
 
 @wp.struct
 class Geometry:
-    """What does not depend on the focal length."""
+    """What does not depend on the focal length; shared by the grids of a pose."""
 
     inverse_z: wp.float32
-    tan: wp.vec2  # x/z, y/z …
-    limited: wp.vec2  # … and clamped far outside the image, where the affine approximation explodes
+    tan: wp.vec2  # x/z, y/z
+    limited: wp.vec2  # `tan`, clamped far outside the image, where the affine approximation diverges
     unit: wp.vec4  # q / |q|
     inverse_norm: wp.float32
     rotation: wp.mat33  # of the Gaussian
@@ -41,8 +39,8 @@ class Geometry:
 
 @wp.struct
 class Footprint:
-    """The ellipse. Lengths are measured in `size`, the larger of T's largest entry and √kernel: whatever the Gaussian,
-    the numbers that are squared twice lie between 0 and a few.
+    """The ellipse. Lengths are in units of `size`, the larger of T's largest entry and √kernel, so that fourth powers neither
+    overflow nor underflow.
     """
 
     X: wp.vec3  # the rows of T
@@ -51,18 +49,18 @@ class Footprint:
     kernel: wp.float32  # / size²
     a: wp.float32  # T Tᵀ / size²
     c: wp.float32
-    normal: wp.vec3  # X × Y / size² …
-    area: wp.float32  # … and its length, √det(T Tᵀ) / size²
+    normal: wp.vec3  # X × Y / size²
+    area: wp.float32  # length of `normal`, √det(T Tᵀ) / size²
     det: wp.float32  # det Σ' / size⁴
     xx: wp.float32  # Σ'⁻¹
     xy: wp.float32
     yy: wp.float32
-    compensation: wp.float32  # Mip-Splatting: √(det T Tᵀ / det Σ'), so that the kernel keeps a splat's total
+    compensation: wp.float32  # Mip-Splatting: √(det T Tᵀ / det Σ'), opacity factor that makes up for the kernel's blur
 
 
 @wp.struct
 class Sums:
-    """What pixels send back to a Gaussian: q = ∂L/∂(log alpha) and its moments about the centre."""
+    """Sums over a Gaussian's pixels: q = ∂L/∂(log alpha) and its moments about the centre."""
 
     q: wp.float32
     first: wp.vec2  # Σ q (dx, dy)
@@ -72,8 +70,8 @@ class Sums:
 
 
 @wp.struct
-class Pulled:
-    """The gradients of one Gaussian."""
+class GaussianGradient:
+    """The gradients of one Gaussian, with its screen gradient."""
 
     mean: wp.vec3
     quat: wp.vec4
@@ -107,13 +105,14 @@ def rotation_of(unit: wp.vec4) -> wp.mat33:
 
 
 @wp.func
-def geometry_of(pose: Pose, screen: Screen, centre: Centre, quat: wp.vec4, scale: wp.vec3) -> Geometry:
+def geometry_of(pose: Pose, grid: Grid, centre: Centre, quat: wp.vec4, scale: wp.vec3) -> Geometry:
     g = Geometry()
     g.inverse_z = 1.0 / wp.float32(centre.z)
     g.tan = wp.vec2(wp.float32(centre.tan[0]), wp.float32(centre.tan[1]))
-    g.limited = wp.min(wp.max(g.tan, screen.low), screen.high)
+    g.limited = wp.min(wp.max(g.tan, grid.low), grid.high)
 
-    # Scaled by the largest component first: |q|² neither overflows nor underflows. The zero quaternion is the identity.
+    # Divides by the largest component first, so that |q|² neither overflows nor underflows. The zero quaternion is the
+    # identity.
     largest = wp.max(wp.max(wp.abs(quat[0]), wp.abs(quat[1])), wp.max(wp.abs(quat[2]), wp.abs(quat[3])))
     g.unit = wp.vec4(1.0, 0.0, 0.0, 0.0)
     g.inverse_norm = 0.0
@@ -131,10 +130,10 @@ def geometry_of(pose: Pose, screen: Screen, centre: Centre, quat: wp.vec4, scale
 
 
 @wp.func
-def footprint_of(g: Geometry, screen: Screen, cuts: Cuts) -> Footprint:
+def footprint_of(g: Geometry, grid: Grid, cuts: Cuts) -> Footprint:
     f = Footprint()
-    f.X = screen.focal[0] * g.x
-    f.Y = screen.focal[1] * g.y
+    f.X = grid.focal[0] * g.x
+    f.Y = grid.focal[1] * g.y
     f.size = wp.max(wp.sqrt(cuts.kernel), wp.max(largest_of(f.X), largest_of(f.Y)))
     shrink = 1.0 / f.size
     x, y = f.X * shrink, f.Y * shrink
@@ -157,13 +156,13 @@ def footprint_of(g: Geometry, screen: Screen, cuts: Cuts) -> Footprint:
 
 @wp.func
 def geometry_vjp(
-    pose: Pose, screen: Screen, cuts: Cuts, g: Geometry, f: Footprint, scale: wp.vec3, sums: Sums
-) -> Pulled:
-    """Back through the projection. With M the second moments and ρ the compensation:
+    pose: Pose, grid: Grid, cuts: Cuts, g: Geometry, f: Footprint, scale: wp.vec3, sums: Sums
+) -> GaussianGradient:
+    """The VJP of the projection. With M the second moments and ρ the compensation:
 
     ∂L/∂u = Σ'⁻¹ (Σ q dx, Σ q dy),   ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T.
     """
-    out = Pulled()
+    out = GaussianGradient()
     du = f.xx * sums.first[0] + f.xy * sums.first[1]
     dv = f.xy * sums.first[0] + f.yy * sums.first[1]
     out.screen = wp.vec2(du, dv)
@@ -173,8 +172,8 @@ def geometry_vjp(
     mx, my = sums.xx * px + sums.xy * py, sums.xy * px + sums.yy * py
     dX, dY = f.xx * mx + f.xy * my, f.xy * mx + f.yy * my
     if cuts.antialiased:
-        # log ρ = ½ log area² - ½ log(area² + κ tr + κ²), written so that what cancels for a large Gaussian is never
-        # formed: ∂ log ρ/∂x = κ/det ((tr + κ)/area² (y × n) - x), and for y with n × x.
+        # log ρ = ½ log area² - ½ log(area² + κ tr + κ²). This form avoids the cancellation for large Gaussians:
+        # ∂ log ρ/∂x = κ/det ((tr + κ)/area² (y × n) - x), and for y with n × x.
         shrink = 1.0 / f.size
         x, y = f.X * shrink, f.Y * shrink
         weight = sums.q * shrink * f.kernel / f.det
@@ -182,9 +181,9 @@ def geometry_vjp(
         dX += weight * (turn * wp.cross(y, f.normal) - x)
         dY += weight * (turn * wp.cross(f.normal, x) - y)
 
-    # T = J axes: to the axes, to 1/z, and to the tangents where they are not clamped.
-    gx, gy = screen.focal[0] * g.inverse_z * dX, screen.focal[1] * g.inverse_z * dY
-    dtx, dty = screen.focal[0] * du, screen.focal[1] * dv
+    # T = J axes: gradients of the axes, of 1/z, and of the tangents where they are not clamped.
+    gx, gy = grid.focal[0] * g.inverse_z * dX, grid.focal[1] * g.inverse_z * dY
+    dtx, dty = grid.focal[0] * du, grid.focal[1] * dv
     if g.tan[0] == g.limited[0]:
         dtx -= wp.dot(g.axes[2], gx)
     if g.tan[1] == g.limited[1]:
@@ -203,7 +202,7 @@ def geometry_vjp(
 
 @wp.func
 def rotation_vjp(unit: wp.vec4, d: wp.mat33) -> wp.vec4:
-    """∂L/∂q for |q| = 1 from ∂L/∂R; a quaternion only turns, so what is along it is taken away."""
+    """∂L/∂q for |q| = 1 from ∂L/∂R, without the component along q."""
     w, x, y, z = unit[0], unit[1], unit[2], unit[3]
     turn_x, turn_y, turn_z = d[2, 1] - d[1, 2], d[0, 2] - d[2, 0], d[1, 0] - d[0, 1]
     xy, xz, yz = d[0, 1] + d[1, 0], d[0, 2] + d[2, 0], d[1, 2] + d[2, 1]

@@ -1,4 +1,4 @@
-"""Project: every Gaussian onto a screen, with its colour; and the sums of the pixels back to its tensors."""
+"""Project: every Gaussian onto a pixel grid, with its colour; and the VJP from the pixels' sums to its tensors."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rasterizers.warp_backend.geometry import (
     geometry_of,
     geometry_vjp,
 )
-from rasterizers.warp_backend.types import FAR, Cuts, Ellipse, Pose, Row, Screen, ellipse_of, row_of
+from rasterizers.warp_backend.types import FAR, Cuts, Ellipse, Grid, Pose, Row, ellipse_of, row_of
 
 wp.set_module_options({"enable_backward": False})
 
-HUGE = wp.constant(1e30)  # an ellipse of 1e-15 px covers no pixel centre, and its square would overflow
+HUGE = wp.constant(1e30)  # such an ellipse, of 1e-15 px, covers no pixel centre, and the square would overflow
 
 
 @wp.func
@@ -41,14 +41,14 @@ def ellipse_at(u: wp.float64, v: wp.float64, f: Footprint, opacity: wp.float32, 
 
 
 @wp.func
-def shows(ellipse: Ellipse, screen: Screen) -> wp.bool:
-    """Conditions to keep, not to cull: NaN fails each."""
-    seen = ellipse.reach > 0.0 and ellipse.A < HUGE and ellipse.C < HUGE
-    seen = seen and wp.abs(ellipse.whole[0]) < HUGE and wp.abs(ellipse.whole[1]) < HUGE
-    seen = seen and ellipse.half[0] >= 0.0 and ellipse.half[1] >= 0.0
-    if not seen:
+def is_visible(ellipse: Ellipse, grid: Grid) -> wp.bool:
+    """Whether the ellipse reaches the image. The conditions say which are kept, because NaN fails each."""
+    visible = ellipse.reach > 0.0 and ellipse.A < HUGE and ellipse.C < HUGE
+    visible = visible and wp.abs(ellipse.whole[0]) < HUGE and wp.abs(ellipse.whole[1]) < HUGE
+    visible = visible and ellipse.half[0] >= 0.0 and ellipse.half[1] >= 0.0
+    if not visible:
         return False
-    return reaches_image(ellipse, screen)
+    return reaches_image(ellipse, grid)
 
 
 @wp.func
@@ -59,7 +59,7 @@ def finite(v: wp.vec3) -> wp.bool:
 @wp.kernel
 def project(
     pose: Pose,
-    screen: Screen,
+    grid: Grid,
     cuts: Cuts,
     means: wp.array[wp.vec3],
     quats: wp.array[wp.vec4],
@@ -67,10 +67,10 @@ def project(
     opacities: wp.array[wp.float32],
     sh0: wp.array[wp.vec3],
     shN: wp.array2d[wp.vec3],
-    moved: wp.bool,
+    has_offsets: wp.bool,
     offsets: wp.array[wp.vec3],
     masked: wp.bool,
-    wanted: wp.array2d[wp.bool],
+    requested: wp.array2d[wp.bool],
     first: wp.bool,
     keys: wp.array[wp.int32],
     colours: wp.array[wp.vec3],
@@ -79,16 +79,19 @@ def project(
     means2d: wp.array[wp.vec2],
     visible: wp.array[wp.bool],
     counts: wp.array[wp.int32],
-    poison: wp.array[wp.int64],
+    not_finite: wp.array[wp.int64],
 ) -> None:
-    """A thread per Gaussian. What the screens of a pose share (depth key, colour, slope) is made by the first that draws it.
+    """One thread per Gaussian. Depth key, colour and slope, which the grids share, are computed for the first grid that
+    draws the Gaussian.
 
-    `poison` becomes 1 if a number that was needed is not finite.
+    `not_finite` becomes 1 if a number that was read is not finite.
     """
     i = wp.tid()
     quat, opacity = quats[i], opacities[i]
-    sound = finite(means[i]) and finite(scales[i]) and wp.isfinite(opacity)
-    sound = sound and wp.isfinite(quat[0]) and wp.isfinite(quat[1]) and wp.isfinite(quat[2]) and wp.isfinite(quat[3])
+    all_finite = finite(means[i]) and finite(scales[i]) and wp.isfinite(opacity)
+    all_finite = (
+        all_finite and wp.isfinite(quat[0]) and wp.isfinite(quat[1]) and wp.isfinite(quat[2]) and wp.isfinite(quat[3])
+    )
     if first:
         keys[i] = FAR
     means2d[i] = wp.vec2(0.0, 0.0)
@@ -97,15 +100,15 @@ def project(
 
     centre = centre_of(pose, means[i])
     if centre.z > cuts.near:
-        u = screen.exact_focal[0] * centre.tan[0] + screen.exact_principal[0]
-        v = screen.exact_focal[1] * centre.tan[1] + screen.exact_principal[1]
+        u = grid.exact_focal[0] * centre.tan[0] + grid.exact_principal[0]
+        v = grid.exact_focal[1] * centre.tan[1] + grid.exact_principal[1]
         means2d[i] = wp.vec2(wp.float32(u), wp.float32(v))
         if opacity >= cuts.alpha_min:
-            footprint = footprint_of(geometry_of(pose, screen, centre, quat, scales[i]), screen, cuts)
+            footprint = footprint_of(geometry_of(pose, grid, centre, quat, scales[i]), grid, cuts)
             ellipse = ellipse_at(u, v, footprint, opacity, cuts)
-            if shows(ellipse, screen):
+            if is_visible(ellipse, grid):
                 visible[i] = True
-                count = count_tiles(ellipse, screen, masked, wanted)
+                count = count_tiles(ellipse, grid, masked, requested)
                 if count > 0:
                     counts[i] = count
                     if keys[i] == FAR:
@@ -115,34 +118,34 @@ def project(
                         if shN.shape[1] > 0:
                             slopes[i] = slope
                     ellipse.rgb = colours[i]
-                    if moved:
+                    if has_offsets:
                         ellipse.rgb += offsets[i]
                     rows[i] = row_of(ellipse)
-                    sound = sound and finite(ellipse.rgb)
-    if not sound:
-        poison[0] = wp.int64(1)
+                    all_finite = all_finite and finite(ellipse.rgb)
+    if not all_finite:
+        not_finite[0] = wp.int64(1)
 
 
 @cache
-def pull(K: int) -> Any:
-    """The kernel that brings K cotangents' sums to the tensors."""
-    Sent = wp.types.vector(length=9 * K, dtype=wp.float32)
+def project_vjp(K: int) -> Any:
+    """The VJP kernel for K cotangents."""
+    PairSums = wp.types.vector(length=9 * K, dtype=wp.float32)
 
     @wp.kernel(module="unique", enable_backward=False)
-    def pull(
+    def project_vjp(
         pose: Pose,
-        screen: Screen,
+        grid: Grid,
         cuts: Cuts,
         means: wp.array[wp.vec3],
         quats: wp.array[wp.vec4],
         scales: wp.array[wp.vec3],
         opacities: wp.array[wp.float32],
         slopes: wp.array[wp.mat33],
-        turns: wp.bool,
+        has_slopes: wp.bool,
         rows: wp.array[Row],
         counts: wp.array[wp.int32],
         firsts: wp.array[wp.int32],
-        sent: wp.array[Sent],
+        pair_sums: wp.array[PairSums],
         d_means: wp.array2d[wp.vec3],
         d_quats: wp.array2d[wp.vec4],
         d_scales: wp.array2d[wp.vec3],
@@ -150,7 +153,7 @@ def pull(K: int) -> Any:
         d_screen: wp.array2d[wp.vec2],
         d_rgb: wp.array2d[wp.vec3],
     ) -> None:
-        """A thread per Gaussian: adds what its tiles sent, in their order, and takes it through the projection."""
+        """One thread per Gaussian: adds its pairs' sums in the order of its tiles, and applies the projection's VJP."""
         i = wp.tid()
         if counts[i] == 0:
             for k in range(K):
@@ -161,11 +164,11 @@ def pull(K: int) -> Any:
                 d_screen[k, i] = wp.vec2(0.0, 0.0)
                 d_rgb[k, i] = wp.vec3(0.0, 0.0, 0.0)
             return
-        total = Sent()
+        total = PairSums()
         for nth in range(counts[i]):
-            total += sent[firsts[i] + nth]
-        g = geometry_of(pose, screen, centre_of(pose, means[i]), quats[i], scales[i])
-        f = footprint_of(g, screen, cuts)
+            total += pair_sums[firsts[i] + nth]
+        g = geometry_of(pose, grid, centre_of(pose, means[i]), quats[i], scales[i])
+        f = footprint_of(g, grid, cuts)
         ellipse = ellipse_of(rows[i])
         for k in range(K):
             sums = Sums()
@@ -174,12 +177,12 @@ def pull(K: int) -> Any:
             sums.xx = total[9 * k + 3]
             sums.xy = total[9 * k + 4]
             sums.yy = total[9 * k + 5]
-            out = geometry_vjp(pose, screen, cuts, g, f, scales[i], sums)
+            out = geometry_vjp(pose, grid, cuts, g, f, scales[i], sums)
             rgb = wp.vec3(0.0, 0.0, 0.0)
             for c in range(3):
-                if ellipse.rgb[c] >= 0.0:  # where the clamp binds the picture does not depend on the colour
+                if ellipse.rgb[c] >= 0.0:  # where the colour is clamped, the image does not depend on it
                     rgb[c] = total[9 * k + 6 + c]
-            if turns:
+            if has_slopes:
                 out.mean += wp.transpose(slopes[i]) * rgb
             d_means[k, i] = out.mean
             d_quats[k, i] = out.quat
@@ -188,4 +191,4 @@ def pull(K: int) -> Any:
             d_screen[k, i] = out.screen
             d_rgb[k, i] = rgb
 
-    return pull
+    return project_vjp

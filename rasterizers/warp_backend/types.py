@@ -1,4 +1,4 @@
-"""What the kernels hand to each other: structures passed by value, and the rows of the tables between the stages."""
+"""The data types that the kernels share: structures passed by value, and rows of the tables between the stages."""
 
 from __future__ import annotations
 
@@ -6,19 +6,20 @@ from typing import Any, Final
 
 import warp as wp
 
+from rasterizers.warp_backend import rasterizer
+
 wp.set_module_options({"enable_backward": False})
 
-TILE: Final = wp.constant(8)
-"""Edge of the tiles that Gaussians are listed for, px."""
-PIXELS: Final = wp.constant(64)
-"""Of a tile."""
+TILE: Final = wp.constant(rasterizer.TILE)
+PIXELS: Final = wp.constant(rasterizer.TILE**2)
+"""Pixels of a tile."""
 FAR: Final = wp.constant(2**31 - 1)
-"""The depth key of a Gaussian that no screen draws."""
+"""The depth key of a Gaussian that is not drawn."""
 
 
 @wp.struct
 class Pose:
-    """World to camera, in float64 where a Gaussian's centre falls is decided, and the camera's position."""
+    """World to camera, in float64 for projected centres, and the camera's position."""
 
     rotation: wp.mat33
     exact_rotation: wp.mat33d
@@ -27,8 +28,8 @@ class Pose:
 
 
 @wp.struct
-class Screen:
-    """A pixel grid of a pose, and how far off-axis the Jacobian follows, as tangents."""
+class Grid:
+    """One pixel grid of a pose, and the tangents at which the Jacobian is clamped."""
 
     exact_focal: wp.vec2d
     exact_principal: wp.vec2d
@@ -55,21 +56,21 @@ class Cuts:
 
 @wp.struct
 class Ellipse:
-    """A Gaussian on a screen: alpha = opacity · exp(-(A dx² + B dx dy + C dy²)) at (dx, dy) px from its centre."""
+    """A projected Gaussian: alpha = opacity · exp(-(A dx² + B dx dy + C dy²)) at (dx, dy) px from its centre."""
 
-    whole: wp.vec2  # the pixel corner nearest to the centre, px: at 1,000 px a float32 alone resolves 6e-5 …
-    rest: wp.vec2  # … and the centre from there
+    whole: wp.vec2  # the pixel corner nearest to the centre, px: at 1,000 px a float32 resolves 6e-5 px
+    rest: wp.vec2  # the centre minus `whole`
     A: wp.float32
     B: wp.float32
     C: wp.float32
     opacity: wp.float32  # after the Mip compensation
-    reach: wp.float32  # alpha >= alpha_min within A dx² + B dx dy + C dy² <= reach, a little generous
+    reach: wp.float32  # alpha >= alpha_min within A dx² + B dx dy + C dy² <= reach, with a margin
     half: wp.vec2  # half the box around that region, px
     rgb: wp.vec3  # before its clamp at 0
 
 
 Row: Final[Any] = wp.types.vector(length=14, dtype=wp.float32)
-"""An `Ellipse` in memory that torch has allocated."""
+"""An `Ellipse` as a row of a torch tensor."""
 
 
 @wp.func

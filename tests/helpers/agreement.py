@@ -1,4 +1,4 @@
-"""What it means that a backend agrees with float64: the bounds, each of them able to fail (test_agreement)."""
+"""The bounds within which a backend agrees with float64. tests/rasterizers/test_agreement.py shows that each can fail."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-INTERIOR = 5e-6  # of image values, for all but …
-INTERIOR_SHARE = 0.9998
-FLIP = 8e-3  # … pixels where a Gaussian crossed a threshold one way here and the other way in float64
+INTERIOR = 5e-6  # the error of image values without flips
+INTERIOR_SHARE = 0.9998  # the share of values without flips
+FLIP = 8e-3  # the error of a value where rounding flips a cut-off
 
 
 def require_image(found: Tensor, exact: Tensor) -> None:
-    """Interior values agree to rounding; the few others are flips of a threshold, bounded and of both signs."""
+    """Nearly all values agree to rounding; the others, where a cut-off flips, are bounded."""
     error = (found.double() - exact.double()).abs()
     inside = float((error <= INTERIOR).double().mean())
     assert inside >= INTERIOR_SHARE, f"only {inside:.5%} of the values agree to {INTERIOR:g}"
@@ -21,7 +21,7 @@ def require_image(found: Tensor, exact: Tensor) -> None:
 
 
 def require_gradient(name: str, found: Tensor, exact: Tensor, *, relative: float = 5e-5) -> None:
-    """Over all Gaussians and one by one: norm, direction, bias, and no gradient missing."""
+    """Gradients agree over all Gaussians and one by one: norm, direction, bias, and none is missing."""
     a, b = (x.double().reshape(len(x), -1) for x in (found, exact))
     assert bool(a.isfinite().all()), f"{name}: not finite"
     size = torch.linalg.vector_norm(b)

@@ -1,4 +1,4 @@
-"""The backends that are judged against float64, each at the widest precision that it has."""
+"""The backends that are compared with float64."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Backend:
     """A rasterizer by name.
 
     Args:
-        edges: the tiles it can be asked for, px.
-        cases: how many pictures of one Gaussian a test may ask for.
-        device: where it draws; the tests' tensors are brought there, and what it finds is brought back.
+        edges: the tile sizes that it supports, px.
+        cases: the number of images that a test with many of them may draw.
+        device: where it draws; tensors are copied there and results back, so that tests work on the CPU.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Backend:
         if self.name != "warp":
             return rasterizers.load(self.name, **settings)
         rasterizer = rasterizers.load(self.name, device=self.device, **settings)
-        return rasterizer if self.device == "cpu" else Elsewhere(rasterizer, self.device)
+        return rasterizer if self.device == "cpu" else OnDevice(rasterizer, self.device)
 
     @property
     def widest(self) -> torch.dtype:
@@ -45,7 +45,7 @@ class Backend:
 
     @property
     def why_not(self) -> str | None:
-        """Why it does not run here."""
+        """Why it does not run on this machine."""
         try:
             self()
         except BackendUnavailable as reason:
@@ -53,24 +53,24 @@ class Backend:
         return None
 
 
-class Elsewhere:
-    """A rasterizer on another device, for tests that stay on the CPU."""
+class OnDevice:
+    """A rasterizer on another device, for tests whose tensors are on the CPU."""
 
     def __init__(self, rasterizer: Rasterizer, device: str) -> None:
         self.rasterizer, self.device = rasterizer, device
         self.traits, self.tile = rasterizer.traits, rasterizer.tile
 
     def __call__(self, splats: Splats, camera: Camera, tiles: torch.Tensor | None = None) -> Rendering:
-        return Home(self.rasterizer(moved(splats, self.device), camera, tiles))
+        return CopiedBack(self.rasterizer(moved(splats, self.device), camera, tiles))
 
     def render_scales(self, jobs, tiles=None) -> list[Rendering]:
         there: dict[int, torch.Tensor] = {}  # the same tensor stays the same tensor
         jobs = [(moved(splats, self.device, there), camera) for splats, camera in jobs]
-        return [Home(rendering) for rendering in self.rasterizer.render_scales(jobs, tiles)]
+        return [CopiedBack(rendering) for rendering in self.rasterizer.render_scales(jobs, tiles)]
 
 
-class Home:
-    """A rendering of another device, brought to the CPU."""
+class CopiedBack:
+    """A rendering of another device, copied to the CPU."""
 
     def __init__(self, rendering: Rendering) -> None:
         self.rendering = rendering
@@ -82,7 +82,7 @@ class Home:
 
 
 def moved(tensors, device: str, there: dict[int, torch.Tensor] | None = None):
-    """Splats or gradients on another device; `there` knows what has been brought."""
+    """Splats or gradients on another device; `there` holds the copies made before."""
     there = {} if there is None else there
     found = {f.name: getattr(tensors, f.name) for f in fields(tensors)}
     return replace(
@@ -100,12 +100,12 @@ BACKENDS = {
 
 @cache
 def why_not(name: str) -> str | None:
-    """Why a backend does not run here."""
+    """Why a backend does not run on this machine."""
     return BACKENDS[name].why_not
 
 
 def backends(*, dtype: torch.dtype | None = None) -> pytest.MarkDecorator:
-    """Run a test for every backend, skipped with the reason where it does not run."""
+    """Run a test for every backend; skip those that do not run, with the reason."""
     params = [
         pytest.param(backend, id=name, marks=pytest.mark.skipif(bool(why_not(name)), reason=str(why_not(name))))
         for name, backend in BACKENDS.items()
@@ -115,9 +115,9 @@ def backends(*, dtype: torch.dtype | None = None) -> pytest.MarkDecorator:
 
 
 def exact(splats: Splats, camera: Camera, **settings: Any) -> Rendering:
-    """The truth: float64, compiled where that can be."""
-    oracle = ReferenceRasterizer(**settings) if why_not("cpp") else rasterizers.load("cpp", **settings)
-    return oracle(to(splats, torch.float64), camera)
+    """The rendering in float64, by "cpp" where it was compiled."""
+    exact_rasterizer = ReferenceRasterizer(**settings) if why_not("cpp") else rasterizers.load("cpp", **settings)
+    return exact_rasterizer(to(splats, torch.float64), camera)
 
 
 def camera(width=65, height=47) -> Camera:
@@ -130,11 +130,11 @@ def cotangents(k, height, width, seed=0) -> torch.Tensor:
 
 def everything(rendering, v):
     g = rendering.vjp(v)
-    picture = (rendering.image, rendering.alpha, rendering.means2d, rendering.visible)
-    return (*picture, *(gradient_of(g, name) for name in ATTRIBUTES), g.basis)
+    pixels = (rendering.image, rendering.alpha, rendering.means2d, rendering.visible)
+    return (*pixels, *(gradient_of(g, name) for name in ATTRIBUTES), g.basis)
 
 
 def dense_scene(n=3000):
-    """Deep enough that pixels end: some hundred Gaussians over each."""
+    """A scene with about a hundred Gaussians over each pixel, so that pixels end."""
     splats = scene(n, bands=15, seed=4)
     return replace(splats, scales=splats.scales * 0.35), camera(130, 97)

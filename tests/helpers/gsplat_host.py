@@ -1,4 +1,4 @@
-"""A gsplat-style trainer, as its documentation has it, on a CPU: gsplat's strategies and our rasterizer. Knows no CLEAR."""
+"""A trainer like those in gsplat's documentation, on a CPU, with our rasterizer. Contains nothing of CLEAR."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rasterizers import autograd
 
 
 class Photometric(torch.autograd.Function):
-    """0.8 L1 + 0.2 (1 - SSIM), the host's own loss."""
+    """0.8 L1 + 0.2 (1 - SSIM), the host's loss."""
 
     @staticmethod
     def forward(ctx, image, target):
@@ -34,7 +34,7 @@ def intrinsics(camera):
 
 
 class Host:
-    """`photos`: what the host itself would load: name -> (camera, image) at LR."""
+    """Parameters, optimizers and LR photos (name -> camera and image) of a gsplat-style trainer."""
 
     def __init__(self, scene, extent=1.0, strategy=None, fused=False, scaler=None, accumulation=1, eps=1e-15):
         self.photos = {v.name: v.lr for v in scene.train}
@@ -59,7 +59,7 @@ class Host:
         )  # fmt: skip
 
     def train(self, names, between=lambda: None):
-        """The loop of gsplat's simple_trainer: backward, step, densify."""
+        """The order of gsplat's simple_trainer: backward, step, densify."""
         for step, name in enumerate(names):
             camera, target = self.photos[name].camera, self.photos[name].image
             renders, _, info = self.render(camera, step)

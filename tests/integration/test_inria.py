@@ -1,14 +1,12 @@
-"""CLEAR beside an Inria-shaped loop: two added lines or none, densification before or after the step, any subset."""
+"""CLEAR in a 3DGS-style loop with two added lines: densification before or after the step, any subset of strategies."""
 
 from __future__ import annotations
 
 import importlib
 import logging
 import math
-import sys
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -16,57 +14,34 @@ from safetensors.torch import load_file
 
 import rasterizers
 from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, DataError, Objective
-from clear_strategies.compose import conductor
 from clear_strategies.core.view import Photo, View
 from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.errors import SettingError
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, scaled
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
-from integration import launch
-from integration.attach import HostError
-from integration.inria import attach, enlarged, intrinsics
-from integration.lineage import change
+from integration import HostError
+from integration.inria import attach
+from integration.inria.attached import intrinsics
+from integration.model_proxy import enlarged_camera
 from tests.helpers import toy
+from tests.helpers.inria import HR_FROM_START, N, options
 
-HOST = Path(__file__).parents[1] / "helpers" / "inria_host"
-AT_ONCE = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
-SILENT = Objective(lambda_hr=WarmupDecay(peak=0, final=0))
-STEPS, N = 25, 24
+WITHOUT_HR = Objective(lambda_hr=WarmupDecay(peak=0, final=0))
+STEPS = 25
 
 
 def svs(**settings):
-    """Made anew each time: a strategy remembers."""
+    """New objects at every call, since strategies have state."""
     weights = {"means": 1e-4, "scales": 1e-4, "detail": 1e-6}
     return scaled(SVS(**{"anchor_strength": 0.01, "anchor_weights": weights} | settings), STEPS / 10_000)
 
 
-@pytest.fixture
-def host(monkeypatch):
-    """The stand-in's train.py; its modules' names are too common to stay."""
-    monkeypatch.syspath_prepend(str(HOST))
-    yield importlib.import_module("train")
-    for name in [m for m in sys.modules if m.split(".")[0] in ("train", "scene", "gaussian_renderer")]:
-        del sys.modules[name]
-
-
-@pytest.fixture
-def folder(host, tmp_path):
-    importlib.import_module("scene").write(tmp_path, toy.scene(N))
-    return tmp_path
-
-
-def options(host, folder, **settings):
-    opt = host.parser().parse_args(["-s", str(folder)])
-    for name, value in settings.items():
-        setattr(opt, name, value)
-    return opt
-
-
-def trained(host, folder, strategies, objective=AT_ONCE, **settings):
-    """Train with the two lines."""
+def trained(host, folder, strategies, objective=HR_FROM_START, **settings):
+    """Train with the two added lines."""
     opt = options(host, folder, **settings)
     gaussians, scene = host.setup(opt)
     render, grads = host.render, {}
@@ -84,7 +59,7 @@ def trained(host, folder, strategies, objective=AT_ONCE, **settings):
 
 
 def double(view, camera):
-    """The view without the rounding of the host's float32 projection, which 25 steps would make large."""
+    """The view without the rounding errors of the host's float32 projection, which 25 steps would amplify."""
 
     def photo(p):
         w, h = p.camera.width, p.camera.height
@@ -95,23 +70,24 @@ def double(view, camera):
     return View(view.name, photo(view.lr), photo(view.hr))
 
 
-def test_its_steps_are_those_of_our_own_trainer(host, folder):
-    """In float64, and no Gaussian round: Adam follows the sign of a gradient that is nothing but rounding."""
+def test_its_steps_equal_those_of_our_own_trainer(inria_host, inria_capture):
+    """In float64 and without spheres: Adam follows the sign of gradients that consist of rounding errors."""
     conductors = [
         Conductor(GCO(), P2G(patch=4), svs(), objective=scaled(Objective(), STEPS / 10_000), statistics_from=1)
         for _ in range(2)
     ]
-    opt = options(host, folder, iterations=STEPS, densify_until_iter=0, sh_interval=1)
+    opt = options(inria_host, inria_capture, iterations=STEPS, densify_until_iter=0, sh_interval=1)
     toy_scene = toy.scene(N)
-    gaussians, scene = host.setup(opt)
-    clear = attach(gaussians, scene.getTrainCameras(), conductors[0], sr=folder / "sr")
-    clear._views = {c.image_name: double(clear._views[c.image_name], c) for c in scene.cameras}
-    views = tuple(clear._views[view.name] for view in toy_scene.train)
+    gaussians, scene = inria_host.setup(opt)
+    clear = attach(gaussians, scene.getTrainCameras(), conductors[0], sr=inria_capture / "sr")
+    clear.views.update({c.image_name: double(clear.views[c.image_name], c) for c in scene.cameras})
+    views = tuple(clear.views[view.name] for view in toy_scene.train)
 
     own = TrainState.start(
         replace(toy_scene, train=views), conductors[1],
         settings=FitSettings(iterations=STEPS, degree_every=1, fused="off", scale_schedule=False),
-        density=DensitySettings(start=1_000, stop=1_001), rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1)),
+        density=DensitySettings(start=1_000, stop=1_001),
+        rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1), detail_decay=0.0),
         mip=MipFilter(variance=0),
     )  # fmt: skip
     own.field.double()
@@ -133,93 +109,35 @@ def test_its_steps_are_those_of_our_own_trainer(host, folder):
             camera.original_image.double(),
             camera.world_view_transform.double(),
         )
-    host.training(opt, gaussians, scene, clear.wrap(host.render), names)
+    inria_host.training(opt, gaussians, scene, clear.wrap(inria_host.render), names)
 
     found = clear.params()
     for name, p in own.field.raw().items():
         difference = float((p.flatten() - found[name].detach().flatten()).norm() / p.norm().clamp_min(1e-12))
         assert difference < 1e-9, name
-    assert clear.attachment.counts["merged"] == STEPS
+    assert clear.attachment.counts["merges"] == STEPS
     assert clear.attachment.counts["HR renders"] == STEPS - 1  # lambda_HR is 0 until t = 1
 
 
-def test_two_lines_and_none_give_the_same_file(host, folder, monkeypatch, caplog):
-    settings = ["strategies.p2g.patch=4", "strategies.svs.anchor_strength=0"]
-    opt = options(host, folder, iterations=12, densify_until_iter=9)
-    gaussians, scene = host.setup(opt)
-    with attach(
-        gaussians, scene.getTrainCameras(), conductor("clear", *settings, iterations=12), sr=folder / "sr",
-        threshold=opt.densify_grad_threshold, densify_until=opt.densify_until_iter,
-    ) as clear:  # fmt: skip
-        host.training(opt, gaussians, scene, clear.wrap(host.render))
-        gaussians.save_ply(folder / "two.ply")
-
-    sets = [f"--set={s}" for s in settings]
-    command = [
-        "--sr",
-        str(folder / "sr"),
-        *sets,
-        str(HOST / "train.py"),
-        "-s",
-        str(folder),
-        "--save",
-        str(folder / "none.ply"),
-    ]
-    with caplog.at_level(logging.INFO):
-        assert launch.main([*command, "--iterations", "12", "--densify_until_iter", "9"]) == 0
-    assert "12 merged" in caplog.text
-    two, none = load_file(folder / "two.ply"), load_file(folder / "none.ply")
-    assert len(two["xyz"]) != N  # the densifier was at work
-    for name, rows in two.items():
-        assert torch.equal(rows, none[name]), name
-    assert not hasattr(host.render, "__wrapped__")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--clear", "nobody"], "nobody"),
-        (["--set", "strategies.gco.tolerance=2"], "tolerance must lie in"),
-        ([], "sr must say where the SR pictures are"),
-    ],
-)
-def test_the_launcher_says_what_is_wrong_before_the_host_starts(arguments, said, folder, caplog):
-    assert launch.main([*arguments, str(HOST / "train.py"), "-s", str(folder)]) == 2
-    assert said in caplog.text
-
-
-def test_the_launcher_refuses_a_missing_script_and_the_hosts_checkpoints(folder, caplog):
-    assert launch.main(["--sr", str(folder), str(folder / "train.py")]) == 2
-    assert "is not there" in caplog.text
-    assert launch.main(["--sr", str(folder), "--", str(HOST / "train.py"), "--start_checkpoint", "chkpnt.pth"]) == 2
-    assert "without --start_checkpoint" in caplog.text
-
-
-def test_a_train_py_that_draws_nothing_is_told(folder, host, caplog):
-    (folder / "train.py").write_text("import gaussian_renderer")
-    assert launch.main(["--sr", str(folder / "sr"), str(folder / "train.py")]) == 1
-    assert "CLEAR took no part" in caplog.text
-
-
-def test_each_strategy_changes_what_it_should_and_nothing_else(host, folder):
-    plain, base = run_once(host, folder)
-    gco, with_gco = run_once(host, folder, GCO())
-    p2g, with_p2g = run_once(host, folder, P2G(patch=4))
-    svs, with_svs = run_once(host, folder, SVS(dropout=Ramp(maximum=0.5, shape="constant")))
-    # GCO: rows in conflict alone, and never f_det.
+def test_each_strategy_changes_what_it_should_and_nothing_else(inria_host, inria_capture):
+    plain, base = run_once(inria_host, inria_capture)
+    gco, with_gco = run_once(inria_host, inria_capture, GCO())
+    p2g, with_p2g = run_once(inria_host, inria_capture, P2G(patch=4))
+    svs, with_svs = run_once(inria_host, inria_capture, SVS(dropout=Ramp(maximum=0.5, shape="constant")))
+    # GCO changes only rows in conflict, and never f_det.
     assert 0 < with_gco.attachment.log["corrected"] < 1
     changed = [(gco[name] != plain[name]).reshape(N, -1).any(1) for name in ("means", "scales", "opacities", "sh0")]
     assert sum(int(c.sum()) for c in changed) > 0
     assert all(int(c.sum()) < N for c in changed)
     assert torch.equal(gco["detail"], plain["detail"])
-    # P2G: the HF share of every Gaussian, and the densifier's score.
+    # P2G changes the HF share of every Gaussian, and the densifier's score.
     assert not torch.equal(p2g["detail"], plain["detail"])
-    assert with_p2g.attachment.counts["scores handed over"] == 1
-    # SVS: the dropped have no gradient at all.
+    assert with_p2g.attachment.counts["scores written"] == 1
+    # SVS: dropped Gaussians have no gradient.
     dropped = svs["means"].abs().sum(1) == 0
     assert 5 <= int((dropped & (plain["means"].abs().sum(1) > 0)).sum()) <= N - 5
     assert (
-        base.attachment.counts == with_svs.attachment.counts == Counter({"HR renders": 1, "LR renders": 1, "merged": 1})
+        base.attachment.counts == with_svs.attachment.counts == Counter({"HR renders": 1, "LR renders": 1, "merges": 1})
     )
 
 
@@ -229,21 +147,21 @@ def run_once(host, folder, *strategies, **settings):
 
 
 @pytest.mark.parametrize("step_first", [False, True], ids=["densify, step", "step, densify"])
-def test_in_either_order_of_events_everything_follows_the_densifier(step_first, host, folder):
+def test_everything_follows_the_densifier_before_or_after_the_step(step_first, inria_host, inria_capture):
     strategies = (GCO(), P2G(patch=4), SVS(dropout=Ramp(maximum=0.2, full=30), anchor_start=24, anchor_strength=0.01))
-    gaussians, clear, grads = trained(host, folder, strategies, iterations=26, step_first=step_first)
+    gaussians, clear, grads = trained(inria_host, inria_capture, strategies, iterations=26, step_first=step_first)
     n = len(gaussians._xyz)
     assert n > N
     counts = clear.attachment.counts
     assert counts["structure changes"] >= 3
-    assert counts["merged"] == counts["HR renders"] == 26
+    assert counts["merges"] == counts["HR renders"] == 26
     assert {len(p) for p in clear.params().values()} == {n}
     assert bool((clear.params()["detail"] != 0).any())
     assert clear.attachment.conductor.state_dict()["SVS.means"].shape == (n, 3)  # anchored at t = 24
     assert all(bool(g.isfinite().all()) for g in grads.values())
 
 
-def test_an_anchor_that_meets_a_changed_number_says_what_to_do(host, folder, caplog):
+def test_densification_after_the_anchor_raises_an_error_with_the_remedy(inria_host, inria_capture, caplog):
     early = SVS(anchor_start=5, anchor_strength=0.01)
     with (
         caplog.at_level(logging.WARNING),
@@ -252,21 +170,21 @@ def test_an_anchor_that_meets_a_changed_number_says_what_to_do(host, folder, cap
             match=r"anchor was taken at t=5 for .* Inria: densify_until_iter\) or raise strategies.svs.anchor_start",
         ),
     ):
-        trained(host, folder, (early,))
-    assert "densifies until densify_until_iter=24, but a strategy ends densification before" in caplog.text
+        trained(inria_host, inria_capture, (early,))
+    assert "densifies until densify_until_iter=24, but a strategy ends densification earlier" in caplog.text
 
 
-def test_the_merge_is_that_of_the_summed_losses(host, folder):
-    """By hand, and on a host whose last colours are frozen."""
-    grads, clear = run_once(host, folder)
-    opt = options(host, folder)
-    gaussians, scene = host.setup(opt)
+def test_without_a_strategy_the_gradient_is_that_of_the_summed_losses(inria_host, inria_capture):
+    """Also where the host trains only some parameters."""
+    grads, clear = run_once(inria_host, inria_capture)
+    opt = options(inria_host, inria_capture)
+    gaussians, scene = inria_host.setup(opt)
     camera = scene.cameras[1]
-    view = clear._views[camera.image_name]
-    drawn = host.render(camera, gaussians, None, None)["render"]
-    host.Photometric.apply(drawn, camera.original_image).backward()
-    image = host.render(enlarged(camera, 4), gaussians, None, None)["render"].permute(1, 2, 0)
-    cotangents = AT_ONCE.hr(image.detach(), view.hr.image).cotangents
+    view = clear.views[camera.image_name]
+    drawn = inria_host.render(camera, gaussians, None, None)["render"]
+    inria_host.Photometric.apply(drawn, camera.original_image).backward()
+    image = inria_host.render(enlarged_camera(camera, 4), gaussians, None, None)["render"].permute(1, 2, 0)
+    cotangents = HR_FROM_START.hr(image.detach(), view.hr.image).cotangents
     (image * (cotangents[0] + 0.2 * cotangents[1])).sum().backward()
     assert torch.allclose(
         grads["means"], gaussians._xyz.grad, rtol=1e-4, atol=1e-7 * float(gaussians._xyz.grad.abs().max())
@@ -274,42 +192,45 @@ def test_the_merge_is_that_of_the_summed_losses(host, folder):
     assert torch.allclose(grads["opacities"], gaussians._opacity.grad, rtol=1e-4, atol=1e-9)
 
     gaussians._features_rest.requires_grad_(False)
-    clear = attach(gaussians, scene.cameras, Conductor(GCO(), objective=AT_ONCE), sr=folder / "sr")
+    clear = attach(gaussians, scene.cameras, Conductor(GCO(), objective=HR_FROM_START), sr=inria_capture / "sr")
     gaussians.optimizer.zero_grad()
-    clear.wrap(host.render)(camera, gaussians, None, None)["render"].sum().backward()
+    clear.wrap(inria_host.render)(camera, gaussians, None, None)["render"].sum().backward()
     assert gaussians._features_rest.grad is None
-    assert clear.attachment.counts["merged"] == 1
+    assert clear.attachment.counts["merges"] == 1
 
 
-def test_the_densifier_reads_the_score_in_its_own_unit(host, folder):
-    """By P2G alone: ‖∇_u‖ as handed over, times the scale, is S_i."""
-    opt = options(host, folder)
-    gaussians, scene = host.setup(opt)
-    clear = attach(gaussians, scene.cameras, Conductor(objective=AT_ONCE), sr=folder / "sr")
-    package = clear.wrap(host.render)(scene.cameras[0], gaussians, None, None)
-    host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
+def test_the_densifier_reads_the_statistic_in_its_own_unit(inria_host, inria_capture):
+    opt = options(inria_host, inria_capture)
+    gaussians, scene = inria_host.setup(opt)
+    clear = attach(gaussians, scene.cameras, Conductor(objective=HR_FROM_START), sr=inria_capture / "sr")
+    package = clear.wrap(inria_host.render)(scene.cameras[0], gaussians, None, None)
+    inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
     with_hr = package["viewspace_points"].grad[:, :2].norm(dim=-1)
 
-    seen = []
-    for camera, target in ((scene.cameras[0], "lr"), (enlarged(scene.cameras[0], 4), "hr")):
-        package = host.render(camera, gaussians, None, None)
-        view = getattr(clear._views[scene.cameras[0].image_name], target)
+    gradients = []
+    for camera, target in ((scene.cameras[0], "lr"), (enlarged_camera(scene.cameras[0], 4), "hr")):
+        package = inria_host.render(camera, gaussians, None, None)
+        view = getattr(clear.views[scene.cameras[0].image_name], target)
         image = package["render"].permute(1, 2, 0)
-        losses = AT_ONCE.lr(image.detach(), view.image) if target == "lr" else AT_ONCE.hr(image.detach(), view.image)
+        losses = (
+            HR_FROM_START.lr(image.detach(), view.image)
+            if target == "lr"
+            else HR_FROM_START.hr(image.detach(), view.image)
+        )
         weights = torch.tensor([1.0, 0.2])[: len(losses.cotangents), None, None, None]
         (image * (weights * losses.cotangents).sum(0)).sum().backward()
-        seen.append(package["viewspace_points"].grad[:, :2])
-    assert torch.allclose(with_hr, (seen[0] + seen[1]).norm(dim=-1), rtol=1e-3, atol=1e-9)
-    assert float((with_hr - seen[0].norm(dim=-1)).abs().max()) > 0
+        gradients.append(package["viewspace_points"].grad[:, :2])
+    assert torch.allclose(with_hr, sum(gradients).norm(dim=-1), rtol=1e-3, atol=1e-9)
+    assert float((with_hr - gradients[0].norm(dim=-1)).abs().max()) > 0
 
 
-def test_absolute_gradients_stay_the_hosts_own(host, folder, caplog):
-    gaussians, scene = host.setup(options(host, folder))
-    clear = attach(gaussians, scene.cameras, Conductor(P2G(patch=4), objective=AT_ONCE), sr=folder / "sr")
+def test_absolute_gradients_stay_the_hosts_own(inria_host, inria_capture, caplog):
+    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
+    clear = attach(gaussians, scene.cameras, Conductor(P2G(patch=4), objective=HR_FROM_START), sr=inria_capture / "sr")
     grads = []
-    for render in (host.render, clear.wrap(host.render)):
+    for render in (inria_host.render, clear.wrap(inria_host.render)):
         package = render(scene.cameras[0], gaussians, None, None, columns=4)
-        host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
+        inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
         grads.append(package["viewspace_points"].grad)
     assert torch.equal(grads[0][:, 2:], grads[1][:, 2:])
     assert not torch.equal(grads[0][:, :2], grads[1][:, :2])
@@ -317,49 +238,49 @@ def test_absolute_gradients_stay_the_hosts_own(host, folder, caplog):
 
 
 @pytest.mark.parametrize("indices", [False, True])
-def test_who_is_dropped_has_not_been_seen(indices, host, folder):
-    gaussians, scene = host.setup(options(host, folder))
+def test_dropped_gaussians_are_not_visible(indices, inria_host, inria_capture):
+    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
     half = SVS(dropout=Ramp(maximum=0.5, shape="constant"))
-    clear = attach(gaussians, scene.cameras, Conductor(half, objective=SILENT))
+    clear = attach(gaussians, scene.cameras, Conductor(half, objective=WITHOUT_HR))
     z = clear.attachment.conductor.gate(1, N)
-    package = clear.wrap(host.render)(scene.cameras[0], gaussians, None, None, indices=indices)
-    seen = package["visibility_filter"]
-    seen = seen[:, 0] if indices else seen.nonzero()[:, 0]
-    assert 0 < len(seen) < N
-    assert bool((z[seen] > 0).all())
-    assert torch.equal((package["radii"] > 0).nonzero()[:, 0], seen)
+    package = clear.wrap(inria_host.render)(scene.cameras[0], gaussians, None, None, indices=indices)
+    visible = package["visibility_filter"]
+    visible = visible[:, 0] if indices else visible.nonzero()[:, 0]
+    assert 0 < len(visible) < N
+    assert bool((z[visible] > 0).all())
+    assert torch.equal((package["radii"] > 0).nonzero()[:, 0], visible)
 
 
-def test_without_hr_no_super_resolution_is_needed(host, folder):
-    dropped = Conductor(SVS(dropout=Ramp(maximum=0.2, shape="constant")), objective=SILENT)
-    opt = options(host, folder, iterations=3)
-    gaussians, scene = host.setup(opt)
+def test_without_hr_no_sr_images_are_needed(inria_host, inria_capture):
+    dropped = Conductor(SVS(dropout=Ramp(maximum=0.2, shape="constant")), objective=WITHOUT_HR)
+    opt = options(inria_host, inria_capture, iterations=3)
+    gaussians, scene = inria_host.setup(opt)
     clear = attach(gaussians, scene.getTrainCameras(), dropped)
-    host.training(opt, gaussians, scene, clear.wrap(host.render))
-    assert clear.attachment.counts == {"LR renders": 3, "merged": 3}
+    inria_host.training(opt, gaussians, scene, clear.wrap(inria_host.render))
+    assert clear.attachment.counts == {"LR renders": 3, "merges": 3}
     assert bool((clear.params()["detail"] == 0).all())
     clear.remove()
-    with pytest.raises(ValueError, match="sr must say where the SR pictures are, got None"):
+    with pytest.raises(SettingError, match="sr: must be the folder of the SR images, got None"):
         attach(gaussians, scene.getTrainCameras(), Conductor(GCO()))
 
 
-def test_what_is_shown_and_saved_has_the_detail_and_training_goes_on_without(host, folder):
-    gaussians, clear, _ = trained(host, folder, (), iterations=4, densify_until_iter=0)
-    render, camera = clear.wrap(host.render), clear_camera(folder)
+def test_evaluation_and_saved_files_use_the_detail_feature_and_training_does_not(inria_host, inria_capture):
+    gaussians, clear, _ = trained(inria_host, inria_capture, (), iterations=4, densify_until_iter=0)
+    render, camera = clear.wrap(inria_host.render), clear_camera(inria_capture)
     dc = gaussians._features_dc
     with torch.no_grad():
-        plain = host.render(camera, gaussians, None, None)["render"]
+        plain = inria_host.render(camera, gaussians, None, None)["render"]
         shown = render(camera, gaussians, None, None)["render"]
-        gaussians.save_ply(folder / "shown.ply")
+        gaussians.save_ply(inria_capture / "shown.ply")
         assert gaussians._features_dc is dc
-        saved = load_file(folder / "shown.ply")["f_dc"]
-        assert torch.equal(host.render(camera, gaussians, None, None)["render"], plain)
+        saved = load_file(inria_capture / "shown.ply")["f_dc"]
+        assert torch.equal(inria_host.render(camera, gaussians, None, None)["render"], plain)
         clear.fold_detail()
         assert torch.equal(saved, gaussians._features_dc)
-        assert torch.allclose(host.render(camera, gaussians, None, None)["render"], shown, atol=1e-6)
+        assert torch.allclose(inria_host.render(camera, gaussians, None, None)["render"], shown, atol=1e-6)
     assert float((shown - plain).abs().max()) > 1e-4
     clear.remove()
-    gaussians.save_ply(folder / "shown.ply")
+    gaussians.save_ply(inria_capture / "shown.ply")
     assert type(gaussians).save_ply is gaussians.save_ply.__func__
 
 
@@ -368,144 +289,80 @@ def clear_camera(folder):
     return scene.Scene(folder, scene.GaussianModel()).cameras[0]
 
 
-def test_removed_it_leaves_the_loop_as_it_was(host, folder):
-    opt = options(host, folder, iterations=3)
+def test_remove_restores_the_loop(inria_host, inria_capture):
+    opt = options(inria_host, inria_capture, iterations=3)
     results = []
     for attached in (False, True):
-        gaussians, scene = host.setup(opt)
+        gaussians, scene = inria_host.setup(opt)
         if attached:
-            clear = attach(gaussians, scene.cameras, Conductor(GCO()), sr=folder / "sr", detail=False)
-            render = clear.wrap(host.render)
+            clear = attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr", detail=False)
+            render = clear.wrap(inria_host.render)
             clear.remove()
-        host.training(opt, gaussians, scene, render if attached else host.render)
+        inria_host.training(opt, gaussians, scene, render if attached else inria_host.render)
         results.append(gaussians)
     assert torch.equal(results[0]._xyz, results[1]._xyz)
     assert torch.equal(results[0]._opacity, results[1]._opacity)
 
 
-def test_without_a_detail_feature_the_rest_is_merged_as_ever(host, folder):
-    with_detail, _ = run_once(host, folder, GCO())
-    gaussians, scene = host.setup(options(host, folder))
-    clear = attach(gaussians, scene.cameras, Conductor(GCO(), objective=AT_ONCE), sr=folder / "sr", detail=False)
-    package = clear.wrap(host.render)(scene.cameras[1], gaussians, None, None)
-    host.Photometric.apply(package["render"], scene.cameras[1].original_image).backward()
+def test_without_the_detail_feature_the_other_gradients_are_the_same(inria_host, inria_capture):
+    with_detail, _ = run_once(inria_host, inria_capture, GCO())
+    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
+    clear = attach(
+        gaussians, scene.cameras, Conductor(GCO(), objective=HR_FROM_START), sr=inria_capture / "sr", detail=False
+    )
+    package = clear.wrap(inria_host.render)(scene.cameras[1], gaussians, None, None)
+    inria_host.Photometric.apply(package["render"], scene.cameras[1].original_image).backward()
     assert "detail" not in clear.params()
     assert torch.equal(with_detail["means"], gaussians._xyz.grad)
 
 
-class Filtered:
-    """Mip-Splatting's getters, one of which calls another."""
-
-    @property
-    def get_opacity_with_3D_filter(self):
-        return 0.5 * self.get_opacity
-
-    @property
-    def get_scaling_n_opacity_with_3D_filter(self):
-        return 2 * self.get_scaling, self.get_opacity_with_3D_filter
-
-
-def test_mip_splattings_getters_are_gated_once(host, folder):
-    from integration.inria import _ROLES
-    from integration.seen import Shown, seen
-
-    base, _ = host.setup(options(host, folder))
-    kind = type("Mip", (Filtered, type(base)), {})
-    model = kind()
-    vars(model).update(vars(base))
-    z = torch.arange(N) / N
-    shown = Shown(gate=z, detail=torch.ones(N, 3))
-    view = seen(model, shown, _ROLES)
-    assert isinstance(view, kind)
-    expected = 0.5 * model.get_opacity * z[:, None]
-    assert torch.equal(view.get_opacity_with_3D_filter, expected)
-    scales, opacities = view.get_scaling_n_opacity_with_3D_filter
-    assert torch.equal(opacities, expected)
-    assert torch.equal(scales, 2 * model.get_scaling)
-    assert shown.read == {"gate"}
-    brighter = view.get_features - model.get_features
-    assert torch.allclose(brighter[:, 0], torch.full((N, 3), 1 / 0.28209479177387814))
-    assert bool((brighter[:, 1:] == 0).all())
-
-
-def test_a_renderer_that_passes_the_getters_by_is_told(host, folder, caplog):
-    gaussians, scene = host.setup(options(host, folder))
+def test_a_renderer_that_does_not_read_the_getters_is_warned_of(inria_host, inria_capture, caplog):
+    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
     always = SVS(dropout=Ramp(maximum=0.2, shape="constant"))
-    clear = attach(gaussians, scene.cameras, Conductor(always, objective=AT_ONCE), sr=folder / "sr")
-    render = clear.wrap(lambda camera, pc, pipe, background: host.render(camera, gaussians, pipe, background))
+    clear = attach(gaussians, scene.cameras, Conductor(always, objective=HR_FROM_START), sr=inria_capture / "sr")
+    render = clear.wrap(lambda camera, pc, pipe, background: inria_host.render(camera, gaussians, pipe, background))
     render(scene.cameras[0], gaussians, None, None)
     assert "dropout has no effect" in caplog.text
     assert "detail feature has no effect" in caplog.text
 
 
-def test_what_is_no_training_camera_passes_and_what_cannot_be_served_is_refused(host, folder, caplog):
-    gaussians, scene = host.setup(options(host, folder))
-    clear = attach(gaussians, scene.cameras, Conductor(GCO()), sr=folder / "sr")
-    render, camera = clear.wrap(host.render), scene.cameras[0]
+def test_other_cameras_pass_through_and_unsupported_calls_are_refused(inria_host, inria_capture, caplog):
+    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
+    clear = attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
+    render, camera = clear.wrap(inria_host.render), scene.cameras[0]
     camera.image_name = "elsewhere"
     render(camera, gaussians, None, None)
     render(camera, gaussians, None, None)
     assert caplog.text.count("none of the 3 views") == 1
-    with pytest.raises(HostError, match=r"24x16 pixels was expected, render gave \(3, 64, 96\)"):
-        render(enlarged(scene.cameras[1], 4), gaussians, None, None)
+    with pytest.raises(HostError, match=r"an image of 24x16 pixels, got shape \(3, 64, 96\)"):
+        render(enlarged_camera(scene.cameras[1], 4), gaussians, None, None)
     with pytest.raises(HostError, match="jittered"):
         render(scene.cameras[1], gaussians, None, None, subpixel_offset=torch.zeros(1))
     with pytest.raises(HostError, match="render must return a dict"):
         clear.wrap(lambda *_: (1, 2))(scene.cameras[1], gaussians, None, None)
     with pytest.raises(HostError, match="attached already"):
-        attach(gaussians, scene.cameras, Conductor(GCO()), sr=folder / "sr")
-    gaussians.training_setup(options(host, folder))
-    with pytest.raises(HostError, match="another optimizer"):
+        attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
+    gaussians.training_setup(options(inria_host, inria_capture))
+    with pytest.raises(HostError, match="new optimizer"):
         render(scene.cameras[1], gaussians, None, None)
     gaussians.optimizer = None
     with pytest.raises(HostError, match="has no optimizer"):
-        attach(gaussians, scene.cameras, Conductor(GCO()), sr=folder / "sr")
+        attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
 
 
-def test_views_need_names_of_their_own_and_pictures_of_their_size(host, folder):
-    gaussians, scene = host.setup(options(host, folder))
+def test_views_need_unique_names_and_sr_images_of_the_right_size(inria_host, inria_capture):
+    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
     with pytest.raises(ValueError, match="at least one training camera"):
-        attach(gaussians, [], Conductor(), sr=folder / "sr")
+        attach(gaussians, [], Conductor(), sr=inria_capture / "sr")
     with pytest.raises(ValueError, match="two training cameras are called 'view0'"):
-        attach(gaussians, [scene.cameras[0]] * 2, Conductor(), sr=folder / "sr")
+        attach(gaussians, [scene.cameras[0]] * 2, Conductor(), sr=inria_capture / "sr")
     with pytest.raises(DataError, match="2 times the LR image is 48x32"):
-        attach(gaussians, scene.cameras, Conductor(), sr=folder / "sr", factor=2)
+        attach(gaussians, scene.cameras, Conductor(), sr=inria_capture / "sr", factor=2)
 
 
-def test_intrinsics_are_read_from_the_projection(host, folder):
-    _, scene = host.setup(options(host, folder))
+def test_intrinsics_are_read_from_the_projection(inria_host, inria_capture):
+    _, scene = inria_host.setup(options(inria_host, inria_capture))
     camera = toy.scene(N).train[0].lr.camera
     K = intrinsics(scene.cameras[0])
     expected = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]).double()
     assert torch.allclose(K, expected, atol=1e-4)
-
-
-def rows(*means, colour=None, turn=0.0):
-    """Gaussians at x = means, each of its own colour unless told."""
-    m = torch.tensor([[x, 0.0, 0.0] for x in means])
-    c = torch.tensor([[[x, 0.0, 0.0]] for x in (means if colour is None else colour)])
-    return {"means": m, "quats": torch.tensor([[1.0, turn, 0.0, 0.0]]).repeat(len(means), 1), "sh0": c}
-
-
-def test_the_change_is_found_by_comparing():
-    before = rows(1.0, 2.0, 3.0, 4.0)
-    assert change(before, rows(1.0, 2.0, 3.0, 4.0)) is None
-    # 2 is pruned, 3 cloned, 4 split in two that keep its colour.
-    happened = change(before, rows(1.0, 3.0, 3.0, 3.9, 4.2, colour=(1.0, 3.0, 3.0, 4.0, 4.0)))
-    assert happened.parents.tolist() == [0, 2, 2, 3, 3]
-    assert happened.fresh.tolist() == [False, False, True, True, True]
-
-
-def test_among_equal_colours_the_nearest_is_the_parent():
-    before = rows(1.0, 2.0, 3.0, colour=(7.0, 7.0, 7.0))
-    happened = change(before, rows(1.0, 2.0, 2.9, 1.2, colour=(7.0, 7.0, 7.0, 7.0)))
-    assert happened.parents.tolist() == [0, 1, 2, 0]
-    assert happened.fresh.tolist() == [False, False, True, True]
-
-
-def test_a_gaussian_from_nowhere_has_no_parent_and_the_first_no_ancestors():
-    assert change(rows(1.0), rows(1.0, 5.0)).parents.tolist() == [0, -1]
-    assert change(rows(1.0), rows(1.0, turn=0.5)).parents.tolist() == [-1]
-    empty = {name: tensor[:0] for name, tensor in rows(1.0).items()}
-    assert change(empty, rows(1.0)).parents.tolist() == [-1]
-    assert change(rows(1.0), empty).parents.tolist() == []

@@ -1,4 +1,4 @@
-"""CLEAR by the class path of a density controller, in a stand-in for gaussian-splatting-lightning."""
+"""CLEAR as a density controller, in a stand-in for gaussian-splatting-lightning."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ import torch
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
-from integration.attach import HostError
+from clear_strategies.errors import SettingError
+from integration import HostError
+from rasterizers.geometry import SH_C0
 from tests.helpers import toy
 
 N = 24
-AT_ONCE = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
+HR_FROM_START = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
 
 
 @pytest.fixture
 def host(monkeypatch):
-    """The stand-in's module, our controller, and photographs."""
+    """The stand-in's module, our controller, and the photos."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "helpers" / "lightning_host"))
     splatting = importlib.import_module("internal.gaussian_splatting")
     controller = importlib.import_module("integration.lightning").ClearDensityController
@@ -45,47 +47,46 @@ def sr(host, tmp_path):
     return str(tmp_path)
 
 
-def fitted(host, density, steps, pixels=True):
+def fitted(host, density, steps, pixels=True, start=0, mask=None):
     torch.manual_seed(0)
     module = host.splatting.GaussianSplatting(host.scene.cloud, density, host.splatting.Renderer(pixels))
-    host.splatting.fit(module, host.photos, steps)
+    host.splatting.fit(module, host.photos, steps, start, mask)
     return module
 
 
-def handle(module):
-    """What a user has no need of: the attachment behind the replaced method."""
-    return module.training_step.func.__self__
+def attachment_of(module):
+    return module.density_controller.clear.attachment
 
 
-def test_named_in_yaml_it_trains_with_the_density_controller_of_the_host(host, sr):
-    settings = {"sr": sr, "suffix": "_x4", "overrides": AT_ONCE}
+def test_it_trains_with_the_hosts_density_controller(host, sr):
+    settings = {"sr": sr, "suffix": "_x4", "overrides": HR_FROM_START}
     module = fitted(host, host.controller(**settings), 16)
     n = module.gaussian_model.n_gaussians
-    attachment = handle(module).attachment
+    attachment = attachment_of(module)
     assert n != N
-    assert attachment.counts["merged"] == attachment.counts["HR renders"] == 16
+    assert attachment.counts["merges"] == attachment.counts["HR renders"] == 16
     assert attachment.counts["structure changes"] >= 2
-    detail = attachment._params()["detail"]
+    detail = attachment.params()["detail"]
     assert detail.shape == (n, 3)
     assert bool((detail != 0).any())
-    # The host finds its own controller, under the names of its own checkpoints.
+    # The host's controller keeps its names in checkpoints.
     assert "density_controller.xyz_gradient_accum" in module.state_dict()
     assert not any("detail" in name for name in module.state_dict())
-    # What is saved and shown has f_det; what is trained has not.
+    # Files and evaluation use f_det; training does not.
     trained = module.gaussian_model.gaussians["shs_dc"]
-    assert torch.allclose(module.saved[0] - trained, detail[:, None] / 0.28209479177387814, atol=1e-6)
+    assert torch.allclose(module.saved[0] - trained, detail[:, None] / SH_C0, atol=1e-6)
     with torch.no_grad():
         camera = host.photos[0][1]
-        shown = module.eval()(camera)["render"]
-        trained += detail[:, None] / 0.28209479177387814
-        handle(module)._eye._detail = None
-        assert torch.allclose(shown, module(camera)["render"], atol=1e-6)
+        evaluated = module.eval()(camera)["render"]
+        trained += detail[:, None] / SH_C0
+        plain = host.splatting.Renderer()(camera, module.gaussian_model, bg_color=torch.zeros(3))["render"]
+        assert torch.allclose(evaluated, plain, atol=1e-6)
 
 
 def test_centres_in_pixels_and_in_ndc_give_the_same_densification(host, sr):
     norms = []
     for pixels in (True, False):
-        settings = {"sr": sr, "suffix": "_x4", "clear": "p2g", "overrides": AT_ONCE}
+        settings = {"sr": sr, "suffix": "_x4", "clear": "p2g", "overrides": HR_FROM_START}
         module = fitted(host, host.controller(**settings), 1, pixels)
         size = torch.tensor([[12.0, 8.0]]) if pixels else 1.0
         norms.append((module.points.grad[:, :2] * size).norm(dim=-1))
@@ -99,46 +100,46 @@ def test_each_strategy_alone_changes_what_it_should(host, sr):
         name = clear[0] if clear else "baseline"
         density = host.controller(clear=name, sr=sr, suffix="_x4", overrides=overrides)
         module = fitted(host, density, 1)
-        return module.grads, handle(module).attachment
+        return module.grads, attachment_of(module)
 
     plain, base = gradients()
     gco, with_gco = gradients("gco")
     _, with_p2g = gradients("p2g", overrides=["strategies.p2g.patch=4"])
     svs, _ = gradients("svs", overrides=["strategies.svs.dropout.shape=constant", "strategies.svs.dropout.maximum=0.5"])
-    assert base.counts == Counter({"HR renders": 1, "LR renders": 1, "merged": 1})
+    assert base.counts == Counter({"HR renders": 1, "LR renders": 1, "merges": 1})
     assert 0 < with_gco.log["corrected"] < 1
     assert any(not torch.equal(gco[name], plain[name]) for name in plain)
-    assert with_p2g.counts["scores handed over"] == 1
+    assert with_p2g.counts["scores written"] == 1
     dropped = svs["means"].abs().sum(1) == 0
     assert 5 <= int((dropped & (plain["means"].abs().sum(1) > 0)).sum()) <= N - 5
 
 
-def test_without_hr_no_super_resolution_is_needed(host):
+def test_without_hr_no_sr_images_are_needed(host):
     off = ["objective.lambda_hr.peak=0", "objective.lambda_hr.final=0"]
     module = fitted(host, host.controller(clear="svs", overrides=off), 3)
-    assert handle(module).attachment.counts == {"LR renders": 3, "merged": 3}
-    with pytest.raises(ValueError, match="sr must say where the SR pictures are"):
+    assert attachment_of(module).counts == {"LR renders": 3, "merges": 3}
+    with pytest.raises(SettingError, match="sr: must be the folder of the SR images"):
         fitted(host, host.controller(clear="svs"), 3)
 
 
-def test_a_controller_without_a_threshold_makes_the_score_idle(host, sr, caplog):
+def test_a_score_without_a_threshold_is_warned_of(host, sr, caplog):
     base = importlib.import_module("internal.density_controllers.density_controller").DensityController()
     fitted(host, host.controller(base=base, clear="p2g", sr=sr, suffix="_x4", overrides=["strategies.p2g.patch=4"]), 1)
-    assert "DensityController reads no screen gradient: the densification score of P2G has no effect" in caplog.text
+    assert (
+        "DensityController does not read the screen gradient: the densification score of P2G has no effect"
+        in caplog.text
+    )
 
 
-def test_the_number_of_steps_must_be_known(host, sr):
+def test_max_steps_must_be_set(host, sr):
     with pytest.raises(HostError, match="max_steps=-1"):
         fitted(host, host.controller(sr=sr, suffix="_x4"), -1)
 
 
-def test_a_resumed_run_goes_on_at_its_step_and_says_what_it_lost(host, sr, caplog):
-    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=AT_ONCE), 4)
-    again = handle(module)
-    again.attachment = None
-    module.trainer.global_step = 3
-    _, camera, image = host.photos[0]
-    module.training_step((camera, ("images/view0.png", image, torch.zeros(1)), None), 0)
-    assert again.attachment.t == 4
+def test_a_resumed_run_continues_at_its_step_and_warns_of_the_lost_state(host, sr, caplog):
+    module = fitted(
+        host, host.controller(sr=sr, suffix="_x4", overrides=HR_FROM_START), 4, start=3, mask=torch.zeros(1)
+    )
+    assert attachment_of(module).t == 4
     assert "resumed at step 3" in caplog.text
-    assert "masks are for the photographs alone" in caplog.text
+    assert "masks apply to the photos only" in caplog.text

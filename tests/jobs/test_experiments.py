@@ -116,7 +116,7 @@ def test_the_compiled_pass_sees_the_same_gradients(lambda_lr, lr_from):
 
 
 def test_what_the_methods_are():
-    """Weights, filters and dropout, row by row of docs/strategies.md."""
+    """Weights, filters and dropout, row by row of docs/how-to/baselines.md."""
     found = {}
     for name in names("method"):
         c = composed(f"+method={name}")

@@ -15,11 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies.kernels import losses as kernels
-from clear_strategies.kernels.losses import cpp, reference, warp
-from clear_strategies.kernels.losses.prepared import prepared
+from clear_strategies.kernels.losses import cpp, reference
+from clear_strategies.kernels.losses.images import image_pair
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, milestones, scaled
 from rasterizers.interface import BackendUnavailable
+from tests.helpers.loss_cases import TRAINING_LOSSES, image, needs_cpp, needs_warp, photo, rough
 
 LOSSES = {
     "l1": kernels.l1,
@@ -27,10 +28,6 @@ LOSSES = {
     "haar": kernels.haar_l1,
     "haar of two levels": lambda x, y: kernels.haar_l1(x, y, 2),
 }
-
-
-def image(height, width, seed=0, dtype=torch.float64):
-    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed)).to(dtype)
 
 
 @pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
@@ -57,31 +54,15 @@ def test_ssim_is_the_mean_that_scikit_image_computes_inside():
         "channel_axis": 2,
     }
     _, their_map = structural_similarity(x.numpy(), y.numpy(), full=True, **options)
-    # Only the border differs (theirs reflects, ours is 3DGS's zero padding): put the pictures into a black frame.
+    # Only the border differs (they reflect, 3DGS pads with zeros), so the images get a black frame.
     framed = [torch.nn.functional.pad(z, (0, 0, 20, 20, 20, 20)) for z in (x, y)]
     _, theirs = structural_similarity(*(z.numpy() for z in framed), full=True, **options)
     assert float(kernels.ssim(*framed).value) == pytest.approx(float(theirs.mean()), abs=1e-9)
     assert their_map.shape == (40, 50, 3)
 
 
-def rough(x, amount, seed=9):
-    """The image and a noisy copy."""
-    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(seed))
-    return x, x + amount * noise
-
-
-def photo(height, width, seed=5):
-    """Blobs of all sizes, edges, fine grain: what a photograph has."""
-    scales = (2, 5, 17, 60)
-    layers = [image(height // s + 1, width // s + 1, seed + s).float() for s in scales]
-    grown = [
-        z.repeat_interleave(s, 0).repeat_interleave(s, 1)[:height, :width] for z, s in zip(layers, scales, strict=True)
-    ]
-    return (0.2 * grown[0] + 0.1 * grown[1] + 0.3 * grown[2] + 0.4 * grown[3]).contiguous()
-
-
 def sky(height=96, width=90):
-    """Above a flat sky, below a wall that is flat at another level, and a textured corner."""
+    """A flat sky above a flat wall of another brightness, with a textured corner."""
     x = torch.full((height, width, 3), 0.93)
     x[height // 2 :] = 0.12
     x[height // 3 :, : width // 3] = image(height - height // 3, width // 3, 3).float()
@@ -110,8 +91,6 @@ PAIRS = {
     "photo inverted": (photo(50, 60), 1 - photo(50, 60)),
     "beyond [0, 1]": (3 * photo(50, 60) - 1, photo(50, 60, 6)),
 }
-needs_cpp = pytest.mark.skipif(not cpp.available(), reason="the compiled kernels were not built")
-needs_warp = pytest.mark.skipif(not warp.available("cpu"), reason="NVIDIA Warp is not installed")
 COMPILED = [pytest.param("cpp", marks=needs_cpp), pytest.param("warp", marks=needs_warp)]
 every_compiled = pytest.mark.parametrize("name", COMPILED)
 every_implementation = pytest.mark.parametrize("name", [*COMPILED, "torch"])
@@ -119,7 +98,7 @@ every_implementation = pytest.mark.parametrize("name", [*COMPILED, "torch"])
 
 @every_implementation
 @pytest.mark.parametrize(("x", "y"), PAIRS.values(), ids=PAIRS)
-def test_ssim_is_that_of_float64(name, x, y):
+def test_ssim_agrees_with_float64(name, x, y):
     value, gradient = kernels.ssim(x, y, kernels=name)
     exact = reference.ssim(x.double(), y.double())
     assert -1 - 1e-6 <= float(value) <= 1 + 1e-6
@@ -130,7 +109,7 @@ def test_ssim_is_that_of_float64(name, x, y):
 @every_implementation
 @pytest.mark.parametrize(("x", "y"), PAIRS.values(), ids=PAIRS)
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
-def test_photometric_is_that_of_float64(name, x, y, share):
+def test_photometric_agrees_with_float64(name, x, y, share):
     value, gradient = kernels.photometric(x, y, share, kernels=name)
     exact = reference.photometric(x.double(), y.double(), share)
     assert float(value) == pytest.approx(float(exact.value), abs=1e-6)
@@ -140,7 +119,7 @@ def test_photometric_is_that_of_float64(name, x, y, share):
 @every_compiled
 @pytest.mark.parametrize(("x", "y"), PAIRS.values(), ids=PAIRS)
 @pytest.mark.parametrize("levels", [1, 2, 3, 7])
-def test_compiled_haar_is_the_reference(name, x, y, levels):
+def test_compiled_haar_agrees_with_the_reference(name, x, y, levels):
     value, gradient = kernels.haar_l1(x, y, levels, kernels=name)
     expected = reference.haar_l1(x, y, levels)  # in float32: a detail that rounding makes 0 must be 0 in both
     assert float(value) == pytest.approx(float(reference.haar_l1(x.double(), y.double(), levels).value), abs=1e-6)
@@ -153,25 +132,17 @@ def assert_close(gradient, exact, relative):
 
 
 @every_compiled
-def test_equal_images_have_no_gradient_at_all(name):
+def test_equal_images_have_zero_gradient(name):
     x = photo(60, 70)
     for loss, perfect in (("photometric", 0.0), ("l1", 0.0), ("ssim", 1.0), ("haar", 0.0)):
-        value, gradient = TRAINED_WITH[loss](x, x.clone(), name)
+        value, gradient = TRAINING_LOSSES[loss](x, x.clone(), name)
         assert float(value) == perfect
         assert not gradient.any()
 
 
-TRAINED_WITH = {
-    "photometric": lambda x, y, name: kernels.photometric(x, y, 0.2, kernels=name),
-    "l1": lambda x, y, name: kernels.l1(x, y, kernels=name),
-    "ssim": lambda x, y, name: kernels.ssim(x, y, kernels=name),
-    "haar": lambda x, y, name: kernels.haar_l1(x, y, 3, kernels=name),
-}
-
-
 @every_compiled
-@pytest.mark.parametrize("loss", TRAINED_WITH.values(), ids=TRAINED_WITH)
-def test_a_value_is_one_number_of_float32(name, loss):
+@pytest.mark.parametrize("loss", TRAINING_LOSSES.values(), ids=TRAINING_LOSSES)
+def test_a_loss_is_a_float32_scalar_outside_of_autograd(name, loss):
     value, gradient = loss(photo(20, 30), photo(20, 30, 6), name)
     assert value.shape == ()
     assert value.dtype == gradient.dtype == torch.float32
@@ -187,15 +158,15 @@ def threads():
 
 
 @needs_cpp
-@pytest.mark.parametrize("loss", TRAINED_WITH.values(), ids=TRAINED_WITH)
-def test_the_bits_do_not_depend_on_threads_or_luck(loss, threads):
+@pytest.mark.parametrize("loss", TRAINING_LOSSES.values(), ids=TRAINING_LOSSES)
+def test_the_bits_do_not_depend_on_threads(loss, threads):
     x, y = rough(photo(261, 350), 0.1)
     results = []
     for n in (1, 2, 3, 4, 8, 8, 1):
         threads(n)
         results.append(loss(x, y, "cpp"))
     threads(2)
-    with ThreadPoolExecutor(3) as callers:  # only one of them gets the pool
+    with ThreadPoolExecutor(3) as callers:  # only one caller gets the pool
         results += callers.map(lambda _: loss(x, y, "cpp"), range(6))
     for value, gradient in results[1:]:
         assert torch.equal(value, results[0].value)
@@ -205,9 +176,10 @@ def test_the_bits_do_not_depend_on_threads_or_luck(loss, threads):
 ISA_SCRIPT = """
 import sys, torch
 sys.path.insert(0, {tests!r})
-from tests.kernels.test_losses import TRAINED_WITH, cpp, photo, rough
+from clear_strategies.kernels.losses import cpp
+from tests.helpers.loss_cases import TRAINING_LOSSES, photo, rough
 x, y = rough(photo(141, 353), 0.1)
-torch.save([cpp.native().isa, *(tuple(loss(x, y, "cpp")) for loss in TRAINED_WITH.values())], {out!r})
+torch.save([cpp.native().isa, *(tuple(loss(x, y, "cpp")) for loss in TRAINING_LOSSES.values())], {out!r})
 """
 
 
@@ -224,14 +196,14 @@ def test_every_instruction_set_agrees(isa, tmp_path):
     found, *theirs = torch.load(out)
     assert found == isa
     x, y = rough(photo(141, 353), 0.1)
-    for loss, (value, gradient) in zip(TRAINED_WITH.values(), theirs, strict=True):
+    for loss, (value, gradient) in zip(TRAINING_LOSSES.values(), theirs, strict=True):
         mine = loss(x, y, "cpp")
         assert float(value) == pytest.approx(float(mine.value), rel=1e-6)
         assert_close(gradient, mine.gradient, 2e-6)
 
 
 @every_compiled
-def test_images_of_any_layout_are_taken(name):
+def test_images_of_any_layout_are_supported(name):
     x, y = photo(40, 50), photo(40, 50, 6)
     expected = kernels.photometric(x, y, 0.2, kernels=name)
     planar = x.movedim(-1, 0).contiguous().movedim(0, -1).requires_grad_()
@@ -242,7 +214,7 @@ def test_images_of_any_layout_are_taken(name):
 
 
 @every_implementation
-def test_gradients_go_where_they_are_wanted(name):
+def test_gradients_are_written_to_out(name):
     x, y = photo(20, 30), photo(20, 30, 6)
     out = torch.full((2, 20, 30, 3), torch.nan)
     ssim = kernels.photometric(x, y, 0.2, kernels=name, out=out[0])
@@ -268,24 +240,24 @@ def test_gradients_go_where_they_are_wanted(name):
         (torch.rand(0, 5, 3), torch.rand(0, 5, 3), ValueError, "with pixels"),
     ],
 )
-def test_what_the_compiled_kernels_refuse(x, y, error, message):
-    with pytest.raises(error, match=message):  # behind the shapes that only the tests' type checker knows
-        prepared(("cpu",), x, y, None)
+def test_the_compiled_kernels_refuse_other_images(x, y, error, message):
+    with pytest.raises(error, match=message):  # the public functions' shape annotations would raise first under pytest
+        image_pair(("cpu",), x, y, None)
 
 
-def test_both_images_lie_on_one_device():
+def test_images_on_different_devices_are_refused():
     x, y = torch.rand(4, 5, 3), torch.rand(4, 5, 3, device="meta")
-    with pytest.raises(TypeError, match="y must be where x is, on cpu, got meta"):
-        prepared(("cpu", "meta"), x, y, None)
+    with pytest.raises(TypeError, match="y must be on cpu, where x is, got meta"):
+        image_pair(("cpu", "meta"), x, y, None)
 
 
-def test_auto_takes_what_the_compiled_kernels_do_not():
+def test_auto_uses_torch_for_images_that_the_compiled_kernels_refuse():
     x, y = image(6, 7, 1), image(6, 7, 2)
     assert kernels.ssim(x, y).value.dtype == torch.float64
     assert torch.equal(kernels.haar_l1(x, y).gradient, reference.haar_l1(x, y).gradient)
 
 
-def test_without_a_compiler_torch_does_it(monkeypatch):
+def test_without_compiled_kernels_torch_is_used(monkeypatch):
     def absent():
         raise BackendUnavailable("the compiled kernels are not installed")
 
@@ -298,9 +270,9 @@ def test_without_a_compiler_torch_does_it(monkeypatch):
 
 
 @needs_cpp
-def test_the_objective_is_the_same_by_either_kernels(caplog):
+def test_the_objective_is_the_same_with_cpp_and_torch(caplog):
     x, y = rough(photo(60, 70), 0.1)
-    kernels._say.cache_clear()
+    kernels._log_once.cache_clear()
     with caplog.at_level(logging.INFO, "clear_strategies.kernels.losses"):
         fast = [Objective(kernels="auto", clamp_render=clamp).hr(x, y) for clamp in (False, True)]
     assert [record.message for record in caplog.records] == [f"image losses: cpp, for {cpp.native().isa}."]
@@ -324,7 +296,7 @@ def test_identical_images_are_perfect():
 
 @given(seed=st.integers(0, 1000), shift=st.floats(-1, 1))
 @settings(max_examples=20, deadline=None)
-def test_haar_is_blind_to_a_constant(seed, shift):
+def test_haar_does_not_depend_on_a_constant(seed, shift):
     x, y = image(8, 12, seed), image(8, 12, seed + 1)
     assert float(kernels.haar_l1(x + shift, y).value) == pytest.approx(float(kernels.haar_l1(x, y).value), rel=1e-9)
 

@@ -1,4 +1,4 @@
-"""What only the per-Gaussian pass in Warp has to show; that it computes what C++ does is in test_fused.py."""
+"""The per-Gaussian step in Warp alone. tests/training/test_compiled_step.py compares it with the readable path."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for, gaussian_pass
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import BackendUnavailable
-from rasterizers.warp_backend.launch import require
-from tests.training.test_compiled_step import Case, T, case, conductors, told
+from rasterizers.warp_runtime import require_warp
+from tests.helpers.compiled_step_cases import Case, T, as_floats, case, conductors
 
 
 @pytest.fixture
 def warp_step():
     try:
-        require("the compiled pass", "cpu", "")
+        require_warp("the compiled pass", "cpu", "")
     except BackendUnavailable as reason:
         pytest.skip(str(reason))
 
@@ -30,24 +30,24 @@ def warp_step():
 
 
 def started(warp_step, **settings) -> tuple[Case, CompiledStep]:
-    """Everything at once, with rows and bands that rest, and rows that nobody sees."""
+    """A case with all strategies, still rows, inactive bands and invisible rows."""
     c = case(1000, degree=2, kind="sparse")
     _, conductor = conductors(lambda: GCO(**settings), P2G, SVS, anchored=c.fields[0])
     adam = Adam(c.fields[1].raw(), LearningRates(detail_decay=0.1, rows="visible"), 1.0)
-    return c, CompiledStep(conductor, adam, passes=warp_step.GaussianPass)
+    return c, CompiledStep(conductor, adam, passes=warp_step.WarpGaussianStep)
 
 
 def two_steps(warp_step):
-    """Parameters and moments, conflicts and readings, and the work_log's counts."""
+    """Parameters and moments, conflict ratios, logged numbers, and the counts of skipped rows."""
     c, step = started(warp_step)
-    conflicts = [told(step.step(c.fields[1].raw(), *c.factors(1), T + i)) for i in range(2)]
+    conflicts = [as_floats(step.step(c.fields[1].raw(), *c.factors(1), T + i)) for i in range(2)]
     state = [*c.fields[1].raw().values(), *step.optimizer.first.values(), *step.optimizer.second.values()]
-    numbers = told(step.conductor.logs())
+    numbers = as_floats(step.conductor.logs())
     return state, conflicts, numbers, step.conductor.work_log.entries["optimizer rows"].skipped
 
 
-def test_blocks_of_many_threads_find_what_one_thread_finds(warp_step, monkeypatch):
-    """As on CUDA: lanes that add up together, the last block of them half empty; on a CPU, where Warp can imitate it."""
+def test_blocks_of_many_threads_give_the_same_bits(warp_step, monkeypatch):
+    """As on CUDA, where lanes sum together and the last block is not full; Warp can emulate this on a CPU."""
     import warp as wp
 
     if not hasattr(wp.config, "enable_cpu_blocks"):
@@ -63,8 +63,8 @@ def test_blocks_of_many_threads_find_what_one_thread_finds(warp_step, monkeypatc
     assert all(skipped.values())
 
 
-class Asked(TorchDispatchMode):
-    """What makes the host wait for a device, had the tensors been there."""
+class Synchronisations(TorchDispatchMode):
+    """Records the operations that would make the host wait if the tensors were on CUDA."""
 
     WAITING = ("aten::_local_scalar_dense", "aten::nonzero", "aten::equal", "aten::_to_copy", "aten::masked_select")
 
@@ -81,36 +81,38 @@ class Asked(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("eps", ["relative:1e-12", "absolute:0"])
-def test_nobody_waits_for_the_device(warp_step, eps):
+def test_the_host_does_not_wait_for_the_device(warp_step, eps):
     c, step = started(warp_step, eps=eps)
     factors = c.factors(1)
-    step.step(c.fields[1].raw(), *factors, T)  # looks at what changes with the structure only
-    with Asked() as asked:
+    step.step(c.fields[1].raw(), *factors, T)  # reads what changes only with the number of Gaussians
+    with Synchronisations() as recorded:
         conflict = step.step(c.fields[1].raw(), *factors, T + 1)
-    assert asked.found == []
-    assert all(0 <= share <= 1 for share in told(conflict).values())
+    assert recorded.found == []
+    assert all(0 <= share <= 1 for share in as_floats(conflict).values())
 
 
 @pytest.fixture
 def adam_on_cuda() -> Adam:
-    """As far as it says where its moments lie."""
+    """An optimizer whose moments say that they are on CUDA."""
     adam = Adam({}, LearningRates(), 1.0)
     adam.first = {"means": SimpleNamespace(device=torch.device("cuda"), dtype=torch.float32)}
     return adam
 
 
-def test_on_cuda_the_pass_is_warps(warp_step, adam_on_cuda, monkeypatch):
-    asked = []
-    monkeypatch.setattr("clear_strategies.training.compiled_step.require", lambda *arguments: asked.append(arguments))
-    assert gaussian_pass(adam_on_cuda) is warp_step.GaussianPass
-    assert [device for _, device, _ in asked] == ["cuda"]
+def test_cuda_fields_use_warp(warp_step, adam_on_cuda, monkeypatch):
+    required = []
+    monkeypatch.setattr(
+        "clear_strategies.training.compiled_step.require_warp", lambda *arguments: required.append(arguments)
+    )
+    assert gaussian_pass(adam_on_cuda) is warp_step.WarpGaussianStep
+    assert [device for _, device, _ in required] == ["cuda"]
 
 
-def test_on_cuda_without_warp_the_readable_path_is_taken_and_that_is_said(adam_on_cuda, monkeypatch, caplog):
+def test_cuda_fields_without_warp_use_the_readable_path_and_log_why(adam_on_cuda, monkeypatch, caplog):
     def missing(what, device, otherwise):
         raise BackendUnavailable(f"{what} needs NVIDIA Warp, which is not installed.")
 
-    monkeypatch.setattr("clear_strategies.training.compiled_step.require", missing)
+    monkeypatch.setattr("clear_strategies.training.compiled_step.require_warp", missing)
     with caplog.at_level("INFO"):
         assert compiled_step_for(Conductor(), adam_on_cuda) is None
     assert caplog.messages == [
@@ -119,14 +121,14 @@ def test_on_cuda_without_warp_the_readable_path_is_taken_and_that_is_said(adam_o
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp for macOS brings no compiler for CUDA")
-def test_the_kernels_compile_for_cuda_without_one(warp_step, monkeypatch, tmp_path):
+def test_the_kernels_compile_for_cuda_on_a_machine_without(warp_step, monkeypatch, tmp_path):
     import warp as wp
 
-    module = warp_step.sweeps.step.module  # all three
+    module = warp_step.passes.step.module  # the module of all three kernels
     monkeypatch.setitem(module.options, "block_dim", warp_step.LANES["cuda"])
     wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
     (compiled,) = tmp_path.glob("*.ptx")
     assembly = compiled.read_text()
     assert ".target sm_90" in assembly
-    assert ".local" not in assembly  # everything of a thread is in registers
-    assert "fma.rn.f32" not in assembly  # products and sums round as they do in torch
+    assert ".local" not in assembly  # no spills: a thread's numbers are in registers
+    assert "fma.rn.f32" not in assembly  # products and sums round as in torch

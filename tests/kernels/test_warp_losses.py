@@ -1,6 +1,6 @@
-"""The image losses on Warp: where they are taken, and that a GPU's blocks find what one thread finds.
+"""The image losses in Warp: when they are used, and that blocks of many threads agree with one thread.
 
-What they find is held against float64 in `test_kernels`.
+test_losses.py compares them with float64.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from clear_strategies import Objective
 from clear_strategies.kernels import losses
 from clear_strategies.kernels.losses import cpp, warp
 from rasterizers.interface import BackendUnavailable
-from tests.kernels.test_losses import TRAINED_WITH, needs_warp, photo, rough
+from tests.helpers.loss_cases import TRAINING_LOSSES, needs_warp, photo, rough
 
 
 @pytest.fixture
-def forgotten():
-    """Nothing is known about Warp, before and after."""
-    for known in (warp.available, warp.needed):
+def uncached():
+    """Clears what is cached about Warp, before and after the test."""
+    for known in (warp.available, warp.require):
         known.cache_clear()
     yield
-    for known in (warp.available, warp.needed):
+    for known in (warp.available, warp.require):
         known.cache_clear()
 
 
 @pytest.fixture
-def missing(monkeypatch, forgotten):
+def missing(monkeypatch, uncached):
     """No Warp here."""
     real = builtins.__import__
 
@@ -43,12 +43,12 @@ def missing(monkeypatch, forgotten):
 
 
 def on_cuda(dtype=torch.float32):
-    """An image whose device says CUDA; nobody may look into it."""
+    """A fake image on CUDA, without data."""
     with FakeTensorMode() as mode:
         return FakeTensor(mode, torch.empty(4, 5, 3, dtype=dtype, device="meta"), torch.device("cuda:0"))
 
 
-def test_auto_takes_warp_on_cuda_alone(monkeypatch):
+def test_auto_uses_warp_on_cuda_only(monkeypatch):
     x = torch.rand(4, 5, 3)
     monkeypatch.setattr(warp, "available", lambda device="cuda": True)
     assert losses._fastest(on_cuda(), on_cuda()) == "warp"
@@ -59,12 +59,12 @@ def test_auto_takes_warp_on_cuda_alone(monkeypatch):
     assert "warp" not in losses.implementations("cpu")
 
 
-def test_without_warp_torch_does_it_on_cuda(missing):
+def test_without_warp_torch_is_used_on_cuda(missing):
     assert losses._fastest(on_cuda(), on_cuda()) == "torch"
     assert list(losses.implementations("cuda")) == ["torch"]
 
 
-def test_without_warp_the_remedy_is_named(missing):
+def test_without_warp_the_error_says_what_to_install(missing):
     with pytest.raises(
         BackendUnavailable, match=r"kernels=warp needs .* not installed .*pip install 'clear-strategies\[warp\]'"
     ):
@@ -73,22 +73,22 @@ def test_without_warp_the_remedy_is_named(missing):
 
 @needs_warp
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA")
-def test_without_cuda_the_remedy_is_named(forgotten):
+def test_without_cuda_the_error_says_what_to_use(uncached):
     with pytest.raises(BackendUnavailable, match=r"kernels=warp cannot run on CUDA: .* kernels=torch runs here"):
-        warp.needed("cuda")
+        warp.require("cuda")
 
 
-def test_images_on_a_cpu_never_ask_for_warp(monkeypatch):
-    monkeypatch.setattr(warp, "needed", lambda device: pytest.fail("asked for Warp"))
+def test_images_on_a_cpu_do_not_import_warp(monkeypatch):
+    monkeypatch.setattr(warp, "require", lambda device: pytest.fail("required Warp"))
     x, y = photo(20, 30), photo(20, 30, 6)
     assert losses.implementations()
-    for loss in TRAINED_WITH.values():
+    for loss in TRAINING_LOSSES.values():
         loss(x, y, "auto")
     Objective().hr(x, y)
 
 
 @needs_warp
-def test_the_objective_is_the_same_by_warp():
+def test_the_objective_is_the_same_with_warp_and_torch():
     x, y = rough(photo(60, 70), 0.1)
     fast, slow = (Objective(kernels=name, haar_levels=2).hr(x, y) for name in ("warp", "torch"))
     assert fast.values == pytest.approx(slow.values, abs=1e-6)
@@ -96,21 +96,21 @@ def test_the_objective_is_the_same_by_warp():
 
 
 @needs_warp
-@pytest.mark.parametrize("loss", TRAINED_WITH.values(), ids=TRAINED_WITH)
-def test_the_bits_are_the_same_again(loss):
+@pytest.mark.parametrize("loss", TRAINING_LOSSES.values(), ids=TRAINING_LOSSES)
+def test_repeated_losses_have_the_same_bits(loss):
     x, y = rough(photo(61, 150), 0.1)
     value, gradient = loss(x, y, "warp")
     for _ in range(3):
-        torch.full((1 << 20,), torch.nan)  # other memory is free, and none of it zero
+        torch.full((1 << 20,), torch.nan)  # the allocator then reuses memory that is not zero
         again = loss(x, y, "warp")
         assert torch.equal(again.value, value)
         assert torch.equal(again.gradient, gradient)
 
 
 @needs_warp
-@pytest.mark.parametrize("loss", TRAINED_WITH.values(), ids=TRAINED_WITH)
-def test_a_block_of_threads_finds_what_one_thread_finds(monkeypatch, loss):
-    """The losses as CUDA runs them, 256 threads a block: on a CPU, where Warp can imitate them."""
+@pytest.mark.parametrize("loss", TRAINING_LOSSES.values(), ids=TRAINING_LOSSES)
+def test_blocks_of_many_threads_agree_with_one_thread(monkeypatch, loss):
+    """As on CUDA, with 256 threads per block; Warp can emulate this on a CPU."""
     import warp as wp
 
     from clear_strategies.kernels.losses.warp import launches
@@ -120,7 +120,7 @@ def test_a_block_of_threads_finds_what_one_thread_finds(monkeypatch, loss):
     x, y = rough(photo(15, 90), 0.1)
     alone = loss(x, y, "warp")
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-    monkeypatch.setitem(launches._LANES, "cpu", launches._LANES["cuda"])
+    monkeypatch.setitem(launches.LANES, "cpu", launches.LANES["cuda"])
     together = loss(x, y, "warp")
     assert float(together.value) == pytest.approx(float(alone.value), rel=1e-6)
     assert torch.allclose(together.gradient, alone.gradient, rtol=1e-5, atol=1e-6 * float(alone.gradient.abs().max()))
@@ -128,12 +128,12 @@ def test_a_block_of_threads_finds_what_one_thread_finds(monkeypatch, loss):
 
 @needs_warp
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp for macOS brings no compiler for CUDA")
-def test_the_kernels_compile_for_cuda_without_one(monkeypatch, tmp_path):
+def test_the_kernels_compile_for_cuda_on_a_machine_without(monkeypatch, tmp_path):
     import warp as wp
 
     from clear_strategies.kernels.losses.warp import haar, launches, similarity, sums
 
-    lanes = launches._LANES["cuda"]
+    lanes = launches.LANES["cuda"]
     made = (similarity.similarity, similarity.gradient, haar.details, sums.absolute, sums.total)
     for kernel in (haar.low_part, *(make(lanes) for make in made)):
         monkeypatch.setitem(kernel.module.options, "block_dim", lanes)
@@ -141,4 +141,4 @@ def test_the_kernels_compile_for_cuda_without_one(monkeypatch, tmp_path):
         (compiled,) = (tmp_path / kernel.key).glob("*.ptx")
         code = compiled.read_text()
         assert ".target sm_90" in code
-        assert ".local" not in code  # rows of numbers are registers
+        assert ".local" not in code  # no spills: rows of numbers are in registers

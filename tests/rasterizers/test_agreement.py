@@ -1,4 +1,4 @@
-"""Each bound of the agreement can fail."""
+"""Each bound of tests/helpers/agreement.py can fail."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from tests.helpers.agreement import require_gradient, require_image
 
 
-def test_equal_is_accepted_and_each_defect_is_not():
+def test_equal_tensors_agree_and_each_defect_is_found():
     image = torch.rand(100, 100, 3)
     require_image(image, image)
     flipped = image.clone()

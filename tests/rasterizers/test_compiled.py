@@ -1,4 +1,4 @@
-"""The compiled backends: the public contract, agreement with float64, the same bits however they are run, hard inputs."""
+"""The compiled backends: the public checks, agreement with float64, reproducible bits, and hard inputs."""
 
 from __future__ import annotations
 
@@ -28,25 +28,25 @@ from tests.helpers.backends import (
 
 
 def require_reference(backend, splats, view, v, **settings):
-    """At its widest precision a backend is the reference, to rounding; in float32 without cut-offs, which would flip."""
+    """A backend agrees with the reference at its highest precision; in float32 without cut-offs, which rounding may flip."""
     narrow = backend.widest == torch.float32
     settings = {**settings, **(CLEAN if narrow else {})}
     of_image, of_gradient = (5e-6, 5e-5) if narrow else (1e-12, 1e-10)
     found = backend(**settings)(to(splats, backend.widest), view)
-    truth = ReferenceRasterizer(**settings)(to(splats, torch.float64), view)
-    assert float((found.image.double() - truth.image).abs().max()) < of_image
-    assert float((found.alpha.double() - truth.alpha).abs().max()) < of_image
-    ours, theirs = found.vjp(v), truth.vjp(v.double())
+    expected = ReferenceRasterizer(**settings)(to(splats, torch.float64), view)
+    assert float((found.image.double() - expected.image).abs().max()) < of_image
+    assert float((found.alpha.double() - expected.alpha).abs().max()) < of_image
+    ours, theirs = found.vjp(v), expected.vjp(v.double())
     for name in ATTRIBUTES:
         a, b = gradient_of(ours, name), gradient_of(theirs, name)
         assert a.shape == b.shape
         assert float((a - b).norm()) <= of_gradient * float(b.norm()) + 1e-14, name
-    return found, truth
+    return found, expected
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
 @backends()
-def test_contract(backend, check):
+def test_every_backend_passes_the_checks(backend, check):
     check(backend)
 
 
@@ -56,7 +56,7 @@ def test_contract(backend, check):
 @pytest.mark.parametrize("settings", [{}, CLEAN], ids=["default", "clean"])
 @pytest.mark.parametrize("bands", [0, 15])
 @backends()
-def test_the_widest_precision_is_the_reference(backend, settings, bands):
+def test_the_highest_precision_agrees_with_the_reference(backend, settings, bands):
     settings = {**settings, "background": (0.2, 0.4, 0.6)}
     require_reference(backend, scene(400, bands=bands), camera(97, 66), cotangents(2, 66, 97), **settings)
 
@@ -69,7 +69,7 @@ def test_float32_agrees_with_float64_at_the_same_cut_offs(backend):
 
 @cache
 def dense_gradients(backend: Backend) -> tuple[SplatGradients, SplatGradients]:
-    """Found and exact, where no threshold flips."""
+    """Found and exact gradients, without cut-offs that rounding may flip."""
     splats, view = dense_scene()
     v = cotangents(1, 97, 130)
     return backend(**CLEAN)(splats, view).vjp(v), exact(splats, view, **CLEAN).vjp(v.double())
@@ -77,15 +77,15 @@ def dense_gradients(backend: Backend) -> tuple[SplatGradients, SplatGradients]:
 
 @pytest.mark.parametrize("name", ATTRIBUTES)
 @backends(dtype=torch.float32)
-def test_gradients_agree_where_no_threshold_flips(backend, name):
-    found, truth = dense_gradients(backend)
-    require_gradient(name, gradient_of(found, name)[0], gradient_of(truth, name)[0])
+def test_gradients_agree_without_cut_offs(backend, name):
+    found, expected = dense_gradients(backend)
+    require_gradient(name, gradient_of(found, name)[0], gradient_of(expected, name)[0])
 
 
 @backends(dtype=torch.float32)
 def test_transmittance_survives_four_hundred_layers(backend):
     n = 400
-    # Near α = 1 the last digit of α itself is worth 1/(1 - α) of them in T.
+    # Near α = 1, an error of α is 1/(1 - α) times as large in T.
     for alpha, tolerance in ((1 / 200, 1e-5), (0.05, 1e-5), (0.5, 1e-5), (0.98, 1e-4)):
         splats = Splats(
             means=torch.tensor([[0.0, 0.0, 2.0]]).repeat(n, 1) + torch.arange(n)[:, None] * torch.tensor([0, 0, 1e-3]),
@@ -99,9 +99,9 @@ def test_transmittance_survives_four_hundred_layers(backend):
         settings = {"alpha_min": 1e-6, "transmittance_min": 1e-9}
         found, right = backend(**settings)(splats, view), exact(splats, view, **settings)
         assert float((found.image.double() - right.image).abs().max()) < 5e-6
-        ours, truth = found.vjp(v), right.vjp(v.double())
+        ours, expected = found.vjp(v), right.vjp(v.double())
         for name in ("opacities", "sh0"):
-            a, b = gradient_of(ours, name).double(), gradient_of(truth, name)
+            a, b = gradient_of(ours, name).double(), gradient_of(expected, name)
             assert float((a - b).norm() / b.norm()) < tolerance
 
 
@@ -125,15 +125,15 @@ def test_needles_keep_their_shape(backend, aspect, pixels):
         one = select(splats, torch.tensor([i]))
         found, right = backend(**CLEAN)(one, view), ReferenceRasterizer(**CLEAN)(to(one, torch.float64), view)
         assert float((found.image.double() - right.image).abs().max()) < 5e-5
-        ours, truth = found.vjp(v), right.vjp(v.double())
+        ours, expected = found.vjp(v), right.vjp(v.double())
         for name in ("means", "scales", "opacities"):
-            a, b = gradient_of(ours, name).double(), gradient_of(truth, name)
+            a, b = gradient_of(ours, name).double(), gradient_of(expected, name)
             assert bool(a.isfinite().all())
             assert float((a - b).norm()) <= 2e-3 * float(b.norm()) + 1e-6, (name, i)
 
 
-def sweep(cases, seed=0):
-    """Sizes, depths, opacities and quaternion norms over many orders of magnitude: a sample of their product."""
+def extreme_cases(cases, seed=0):
+    """A sample of sizes, depths, opacities and quaternion norms over many orders of magnitude."""
     scales, depths = [10.0**k for k in range(-8, 9)], [10.0**k for k in range(-6, 7)]
     logits, norms = (-100.0, -15.0, -3.0, 0.0, 3.0, 15.0, 100.0), [10.0**k for k in range(-20, 21, 5)]
     table = list(product(scales, depths, logits, norms))
@@ -143,10 +143,10 @@ def sweep(cases, seed=0):
 
 @backends(dtype=torch.float32)
 def test_extreme_gaussians_are_right_or_absent(backend):
-    # Finite and as in float64, or culled as the near plane and alpha_min say.
+    # Finite and as in float64, or culled by the near plane and alpha_min.
     view, settings = camera(24, 20), {"near": 1e-4, "background": (0.1, 0.2, 0.3)}
     v, drawn = cotangents(1, 20, 24), 0
-    for scale, depth, logit, norm in sweep(cases=backend.cases):
+    for scale, depth, logit, norm in extreme_cases(cases=backend.cases):
         splats = Splats(
             means=torch.tensor([[0.03 * depth, -0.02 * depth, depth]]),
             quats=torch.tensor([[0.5, -0.5, 0.1, 0.7]]) * norm,
@@ -159,13 +159,13 @@ def test_extreme_gaussians_are_right_or_absent(backend):
         case = f"scale {scale:g} depth {depth:g} logit {logit:g} norm {norm:g}"
         error = float((found.image.double() - right.image).abs().max())
         assert error < 1e-4 or (error < FLIP_OF_ONE and bool(found.visible) == bool(right.visible)), (case, error)
-        pulled = found.vjp(v)
-        assert all(bool(gradient_of(pulled, name).isfinite().all()) for name in ATTRIBUTES), case
+        gradients = found.vjp(v)
+        assert all(bool(gradient_of(gradients, name).isfinite().all()) for name in ATTRIBUTES), case
         drawn += bool(right.visible)
     assert drawn > backend.cases / 8
 
 
-FLIP_OF_ONE = 1 / 255 + 1e-3  # a single Gaussian at alpha_min: drawn by one precision, passed over by the other
+FLIP_OF_ONE = 1 / 255 + 1e-3  # a single Gaussian at alpha_min: drawn in one precision, skipped in the other
 
 
 # ---- the same bits -----------------------------------------------------------------------------------------------
@@ -181,7 +181,7 @@ def test_bits_do_not_depend_on_the_run(backend):
 
 
 @backends()
-def test_more_than_the_budget_is_refused_with_figures(backend):
+def test_lists_beyond_the_memory_budget_are_refused(backend):
     splats = scene(4000, bands=0)
     huge = replace(splats, scales=splats.scales * 1e3)
     with pytest.raises(MemoryError, match=r"pairs of Gaussian and .*MiB.*largest Gaussian is number \d+"):
@@ -189,7 +189,7 @@ def test_more_than_the_budget_is_refused_with_figures(backend):
 
 
 @backends()
-def test_scales_together_are_scales_alone(backend):
+def test_scales_drawn_together_equal_scales_drawn_alone(backend):
     splats, hr = scene(500, bands=15), camera(128, 96)
     lr = hr.scaled(1 / 4)
     plain = replace(splats, rgb_offset=None, opacities=splats.opacities * 0.9)
@@ -197,21 +197,21 @@ def test_scales_together_are_scales_alone(backend):
     for rendering, (job, view) in zip(shared, [(plain, lr), (splats, hr)], strict=True):
         v = cotangents(2, view.height, view.width)
         alone = backend()(job, view)
-        *found, _ = everything(rendering, v)  # Y is of the union: not 0 for a Gaussian that only the other screen shows
+        *found, _ = everything(rendering, v)  # Y is not 0 for a Gaussian that is visible at the other scale only
         *expected, _ = everything(alone, v)
         require_same_bits(found, expected)
 
 
 @backends()
-def test_scales_that_share_nothing_are_drawn_alone(backend):
+def test_jobs_that_share_nothing_are_drawn_alone(backend):
     a, b, view = scene(50, seed=1), scene(50, seed=2), camera()
     for rendering, job in zip(backend().render_scales([(a, view), (b, view)]), (a, b), strict=True):
         assert torch.equal(rendering.image, backend()(job, view).image)
 
 
 @backends()
-def test_order_is_by_depth_then_index_in_every_storage(backend):
-    # Gaussians of one depth but different index: the picture follows the index, whoever else is there.
+def test_equal_depths_are_ordered_by_index(backend):
+    # With all Gaussians at one depth, the image follows the order of their indices.
     splats, view = scene(64), camera(32, 32)
     flat = replace(splats, means=torch.cat((splats.means[:, :2], torch.full((64, 1), 5.0)), dim=1))
     require_image(backend()(flat, view).image, ReferenceRasterizer()(to(flat, torch.float64), view).image)
@@ -220,8 +220,8 @@ def test_order_is_by_depth_then_index_in_every_storage(backend):
 
 
 @backends()
-def test_long_lists_are_worked_off_to_the_end(backend):
-    # More Gaussians over one tile than any buffer holds (cpp: 2048), most of them faint: every pixel sees them all.
+def test_lists_longer_than_a_segment_are_blended_to_the_end(backend):
+    # More Gaussians over a tile than a buffer holds (cpp: 2048), most of them faint, so that no pixel ends early.
     splats, view = scene(5000, bands=0, seed=3), camera(33, 31)
     faint = replace(splats, opacities=splats.opacities * 0.02)
     require_reference(backend, faint, view, cotangents(2, 31, 33))
@@ -239,13 +239,13 @@ def test_any_number_of_gaussians(backend, n):
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (15, 16), (16, 17), (31, 33), (32, 32), (64, 65)])
 @backends()
 def test_any_image_size(backend, size):
-    found, truth = require_reference(backend, scene(80), camera(*size), cotangents(1, size[1], size[0]))
-    assert torch.equal(found.visible, truth.visible)
+    found, expected = require_reference(backend, scene(80), camera(*size), cotangents(1, size[1], size[0]))
+    assert torch.equal(found.visible, expected.visible)
 
 
 @pytest.mark.parametrize("tile", [4, 8, 16, 32, 64])
 @backends()
-def test_tiles_not_asked_for_cost_nothing_and_change_nothing(backend, tile):
+def test_tiles_not_requested_do_not_change_the_others(backend, tile):
     if tile not in backend.edges:
         pytest.skip(f"{backend.name} has no tiles of {tile} px")
     splats, view = scene(200), camera(100, 70)
@@ -265,9 +265,9 @@ def test_tiles_not_asked_for_cost_nothing_and_change_nothing(backend, tile):
 
 
 @backends()
-def test_inactive_bands_are_stepped_over(backend):
+def test_a_view_of_the_active_bands_is_drawn_like_a_copy(backend):
     splats, view = scene(60, bands=15), camera()
-    active = replace(splats, shN=splats.shN[:, :3])  # a view: rows lie 45 numbers apart
+    active = replace(splats, shN=splats.shN[:, :3])  # a view whose rows are 45 numbers apart
     assert not active.shN.is_contiguous()
     packed = replace(splats, shN=splats.shN[:, :3].contiguous())
     v = cotangents(1, view.height, view.width)
@@ -277,7 +277,7 @@ def test_inactive_bands_are_stepped_over(backend):
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN", "rgb_offset"])
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 @backends()
-def test_numbers_that_are_not_finite_are_named(backend, name, bad):
+def test_numbers_that_are_not_finite_are_refused(backend, name, bad):
     splats = scene(20)
     visible = int(backend()(splats, camera()).visible.nonzero()[3])
     value = getattr(splats, name).clone()
@@ -294,13 +294,13 @@ def test_half_precision_is_refused(backend):
 
 @pytest.mark.parametrize(("setting", "rule"), [({"tile": 6}, "multiple of [48]"), ({"memory": 0}, "at least 1 MiB")])
 @backends()
-def test_settings_out_of_range_are_named(backend, setting, rule):
+def test_settings_out_of_range_are_refused(backend, setting, rule):
     with pytest.raises(ValueError, match=rule):
         backend(**setting)
 
 
 @backends()
-def test_a_picture_outlives_its_rasterizer_and_its_memory_is_used_again(backend):
+def test_an_image_stays_valid_while_later_ones_are_drawn(backend):
     splats, view = scene(3000), camera(200, 150)
     kept = backend()(splats, view).image
     before = kept.clone()

@@ -1,4 +1,4 @@
-"""What only the compiled backend for CPUs has to show: its instruction sets, its threads, its memory budget."""
+"""The backend "cpp" alone: its instruction sets, its threads and its memory budget."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def cpp(**settings):
 
 
 @pytest.mark.parametrize("isa", ["baseline", "avx2", "avx512"])
-def test_every_instruction_set_keeps_the_contract(isa):
+def test_every_instruction_set_passes_the_checks(isa):
     try:
         runs_here = [*native.load_kernels("rasterizers.cpp").instruction_sets(), "baseline"]
     except BackendUnavailable as reason:
@@ -32,8 +32,8 @@ def test_every_instruction_set_keeps_the_contract(isa):
         pytest.skip(f"this processor has no {isa}")
     program = (
         "import torch; torch.set_num_threads(1)\n"
-        "from rasterizers.testing import check_rasterizer; from rasterizers.cpp import create\n"
-        "check_rasterizer(create)\n"
+        "from rasterizers.testing import check_rasterizer; from rasterizers.cpp import CppRasterizer\n"
+        "check_rasterizer(CppRasterizer)\n"
         "from rasterizers.native import load_kernels; print(load_kernels('rasterizers.cpp').isa)"
     )
     done = subprocess.run(
@@ -61,10 +61,10 @@ def test_bits_do_not_depend_on_the_memory_budget():
     v = cotangents(2, 700, 1000)
     one_band = everything(cpp()(splats, view), v)
     bands = cpp(memory=4)(splats, view)
-    assert bands._frame.native.pairs(0) * 16 > 4 << 20  # it does take bands
+    assert bands._frame.native.pairs(0) * 16 > 4 << 20  # it needs several bands
     require_same_bits(everything(bands, v), one_band)
 
 
-def test_threads_out_of_range_are_named():
+def test_threads_out_of_range_are_refused():
     with pytest.raises(ValueError, match="at least 1"):
         cpp(threads=0)

@@ -1,4 +1,4 @@
-"""gsplat's kernels behind the interface: the adapter, with our own rasterizer in place of what needs CUDA."""
+"""The backend "gsplat", with a rasterizer of this package in place of gsplat's function, which needs CUDA."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def both(**settings):
 
 
 @pytest.mark.parametrize("offset", [False, True])
-def test_picture_and_transpose_are_those_of_what_draws(offset):
+def test_image_and_vjp_are_those_of_the_underlying_rasterizer(offset):
     mine, reference = both(background=(0.2, 0.5, 0.9), kernel=0.3)
     splats = toy.splats(20)
     if offset:
@@ -41,7 +41,7 @@ def test_picture_and_transpose_are_those_of_what_draws(offset):
         assert torch.allclose(a, b, rtol=1e-3, atol=1e-4 * float(b.abs().max())), name
 
 
-def test_tiles_that_nobody_asked_for_show_the_background_and_send_nothing_back():
+def test_tiles_not_requested_show_the_background_and_have_no_gradient():
     mine, _ = both(background=(0.25, 0.5, 0.75), tile=16)
     tiles = torch.zeros(2, 3, dtype=torch.bool)
     tiles[0, 0] = True
@@ -54,7 +54,7 @@ def test_tiles_that_nobody_asked_for_show_the_background_and_send_nothing_back()
     assert float(part.vjp(cotangent).means.abs().max()) == 0
 
 
-def test_bad_input_is_refused_in_the_words_of_every_backend():
+def test_bad_input_is_refused_with_the_messages_of_every_backend():
     mine, _ = both(tile=16)
     splats, camera = toy.splats(10), toy.camera(0.0, 48, 32)
     with pytest.raises(ValueError, match=r"tile mask must be \[2, 3\]"):
@@ -66,7 +66,7 @@ def test_bad_input_is_refused_in_the_words_of_every_backend():
         mine(splats, camera)
 
 
-def test_scales_are_drawn_one_after_the_other():
+def test_render_scales_draws_each_job():
     mine, _ = both()
     splats, camera = toy.splats(10), toy.camera(0.0, 48, 32)
     low, high = mine.render_scales([(splats, camera.scaled(0.5)), (splats, camera)])
@@ -74,7 +74,7 @@ def test_scales_are_drawn_one_after_the_other():
     assert low.image.shape == (16, 24, 3)
 
 
-def test_cut_offs_and_devices_that_it_does_not_have_are_refused():
+def test_other_cut_offs_and_other_devices_are_refused():
     with pytest.raises(ValueError, match="alpha_min must stay"):
         both(alpha_min=1 / 4096)
     with pytest.raises(ValueError, match="on cuda, got"):
@@ -82,7 +82,7 @@ def test_cut_offs_and_devices_that_it_does_not_have_are_refused():
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="says what to do without CUDA")
-def test_without_cuda_it_says_so_in_one_sentence():
+def test_without_cuda_the_error_says_so():
     with pytest.raises(BackendUnavailable, match=r"needs gsplat|draws on CUDA only"):
         rasterizers.load("gsplat")
     assert rasterizers.available()["gsplat"] is not None

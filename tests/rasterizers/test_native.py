@@ -1,4 +1,4 @@
-"""Who has the cores, and which kernels run on them."""
+"""The number of threads of compiled kernels, and the choice of the compiled module."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ import torch
 from rasterizers import BackendUnavailable, native
 
 
-def test_kernels_take_as_many_threads_as_torch_unless_they_own_the_cores():
+def test_kernels_use_as_many_threads_as_torch_outside_of_kernel_threads():
     before = torch.get_num_threads()
     assert native.threads() == before
-    with native.own_threads(3):
+    with native.kernel_threads(3):
         assert (native.threads(), torch.get_num_threads()) == (3, 1)
-        with native.own_threads(2):
+        with native.kernel_threads(2):
             assert native.threads() == 2
         assert (native.threads(), torch.get_num_threads()) == (3, 1)
     assert (native.threads(), torch.get_num_threads()) == (before, before)
 
 
-def test_the_cores_are_given_back_after_an_error():
+def test_torchs_threads_are_restored_after_an_error():
     before = torch.get_num_threads()
-    with pytest.raises(RuntimeError), native.own_threads(4):
+    with pytest.raises(RuntimeError), native.kernel_threads(4):
         raise RuntimeError
     assert (native.threads(), torch.get_num_threads()) == (before, before)
 
 
-def test_without_compiled_kernels_the_remedy_is_named():
+def test_without_compiled_kernels_the_error_says_what_to_install():
     with pytest.raises(BackendUnavailable, match=r"C\+\+20 compiler"):
         native.load_kernels("rasterizers.reference")
 
 
-def test_an_instruction_set_that_is_not_here_is_named(monkeypatch):
+def test_an_unsupported_instruction_set_is_refused(monkeypatch):
     try:
         native.load_kernels("rasterizers.cpp")
     except BackendUnavailable as reason:

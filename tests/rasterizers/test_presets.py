@@ -14,7 +14,7 @@ def test_a_preset_sets_the_cut_offs(name):
     assert {key: getattr(rasterizer, key) for key in PRESETS[name]} == PRESETS[name]
 
 
-def test_settings_win_over_the_preset():
+def test_settings_override_the_preset():
     rasterizer = rasterizers.load("torch", preset="exact", alpha_min=1 / 64)
     assert rasterizer.alpha_min == 1 / 64
     assert rasterizer.transmittance_min == PRESETS["exact"]["transmittance_min"]
@@ -29,6 +29,6 @@ def test_fast_is_the_default():
     assert rasterizers.load("torch", preset="fast") == rasterizers.load("torch")
 
 
-def test_an_unknown_preset_is_refused_with_the_known_ones():
+def test_an_unknown_preset_is_refused():
     with pytest.raises(ValueError, match="unknown preset 'best'; choose one of fast, accurate, exact"):
         rasterizers.load("torch", preset="best")

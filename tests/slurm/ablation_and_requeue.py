@@ -4,7 +4,7 @@ Starts a cluster of this one machine in FOLDER, runs the four rows of the ablati
 `hydra/launcher=submitit_slurm`, the same again, and a sweep with a job that fails. Then one longer run four times:
 undisturbed and without Slurm; as a job that `scontrol requeue` takes away; as one that is killed; as one that runs into
 its time limit. All must leave the same point cloud, byte for byte. What happens is told on standard output and in
-FOLDER/log.txt, which docs/cluster.md quotes.
+FOLDER/log.txt, which docs/how-to/cluster.md quotes.
 """
 
 from __future__ import annotations

@@ -14,27 +14,34 @@ from functools import partial
 import pytest
 import torch
 
-from clear_strategies import CONFLICT_GROUPS, GCO, P2G, SVS, Conductor, Evidence, Objective
+from clear_strategies import CONFLICT_GROUPS, GCO, P2G, SVS, Conductor, Objective
 from clear_strategies.core import deferred
 from clear_strategies.density.adaptive import DensitySettings
-from clear_strategies.kernels.gaussian_step import cpp as kernel
-from clear_strategies.merging.conductor import HrGradients
+from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.strategies.base import describes
-from clear_strategies.training.compiled_step import CompiledStep, Factors, compiled_step_for
-from clear_strategies.training.field import GaussianField
+from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
-from rasterizers.interface import BackendUnavailable, SplatGradients
+from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels
-from rasterizers.warp_backend.launch import require
+from rasterizers.warp_runtime import require_warp
 from tests.helpers import toy
+from tests.helpers.compiled_step_cases import (
+    ANCHORING,
+    HR_COTANGENTS,
+    Case,
+    T,
+    as_floats,
+    case,
+    conductors,
+    readable_merge,
+)
 
 EPS = torch.finfo(torch.float32).eps
-T = 5  # any iteration at which λ_HR = 1
 
 
 @pytest.fixture(params=["cpp", "warp", "warp-cuda"])
@@ -43,13 +50,13 @@ def sweeps(request):
     try:
         if request.param == "cpp":
             load_kernels("clear_strategies.kernels")
-            return kernel.GaussianPass
-        require("the compiled pass", "cuda" if request.param == "warp-cuda" else "cpu", "")
+            return CppGaussianStep
+        require_warp("the compiled pass", "cuda" if request.param == "warp-cuda" else "cpu", "")
     except BackendUnavailable as reason:
         pytest.skip(str(reason))
     from clear_strategies.kernels.gaussian_step import warp
 
-    return warp.GaussianPass if request.param == "warp" else partial(Elsewhere, warp.GaussianPass, "cuda")
+    return warp.WarpGaussianStep if request.param == "warp" else partial(Elsewhere, warp.WarpGaussianStep, "cuda")
 
 
 class Elsewhere:
@@ -85,115 +92,6 @@ class Elsewhere:
         )
         self.fetch(*(x for a in attributes.values() for x in (a.p, a.m, a.v, a.merged)))
         return found
-
-
-def told(numbers) -> dict[str, float]:
-    """Numbers by name, read if they are still on a device."""
-    return dict(zip(numbers, deferred.read(list(numbers.values())), strict=True))
-
-
-@dataclass
-class Case:
-    """One view's gradients, with their field, twice: for the readable path and for the compiled one."""
-
-    fields: tuple[GaussianField, GaussianField]
-    lr: SplatGradients
-    hr: SplatGradients
-    m: torch.Tensor | float
-    e: Evidence | None
-    visible: torch.Tensor
-    z: torch.Tensor | None
-
-    def factors(self, use: int, hr: str = "both") -> tuple:
-        a = self.fields[use]._activate(self.z)
-        lr = Factors(self.lr, 0, a, self.visible)
-        return lr, self._bundle(*(Factors(self.hr, k, a, self.visible) if k < _K[hr] else None for k in (0, 1)))
-
-    def grads(self, use: int, hr: str = "both") -> tuple:
-        a = self.fields[use]._activate(self.z)
-        hf = (a.vjp(self.hr, k, detail=True) if k < _K[hr] else None for k in (0, 1))
-        return a.vjp(self.lr, 0, detail=False), self._bundle(*hf)
-
-    def _bundle(self, base, hf) -> HrGradients | None:
-        return None if base is None else HrGradients(base, hf, (1, 1), self.e, self.m)
-
-
-def readable_merge(conductor, params, g_lr, hr, t) -> tuple:
-    """The merged gradient and the conflict ratios of the readable path."""
-    merged = conductor.merge(params, g_lr, hr, t)
-    return merged.grads, merged.conflict
-
-
-ANCHORING = partial(
-    SVS, anchor_strength=0.01,
-    anchor_weights={"means": 1.0, "scales": 1.0, "quats": 1.0, "opacities": 0.1, "sh0": 0.01, "shN": 0.01, "detail": 0.0},
-)  # fmt: skip
-_K = {"none": 0, "base": 1, "both": 2}
-
-
-def case(n=1000, degree=3, kind="random", seed=0, bands=15, gate=False, evidence=True) -> Case:
-    g = torch.Generator().manual_seed(seed)
-
-    def normal(*shape):
-        return torch.randn(*shape, generator=g)
-
-    parameters = {
-        "means": normal(n, 3), "quats": normal(n, 4), "scales": normal(n, 3) - 3, "opacities": normal(n) * 3,
-        "sh0": normal(n, 1, 3), "shN": normal(n, bands, 3) * 0.1, "detail": normal(n, 3) * 0.1,
-    }  # fmt: skip
-    parameters["shN"][:, (degree + 1) ** 2 - 1 :] = 0
-    fields = tuple(GaussianField(parameters, degree=degree) for _ in range(2))
-    filter_3d = torch.rand(n, generator=g) * 0.05
-    for field in fields:
-        field.filter_3d = filter_3d.clone()
-    basis = normal(n, (degree + 1) ** 2)
-    rows = {"random": 1e-5, "tiny": 1e-30, "huge": 1e20}.get(kind, 1e-5) * torch.ones(n)
-    if kind == "mixed":
-        rows = 10.0 ** (torch.rand(n, generator=g) * 50 - 30)
-
-    def gradients(k):
-        def rowed(*shape):
-            return normal(k, n, *shape) * rows.view(1, n, *[1] * len(shape))
-
-        return SplatGradients(rowed(3), rowed(4), rowed(3), rowed(), rowed(2), rowed(3), basis.clone())
-
-    lr, hr = gradients(1), gradients(2)
-    if kind in ("opposite", "parallel"):
-        sign = -1.0 if kind == "opposite" else 1.0
-        hr = SplatGradients(
-            *(getattr(lr, f).repeat(2, *[1] * (getattr(lr, f).dim() - 1)) * sign for f in FACTORS), basis
-        )
-    visible = torch.ones(n, dtype=torch.bool)
-    if kind == "sparse":  # most Gaussians are not seen, some are seen at one scale only
-        visible = torch.rand(n, generator=g) < 0.2
-        for s, seen in ((lr, visible), (hr, visible & (torch.rand(n, generator=g) < 0.5))):
-            for name in FACTORS:
-                getattr(s, name)[:, ~seen] = 0
-    if kind == "zero":
-        for s, name in itertools.product((lr, hr), FACTORS):
-            getattr(s, name).zero_()
-    if kind == "round":  # equal axes: rotation gradients are rounding
-        lr.quats.mul_(2.0**-30)
-    m = 0.25 + 0.75 * torch.rand(n, generator=g) if evidence else 1.0
-    e = Evidence(torch.rand(n, generator=g), torch.rand(n, generator=g)) if evidence else None
-    z = (torch.rand(n, generator=g) > 0.2).float() / 0.8 if gate else None
-    return Case(fields, lr, hr, m, e, visible, z)
-
-
-FACTORS = ("means", "quats", "scales", "opacities", "screen", "rgb")
-ALWAYS = WarmupDecay(start=0, full=1, decay_from=10, end=10)
-
-
-def conductors(*makers, anchored=None, hf=0.2, λ=ALWAYS) -> tuple[Conductor, Conductor]:
-    """Two of the same; with an anchor a little beside the field where one is given."""
-    makers = [ANCHORING if make is SVS else make for make in makers]
-    both = tuple(Conductor(*(make() for make in makers), objective=Objective(lambda_hr=λ, lambda_hf=hf)) for _ in "ab")
-    for conductor in both:
-        conductor.on_fit_start(3, 0)
-        for s in conductor.strategies:
-            if isinstance(s, SVS) and anchored is not None:
-                s.after_step({name: p * 1.01 for name, p in anchored.raw().items()}, s.anchor_start)
-    return both
 
 
 def assert_same_gradient(c: Case, expected, found, λ=1.0, hr="both"):
@@ -248,21 +146,21 @@ def test_the_merged_gradient_is_the_readable_one(sweeps, setting, kind, caplog):
         found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), T)
         assert_same_gradient(c, expected, found)
         assert all(torch.equal(before[name], p) for name, p in c.fields[1].raw().items())
-        assert repr(told(found_conflict)) == repr(told(conflict))
-        same(told(readable.strategies[0].logs), told(compiled.strategies[0].logs))
+        assert repr(as_floats(found_conflict)) == repr(as_floats(conflict))
+        same(as_floats(readable.strategies[0].logs), as_floats(compiled.strategies[0].logs))
         assert caplog.messages == said
 
 
 @pytest.mark.parametrize("names", [s for k in range(4) for s in itertools.combinations((GCO, P2G, SVS), k)], ids=str)
 def test_every_subset_of_strategies_with_and_without_hr(sweeps, names):
-    for hr, anchored, hf in itertools.product(_K, (False, True), (0.2, 1.0)):
+    for hr, anchored, hf in itertools.product(HR_COTANGENTS, (False, True), (0.2, 1.0)):
         c = case(100, kind="random", evidence=P2G in names)
         readable, compiled = conductors(*names, anchored=c.fields[0] if anchored else None, hf=hf)
         expected, conflict = readable_merge(readable, c.fields[0].raw(), *c.grads(0, hr), T)
         step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), passes=sweeps)
         found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1, hr), T)
         assert_same_gradient(c, expected, found, hr=hr)
-        assert repr(told(found_conflict)) == repr(told(conflict))
+        assert repr(as_floats(found_conflict)) == repr(as_floats(conflict))
 
 
 def test_hr_for_the_score_alone_is_neither_compared_nor_corrected(sweeps):
@@ -303,8 +201,8 @@ def assert_same_state(c: Case, adams, rates: LearningRates):
 @pytest.mark.parametrize("kind", ["random", "sparse", "zero"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_a_step_is_adams(sweeps, degree, kind, rows):
-    sizes = (0, 1, 15, 16, 17) if sweeps is kernel.GaussianPass else (0, 17)  # C++ takes sixteen at a time
-    for n, hr in itertools.product(sizes, _K):
+    sizes = (0, 1, 15, 16, 17) if sweeps is CppGaussianStep else (0, 17)  # C++ takes sixteen at a time
+    for n, hr in itertools.product(sizes, HR_COTANGENTS):
         c = case(n, degree, kind)
         rates = LearningRates(rows=rows, detail_decay=0.1, means=LogLinear(end=10))
         adams = three_steps(sweeps, c, conductors(P2G), rates, hr)
@@ -383,7 +281,7 @@ def test_the_same_bits_for_any_number_of_threads(sweeps):
             for i in range(3):
                 step.step(c.fields[1].raw(), *c.factors(1), T + i)
             state = [*c.fields[1].raw().values(), *adam.first.values(), *adam.second.values()]
-            states.append((state, repr(told(conductor.strategies[0].logs))))
+            states.append((state, repr(as_floats(conductor.strategies[0].logs))))
     finally:
         torch.set_num_threads(threads)
     for state, readings in states[1:]:
@@ -399,7 +297,7 @@ def test_bases_of_both_scales_may_differ(sweeps):
     step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), passes=sweeps)
     found, found_conflict = step.gradient(c.fields[1].raw(), *c.factors(1), T)
     assert_same_gradient(c, expected, found)
-    assert told(conflict) == told(found_conflict)
+    assert as_floats(conflict) == as_floats(found_conflict)
 
 
 def test_wrong_tensors_are_refused_at_the_border(sweeps):

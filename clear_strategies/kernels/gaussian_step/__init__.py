@@ -1,0 +1,129 @@
+"""The per-Gaussian step of one iteration in compiled code: its inputs, its outputs, and its two passes.
+
+It computes what the readable path computes, which specifies it: `merging.conductor.Conductor.merge`,
+`strategies.gco.GCO.correct`, `strategies.svs.SVS.regularize`, `training.field.Activation.vjp`, `training.optim.Adam.step` and
+`training.field.GaussianField.constrain`. `training.compiled_step` calls it; tests/training/test_compiled_step.py compares.
+
+`cpp.CppGaussianStep` runs on the CPU and returns Python numbers. `warp.WarpGaussianStep` runs on CUDA and returns tensors
+there, so the host does not wait.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Conflicts before correction, by conflict group and then for the whole Gaussian.
+
+    Args:
+        comparable: Gaussians whose LR and HR gradients are both nonzero.
+        opposed: comparable Gaussians whose LR and HR gradients have a negative inner product.
+        norm_lr, norm_hr: Σ ‖g_LR‖ and Σ ‖g_HR‖ over the comparable Gaussians, by group.
+    """
+
+    comparable: Sequence[int] | Int[Tensor, " 7"]
+    opposed: Sequence[int] | Int[Tensor, " 7"]
+    norm_lr: Sequence[float] | Float[Tensor, " 6"]
+    norm_hr: Sequence[float] | Float[Tensor, " 6"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """GCO's settings as numbers, by conflict group where they differ.
+
+    Args:
+        groups: whether each group is corrected.
+        reliability: q [N], None: 0.
+    """
+
+    groups: Sequence[bool]
+    eps_cos: Sequence[float] | Float[Tensor, " 6"]
+    eps_corr: Sequence[float] | Float[Tensor, " 6"]
+    tolerance: float
+    weight_min: float
+    weight_max: float
+    rotation_noise: float
+    bounds_hold_omega: bool
+    reliability: Tensor | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attribute:
+    """A parameter with its Adam moments, [N, …] each, updated in place.
+
+    Args:
+        rate: learning rate over the bias of the first moment.
+        anchor: θ^a; adds (θ - θ^a) · `stiffness` to the gradient.
+        keep: factor of the parameter's decay per step.
+        limit: the parameter is clamped to ±limit.
+        merged: receives the merged gradient; no step is taken then.
+    """
+
+    p: Tensor
+    m: Tensor
+    v: Tensor
+    rate: float
+    anchor: Tensor | None = None
+    stiffness: float = 0.0
+    keep: float = 1.0
+    limit: float = float("inf")
+    merged: Tensor | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepSettings:
+    """The settings of a step that all attributes share.
+
+    Args:
+        bias2: bias of Adam's second moment.
+        visible: rows that may step, None: all.
+        skips: skip rows that would not change.
+        width: numbers of an shN row that are stepped, at least those of the active bands.
+    """
+
+    beta1: float
+    beta2: float
+    bias2: float
+    eps: float
+    lambda_hr: float
+    visible: Tensor | None
+    skips: bool
+    width: int
+
+
+@dataclass(frozen=True, slots=True)
+class StepCounts:
+    """What a step did.
+
+    Args:
+        corrected, omega, at_lower_bound: by conflict group, rows corrected, Σ ω, and rows with ω at its lower bound.
+        still: rows that were skipped because they would not change.
+        invisible: rows that took no step because they are not visible.
+    """
+
+    corrected: Sequence[int] | Int[Tensor, " 6"]
+    omega: Sequence[float] | Float[Tensor, " 6"]
+    at_lower_bound: Sequence[int] | Int[Tensor, " 6"]
+    still: int | Int[Tensor, ""]
+    invisible: int | Int[Tensor, ""]
+
+
+class GaussianStep(Protocol):
+    """The two passes over one view's gradients. Implementations take them as `cpp.CppGaussianStep` does."""
+
+    def compare(self, products: Float[Tensor, "6 N"] | None = None) -> Comparison:
+        """Count the conflicts before correction. `products`, float64, receives ‖g_LR‖‖g_HR‖ by group."""
+        ...
+
+    def step(
+        self, attributes: Mapping[str, Attribute], correction: Correction | None, settings: StepSettings
+    ) -> StepCounts:
+        """Merge, correct, add the anchor's gradient and apply Adam, in place."""
+        ...

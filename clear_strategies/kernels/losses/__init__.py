@@ -1,8 +1,7 @@
-"""The trainer's own hot loops: image losses with their gradients.
+"""Image losses with their gradients, in three implementations.
 
-`torch` is the specification, in float64 inside; the others agree with it, for images of float32: `cpp` runs on the CPU,
-where it was built, `warp` on CUDA, where NVIDIA Warp is installed. Every function takes `kernels` to choose: "auto" (the
-fastest that takes these images where they lie), "torch", "cpp" or "warp".
+`reference` specifies the losses in torch, in float64 internally. `cpp` (the CPU) and `warp` (CUDA) compute the same for float32
+images. Every function has an argument `kernels`: "torch", "cpp", "warp", or "auto" for the fastest that supports the images.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from typing import Literal, Protocol, get_args, runtime_checkable
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.errors import SettingError
 from clear_strategies.kernels.losses import cpp, warp
 from clear_strategies.kernels.losses import reference as reference
 from clear_strategies.kernels.losses.reference import LossAndGradient
@@ -37,7 +37,7 @@ Choice = Literal["auto", "torch", "cpp", "warp"]
 
 @runtime_checkable
 class Implementation(Protocol):
-    """What a module of kernels offers; `torch` says what each function means."""
+    """The functions of an implementation; `reference` specifies them."""
 
     def photometric(self, x: Tensor, y: Tensor, lambda_ssim: float, out: Tensor | None = None) -> LossAndGradient: ...
 
@@ -49,9 +49,9 @@ class Implementation(Protocol):
 
 
 def implementations(device: str = "cpu") -> dict[str, Implementation]:
-    """Those to be used for images on `device`, "cpu" or "cuda", by name, the fastest first.
+    """The implementations for images on `device`, "cpu" or "cuda", by name, fastest first.
 
-    On a CPU Warp's kernels are there to be checked: they are taken only by name.
+    Warp's kernels on a CPU are for checks, and are not listed.
     """
     found: dict[str, Implementation] = {}
     if device == "cpu" and cpp.available():
@@ -62,18 +62,18 @@ def implementations(device: str = "cpu") -> dict[str, Implementation]:
 
 
 def require(kernels: Choice) -> None:
-    """Make sure of a choice before it is needed.
+    """Check that an implementation can run, before the first image.
 
     Raises:
-        ValueError: there is no such implementation.
-        BackendUnavailable: "cpp" was not built, or Warp is not installed; the message says what to do.
+        SettingError: there is no such implementation.
+        BackendUnavailable: "cpp" was not compiled, or Warp is not installed; the message says what to do.
     """
     if kernels not in get_args(Choice):
-        raise ValueError(f"kernels must be one of {', '.join(get_args(Choice))}, got {kernels!r}.")
+        raise SettingError(f"kernels must be one of {', '.join(get_args(Choice))}, got {kernels!r}.")
     if kernels == "cpp":
         cpp.native()
     if kernels == "warp":
-        warp.needed("cpu")
+        warp.require("cpu")
 
 
 def photometric(
@@ -114,7 +114,7 @@ def _choose(kernels: Choice, x: Tensor, y: Tensor) -> Implementation:
     require(kernels)
     if kernels == "auto":
         kernels = _fastest(x, y)
-    _say(f"cpp, for {cpp.native().isa}" if kernels == "cpp" else kernels)
+    _log_once(f"cpp, for {cpp.native().isa}" if kernels == "cpp" else kernels)
     return {"torch": reference, "cpp": cpp, "warp": warp}[kernels]
 
 
@@ -125,5 +125,5 @@ def _fastest(x: Tensor, y: Tensor) -> Choice:
 
 
 @cache
-def _say(which: str) -> None:
+def _log_once(which: str) -> None:
     _log.info("image losses: %s.", which)

@@ -1,10 +1,10 @@
-"""The losses of `torch`, same names and meaning, by compiled kernels in float32: for images [H, W, 3] on the CPU.
+"""The losses of `reference` in C++, for float32 images [H, W, 3] on the CPU.
 
-SSIM keeps its digits without float64: sums are taken about a value inside each window (`src/ssim.hpp`). The same bits for
-any number of threads, which are as many as torch uses.
+SSIM is accurate in float32 because sums are taken about a value inside each window (`kernels/src/ssim.hpp`). Results have
+the same bits for any number of threads.
 
-Every function here raises `BackendUnavailable` where the kernels were not built, `TypeError` for images that are not
-float32 tensors on the CPU, and `ValueError` for sizes that do not fit.
+Every loss raises `BackendUnavailable` if the kernels were not compiled, `TypeError` for images that are not float32 on the
+CPU, and `ValueError` for sizes that do not match.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.kernels.losses.prepared import Prepared, prepared, takes
+from clear_strategies.kernels.losses.images import ImagePair, image_pair, supported
 from clear_strategies.kernels.losses.reference import LossAndGradient
 from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels, threads
@@ -26,7 +26,7 @@ _DEVICES: Final = ("cpu",)
 
 
 def available() -> bool:
-    """Whether the kernels were built and run on this processor."""
+    """Whether the kernels were compiled and run on this processor."""
     try:
         native()
     except BackendUnavailable:
@@ -36,13 +36,13 @@ def available() -> bool:
 
 @cache
 def native() -> ModuleType:
-    """The module for this processor's instruction set."""
+    """The compiled module for this processor's instruction set."""
     return load_kernels("clear_strategies.kernels")
 
 
 def accepts(*images: Tensor) -> bool:
-    """Whether these images are of the type and shape that the kernels are written for."""
-    return takes(_DEVICES, *images)
+    """Whether the kernels support these images."""
+    return supported(_DEVICES, *images)
 
 
 def photometric(
@@ -51,10 +51,10 @@ def photometric(
     lambda_ssim: float,
     out: Float[Tensor, "H W 3"] | None = None,
 ) -> LossAndGradient:
-    """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient, in one pass; without λ no SSIM is computed."""
-    images = prepared(_DEVICES, x, y, out)
+    """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient, in one pass; with λ = 0 no SSIM is computed."""
+    images = image_pair(_DEVICES, x, y, out)
     l1_mean, dissimilarity = native().photometric(*images, 1 - lambda_ssim, lambda_ssim, threads())
-    return _answer((1 - lambda_ssim) * l1_mean + lambda_ssim * dissimilarity, images)
+    return _result((1 - lambda_ssim) * l1_mean + lambda_ssim * dissimilarity, images)
 
 
 def l1(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> LossAndGradient:
@@ -64,9 +64,9 @@ def l1(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> LossAndGradient:
 
 def ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> LossAndGradient:
     """Mean structural similarity as 3DGS trains with it: zero padding, so borders count less."""
-    images = prepared(_DEVICES, x, y, None)
+    images = image_pair(_DEVICES, x, y, None)
     _, dissimilarity = native().photometric(*images, 0.0, -1.0, threads())  # SSIM - 1, and its gradient
-    return _answer(1 - dissimilarity, images)
+    return _result(1 - dissimilarity, images)
 
 
 def haar_l1(
@@ -75,9 +75,9 @@ def haar_l1(
     """Mean absolute difference of the three detail bands of an orthonormal Haar transform, averaged over levels."""
     if levels < 1:
         raise ValueError(f"levels must be at least 1, got {levels}.")
-    images = prepared(_DEVICES, x, y, out)
-    return _answer(native().haar_l1(*images, levels, threads()), images)
+    images = image_pair(_DEVICES, x, y, out)
+    return _result(native().haar_l1(*images, levels, threads()), images)
 
 
-def _answer(value: float, images: Prepared) -> LossAndGradient:
+def _result(value: float, images: ImagePair) -> LossAndGradient:
     return LossAndGradient(torch.tensor(value, dtype=torch.float32), images.gradient)

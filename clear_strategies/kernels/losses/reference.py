@@ -1,7 +1,7 @@
-"""Image losses, each with its gradient with respect to the first image. Gradients are written out, not taped:
-the trainer needs image-space cotangents, and nothing else of a graph.
+"""The reference implementation of the image losses, each with its gradient with respect to the first image.
 
-Where a function takes `out`, the gradient is written there, and is that tensor.
+The gradients are written by hand, without autograd, because the trainer needs only gradients of images. A function with an
+argument `out` writes the gradient to that tensor and returns it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _C2: Final = 0.03**2
 
 
 class LossAndGradient(NamedTuple):
-    """A scalar and its gradient with respect to the image it was computed for."""
+    """A loss, and its gradient with respect to the first image."""
 
     value: Float[Tensor, ""]
     gradient: Float[Tensor, "H W C"]
@@ -32,7 +32,7 @@ def photometric(
     lambda_ssim: float,
     out: Float[Tensor, "H W C"] | None = None,
 ) -> LossAndGradient:
-    """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient; without λ no SSIM is computed."""
+    """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient; with λ = 0 no SSIM is computed."""
     value, gradient = l1(x, y)
     if lambda_ssim > 0:
         similarity = ssim(x, y)
@@ -51,8 +51,8 @@ def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"]) -> LossAndGradien
     """Mean structural similarity as 3DGS trains with it: zero padding, so borders count less.
 
     With A1 = 2 μx μy + C1, A2 = 2 σxy + C2, B1 = μx² + μy² + C1, B2 = σx² + σy² + C2, the map is S = A1 A2 / (B1 B2).
-    In float64: E[x²] - E[x]² in float32 loses the variance of flat regions (STRESS row 8: 0.6 % of the gradient on
-    a constant image). For evaluation use `metrics`, where scikit-image's definition rules.
+    Computed in float64, because E[x²] - E[x]² in float32 loses the variance of flat regions. For evaluation use
+    `outputs.metrics`, which follows scikit-image.
     """
     X, Y = x.double().movedim(-1, 0), y.double().movedim(-1, 0)
     mu_x, mu_y, e_xx, e_yy, e_xy = _window_mean(torch.stack((X, Y, X * X, Y * Y, X * Y)))
@@ -74,7 +74,7 @@ def haar_l1(
 ) -> LossAndGradient:
     """Mean absolute difference of the three detail bands of an orthonormal Haar transform, averaged over levels.
 
-    Blind to the mean of each 2 × 2 block. An odd last row or column is repeated, so every pixel takes part.
+    It does not depend on the mean of each 2 × 2 block. An odd last row or column is repeated, so every pixel counts.
     """
     low = x - y  # the transform is linear
     sizes, signs = [], []
@@ -115,7 +115,7 @@ def _pad_to_even(image: Float[Tensor, "H W C"]) -> Float[Tensor, "h w C"]:
 
 
 def _fold_padding(gradient: Float[Tensor, "h w C"], shape: torch.Size) -> Float[Tensor, "H W C"]:
-    """The transpose of `_pad_to_even`: a repeated pixel receives both gradients."""
+    """The VJP of `_pad_to_even`: a repeated pixel receives both gradients."""
     height, width = shape[:2]
     if gradient.shape[1] > width:
         gradient[:, width - 1] += gradient[:, width]
@@ -125,7 +125,7 @@ def _fold_padding(gradient: Float[Tensor, "h w C"], shape: torch.Size) -> Float[
 
 
 def _window_mean(maps: Float[Tensor, "... H W"]) -> Float[Tensor, "... H W"]:
-    """Separable Gaussian mean with zero padding, as eleven shifted sums each way (torch's grouped conv is slower)."""
+    """Separable Gaussian mean with zero padding, as eleven shifted sums per axis (torch's grouped convolution is slower)."""
     return _mean_along(_mean_along(maps, -1), -2)
 
 

@@ -1,5 +1,5 @@
-// Adam on sixteen numbers, and on rows of any length; operation by operation optim.Adam, but for a division by the bias
-// of the second moment, which is a multiplication here.
+// Adam on sixteen numbers, and on rows of any length. Same operations as training.optim.Adam, except that the division by
+// the second moment's bias is a multiplication here.
 #pragma once
 
 #include <cstddef>
@@ -14,26 +14,26 @@ struct AdamStep {
   float per_bias2, eps;  // 1 / bias of the second moment
 };
 
-// One parameter tensor with its moments [N, width], the anchor that holds it, and its limits.
+// One parameter tensor with its moments [N, width], its anchor and its limits.
 struct Attribute {
   float *p, *m, *v;
   int width;
   const float* anchor = nullptr;  // θ^a, or null
-  float stiffness = 0;            // of the anchor: 2 λ_stab W
+  float stiffness = 0;            // 2 λ_stab W
   float rate;                     // - learning rate / bias of the first moment
-  float keep = 1;                 // what decay leaves of the parameter (f_det)
+  float keep = 1;                 // factor of the decay per step (f_det), 1: none
   float limit = std::numeric_limits<float>::infinity();
-  float* merged = nullptr;        // where to write the merged gradient instead of stepping
+  float* merged = nullptr;        // receives the merged gradient; no step is taken then
 };
 
 CLEAR_INLINE Floats clamp_keeping_nan(const Floats& x, const Floats& limit) {
-  return minimum(limit, maximum(-limit, x));  // a NaN in the second place wins
+  return minimum(limit, maximum(-limit, x));  // returns the second operand if it is NaN
 }
 
 struct Adam {
   Floats p, m, v;
 
-  // Decay, step and projection. `g` holds everything but the anchor's pull.
+  // Decay and step. `g` includes the anchor's gradient.
   CLEAR_INLINE void step(const AdamStep& s, const Attribute& a, const Floats& g) {
     m = multiply_add(g, s.gain1, m * Floats(s.beta1));
     v = multiply_add(g * Floats(s.gain2), g, v * Floats(s.beta2));
@@ -48,7 +48,7 @@ CLEAR_INLINE Floats with_anchor(const Attribute& a, const Floats& g, const Float
   return g + (p - anchor) * Floats(a.stiffness);  // Eq. 16
 }
 
-// Sixteen numbers at `at`, of which `moves` (0 or 1 each; null: all) take part. The others only decay and are projected.
+// Steps sixteen numbers. Those with `moves` = 0 (null: none) only decay and are clamped to the limit.
 CLEAR_INLINE void step_sixteen(const AdamStep& s, const Attribute& a, float* p, float* m, float* v, const float* anchor,
                                const float* g_in, const float* moves) {
   Adam x{Floats::load(p), Floats::load(m), Floats::load(v)};
@@ -64,13 +64,13 @@ CLEAR_INLINE void step_sixteen(const AdamStep& s, const Attribute& a, float* p, 
   y.m.store(m), y.v.store(v);
 }
 
-// `count` numbers from `offset` on.
+// Steps `count` numbers from `offset` on.
 inline void step_numbers(const AdamStep& s, const Attribute& a, std::int64_t offset, int count, const float* g,
                          const float* moves) {
   if (a.merged) {
     for (int j = 0; j < count; ++j) {
-      float pull = a.anchor ? (a.p[offset + j] - a.anchor[offset + j]) * a.stiffness : 0.0f;
-      a.merged[offset + j] = a.anchor ? g[j] + pull : g[j];
+      float from_anchor = a.anchor ? (a.p[offset + j] - a.anchor[offset + j]) * a.stiffness : 0.0f;
+      a.merged[offset + j] = a.anchor ? g[j] + from_anchor : g[j];
     }
     return;
   }
@@ -90,7 +90,7 @@ inline void step_numbers(const AdamStep& s, const Attribute& a, std::int64_t off
   std::memcpy(p + j, last[0], bytes), std::memcpy(m + j, last[1], bytes), std::memcpy(v + j, last[2], bytes);
 }
 
-// What happens to a row that takes no step: decay and projection alone.
+// A row that takes no step: decay and clamp only.
 inline void rest_row(const Attribute& a, std::int64_t row) {
   if (a.merged || (a.keep == 1 && a.limit == std::numeric_limits<float>::infinity())) return;
   for (int d = 0; d < a.width; ++d) {
@@ -101,7 +101,7 @@ inline void rest_row(const Attribute& a, std::int64_t row) {
 }
 
 CLEAR_INLINE bool all_zero(const float* values, int count) {
-  std::uint32_t any = 0;  // of the bits, all but the sign
+  std::uint32_t any = 0;  // the bits of all values without their signs
   for (int k = 0; k < count; ++k) {
     std::uint32_t bits;
     std::memcpy(&bits, values + k, sizeof bits);
@@ -110,7 +110,7 @@ CLEAR_INLINE bool all_zero(const float* values, int count) {
   return any == 0;
 }
 
-// Whether nothing would move a row whose gradient is 0: no momentum, no pull of the anchor.
+// Whether a row with gradient 0 would stay as it is: both moments are 0, and it equals its anchor.
 inline bool is_still(const Attribute& a, std::int64_t row, int width) {
   std::int64_t at = row * a.width;
   if (!all_zero(a.m + at, width) || !all_zero(a.v + at, width)) return false;

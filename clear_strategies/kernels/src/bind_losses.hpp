@@ -1,4 +1,4 @@
-// Image losses for Python: images are [H, W, 3] float32, contiguous, on the CPU; gradients are written into a given one.
+// Python bindings of the image losses. Images are contiguous float32 [H, W, 3] on the CPU, as is the gradient's output.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -21,7 +21,7 @@ using ImageOut = Image<float>;
 inline ImagePair same_size(const ImageIn& x, const ImageIn& y, const ImageOut& gradient) {
   for (std::size_t axis : {0, 1})
     if (x.shape(axis) != y.shape(axis) || x.shape(axis) != gradient.shape(axis) || x.shape(axis) == 0)
-      throw std::invalid_argument("the images and the gradient must have one size, and pixels.");
+      throw std::invalid_argument("the images and the gradient must have the same size, at least one pixel.");
   return {x.data(), y.data(), gradient.data(), int(x.shape(0)), int(x.shape(1)) * kChannels};
 }
 

@@ -1,4 +1,4 @@
-// The border of the per-Gaussian pass: Python's tensors become pointers here, once their type and shape are known.
+// Python bindings of the per-Gaussian step: checks the tensors' types and shapes and takes their pointers.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -14,10 +14,10 @@ namespace clear {
 
 namespace nb = nanobind;
 
-// Keeps the tensors alive of which it handed out pointers.
+// Hands out pointers to tensors, and keeps those tensors alive.
 class Tensors {
  public:
-  // `table[name]` as n rows of `width` numbers; null where it is None and may be.
+  // `table[name]` as n rows of `width` numbers; null if it is None and optional.
   template <class T>
   T* rows(const nb::dict& table, const char* name, std::int64_t n, std::int64_t width, bool optional = false) {
     if (!table.contains(name)) throw nb::key_error(name);
@@ -48,10 +48,10 @@ class Tensors {
   std::vector<nb::object> kept_;
 };
 
-// The gradients of one view; the two sweeps are its methods.
-class GaussianPass {
+// The gradients of one view, and the two passes over them: compare and step.
+class GaussianStep {
  public:
-  GaussianPass(nb::dict activation, nb::dict lr, nb::object base, nb::object hf, std::int64_t bases, double lambda_hf) {
+  GaussianStep(nb::dict activation, nb::dict lr, nb::object base, nb::object hf, std::int64_t bases, double lambda_hf) {
     if (bases < 1 || bases > kLanes) throw nb::value_error("the basis must have 1 to 16 columns");
     std::int64_t n = g_.n = std::int64_t(nb::len(nb::object(activation["sigmoid"])));
     g_.bases = int(bases);
@@ -66,7 +66,7 @@ class GaussianPass {
     if (base.is_none() && !hf.is_none()) throw nb::value_error("hf needs base");
   }
 
-  // (comparable, opposed, norm_lr, norm_hr) by group; norm_products {"products": [6, N] or None}.
+  // Returns (comparable, opposed, norm_lr, norm_hr) by group; `out` is {"products": [6, N] or None}.
   nb::tuple compare(nb::dict out, int threads) const {
     if (g_.n && !g_.base) throw nb::value_error("there is no HR gradient to compare with");
     Tensors tensors;
@@ -80,7 +80,7 @@ class GaussianPass {
   }
 
   // Steps `attributes` {name: {p, m, v, anchor, merged, width, stiffness, rate, keep, limit}} in place.
-  // Returns (corrected rows, Σ ω, rows at its lower bound) by group, rows that were still, rows that were not visible.
+  // Returns (corrected rows, Σ ω, rows with ω at its lower bound) by group, still rows and invisible rows.
   nb::tuple step(nb::dict attributes, nb::object correction, nb::dict settings, int threads) const {
     Tensors tensors;
     Step s;
@@ -161,11 +161,11 @@ class GaussianPass {
 };
 
 inline void bind_step(nb::module_& m) {
-  nb::class_<GaussianPass>(m, "GaussianPass")
+  nb::class_<GaussianStep>(m, "GaussianStep")
       .def(nb::init<nb::dict, nb::dict, nb::object, nb::object, std::int64_t, double>(), nb::arg("activation"), nb::arg("lr"),
            nb::arg("base").none(), nb::arg("hf").none(), nb::arg("bases"), nb::arg("lambda_hf"))
-      .def("compare", &GaussianPass::compare, nb::arg("out"), nb::arg("threads"))
-      .def("step", &GaussianPass::step, nb::arg("attributes"), nb::arg("correction").none(), nb::arg("settings"),
+      .def("compare", &GaussianStep::compare, nb::arg("out"), nb::arg("threads"))
+      .def("step", &GaussianStep::step, nb::arg("attributes"), nb::arg("correction").none(), nb::arg("settings"),
            nb::arg("threads"));
 }
 

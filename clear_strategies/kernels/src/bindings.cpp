@@ -1,4 +1,4 @@
-// Python's view of the trainer's hot loops. Nothing but borders: types and shapes are checked, the GIL is let go.
+// The Python module: image losses and the per-Gaussian step. The bindings check types and shapes and release the GIL.
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>

@@ -1,4 +1,4 @@
-// Sixteen Gaussians at a time: from rows in memory to lanes and back.
+// Loads sixteen Gaussians from rows in memory into lanes, and arithmetic that only the trainer's kernels need.
 #pragma once
 
 #include <cstdint>
@@ -40,7 +40,7 @@ CLEAR_INLINE double sum(const Doubles& a) {
   return total;
 }
 
-// a · b + c, rounded once where the processor can: torch's add_(alpha) and addcmul_ do the same.
+// a · b + c, rounded once where the processor has FMA, as torch's add_(alpha) and addcmul_ do.
 CLEAR_INLINE Floats multiply_add(const Floats& a, const Floats& b, const Floats& c) {
 #if defined(__AVX512F__)
   Floats out;

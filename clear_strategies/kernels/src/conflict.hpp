@@ -1,15 +1,15 @@
-// Where do LR and HR gradients disagree, and what becomes of the HR one? Decisions in double: no product of two floats
-// over- or underflows there.  Eq. 6, 7, 11
+// The conflict between LR and HR gradients by group, and the correction of the HR gradient (Eq. 6, 7, 11). Decisions are
+// made in double, where no product of two floats over- or underflows.
 #pragma once
 
 #include <algorithm>
 #include <limits>
 
-#include "pulled.hpp"
+#include "raw_gradients.hpp"
 
 namespace clear {
 
-// The paper's six groups in the order of gradients.CONFLICT_GROUPS; as a seventh, the Gaussian as a whole.
+// The paper's six groups in the order of core.gradients.CONFLICT_GROUPS, and the whole Gaussian as a seventh.
 enum Group { kMeans, kSh0, kShN, kOpacities, kScales, kQuats, kGroups, kGaussian = kGroups };
 
 struct Products {
@@ -42,7 +42,7 @@ CLEAR_INLINE void group_products(const Gradients& g, const Block& b, std::int64_
   p[kShN] = {Y.cross * rgb.dot, Y.lr2 * rgb.l2, Y.hr2 * rgb.h2};
 }
 
-// Counts of one stretch of Gaussians, before correction; sums run in the order of the stretches.
+// Counts over a chunk of Gaussians, before correction; chunks are added up in order.
 struct Comparison {
   std::int64_t comparable[kGroups + 1] = {}, opposed[kGroups + 1] = {};
   double norm_lr[kGroups] = {}, norm_hr[kGroups] = {};  // Σ ‖l‖, Σ ‖h‖ over comparable Gaussians
@@ -58,8 +58,8 @@ struct Correction {
   bool corrects[kGroups] = {};
   double eps_cos[kGroups] = {}, eps_corr[kGroups] = {};
   double tolerance, weight_min, weight_max;
-  double rotation_noise;           // ‖g_quats‖ at or below this times ‖g_scales‖ is rounding
-  bool bounds_hold_omega;          // else they hold the coefficient
+  double rotation_noise;           // a ‖g_quats‖ up to this times ‖g_scales‖ counts as rounding
+  bool bounds_hold_omega;          // weight_min and weight_max bound ω, else the coefficient
   const float* reliability;        // q_i, or null for 0
 };
 
@@ -75,7 +75,7 @@ struct Corrected {
   }
 };
 
-// What a stretch has corrected so far, lane by lane.
+// A chunk's counts by lane.
 struct Tally {
   Doubles omega[kGroups];
   std::int64_t rows[kGroups] = {}, at_lower_bound[kGroups] = {};
@@ -90,13 +90,14 @@ struct Tally {
   }
 };
 
-// By which multiple of g_LR each of the sixteen is corrected in this group; 0 where it is not.
-CLEAR_INLINE bool correction_steps(const Correction& c, Group group, const Products& p, const Mask<double>& candidates,
-                                   const Doubles& q, Doubles& step, Tally& done) {
+// The multiple of g_LR that is subtracted from each HR gradient of the group; 0 where there is no conflict. Returns false
+// if there is none at all.
+CLEAR_INLINE bool correction_multiples(const Correction& c, Group group, const Products& p, const Mask<double>& candidates,
+                                   const Doubles& q, Doubles& multiple, Tally& done) {
   Doubles zero = 0.0, one = 1.0, tau = c.tolerance;
   auto apart = (p.dot < zero) & candidates;
   if (!apart.any()) return false;
-  Doubles n = root(p.l2 * p.h2);  // ‖l‖‖h‖; squares of floats leave room for a product
+  Doubles n = root(p.l2 * p.h2);  // ‖l‖‖h‖; a product of four floats fits a double
   Doubles low = c.weight_min, high = c.weight_max;
   Doubles cosine = p.dot / maximum(n + Doubles(c.eps_cos[group]), Doubles(std::numeric_limits<double>::min()));  // Eq. 6
   auto conflict = (n > zero) & (cosine < -tau) & apart;
@@ -106,9 +107,9 @@ CLEAR_INLINE bool correction_steps(const Correction& c, Group group, const Produ
   Doubles coefficient = (p.dot + tau * n) / (p.l2 + Doubles(c.eps_corr[group]));
   if (c.bounds_hold_omega) {
     omega = clamp(omega, low, high);
-    step = where(conflict, omega * coefficient);
+    multiple = where(conflict, omega * coefficient);
   } else {
-    step = where(conflict, -clamp(absolute(omega * coefficient), low, high));
+    multiple = where(conflict, -clamp(absolute(omega * coefficient), low, high));
   }
   done.omega[group] += where(conflict, omega);
   done.rows[group] += __builtin_popcount(conflict.bits());
@@ -116,10 +117,10 @@ CLEAR_INLINE bool correction_steps(const Correction& c, Group group, const Produ
   return true;
 }
 
-// h - step · l; rows with step 0 are handed back bit for bit.
-CLEAR_INLINE Floats corrected(const Floats& h, const Floats& l, const Doubles& step) {
-  auto touched = narrow(where(absolute(step) > Doubles(0.0), Doubles(1.0))) > Floats(0.0f);
-  return select(touched, narrow(widen(h) - widen(l) * step), h);  // Eq. 7
+// h - multiple · l; rows with multiple 0 keep their bits.
+CLEAR_INLINE Floats corrected(const Floats& h, const Floats& l, const Doubles& multiple) {
+  auto touched = narrow(where(absolute(multiple) > Doubles(0.0), Doubles(1.0))) > Floats(0.0f);
+  return select(touched, narrow(widen(h) - widen(l) * multiple), h);  // Eq. 7
 }
 
 }  // namespace clear

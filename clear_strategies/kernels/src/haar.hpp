@@ -1,11 +1,11 @@
 // Mean absolute detail of the difference x - y in an orthonormal Haar basis, with its gradient.
 //
-// A level turns each block of pixels (a b; c d) into its low part (a+b+c+d)/2, which the next level goes on with, and
-// three details: (a-b+c-d)/2, (a+b-c-d)/2, (a-b-c+d)/2. An odd last row or column is repeated; the pixel that stood in
-// for its neighbour then receives the gradient of both. Only signs go back, from the last level to the first.
+// A level turns each block of pixels (a b; c d) into its low part (a+b+c+d)/2, the input of the next level, and three
+// details: (a-b+c-d)/2, (a+b-c-d)/2, (a-b-c+d)/2. An odd last row or column is repeated; the repeated pixel receives the
+// gradient of both. The backward pass needs only the signs of the details, from the last level to the first.
 //
-// Pixels are interleaved: the partner of a number lies three further on or three before, as the pixel is the block's left
-// or its right. Both then compute the same details; half of the work is done twice, and nothing is shuffled.
+// Channels are interleaved: a number's partner lies three places after it (left pixel of a block) or before it (right
+// pixel). Both compute the same details: half of the work is done twice, but no lanes are shuffled.
 #pragma once
 
 #include <cstring>
@@ -22,17 +22,17 @@ using Floats = Lanes<float>;
 
 inline constexpr int kRowPairsInATask = 8;
 
-// One level's input: pixels of x - y at the first, of the low part of the one before at the others.
+// The input of a level: x - y at the first level, the previous low part at the others.
 struct Level {
-  const float *x, *y;  // y is null but at the first level
+  const float *x, *y;  // y is null except at the first level
   int height, width;   // pixels
 
   int low_height() const { return (height + 1) / 2; }
   int low_width() const { return (width + 1) / 2; }
-  int even_row() const { return 2 * low_width() * kChannels; }  // numbers in a row that ends with a whole block
+  int even_row() const { return 2 * low_width() * kChannels; }  // numbers in a row that is padded to whole blocks
 };
 
-// Rows of one block row, with room on both sides for the partners of the first and the last.
+// Buffers for one row of blocks, padded on both sides for the partners of the first and last number.
 class Workspace {
  public:
   explicit Workspace(const Level& level) : in_(level), width_((level.even_row() + kLanes - 1) / kLanes * kLanes) {
@@ -42,11 +42,11 @@ class Workspace {
     for (int i = 0; i < width_; ++i) side()[i] = i / kChannels % 2 == 0 ? 1.0f : -1.0f;
   }
 
-  int width() const { return width_; }     // in whole Lanes
+  int width() const { return width_; }     // rounded up to whole Lanes
   float* input(int k) { return rows_[k]; }  // k = 0 the upper row, 1 the lower
   float* output(int k) { return rows_[2 + k]; }
-  float* above() { return rows_[4]; }  // the low part's gradient, once for each pixel of a block
-  float* side() { return rows_[5]; }   // 1 at a block's left pixel, -1 at its right
+  float* above() { return rows_[4]; }  // the low part's gradient, repeated for each pixel of a block
+  float* side() { return rows_[5]; }   // 1 for a block's left pixel, -1 for its right
 
   void read(int block_row) {
     for (int k : {0, 1}) {
@@ -115,7 +115,7 @@ inline double blocks_of_row(Workspace& work, float scale, bool has_above) {
   sum.store(lanes);
   double all = 0;
   for (float v : lanes) all += v;
-  return all / 4;  // each detail twice, and not yet halved
+  return all / 4;  // each detail was counted twice and not halved
 }
 
 // Writes the gradient of scale · Σ |detail| + <above, low part>; returns Σ |detail|.

@@ -1,4 +1,4 @@
-// The images that a loss compares: pixels of three interleaved numbers, so that a row is W · 3 numbers like any others.
+// The images that a loss compares. Channels are interleaved: a row is W · 3 numbers.
 #pragma once
 
 namespace clear {

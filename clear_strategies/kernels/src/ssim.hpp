@@ -1,24 +1,24 @@
-// L1 and mean SSIM (11 x 11 Gaussian window of σ = 1.5, zero padding) with their gradient, in one pass over the images.
+// L1 and mean SSIM (11 x 11 Gaussian window, σ = 1.5, zero padding) with their gradient, in one pass over the images.
 //
-// In the sum s = x + y and the difference e = y - x of the images the formula falls into two factors,
+// With the sum s = x + y and the difference e = y - x of the images, SSIM factorises:
 //
 //   SSIM = (1 - u)(1 - n),   u = μe² / B1,  B1 = (μs² + μe²)/2 + C1,   n = σe² / B2,  B2 = (σs² + σe²)/2 + C2,
 //
-// which needs two means and two variances, no covariance, and keeps its digits where the images are nearly the same
-// (there u and n are small, not differences of nearly equal numbers; equal images give exactly 1, and gradient 0).
-// With a window w around q the gradient at a pixel p is
+// This form needs two means and two variances, no covariance, and is accurate where the images are nearly equal (u and n
+// are then small numbers, not differences of nearly equal ones; equal images give exactly 1 and gradient 0).
+// With a window w around q, the gradient at a pixel p is
 //
 //   ∂Σ SSIM / ∂x_p = Σ_q w(p-q) [a(q) + b(q) (s_p - μs(q)) + c(q) (e_p - μe(q))],
 //   a = (1-n) (2μe + u (μs - μe)) / B1,   b = (1-u) n / B2,   c = (1-u) (2-n) / B2.
 //
-// Windows are separable: down the columns first, then along the rows. E[s²] - E[s]² would lose the variance of flat
-// regions, so every sum is taken about a value from within its window: about a pixel of the column when going down,
-// about the column's own mean when going along (the means of columns add their variance to the variances of columns).
-// The gradient's sums go about local means in the same way.
+// Windows are separable: columns first, then rows. E[s²] - E[s]² would lose the variance of flat regions, so every sum is
+// taken about a value inside its window: a pixel of the column for the column sums, the column's mean for the row sums
+// (the variance of the columns' means is added to the columns' variances). The gradient's sums are taken about local
+// means in the same way.
 //
-// Pixels are interleaved, so a neighbour is three numbers away and a row is W · 3 numbers like any others. The image is
-// cut into tiles, by its size alone; a tile goes down its rows four at a time, and keeps the last sixteen rows of what
-// it needs in rings that fit the second-level cache.
+// Channels are interleaved, so a neighbour is three numbers away and a row is W · 3 numbers. The image is split into tiles
+// that depend only on its size. A tile processes four rows at a time, and keeps the last sixteen rows of its inputs in ring
+// buffers that fit the L2 cache.
 #pragma once
 
 #include <algorithm>
@@ -31,7 +31,7 @@
 
 namespace clear {
 
-// What is minimised: l1 · mean |x - y| + dssim · (1 - SSIM).
+// The loss: l1 · mean |x - y| + dssim · (1 - SSIM).
 struct PhotometricWeights {
   float l1, dssim;
 };
@@ -50,21 +50,21 @@ inline constexpr float kWindow[kTaps] = {0.001028380084f, 0.007598758135f, 0.036
                                          0.2130055377f,   0.2660117249f,   0.2130055377f,  0.1093606895f,
                                          0.03600077213f,  0.007598758135f, 0.001028380084f};
 
-inline constexpr int kGroup = 4;                   // rows that are made together, from
-inline constexpr int kSpan = kGroup + kTaps - 1;   // this many rows,
-inline constexpr int kRing = 16;                   // of a ring of this many.
-inline constexpr int kHalo = 16;                   // numbers beside a tile that its window reaches, in whole Lanes
+inline constexpr int kGroup = 4;                   // rows that are computed together
+inline constexpr int kSpan = kGroup + kTaps - 1;   // the rows that they depend on
+inline constexpr int kRing = 16;                   // rows in a ring buffer
+inline constexpr int kHalo = 16;                   // numbers beside a tile that its windows reach, rounded up to whole Lanes
 static_assert(kRing >= kSpan && kHalo >= kReach * kChannels && kHalo % kLanes == 0);
 
-// Aims, in numbers and rows; the tiles of one image are about equal. Narrow, so that the rows of a group stay in the
-// first-level cache: wider tiles compute fewer numbers twice, and take longer.
+// The largest tile, in numbers and rows; the tiles of an image have about equal sizes. Narrow tiles keep the rows of a group
+// in the L1 cache: wider ones compute fewer numbers twice, but take longer.
 inline constexpr int kTileWidth = 256;
 inline constexpr int kTileHeight = 128;
 
-// How many of the group's rows the registers have room for at once.
+// How many of a group's rows fit the registers.
 inline constexpr int kTogether = kRegisterBytes == 64 ? 4 : 1;
 
-// Rows of numbers, the newest kRing of them.
+// The last kRing rows of something.
 struct Ring {
   float* data;
   int width;
@@ -86,13 +86,13 @@ inline double total(const Floats& v) {
   return all;
 }
 
-// What the column sums of a group are made of: the kSpan rows from 5 above the group's first to 5 below its last.
+// The input of a group's column sums: the kSpan rows from 5 above the group's first row to 5 below its last.
 struct Columns {
   const float *s[kSpan], *e[kSpan];
   const float *s_origin, *e_origin;
 };
 
-// Means and variances down the columns for rows [first, first + Rows) of the group.
+// Column means and variances for rows [first, first + Rows) of the group.
 template <int Rows>
 void down_columns(const Columns& in, int first, int width, float* const* mean_s, float* const* mean_e,
                   float* const* var_s, float* const* var_e) {
@@ -130,8 +130,8 @@ struct MapRow {
   float *mean_s, *mean_e, *a, *b, *c, *dissimilarity;
 };
 
-// From the columns' means and variances to those of whole windows, and what follows from them. `mean_s`, … begin kHalo
-// numbers before the maps do.
+// Computes the windows' means and variances from those of the columns, and the maps from them. `mean_s`, … start kHalo
+// numbers before the maps.
 inline void along_row(const float* mean_s, const float* mean_e, const float* var_s, const float* var_e, int width,
                       const MapRow& out) {
   for (int i = 0; i < width; i += kLanes) {
@@ -165,13 +165,13 @@ inline void along_row(const float* mean_s, const float* mean_e, const float* var
   }
 }
 
-// The kSpan rows of maps around a group, and a row of local means to take the sums about.
+// The kSpan rows of maps around a group, and the row of local means that the sums are taken about.
 struct Maps {
   const float *mean_s[kSpan], *mean_e[kSpan], *a[kSpan], *b[kSpan], *c[kSpan];
   const float *s_origin, *e_origin;
 };
 
-// The gradient's sums down the columns: Σ w [a + b (s0 - μs) + c (e0 - μe)], Σ w b and Σ w c.
+// The gradient's column sums: Σ w [a + b (s0 - μs) + c (e0 - μe)], Σ w b and Σ w c.
 template <int Rows>
 void down_maps(const Maps& in, int first, int width, float* const* sum_a, float* const* sum_b, float* const* sum_c) {
   for (int i = 0; i < width; i += kLanes) {
@@ -202,7 +202,7 @@ void down_maps(const Maps& in, int first, int width, float* const* sum_a, float*
   }
 }
 
-// Sum of n numbers, the rounding that of one Lanes of a row.
+// Sum of n numbers, accumulated in float by lane.
 inline double total(const float* values, int n) {
   Floats sum(0.0f);
   int i = 0;
@@ -218,8 +218,8 @@ struct GradientRow {
   float l1_scale, ssim_scale;
 };
 
-// The gradient of one row, from the sums down the columns about s_origin and e_origin, which with the column sums begin
-// kHalo numbers before the row; returns Σ |e|.
+// Computes the gradient of one row from the column sums about s_origin and e_origin, all of which start kHalo numbers
+// before the row; returns Σ |e|.
 inline double along_sums(const float* sum_a, const float* sum_b, const float* sum_c, const float* s_origin,
                          const float* e_origin, const float* s, const float* e, const GradientRow& out) {
   Floats zero(0.0f), step(out.l1_scale), absolute_sum(0.0f);
@@ -245,14 +245,14 @@ inline double along_sums(const float* sum_a, const float* sum_b, const float* su
   return total(absolute_sum);
 }
 
-// Buffers of one thread, kept between calls: fresh memory would cost a page fault every 4 KB.
+// A thread's buffers, kept between calls because fresh memory costs a page fault every 4 KB.
 inline float* scratch(std::size_t n) {
   static thread_local std::vector<float> memory;
   if (memory.size() < n) memory.resize(n);
   return memory.data();
 }
 
-// One tile's share of the means, summed; its part of the gradient is written.
+// Writes a tile's part of the gradient; returns its part of the sums.
 inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, PhotometricWeights weights) {
   const int width = t.width(), map_width = width + 2 * kHalo, in_width = map_width + 2 * kHalo;
   const int in_left = t.left - 2 * kHalo, map_left = t.left - kHalo;
@@ -275,7 +275,7 @@ inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, Photometric
   for (auto& quantity : sum)
     for (float*& row : quantity) row = take(map_width);
 
-  // Rows of s and e with the image's zero padding.
+  // Rows of s and e, zero outside the image.
   auto read = [&](int r) {
     float *to_s = s.row(r), *to_e = e.row(r);
     std::fill_n(to_s, in_width, 0.0f);
@@ -290,7 +290,7 @@ inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, Photometric
   };
 
   PhotometricMeans sums{0, 0};
-  // Maps of rows [q, q + 4); outside the image there is no SSIM, and nothing to pass on.
+  // The maps of rows [q, q + 4); zero outside the image.
   auto forward = [&](int q) {
     Columns in;
     for (int k = 0; k < kSpan; ++k) in.s[k] = s.row(q - kReach + k), in.e[k] = e.row(q - kReach + k);
@@ -311,7 +311,7 @@ inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, Photometric
       if (y >= t.top && y < t.bottom) sums.dssim += total(dissimilarity + kHalo, t.right - t.left);
     }
   };
-  // Gradient of rows [p, p + 4).
+  // The gradient of rows [p, p + 4).
   auto backward = [&](int p) {
     Maps in;
     for (int k = 0; k < kSpan; ++k) {
@@ -329,7 +329,7 @@ inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, Photometric
     }
   };
 
-  // The maps of a group are followed by the gradient of the group five rows above: that one now has all its neighbours.
+  // After the maps of a group, the gradient of the group five rows above has all of its inputs.
   int q = t.top - kReach - 2;  // whole groups: -7 = -12 + 5
   for (int r = q - kReach; r < q + kReach; ++r) read(r);
   for (; q - kReach < t.bottom; q += kGroup) {
@@ -342,7 +342,7 @@ inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, Photometric
 
 }  // namespace ssim
 
-// L1 alone, without a look at neighbours.
+// L1 alone; no windows.
 inline double l1_with_gradient(const ImagePair& im, float weight, int threads) {
   using ssim::Floats;
   constexpr std::int64_t chunk = 1 << 14;
@@ -370,8 +370,8 @@ inline double l1_with_gradient(const ImagePair& im, float weight, int threads) {
   return all / double(n);
 }
 
-// Writes the gradient of l1 · mean |x - y| + dssim · (1 - SSIM) with respect to x; returns both means. Without weight on
-// SSIM none is computed, and its mean is 0.
+// Writes the gradient of l1 · mean |x - y| + dssim · (1 - SSIM) with respect to x; returns both means. With dssim = 0 no
+// SSIM is computed, and its mean is 0.
 inline PhotometricMeans photometric(const ImagePair& im, PhotometricWeights weights, int threads) {
   if (weights.dssim == 0) return {l1_with_gradient(im, weights.l1, threads), 0};
   auto parts = [](int size, int aim, int whole) {  // equal parts of about `aim`, in multiples of `whole`

@@ -1,5 +1,5 @@
-// Compiled without contraction: products and sums round as they do in torch, so gradients agree with the readable path
-// bit for bit where it matters (equal decisions), and fused multiply-add appears only where torch has it.
+// Compiled with -ffp-contract=off: products and sums round as in torch, and multiply-adds are used only where torch uses
+// them, so that the step makes the same decisions as the readable path.
 #include "step.hpp"
 
 #include <iterator>
@@ -10,20 +10,20 @@
 namespace clear {
 namespace {
 
-constexpr std::int64_t kStretch = 1024;  // Gaussians a task takes; a multiple of sixteen
+constexpr std::int64_t kChunk = 1024;  // Gaussians per task, a multiple of sixteen
 
-std::int64_t stretches(std::int64_t n) { return (n + kStretch - 1) / kStretch; }
+std::int64_t chunks(std::int64_t n) { return (n + kChunk - 1) / kChunk; }
 
 CLEAR_INLINE std::uint32_t first_bits(int count) { return count == kLanes ? 0xffffu : (1u << count) - 1; }
 
-// task(i, count) for each sixteen Gaussians of stretch `number`.
+// Calls task(i, count) for every sixteen Gaussians of chunk `number`.
 template <class Task>
 CLEAR_INLINE void each_sixteen(std::int64_t n, std::int64_t number, Task&& task) {
-  std::int64_t end = std::min(n, (number + 1) * kStretch);
-  for (std::int64_t i = number * kStretch; i < end; i += kLanes) task(i, int(std::min<std::int64_t>(kLanes, end - i)));
+  std::int64_t end = std::min(n, (number + 1) * kChunk);
+  for (std::int64_t i = number * kChunk; i < end; i += kLanes) task(i, int(std::min<std::int64_t>(kLanes, end - i)));
 }
 
-Comparison compare_stretch(const Gradients& g, double* norm_products, std::int64_t number) {
+Comparison compare_chunk(const Gradients& g, double* norm_products, std::int64_t number) {
   Comparison c;
   Doubles norm_lr[kGroups], norm_hr[kGroups];
   for (int k = 0; k < kGroups; ++k) norm_lr[k] = norm_hr[k] = 0.0;
@@ -52,8 +52,8 @@ Comparison compare_stretch(const Gradients& g, double* norm_products, std::int64
   return c;
 }
 
-// Where the numbers of an shN row come from: channel and band of each, in up to three sixteens. The last sixteen ends with
-// the row and overlaps the one before; all are read before any is written, so the overlap is written twice alike.
+// The channel and band of each number of an shN row, in up to three groups of sixteen. The last group ends with the row
+// and overlaps the previous one; all are read before any is written, so the overlap is written twice with the same values.
 struct RowPlan {
   int sixteens, width, offset[3];
   std::int32_t channel[3][kLanes], band[3][kLanes];
@@ -63,7 +63,7 @@ struct RowPlan {
       offset[k] = std::max(0, std::min(kLanes * k, width - kLanes));
       for (int j = 0; j < kLanes; ++j) {
         channel[k][j] = (offset[k] + j) % 3;
-        band[k][j] = std::min((offset[k] + j) / 3 + 1, kLanes - 1);  // beyond the active ones the basis reads 0
+        band[k][j] = std::min((offset[k] + j) / 3 + 1, kLanes - 1);  // the basis is 0 for inactive bands
       }
     }
   }
@@ -73,7 +73,7 @@ struct RowTables {
   Floats Y_lr, Y_hr, lr, base, hf;
 };
 
-// Sixteen numbers of g = g_LR + λ ĝ_HR in an shN row, expanded from its factors.
+// Sixteen numbers of g = g_LR + λ ĝ_HR in an shN row, from its factors.
 CLEAR_INLINE Floats expand(const Gradients& g, const Step& s, const RowTables& t, float m, double correction,
                            const std::int32_t* band, const std::int32_t* channel) {
   Floats l = pick(t.Y_lr, band) * pick(t.lr, channel);
@@ -89,12 +89,12 @@ CLEAR_INLINE Floats basis_row(const SplatGradient& g, int bases, std::int64_t ro
   return load_some(g.basis + bases * row, bases);
 }
 
-class Sweep {
+class ChunkStep {
  public:
-  Sweep(const Gradients& g, const Correction* correction, const Step& s)
+  ChunkStep(const Gradients& g, const Correction* correction, const Step& s)
       : g(g), correction(correction), s(s), plan(s.width) {}
 
-  Stepped stretch(std::int64_t number) const {
+  Stepped run(std::int64_t number) const {
     Stepped done;
     Tally tally;
     each_sixteen(g.n, number, [&](std::int64_t i, int count) { sixteen(i, count, done, tally); });
@@ -113,24 +113,24 @@ class Sweep {
     load(g, i, count, b);
     std::uint32_t rows = first_bits(count);
     std::uint32_t still = s.skips ? still_rows(b, i, rows) : 0;
-    std::uint32_t unseen = 0;
+    std::uint32_t invisible = 0;
     if (s.visible)
-      for (int k = 0; k < count; ++k) unseen |= std::uint32_t(!s.visible[i + k]) << k;
-    done.invisible += __builtin_popcount(unseen);
-    done.still += __builtin_popcount(still & ~unseen);
-    std::uint32_t moving = rows & ~(still | unseen);
+      for (int k = 0; k < count; ++k) invisible |= std::uint32_t(!s.visible[i + k]) << k;
+    done.invisible += __builtin_popcount(invisible);
+    done.still += __builtin_popcount(still & ~invisible);
+    std::uint32_t moving = rows & ~(still | invisible);
 
-    double shN_step[kLanes] = {};
-    if (correction) correct(b, i, count, shN_step, tally);
+    double shN_multiple[kLanes] = {};
+    if (correction) correct(b, i, count, shN_multiple, tally);
     if (moving) {
-      std::uint32_t seen = rows & ~unseen;  // a still row among others may take its step: it stays as it is
-      step_columns(s.means, b.lr.means, b.hr.means, i, count, seen);
-      step_columns(s.quats, b.lr.quats, b.hr.quats, i, count, seen);
-      step_columns(s.scales, b.lr.scales, b.hr.scales, i, count, seen);
-      step_columns(s.opacities, b.lr.opacities, b.hr.opacities, i, count, seen);
-      step_columns(s.sh0, b.lr.sh0, b.hr.sh0, i, count, seen);
-      step_detail(b, i, count, seen);
-      step_rows(b, i, count, moving, shN_step);
+      std::uint32_t visible = rows & ~invisible;  // still rows among them may step, which leaves them unchanged
+      step_columns(s.means, b.lr.means, b.hr.means, i, count, visible);
+      step_columns(s.quats, b.lr.quats, b.hr.quats, i, count, visible);
+      step_columns(s.scales, b.lr.scales, b.hr.scales, i, count, visible);
+      step_columns(s.opacities, b.lr.opacities, b.hr.opacities, i, count, visible);
+      step_columns(s.sh0, b.lr.sh0, b.hr.sh0, i, count, visible);
+      step_detail(b, i, count, visible);
+      step_rows(b, i, count, moving, shN_multiple);
     }
     for (std::uint32_t resting = moving ? 0 : rows; resting; resting &= resting - 1) {
       std::int64_t row = i + __builtin_ctz(resting);
@@ -138,28 +138,28 @@ class Sweep {
     }
   }
 
-  // Eq. 6, 7, 11. Lanes beyond the last Gaussian hold zeros, which are in no conflict.
-  CLEAR_INLINE void correct(Block& b, std::int64_t i, int count, double (&shN_step)[kLanes], Tally& done) const {
+  // Corrects the HR gradients (Eq. 6, 7, 11). Lanes beyond the last Gaussian are zeros, which do not conflict.
+  CLEAR_INLINE void correct(Block& b, std::int64_t i, int count, double (&shN_multiple)[kLanes], Tally& done) const {
     const Correction& c = *correction;
     Products p[kGroups];
     group_products(g, b, i, count, p);
     Doubles q = c.reliability ? widen(load_some(c.reliability + i, count)) : Doubles(0.0);
     auto every = Doubles(0.0) <= Doubles(0.0);
     auto columns = [&](Group group, auto& h, const auto& l, const Mask<double>& candidates) {
-      Doubles step;
-      if (c.corrects[group] && correction_steps(c, group, p[group], candidates, q, step, done))
-        for (std::size_t d = 0; d < std::size(h); ++d) h[d] = corrected(h[d], l[d], step);
+      Doubles multiple;
+      if (c.corrects[group] && correction_multiples(c, group, p[group], candidates, q, multiple, done))
+        for (std::size_t d = 0; d < std::size(h); ++d) h[d] = corrected(h[d], l[d], multiple);
     };
     columns(kMeans, b.hr.means, b.lr.means, every);
     columns(kSh0, b.hr.sh0, b.lr.sh0, every);
     columns(kOpacities, b.hr.opacities, b.lr.opacities, every);
     columns(kScales, b.hr.scales, b.lr.scales, every);
     columns(kQuats, b.hr.quats, b.lr.quats, turns_something(p));
-    Doubles step;
-    if (c.corrects[kShN] && correction_steps(c, kShN, p[kShN], every, q, step, done)) step.store(shN_step);
+    Doubles multiple;
+    if (c.corrects[kShN] && correction_multiples(c, kShN, p[kShN], every, q, multiple, done)) multiple.store(shN_multiple);
   }
 
-  // A Gaussian with equal axes does not change when it is turned: its rotation gradient is noise.
+  // A Gaussian with equal axes does not change under rotation, so its rotation gradient is noise.
   CLEAR_INLINE Mask<double> turns_something(const Products (&p)[kGroups]) const {
     Doubles noise2 = correction->rotation_noise * correction->rotation_noise;
     return (p[kQuats].l2 > noise2 * p[kScales].l2) & (p[kQuats].h2 > noise2 * p[kScales].h2);
@@ -178,7 +178,7 @@ class Sweep {
     step_numbers(s.adam, a, D * i, D * count, numbers, all ? nullptr : moves);
   }
 
-  // f_det: never corrected, never from L_base.
+  // f_det gets only the routed gradient of L_HF, uncorrected.
   void step_detail(const Block& b, std::int64_t i, int count, std::uint32_t moving) const {
     Floats none[3] = {0.0f, 0.0f, 0.0f}, routed[3] = {0.0f, 0.0f, 0.0f};
     if (g.hf)
@@ -188,7 +188,7 @@ class Sweep {
 
   void step_rows(const Block& b, std::int64_t i, int count, std::uint32_t moving, const double (&correction)[kLanes]) const {
     if (!s.width) return;
-    float m[kLanes], lr[4 * kLanes] = {}, base[4 * kLanes] = {}, hf[4 * kLanes] = {};  // tables are read sixteen wide
+    float m[kLanes], lr[4 * kLanes] = {}, base[4 * kLanes] = {}, hf[4 * kLanes] = {};  // padded, because reads are sixteen wide
     std::copy_n(g.lr.rgb + 3 * i, 3 * count, lr);
     if (g.base) std::copy_n(g.base.rgb + 3 * i, 3 * count, base);
     if (g.hf) std::copy_n(g.hf.rgb + 3 * i, 3 * count, hf), b.m.store(m);
@@ -228,9 +228,9 @@ class Sweep {
       x[v] = {Floats::load(a.p + from), Floats::load(a.m + from), Floats::load(a.v + from)};
     }
     for (int v = 0; v < V; ++v) {
-      Floats pulled = gradient[v];
-      if (a.anchor) pulled = with_anchor(a, pulled, x[v].p, Floats::load(a.anchor + at + plan.offset[v]));
-      x[v].step(s.adam, a, pulled);
+      Floats total = gradient[v];
+      if (a.anchor) total = with_anchor(a, total, x[v].p, Floats::load(a.anchor + at + plan.offset[v]));
+      x[v].step(s.adam, a, total);
     }
     for (int v = 0; v < V; ++v) {
       std::int64_t to = at + plan.offset[v];
@@ -238,7 +238,7 @@ class Sweep {
     }
   }
 
-  // Rows whose gradient, moments and anchor's pull are all 0: a step would leave them as they are.
+  // Still rows: gradient, moments and the anchor's gradient are all 0, so a step would not change them.
   std::uint32_t still_rows(const Block& b, std::int64_t i, std::uint32_t rows) const {
     Floats total = magnitude(b.lr);
     if (g.base) total += magnitude(b.hr);
@@ -263,7 +263,7 @@ class Sweep {
     for (const Floats& c : columns) total += absolute(c);
     return total;
   }
-  static CLEAR_INLINE Floats magnitude(const Pulled& g) {
+  static CLEAR_INLINE Floats magnitude(const RawGradients& g) {
     return magnitude(g.means) + magnitude(g.quats) + magnitude(g.scales) + magnitude(g.opacities) + magnitude(g.rgb);
   }
 };
@@ -271,18 +271,18 @@ class Sweep {
 }  // namespace
 
 Comparison compare(const Gradients& g, double* norm_products, int threads) {
-  std::vector<Comparison> parts(stretches(g.n));
+  std::vector<Comparison> parts(chunks(g.n));
   Pool::instance().run(threads, std::int64_t(parts.size()),
-                       [&](std::int64_t k) { parts[k] = compare_stretch(g, norm_products, k); });
+                       [&](std::int64_t k) { parts[k] = compare_chunk(g, norm_products, k); });
   Comparison total;
   for (const Comparison& part : parts) total.add(part);
   return total;
 }
 
 Stepped step(const Gradients& g, const Correction* correction, const Step& s, int threads) {
-  std::vector<Stepped> parts(stretches(g.n));
-  Sweep sweep(g, correction, s);
-  Pool::instance().run(threads, std::int64_t(parts.size()), [&](std::int64_t k) { parts[k] = sweep.stretch(k); });
+  std::vector<Stepped> parts(chunks(g.n));
+  ChunkStep chunk_step(g, correction, s);
+  Pool::instance().run(threads, std::int64_t(parts.size()), [&](std::int64_t k) { parts[k] = chunk_step.run(k); });
   Stepped total;
   for (const Stepped& part : parts) {
     total.corrected.add(part.corrected);

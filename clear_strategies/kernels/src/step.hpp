@@ -1,8 +1,8 @@
-// The per-Gaussian pass of one iteration in two sweeps: one that counts, one that merges, corrects, anchors and steps.
+// The per-Gaussian step of one iteration, in two passes over the Gaussians: `compare` counts conflicts; `step` merges,
+// corrects, adds the anchor's gradient, and applies Adam.
 //
-// Nothing per Gaussian is written in between: both sweeps make the gradients anew from their factors, which is cheaper
-// than storing 59 numbers for each of three losses. Every stretch of Gaussians sums for itself, and the sums are added in
-// the order of the stretches: the same bits for any number of threads.
+// Both passes compute the gradients from their factors, which is cheaper than storing 59 numbers for each of three losses.
+// Sums are taken by chunk of Gaussians and added in the order of the chunks: the same bits for any number of threads.
 #pragma once
 
 #include "adam.hpp"
@@ -15,19 +15,19 @@ struct Step {
   AdamStep adam;
   float lambda_hr;
   const bool* visible = nullptr;  // rows that may step; null: all
-  bool skips = true;              // leave out rows that would not move
-  int width = 0;                  // numbers of an shN row to step, a multiple of 3: those of the active bands, or all
+  bool skips = true;              // skip rows that would not change
+  int width = 0;                  // numbers of an shN row that are stepped, a multiple of 3: the active bands', or all
 };
 
 struct Stepped {
   Corrected corrected;
-  std::int64_t still = 0, invisible = 0;  // rows that took no step
+  std::int64_t still = 0, invisible = 0;  // rows that took no step, and why
 };
 
-// Comparable and opposed Gaussians by group. `norm_products` [6, N] takes ‖l‖‖h‖ if it is not null.
+// Counts comparable and opposed Gaussians by group. Writes ‖l‖‖h‖ to `norm_products` [6, N] unless it is null.
 Comparison compare(const Gradients& g, double* norm_products, int threads);
 
-// One step of every attribute in place, or, where `merged` is set, its gradient.
+// Steps every attribute in place, or writes its merged gradient where `merged` is set.
 Stepped step(const Gradients& g, const Correction* correction, const Step& s, int threads);
 
 }  // namespace clear

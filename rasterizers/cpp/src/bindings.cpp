@@ -1,4 +1,4 @@
-// Python's view: a frame in float32 and one in float64. Nothing but borders: shapes and types are checked, the GIL is let go.
+// Python bindings: `Frame` in float32 and in float64. Checks shapes and types and releases the GIL; no arithmetic.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -19,7 +19,7 @@ using Read = nb::ndarray<const T, nb::shape<shape...>, nb::c_contig, nb::device:
 template <class T, std::int64_t... shape>
 using Write = nb::ndarray<T, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
 template <class T>
-using Rows = nb::ndarray<const T, nb::shape<-1, -1, 3>, nb::device::cpu>;  // shN: rows may lie apart
+using Rows = nb::ndarray<const T, nb::shape<-1, -1, 3>, nb::device::cpu>;  // shN: rows need not be contiguous to each other
 
 inline void require(bool holds, const char* rule) {
   if (!holds) throw nb::value_error(rule);
@@ -38,7 +38,7 @@ Splats<T> splats_of(const Read<T, -1, 3>& means, const Read<T, -1, 4>& quats, co
   return {n, means.data(), quats.data(), scales.data(), sh0.data(), shN.data(), n ? shN.stride(0) : 0, int(bands)};
 }
 
-// A torch tensor whose memory goes back to the recycler when it is freed: gradients of one iteration are the next one's.
+// A torch tensor whose memory returns to the recycler when it is freed, for the gradients of the next iteration.
 template <class T>
 nb::ndarray<nb::pytorch, T> empty(const std::vector<std::size_t>& shape) {
   std::size_t size = 1;
@@ -51,9 +51,6 @@ nb::ndarray<nb::pytorch, T> empty(const std::vector<std::size_t>& shape) {
   return nb::ndarray<nb::pytorch, T>(data, shape.size(), shape.data(), owner);
 }
 
-// (fx, fy, cx, cy, width, height)
-using Grid = std::tuple<double, double, double, double, int, int>;
-
 template <class T>
 void bind_frame(nb::module_& m, const char* name) {
   using F = Frame<T>;
@@ -63,8 +60,8 @@ void bind_frame(nb::module_& m, const char* name) {
           [](F* self, double kernel, double near, double alpha_min, double alpha_max, double transmittance_min,
              std::vector<double> background, bool antialiased, std::vector<double> world_to_camera,
              std::vector<double> center, std::int64_t budget) {
-            require(background.size() == 3 && world_to_camera.size() == 16 && center.size() == 3, "3, 16 and 3 numbers");
-            // However low the limit, a pixel ends before T leaves the normal numbers: it could not be rebuilt on the way back.
+            require(background.size() == 3 && world_to_camera.size() == 16 && center.size() == 3, "background, world_to_camera and center must have 3, 16 and 3 numbers");
+            // A pixel always ends before T becomes subnormal, because the backward pass could not rebuild it.
             const T through_min = std::max(T(transmittance_min), T(sizeof(T) == 4 ? 1e-30 : 1e-250));
             Settings<T> s{T(kernel), T(near), T(alpha_min), T(alpha_max), through_min,
                           {T(background[0]), T(background[1]), T(background[2])}, antialiased};
@@ -90,20 +87,20 @@ void bind_frame(nb::module_& m, const char* name) {
              const std::size_t n = std::size_t(splats.n), count = grids.size();
              require(count >= 1 && count <= 4 && opacities.size() == count && offsets.size() == count &&
                          means2d.size() == count && visible.size() == count && tiles.size() == count,
-                     "one to four screens, each with its opacities, offset, tiles and outputs");
+                     "one to four pixel grids, each with its opacities, offset, tiles and outputs");
              std::vector<Target<T>> targets(count);
              for (std::size_t i = 0; i < count; ++i) {
                const std::vector<double>& g = grids[i];
-               require(g.size() == 6, "a screen is (fx, fy, cx, cy, width, height)");
+               require(g.size() == 6, "a pixel grid is (fx, fy, cx, cy, width, height)");
                require(opacities[i].shape(0) == n && means2d[i].shape(0) == n && visible[i].shape(0) == n &&
                            (!offsets[i] || offsets[i]->shape(0) == n),
-                       "every tensor of a screen must have one row per Gaussian");
-               targets[i].screen = {T(g[0]), T(g[1]), T(g[2]), T(g[3]), int(g[4]), int(g[5])};
+                       "every tensor of a pixel grid must have one row per Gaussian");
+               targets[i].grid = {T(g[0]), T(g[1]), T(g[2]), T(g[3]), int(g[4]), int(g[5])};
                targets[i].opacities = opacities[i].data();
                targets[i].rgb_offset = offsets[i] ? offsets[i]->data() : nullptr;
                targets[i].means2d = means2d[i].data();
                targets[i].visible = visible[i].data();
-               if (tiles[i]) targets[i].wanted = blocks_of_tiles(tiles[i]->data(), edge, int(g[4]), int(g[5]));
+               if (tiles[i]) targets[i].requested = blocks_of_tiles(tiles[i]->data(), edge, int(g[4]), int(g[5]));
              }
              nb::gil_scoped_release release;
              return self.project(splats, std::move(targets), threads);
@@ -119,7 +116,7 @@ void bind_frame(nb::module_& m, const char* name) {
              nb::gil_scoped_release release;
              self.draw(i, pixels, cover, threads);
            },
-           nb::arg("screen"), nb::arg("image"), nb::arg("alpha"), nb::arg("threads"))
+           nb::arg("grid"), nb::arg("image"), nb::arg("alpha"), nb::arg("threads"))
       .def("vjp",
            [](F& self, int i, Read<T, -1, -1, -1, 3> cotangents, Read<T, -1, 3> means, Read<T, -1, 4> quats,
               Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1, 3> d_means,

@@ -1,7 +1,7 @@
-// Bin, second half: which Gaussians may touch which 32 x 32 bin, front to back, by a stable counting scatter.
+// Bin, second half: lists the Gaussians that may touch each 32 x 32 bin, front to back, by a stable counting scatter.
 //
-// What a bin sends back to a Gaussian lies where their pair does, so bins write in one stream. A Gaussian finds its pairs
-// by `where`, in a fixed order: that, not the scheduling of threads, decides the order of the sums.
+// The backward pass stores each (Gaussian, bin) pair's sums at the pair's place, so bins write sequentially. A Gaussian
+// finds its pairs by `where`, in a fixed order, so the order of its sums does not depend on thread scheduling.
 #pragma once
 
 #include <algorithm>
@@ -19,20 +19,20 @@ struct BinRange {
   std::int64_t count() const { return x1 < x0 || y1 < y0 ? 0 : std::int64_t(x1 - x0 + 1) * (y1 - y0 + 1); }
 };
 
-// The pairs of some rows of bins ("band"): all rows at once, unless that would not fit the memory budget.
+// The pairs of a band (some rows of bins). There is one band, unless its pairs would not fit the memory budget.
 struct Bins {
   int columns = 0, first_row = 0, end_row = 0;
   Buffer<std::uint32_t> pairs;        // the Gaussian of each pair; by bin, then depth, then index
   std::vector<std::int64_t> starts;   // [bins of the band + 1]
-  Buffer<std::uint64_t> masks;        // of each pair: the blocks of its bin that its ellipse reaches (set by blocks.hpp)
+  Buffer<std::uint64_t> masks;        // by pair: the blocks of its bin that its ellipse reaches (set by blocks.hpp)
   Buffer<std::uint32_t> first;        // [n + 1]: Gaussian i's pairs are where[first[i]] … where[first[i + 1] - 1]
-  Buffer<std::uint32_t> where;        // places in `pairs`, Gaussian by Gaussian, each from its top left bin on
+  Buffer<std::uint32_t> where;        // indices into `pairs` by Gaussian, from its top left bin on
   bool has_masks = false;
 
   int bins() const { return columns * (end_row - first_row); }
 };
 
-// How many pairs each row of bins has in all: 64-bit, a full screen times a million Gaussians is 10^9.
+// The number of pairs in each row of bins. 64-bit: a million Gaussians that cover the image make 10^9 pairs.
 inline std::vector<std::int64_t> count_pairs(int rows, const Buffer<BinRange>& ranges, std::int64_t n, int threads) {
   const std::int64_t chunk = 16384, chunks = (n + chunk - 1) / chunk;
   std::vector<std::int64_t> steps(std::size_t(chunks) * (rows + 1), 0);  // differences from row to row
@@ -54,9 +54,9 @@ inline std::vector<std::int64_t> count_pairs(int rows, const Buffer<BinRange>& r
   return pairs;
 }
 
-// List the pairs of rows [first_row, end_row). `wanted[bin]` (or null) leaves out bins that nobody asked for.
+// Lists the pairs of rows [first_row, end_row). Bins with `requested[bin]` = 0 are left out; null: none is.
 inline void list_pairs(int columns, int first_row, int end_row, const Buffer<std::uint32_t>& order,
-                       const Buffer<BinRange>& ranges, std::int64_t n, const std::uint64_t* wanted, Bins& out, int threads) {
+                       const Buffer<BinRange>& ranges, std::int64_t n, const std::uint64_t* requested, Bins& out, int threads) {
   out.columns = columns, out.first_row = first_row, out.end_row = end_row, out.has_masks = false;
   const int bins = out.bins();
   auto clipped = [&](std::uint32_t i) {
@@ -67,10 +67,10 @@ inline void list_pairs(int columns, int first_row, int end_row, const Buffer<std
   auto each_bin = [&](const BinRange& r, auto&& visit) {
     for (int y = r.y0; y <= r.y1; ++y)
       for (int x = r.x0; x <= r.x1; ++x)
-        if (!wanted || wanted[y * columns + x]) visit((y - first_row) * columns + x);
+        if (!requested || requested[y * columns + x]) visit((y - first_row) * columns + x);
   };
 
-  // How many pairs each Gaussian has.
+  // Count each Gaussian's pairs.
   const std::int64_t chunk = 16384, chunks = (n + chunk - 1) / chunk;
   std::vector<std::int64_t> base(chunks + 1, 0);
   out.first.reserve_lost(n + 1);
@@ -79,7 +79,7 @@ inline void list_pairs(int columns, int first_row, int end_row, const Buffer<std
     for (std::int64_t i = c * chunk; i < std::min(n, (c + 1) * chunk); ++i) {
       out.first[i] = std::uint32_t(count);
       BinRange r = clipped(std::uint32_t(i));
-      if (wanted) each_bin(r, [&](int) { ++count; });
+      if (requested) each_bin(r, [&](int) { ++count; });
       else count += r.count();
     }
     base[c + 1] = count;
@@ -91,8 +91,8 @@ inline void list_pairs(int columns, int first_row, int end_row, const Buffer<std
   });
   out.first[n] = std::uint32_t(base[chunks]);
 
-  // Pairs, front to back within each bin: count by part of the depth order, then scatter part by part. What the first walk
-  // had to look up anywhere, the second reads in a row.
+  // List the pairs front to back within each bin: count in parts of the depth order, then scatter part by part. The first
+  // pass reads in random order and stores what the second then reads sequentially.
   struct Ranked {
     BinRange range;
     std::uint32_t splat, first;

@@ -1,8 +1,8 @@
-// Blend: a block of 4 x 4 pixels, front to back, and its transpose for K image cotangents, back to front.
+// Blends a block of 4 x 4 pixels front to back; its VJP for K image cotangents runs back to front.
 //
 //   α_i = min(α_max, 2^(…)),   T_i = Π_{j<i} (1 - α_j),   I = Σ T_i α_i c_i + T_end · background
 //
-// A Gaussian with α_i < α_min is passed over; a pixel ends before the one that would take its T below transmittance_min.
+// A Gaussian with α_i < α_min is skipped; a pixel ends before the Gaussian that would take its T below transmittance_min.
 #pragma once
 
 #include <climits>
@@ -12,7 +12,7 @@
 
 namespace clear {
 
-// A block's sixteen pixels, row by row from its corner; from the bin's corner, as the Gaussians of a segment.
+// The centres of a block's sixteen pixels, row by row, relative to the bin's corner like a segment's Gaussians.
 template <class T>
 struct PixelCentres {
   Lanes<T> x, y;
@@ -24,11 +24,11 @@ struct PixelCentres {
   }
 };
 
-// What of a pixel outlives the forward pass: T at its end, and the first pair of the bin that it no longer took.
+// What the backward pass needs of each pixel: its final T, and the first pair of the bin that it did not blend.
 template <class T>
 struct BlockEnd {
   T transmittance[kLanes];
-  std::int32_t ended[kLanes];  // INT_MAX: went through the whole list
+  std::int32_t ended[kLanes];  // INT_MAX: it blended the whole list
 
   bool finished() const {
     bool all = true;
@@ -42,7 +42,7 @@ struct BlockColour {
   T r[kLanes], g[kLanes], b[kLanes];
 };
 
-// A block's pixels in an [height, width, C] image; blocks may hang over its edge.
+// Loads a block's pixels from a [height, width, C] image; zeros beyond the image's edge.
 template <int C, class T>
 CLEAR_INLINE void load_block(const T* image, int width, int height, int X, int Y, Lanes<T> (&channels)[C]) {
   T pixels[kLanes * C];
@@ -76,7 +76,7 @@ CLEAR_INLINE Lanes<T> exponent(const Ellipse<T>& e, const Lanes<T>& dx, const La
   return L(e.peak) - dx * along - L(e.C) * dy * dy;
 }
 
-// One segment's part of a block; after the first, `colour` and `end` go on from where the segment before left them.
+// Blends one segment into a block; segments after the first continue from `colour` and `end`.
 template <class T>
 void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, BlockColour<T>& colour, BlockEnd<T>& end) {
   using L = Lanes<T>;
@@ -101,7 +101,7 @@ void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, Blo
     const L alpha = minimum(exp2(exponent(e, dx, dy)), alpha_max);
     const Mask<T> counts = (alpha >= alpha_min) & alive;
     if (!counts.any()) continue;
-    // T (1 - α) in one rounding: from T - weight an α near 1 would leave few digits, and the way back divides by 1 - α.
+    // T (1 - α) with one rounding: T - weight loses digits for an α near 1, and the backward pass divides by 1 - α.
     const L weight = through * alpha, after = subtract_product(through, through, alpha);
     const Mask<T> kept = counts & (after >= transmittance_min);
     const std::uint32_t stops = counts.bits() ^ kept.bits();
@@ -119,16 +119,16 @@ void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, Blo
   r.store(colour.r), g.store(colour.g), b.store(colour.b);
 }
 
-// Sums over the pixels of a block, for the bin's Gaussians: one row of `Pulled` per (Gaussian, cotangent).
+// Sums over a block's pixels for the Gaussians of its bin: one row of `PairSums` per (Gaussian, cotangent).
 template <class T, int K>
-struct BlockPull {
-  static constexpr int kRows = kLanes;  // Gaussians are collected until there is one for every lane
+struct BlockSums {
+  static constexpr int kRows = kLanes;  // Gaussians are collected until every lane has one
   T q[K][kRows][kLanes], weight[kRows][kLanes];
   T offset_x[kRows], offset_y[kRows];  // from the Gaussian's centre to the block's
   int place[kRows];
 
-  // Lanes become Gaussians: rows are transposed, then a sum over pixels is fifteen additions for sixteen Gaussians.
-  CLEAR_INLINE void flush(int count, const T (&cotangent)[K][3][kLanes], Pulled<T>* sums) {
+  // Transposes the rows so that a lane is a Gaussian; a sum over pixels is then fifteen additions for sixteen Gaussians.
+  CLEAR_INLINE void flush(int count, const T (&cotangent)[K][3][kLanes], PairSums<T>* sums) {
     using L = Lanes<T>;
     if (!count) return;
     for (int i = count; i < kRows; ++i) {
@@ -162,7 +162,7 @@ struct BlockPull {
   }
 
  private:
-  // Σ v, Σ v·dx, … about the Gaussian's centre, by way of the block's centre, where the offsets are constants.
+  // Σ v, Σ v·dx, … about the Gaussian's centre, from the moments about the block's centre, whose offsets are constants.
   static CLEAR_INLINE void moments(const Lanes<T> (&v)[kLanes], const Lanes<T>& ox, const Lanes<T>& oy,
                                    Lanes<T> (&out)[kLanes]) {
     using L = Lanes<T>;
@@ -183,18 +183,18 @@ struct BlockPull {
   }
 };
 
-// What a block carries from segment to segment on the way back: T in front of what was visited, and for each cotangent the
-// light from behind, Σ_{j>i} T_j α_j (c_j·v) + T_end background·v.
+// What a block passes from segment to segment in the backward pass: T in front of the visited Gaussians, and for each
+// cotangent what lies behind, Σ_{j>i} T_j α_j (c_j·v) + T_end background·v.
 template <class T, int K>
 struct BlockBack {
   T transmittance[kLanes], behind[K][kLanes];
 };
 
 //   ∂I·v/∂α_i = T_i (c_i·v) - behind / (1 - α_i)
-// Where the cap binds the picture does not depend on the ellipse.
+// Where α is capped, the image does not depend on the ellipse.
 template <class T, int K>
 void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s, const BlockEnd<T>& end,
-                     const T (&cotangent)[K][3][kLanes], BlockBack<T, K>& back, Pulled<T>* sums) {
+                     const T (&cotangent)[K][3][kLanes], BlockBack<T, K>& back, PairSums<T>* sums) {
   using L = Lanes<T>;
   const PixelCentres<T> pixel(block);
   const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, one = T(1);
@@ -202,7 +202,7 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
   const T centre_y = T(block / kBlocksAcross * kBlock) + T(kBlock) / 2;
   const std::uint16_t* list = segment.list(block);
 
-  // Ends, counted from this segment's first pair: exact in T.
+  // Where each pixel ended, counted from this segment's first pair; small integers, so exact in T.
   T ends[kLanes];
   const std::int32_t before = std::int32_t(segment.first);
   int last = 0;
@@ -220,7 +220,7 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
     behind[k] = L::load(back.behind[k]);
     for (int c = 0; c < 3; ++c) v[k][c] = L::load(cotangent[k][c]);
   }
-  BlockPull<T, K> pull;
+  BlockSums<T, K> collected;
   int count = 0;
   const Ellipse<T>* ellipses = segment.ellipses.data();
   for (int i = n - 1; i >= 0; --i) {
@@ -235,19 +235,19 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
     through *= over;
     const L weight = through * alpha;
     const Mask<T> moves = kept & (free <= alpha_max);
-    weight.store(pull.weight[count]);
+    weight.store(collected.weight[count]);
     for (int k = 0; k < K; ++k) {
       const L light = v[k][0] * L(e.r) + v[k][1] * L(e.g) + v[k][2] * L(e.b);
       const L d_alpha = through * light - behind[k] * over;
-      where(moves, alpha * d_alpha).store(pull.q[k][count]);
+      where(moves, alpha * d_alpha).store(collected.q[k][count]);
       behind[k] += weight * light;
     }
-    pull.offset_x[count] = centre_x - e.u;
-    pull.offset_y[count] = centre_y - e.v;
-    pull.place[count] = place;
-    if (++count == pull.kRows) pull.flush(count, cotangent, sums), count = 0;
+    collected.offset_x[count] = centre_x - e.u;
+    collected.offset_y[count] = centre_y - e.v;
+    collected.place[count] = place;
+    if (++count == collected.kRows) collected.flush(count, cotangent, sums), count = 0;
   }
-  pull.flush(count, cotangent, sums);
+  collected.flush(count, cotangent, sums);
   through.store(back.transmittance);
   for (int k = 0; k < K; ++k) behind[k].store(back.behind[k]);
 }

@@ -1,5 +1,5 @@
-// Within a bin: which Gaussian may touch which 4 x 4 block. A bin is worked off in segments of bounded length, so that
-// what a thread holds stays in its cache however many Gaussians pile up.
+// Lists the Gaussians of a bin that may touch each 4 x 4 block. A bin is processed in segments of bounded length, so that
+// a thread's working set fits its cache however many Gaussians overlap.
 #pragma once
 
 #include "bins.hpp"
@@ -7,9 +7,10 @@
 namespace clear {
 
 inline constexpr int kSegment = 2048;
-inline constexpr int kListStride = kSegment + 32;  // lists 4 KiB apart would all compete for the same lines of the cache
+inline constexpr int kListStride = kSegment + 32;  // lists exactly 4 KiB apart would share the same cache lines
 
-// A segment of a bin: its Gaussians, copied side by side with their centres from the bin's corner, and for each block the places of those that reach it, in order.
+// A segment of a bin: its Gaussians, contiguous and with centres relative to the bin's corner, and for each block the
+// indices of those that reach it, in order.
 template <class T>
 struct Segment {
   Buffer<Ellipse<T>> ellipses;
@@ -25,15 +26,15 @@ struct Segment {
   const std::uint16_t* list(int block) const { return places.data() + std::size_t(block) * kListStride; }
 };
 
-// Sixteen Gaussians, their centres (u, v) from the bin's corner, against all blocks of the bin. Row of blocks by row of blocks: where is the
-// ellipse within this slab widest to the left, and to the right? Exact up to a thousandth of a pixel, always generous.
+// The blocks of the bin that each of sixteen Gaussians reaches, with centres (u, v) relative to the bin's corner. For each
+// row of blocks: the leftmost and rightmost point of the ellipse within the row, exact up to a margin of 1e-3 px.
 template <class T>
 CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], const Lanes<T>& u, const Lanes<T>& v, std::uint64_t* masks) {
   using L = Lanes<T>;
   const L A = e[kA], B = e[kB], C = e[kC], reach = e[kReach], half_x = e[kHalfX], half_y = e[kHalfY];
   const L one = T(1), zero = T(0), slack = T(1e-3), eight = T(kBlocksAcross);
   const L inverse = one / maximum(half_y, L(T(1e-20)));
-  const L shear = -B / (L(T(2)) * A);                  // where x is extreme along a line of constant y, per dy
+  const L shear = -B / (L(T(2)) * A);                  // dx of the chord's middle per dy
   const L width = root(reach / A);                     // half the chord through the centre
   const L widest = -B / (L(T(2)) * C) * half_x;        // dy of the rightmost point; the leftmost lies opposite
   std::uint32_t low[kLanes] = {}, high[kLanes] = {};
@@ -59,7 +60,7 @@ CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], const Lanes<T>& u, co
   for (int i = 0; i < kLanes; ++i) masks[i] = std::uint64_t(high[i]) << 32 | low[i];
 }
 
-// The blocks of a bin that lie in the image.
+// The blocks of a bin that lie in the image, as bits.
 inline std::uint64_t blocks_in_image(int bin_x, int bin_y, int width, int height) {
   const int columns = std::min(kBlocksAcross, (width - bin_x * kBin + kBlock - 1) / kBlock);
   const int rows = std::min(kBlocksAcross, (height - bin_y * kBin + kBlock - 1) / kBlock);
@@ -68,21 +69,21 @@ inline std::uint64_t blocks_in_image(int bin_x, int bin_y, int width, int height
   return all;
 }
 
-// The blocks of tiles of `edge` px (a multiple of 4) that are asked for, bin by bin.
+// The blocks of the requested tiles, by bin; tiles have `edge` px, a multiple of 4.
 inline std::vector<std::uint64_t> blocks_of_tiles(const bool* tiles, int edge, int width, int height) {
   const int columns = (width + kBin - 1) / kBin, rows = (height + kBin - 1) / kBin, across = (width + edge - 1) / edge;
-  std::vector<std::uint64_t> wanted(std::size_t(columns) * rows, 0);
+  std::vector<std::uint64_t> requested(std::size_t(columns) * rows, 0);
   for (int y = 0; y * kBlock < height; ++y)
     for (int x = 0; x * kBlock < width; ++x)
       if (tiles[y * kBlock / edge * across + x * kBlock / edge])
-        wanted[y / kBlocksAcross * columns + x / kBlocksAcross] |=
+        requested[y / kBlocksAcross * columns + x / kBlocksAcross] |=
             std::uint64_t(1) << (y % kBlocksAcross * kBlocksAcross + x % kBlocksAcross);
-  return wanted;
+  return requested;
 }
 
-// Gather a segment's Gaussians and list its blocks. Masks are computed the first time, and saved for the way back.
+// Gathers a segment's Gaussians and lists those of each block. Masks are computed once and kept for the backward pass.
 template <class T>
-void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_t first, std::uint64_t wanted,
+void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_t first, std::uint64_t requested,
             Segment<T>& out) {
   const std::int64_t begin = bins.starts[bin] + first;
   const int n = out.count = int(std::min<std::int64_t>(kSegment, bins.starts[bin + 1] - begin));
@@ -104,14 +105,14 @@ void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_
       if (i < count) {
         Ellipse<T>& mine = out.ellipses[at];
         rows[i].store(&mine.u);
-        mine.u += mine.whole_u - X, mine.v += mine.whole_v - Y;  // from here on, from the bin's corner
+        mine.u += mine.whole_u - X, mine.v += mine.whole_v - Y;  // relative to the bin's corner from here on
       }
     }
     if (!bins.has_masks) {
       std::uint64_t fresh[kLanes];
       transpose(rows);
       block_masks(rows, rows[kU] + (rows[kWholeU] - Lanes<T>(X)), rows[kV] + (rows[kWholeV] - Lanes<T>(Y)), fresh);
-      for (int i = 0; i < count; ++i) masks[start + i] = fresh[i] & wanted;
+      for (int i = 0; i < count; ++i) masks[start + i] = fresh[i] & requested;
     }
     for (int i = 0; i < count; ++i)
       for (std::uint64_t m = masks[start + i]; m; m &= m - 1) *next[__builtin_ctzll(m)]++ = std::uint16_t(start + i);

@@ -1,14 +1,14 @@
-// Colour: spherical harmonics of sixteen directions, with the slope of the colour along the position.
+// Colour from spherical harmonics for sixteen directions, with its derivative along the position (`slope`).
 //
-// One view sees a Gaussian from one direction whatever the resolution, so colour and slope are computed once for all
-// screens; and since the slope is kept (nine numbers), the way back never reads the coefficients again.
+// The direction does not depend on the resolution, so colour and slope are computed once for all pixel grids. The slope
+// (nine numbers) is kept, so the backward pass does not read the coefficients again.
 #pragma once
 
 #include "geometry.hpp"
 
 namespace clear {
 
-// Y and its derivatives along the unit direction's coordinates, band by band, with the signs that 3DGS stores.
+// Y and its derivatives with respect to the unit direction, band by band, with the signs of 3DGS.
 // Calls band(k, Y, dx, dy, dz) for k = 0 … bands.
 template <class T, class Band>
 CLEAR_INLINE void each_band(int bands, const Vec3<T>& direction, Band&& band) {
@@ -73,7 +73,7 @@ CLEAR_INLINE void colour_of(const Pose& pose, const Vec3<T>& mean, int bands, co
       out.slope[3 * c + 2] += dz * w;
     }
   });
-  for (int c = 0; c < 3; ++c) {  // a direction only turns: (I - d dᵀ) / length
+  for (int c = 0; c < 3; ++c) {  // derivative of the unit direction: (I - d dᵀ) / length
     L* slope = out.slope + 3 * c;
     L radial = slope[0] * direction[0] + slope[1] * direction[1] + slope[2] * direction[2];
     for (int k = 0; k < 3; ++k) slope[k] = (slope[k] - radial * direction[k]) * inverse_length;

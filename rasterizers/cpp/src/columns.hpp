@@ -1,4 +1,4 @@
-// Between tensors, one Gaussian a row, and lanes, one Gaussian a lane. Groups are sixteen neighbours in memory.
+// Converts between tensors (a Gaussian per row) and lanes (a Gaussian per lane). A group is sixteen consecutive rows.
 #pragma once
 
 #include <algorithm>
@@ -7,7 +7,7 @@
 
 namespace clear {
 
-// Columns of a contiguous [n, C] tensor, for the `count` (1 … 16) rows that start at `row`; the last row fills the rest.
+// Columns of a contiguous [n, C] tensor, for the `count` (1 … 16) rows from `row` on; the last row is repeated to sixteen.
 template <int C, class T>
 CLEAR_INLINE void load_rows(const T* tensor, std::int64_t row, int count, Lanes<T> (&columns)[C]) {
   const T* p = tensor + row * C;
@@ -35,11 +35,11 @@ CLEAR_INLINE Lanes<T> load_row(const T* tensor, std::int64_t row, int count) {
   return columns[0];
 }
 
-// Columns of sixteen rows of `width` numbers that lie anywhere; a null row is zeros. Reads nothing beyond a row.
+// Columns of sixteen rows of `width` numbers at arbitrary addresses; a null row is zeros. Does not read beyond a row.
 template <class T>
 CLEAR_INLINE void gather_rows(const T* const (&rows)[kLanes], int width, Lanes<T>* columns) {
   for (int start = 0; start < width; start += kLanes) {
-    int first = std::max(0, std::min(start, width - kLanes));  // the last sixteen overlap what came before
+    int first = std::max(0, std::min(start, width - kLanes));  // the last sixteen overlap the previous ones
     Lanes<T> block[kLanes];
     for (int i = 0; i < kLanes; ++i) {
       if (!rows[i]) {
@@ -57,7 +57,7 @@ CLEAR_INLINE void gather_rows(const T* const (&rows)[kLanes], int width, Lanes<T
   }
 }
 
-// Sixteen truths to bytes.
+// Writes the bits as bools.
 inline void store_bits(bool* out, int count, std::uint32_t bits) {
   for (int i = 0; i < count; ++i) out[i] = (bits >> i) & 1;
 }

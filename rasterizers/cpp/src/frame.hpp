@@ -1,18 +1,19 @@
-// A frame: one set of Gaussians seen from one pose on one or more screens. Runs the stages and keeps what they share.
+// A frame: one set of Gaussians seen from one pose on one or more pixel grids. Runs the stages and keeps what they share.
 //
-//   project -> order -> (for each band: list pairs -> blend)          and back: (list pairs -> blend_vjp) -> pull
+//   forward:   project -> order -> (for each band: list pairs -> blend)
+//   backward:  (for each band: list pairs -> blend_vjp) -> project_vjp
 //
-// A band is some rows of bins. There is one, unless its pairs would not fit the memory budget; then the picture is drawn
-// band by band, and bit for bit the same.
+// A band is some rows of bins. There is one, unless its pairs would not fit the memory budget; the image is then drawn
+// band by band, with the same bits.
 #pragma once
 
 #include "order.hpp"
 #include "passes.hpp"
-#include "pull.hpp"
+#include "project_vjp.hpp"
 
 namespace clear {
 
-// More memory than allowed, said before it is taken.
+// The lists would need more memory than allowed; thrown before it is allocated.
 struct OverBudget : std::runtime_error {
   using std::runtime_error::runtime_error;
 };
@@ -23,12 +24,12 @@ class Frame {
   Frame(const Settings<T>& settings, const Pose& pose, std::int64_t budget)
       : settings_(settings), pose_(pose), budget_(budget) {}
 
-  // False if a number that was needed is not finite.
+  // Returns false if a number that it read is not finite.
   bool project(const Splats<T>& splats, std::vector<Target<T>> targets, int threads) {
     views_.clear();
     n_ = splats.n;
     if (!clear::project(pose_, settings_, splats, targets, palette_, depths_, threads)) return false;
-    // One order over the union of what any screen draws.
+    // One depth order for all Gaussians that any grid draws.
     order_by_depth<T>(
         n_,
         [&](std::int64_t i) {
@@ -40,7 +41,7 @@ class Frame {
     for (Target<T>& target : targets) {
       View view;
       view.target = std::move(target);
-      view.pairs_in_row = count_pairs(view.target.screen.rows(), view.target.ranges, n_, threads);
+      view.pairs_in_row = count_pairs(view.target.grid.rows(), view.target.ranges, n_, threads);
       views_.push_back(std::move(view));
     }
     return true;
@@ -54,8 +55,8 @@ class Frame {
 
   void draw(int i, T* image, T* alpha, int threads) {
     View& view = views_.at(i);
-    const Screen<T>& screen = view.target.screen;
-    view.ends.reserve_lost(std::size_t(screen.columns()) * screen.rows() * kBlocks);
+    const Grid<T>& grid = view.target.grid;
+    view.ends.reserve_lost(std::size_t(grid.columns()) * grid.rows() * kBlocks);
     const std::vector<int> bands = bands_of(view, kBytesPerPair);
     for (std::size_t b = 0; b + 1 < bands.size(); ++b) {
       list(view, bands[b], bands[b + 1], threads);
@@ -64,10 +65,10 @@ class Frame {
     }
   }
 
-  // K cotangents [K, height, width, 3] to gradients [K, n, …].
+  // The gradients [K, n, …] for K cotangents [K, height, width, 3].
   void vjp(int i, int K, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
     View& view = views_.at(i);
-    const std::int64_t image = std::int64_t(view.target.screen.width) * view.target.screen.height * 3;
+    const std::int64_t image = std::int64_t(view.target.grid.width) * view.target.grid.height * 3;
     for (int k = 0; k < K;) {
       const int now = std::min(3, K - k);
       const std::int64_t at = k * n_;
@@ -80,7 +81,7 @@ class Frame {
     }
   }
 
-  // Y of every Gaussian that some screen shows, [n, bands + 1]; zeros for the others.
+  // Y of every Gaussian that is visible on some grid, [n, bands + 1]; zeros for the others.
   void basis(const Splats<T>& splats, T* out, int threads) {
     using L = Lanes<T>;
     const int width = splats.bands + 1;
@@ -108,17 +109,17 @@ class Frame {
   }
 
  private:
-  // Gaussian, place, blocks.
+  // `Bins::pairs`, `where` and `masks`.
   static constexpr std::int64_t kBytesPerPair = 2 * sizeof(std::uint32_t) + sizeof(std::uint64_t);
 
   struct View {
     Target<T> target;
     std::vector<std::int64_t> pairs_in_row;
     Buffer<BlockEnd<T>> ends;           // [bins, 64]
-    Bins bins;                          // the band listed last
+    Bins bins;                          // the last listed band
   };
 
-  // Cut the rows of bins so that each band's pairs fit the budget: [0, …, rows].
+  // Splits the rows of bins into bands whose pairs fit the budget: [0, …, rows].
   std::vector<int> bands_of(const View& view, std::int64_t bytes_per_pair) const {
     std::vector<int> bands = {0};
     std::int64_t held = 0;
@@ -147,13 +148,13 @@ class Frame {
   }
 
   void list(View& view, int first_row, int end_row, int threads) {
-    list_pairs(view.target.screen.columns(), first_row, end_row, order_, view.target.ranges, n_,
-               view.target.wanted.empty() ? nullptr : view.target.wanted.data(), view.bins, threads);
+    list_pairs(view.target.grid.columns(), first_row, end_row, order_, view.target.ranges, n_,
+               view.target.requested.empty() ? nullptr : view.target.requested.data(), view.bins, threads);
   }
 
-  // The band's bin, with the blocks that were asked for.
+  // The job of a bin of the band, with its requested blocks.
   BinJob<T> job(View& view, std::int64_t bin) const {
-    const Screen<T>& s = view.target.screen;
+    const Grid<T>& s = view.target.grid;
     const int x = int(bin) % view.bins.columns, y = view.bins.first_row + int(bin) / view.bins.columns;
     const std::size_t place = std::size_t(y) * s.columns() + x;
     const std::uint64_t inside = blocks_in_image(x, y, s.width, s.height);
@@ -165,18 +166,18 @@ class Frame {
             x,
             y,
             inside,
-            view.target.wanted.empty() ? inside : inside & view.target.wanted[place],
+            view.target.requested.empty() ? inside : inside & view.target.requested[place],
             view.ends.data() + place * kBlocks};
   }
 
   template <int K>
   void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
-    const std::vector<int> bands = bands_of(view, kBytesPerPair + K * sizeof(Pulled<T>));
+    const std::vector<int> bands = bands_of(view, kBytesPerPair + K * sizeof(PairSums<T>));
     const std::int64_t groups = groups_of(n_), per_task = 32;
     const bool whole = bands.size() == 2;
     if (!whole) {
-      sums_.reserve_lost(std::size_t(n_) * K);
-      std::memset(static_cast<void*>(sums_.data()), 0, sizeof(Pulled<T>) * n_ * K);
+      splat_sums_.reserve_lost(std::size_t(n_) * K);
+      std::memset(static_cast<void*>(splat_sums_.data()), 0, sizeof(PairSums<T>) * n_ * K);
     }
     auto each_group = [&](auto&& visit) {
       Pool::instance().run(threads, (groups + per_task - 1) / per_task, [&](std::int64_t task) {
@@ -185,19 +186,19 @@ class Frame {
     };
     for (std::size_t b = 0; b + 1 < bands.size(); ++b) {
       if (view.bins.first_row != bands[b] || view.bins.end_row != bands[b + 1]) list(view, bands[b], bands[b + 1], threads);
-      sent_.reserve_lost(view.bins.pairs.size() * K);
+      pair_sums_.reserve_lost(view.bins.pairs.size() * K);
       Pool::instance().run(threads, view.bins.bins(),
-                           [&](std::int64_t bin) { send_bin<T, K>(job(view, bin), cotangents, sent_.data()); });
+                           [&](std::int64_t bin) { blend_vjp_bin<T, K>(job(view, bin), cotangents, pair_sums_.data()); });
       view.bins.has_masks = true;
       if (whole) break;
       each_group([&](std::int64_t g) {
         const int count = int(std::min<std::int64_t>(kLanes, n_ - g * kLanes));
         Lanes<T> rows[K][kLanes];
         for (int k = 0; k < K; ++k)
-          for (int i = 0; i < count; ++i) rows[k][i] = Lanes<T>::load(&sums_[(g * kLanes + i) * K + k].q);
-        add_sent<T, K>(view.bins, g * kLanes, count, n_, sent_, rows);
+          for (int i = 0; i < count; ++i) rows[k][i] = Lanes<T>::load(&splat_sums_[(g * kLanes + i) * K + k].q);
+        add_pair_sums<T, K>(view.bins, g * kLanes, count, n_, pair_sums_, rows);
         for (int k = 0; k < K; ++k)
-          for (int i = 0; i < count; ++i) rows[k][i].store(&sums_[(g * kLanes + i) * K + k].q);
+          for (int i = 0; i < count; ++i) rows[k][i].store(&splat_sums_[(g * kLanes + i) * K + k].q);
       });
     }
     each_group([&](std::int64_t g) {
@@ -210,14 +211,14 @@ class Frame {
       if (whole) {
         const std::uint32_t* mine = view.bins.first.data() + first;
         for (int i = 0; i < count; ++i) touched |= std::uint32_t(mine[i + 1] > mine[i]) << i;
-        add_sent<T, K>(view.bins, first, count, n_, sent_, rows);
+        add_pair_sums<T, K>(view.bins, first, count, n_, pair_sums_, rows);
       } else {
         for (int i = 0; i < count; ++i) {
           touched |= std::uint32_t(view.target.ranges[first + i].count() > 0) << i;
-          for (int k = 0; k < K; ++k) rows[k][i] = Lanes<T>::load(&sums_[(first + i) * K + k].q);
+          for (int k = 0; k < K; ++k) rows[k][i] = Lanes<T>::load(&splat_sums_[(first + i) * K + k].q);
         }
       }
-      pull_group<T, K>(pose_, settings_, splats, view.target, palette_, g, rows, touched, out);
+      project_vjp_group<T, K>(pose_, settings_, splats, view.target, palette_, g, rows, touched, out);
     });
   }
 
@@ -228,7 +229,7 @@ class Frame {
   Buffer<double> depths_;
   Buffer<std::uint32_t> order_;
   std::vector<View> views_;
-  Buffer<Pulled<T>> sent_, sums_;  // by pair; by Gaussian, when there are several bands
+  Buffer<PairSums<T>> pair_sums_, splat_sums_;  // by pair; by Gaussian, when there are several bands
 };
 
 }  // namespace clear

@@ -1,8 +1,8 @@
-// Project: sixteen Gaussians to ellipses on a screen, and the way back. Mathematics on lanes; touches no memory.
+// Projects sixteen Gaussians to ellipses on a pixel grid, and its VJP. Arithmetic on lanes only; no tensors.
 //
 //   Σ' = X-Y block of T Tᵀ + kernel·I,   T = J W R(q) diag(s)   (2 x 3)
 //
-// Determinants come from the factor T as sums of squared minors (Cauchy-Binet): ac - b² loses every digit of a needle.
+// Determinants are sums of squared minors of the factor T (Cauchy-Binet), because ac - b² loses all digits for a needle.
 #pragma once
 
 #include "types.hpp"
@@ -33,8 +33,8 @@ struct Rotation {
   T operator[](int i) const { return R[i]; }
 };
 
-// Where the centre lies, in double whatever T: a screen coordinate of 1,000 px that is wrong by one part in 10^7 moves a
-// needle by a tenth of its width in a thousand, and two depths that float cannot tell apart are drawn in the wrong order.
+// The centre in camera coordinates, always in double: in float, an image coordinate of 1,000 px is off by 1e-4 px, which
+// shifts thin needles, and close depths may compare equal and be drawn in the wrong order.
 struct Centre {
   using D = Lanes<double>;
   D x, y, z, tan_x, tan_y;
@@ -51,7 +51,7 @@ struct Centre {
   }
 };
 
-// Everything that does not depend on the focal length, so that all screens of a pose share it.
+// Everything that does not depend on the focal length; shared by the grids of a pose.
 template <class T>
 struct Geometry {
   using L = Lanes<T>;
@@ -59,18 +59,18 @@ struct Geometry {
   L tan_x, tan_y;        // x/z, y/z …
   L lim_x, lim_y;        // … and clamped far outside the image, where the affine approximation explodes
   L unit[4], inverse_norm;  // q / |q|
-  L R[9];                // of the Gaussian
+  L R[9];                // the Gaussian's rotation
   L axes[9];             // W R diag(s)
   L row_x[3], row_y[3];  // T for focal length 1
 
-  CLEAR_INLINE Geometry(const Pose& pose, const Screen<T>& screen, const Centre& centre, const L (&quat)[4],
+  CLEAR_INLINE Geometry(const Pose& pose, const Grid<T>& grid, const Centre& centre, const L (&quat)[4],
                         const Vec3<T>& scale) {
     const Rotation<T> W(pose);
     x = convert<T>(centre.x), y = convert<T>(centre.y), z = convert<T>(centre.z);
     inverse_z = L(T(1)) / z;
     tan_x = convert<T>(centre.tan_x), tan_y = convert<T>(centre.tan_y);
-    lim_x = clamp(tan_x, L(screen.left()), L(screen.right()));
-    lim_y = clamp(tan_y, L(screen.top()), L(screen.bottom()));
+    lim_x = clamp(tan_x, L(grid.left()), L(grid.right()));
+    lim_y = clamp(tan_y, L(grid.top()), L(grid.bottom()));
 
     rotation(quat);
     for (int i = 0; i < 3; ++i)
@@ -83,7 +83,8 @@ struct Geometry {
   }
 
  private:
-  // Scaled by the largest component first: |q|² neither overflows nor underflows. The zero quaternion is the identity.
+  // Divides by the largest component first, so that |q|² neither overflows nor underflows. The zero quaternion is the
+  // identity.
   CLEAR_INLINE void rotation(const L (&quat)[4]) {
     L largest = maximum(maximum(absolute(quat[0]), absolute(quat[1])), maximum(absolute(quat[2]), absolute(quat[3])));
     Mask<T> zero = largest <= L(T(0));
@@ -100,8 +101,8 @@ struct Geometry {
   friend CLEAR_INLINE L operator*(T a, const L& b) { return L(a) * b; }
 };
 
-// The ellipse of a screen. Lengths are measured in `size`, the larger of T's largest entry and √kernel: whatever the
-// Gaussian, the numbers that are squared twice lie between 0 and a few.
+// The ellipse on a pixel grid. Lengths are in units of `size`, the larger of T's largest entry and √kernel, so that
+// fourth powers neither overflow nor underflow.
 template <class T>
 struct Footprint {
   using L = Lanes<T>;
@@ -111,13 +112,13 @@ struct Footprint {
   L normal[3], area;     // X x Y / size² and its length, √det(T Tᵀ) / size²
   L det;                 // det Σ' / size⁴
   L xx, xy, yy;          // Σ'⁻¹
-  L compensation;        // Mip-Splatting: √(det T Tᵀ / det Σ'), so that the kernel keeps a splat's total
+  L compensation;        // Mip-Splatting: √(det T Tᵀ / det Σ'), opacity factor that makes up for the kernel's blur
 
-  CLEAR_INLINE Footprint(const Geometry<T>& g, const Screen<T>& screen, const Settings<T>& s) {
+  CLEAR_INLINE Footprint(const Geometry<T>& g, const Grid<T>& grid, const Settings<T>& s) {
     L largest = root(L(s.kernel));
     for (int k = 0; k < 3; ++k) {
-      X[k] = L(screen.fx) * g.row_x[k];
-      Y[k] = L(screen.fy) * g.row_y[k];
+      X[k] = L(grid.fx) * g.row_x[k];
+      Y[k] = L(grid.fy) * g.row_y[k];
       largest = maximum(largest, maximum(absolute(X[k]), absolute(Y[k])));
     }
     size = largest;
@@ -138,18 +139,18 @@ struct Footprint {
 
 // Gradients of one Gaussian's tensors, sixteen at a time.
 template <class T>
-struct Pull {
+struct LaneGradients {
   using L = Lanes<T>;
   L mean[3], quat[4], scale[3], opacity, screen[2];
 };
 
-// Back through the projection. q and its moments come from the blocks; M = [[qxx, qxy], [qxy, qyy]]:
+// VJP of the projection. q and its moments come from the blocks; M = [[qxx, qxy], [qxy, qyy]]:
 //   ∂L/∂u = Σ'⁻¹ (qx, qy)      ∂L/∂T = Σ'⁻¹ M Σ'⁻¹ T + q ∂ log ρ/∂T, ρ the compensation
 template <class T>
-CLEAR_INLINE void project_vjp(const Pose& pose, const Screen<T>& screen, const Settings<T>& s, const Geometry<T>& g,
+CLEAR_INLINE void project_vjp(const Pose& pose, const Grid<T>& grid, const Settings<T>& s, const Geometry<T>& g,
                               const Footprint<T>& f, const Vec3<T>& scale, const Lanes<T>& opacity, const Lanes<T>& q,
                               const Lanes<T>& qx, const Lanes<T>& qy, const Lanes<T>& qxx, const Lanes<T>& qxy,
-                              const Lanes<T>& qyy, Pull<T>& out) {
+                              const Lanes<T>& qyy, LaneGradients<T>& out) {
   using L = Lanes<T>;
   const Rotation<T> W(pose);
   out.opacity = q / opacity;
@@ -165,7 +166,7 @@ CLEAR_INLINE void project_vjp(const Pose& pose, const Screen<T>& screen, const S
     dY[k] = f.xy * mx + f.yy * my;
   }
   if (s.antialiased) {
-    // log ρ = ½ log area² - ½ log(area² + κ tr + κ²). Written so that what cancels for a large Gaussian is never formed:
+    // log ρ = ½ log area² - ½ log(area² + κ tr + κ²). This form avoids the cancellation for large Gaussians:
     //   ∂ log ρ/∂x = κ/det ((tr + κ)/area² (y x n) - x),   and for y with n x x.
     L x[3], y[3], along_x[3], along_y[3], shrink = L(T(1)) / f.size;
     for (int k = 0; k < 3; ++k) x[k] = f.X[k] * shrink, y[k] = f.Y[k] * shrink;
@@ -178,10 +179,10 @@ CLEAR_INLINE void project_vjp(const Pose& pose, const Screen<T>& screen, const S
     }
   }
 
-  // T = J axes: to the axes, to 1/z, and to the tangents where they are not clamped.
+  // T = J axes: gradients of the axes, of 1/z, and of the tangents where they are not clamped.
   L dA[9], slope_x = T(0), slope_y = T(0), over_z = T(0);
   for (int k = 0; k < 3; ++k) {
-    L gx = L(screen.fx) * dX[k] * g.inverse_z, gy = L(screen.fy) * dY[k] * g.inverse_z;
+    L gx = L(grid.fx) * dX[k] * g.inverse_z, gy = L(grid.fy) * dY[k] * g.inverse_z;
     dA[k] = gx;
     dA[3 + k] = gy;
     dA[6 + k] = -(g.lim_x * gx + g.lim_y * gy);
@@ -189,8 +190,8 @@ CLEAR_INLINE void project_vjp(const Pose& pose, const Screen<T>& screen, const S
     slope_y -= g.axes[6 + k] * gy;
     over_z += f.X[k] * dX[k] + f.Y[k] * dY[k];
   }
-  L dtx = L(screen.fx) * du + where((g.tan_x >= L(screen.left())) & (g.tan_x <= L(screen.right())), slope_x);
-  L dty = L(screen.fy) * dv + where((g.tan_y >= L(screen.top())) & (g.tan_y <= L(screen.bottom())), slope_y);
+  L dtx = L(grid.fx) * du + where((g.tan_x >= L(grid.left())) & (g.tan_x <= L(grid.right())), slope_x);
+  L dty = L(grid.fy) * dv + where((g.tan_y >= L(grid.top())) & (g.tan_y <= L(grid.bottom())), slope_y);
   L dx = dtx * g.inverse_z, dy = dty * g.inverse_z;
   L dz = -(dtx * g.tan_x + dty * g.tan_y + over_z) * g.inverse_z;
   for (int k = 0; k < 3; ++k) out.mean[k] = L(W[k]) * dx + L(W[3 + k]) * dy + L(W[6 + k]) * dz;

@@ -1,7 +1,7 @@
-// Large arrays that nobody clears before they are written, and that are used again.
+// Large uninitialised arrays whose memory is reused.
 //
-// A frame's arrays live for one iteration and are wanted again in the next, at nearly the same size. Fresh pages from the
-// system cost more than what is computed in them, so what is freed is kept for whoever asks next.
+// A frame's arrays live for one iteration, and the next one needs nearly the same sizes. Fresh pages from the system cost
+// more than what is computed in them, so freed blocks are kept for the next request.
 #pragma once
 
 #include <cstddef>
@@ -29,7 +29,7 @@ class Recycler {
     return *it;
   }
 
-  // At least `bytes`, and not more than half of it wasted. Under the address sanitizer nothing is kept, and nothing spare.
+  // A block of at least `bytes`, at most about twice that. The address sanitizer gets exact blocks, and none is kept.
   Block take(std::size_t bytes) {
 #if defined(__SANITIZE_ADDRESS__)
     const std::size_t exact = (bytes + 63) / 64 * 64;
@@ -52,11 +52,11 @@ class Recycler {
       }
     }
     const std::size_t align = bytes >= kHuge ? kHuge : kPage;
-    Block fresh{nullptr, (bytes + bytes / 8 + align) / align * align};  // a little more: the next may be a little larger
+    Block fresh{nullptr, (bytes + bytes / 8 + align) / align * align};  // some more than asked: the next request may be a little larger
     fresh.data = std::aligned_alloc(align, fresh.bytes);
     if (!fresh.data) throw std::bad_alloc();
 #if defined(__linux__)
-    if (align == kHuge) madvise(fresh.data, fresh.bytes, MADV_HUGEPAGE);  // scattered reads: fewer pages to look up
+    if (align == kHuge) madvise(fresh.data, fresh.bytes, MADV_HUGEPAGE);  // random reads: fewer TLB misses
 #endif
     return fresh;
   }
@@ -97,7 +97,7 @@ class Buffer {
   }
   ~Buffer() { Recycler::instance().give(block_); }
 
-  // Makes room for n; what was there is lost when it has to grow.
+  // Makes room for n numbers; the contents are lost if it has to grow.
   void reserve_lost(std::size_t n) {
     if (n * sizeof(T) > block_.bytes) {
       Recycler::instance().give(std::exchange(block_, {}));

@@ -1,4 +1,4 @@
-// Bin, first half: the Gaussians that show, front to back. Only these few numbers are sorted, never (tile, Gaussian) pairs.
+// Bin, first half: sorts the visible Gaussians front to back. Only these are sorted, never (tile, Gaussian) pairs.
 #pragma once
 
 #include <bit>
@@ -8,12 +8,12 @@
 
 namespace clear {
 
-// A depth and whose it is. Positive numbers order like their bits; ties keep the order of the indices (stable sorts).
+// A depth and its Gaussian. Positive floats order like their bits; ties keep the index order (stable sorts).
 struct DepthKey {
   std::uint32_t depth, index;
 };
 
-// Least significant digit first, every digit a stable counting sort in parallel over chunks.
+// Radix sort, least significant digit first; each digit is a stable counting sort, parallel over chunks.
 inline void sort_by_depth(Buffer<DepthKey>& keys, Buffer<DepthKey>& spare, int threads) {
   const std::int64_t n = std::int64_t(keys.size());
   if (n < 2) return;
@@ -76,7 +76,7 @@ void order_by_depth(std::int64_t n, Shows&& shows, const Buffer<double>& depths,
   }
   order.reserve_lost(all.count);
   if constexpr (sizeof(T) == 4) {
-    // The 32 bits below the highest in which two depths differ: some 30 binary digits where a float has 24.
+    // Keys are the 32 bits below the highest bit in which two depths differ: about 30 significant bits, a float has 24.
     const int shift = all.count ? std::max(0, int(std::bit_width(all.high - all.low)) - 32) : 0;
     Buffer<DepthKey> keys, spare;
     keys.reserve_lost(all.count);

@@ -1,4 +1,4 @@
-// Blend, bin by bin: a bin's blocks forward to pixels, and back to what its Gaussians get. One task of the pool each.
+// The forward and the backward pass of one bin over its blocks. Each is one task of the pool.
 #pragma once
 
 #include "blend.hpp"
@@ -9,11 +9,11 @@ namespace clear {
 template <class T>
 struct BinJob {
   const Settings<T>& settings;
-  const Screen<T>& screen;
+  const Grid<T>& grid;
   const Buffer<Ellipse<T>>& ellipses;
   Bins& bins;
-  int bin, x, y;                 // which of the band, and where on the screen
-  std::uint64_t inside, wanted;  // blocks in the image; those of them that were asked for
+  int bin, x, y;                 // its index in the band, and its place on the pixel grid
+  std::uint64_t inside, requested;  // blocks in the image; the requested ones among them
   BlockEnd<T>* ends;             // [64]
 
   std::int64_t pairs() const { return bins.starts[bin + 1] - bins.starts[bin]; }
@@ -27,12 +27,12 @@ CLEAR_INLINE void each_block(std::uint64_t blocks, Visit&& visit) {
 }
 
 template <class T>
-Segment<T>& my_segment() {
+Segment<T>& thread_segment() {
   static thread_local Segment<T> segment;
   return segment;
 }
 
-// Draw the bin's pixels into [height, width, 3] and [height, width]; blocks not asked for show the background.
+// Draws the bin's pixels into [height, width, 3] and [height, width]; blocks not requested show the background.
 template <class T>
 void draw_bin(const BinJob<T>& job, T* image, T* alpha) {
   using L = Lanes<T>;
@@ -44,10 +44,10 @@ void draw_bin(const BinJob<T>& job, T* image, T* alpha) {
     colours[b] = {};
   });
   const std::int64_t n = job.pairs();
-  std::uint64_t open = job.wanted;
+  std::uint64_t open = job.requested;
   for (std::int64_t first = 0; first < n && open; first += kSegment) {
-    Segment<T>& part = my_segment<T>();
-    gather(job.ellipses, job.bins, job.bin, first, job.wanted, part);
+    Segment<T>& part = thread_segment<T>();
+    gather(job.ellipses, job.bins, job.bin, first, job.requested, part);
     each_block(open, [&](int b) {
       if (!part.lengths[b]) return;
       blend_block(part, b, job.settings, colours[b], job.ends[b]);
@@ -59,28 +59,28 @@ void draw_bin(const BinJob<T>& job, T* image, T* alpha) {
     const L channels[3] = {L::load(colours[b].r), L::load(colours[b].g), L::load(colours[b].b)};
     L pixel[3], cover[1] = {L(T(1)) - through};
     for (int c = 0; c < 3; ++c) pixel[c] = channels[c] + through * L(job.settings.background[c]);
-    store_block<3>(image, job.screen.width, job.screen.height, job.block_x(b), job.block_y(b), pixel);
-    store_block<1>(alpha, job.screen.width, job.screen.height, job.block_x(b), job.block_y(b), cover);
+    store_block<3>(image, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), pixel);
+    store_block<1>(alpha, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), cover);
   });
 }
 
-// What a bin's blocks start the way back with.
+// The state of a bin's blocks in the backward pass.
 template <class T, int K>
-struct Entrance {
+struct BinVjp {
   BlockBack<T, K> back[kBlocks];
   T cotangent[kBlocks][K][3][kLanes];
 };
 
 template <class T, int K>
-void enter(const BinJob<T>& job, const T* cotangents, Entrance<T, K>& out) {
+void start_vjp(const BinJob<T>& job, const T* cotangents, BinVjp<T, K>& out) {
   using L = Lanes<T>;
-  const std::int64_t image = std::int64_t(job.screen.width) * job.screen.height * 3;
-  each_block(job.wanted, [&](int b) {
+  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * 3;
+  each_block(job.requested, [&](int b) {
     const L through = L::load(job.ends[b].transmittance);
     through.store(out.back[b].transmittance);
     for (int k = 0; k < K; ++k) {
       L v[3], light = T(0);
-      load_block<3>(cotangents + k * image, job.screen.width, job.screen.height, job.block_x(b), job.block_y(b), v);
+      load_block<3>(cotangents + k * image, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), v);
       for (int c = 0; c < 3; ++c) {
         light += v[c] * L(job.settings.background[c]);
         v[c].store(out.cotangent[b][k][c]);
@@ -90,38 +90,38 @@ void enter(const BinJob<T>& job, const T* cotangents, Entrance<T, K>& out) {
   });
 }
 
-// The cotangents of a bin lie in rows far apart: on their way while its Gaussians are gathered.
+// Prefetches a bin's cotangents, whose rows lie far apart in memory, while its Gaussians are gathered.
 template <class T, int K>
 CLEAR_INLINE void fetch_cotangents(const BinJob<T>& job, const T* cotangents) {
-  const std::int64_t image = std::int64_t(job.screen.width) * job.screen.height * 3;
+  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * 3;
   for (int k = 0; k < K; ++k)
-    for (int y = job.y * kBin; y < std::min(job.screen.height, (job.y + 1) * kBin); ++y)
+    for (int y = job.y * kBin; y < std::min(job.grid.height, (job.y + 1) * kBin); ++y)
       for (int x = 0; x < 3 * kBin; x += kLanes)
-        __builtin_prefetch(cotangents + k * image + (std::int64_t(y) * job.screen.width + job.x * kBin) * 3 + x);
+        __builtin_prefetch(cotangents + k * image + (std::int64_t(y) * job.grid.width + job.x * kBin) * 3 + x);
 }
 
-// Back to front. What the bin's pairs get goes to `sent` [pairs, K], every one of them written.
+// The backward pass of a bin, back to front. Writes every row of `pair_sums` [pairs, K].
 template <class T, int K>
-void send_bin(const BinJob<T>& job, const T* cotangents, Pulled<T>* sent) {
+void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T>* pair_sums) {
   const std::int64_t n = job.pairs();
   if (!n) return;
-  static thread_local Entrance<T, K> scratch;
-  Entrance<T, K>& mine = scratch;
+  static thread_local BinVjp<T, K> scratch;
+  BinVjp<T, K>& mine = scratch;
   fetch_cotangents<T, K>(job, cotangents);
-  std::int64_t end = 0;  // no pixel took a pair from here on; its segments may not even have been listed
-  each_block(job.wanted, [&](int b) {
+  std::int64_t end = 0;  // no pixel blended a pair from here on, and their segments may not have been listed
+  each_block(job.requested, [&](int b) {
     for (std::int32_t e : job.ends[b].ended) end = std::max<std::int64_t>(end, std::min<std::int64_t>(e, n));
   });
-  bool entered = false;
+  bool started = false;
   for (std::int64_t first = (n - 1) / kSegment * kSegment; first >= 0; first -= kSegment) {
     const std::int64_t count = std::min<std::int64_t>(kSegment, n - first);
-    Pulled<T>* sums = sent + (job.bins.starts[job.bin] + first) * K;
-    std::memset(static_cast<void*>(sums), 0, sizeof(Pulled<T>) * count * K);
+    PairSums<T>* sums = pair_sums + (job.bins.starts[job.bin] + first) * K;
+    std::memset(static_cast<void*>(sums), 0, sizeof(PairSums<T>) * count * K);
     if (first >= end) continue;
-    Segment<T>& part = my_segment<T>();
-    gather(job.ellipses, job.bins, job.bin, first, job.wanted, part);
-    if (!std::exchange(entered, true)) enter(job, cotangents, mine);
-    each_block(job.wanted, [&](int b) {
+    Segment<T>& part = thread_segment<T>();
+    gather(job.ellipses, job.bins, job.bin, first, job.requested, part);
+    if (!std::exchange(started, true)) start_vjp(job, cotangents, mine);
+    each_block(job.requested, [&](int b) {
       if (part.lengths[b])
         blend_block_vjp<T, K>(part, b, job.settings, job.ends[b], mine.cotangent[b], mine.back[b], sums);
     });

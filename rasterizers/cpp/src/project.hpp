@@ -1,4 +1,4 @@
-// Project, in memory: every group of sixteen Gaussians onto every screen of a pose, and the colours of those that show.
+// Projects every group of sixteen Gaussians onto each pixel grid of a pose, and computes the colours of the visible ones.
 #pragma once
 
 #include "bins.hpp"
@@ -8,7 +8,7 @@
 
 namespace clear {
 
-// Colours of the Gaussians that some screen shows, group by group: before offset and clamp, and ∂rgb/∂mean.
+// Colours, before offset and clamp, and ∂rgb/∂mean of the Gaussians that are visible on some grid; by group.
 template <class T>
 struct Palette {
   static constexpr int kRgb = 3 * kLanes, kSlope = 9 * kLanes;
@@ -16,27 +16,27 @@ struct Palette {
 
   void reserve(std::int64_t groups, bool turns) {
     rgb.reserve_lost(groups * kRgb);
-    slope.reserve_lost(turns ? groups * kSlope : 0);  // without higher bands a colour does not depend on the position
+    slope.reserve_lost(turns ? groups * kSlope : 0);  // without higher bands the colour does not depend on the position
   }
 };
 
-// What differs between the screens of a pose, and what projecting onto one yields.
+// One pixel grid of a pose: what differs between them, and the result of the projection.
 template <class T>
 struct Target {
-  Screen<T> screen;
+  Grid<T> grid;
   const T* opacities;   // [n]
   const T* rgb_offset;  // [n, 3] or null
   T* means2d;           // out [n, 2]
   bool* visible;        // out [n]
-  std::vector<std::uint64_t> wanted;  // blocks asked for, bin by bin; empty: all
+  std::vector<std::uint64_t> requested;  // the requested blocks of each bin; empty: all
   Buffer<Ellipse<T>> ellipses;
   Buffer<BinRange> ranges;    // [n]
-  Buffer<std::uint16_t> lit;  // [groups, 3]: the lanes whose channel was not below 0, and so has a gradient
+  Buffer<std::uint16_t> lit;  // [groups, 3]: the lanes whose channel was not clamped at 0, and so has a gradient
 };
 
 // The bins whose pixel centres the ellipses' boxes cover.
 template <class T>
-CLEAR_INLINE void bins_of(const Screen<T>& screen, const Lanes<T> (&e)[kLanes], std::uint32_t shown, int count,
+CLEAR_INLINE void bins_of(const Grid<T>& grid, const Lanes<T> (&e)[kLanes], std::uint32_t shown, int count,
                           BinRange* out) {
   using L = Lanes<T>;
   auto bin = [](const L& pixel, int size, T (&store)[kLanes]) CLEAR_LAMBDA {
@@ -45,35 +45,35 @@ CLEAR_INLINE void bins_of(const Screen<T>& screen, const Lanes<T> (&e)[kLanes], 
   const L half = T(0.5);
   T x0[kLanes], x1[kLanes], y0[kLanes], y1[kLanes];
   const L u = e[kWholeU] + e[kU] - half, v = e[kWholeV] + e[kV] - half;
-  bin(u - e[kHalfX], screen.width, x0), bin(u + e[kHalfX], screen.width, x1);
-  bin(v - e[kHalfY], screen.height, y0), bin(v + e[kHalfY], screen.height, y1);
+  bin(u - e[kHalfX], grid.width, x0), bin(u + e[kHalfX], grid.width, x1);
+  bin(v - e[kHalfY], grid.height, y0), bin(v + e[kHalfY], grid.height, y1);
   for (int i = 0; i < count; ++i)
     out[i] = (shown >> i) & 1 ? BinRange{std::int16_t(x0[i]), std::int16_t(x1[i]), std::int16_t(y0[i]), std::int16_t(y1[i])}
                               : BinRange{};
 }
 
-// Of the Gaussians that show, those with a bin that was asked for; the others' ranges become empty.
+// The visible Gaussians with a requested bin; the ranges of the others become empty.
 template <class T>
-std::uint32_t asked_for(const Target<T>& target, std::uint32_t shown, BinRange* ranges) {
-  if (target.wanted.empty()) return shown;
-  std::uint32_t asked = 0;
+std::uint32_t keep_requested(const Target<T>& target, std::uint32_t shown, BinRange* ranges) {
+  if (target.requested.empty()) return shown;
+  std::uint32_t requested = 0;
   for (std::uint32_t m = shown; m; m &= m - 1) {
     const int i = __builtin_ctz(m);
     bool any = false;
     for (int y = ranges[i].y0; y <= ranges[i].y1 && !any; ++y)
-      for (int x = ranges[i].x0; x <= ranges[i].x1 && !any; ++x) any = target.wanted[y * target.screen.columns() + x] != 0;
-    if (any) asked |= 1u << i;
+      for (int x = ranges[i].x0; x <= ranges[i].x1 && !any; ++x) any = target.requested[y * target.grid.columns() + x] != 0;
+    if (any) requested |= 1u << i;
     else ranges[i] = BinRange{};
   }
-  return asked;
+  return requested;
 }
 
 inline std::int64_t groups_of(std::int64_t n) { return (n + kLanes - 1) / kLanes; }
 
-// Whether the smallest value of A dx² + B dx dy + C dy² over the image's pixel centres' box is within reach: exact. A convex
-// quadratic over a box is smallest at its centre if that is inside, else on one of the sides that face it.
+// Whether the minimum of A dx² + B dx dy + C dy² over the box of the image's pixel centres is within reach; exact. A convex
+// quadratic has its minimum over a box at its centre if that is inside, else on one of the sides that face the centre.
 template <class T>
-CLEAR_INLINE Mask<T> reaches_image(const Screen<T>& s, const Lanes<T>& u, const Lanes<T>& v, const Lanes<T>& A,
+CLEAR_INLINE Mask<T> reaches_image(const Grid<T>& s, const Lanes<T>& u, const Lanes<T>& v, const Lanes<T>& A,
                                    const Lanes<T>& B, const Lanes<T>& C, const Lanes<T>& reach) {
   using L = Lanes<T>;
   L left = L(T(0.5)) - u, right = L(T(s.width) - T(0.5)) - u, top = L(T(0.5)) - v, bottom = L(T(s.height) - T(0.5)) - v;
@@ -83,15 +83,15 @@ CLEAR_INLINE Mask<T> reaches_image(const Screen<T>& s, const Lanes<T>& u, const 
   return minimum(power(near_x, on_x), power(on_y, near_y)) <= reach;
 }
 
-// Lanes of one group on one screen; returns which of them show. Conditions to keep, not to cull: NaN fails each.
+// One group's ellipses on one grid; returns the visible lanes. The conditions say what is kept, because NaN fails each.
 template <class T>
-CLEAR_INLINE Mask<T> ellipse_of(const Centre& centre, const Geometry<T>& g, const Screen<T>& screen,
+CLEAR_INLINE Mask<T> ellipse_of(const Centre& centre, const Geometry<T>& g, const Grid<T>& grid,
                                 const Settings<T>& s, const Lanes<T>& opacity, Lanes<T> (&e)[kLanes]) {
   using L = Lanes<T>;
-  Footprint<T> f(g, screen, s);
+  Footprint<T> f(g, grid, s);
   constexpr T log2e = kLog2E<T>;
   using D = Lanes<double>;
-  const D exact_u = D(screen.fx) * centre.tan_x + D(screen.cx), exact_v = D(screen.fy) * centre.tan_y + D(screen.cy);
+  const D exact_u = D(grid.fx) * centre.tan_x + D(grid.cx), exact_v = D(grid.fy) * centre.tan_y + D(grid.cy);
   const D whole_u = nearest(exact_u), whole_v = nearest(exact_v);
   const L u = convert<T>(exact_u), v = convert<T>(exact_v);
   L A = L(log2e / 2) * f.xx, B = L(log2e) * f.xy, C = L(log2e / 2) * f.yy;
@@ -99,10 +99,10 @@ CLEAR_INLINE Mask<T> ellipse_of(const Centre& centre, const Geometry<T>& g, cons
   L reach = (peak - L(std::log2(s.alpha_min))) * L(T(1.001)) + L(T(1e-3) * log2e);
   L extent = root(maximum(reach, L(T(0))) * L(2 / log2e)) * f.size;
   L half_x = extent * root(f.a + f.kernel), half_y = extent * root(f.c + f.kernel);
-  constexpr T huge = T(1e30);  // an ellipse of 1e-15 px covers no pixel centre, and its square would overflow
+  constexpr T huge = T(1e30);  // such an ellipse, of 1e-15 px, covers no pixel centre, and the square would overflow
   Mask<T> shows = (g.z > L(s.near)) & (opacity >= L(s.alpha_min)) & (reach > L(T(0))) & (A < L(huge)) & (C < L(huge)) &
                   (absolute(u) < L(huge)) & (absolute(v) < L(huge)) & (half_x >= L(T(0))) & (half_y >= L(T(0))) &
-                  reaches_image(screen, u, v, A, B, C, reach);
+                  reaches_image(grid, u, v, A, B, C, reach);
   e[kU] = convert<T>(exact_u - whole_u), e[kV] = convert<T>(exact_v - whole_v);
   e[kWholeU] = convert<T>(whole_u), e[kWholeV] = convert<T>(whole_v);
   e[kA] = A, e[kB] = B, e[kC] = C, e[kPeak] = peak, e[kReach] = select(shows, reach, L(T(-1)));
@@ -110,9 +110,9 @@ CLEAR_INLINE Mask<T> ellipse_of(const Centre& centre, const Geometry<T>& g, cons
   return shows;
 }
 
-// Finite numbers times 0 are 0; NaN and infinity are NaN, and stay.
+// Leaves `poison` 0 for finite numbers and NaN otherwise: NaN and infinity times 0 are NaN.
 template <class T>
-CLEAR_INLINE void note(const Lanes<T>* columns, int count, Lanes<T>& poison) {
+CLEAR_INLINE void add_times_zero(const Lanes<T>* columns, int count, Lanes<T>& poison) {
   for (int i = 0; i < count; ++i) poison += columns[i] * Lanes<T>(T(0));
 }
 
@@ -129,30 +129,30 @@ bool project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& spla
   load_rows<4>(splats.quats, first, count, quat);
   load_rows<3>(splats.scales, first, count, scale);
   L poison = T(0);
-  note(mean, 3, poison), note(quat, 4, poison), note(scale, 3, poison);
+  add_times_zero(mean, 3, poison), add_times_zero(quat, 4, poison), add_times_zero(scale, 3, poison);
   const Centre centre(pose, mean);
-  const Geometry<T> g(pose, targets[0].screen, centre, quat, scale);
+  const Geometry<T> g(pose, targets[0].grid, centre, quat, scale);
 
   centre.z.store(depths.data() + first);
   Mask<T> in_front = g.z > L(s.near);
   L ellipse[4][kLanes];
-  std::uint32_t shown[4], any = 0;  // to be drawn: visible, and on a bin that was asked for
+  std::uint32_t shown[4], any = 0;  // visible, and on a requested bin
   for (std::size_t i = 0; i < targets.size(); ++i) {
     Target<T>& target = targets[i];
     const L opacity = load_row(target.opacities, first, count);
-    note(&opacity, 1, poison);
-    // Screens of one pose are nearly always scaled copies of each other, and share the geometry too.
-    Mask<T> shows = same_view(target.screen, targets[0].screen)
-                        ? ellipse_of(centre, g, target.screen, s, opacity, ellipse[i])
-                        : ellipse_of(centre, Geometry<T>(pose, target.screen, centre, quat, scale), target.screen, s,
+    add_times_zero(&opacity, 1, poison);
+    // The grids of one pose are nearly always scaled copies of each other; they then share the geometry, too.
+    Mask<T> shows = same_view(target.grid, targets[0].grid)
+                        ? ellipse_of(centre, g, target.grid, s, opacity, ellipse[i])
+                        : ellipse_of(centre, Geometry<T>(pose, target.grid, centre, quat, scale), target.grid, s,
                                      opacity, ellipse[i]);
     const std::uint32_t visible = shows.bits() & real;
     const L uv[2] = {where(in_front, ellipse[i][kWholeU] + ellipse[i][kU]),
                      where(in_front, ellipse[i][kWholeV] + ellipse[i][kV])};
     store_rows<2>(target.means2d, first, count, uv);
     store_bits(target.visible + first, count, visible);
-    bins_of(target.screen, ellipse[i], visible, count, target.ranges.data() + first);
-    any |= shown[i] = asked_for(target, visible, target.ranges.data() + first);
+    bins_of(target.grid, ellipse[i], visible, count, target.ranges.data() + first);
+    any |= shown[i] = keep_requested(target, visible, target.ranges.data() + first);
   }
 
   Colour<T> colour;
@@ -166,7 +166,7 @@ bool project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& spla
     }
     gather_rows(base, 3, coefficients);
     if (splats.bands) gather_rows(bands, 3 * splats.bands, coefficients + 3);
-    note(coefficients, 3 + 3 * splats.bands, poison);
+    add_times_zero(coefficients, 3 + 3 * splats.bands, poison);
     colour_of(pose, mean, splats.bands, coefficients, colour);
     for (int c = 0; c < 3; ++c) colour.rgb[c].store(palette.rgb.data() + group * palette.kRgb + c * kLanes);
     if (splats.bands)
@@ -177,7 +177,7 @@ bool project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& spla
     L(&e)[kLanes] = ellipse[i];
     L offset[3] = {T(0), T(0), T(0)};
     if (targets[i].rgb_offset && shown[i]) load_rows<3>(targets[i].rgb_offset, first, count, offset);
-    note(offset, 3, poison);
+    add_times_zero(offset, 3, poison);
     for (int c = 0; c < 3; ++c) {
       L rgb = any ? colour.rgb[c] + offset[c] : L(T(0));
       e[kRed + c] = maximum(rgb, L(T(0)));
@@ -191,7 +191,7 @@ bool project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& spla
   return (poison >= L(T(0))).bits() == 0xffff;
 }
 
-// Room for whole groups; the rows beyond n repeat the last Gaussian and are never listed.
+// Allocates whole groups; the rows beyond n repeat the last Gaussian and are never listed.
 template <class T>
 bool project(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
              Palette<T>& palette, Buffer<double>& depths, int threads) {

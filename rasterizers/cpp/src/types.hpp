@@ -1,4 +1,4 @@
-// What the stages hand to each other. `T` is float, or double for checking.
+// The data types shared by the stages. `T` is float, or double for checking.
 #pragma once
 
 #include <cstdint>
@@ -9,10 +9,10 @@
 
 namespace clear {
 
-inline constexpr int kBin = 32;                             // edge of a bin, px: what a Gaussian is sorted into
-inline constexpr int kBlock = 4;                            // edge of a block, px: what sixteen lanes blend
+inline constexpr int kBin = 32;                             // edge of a bin, px: Gaussians are listed by bin
+inline constexpr int kBlock = 4;                            // edge of a block, px: sixteen lanes blend one
 inline constexpr int kBlocksAcross = kBin / kBlock;         // 8
-inline constexpr int kBlocks = kBlocksAcross * kBlocksAcross;  // 64: the blocks of a bin are the bits of a word
+inline constexpr int kBlocks = kBlocksAcross * kBlocksAcross;  // 64: a 64-bit word has a bit per block of a bin
 
 template <class T>
 inline constexpr T kLog2E = T(1.4426950408889634);
@@ -25,14 +25,14 @@ struct Settings {
   bool antialiased;
 };
 
-// In double: where a Gaussian's centre falls is computed in double whatever T, see `Centre`.
+// In double, because centres are always computed in double; see `Centre`.
 struct Pose {
   double R[9], t[3], center[3];
 };
 
-// One pixel grid of a pose, and how far off-axis the Jacobian follows (as tangents).
+// One pixel grid of a pose, and the tangents at which the Jacobian is clamped.
 template <class T>
-struct Screen {
+struct Grid {
   T fx, fy, cx, cy;
   int width, height;
 
@@ -46,39 +46,39 @@ struct Screen {
 };
 
 template <class T>
-bool same_view(const Screen<T>& a, const Screen<T>& b) {
+bool same_view(const Grid<T>& a, const Grid<T>& b) {
   return a.left() == b.left() && a.right() == b.right() && a.top() == b.top() && a.bottom() == b.bottom();
 }
 
-// The tensors of rasterizers.interface.Splats that all screens share.
+// The tensors of rasterizers.interface.Splats that are shared by all grids.
 template <class T>
 struct Splats {
   std::int64_t n;
   const T *means, *quats, *scales, *sh0, *shN;
-  std::int64_t shN_stride;  // numbers from one Gaussian's shN to the next: inactive bands are stepped over
+  std::int64_t shN_stride;  // distance between the shN rows of two Gaussians: inactive bands are skipped
   int bands;                // 0, 3, 8 or 15
 };
 
-// A Gaussian on a screen: alpha = 2^(peak - A dx² - B dx dy - C dy²). Sixteen numbers: one cache line, one register.
+// A projected Gaussian: alpha = 2^(peak - A dx² - B dx dy - C dy²). Sixteen numbers: one cache line, one register.
 template <class T>
 struct alignas(kLanes * sizeof(T)) Ellipse {
-  T u, v;            // centre, px, less …
+  T u, v;            // centre, px, minus (whole_u, whole_v)
   T A, B, C;         // conic times log2(e)/2, log2(e), log2(e)/2
   T peak;            // log2 of the opacity after the Mip compensation
-  T reach;           // alpha >= alpha_min within A dx² + B dx dy + C dy² <= reach (a little generous); <= 0: not drawn
+  T reach;           // alpha >= alpha_min within A dx² + B dx dy + C dy² <= reach (with a margin); <= 0: not drawn
   T half_x, half_y;  // half the box around that region, px
   T r, g, b;         // colour, clamped at 0
-  T whole_u, whole_v;  // … its nearest whole pixel: at 1,000 px a float alone resolves 6e-5
+  T whole_u, whole_v;  // the whole pixel nearest to the centre: at 1,000 px a float resolves 6e-5 px
   T padding[2];
 };
 static_assert(sizeof(Ellipse<float>) == 64);
 
-// The places of an Ellipse's fields among its sixteen numbers.
+// Indices of an Ellipse's fields among its sixteen numbers.
 enum Field { kU, kV, kA, kB, kC, kPeak, kReach, kHalfX, kHalfY, kRed, kGreen, kBlue, kWholeU, kWholeV };
 
-// What the blocks send back to a Gaussian: q = ∂L/∂(log alpha) summed over pixels, q's moments about the centre, and ∂L/∂rgb.
+// Sums over the pixels of a (Gaussian, bin) pair: q = ∂L/∂(log alpha), q's moments about the centre, and ∂L/∂rgb.
 template <class T>
-struct alignas(kLanes * sizeof(T)) Pulled {
+struct alignas(kLanes * sizeof(T)) PairSums {
   T q, qx, qy, qxx, qxy, qyy, r, g, b;
   T padding[7];
 };

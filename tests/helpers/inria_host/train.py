@@ -1,4 +1,4 @@
-"""The loop of an Inria-style trainer, in its own order: backward, densify, step. Knows no CLEAR."""
+"""A 3DGS-style training loop in its own order: backward, densify, step. Contains nothing of CLEAR."""
 
 import argparse
 

@@ -1,7 +1,7 @@
-"""The per-Gaussian pass in Warp, the same one as in C++ (`step`): for CUDA, and on a CPU the same kernels, to check them.
+"""The per-Gaussian step in Warp, for CUDA; the same kernels run on a CPU, to check them.
 
-What is counted stays on the device: a `Comparison` and a `Stepped` hold tensors there, counts int64 and sums float64, and
-nobody waits for them. To be imported once `rasterizers.warp_backend.launch.require` has found Warp.
+Counts stay on the device: `Comparison` and `StepCounts` hold tensors, int64 for counts and float64 for sums. Importing this
+package imports Warp; call `rasterizers.warp_runtime.require_warp` first.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from clear_strategies.kernels.gaussian_step.cpp import Attribute, Comparison, Correction, Step, Stepped
-from clear_strategies.kernels.gaussian_step.warp import adam, conflict, pulled, sweeps
-from rasterizers.warp_backend.launch import array, on_stream
+from clear_strategies.kernels.gaussian_step import Attribute, Comparison, Correction, StepCounts, StepSettings
+from clear_strategies.kernels.gaussian_step.warp import adam, conflict, passes, raw_gradients
+from rasterizers.warp_runtime import array, on_stream
 
 LANES: Final = {"cuda": 128, "cpu": 1}
-"""Threads a block; on a CPU Warp's blocks have one."""
+"""Threads per block; on a CPU, Warp's blocks have one."""
 
 _GROUPS: Final = int(conflict.GROUPS)
 _WIDTHS: Final = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3, "detail": 3}
 
 
-class GaussianPass:
-    """The gradients of one view's losses, as a rasterizer left them, and the sweeps over them.
+class WarpGaussianStep:
+    """The gradients of one view's losses, as the rasterizer returns them, and the two passes over them.
 
     Args:
-        activation, lr, base, hf: as for `step.GaussianPass`, all on one device.
+        activation, lr, base, hf: as for `cpp.CppGaussianStep`, all on one device.
 
     Raises:
-        TypeError, ValueError: a tensor is not float32, contiguous and on that device, or has another shape.
+        TypeError, ValueError: a tensor is not float32, contiguous and on that device, or has a wrong shape.
     """
 
     def __init__(
@@ -49,22 +49,22 @@ class GaussianPass:
         if not 1 <= self._bases <= 16:
             raise ValueError(f"the basis must have 1 to 16 columns, got {self._bases}.")
         if 45 * self._n >= 2**31:
-            raise ValueError(f"numbers of shN are counted in 32 bits, got {self._n} Gaussians. Set fit.fused=off.")
+            raise ValueError(f"shN is indexed with 32 bits, which {self._n} Gaussians exceed. Set fit.fused=off.")
         if base is None and hf is not None:
             raise ValueError("hf needs base, got None.")
-        self._kept = (activation, lr, base, hf)  # while kernels may read them
+        self._kept = (activation, lr, base, hf)  # kept alive while kernels may read them
         self._has_base, self._hr_basis = base is not None, (lr if base is None else base)["basis"]
         self._one_basis = self._hr_basis.data_ptr() == lr["basis"].data_ptr()
-        view = pulled.View()
+        view = raw_gradients.View()
         view.n, view.bases, view.one_basis, view.lambda_hf = self._n, self._bases, self._one_basis, lambda_hf
         view.has_base, view.has_hf, view.routed = self._has_base, hf is not None, activation["route"] is not None
-        drawn = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "route": 1}
+        inputs = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "route": 1}
         widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "rgb": 3, "basis": self._bases}
         self._gradients = (
-            self._structure("activation", pulled.Activation, activation, drawn, optional=("route",)),
-            self._structure("lr", pulled.Gradient, lr, widths),
-            pulled.Gradient() if base is None else self._structure("base", pulled.Gradient, base, widths),
-            pulled.Gradient() if hf is None else self._structure("hf", pulled.Gradient, hf, widths),
+            self._structure("activation", raw_gradients.Activation, activation, inputs, optional=("route",)),
+            self._structure("lr", raw_gradients.Gradient, lr, widths),
+            raw_gradients.Gradient() if base is None else self._structure("base", raw_gradients.Gradient, base, widths),
+            raw_gradients.Gradient() if hf is None else self._structure("hf", raw_gradients.Gradient, hf, widths),
             view,
         )
 
@@ -73,48 +73,50 @@ class GaussianPass:
             raise ValueError("there is no HR gradient to compare with.")
         if products is not None:
             self._required("products", products, (_GROUPS, self._n), torch.float64)
-        counts, norms = self._blocks(sweeps.Counts, torch.int32), self._blocks(sweeps.Norms, torch.float64)
+        counts, norms = self._blocks(passes.Counts, torch.int32), self._blocks(passes.Norms, torch.float64)
         with on_stream(self._like.device):
             self._launch_tiled(
-                sweeps.compare, *self._gradients, products is not None, array(products),
-                array(counts, sweeps.Counts), array(norms, sweeps.Norms),
+                passes.compare, *self._gradients, products is not None, array(products),
+                array(counts, passes.Counts), array(norms, passes.Norms),
             )  # fmt: skip
         (comparable, opposed), (norm_lr, norm_hr) = counts.sum(0).view(2, -1), norms.sum(0).view(2, -1)
         return Comparison(comparable, opposed, norm_lr, norm_hr)
 
-    def step(self, attributes: Mapping[str, Attribute], correction: Correction | None, step: Step) -> Stepped:
+    def step(
+        self, attributes: Mapping[str, Attribute], correction: Correction | None, settings: StepSettings
+    ) -> StepCounts:
         if self._n and correction is not None and not self._has_base:
             raise ValueError("there is no HR gradient to correct.")
         parameters = {name: self._attribute(name, attributes[name], width) for name, width in _WIDTHS.items()}
         bands = self._attribute("shN", attributes["shN"], math.prod(attributes["shN"].p.shape[1:]))
-        if step.width % 3 or not 3 * (self._bases - 1) <= step.width <= min(bands.width, 45):
+        if settings.width % 3 or not 3 * (self._bases - 1) <= settings.width <= min(bands.width, 45):
             raise ValueError(
                 "width must be a multiple of 3 between the active bands' numbers and an shN row's, got "
-                f"{step.width} beside {3 * (self._bases - 1)} and {bands.width}."
+                f"{settings.width} beside {3 * (self._bases - 1)} and {bands.width}."
             )
-        if step.visible is not None:
-            self._required("visible", step.visible, (self._n,), torch.uint8)
+        if settings.visible is not None:
+            self._required("visible", settings.visible, (self._n,), torch.uint8)
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
-        counts, omegas = self._blocks(sweeps.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
-        (rule, *numbers), adam_step = self._rule(correction), _adam(step)
+        counts, omegas = self._blocks(passes.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
+        (rule, *numbers), adam_step = self._rule(correction), _adam(settings)
         with on_stream(self._like.device):
             self._launch_tiled(
-                sweeps.step, *self._gradients, rule, *(array(x) for x in numbers), self._sweep(correction, step),
-                adam_step, *parameters.values(), bands, array(step.visible), array(colours), array(moving),
-                array(counts, sweeps.Counts), array(omegas, conflict.Six),
+                passes.step, *self._gradients, rule, *(array(x) for x in numbers), self._options(correction, settings),
+                adam_step, *parameters.values(), bands, array(settings.visible), array(colours), array(moving),
+                array(counts, passes.Counts), array(omegas, conflict.Six),
             )  # fmt: skip
             wp.launch(
-                sweeps.step_bands, (self._n, step.width), device=self._device, block_dim=self._lanes,
+                passes.step_bands, (self._n, settings.width), device=self._device, block_dim=self._lanes,
                 inputs=[
                     self._gradients[-1], array(self._like), array(self._hr_basis), array(colours),
                     array(moving), adam_step, bands,
                 ],
             )  # fmt: skip
         corrected, at_lower_bound, (still, invisible) = torch.split(counts.sum(0), [_GROUPS, _GROUPS, 2])
-        return Stepped(
+        return StepCounts(
             corrected, omegas.sum(0), at_lower_bound,
-            still if step.skips else 0, 0 if step.visible is None else invisible,
+            still if settings.skips else 0, 0 if settings.visible is None else invisible,
         )  # fmt: skip
 
     @property
@@ -126,13 +128,13 @@ class GaussianPass:
         return wp.device_from_torch(self._like.device)
 
     def _launch_tiled(self, kernel: Any, *arguments: Any) -> None:
-        """A thread per Gaussian, in blocks that add up together."""
+        """Launch a kernel with one thread per Gaussian, in blocks that sum together."""
         wp.launch_tiled(
             kernel, dim=[-(-self._n // self._lanes)], inputs=arguments, block_dim=self._lanes, device=self._device
         )
 
     def _blocks(self, row: Any, dtype: torch.dtype) -> Tensor:
-        """Room for what each block counts."""
+        """A row per block for its counts."""
         return self._like.new_empty(-(-self._n // self._lanes), len(row()), dtype=dtype)
 
     def _attribute(self, name: str, a: Attribute, width: int) -> Any:
@@ -144,14 +146,14 @@ class GaussianPass:
         out.stiffness, out.rate, out.keep, out.limit = a.stiffness, -a.rate, a.keep, a.limit
         return out
 
-    def _sweep(self, correction: Correction | None, step: Step) -> Any:
-        out = sweeps.Sweep()
-        out.lambda_hr, out.skips, out.width = step.lambda_hr, step.skips, step.width
-        out.corrects, out.chooses = correction is not None, step.visible is not None
+    def _options(self, correction: Correction | None, settings: StepSettings) -> Any:
+        out = passes.StepOptions()
+        out.lambda_hr, out.skips, out.width = settings.lambda_hr, settings.skips, settings.width
+        out.corrects, out.has_visible = correction is not None, settings.visible is not None
         return out
 
     def _rule(self, c: Correction | None) -> tuple[Any, Tensor | None, Tensor | None, Tensor | None]:
-        """The settings, and ε of the cosine, ε of the correction and q where they are read."""
+        """The settings, and ε of the cosine, ε of the correction and q as tensors."""
         rule = conflict.Rule()
         if c is None:
             return rule, None, None, None
@@ -163,7 +165,7 @@ class GaussianPass:
         )
         if not len(c.groups) == len(eps_cos) == len(eps_corr) == _GROUPS:
             raise ValueError(f"groups, eps_cos and eps_corr must have one entry for each of {_GROUPS} conflict groups.")
-        rule.judged = c.reliability is not None
+        rule.has_reliability = c.reliability is not None
         if c.reliability is not None:
             self._required("reliability", c.reliability, (self._n,), torch.float32)
         return rule, eps_cos, eps_corr, c.reliability
@@ -176,7 +178,7 @@ class GaussianPass:
         widths: Mapping[str, int],
         optional: Sequence[str] = (),
     ) -> Any:
-        """A structure of `kind` over tensors of n rows each, `widths` numbers wide."""
+        """A structure of `kind` over tensors of n rows with `widths` numbers each."""
         fields = tuple(
             (name, self._required(name, tensors[name], (self._n, width), torch.float32).data_ptr(), self._n * width)
             for name, width in widths.items()
@@ -196,8 +198,8 @@ class GaussianPass:
 
 @lru_cache(maxsize=4096)
 def _structure(owner: str, kind: Any, fields: tuple[tuple[str, int, int], ...], device: str) -> Any:
-    """Arrays (name, address, length) in a structure of their owner's, made once for as long as they stay where they are:
-    to describe a tensor to Warp takes longer than to launch a kernel. A launch copies it, with the numbers set by then.
+    """A structure of arrays given by (name, address, length), cached because describing a tensor to Warp takes longer than
+    launching a kernel. `owner` keeps structures over the same addresses apart. A launch copies the structure.
     """
     out = kind()
     for name, address, length in fields:
@@ -205,7 +207,7 @@ def _structure(owner: str, kind: Any, fields: tuple[tuple[str, int, int], ...], 
     return out
 
 
-def _adam(s: Step) -> Any:
+def _adam(s: StepSettings) -> Any:
     out = adam.AdamStep()
     out.beta1, out.beta2, out.gain1, out.gain2 = s.beta1, s.beta2, 1 - s.beta1, 1 - s.beta2
     out.per_bias2, out.eps = 1 / s.bias2, s.eps

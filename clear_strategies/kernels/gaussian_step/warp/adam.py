@@ -1,4 +1,4 @@
-"""Adam on one number; operation by operation optim.Adam, but for a division by the bias of the second moment, which is a
+"""Adam on one number. Same operations as training.optim.Adam, except that the division by the second moment's bias is a
 multiplication here.
 """
 
@@ -12,7 +12,7 @@ import warp as wp
 @wp.struct
 @no_type_check
 class AdamStep:
-    """What all attributes share."""
+    """The settings that all attributes share."""
 
     beta1: wp.float32
     beta2: wp.float32
@@ -25,27 +25,27 @@ class AdamStep:
 @wp.struct
 @no_type_check
 class Attribute:
-    """A parameter tensor with its moments, row-major, the anchor that holds it, and its limits."""
+    """A parameter tensor with its moments, row-major, its anchor and its limits."""
 
     p: wp.array[wp.float32]
     m: wp.array[wp.float32]
     v: wp.array[wp.float32]
     anchor: wp.array[wp.float32]  # θ^a
-    merged: wp.array[wp.float32]  # where the merged gradient is written instead of a step
+    merged: wp.array[wp.float32]  # receives the merged gradient; no step is taken then
     width: wp.int32
     anchored: wp.bool
     merges: wp.bool
-    bounded: wp.bool  # a row at rest may change all the same: it decays or is projected
-    stiffness: wp.float32  # of the anchor: 2 λ_stab W
+    bounded: wp.bool  # a row that takes no step may still decay or be clamped
+    stiffness: wp.float32  # 2 λ_stab W
     rate: wp.float32  # - learning rate / bias of the first moment
-    keep: wp.float32  # what decay leaves of the parameter (f_det)
+    keep: wp.float32  # factor of the decay per step (f_det), 1: none
     limit: wp.float32
 
 
 @wp.func
 @no_type_check
 def step_number(adam: AdamStep, a: Attribute, at: wp.int32, gradient: wp.float32, moves: wp.bool) -> None:
-    """Decay, step and projection of one number; one that does not move only decays and is projected."""
+    """Decay, step and clamp one number; with `moves` False only decay and clamp it."""
     if not (moves or a.bounded):
         return
     p = a.p[at]
@@ -62,7 +62,7 @@ def step_number(adam: AdamStep, a: Attribute, at: wp.int32, gradient: wp.float32
         a.m[at] = m
         a.v[at] = v
         after += m * a.rate / (wp.sqrt(v * adam.per_bias2) + adam.eps)
-    if after > a.limit:  # a NaN is above nothing, and stays
+    if after > a.limit:  # False for NaN, which stays
         after = a.limit
     elif after < -a.limit:
         after = -a.limit
@@ -72,7 +72,7 @@ def step_number(adam: AdamStep, a: Attribute, at: wp.int32, gradient: wp.float32
 @wp.func
 @no_type_check
 def is_still(a: Attribute, i: wp.int32, width: wp.int32) -> wp.bool:
-    """Whether nothing would move a row whose gradient is 0: no momentum, no pull of the anchor."""
+    """Whether a row with gradient 0 would stay as it is: both moments are 0, and it equals its anchor."""
     for at in range(a.width * i, a.width * i + width):
         if a.m[at] != 0.0 or a.v[at] != 0.0:
             return False

@@ -1,7 +1,7 @@
-"""Where do LR and HR gradients disagree, and what becomes of the HR one? Decisions in float64: no product of two floats
-over- or underflows there.  Eq. 6, 7, 11
+"""The conflict between LR and HR gradients by group, and the correction of the HR gradient (Eq. 6, 7, 11).
 
-Groups are numbered as in gradients.CONFLICT_GROUPS; as a seventh, the Gaussian as a whole.
+Decisions are made in float64, where no product of two floats over- or underflows. Groups are numbered as in
+core.gradients.CONFLICT_GROUPS, and the whole Gaussian is a seventh.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import Any, Final, no_type_check
 
 import warp as wp
 
-from clear_strategies.kernels.gaussian_step.warp.pulled import Gradient, Pulled, View, basis_products
+from clear_strategies.kernels.gaussian_step.warp.raw_gradients import Gradient, RawGradient, View, basis_products
 
 GROUPS: Final = wp.constant(6)
 MEANS: Final = wp.constant(0)
@@ -28,7 +28,7 @@ Seven: Final[Any] = wp.types.vector(length=7, dtype=wp.float64)
 @wp.struct
 @no_type_check
 class Products:
-    """⟨l, h⟩, ‖l‖², ‖h‖² by group, and of the Gaussian as a whole."""
+    """⟨l, h⟩, ‖l‖², ‖h‖² by group and of the whole Gaussian."""
 
     dot: Seven
     l2: Seven
@@ -38,23 +38,25 @@ class Products:
 @wp.struct
 @no_type_check
 class Rule:
-    """GCO's settings; ε is read from device memory, where it was computed from what has been compared."""
+    """GCO's settings without ε, which is read from device memory because it may depend on the comparison."""
 
     groups: wp.int32  # bit k: group k is corrected
     tolerance: wp.float64
     weight_min: wp.float64
     weight_max: wp.float64
-    rotation_noise: wp.float64  # ‖g_quats‖ at or below this times ‖g_scales‖ is rounding
-    bounds_hold_omega: wp.bool  # else they hold the coefficient
-    judged: wp.bool  # a reliability is given, else q = 0
+    rotation_noise: wp.float64  # a ‖g_quats‖ up to this times ‖g_scales‖ counts as rounding
+    bounds_hold_omega: wp.bool  # weight_min and weight_max bound ω, else the coefficient
+    has_reliability: wp.bool  # else q = 0
 
 
 @wp.struct
 @no_type_check
 class Corrected:
-    """By group: of which multiple of g_LR the HR gradient is freed, and ω; bit k: group k is, and with ω at its lower bound."""
+    """By group, the multiple of g_LR that is subtracted from the HR gradient, and ω. Bit k of `rows` and `at_lower_bound`:
+    group k is corrected, and its ω is at the lower bound.
+    """
 
-    step: Six
+    multiple: Six
     omega: Six
     rows: wp.int32
     at_lower_bound: wp.int32
@@ -76,7 +78,9 @@ def products4(low: wp.vec4, high: wp.vec4) -> wp.vec3d:
 
 @wp.func
 @no_type_check
-def group_products(low: Pulled, high: Pulled, lr: Gradient, base: Gradient, view: View, i: wp.int32) -> Products:
+def group_products(
+    low: RawGradient, high: RawGradient, lr: Gradient, base: Gradient, view: View, i: wp.int32
+) -> Products:
     a, b = wp.float64(low.opacity), wp.float64(high.opacity)
     means, sh0, scales = (
         products3(low.means, high.means),
@@ -96,7 +100,7 @@ def group_products(low: Pulled, high: Pulled, lr: Gradient, base: Gradient, view
 @wp.func
 @no_type_check
 def turns_something(p: Products, rotation_noise: wp.float64) -> wp.bool:
-    """A Gaussian with equal axes does not change when it is turned: its rotation gradient is noise."""
+    """Whether the rotation gradient is not noise: a Gaussian with equal axes does not change under rotation."""
     noise2 = rotation_noise * rotation_noise
     return p.l2[QUATS] > noise2 * p.l2[SCALES] and p.h2[QUATS] > noise2 * p.h2[SCALES]
 
@@ -111,32 +115,32 @@ def correct(
     reliability: wp.array[wp.float32],
     i: wp.int32,
 ) -> Corrected:
-    """Eq. 6, 7, 11"""
-    step, omegas, rows, at_bound = Six(), Six(), wp.int32(0), wp.int32(0)
+    """The corrections of a Gaussian by group (Eq. 6, 7, 11)."""
+    multiple, omegas, rows, at_bound = Six(), Six(), wp.int32(0), wp.int32(0)
     one, tolerance, q = wp.float64(1.0), rule.tolerance, wp.float64(0.0)
-    if rule.judged:
+    if rule.has_reliability:
         q = wp.float64(reliability[i])
     for k in range(GROUPS):
         apart = ((rule.groups >> k) & 1) == 1 and p.dot[k] < wp.float64(0.0)
         if k == QUATS:
             apart = apart and turns_something(p, rule.rotation_noise)
         if apart:
-            n = wp.sqrt(p.l2[k] * p.h2[k])  # ‖low‖‖high‖; squares of floats leave room for a product
+            n = wp.sqrt(p.l2[k] * p.h2[k])  # ‖low‖‖high‖; a product of four floats fits a float64
             cosine = p.dot[k] / wp.max(n + eps_cos[k], SMALLEST)  # Eq. 6
             if n > wp.float64(0.0) and cosine < -tolerance:
                 omega = wp.clamp((-cosine - tolerance) / (one - tolerance), wp.float64(0.0), one) * (one - q)  # Eq. 11
                 coefficient = (p.dot[k] + tolerance * n) / (p.l2[k] + eps_corr[k])
                 if rule.bounds_hold_omega:
                     omega = wp.clamp(omega, rule.weight_min, rule.weight_max)
-                    step[k] = omega * coefficient
+                    multiple[k] = omega * coefficient
                 else:
-                    step[k] = -wp.clamp(wp.abs(omega * coefficient), rule.weight_min, rule.weight_max)
+                    multiple[k] = -wp.clamp(wp.abs(omega * coefficient), rule.weight_min, rule.weight_max)
                 omegas[k] = omega
                 rows |= 1 << k
                 if omega <= rule.weight_min:
                     at_bound |= 1 << k
     out = Corrected()
-    out.step = step
+    out.multiple = multiple
     out.omega = omegas
     out.rows = rows
     out.at_lower_bound = at_bound
@@ -145,31 +149,31 @@ def correct(
 
 @wp.func
 @no_type_check
-def corrected3(high: wp.vec3, low: wp.vec3, step: wp.float64) -> wp.vec3:
-    """ĝ_HR = g_HR - step · g_LR; with step 0 it is handed back bit for bit.  Eq. 7"""
-    if step == wp.float64(0.0):
+def corrected3(high: wp.vec3, low: wp.vec3, multiple: wp.float64) -> wp.vec3:
+    """ĝ_HR = g_HR - multiple · g_LR (Eq. 7); with multiple 0 it keeps its bits."""
+    if multiple == wp.float64(0.0):
         return high
-    return wp.vec3(wp.vec3d(high) - wp.vec3d(low) * step)
+    return wp.vec3(wp.vec3d(high) - wp.vec3d(low) * multiple)
 
 
 @wp.func
 @no_type_check
-def merged3(low: wp.vec3, high: wp.vec3, step: wp.float64, weight: wp.float32) -> wp.vec3:
-    """The sum g_LR + λ ĝ_HR.  Eq. 8"""
-    return low + corrected3(high, low, step) * weight
+def merged3(low: wp.vec3, high: wp.vec3, multiple: wp.float64, weight: wp.float32) -> wp.vec3:
+    """The sum g_LR + λ ĝ_HR (Eq. 8)."""
+    return low + corrected3(high, low, multiple) * weight
 
 
 @wp.func
 @no_type_check
-def merged4(low: wp.vec4, high: wp.vec4, step: wp.float64, weight: wp.float32) -> wp.vec4:
-    if step == wp.float64(0.0):
+def merged4(low: wp.vec4, high: wp.vec4, multiple: wp.float64, weight: wp.float32) -> wp.vec4:
+    if multiple == wp.float64(0.0):
         return low + high * weight
-    return low + wp.vec4(wp.vec4d(high) - wp.vec4d(low) * step) * weight
+    return low + wp.vec4(wp.vec4d(high) - wp.vec4d(low) * multiple) * weight
 
 
 @wp.func
 @no_type_check
-def merged1(low: wp.float32, high: wp.float32, step: wp.float64, weight: wp.float32) -> wp.float32:
-    if step == wp.float64(0.0):
+def merged1(low: wp.float32, high: wp.float32, multiple: wp.float64, weight: wp.float32) -> wp.float32:
+    if multiple == wp.float64(0.0):
         return low + high * weight
-    return low + wp.float32(wp.float64(high) - wp.float64(low) * step) * weight
+    return low + wp.float32(wp.float64(high) - wp.float64(low) * multiple) * weight

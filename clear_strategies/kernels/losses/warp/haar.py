@@ -1,8 +1,7 @@
-"""What runs on the device for Haar-L1: the details of every block of 2 x 2 pixels, and their signs' way back.
+"""The kernels of the Haar loss: the details of every block of 2 x 2 pixels, and their gradient.
 
-A level turns a block (a b; c d) of x - y into its low part (a+b+c+d)/2, which the next level goes on with, and three
-details: (a-b+c-d)/2, (a+b-c-d)/2, (a-b-c+d)/2. An odd last row or column is repeated; the pixel that stood in for its
-neighbour then receives the gradient of both.
+A level turns a block (a b; c d) of x - y into its low part (a+b+c+d)/2, the input of the next level, and three details:
+(a-b+c-d)/2, (a+b-c-d)/2, (a-b-c+d)/2. An odd last row or column is repeated; the repeated pixel receives both gradients.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 @no_type_check
 def pixel(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, row: wp.int32, column: wp.int32) -> wp.vec3:
-    """Of x - y at the first level, of x, a low part, at the others; the last one stands in for those beyond it."""
+    """A pixel of x - y at the first level, and of the low part x at the others; beyond the edge the last one is repeated."""
     i, j = wp.min(row, x.shape[0] - 1), wp.min(column, x.shape[1] - 1)
     if first:
         return x[i, j] - y[i, j]
@@ -42,7 +41,7 @@ def magnitude(v: wp.vec3) -> wp.float32:
 @wp.kernel
 @no_type_check
 def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, low: wp.array2d[wp.vec3]) -> None:
-    """A thread per block."""
+    """One thread per block."""
     i, j = wp.tid()
     a, b = pixel(x, y, first, 2 * i, 2 * j), pixel(x, y, first, 2 * i, 2 * j + 1)
     c, d = pixel(x, y, first, 2 * i + 1, 2 * j), pixel(x, y, first, 2 * i + 1, 2 * j + 1)
@@ -52,9 +51,9 @@ def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, low
 @cache
 @no_type_check
 def details(lanes: int) -> Any:
-    """The kernel, with `lanes` threads for each row of blocks, of weight · Σ |details| + <above, low part>.
+    """The kernel for weight · Σ |details| + <above, low part>, with `lanes` threads per row of blocks.
 
-    It writes the gradient, and the row's part of the first sum. There is no `above` at the last level.
+    It writes the gradient, and the row's part of the first sum. The last level has no `above`.
     """
 
     @wp.kernel(module="unique", enable_backward=False)

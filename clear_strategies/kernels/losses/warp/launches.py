@@ -1,4 +1,4 @@
-"""The order of the kernels, and the memory between them. What they write goes to `images.gradient`; the loss is returned."""
+"""Launches the kernels in order, and allocates the memory between them. Gradients are written to `images.gradient`."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import warp as wp
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.kernels.losses.prepared import Prepared
+from clear_strategies.kernels.losses.images import ImagePair
 from clear_strategies.kernels.losses.warp import haar, similarity, sums
-from rasterizers.warp_backend.launch import array, on_stream
+from rasterizers.warp_runtime import array, on_stream
 
-_LANES: Final = {"cuda": 256, "cpu": 1}  # threads a block; on a CPU Warp's blocks have one
+LANES: Final = {"cuda": 256, "cpu": 1}  # threads per block; on a CPU, Warp's blocks have one
 
 
-def photometric(images: Prepared, l1: float, dssim: float, start: float = 0.0) -> Float[Tensor, ""]:
-    """The value l1 · mean |x - y| + dssim · (1 - SSIM) + start; without weight on SSIM none is computed."""
+def photometric(images: ImagePair, l1: float, dssim: float, start: float = 0.0) -> Float[Tensor, ""]:
+    """The value l1 · mean |x - y| + dssim · (1 - SSIM) + start; with dssim = 0 no SSIM is computed."""
     x, y, out = (image.flatten(1) for image in images)
     height, width = x.shape
     l1_share, dssim_share = l1 / x.numel(), dssim / x.numel()
@@ -37,11 +37,11 @@ def photometric(images: Prepared, l1: float, dssim: float, start: float = 0.0) -
         return _total(parts, start)
 
 
-def haar_l1(images: Prepared, levels: int) -> Float[Tensor, ""]:
-    """Mean |detail| of each level, averaged over the levels."""
+def haar_l1(images: ImagePair, levels: int) -> Float[Tensor, ""]:
+    """The mean |detail| of each level, averaged over the levels."""
     x, y, out = images
     with on_stream(x.device):
-        pyramid = [x]  # what each level takes apart; at the first it is x - y
+        pyramid = [x]  # the input of each level; the first one is x - y
         for _ in range(levels - 1):
             finer = pyramid[-1]
             low = finer.new_empty(-(-finer.shape[0] // 2), -(-finer.shape[1] // 2), 3)
@@ -74,6 +74,6 @@ def _total(parts: Tensor, start: float) -> Float[Tensor, ""]:
 
 
 def _launch(kernel: Any, blocks: Sequence[int], device: torch.device, *arguments: Any) -> None:
-    """`kernel` is made for a number of threads a block; the arguments are the kernel's."""
-    lanes = _LANES[device.type]
+    """Launch a kernel; `kernel` makes it for a number of threads per block."""
+    lanes = LANES[device.type]
     wp.launch_tiled(kernel(lanes), dim=blocks, block_dim=lanes, inputs=arguments, device=wp.device_from_torch(device))

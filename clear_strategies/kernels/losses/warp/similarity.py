@@ -1,21 +1,21 @@
-"""What runs on the device for SSIM (11 x 11 Gaussian window of σ = 1.5, zero padding): its maps, and the gradient.
+"""The kernels of SSIM (11 x 11 Gaussian window, σ = 1.5, zero padding): its maps, and the gradient.
 
-In the sum s = x + y and the difference d = y - x of the images the formula falls into two factors,
+With the sum s = x + y and the difference d = y - x of the images, SSIM factorises:
 
     SSIM = (1 - u)(1 - n),   u = μd² / B1,  B1 = (μs² + μd²)/2 + C1,   n = σd² / B2,  B2 = (σs² + σd²)/2 + C2,
 
-and with a window w around q the gradient at a pixel p is
+With a window w around q, the gradient at a pixel p is
 
     ∂Σ SSIM / ∂x_p = Σ_q w(p-q) [a(q) + b(q) (s_p - μs(q)) + c(q) (d_p - μd(q))],
     a = (1-n) (2μd + u (μs - μd)) / B1,   b = (1-u) n / B2,   c = (1-u) (2-n) / B2.
 
-Windows are separable: down the columns first, then along the rows; and every sum is taken about a value from within its
-window, or flat regions would lose their variance (STRESS row 8). Both are as in `kernels/src/ssim.hpp`.
+Windows are separable: columns first, then rows. Every sum is taken about a value inside its window, because flat regions
+would otherwise lose their variance. `kernels/src/ssim.hpp` does the same.
 
-Pixels are interleaved: a row is W · 3 numbers, and a neighbour is three further on. A block of threads owns `ROWS` rows of
-`WIDTH` numbers, those that its windows reach on either side included, a thread a column: it goes down the column with the
-block's rows in registers, leaves the sums where the other threads see them (shared memory), and goes on along the rows.
-On a CPU, where Warp's blocks have one thread, that thread takes the columns in turn.
+Channels are interleaved: a row is W · 3 numbers, and a neighbour is three numbers away. A block of threads has `ROWS` rows of
+`WIDTH` numbers, including those that its windows reach on either side, and a thread per column: the thread sums down the
+column with the block's rows in registers, writes the sums to shared memory, and continues along the rows. On a CPU, where
+Warp's blocks have one thread, this thread processes all columns.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ wp.set_module_options({"enable_backward": False})
 
 REACH: Final = 5
 TAPS: Final = 2 * REACH + 1
-ROWS: Final = 6  # with what the window reaches above and below 16, the longest loop that Warp unrolls
+ROWS: Final = 6  # SPAN is then 16, the longest loop that Warp unrolls
 SPAN: Final = ROWS + TAPS - 1
 WIDTH: Final = 256
 HALO: Final = 3 * REACH
 STRIDE: Final = WIDTH - 2 * HALO
-"""Numbers of a row that a block answers for; the rest is what their windows reach."""
+"""Numbers of a row that a block computes; the rest of `WIDTH` is what their windows reach."""
 MAPS: Final = 5
-"""For each number: μs, μd, a, b and c."""
+"""The maps are μs, μd, a, b and c."""
 
 Rows: Final[Any] = wp.types.vector(length=ROWS, dtype=wp.float32)
 WINDOW: Final = wp.constant(wp.types.vector(length=TAPS, dtype=wp.float32)(*gaussian_window()))
@@ -48,7 +48,7 @@ SHARES: Final = wp.constant(
         *(gaussian_window()[k - r] if 0 <= k - r < TAPS else 0.0 for k in range(SPAN) for r in range(ROWS))
     )
 )
-"""Weights of the k-th row that a block reads in the windows around each of its rows."""
+"""The weights of the k-th row that a block reads, in the windows around each of the block's rows."""
 C1: Final = wp.constant(0.01**2)
 C2: Final = wp.constant(0.03**2)
 
@@ -56,7 +56,7 @@ C2: Final = wp.constant(0.03**2)
 @wp.func
 @no_type_check
 def pair_at(x: wp.array2d[wp.float32], y: wp.array2d[wp.float32], row: wp.int32, column: wp.int32) -> wp.vec2:
-    """The sum s and the difference d, 0 beyond the image. It reads in any case: loads that wait for no condition overlap."""
+    """The sum s and the difference d, 0 beyond the image. Always loads, because unconditional loads overlap."""
     i, j = wp.clamp(row, 0, x.shape[0] - 1), wp.clamp(column, 0, x.shape[1] - 1)
     pair = wp.vec2(x[i, j] + y[i, j], y[i, j] - x[i, j])
     return wp.where(i == row and j == column, pair, wp.vec2(0.0, 0.0))
@@ -65,7 +65,7 @@ def pair_at(x: wp.array2d[wp.float32], y: wp.array2d[wp.float32], row: wp.int32,
 @wp.func
 @no_type_check
 def map_at(maps: wp.array3d[wp.float32], nth: wp.int32, row: wp.int32, column: wp.int32) -> wp.float32:
-    """Beyond the image 0: nothing is passed on from there."""
+    """A value of a map, 0 beyond the image."""
     i, j = wp.clamp(row, 0, maps.shape[1] - 1), wp.clamp(column, 0, maps.shape[2] - 1)
     return wp.where(i == row and j == column, maps[nth, i, j], 0.0)
 
@@ -79,7 +79,7 @@ def blocks_across(width: wp.int32) -> wp.int32:
 @cache
 @no_type_check
 def similarity(lanes: int) -> Any:
-    """The kernel, with `lanes` threads a block, that makes the maps; a block's part is weight · Σ (1 - SSIM)."""
+    """The kernel that computes the maps, with `lanes` threads per block; a block's part is weight · Σ (1 - SSIM)."""
     turns = WIDTH // lanes
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -148,7 +148,7 @@ def similarity(lanes: int) -> Any:
 @cache
 @no_type_check
 def gradient(lanes: int) -> Any:
-    """The kernel, with `lanes` threads a block, that takes the maps back to x, and L1's signs; a block adds to its part."""
+    """The kernel of the gradient of SSIM and L1, with `lanes` threads per block; a block adds L1 to its part."""
     turns = WIDTH // lanes
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -203,7 +203,7 @@ def gradient(lanes: int) -> Any:
         total *= l1_weight
         part = group * blocks_across(width) + across
         if lane == 0:
-            total += parts[part]  # what `similarity` left
+            total += parts[part]  # written by `similarity`
         wp.tile_store(parts, wp.tile_sum(wp.tile(total)), offset=(part,))
 
     return gradient

@@ -1,6 +1,6 @@
-"""What runs on the device for L1, and for every loss: the sign that is 0 at 0, and the sum of what blocks have summed.
+"""The kernel of L1, and what all losses share: the sign function, and the sum over blocks.
 
-A block leaves its share of a loss in `parts`, in float64; one block then adds them up. So every sum has one order.
+Every block writes its part of the loss to `parts`, in float64, and one block then adds them up: sums have a fixed order.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 @no_type_check
 def sign(x: wp.float32) -> wp.float32:
-    """Of NaN it is 0, too."""
+    """-1, 0 or 1; 0 for NaN."""
     return wp.where(x > 0.0, 1.0, 0.0) - wp.where(x < 0.0, 1.0, 0.0)
 
 
 @cache
 @no_type_check
 def absolute(lanes: int) -> Any:
-    """The kernel of L1, with a block of `lanes` threads a row: step · sign(x - y), and the part weight · Σ |x - y|."""
+    """The kernel of L1, with `lanes` threads per row: writes step · sign(x - y), and the part weight · Σ |x - y|."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def absolute(
@@ -48,7 +48,7 @@ def absolute(lanes: int) -> Any:
 @cache
 @no_type_check
 def total(lanes: int) -> Any:
-    """The kernel, of one block of `lanes` threads, that writes start + Σ parts in float32."""
+    """The kernel that writes start + Σ parts in float32, with one block of `lanes` threads."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def total(parts: wp.array[wp.float64], start: wp.float64, value: wp.array[wp.float32]) -> None:

@@ -1,4 +1,4 @@
-"""The public shape of an Inria-style renderer, drawn on a CPU."""
+"""A renderer with the interface of 3DGS, on a CPU."""
 
 import torch
 
@@ -8,7 +8,7 @@ RASTERIZER = load("torch", near=0.01, kernel=0.3, antialiased=False)
 
 
 class _InNdc(torch.autograd.Function):
-    """Projected centres whose gradient arrives, in NDC, at a dummy of zeros."""
+    """Zero offsets of the projected centres; their gradient goes to a tensor of zeros, in NDC."""
 
     @staticmethod
     def forward(ctx, dummy, width, height):
@@ -19,7 +19,7 @@ class _InNdc(torch.autograd.Function):
     def backward(ctx, g):
         ndc = torch.zeros(len(g), ctx.columns, dtype=g.dtype)
         ndc[:, :2] = g * g.new_tensor(ctx.size) / 2
-        if ctx.columns == 4:  # forks that keep absolute gradients
+        if ctx.columns == 4:  # some forks keep absolute gradients here
             ndc[:, 2:] = 3 * ndc[:, :2].abs()
         return ndc, None, None
 

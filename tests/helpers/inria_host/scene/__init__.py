@@ -1,4 +1,4 @@
-"""The public shape of an Inria-style scene: cameras with their photographs, and the Gaussians."""
+"""A scene with the interface of 3DGS: cameras with their photos, and the Gaussians."""
 
 import json
 import math
@@ -44,7 +44,7 @@ class Scene:
 
 
 def write(folder, scene):
-    """A folder with LR photographs in images/ and SR pictures in sr/."""
+    """Write LR photos to images/ and SR images to sr/."""
     cameras = {}
     for view in scene.train:
         c = view.lr.camera

@@ -1,4 +1,4 @@
-"""The public shape of an Inria-style GaussianModel: one Adam with named groups, parameters replaced when rows change."""
+"""A GaussianModel with the interface of 3DGS: one Adam with named groups; a changed structure replaces the parameters."""
 
 import torch
 from safetensors.torch import save_file
@@ -22,7 +22,7 @@ class GaussianModel:
         tensors = (raw["means"], raw["sh0"], raw["shN"], raw["opacities"][:, None], raw["scales"], raw["quats"])
         for attribute, tensor in zip(GROUPS.values(), tensors, strict=True):
             setattr(self, attribute, torch.nn.Parameter(tensor.clone()))
-        self._forget()
+        self._reset_statistics()
 
     def training_setup(self, opt):
         rates = {
@@ -84,7 +84,7 @@ class GaussianModel:
         self.cat_tensors_to_optimizer(
             dict(zip(GROUPS, (xyz, features_dc, features_rest, opacities, scaling, rotation), strict=True))
         )
-        self._forget()
+        self._reset_statistics()
 
     def cat_tensors_to_optimizer(self, new):
         self._replace(lambda name, rows, fresh: torch.cat((rows, torch.zeros_like(new[name]) if fresh else new[name])))
@@ -114,9 +114,9 @@ class GaussianModel:
         self._opacity = group["params"][0] = torch.nn.Parameter(self._opacity.detach().clamp_max(limit))
 
     def save_ply(self, path):
-        """In this stand-in: the raw tensors, by name."""
+        """Writes the raw tensors by name."""
         save_file({name: getattr(self, a).detach().contiguous() for name, a in GROUPS.items()}, path)
 
-    def _forget(self):
+    def _reset_statistics(self):
         self.xyz_gradient_accum = torch.zeros(len(self._xyz), 1)
         self.denom = torch.zeros(len(self._xyz), 1)

@@ -1,1 +1,1 @@
-"""The public shape of gaussian-splatting-lightning, as far as a density controller meets it; without lightning, on a CPU."""
+"""A stand-in for gaussian-splatting-lightning: the classes that a density controller uses, without lightning, on a CPU."""

@@ -1,4 +1,4 @@
-"""The module with its model, renderer and cameras; and the little of a lightning Trainer that calls it."""
+"""The module with its model, renderer and cameras, and the calls of a lightning Trainer."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -15,7 +15,7 @@ RASTERIZER = load("torch", near=0.01, kernel=0.3, antialiased=False)
 
 @dataclass
 class Camera:
-    """Every field a tensor; world_to_camera for row vectors."""
+    """All fields are tensors; world_to_camera is for row vectors."""
 
     fx: torch.Tensor
     fy: torch.Tensor
@@ -57,7 +57,7 @@ class VanillaGaussianModel(torch.nn.Module):
 
 
 class Renderer(torch.nn.Module):
-    """Centres in pixels, as gsplat's, or in NDC behind a dummy of zeros."""
+    """Keeps centres in pixels, like the host's gsplat renderers, or in NDC, like 3DGS."""
 
     def __init__(self, pixels=True):
         super().__init__()
@@ -103,14 +103,14 @@ class GaussianSplatting(torch.nn.Module):
         for optimizer in self.gaussian_optimizers:
             optimizer.zero_grad(set_to_none=True)
         outputs = self(camera)
-        told = (outputs, batch, self.gaussian_model, self.gaussian_optimizers, global_step, self)
-        self.density_controller.before_backward(*told)
+        arguments = (outputs, batch, self.gaussian_model, self.gaussian_optimizers, global_step, self)
+        self.density_controller.before_backward(*arguments)
         image = outputs["render"].permute(1, 2, 0)
         loss = losses.photometric(image.detach(), gt_image.permute(1, 2, 0), 0.2, kernels="torch")
         (image * loss.gradient).sum().backward()
         self.grads = {k: p.grad for k, p in self.gaussian_model.gaussians.items()}
         self.points = outputs["viewspace_points"]
-        self.density_controller.after_backward(*told)
+        self.density_controller.after_backward(*arguments)
         for optimizer in self.gaussian_optimizers:
             optimizer.step()
 
@@ -118,16 +118,16 @@ class GaussianSplatting(torch.nn.Module):
         self.saved.append(self.gaussian_model.gaussians["shs_dc"].detach().clone())
 
 
-def fit(module, photos, steps):
-    """What a Trainer does: setup, optimizers, and a batch after the other; photos: (name, camera, image) each."""
+def fit(module, photos, steps, start=0, mask=None):
+    """Setup, optimizers and one batch per step, from step `start`; each photo is (name, camera, image)."""
     outputs = SimpleNamespace(train_set=SimpleNamespace(image_names=[name for name, _, _ in photos]))
     datamodule = SimpleNamespace(dataparser_outputs=outputs)
-    module.trainer = SimpleNamespace(global_step=0, max_steps=steps, datamodule=datamodule)
+    module.trainer = SimpleNamespace(global_step=start, max_steps=steps, datamodule=datamodule)
     module.density_controller.setup("fit", module)
     module.gaussian_optimizers = module.gaussian_model.training_setup()
     while module.trainer.global_step < steps:
         name, camera, image = photos[module.trainer.global_step % len(photos)]
-        module.training_step((camera, (name, image, None), None), 0)
+        module.training_step((camera, (name, image, mask), None), 0)
         module.trainer.global_step += 1
         for hook in module.on_train_batch_end_hooks:
             hook(None, None, module.gaussian_model, module.trainer.global_step, module)

@@ -1,1 +1,1 @@
-"""Density controllers: a dataclass of settings that makes a module with hooks around backward."""
+"""Density controllers: each is a dataclass of settings that builds a module with hooks around backward."""

@@ -1,4 +1,4 @@
-"""Clones what moves on the screen and prunes what is transparent, by replacing the parameters of all optimizers."""
+"""Clones Gaussians with large screen gradients and prunes transparent ones; replaces the parameters of all optimizers."""
 
 from dataclasses import dataclass
 
@@ -20,9 +20,9 @@ class VanillaDensityController(DensityController):
 
 class VanillaDensityControllerImpl(DensityControllerImpl):
     def setup(self, stage, pl_module):
-        self.forget(pl_module.gaussian_model.n_gaussians)
+        self.reset_statistics(pl_module.gaussian_model.n_gaussians)
 
-    def forget(self, n):
+    def reset_statistics(self, n):
         self.register_buffer("xyz_gradient_accum", torch.zeros(n), persistent=True)
         self.register_buffer("denom", torch.zeros(n), persistent=True)
 
@@ -33,10 +33,10 @@ class VanillaDensityControllerImpl(DensityControllerImpl):
     def after_backward(self, outputs, batch, gaussian_model, optimizers, global_step, pl_module):
         if global_step >= self.config.densify_until_iter:
             return
-        seen = outputs["visibility_filter"]
+        visible = outputs["visibility_filter"]
         gradient = outputs["viewspace_points"].grad[:, :2] * outputs.get("viewspace_points_grad_scale", 1)
-        self.xyz_gradient_accum[seen] += gradient[seen].norm(dim=-1)
-        self.denom[seen] += 1
+        self.xyz_gradient_accum[visible] += gradient[visible].norm(dim=-1)
+        self.denom[visible] += 1
         if global_step > self.config.densify_from_iter and global_step % self.config.densification_interval == 0:
             mean = (self.xyz_gradient_accum / self.denom).nan_to_num(0)
             kept = gaussian_model.get_opacities()[:, 0] > 0.005
@@ -53,4 +53,4 @@ class VanillaDensityControllerImpl(DensityControllerImpl):
                             state[name][old:] = 0
                     optimizer.state[after] = state
                     gaussian_model.gaussians[group["name"]] = after
-            self.forget(len(rows))
+            self.reset_statistics(len(rows))

@@ -1,0 +1,60 @@
+"""Contenders take turns, so that other work on the machine slows all of them alike.
+
+On a CPU times are wall-clock. On CUDA they are taken between events on torch's current stream
+(`WorkLog`), and the device is synchronized only between turns: a stage then costs what it costs in
+a training loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import pandas as pd
+import torch
+from tqdm import tqdm
+
+from clear_strategies.core.work_log import WorkLog
+
+Contender = Callable[[], Mapping[str, float]]
+"""Runs all its stages once and returns the milliseconds of each."""
+
+WARM_UPS: Final = {"cpu": 1, "cuda": 3}
+"""Rounds that do not count: kernels are compiled, buffers grow and clocks rise in them."""
+
+
+def milliseconds(work_log: WorkLog) -> dict[str, float]:
+    """The time of each stage."""
+    return {name: 1e3 * entry.seconds for name, entry in work_log.entries.items()}
+
+
+def one_stage(name: str, device: torch.device | str, run: Callable[[], object]) -> Contender:
+    """A contender with a single stage."""
+
+    def turn() -> dict[str, float]:
+        work_log = WorkLog(device)
+        with work_log.stage(name):
+            run()
+        return milliseconds(work_log)
+
+    return turn
+
+
+def interleaved(
+    contenders: Mapping[str, Contender], repeats: int, *, device: str = "cpu", label: str = ""
+) -> pd.DataFrame:
+    """Time the contenders round robin; one row for each stage of each turn."""
+    rows, warm_ups = [], WARM_UPS[device]
+    with tqdm(total=len(contenders) * (warm_ups + repeats), desc=label, unit="turn", leave=False) as progress:
+        for turn in range(-warm_ups, repeats):
+            for name, contender in contenders.items():
+                ms = contender()
+                progress.update()
+                if turn >= 0:
+                    rows += [{"contender": name, "turn": turn, "stage": s, "ms": value} for s, value in ms.items()]
+    return pd.DataFrame(rows, columns=["contender", "turn", "stage", "ms"])
+
+
+def medians(turns: pd.DataFrame) -> pd.DataFrame:
+    """Median milliseconds: one row per contender, one column per stage."""
+    return turns.pivot_table("ms", "contender", "stage", aggfunc="median", sort=False)

@@ -1,0 +1,206 @@
+"""The kernels of the two passes: `compare` counts conflicts; `step` merges, corrects, adds the anchor's gradient and applies
+Adam, and `step_bands` does this for the rows of shN.
+
+`compare` and `step` use one thread per Gaussian. `step_bands` uses one per number, because shN has three quarters of all
+numbers and neighbouring threads then access neighbouring memory. `step` passes it a table of colours: the merged gradient
+of shN is Y ⊗ colour.
+
+Products and sums round as in torch (no contraction), so that the step makes the same decisions as the readable path.
+Blocks sum their counts, and torch sums over the blocks: every sum has a fixed order.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, no_type_check
+
+import warp as wp
+
+from clear_strategies.kernels.gaussian_step.warp.adam import AdamStep, Attribute, is_still, step_number
+from clear_strategies.kernels.gaussian_step.warp.conflict import (
+    GROUPS,
+    MEANS,
+    OPACITIES,
+    QUATS,
+    SCALES,
+    SH0,
+    SHN,
+    Corrected,
+    Rule,
+    Six,
+    correct,
+    corrected3,
+    group_products,
+    merged1,
+    merged3,
+    merged4,
+)
+from clear_strategies.kernels.gaussian_step.warp.raw_gradients import Activation, Gradient, View, load, route_of, size
+
+wp.set_module_options({"enable_backward": False, "fuse_fp": False})
+
+Counts: Final[Any] = wp.types.vector(length=14, dtype=wp.int32)
+"""For `compare`: comparable and opposed Gaussians, [7] each. For `step`: rows corrected, and with ω at its lower bound, [6]
+each; then still and invisible rows.
+"""
+Norms: Final[Any] = wp.types.vector(length=12, dtype=wp.float64)
+"""Σ ‖l‖ and Σ ‖h‖ [6] each."""
+
+
+@wp.struct
+@no_type_check
+class StepOptions:
+    """The settings of a step other than Adam's."""
+
+    lambda_hr: wp.float32
+    corrects: wp.bool
+    skips: wp.bool  # skip rows that would not change
+    has_visible: wp.bool  # only visible rows may step
+    width: wp.int32  # numbers of an shN row that are stepped
+
+
+@wp.kernel
+@no_type_check
+def compare(
+    activation: Activation,
+    lr: Gradient,
+    base: Gradient,
+    hf: Gradient,
+    view: View,
+    has_products: wp.bool,
+    norm_products: wp.array2d[wp.float64],
+    counts: wp.array[Counts],
+    norms: wp.array[Norms],
+) -> None:
+    """One thread per Gaussian: whether its gradients are comparable and opposed, and their norms."""
+    block, lane = wp.tid()
+    i = block * wp.block_dim() + lane
+    found, lengths = Counts(), Norms()
+    if i < view.n:
+        g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
+        p = group_products(g_lr, g_hr, lr, base, view, i)
+        for k in range(GROUPS + 1):
+            comparable = p.l2[k] > wp.float64(0.0) and p.h2[k] > wp.float64(0.0)
+            if comparable:
+                found[k] = 1
+                if p.dot[k] < wp.float64(0.0):
+                    found[GROUPS + 1 + k] = 1
+            if k < GROUPS:
+                norm_l, norm_h = wp.sqrt(p.l2[k]), wp.sqrt(p.h2[k])
+                if comparable:
+                    lengths[k] = norm_l
+                    lengths[GROUPS + k] = norm_h
+                if has_products:
+                    norm_products[k, i] = norm_l * norm_h
+    wp.tile_store(counts, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(block,))
+    wp.tile_store(norms, wp.tile_sum(wp.tile(lengths, preserve_type=True)), offset=(block,))
+
+
+@wp.kernel
+@no_type_check
+def step(
+    activation: Activation,
+    lr: Gradient,
+    base: Gradient,
+    hf: Gradient,
+    view: View,
+    rule: Rule,
+    eps_cos: wp.array[wp.float64],
+    eps_corr: wp.array[wp.float64],
+    reliability: wp.array[wp.float32],
+    options: StepOptions,
+    adam: AdamStep,
+    means: Attribute,
+    quats: Attribute,
+    scales: Attribute,
+    opacities: Attribute,
+    sh0: Attribute,
+    detail: Attribute,
+    shN: Attribute,
+    visible: wp.array[wp.uint8],
+    colours: wp.array3d[wp.float32],
+    moving: wp.array[wp.bool],
+    counts: wp.array[Counts],
+    omegas: wp.array[Six],
+) -> None:
+    """One thread per Gaussian: steps everything but shN, for which it writes the merged colour to `colours`.
+
+    If LR and HR have different bases, there are two colours, one for each.
+    """
+    block, lane = wp.tid()
+    at = block * wp.block_dim() + lane
+    i = wp.min(at, view.n - 1)  # lanes beyond the last Gaussian neither count nor write
+    g_lr, g_hr, g_hf = load(activation, lr, base, hf, view, i)
+    may_step = not options.has_visible or visible[i] != wp.uint8(0)
+    still = options.skips and size(g_lr) + size(g_hr) + size(g_hf) <= 0.0
+    still = still and is_still(means, i, 3) and is_still(quats, i, 4) and is_still(scales, i, 3)
+    still = still and is_still(opacities, i, 1) and is_still(sh0, i, 3) and is_still(detail, i, 3)
+    still = still and is_still(shN, i, options.width)
+    change = Corrected()
+    if options.corrects:
+        products = group_products(g_lr, g_hr, lr, base, view, i)
+        change = correct(products, rule, eps_cos, eps_corr, reliability, i)
+
+    moves, λ = may_step and not still, options.lambda_hr
+    d_means = merged3(g_lr.means, g_hr.means, change.multiple[MEANS], λ)
+    d_quats = merged4(g_lr.quats, g_hr.quats, change.multiple[QUATS], λ)
+    d_scales = merged3(g_lr.scales, g_hr.scales, change.multiple[SCALES], λ)
+    d_opacity = merged1(g_lr.opacity, g_hr.opacity, change.multiple[OPACITIES], λ)
+    d_sh0 = merged3(g_lr.sh0, g_hr.sh0, change.multiple[SH0], λ)
+    # f_det gets only the routed gradient of L_HF, uncorrected
+    d_detail = g_hf.rgb * route_of(activation, view, i) * view.lambda_hf * λ
+    rgb_lr, rgb_hr = merged3(g_lr.rgb, g_hr.rgb, change.multiple[SHN], λ), wp.vec3()
+    if not view.one_basis:
+        rgb_lr, rgb_hr = corrected3(g_lr.rgb, g_lr.rgb, change.multiple[SHN] * wp.float64(λ)), g_hr.rgb * λ
+
+    found, omega = Counts(), Six()
+    if at < view.n:
+        omega = change.omega
+        for k in range(GROUPS):
+            found[k] = (change.rows >> k) & 1
+            found[GROUPS + k] = (change.at_lower_bound >> k) & 1
+        if not may_step:
+            found[13] = 1
+        elif still:
+            found[12] = 1
+    wp.tile_store(counts, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(block,))
+    wp.tile_store(omegas, wp.tile_sum(wp.tile(omega, preserve_type=True)), offset=(block,))
+    if at >= view.n:
+        return
+
+    moving[i] = moves
+    for channel in range(3):
+        colours[0, i, channel] = rgb_lr[channel]
+        if not view.one_basis:
+            colours[1, i, channel] = rgb_hr[channel]
+    for d in range(3):
+        step_number(adam, means, 3 * i + d, d_means[d], moves)
+        step_number(adam, scales, 3 * i + d, d_scales[d], moves)
+        step_number(adam, sh0, 3 * i + d, d_sh0[d], moves)
+        step_number(adam, detail, 3 * i + d, d_detail[d], moves)
+    for d in range(4):
+        step_number(adam, quats, 4 * i + d, d_quats[d], moves)
+    step_number(adam, opacities, i, d_opacity, moves)
+
+
+@wp.kernel
+@no_type_check
+def step_bands(
+    view: View,
+    lr_basis: wp.array2d[wp.float32],
+    hr_basis: wp.array2d[wp.float32],
+    colours: wp.array3d[wp.float32],
+    moving: wp.array[wp.bool],
+    adam: AdamStep,
+    shN: Attribute,
+) -> None:
+    """One thread per number of shN's stepped bands."""
+    i, j = wp.tid()
+    if not moving[i]:
+        return
+    band, channel = 1 + j / 3, j % 3
+    gradient = wp.float32(0.0)
+    if band < view.bases:
+        gradient = lr_basis[i, band] * colours[0, i, channel]
+        if view.has_base and not view.one_basis:
+            gradient += hr_basis[i, band] * colours[1, i, channel]
+    step_number(adam, shN, shN.width * i + j, gradient, True)

@@ -1,0 +1,158 @@
+"""The gradients of a view's three losses with respect to the raw parameters, computed per Gaussian and never stored."""
+
+from __future__ import annotations
+
+from typing import no_type_check
+
+import warp as wp
+
+
+@wp.struct
+@no_type_check
+class Gradient:
+    """One cotangent's rasterizers.interface.SplatGradients, row-major; the colour gradient as its factors rgb and basis."""
+
+    means: wp.array[wp.float32]
+    quats: wp.array[wp.float32]
+    scales: wp.array[wp.float32]
+    opacities: wp.array[wp.float32]
+    rgb: wp.array[wp.float32]
+    basis: wp.array[wp.float32]
+
+
+@wp.struct
+@no_type_check
+class Activation:
+    """The inputs of the activations' VJP (training.field.Activation), and m unless it is 1."""
+
+    scales: wp.array[wp.float32]
+    filtered: wp.array[wp.float32]
+    filter: wp.array[wp.float32]
+    sigmoid: wp.array[wp.float32]
+    factor: wp.array[wp.float32]
+    route: wp.array[wp.float32]
+
+
+@wp.struct
+@no_type_check
+class View:
+    """The sizes, and which gradients are given."""
+
+    n: wp.int32
+    bases: wp.int32  # columns of Y: 1 + active higher bands
+    one_basis: wp.bool  # LR and HR have the same Y
+    has_base: wp.bool
+    has_hf: wp.bool
+    routed: wp.bool
+    lambda_hf: wp.float32
+
+
+@wp.struct
+@no_type_check
+class RawGradient:
+    """∇θ of one loss for one Gaussian. shN's gradient stays in factors: Y ⊗ rgb."""
+
+    means: wp.vec3
+    quats: wp.vec4
+    scales: wp.vec3
+    opacity: wp.float32
+    sh0: wp.vec3
+    rgb: wp.vec3
+
+
+@wp.func
+@no_type_check
+def row3(rows: wp.array[wp.float32], i: wp.int32) -> wp.vec3:
+    return wp.vec3(rows[3 * i], rows[3 * i + 1], rows[3 * i + 2])
+
+
+@wp.func
+@no_type_check
+def row4(rows: wp.array[wp.float32], i: wp.int32) -> wp.vec4:
+    return wp.vec4(rows[4 * i], rows[4 * i + 1], rows[4 * i + 2], rows[4 * i + 3])
+
+
+@wp.func
+@no_type_check
+def activation_vjp(g: Gradient, a: Activation, bases: wp.int32, i: wp.int32) -> RawGradient:
+    """The VJP of the 3D filter, exp and sigmoid. Same operations as training.field.Activation.vjp."""
+    out = RawGradient()
+    scales, filtered, reach = row3(a.scales, i), row3(a.filtered, i), a.filter[i]
+    factor, sigmoid, d_opacity = a.factor[i], a.sigmoid[i], g.opacities[i]
+    share = wp.vec3(reach / filtered[0], reach / filtered[1], reach / filtered[2])
+    share = wp.cw_mul(share, share)  # log(coefficient) grows with log(s) by f² / (s² + f²)
+    along = wp.cw_div(wp.cw_mul(row3(g.scales, i), wp.cw_mul(scales, scales)), filtered)
+    out.means = row3(g.means, i)
+    out.quats = row4(g.quats, i)
+    out.scales = along + d_opacity * (factor * sigmoid) * share
+    out.opacity = d_opacity * factor * sigmoid * (1.0 - sigmoid)
+    out.rgb = row3(g.rgb, i)
+    out.sh0 = g.basis[bases * i] * out.rgb
+    return out
+
+
+@wp.func
+@no_type_check
+def route_of(a: Activation, view: View, i: wp.int32) -> wp.float32:
+    """m_i, or 1."""
+    m = wp.float32(1.0)
+    if view.routed:
+        m = a.route[i]
+    return m
+
+
+@wp.func
+@no_type_check
+def routed(base: RawGradient, hf: RawGradient, m: wp.float32, lambda_hf: wp.float32) -> RawGradient:
+    """g^HR = g_base + λ_HF m g_HF (Eq. 13), multiplied in the same order as the conductor does."""
+    out = RawGradient()
+    out.means = base.means + hf.means * m * lambda_hf
+    out.quats = base.quats + hf.quats * m * lambda_hf
+    out.scales = base.scales + hf.scales * m * lambda_hf
+    out.opacity = base.opacity + hf.opacity * m * lambda_hf
+    out.sh0 = base.sh0 + hf.sh0 * m * lambda_hf
+    out.rgb = base.rgb + hf.rgb * m * lambda_hf
+    return out
+
+
+@wp.func
+@no_type_check
+def load(
+    activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View, i: wp.int32
+) -> tuple[RawGradient, RawGradient, RawGradient]:
+    """∇L_LR, g^HR and ∇L_HF of a Gaussian; 0 for those not given."""
+    g_lr, g_hr, g_hf = activation_vjp(lr, activation, view.bases, i), RawGradient(), RawGradient()
+    if view.has_base:
+        g_hr = activation_vjp(base, activation, view.bases, i)
+    if view.has_hf:
+        g_hf = activation_vjp(hf, activation, view.bases, i)
+        g_hr = routed(g_hr, g_hf, route_of(activation, view, i), view.lambda_hf)
+    return g_lr, g_hr, g_hf
+
+
+@wp.func
+@no_type_check
+def basis_products(lr: Gradient, base: Gradient, view: View, i: wp.int32) -> wp.vec3d:
+    """⟨Y_LR, Y_HR⟩, ‖Y_LR‖², ‖Y_HR‖² over the higher bands, for ⟨Y_a ⊗ a, Y_b ⊗ b⟩ = ⟨Y_a, Y_b⟩ ⟨a, b⟩."""
+    out = wp.vec3d()
+    for k in range(1, view.bases):
+        low = wp.float64(lr.basis[view.bases * i + k])
+        high = low
+        if not view.one_basis:
+            high = wp.float64(base.basis[view.bases * i + k])
+        out += wp.vec3d(low * high, low * low, high * high)
+    return out
+
+
+@wp.func
+@no_type_check
+def size3(v: wp.vec3) -> wp.float32:
+    return wp.abs(v[0]) + wp.abs(v[1]) + wp.abs(v[2])
+
+
+@wp.func
+@no_type_check
+def size(g: RawGradient) -> wp.float32:
+    """A norm that is 0 only if the gradient is 0; sh0 follows rgb."""
+    turn = wp.abs(g.quats[0]) + wp.abs(g.quats[1]) + wp.abs(g.quats[2]) + wp.abs(g.quats[3])
+    return size3(g.means) + turn + size3(g.scales) + wp.abs(g.opacity) + size3(g.rgb)

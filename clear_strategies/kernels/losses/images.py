@@ -1,0 +1,60 @@
+"""The images that the compiled losses support: float32 [H, W, 3] on a device that the kernels run on."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Final, NamedTuple
+
+import torch
+from torch import Tensor
+
+_IN_WORDS: Final = {"cpu": "the CPU", "cuda": "CUDA"}
+
+
+class ImagePair(NamedTuple):
+    """Two images, contiguous and detached, and the tensor that receives the gradient."""
+
+    x: Tensor
+    y: Tensor
+    gradient: Tensor
+
+
+def supported(devices: Collection[str], *images: Tensor) -> bool:
+    """Whether kernels for `devices` support the type, shape and device of these images."""
+    return all(
+        image.dtype == torch.float32
+        and image.device.type in devices
+        and image.device == images[0].device
+        and image.ndim == 3
+        and image.shape[2] == 3
+        and image.numel() > 0
+        for image in images
+    )
+
+
+def image_pair(devices: Collection[str], x: Tensor, y: Tensor, out: Tensor | None) -> ImagePair:
+    """The images as kernels for `devices` read them.
+
+    Raises:
+        TypeError: an image is not float32, or not on such a device, or not on the same device as x.
+        ValueError: an image is not [H, W, 3], or not as large as x; or `out` is not contiguous.
+    """
+    for name, image in (("x", x), ("y", y), ("out", out)):
+        if image is None:
+            continue
+        if image.dtype != torch.float32 or image.device.type not in devices:
+            raise TypeError(
+                f"{name} must be float32 on {' or '.join(_IN_WORDS[device] for device in devices)}, got {image.dtype} on "
+                f"{image.device}; kernels=torch supports any."
+            )
+        if image.device != x.device:
+            raise TypeError(f"{name} must be on {x.device}, where x is, got {image.device}.")
+        if image.ndim != 3 or image.shape[2] != 3 or image.shape != x.shape or image.numel() == 0:
+            raise ValueError(
+                f"{name} must be an image [H, W, 3] with pixels, and as large as x; got {tuple(image.shape)} "
+                f"beside {tuple(x.shape)}."
+            )
+    gradient = torch.empty_like(x, memory_format=torch.contiguous_format, requires_grad=False) if out is None else out
+    if not gradient.is_contiguous():
+        raise ValueError(f"out must be contiguous, got strides {gradient.stride()}.")
+    return ImagePair(x.detach().contiguous(), y.detach().contiguous(), gradient)

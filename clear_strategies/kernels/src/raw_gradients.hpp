@@ -1,0 +1,134 @@
+// The gradients of a view's three losses with respect to the raw parameters, computed per Gaussian and never stored.
+#pragma once
+
+#include "block.hpp"
+
+namespace clear {
+
+// One cotangent's rasterizers.interface.SplatGradients, row-major; the colour gradient as its factors rgb and basis.
+struct SplatGradient {
+  const float *means = nullptr, *quats = nullptr, *scales = nullptr, *opacities = nullptr, *rgb = nullptr;
+  const float* basis = nullptr;  // Y [N, bases]
+  explicit operator bool() const { return means != nullptr; }
+};
+
+// The inputs of the activations' VJP (training.field.Activation).
+struct Activation {
+  const float *scales, *filtered, *filter, *sigmoid, *factor;
+};
+
+struct Gradients {
+  std::int64_t n;
+  int bases;                     // columns of Y: 1 + active higher bands
+  SplatGradient lr, base, hf;    // base and hf may be absent
+  Activation activation;
+  const float* route;            // m_i, or null for 1
+  float lambda_hf;
+};
+
+// ∇θ of one loss for sixteen Gaussians. shN's gradient stays in factors: Y ⊗ rgb.
+struct RawGradients {
+  Floats means[3], quats[4], scales[3], opacities[1], sh0[3], rgb[3];
+};
+
+// The part of the activations' VJP for sixteen Gaussians that the three losses share.
+struct Activated {
+  Floats squares[3], filtered[3], shares[3], sigmoid, factor, opacity, slope;
+};
+
+CLEAR_INLINE void load(const Activation& a, std::int64_t i, int count, Activated& out) {
+  Floats s[3], filter = load_some(a.filter + i, count);
+  load_columns(a.scales + 3 * i, count, s);
+  load_columns(a.filtered + 3 * i, count, out.filtered);
+  out.sigmoid = load_some(a.sigmoid + i, count);
+  out.factor = load_some(a.factor + i, count);
+  out.opacity = out.factor * out.sigmoid;
+  out.slope = 1.0f - out.sigmoid;
+  for (int k = 0; k < 3; ++k) {
+    Floats share = filter / out.filtered[k];  // log(coefficient) grows with log(s) by f² / (s² + f²)
+    out.shares[k] = share * share;
+    out.squares[k] = s[k] * s[k];
+  }
+}
+
+// The VJP of the 3D filter, exp and sigmoid. Same operations as training.field.Activation.vjp.
+CLEAR_INLINE void activation_vjp(const SplatGradient& g, const Activated& a, const Floats& Y0, std::int64_t i, int count, RawGradients& out) {
+  load_columns(g.means + 3 * i, count, out.means);
+  load_columns(g.quats + 4 * i, count, out.quats);
+  load_columns(g.scales + 3 * i, count, out.scales);
+  load_columns(g.rgb + 3 * i, count, out.rgb);
+  Floats d_opacity = load_some(g.opacities + i, count);
+  for (int k = 0; k < 3; ++k) {
+    out.scales[k] = out.scales[k] * a.squares[k] / a.filtered[k] + d_opacity * a.opacity * a.shares[k];
+    out.sh0[k] = Y0 * out.rgb[k];
+  }
+  out.opacities[0] = d_opacity * a.factor * a.sigmoid * a.slope;
+}
+
+CLEAR_INLINE Floats first_band(const SplatGradient& g, int bases, std::int64_t i, int count) {
+  Floats Y0[1];
+  load_columns(g.basis + bases * i, count, Y0, bases);
+  return Y0[0];
+}
+
+// The higher bands of sixteen bases, one Gaussian per lane.
+CLEAR_INLINE void load_bands(const float* basis, int bases, std::int64_t i, int count, Floats (&bands)[kLanes]) {
+  for (int row = 0; row < kLanes; ++row) bands[row] = row < count ? load_some(basis + bases * (i + row), bases) : Floats(0.0f);
+  transpose(bands);
+}
+
+// ⟨Y_a, Y_b⟩ over the higher bands, for ⟨Y_a ⊗ a, Y_b ⊗ b⟩ = ⟨Y_a, Y_b⟩ ⟨a, b⟩.
+struct BasisProducts {
+  Doubles lr2 = 0.0, hr2 = 0.0, cross = 0.0;
+};
+
+CLEAR_INLINE BasisProducts basis_products(const float* lr, const float* hr, int bases, std::int64_t i, int count) {
+  BasisProducts out;
+  if (bases == 1) return out;
+  Floats l[kLanes], h[kLanes];
+  load_bands(lr, bases, i, count, l);
+  if (hr == lr) {
+    for (int k = 1; k < bases; ++k) out.lr2 += widen(l[k]) * widen(l[k]);
+    out.hr2 = out.cross = out.lr2;
+    return out;
+  }
+  load_bands(hr, bases, i, count, h);
+  for (int k = 1; k < bases; ++k) {
+    Doubles a = widen(l[k]), b = widen(h[k]);
+    out.lr2 += a * a, out.hr2 += b * b, out.cross += a * b;
+  }
+  return out;
+}
+
+// g^HR = g_base + λ_HF m g_HF, multiplied in the same order as the conductor does.
+template <int D>
+CLEAR_INLINE void route(Floats (&base)[D], const Floats (&hf)[D], const Floats& m, const Floats& lambda_hf) {
+  for (int d = 0; d < D; ++d) base[d] += hf[d] * m * lambda_hf;  // Eq. 13
+}
+
+// The gradients of sixteen Gaussians for one view; `hr` is g^HR, after routing.
+struct Block {
+  RawGradients lr, hr, hf;
+  Floats m;
+};
+
+CLEAR_INLINE void load(const Gradients& g, std::int64_t i, int count, Block& b) {
+  Activated a;
+  load(g.activation, i, count, a);
+  Floats Y0 = first_band(g.lr, g.bases, i, count);
+  activation_vjp(g.lr, a, Y0, i, count, b.lr);
+  if (!g.base) return;
+  if (g.base.basis != g.lr.basis) Y0 = first_band(g.base, g.bases, i, count);
+  activation_vjp(g.base, a, Y0, i, count, b.hr);
+  if (!g.hf) return;
+  activation_vjp(g.hf, a, Y0, i, count, b.hf);
+  b.m = g.route ? load_some(g.route + i, count) : Floats(1.0f);
+  route(b.hr.means, b.hf.means, b.m, g.lambda_hf);
+  route(b.hr.quats, b.hf.quats, b.m, g.lambda_hf);
+  route(b.hr.scales, b.hf.scales, b.m, g.lambda_hf);
+  route(b.hr.opacities, b.hf.opacities, b.m, g.lambda_hf);
+  route(b.hr.sh0, b.hf.sh0, b.m, g.lambda_hf);
+  route(b.hr.rgb, b.hf.rgb, b.m, g.lambda_hf);
+}
+
+}  // namespace clear

@@ -1,0 +1,127 @@
+"""Draws the pictures of docs/explanation/evidence.md from its CSV files: `python docs/figures.py`."""
+
+from __future__ import annotations
+
+import csv
+import re
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib as mpl
+
+mpl.use("Agg")
+mpl.rcParams.update({"svg.hashsalt": "clear", "font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
+
+import matplotlib.pyplot as plt  # noqa: E402 - after the backend was chosen
+
+DOCS: Final = Path(__file__).resolve().parent
+GREY: Final = "0.6"
+
+
+def table(name: str) -> list[dict[str, str]]:
+    with (DOCS / "data" / "evidence" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def numbers(cell: str) -> list[float]:
+    """The values of a cell: "+0.07, +0.19 (0.5)" holds two."""
+    values = re.sub(r"\(.*?\)", "", cell).split("±")[0]
+    return [float(part) for part in values.replace(",", " ").split()]
+
+
+def error(cell: str) -> float:
+    """What stands behind ±, else 0."""
+    return float(cell.split("±")[1]) if "±" in cell else 0.0
+
+
+def write(figure: Any, folder: Path, name: str) -> None:
+    figure.tight_layout()
+    figure.savefig(folder / f"evidence_{name}.svg", metadata={"Date": None})
+    plt.close(figure)
+
+
+def ablation(folder: Path) -> None:
+    rows = [row for row in table("ablation") if row["Δ"]]
+    methods = list(dict.fromkeys(row["method"] for row in rows))[1:]
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    figure, axes = plt.subplots(figsize=(7, 3))
+    for k, scene in enumerate(scenes):
+        own = {row["method"]: row["Δ"] for row in rows if row["scene"] == scene}
+        average = scene.startswith("average")
+        axes.errorbar(
+            [i + 0.11 * (k - (len(scenes) - 1) / 2) for i in range(len(methods))],
+            [numbers(own[m])[0] for m in methods],
+            [error(own[m]) for m in methods],
+            fmt="D" if average else "o",
+            color="black" if average else None,
+            markersize=6 if average else 4,
+            elinewidth=1,
+            label=scene,
+        )
+    axes.axhline(0, color=GREY, linewidth=1)
+    axes.set_xticks(range(len(methods)), methods)
+    axes.set_ylabel("Δ PSNR over the baseline, dB")
+    axes.legend(fontsize=7, ncols=3, frameon=False)
+    write(figure, folder, "ablation")
+
+
+def dots(folder: Path, name: str, column: str, label: str) -> None:
+    """One line a method, with the error where the cell has one."""
+    rows = [row for row in table(name) if row[column]]
+    figure, axes = plt.subplots(figsize=(7, 0.28 * len(rows) + 0.9))
+    for y, row in enumerate(rows):
+        ours = row["method"].lower() == "clear"
+        (x,), colour = numbers(row[column]), "C0" if ours else "0.4"
+        axes.errorbar(x, y, xerr=error(row[column]), fmt="o", color=colour)
+        axes.annotate(row[column], (x, y), (0, 6), textcoords="offset points", ha="center", fontsize=7, color=colour)
+    axes.set_yticks(range(len(rows)), [row["method"] for row in rows])
+    axes.set_ylim(len(rows) - 0.5, -0.8)
+    axes.grid(axis="y", linewidth=0.3)
+    axes.set_xlabel(label)
+    write(figure, folder, name)
+
+
+def skips(folder: Path) -> None:
+    rows = [row for row in table("skips") if row["scene"] != "average"]
+    figure, axes = plt.subplots(figsize=(7, 2.6))
+    for row in rows:
+        seconds = [float(row["seconds, all drawn"]), float(row["seconds, default skips"])]
+        psnr = [float(row["PSNR, all drawn"]), float(row["PSNR, default skips"])]
+        (line,) = axes.plot(seconds, [p - psnr[0] for p in psnr], marker="o", label=row["scene"])
+        axes.errorbar(seconds[1], psnr[1] - psnr[0], error(row["Δ"]), color=line.get_color(), elinewidth=1)
+    axes.axhline(0, color=GREY, linewidth=1, zorder=0)
+    axes.set_xlabel("seconds (right: everything drawn, left: default skips)")
+    axes.set_ylabel("Δ PSNR, dB")
+    axes.legend(fontsize=7, frameon=False)
+    write(figure, folder, "skips")
+
+
+def changes(folder: Path, name: str, first: str, drop: int = 0) -> None:
+    """Δ of each change on the scenes that it was tried on; several values are several seeds."""
+    rows = table(name)[drop:]
+    scenes: Sequence[str] = ("fern", "fountain", "demo")
+    figure, axes = plt.subplots(figsize=(8, 0.42 * len(rows) + 0.9))
+    for k, (scene, marker) in enumerate(zip(scenes, "os^", strict=True)):
+        points = [(x, y + 0.15 * (k - 1)) for y, row in enumerate(rows) for x in numbers(row[scene])]
+        axes.plot([x for x, _ in points], [y for _, y in points], marker, label=scene, markersize=4)
+    axes.axvline(0, color=GREY, linewidth=1)
+    axes.set_yticks(range(len(rows)), [textwrap.fill(row[first], 46) for row in rows], fontsize=8)
+    axes.invert_yaxis()
+    axes.set_xlabel("Δ PSNR, dB")
+    axes.legend(fontsize=7, frameon=False)
+    write(figure, folder, name)
+
+
+def main(folder: Path) -> None:
+    ablation(folder)
+    dots(folder, "baselines", "average", "PSNR of the test views, dB, average of five scenes")
+    dots(folder, "corrupted", "Δ", "Δ PSNR over the baseline, dB, average of five scenes")
+    skips(folder)
+    changes(folder, "readings", "change", drop=1)
+    changes(folder, "skips_chosen", "left out")
+
+
+if __name__ == "__main__":
+    main(DOCS / "images")

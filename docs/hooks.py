@@ -1,0 +1,382 @@
+"""What `mkdocs build` adds to the pages: the configuration reference, from conf/ and the classes that its `_target_`s name.
+
+A field's type and default come from the signature of the class, its description from the `Args:` of the docstring, or
+from the comment beside it in the YAML file where the docstring says nothing. Nothing of the page is written by hand.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import re
+import sys
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+CONF: Final = ROOT / "conf"
+PAGE: Final = "reference/configuration.md"
+GENERATED: Final = frozenset({PAGE})
+OURS: Final = frozenset({"clear_strategies", "rasterizers", "integration"})
+
+# Nodes of conf/config.yaml that the run itself turns into these classes, so that they have no `_target_`.
+CLASSES: Final = {
+    "fit": "clear_strategies.training.loop.FitSettings",
+    "mip": "clear_strategies.training.mip.MipFilter",
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One field of the configuration."""
+
+    name: str
+    type: str
+    default: str
+    description: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A node of the configuration: what builds it, and its fields."""
+
+    choice: str
+    key: str
+    target: str | None
+    summary: str
+    settings: tuple[Setting, ...]
+
+    @property
+    def undescribed(self) -> list[str]:
+        return [f"{self.key}.{s.name}" for s in self.settings if not s.description]
+
+
+@dataclass(frozen=True)
+class Group:
+    """A folder of conf/: the choices that it holds, and the nodes that these set."""
+
+    name: str
+    options: Mapping[str, str]
+    sections: tuple[Section, ...]
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """MkDocs calls this with the files of the site."""
+    from mkdocs.structure.files import File
+
+    files.append(File.generated(config, PAGE, content=page(groups())))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """Links to files outside docs/ work in a checkout; the site does not hold those files and shows the text alone."""
+    here = Path(page.file.abs_src_path or ROOT).parent
+
+    def text_alone(link: re.Match[str]) -> str:
+        target = (here / link[2]).resolve()
+        return link[0] if target.is_relative_to(ROOT / "docs") else link[1]
+
+    return re.sub(r"\[([^\]]+)\]\((\.\.[^)#]*)(?:#[^)]*)?\)", text_alone, markdown)
+
+
+def groups() -> list[Group]:
+    """Everything in conf/, the base configuration first. Each field is listed once, each class once per node."""
+    if str(ROOT) not in sys.path:
+        sys.path.insert(0, str(ROOT))
+    folders = sorted({path.parent for path in CONF.rglob("*.yaml")}, key=lambda p: (p != CONF, str(p)))
+    return [_group(folder) for folder in folders]
+
+
+def _group(folder: Path) -> Group:
+    paths = sorted(folder.glob("*.yaml"), key=lambda p: (not p.stem.startswith("_"), p.stem != "auto", p.stem))
+    texts = {path: path.read_text(encoding="utf-8") for path in paths}
+    sections = [section for path in paths for section in _sections(path, texts[path])]
+    built = {(s.key, s.target): s for s in reversed(sections) if s.target}
+    known = {f"{s.key}.{field.name}" for s in built.values() for field in s.settings}
+    shown: list[Section] = []
+    sets: dict[str, list[str]] = {}
+    for section in sections:
+        if section.target:
+            if built.pop((section.key, section.target), None) is not None:
+                shown.append(section)
+            continue
+        fresh = tuple(s for s in section.settings if f"{section.key}.{s.name}" not in known)
+        again = [s for s in section.settings if s not in fresh]
+        sets.setdefault(section.choice, []).extend(f"`{section.key}.{s.name}={s.default}`" for s in again)
+        known |= {f"{section.key}.{s.name}" for s in fresh}
+        if fresh:
+            shown.append(dataclasses.replace(section, settings=fresh))
+    options = {}
+    for path in paths:
+        if path.stem.startswith("_"):
+            continue
+        summaries = [s.summary for s in sections if s.choice == path.stem and s.summary]
+        options[path.stem] = _heading(texts[path]) or next(iter(summaries), "")
+        if set_here := sets.get(path.stem):
+            options[path.stem] += f" Sets {', '.join(set_here)}."
+    return Group(folder.relative_to(CONF).as_posix(), options, tuple(shown))
+
+
+def undescribed(found: list[Group]) -> list[str]:
+    """The fields that neither a docstring nor a comment describes."""
+    return sorted({name for group in found for section in group.sections for name in section.undescribed})
+
+
+def page(found: list[Group]) -> str:
+    """The Markdown of the reference."""
+    lines = [
+        "# Configuration",
+        "",
+        "This page is generated from `conf/` and from the classes that it builds. `--cfg job` prints the composed",
+        "configuration of a run. A field is set on the command line by its full name: `strategies.gco.tolerance=0.1`.",
+        "",
+        "A *milestone* is an iteration number that is written for a run of 10,000 iterations. It is stretched to",
+        "`fit.iterations`.",
+        "",
+    ]
+    for group in found:
+        lines += [f"## {'The base configuration' if group.name == '.' else f'`{group.name}=`'}", ""]
+        if group.name != ".":
+            lines += ["| choice | what it is |", "|---|---|"]
+            lines += [f"| `{name}` | {_cell(text)} |" for name, text in group.options.items()]
+            lines.append("")
+        for section in group.sections:
+            choice = "" if section.choice.startswith("_") or group.name == "." else f" ({section.choice})"
+            lines += [f"### `{section.key}`{choice}" if section.key else "### Top level", ""]
+            if section.target:
+                lines += [f"`{section.target}`", ""]
+            if section.summary:
+                lines += [section.summary, ""]
+            if section.settings:
+                lines += ["| field | type | default | description |", "|---|---|---|---|"]
+                lines += [
+                    f"| `{s.name}` | {_code(s.type)} | {_code(s.default)} | {_cell(s.description)} |"
+                    for s in section.settings
+                ]
+                lines.append("")
+    return "\n".join(lines)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+def _code(text: str) -> str:
+    return f"`{text}`" if text else ""  # a pipe inside backticks ends no cell
+
+
+def _heading(text: str) -> str:
+    """The comment at the top of a YAML file, up to its first sentence."""
+    lines = []
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            break
+        if "@package" not in line:
+            lines.append(line.lstrip("# "))
+    whole = " ".join(lines)
+    return re.split(r"(?<=\.)\s(?=[A-Z])|: +(?=python)", whole, maxsplit=1)[0].rstrip(":")
+
+
+def _sections(path: Path, text: str) -> Iterator[Section]:
+    """The nodes of one file that are built from a class; in the base configuration and in a group of plain values, all."""
+    package = re.search(r"^# @package (\S+)", text, re.MULTILINE)
+    group = path.parent.relative_to(CONF).as_posix()
+    here = package[1] if package else ("" if group == "." else group.replace("/", "."))
+    config = OmegaConf.create(OmegaConf.load(path))
+    if not isinstance(config, DictConfig):
+        return
+    skipped = {"defaults", "hydra"} if here in ("", "_global_") else {"defaults"}
+    values = {str(k): v for k, v in config.items_ex(resolve=False) if k not in skipped}
+    prefix = "" if here == "_global_" else here
+    comments = _comments(text)
+    plain = group == "." or (package is None and bool(values))
+    for section in _walk(prefix, values, "", comments, plain=plain):
+        yield dataclasses.replace(section, choice=path.stem)
+
+
+def _walk(
+    key: str, values: Mapping[str, Any], path: str, comments: Mapping[str, str], *, plain: bool
+) -> Iterator[Section]:
+    nodes = {k: v for k, v in values.items() if isinstance(v, DictConfig)}
+    target = values.get("_target_") or (CLASSES.get(key) if plain else None)
+    dotted = {name: f"{path}.{name}" if path else name for name in values}
+    leaves = {name: _shown(v) for name, v in values.items() if name not in nodes and not name.startswith("_")}
+    notes = {name: comments.get(dotted[name], "") for name in values}
+    inner: dict[str, Any] = {}
+    if target:
+        section, inner = _built(key, str(target), leaves, notes)
+        yield section
+    elif plain and leaves:
+        yield Section("", key, None, "", tuple(Setting(n, "", v, _described(v, notes[n])) for n, v in leaves.items()))
+    for name in dict.fromkeys([*inner, *nodes]):
+        under = {str(k): v for k, v in nodes[name].items_ex(resolve=False)} if name in nodes else {}
+        if name in inner and "_target_" not in under:
+            kind = type(inner[name])
+            own = {k: v for k, v in _values(inner[name]).items() if k not in under}
+            under = {"_target_": f"{kind.__module__}.{kind.__qualname__}", **own, **under}
+        yield from _walk(
+            f"{key}.{name}" if key else name, under, dotted.get(name, f"{path}.{name}"), comments, plain=plain
+        )
+
+
+def _built(
+    key: str, target: str, leaves: Mapping[str, str], notes: Mapping[str, str]
+) -> tuple[Section, dict[str, Any]]:
+    """The fields of the class or function that a node is built from; and the defaults that are dataclasses themselves."""
+    module, _, name = target.rpartition(".")
+    built = getattr(importlib.import_module(module), name)
+    ours = built.__module__.split(".")[0] in OURS
+    summary, described = _docstring(built) if ours else (f"A class of {built.__module__.split('.')[0]}.", {})
+    hints = _hints(built)
+    metadata = {f.name: f.metadata for f in dataclasses.fields(built)} if dataclasses.is_dataclass(built) else {}
+    settings: dict[str, Setting] = {}
+    inner: dict[str, Any] = {}
+    for parameter in _parameters(built):
+        default = parameter.default
+        if dataclasses.is_dataclass(default) and not isinstance(default, type):
+            inner[parameter.name] = default
+            continue
+        if not ours and parameter.name not in leaves:
+            continue
+        if default is inspect.Parameter.empty and parameter.name not in leaves and (CONF / parameter.name).is_dir():
+            continue  # a group of its own
+        kind = hints.get(parameter.name, "")
+        if "milestone" in metadata.get(parameter.name, {}):
+            kind = f"{kind}, milestone"
+        own = "???" if default is inspect.Parameter.empty else _shown(default)
+        value = leaves.get(parameter.name, own)
+        text = described.get(parameter.name) or notes.get(parameter.name, "")
+        settings[parameter.name] = Setting(parameter.name, kind, value, _described(value, text))
+    for name, value in leaves.items():
+        if name not in settings and name not in inner:
+            settings[name] = Setting(name, "", value, _described(value, notes.get(name, "")))
+    return Section("", key, target, summary, tuple(settings.values())), inner
+
+
+def _values(instance: Any) -> dict[str, str]:
+    """The fields of a dataclass as they are shown; without those that are dataclasses themselves."""
+    values = {f.name: getattr(instance, f.name) for f in dataclasses.fields(instance) if f.init}
+    return {name: _shown(v) for name, v in values.items() if not dataclasses.is_dataclass(v)}
+
+
+def _parameters(built: Any) -> Iterator[inspect.Parameter]:
+    """The parameters; a dataclass's default factories are called, so that their result is shown."""
+    factories = {}
+    if dataclasses.is_dataclass(built):
+        factories = {
+            f.name: f.default_factory for f in dataclasses.fields(built) if f.default_factory is not dataclasses.MISSING
+        }
+    for parameter in inspect.signature(built).parameters.values():
+        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+            continue
+        made = factories.get(parameter.name)
+        yield parameter.replace(default=made()) if made is not None else parameter
+
+
+def _hints(built: Any) -> dict[str, str]:
+    function = built.__init__ if inspect.isclass(built) else built
+    annotations: dict[str, Any] = dict(getattr(function, "__annotations__", {}))
+    try:
+        resolved: Mapping[str, Any] = typing.get_type_hints(function)
+    except (NameError, TypeError):
+        resolved = {}
+    return {name: _type(resolved.get(name, annotation)) for name, annotation in annotations.items()}
+
+
+def _type(annotation: Any) -> str:
+    if isinstance(annotation, type):
+        return annotation.__name__
+    text = annotation if isinstance(annotation, str) else repr(annotation)
+    return re.sub(r"\b(?:[A-Za-z_]\w*\.)+(?=\w)", "", text)
+
+
+def _shown(value: Any) -> str:
+    """A value as it is written in YAML."""
+    if isinstance(value, ListConfig | DictConfig):
+        value = OmegaConf.to_container(value, resolve=False)
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(_shown(v) for v in value)}]"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{k}: {_shown(v)}' for k, v in value.items())}}}"
+    return '""' if value == "" else str(value)
+
+
+def _docstring(built: Any) -> tuple[str, dict[str, str]]:
+    """The first paragraph, and the description of each argument."""
+    summary = " ".join((inspect.getdoc(built) or "").split("\n\n")[0].split())
+    if summary.startswith(f"{built.__name__}("):  # a dataclass without a docstring
+        summary = ""
+    described: dict[str, str] = {}
+    for owner in reversed(inspect.getmro(built)[:-1] if inspect.isclass(built) else (built,)):
+        described |= _arguments(inspect.cleandoc(owner.__doc__ or ""))
+    return summary, described
+
+
+def _arguments(text: str) -> dict[str, str]:
+    """What the `Args:` of a docstring say, by argument."""
+    block = re.search(r"^Args:\n((?:[ \t]+.*\n?|\n)+)", text, re.MULTILINE)
+    described: dict[str, str] = {}
+    if block:
+        lines = block[1].splitlines()
+        margin = min(len(line) - len(line.lstrip()) for line in lines if line.strip())
+        entries: list[str] = []
+        for line in lines:
+            if not line.strip():
+                continue
+            if len(line) - len(line.lstrip()) == margin:
+                entries.append(line.strip())
+            else:
+                entries[-1] += " " + line.strip()
+        for entry in entries:
+            # "a, b: …" describes both; "a: …. b: …" in one entry describes each.
+            for part in re.split(r"(?<=[.;])\s+(?=[a-z_]\w*: )", entry):
+                names, colon, description = part.partition(":")
+                if colon:
+                    described |= {n.strip().lstrip("*"): description.strip() for n in names.split(",")}
+    return described
+
+
+def _described(value: str, text: str) -> str:
+    """The description, which says where the value must or does come from."""
+    if value == "???":
+        text = f"Required. {_sentence(text)}".strip()
+    elif not text and value.startswith("${"):
+        text = "Follows the field that its default names."
+    return _sentence(text)
+
+
+def _sentence(text: str) -> str:
+    text = " ".join(text.replace("(10k)", "").split())  # the type says that it is a milestone
+    return text[:1].upper() + text[1:] if re.match(r"[a-z]+ [a-z(]", text) else text
+
+
+def _comments(text: str) -> dict[str, str]:
+    """The comment behind each key of a YAML text, by the key's dotted path."""
+    found: dict[str, str] = {}
+    stack: list[tuple[int, str]] = []
+    current: str | None = None
+    column = 0
+    for line in text.splitlines():
+        key = re.match(r"^(\s*)([\w+]+):(?:\s|$)", line)
+        note = re.search(r"(?:^|\s)#\s?(.*)$", line)
+        if key:
+            stack = [(i, name) for i, name in stack if i < len(key[1])]
+            stack.append((len(key[1]), key[2]))
+            current = ".".join(name for _, name in stack)
+            if note:
+                found[current], column = note[1].strip(), note.start()
+            else:
+                column = -1
+        elif note and current in found and column > 0 and abs(note.start() - column) <= 1:
+            found[current] += " " + note[1].strip()
+    return found

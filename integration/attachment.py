@@ -1,0 +1,241 @@
+"""For a loop that stays as it is: render both scales where the host renders one, and merge in the host's `backward()`.
+
+One training iteration:
+
+1. The host renders. The gate zᵗ is sampled, Î_HR is rendered and its gradients are taken. Then Î_LR is rendered with the
+   same zᵗ and returned to the host.
+2. The host calls `backward()` on its own loss, whatever it is: that is the LR side. When this pass ends, `.grad` of every
+   parameter becomes the merged gradient, and the tensor that the densifier reads holds the score.
+3. Gradient clipping, unscaling, the optimizer step and densification are the host's, in any order.
+
+The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
+optimizers other than `torch.optim.Optimizer` work, and so do hosts that densify before the step (3DGS) as well as hosts
+that densify after it (gsplat).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.gradients import Grads, conflict_columns, to_ndc
+from clear_strategies.core.view import View
+from clear_strategies.errors import SettingError
+from clear_strategies.merging.conductor import Conductor, HrGradients, only
+from integration.autograd_shot import AutogradShot
+from integration.errors import HostError
+from integration.host_score import ScoreScaler, score_for_host
+
+_log = logging.getLogger(__name__)
+
+Resolution = Literal["lr", "hr"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HostRendering:
+    """One rendering by a host, as an adapter passes it to an `Attachment`.
+
+    Args:
+        output: a tensor that the host computes its loss from. Its gradient marks the start of the host's backward pass.
+        returned: what the host's own render function returns.
+    """
+
+    shot: AutogradShot
+    output: Tensor
+    returned: Any
+
+
+class RenderAt(Protocol):
+    """Renders the view of this iteration at one resolution."""
+
+    def __call__(self, resolution: Resolution, gate: Float[Tensor, " N"] | None) -> HostRendering:
+        """At LR without f_det, or at HR with f_det; opacities are multiplied by `gate`."""
+        ...
+
+
+class Attachment:
+    """The strategies beside a host's training loop.
+
+    Args:
+        params: returns the leaves that the host optimizes, by gsplat's names (and "detail"). It is called at every
+            iteration, since densifiers replace parameters.
+        n_views, seed: for the strategies' `on_fit_start`.
+        poll_parents: called at every iteration. It returns parents[M] if the structure has changed since its last call
+            (row i of every parameter now comes from row parents[i]), else None. Without this function the host cannot
+            tell, and no strategy may hold per-Gaussian state when the number of Gaussians changes.
+        threshold: the host's densification threshold on the mean ‖∇_u‖ in NDC units; None: the score is not scaled.
+        loss_scale: returns the factor of the host's loss (`scaler.get_scale` of an AMP gradient scaler).
+        accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
+
+    Attributes:
+        t: the current iteration, from 1.
+        counts: how often each kind of work was done.
+        removed: whether `remove` was called.
+    """
+
+    def __init__(
+        self,
+        conductor: Conductor,
+        params: Callable[[], Mapping[str, Tensor]],
+        *,
+        n_views: int,
+        seed: int = 0,
+        poll_parents: Callable[[], Int[Tensor, " M"] | None] | None = None,
+        threshold: float | None = None,
+        loss_scale: Callable[[], float] | None = None,
+        accumulation: int = 1,
+    ) -> None:
+        if accumulation < 1:
+            raise SettingError(f"accumulation: must be at least 1 backward pass per step, got {accumulation}.")
+        if not conductor.wants_lr:
+            raise SettingError(
+                "objective: a host renders LR itself, so lambda_lr must be > 0 and lr_from must be lr, got "
+                f"lambda_lr={conductor.objective.lambda_lr}, lr_from={conductor.objective.lr_from!r}."
+            )
+        self.conductor, self.params, self.accumulation = conductor, params, accumulation
+        self.t = 1
+        self.counts: Counter[str] = Counter()
+        self.removed = False
+        self._poll_parents, self._loss_scale = poll_parents, loss_scale
+        self._scaler = None if threshold is None else ScoreScaler(threshold)
+        self._n = len(params()["means"])
+        self._passes = 0  # backward passes of this iteration
+        self._pending: tuple[HostRendering, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
+        self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
+        self._logged: dict[str, Number] = {}
+        conductor.on_fit_start(n_views, seed, params()["means"].device)
+        if not conductor.strategies:
+            _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
+
+    def render_view(self, view: View, render_at: RenderAt) -> Any:
+        """Render a training view at both scales; returns what the host's render function returns at LR."""
+        if self.removed:
+            return render_at("lr", None).returned
+        self._finish_previous_step()
+        conductor, t = self.conductor, self.t
+        z = conductor.gate(t, self._n)
+        if z is not None:
+            z = z.to(self.params()["means"])
+        hr_grads = None
+        if conductor.wants_hr(t):
+            self.counts["HR renders"] += 1
+            hr_grads = conductor.hr_gradients(render_at("hr", z).shot, view)
+        rendering = render_at("lr", z)
+        if rendering.output.requires_grad:
+            self._pending = rendering, hr_grads
+            rendering.output.register_hook(self._on_backward)  # type: ignore[no-untyped-call]
+        self.counts["LR renders"] += 1
+        return rendering.returned
+
+    @property
+    def log(self) -> dict[str, float]:
+        """Scalars of the last iteration. On a device, reading them waits for the device."""
+        return deferred.resolve([self._logged])[0]
+
+    def remove(self) -> None:
+        """Stop: the host's renderings pass through, and the gradients of one that is still pending stay unmerged."""
+        self.removed, self._pending = True, None
+
+    def _finish_previous_step(self) -> None:
+        """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified."""
+        params = self.params()
+        self._resize(len(params["means"]))
+        if self._passes >= self.accumulation:
+            self.conductor.after_step({name: p.detach() for name, p in params.items()}, self.t)
+            self.t += 1
+            self._passes = 0
+
+    def _resize(self, n: int) -> None:
+        """Gather the strategies' per-Gaussian state if the structure has changed."""
+        parents = None if self._poll_parents is None else self._poll_parents()
+        if parents is None and n == self._n:
+            return
+        state = ", ".join(self.conductor.state_dict())
+        if parents is not None:
+            self.conductor.on_resize(parents)
+        elif state:
+            # SVS raises an AnchorError here, which says more: the anchor's iteration, and the setting to change.
+            self.conductor.on_resize(torch.zeros(n, dtype=torch.long))
+            raise HostError(
+                f"the number of Gaussians changed from {self._n:,} to {n:,} and the host does not say which came from "
+                f"which, but {state} is stored per Gaussian. End densification first, or pass the host's state."
+            )
+        self.counts["structure changes"] += 1
+        self._n = n
+
+    def _on_backward(self, _: Tensor) -> None:
+        """The host's backward pass has reached Î_LR, but no parameter yet."""
+        if self._pending is None:
+            return
+        self._grads_before = {name: p.grad.clone() for name, p in self.params().items() if p.grad is not None}
+        centres = self._pending[0].shot.gradient_slot.tensor
+        screen_gradients: list[Tensor] = []
+        if centres.requires_grad:
+            hook = centres.register_hook(screen_gradients.append)  # type: ignore[no-untyped-call]
+
+        def on_backward_end() -> None:
+            if centres.requires_grad:
+                hook.remove()
+            self._merge(screen_gradients[0] if screen_gradients else None)
+
+        torch.autograd.Variable._execution_engine.queue_callback(on_backward_end)
+
+    @torch.no_grad()
+    def _merge(self, screen_gradient: Tensor | None) -> None:
+        """The host's backward pass has ended: replace its gradients by the merged ones."""
+        if self._pending is None:
+            return
+        (rendering, hr_grads), self._pending = self._pending, None
+        grad_scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
+        trained = {name: p for name, p in self.params().items() if p.grad is not None or name == "detail"}
+        g_lr = Grads({
+            name: self._grad_of_this_pass(name, p) * (1 / grad_scale) for name, p in trained.items() if p.grad is not None
+        })  # fmt: skip
+        values = {name: p.detach() for name, p in trained.items()}
+        hr_trained = None if hr_grads is None else only(hr_grads, trained)
+        merged = self.conductor.merge(values, g_lr, hr_trained, self.t)
+        for name, p in trained.items():
+            # Without HR the gradient of f_det is 0 and not None, so that its Adam counts every step.
+            g = merged.grads[name] * grad_scale if name in merged.grads else torch.zeros_like(p)
+            p.grad = (g + self._grads_before[name] if name in self._grads_before else g).to(p)
+        if screen_gradient is not None and hr_grads is not None:
+            self._write_score(rendering.shot, screen_gradient / grad_scale, hr_grads, grad_scale)
+        self._grads_before = {}
+        self._passes += 1
+        self.counts["merges"] += 1
+        λ = self.conductor.objective.lambda_hr(self.t)
+        losses = {} if hr_grads is None else hr_grads.losses
+        self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **self.conductor.logs()}
+        self._logged |= conflict_columns(merged.conflict)
+
+    def _grad_of_this_pass(self, name: str, p: Tensor) -> Tensor:
+        if p.grad is None or p.grad.is_sparse:
+            raise HostError(
+                f"{name}.grad is sparse, but the gradients of all Gaussians are merged. In gsplat: "
+                "rasterization(sparse_grad=False)."
+            )
+        return p.grad - self._grads_before[name] if name in self._grads_before else p.grad
+
+    def _write_score(
+        self, shot: AutogradShot, gradient: Tensor, hr_grads: HrGradients[Grads], grad_scale: float
+    ) -> None:
+        """Write the score where the host's densifier reads the screen gradient, if it reads it."""
+        slot = shot.gradient_slot
+        retained = slot.tensor.is_leaf or slot.tensor.retains_grad
+        if not retained or slot.tensor.grad is None:
+            return
+        screen_lr = to_ndc(slot.per_gaussian(gradient, self._n), slot.size)
+        score, ordinary = self.conductor.scores(screen_lr, hr_grads, self.t)
+        written = score_for_host(slot, score, ordinary, shot.visible, self._scaler, grad_scale)
+        if written is not None:
+            slot.write(grad_scale * written)
+        self.counts["scores written"] += score is not ordinary

@@ -1,0 +1,116 @@
+"""The detail feature f_det in a host, which has no such parameter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from clear_strategies.training.optim import LearningRates
+from integration.errors import HostError
+from integration.lineage import COMPARED, Change, find_change
+from rasterizers.geometry import SH_C0
+
+
+def detail_adam(detail: torch.nn.Parameter) -> torch.optim.Adam:
+    """An Adam for f_det, with our trainer's learning rate."""
+    rates = LearningRates()
+    return torch.optim.Adam([detail], lr=rates.detail, eps=rates.eps)
+
+
+def sh0_offset(detail: Float[Tensor, "N 3"], sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
+    """f_det as an offset of the constant SH band."""
+    return (detail / SH_C0).view_as(sh0)
+
+
+class DetailFeature:
+    """f_det and its Adam beside the host's parameters, for hosts that look parameters up by name and allow no other.
+
+    Its rows follow the host's Gaussians.
+
+    Args:
+        params: returns the host's current leaves, by gsplat's names.
+    """
+
+    def __init__(self, params: Callable[[], Mapping[str, Tensor]]) -> None:
+        self._params = params
+        self._known = self._compared()
+        self._parents: Int[Tensor, " M"] | None = None  # since the last `poll_parents`
+        self._value = torch.nn.Parameter(torch.zeros_like(self._known["means"], requires_grad=False))
+        self._adam = detail_adam(self._value)
+
+    @property
+    def value(self) -> Float[Tensor, "N 3"]:
+        """f_det, one row per Gaussian of the host."""
+        self._follow_host()
+        return self._value
+
+    def offset(self, sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
+        """f_det as an offset of the constant SH band."""
+        return sh0_offset(self.value.detach(), sh0)
+
+    def poll_parents(self, state: Callable[[], Mapping[str, Tensor]]) -> Int[Tensor, " M"] | None:
+        """parents[M] of the changes since the last call; None: there were none.
+
+        Args:
+            state: returns what strategies store per Gaussian.
+
+        Raises:
+            HostError: the parent of a new Gaussian is unknown, but there is per-Gaussian state.
+        """
+        self._follow_host()
+        parents, self._parents = self._parents, None
+        if parents is None:
+            return None
+        unknown = int((parents < 0).sum())
+        if unknown and (names := ", ".join(state())):
+            raise HostError(
+                f"{unknown:,} new Gaussians have the colour and rotation of no old one, so their parents are unknown, but "
+                f"{names} is stored per Gaussian. End densification first."
+            )
+        return parents.clamp_min(0)
+
+    def step(self) -> None:
+        """One optimizer step, if there is a gradient; called when the host steps."""
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+
+    def _compared(self) -> dict[str, Tensor]:
+        params = self._params()
+        return {name: params[name] for name in COMPARED}
+
+    @torch.no_grad()
+    def _follow_host(self) -> None:
+        """Apply a change of the host's structure to f_det, and add it to the parents to report."""
+        now = self._compared()
+        if now["means"] is self._known["means"]:
+            if len(now["means"]) != len(self._value):
+                raise HostError(
+                    f"the host changed the number of Gaussians from {len(self._value):,} to {len(now['means']):,} inside "
+                    "its parameters. A changed set must be a new parameter, as in 3DGS."
+                )
+            return
+        before, self._known = self._known, now
+        change = find_change(before, now)
+        if change is not None:
+            self._gather(change)
+            earlier = self._parents
+            parents = change.parents if earlier is None else earlier[change.parents.clamp_min(0)]
+            self._parents = torch.where(change.parents < 0, -1, parents)
+
+    def _gather(self, change: Change) -> None:
+        """Give each row its parent's f_det, or 0 without a parent; only old rows keep their Adam moments."""
+        rows, unknown = change.parents.clamp_min(0), change.parents < 0
+        state = self._adam.state.pop(self._value, {})
+        value = self._value[rows]
+        value[unknown] = 0
+        self._value = torch.nn.Parameter(value)
+        self._adam.param_groups[0]["params"] = [self._value]
+        for name, moment in state.items():
+            if moment.dim():  # Adam's step count has no rows
+                state[name] = moment[rows]
+                state[name][change.fresh | unknown] = 0
+        if state:
+            self._adam.state[self._value] = state

@@ -1,0 +1,274 @@
+"""`attach` for gsplat-style loops: a dict of parameters, a dict of optimizers, and `rasterization`."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import logging
+import sys
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from typing import Any, Final
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from clear_strategies.core.view import View
+from clear_strategies.merging.conductor import Conductor
+from integration.attachment import Attachment, HostRendering, Resolution
+from integration.autograd_shot import AutogradShot, ScreenGradientSlot
+from integration.detail import detail_adam, sh0_offset
+from integration.errors import HostError
+from integration.host_score import warn_if_densification_outlasts, warn_if_score_is_unused
+from rasterizers.geometry import SH_C0
+
+_log = logging.getLogger(__name__)
+
+ROWS: Final = "clear_rows"
+"""Key in a gsplat strategy's `state`: the row of each Gaussian before the structure last changed. gsplat gathers every tensor
+of the state together with the parameters, so this tensor becomes the map of the change."""
+
+_PARAMETERS: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
+_ATTACHED: Final = "clear_attached"  # attribute of a wrapped function: its Attached
+_SAME_POSE: Final = 1e-3  # largest difference between the entries of two poses of one camera
+
+Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
+
+
+class Attached:
+    """The strategies of a conductor in a gsplat-style loop; `attach` makes one.
+
+    Args:
+        params: gsplat's dict of leaves. optimizers: one for each of them.
+        views: all training views. A rendering is matched to a view by its pose.
+        strategy, state: gsplat's densification strategy and its state. The strategy's threshold scales P2G's score, and
+            the state records every change of structure. None: a loop without densification.
+        detail: add the detail feature f_det as `params["detail"]`, with an Adam of its own. gsplat's strategies clone,
+            split and prune it like any other parameter.
+        names: gsplat's parameter name -> the host's, where they differ (nerfstudio: sh0 is features_dc).
+        loss_scale, accumulation: see `Attachment`.
+
+    Raises:
+        ValueError: there is no view, or a parameter is missing.
+    """
+
+    def __init__(
+        self,
+        params: MutableMapping[str, Any] | torch.nn.ParameterDict,
+        optimizers: MutableMapping[str, Any],
+        views: Sequence[View],
+        conductor: Conductor,
+        *,
+        strategy: Any = None,
+        state: dict[str, Any] | None = None,
+        detail: bool = True,
+        names: Mapping[str, str] | None = None,
+        seed: int = 0,
+        loss_scale: Callable[[], float] | None = None,
+        accumulation: int = 1,
+    ) -> None:
+        if not views:
+            raise ValueError(
+                "at least one view is needed; integration.views.view(...) makes one from an image and a camera."
+            )
+        self._params, self._names, self._views = params, {**dict.fromkeys(_PARAMETERS), **(names or {})}, tuple(views)
+        host_names = [self._host_name(name) for name in _PARAMETERS]
+        if missing := [name for name in host_names if name not in params]:
+            raise ValueError(f"params must hold {', '.join(host_names)}; {missing[0]} is missing.")
+        means = params[self._host_name("means")]
+        if detail and "detail" not in params:
+            params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
+            optimizers["detail"] = detail_adam(params["detail"])
+        self._state = state
+        self._unchanged_rows: Tensor | None = None
+        self._number_rows()
+        self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).to(means)
+        self._warned_of_pose = False
+        self._replaced: list[tuple[Any, str, Any]] = []
+        self.attachment = Attachment(
+            conductor, self.params, n_views=len(self._views), seed=seed, loss_scale=loss_scale, accumulation=accumulation,
+            poll_parents=None if state is None else self._poll_parents, threshold=_threshold(strategy, conductor),
+        )  # fmt: skip
+
+    def params(self) -> dict[str, Tensor]:
+        """The current leaves, by gsplat's names."""
+        found = {name: self._params[self._host_name(name)] for name in _PARAMETERS}
+        return found | ({"detail": self._params["detail"]} if "detail" in self._params else {})
+
+    def wrap(self, rasterization: Rasterization) -> Rasterization:
+        """`rasterization` that renders training views at both scales, and shows f_det in renderings without gradients."""
+        if hasattr(rasterization, _ATTACHED):
+            raise HostError("this rasterization is wrapped already; remove() the attachment that wrapped it first.")
+        signature = inspect.signature(rasterization)
+        var_keyword = [name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD]
+        if missing := {"means", "opacities", "colors", "viewmats", "Ks", "width", "height"} - {*signature.parameters}:
+            raise HostError(
+                f"{rasterization} is not gsplat's rasterization: it has no parameter {', '.join(sorted(missing))}. Wrap the "
+                "function that takes them by name."
+            )
+
+        @functools.wraps(rasterization)
+        def wrapped(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+            call = signature.bind(*args, **kwargs).arguments
+            for name in var_keyword:
+                call |= call.pop(name, {})
+            if self.attachment.removed:
+                return rasterization(**call)
+            if not torch.is_grad_enabled():
+                return rasterization(**self._with_detail(call))
+            view = self._find_view(call["viewmats"])
+            if view is None:
+                return rasterization(**call)
+
+            def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
+                return self._render(rasterization, call, view, resolution, gate)
+
+            return self.attachment.render_view(view, render_at)  # type: ignore[no-any-return]
+
+        setattr(wrapped, _ATTACHED, self)
+        return wrapped
+
+    def replace_everywhere(self, rasterization: Rasterization) -> Rasterization:
+        """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
+        wrapped = self.wrap(rasterization)
+        for module in list(sys.modules.values()):
+            for name, value in list(vars(module).items()) if hasattr(module, "__dict__") else ():
+                if value is rasterization:
+                    setattr(module, name, wrapped)
+                    self._replaced.append((module, name, rasterization))
+        return wrapped
+
+    @torch.no_grad()
+    def fold_detail(self) -> None:
+        """Add f_det to sh0 and set it to 0, for exports and viewers without a detail feature."""
+        if "detail" in self._params:
+            sh0, detail = self._params[self._host_name("sh0")], self._params["detail"]
+            sh0 += sh0_offset(detail, sh0)
+            detail.zero_()
+
+    def remove(self) -> None:
+        """Restore the loop; f_det stays a parameter, see `fold_detail`."""
+        self.attachment.remove()
+        for module, name, original in self._replaced:
+            setattr(module, name, original)
+        self._replaced.clear()
+        if self._state is not None:
+            self._state.pop(ROWS, None)
+
+    def _host_name(self, name: str) -> str:
+        return self._names.get(name) or name
+
+    def _poll_parents(self) -> Int[Tensor, " M"] | None:
+        """parents[M] of the changes since the last call; None: there were none."""
+        if self._state is None or self._state[ROWS] is self._unchanged_rows:
+            return None
+        rows: Tensor = self._state[ROWS]
+        if bool((rows == 0).any()) and (state := self.attachment.conductor.state_dict()):
+            raise HostError(
+                "MCMC added Gaussians and gsplat does not say where they come from, but "
+                f"{', '.join(state)} is stored per Gaussian. End MCMC (refine_stop_iter) before SVS's anchor_start."
+            )
+        self._number_rows()
+        return (rows - 1).clamp_min(0)
+
+    def _number_rows(self) -> None:
+        """Store the row of each Gaussian, from 1: gsplat's operations write 0 where the origin is unknown."""
+        if self._state is not None:
+            means = self._params[self._host_name("means")]
+            self._unchanged_rows = self._state[ROWS] = torch.arange(1, len(means) + 1, device=means.device)
+
+    def _find_view(self, viewmats: Float[Tensor, "*C 4 4"]) -> View | None:
+        poses = viewmats.detach().reshape(-1, 4, 4)
+        if len(poses) != 1:
+            raise HostError(
+                f"only one view per step is supported, got {len(poses)}. Set batch_size=1, or call joint_loss for each view "
+                "and average."
+            )
+        distance = (self._poses - poses).abs().amax((1, 2))
+        nearest = int(distance.argmin())
+        if float(distance[nearest]) > _SAME_POSE * max(1.0, float(poses.abs().max())):
+            if not self._warned_of_pose:
+                _log.warning(
+                    "a camera has the pose of none of the %d views; its renderings are left unchanged.",
+                    len(self._views),
+                )
+                self._warned_of_pose = True
+            return None
+        return self._views[nearest]
+
+    def _render(
+        self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, resolution: Resolution, gate: Tensor | None
+    ) -> HostRendering:  # fmt: skip
+        call = dict(arguments)
+        if gate is not None:
+            call["opacities"] = call["opacities"] * gate.to(call["opacities"])
+        if resolution == "hr":
+            call, factor = self._with_detail(call), view.factor
+            call |= {
+                "Ks": _scaled(call["Ks"], factor),
+                "width": call["width"] * factor,
+                "height": call["height"] * factor,
+            }
+            call["render_mode"] = "RGB"
+        expected = view.hr.camera if resolution == "hr" else view.lr.camera
+        if (call["width"], call["height"]) != (expected.width, expected.height):
+            raise HostError(
+                f"{view.name} is rendered at {arguments['width']}x{arguments['height']}, but its photo has "
+                f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
+                "num_downscales=0)."
+            )
+        renders, alphas, info = rasterization(**call)
+        size = call["width"], call["height"]
+        packed = info["means2d"].dim() == 2
+        rows = info["gaussian_ids"] if packed else None
+        visible = _visible(info["radii"], packed)
+        if gate is not None:  # dropped Gaussians are not visible
+            kept = (gate > 0)[rows] if rows is not None else gate > 0
+            visible = visible & kept
+            radii = info["radii"]
+            info["radii"] = radii * kept.view(*kept.shape, *[1] * (radii.dim() - (1 if packed else 2))).to(radii)
+        n = len(self._params[self._host_name("means")])
+        means2d, visible = info["means2d"].detach().reshape(-1, 2), visible.reshape(-1)
+        if rows is not None:
+            means2d = means2d.new_zeros(n, 2).index_copy_(0, rows, means2d)
+            visible = torch.zeros(n, dtype=torch.bool, device=rows.device).index_copy_(0, rows, visible)
+        params = self.params()
+        if resolution == "lr":
+            params.pop("detail", None)
+        image = renders[..., :3].reshape(size[1], size[0], 3)
+        shot = AutogradShot(image, means2d, visible, params, ScreenGradientSlot(info["means2d"], size, rows=rows))
+        return HostRendering(shot, renders, (renders, alphas, info))
+
+    def _with_detail(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """The same call with colours f_base + f_det."""
+        call = dict(arguments)
+        if "detail" not in self._params or len(call["means"]) != len(self._params["detail"]):
+            return call  # only a part of the scene is rendered, and it is unknown which
+        detail, colors = self._params["detail"], call["colors"]
+        if call.get("sh_degree") is None:
+            call["colors"] = colors + detail
+        else:
+            call["colors"] = torch.cat((colors[..., :1, :] + detail[:, None] / SH_C0, colors[..., 1:, :]), -2)
+        return call
+
+
+attach = Attached
+
+
+def _threshold(strategy: Any, conductor: Conductor) -> float | None:
+    """The densification threshold of gsplat's strategy; warns about what the strategy does not follow."""
+    threshold = getattr(strategy, "grow_grad2d", None)
+    warn_if_score_is_unused(conductor, strategy, threshold)
+    if not getattr(strategy, "follows_may_densify", False):
+        warn_if_densification_outlasts(conductor, getattr(strategy, "refine_stop_iter", None), "refine_stop_iter")
+    return None if threshold is None else float(threshold)
+
+
+def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, ...]:
+    """Gaussians with positive radii: one number per Gaussian in gsplat 1.4, two in 1.5."""
+    two_radii = radii.dim() == (2 if packed else 3)
+    return (radii > 0).all(-1) if two_radii else radii > 0
+
+
+def _scaled(Ks: Float[Tensor, "*C 3 3"], factor: int) -> Float[Tensor, "*C 3 3"]:
+    return Ks * Ks.new_tensor([[factor], [factor], [1]])

@@ -1,0 +1,107 @@
+"""The densification score in the unit of a host's fixed threshold.  Eq. 14"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Final
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from clear_strategies.core.gradients import to_ndc
+from clear_strategies.density.threshold import count_passing, topk_threshold
+from clear_strategies.errors import SettingError
+from clear_strategies.merging.conductor import Conductor
+from integration.autograd_shot import ScreenGradientSlot
+
+_log = logging.getLogger(__name__)
+
+_VIEWS_PER_FIT: Final = 10  # sorting N scores at every view would cost more than a fresher factor gains
+
+
+class ScoreScaler:
+    """Scales a score so that as many Gaussians pass the host's threshold as pass by the ordinary statistic.
+
+    S_i is 3 to 30 times smaller than the statistic that hosts compare with their threshold. The factor is computed from
+    means over the views of about one densification interval. It is the same for all Gaussians, so their order stays.
+
+    Args:
+        threshold: the host's densification threshold, on the mean over views of ‖∇_u‖ in NDC units.
+        half_life: number of views after which a view counts half in the means.
+
+    Attributes:
+        factor: what the score was last multiplied by.
+    """
+
+    def __init__(self, threshold: float, half_life: int = 100) -> None:
+        if not threshold > 0:
+            raise SettingError(f"threshold: the host's densification threshold must be > 0, got {threshold}.")
+        if half_life < 1:
+            raise SettingError(f"half_life: must be at least 1 view, got {half_life}.")
+        self.threshold, self.factor = threshold, 1.0
+        self._decay = 0.5 ** (1 / half_life)
+        self._sums: Float[Tensor, "3 N"] | None = None
+        self._views = 0
+
+    def __call__(
+        self, score: Float[Tensor, " N"], ordinary: Float[Tensor, " N"], visible: Bool[Tensor, " N"]
+    ) -> Float[Tensor, " N"]:
+        """The scaled score of one view; a changed number of Gaussians starts the means anew."""
+        if self._sums is None or self._sums.shape[1] != len(score):
+            self._sums, self._views = score.new_zeros(3, len(score)), 0
+        self._sums *= self._decay
+        self._sums += torch.stack((score, ordinary, torch.ones_like(score))) * visible
+        if self._views % _VIEWS_PER_FIT == 0:
+            mean_score, mean_ordinary = self._sums[:2] / self._sums[2].clamp_min(1e-12)
+            self.factor = self._fit_factor(mean_score, mean_ordinary)
+        self._views += 1
+        return score * self.factor
+
+    def _fit_factor(self, score: Float[Tensor, " N"], ordinary: Float[Tensor, " N"]) -> float:
+        passing = count_passing(ordinary, self.threshold)
+        # Without a passing Gaussian, the highest score becomes half the threshold.
+        equivalent = topk_threshold(score, passing) if passing else 2 * float(score.max())
+        return self.threshold / equivalent if equivalent > 0 else 1.0
+
+
+def score_for_host(
+    slot: ScreenGradientSlot,
+    score: Float[Tensor, " N"],
+    ordinary: Float[Tensor, " N"],
+    visible: Bool[Tensor, " N"],
+    scaler: ScoreScaler | None,
+    loss_scale: float = 1.0,
+) -> Float[Tensor, " N"] | None:
+    """The values in NDC units that the host's densifier should read; None: those that it has already.
+
+    Args:
+        score, ordinary: from `Conductor.scores`; the same tensor if no strategy has a score.
+        loss_scale: the factor that the slot's own gradients carry.
+    """
+    absgrad = slot.absgrad(len(score))
+    if absgrad is not None:
+        # The host's threshold applies to Σ|∂L/∂u|, so that statistic decides how many Gaussians the score lets pass.
+        if score is ordinary:
+            return None
+        ordinary = torch.linalg.vector_norm(to_ndc(absgrad / loss_scale, slot.size), dim=-1)
+    return score if score is ordinary or scaler is None else scaler(score, ordinary, visible)
+
+
+def warn_if_densification_outlasts(conductor: Conductor, until: int | None, setting: str) -> None:
+    """Warn if the host's `setting` lets densification continue after a strategy ends it."""
+    if until is not None and conductor.may_densify(0) and not conductor.may_densify(until - 1):
+        _log.warning(
+            "the host densifies until %s=%d, but a strategy ends densification earlier (SVS: anchor_start). Lower %s to "
+            "that iteration.", setting, until, setting,
+        )  # fmt: skip
+
+
+def warn_if_score_is_unused(conductor: Conductor, densifier: Any, threshold: float | None) -> None:
+    """Warn if a strategy has a score, but the host's densifier has no threshold on the screen gradient."""
+    scoring = conductor.owner("score")
+    if scoring is not None and densifier is not None and threshold is None:
+        _log.warning(
+            "%s does not read the screen gradient: the densification score of %s has no effect.",
+            type(densifier).__name__, type(scoring).__name__,
+        )  # fmt: skip

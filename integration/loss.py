@@ -1,0 +1,88 @@
+"""For a loop that you edit: a loss whose gradient is the merged gradient of both scales.
+
+The host keeps `loss.backward()` and everything after it: optimizer, gradient scaler, accumulation, densifier. For a loop
+that must stay as it is, see attachment.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.deferred import Scalar
+from clear_strategies.core.gradients import Grads, Shot
+from clear_strategies.merging.conductor import Conductor, Update
+from integration.autograd_shot import AutogradShot
+from integration.host_score import ScoreScaler, score_for_host
+
+
+def joint_loss(
+    conductor: Conductor,
+    params: Mapping[str, Tensor],
+    lr: Shot,
+    hr: Shot | None,
+    view: Any,
+    t: int,
+    scaler: ScoreScaler | None = None,
+) -> Float[Tensor, ""]:
+    """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF); its gradient is the conductor's merged gradient.
+
+    Args:
+        params: the leaves that the host optimizes, by gsplat's names (and "detail", if the host has it).
+        lr, hr: the renderings of this view at both scales, e.g. `AutogradShot`. view: a `clear_strategies.core.view.View`.
+        scaler: for hosts with a densifier; `backward()` then also writes the score where the densifier reads the screen
+            gradient.
+    """
+    return joint_update(conductor, params, lr, hr, view, t, scaler)[0]
+
+
+def joint_update(
+    conductor: Conductor,
+    params: Mapping[str, Tensor],
+    lr: Shot,
+    hr: Shot | None,
+    view: Any,
+    t: int,
+    scaler: ScoreScaler | None = None,
+) -> tuple[Float[Tensor, ""], Update]:
+    """`joint_loss` together with its `Update`, which holds the densification scores and the conflict ratios."""
+    values = {name: p.detach() for name, p in params.items()}
+    update = conductor.update(values, lr, hr, view, t)
+    objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
+    losses = update.losses
+    value = objective.lambda_lr * losses["lr"] + λ * (
+        losses.get("base", 0.0) + objective.lambda_hf * losses.get("hf", 0.0)
+    )
+    merged = update.grads or Grads()
+    trained = {name: p for name, p in params.items() if name in merged}
+    gradients = [merged[name].to(p) for name, p in trained.items()]
+
+    slot = lr.gradient_slot if scaler is not None and isinstance(lr, AutogradShot) else None
+    score = None if slot is None else score_for_host(slot, update.score, update.ordinary, lr.visible, scaler)
+
+    def write_score(loss_scale: Float[Tensor, ""]) -> None:
+        if slot is not None and score is not None:
+            slot.write(loss_scale * score)
+
+    loss: Tensor = _GivenGradients.apply(value, gradients, write_score, *trained.values())  # type: ignore[no-untyped-call]
+    return loss, update
+
+
+class _GivenGradients(torch.autograd.Function):
+    """A scalar whose gradients are given; scaling the loss scales them."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, value: Scalar, gradients: list[Tensor], write_score: Callable[[Tensor], None], *params: Tensor
+    ) -> Tensor:
+        ctx.gradients, ctx.write_score = gradients, write_score
+        return torch.as_tensor(value, dtype=params[0].dtype, device=params[0].device)
+
+    @staticmethod
+    def backward(ctx: Any, *loss_scale: Tensor) -> Any:
+        ctx.write_score(loss_scale[0])
+        return None, None, None, *(g * loss_scale[0] for g in ctx.gradients)

@@ -1,0 +1,242 @@
+"""For hosts whose `render` takes the whole model (3DGS and its forks): render the model with gated opacities and with f_det
+in its colours, at LR or HR.
+"""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Final, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.view import View
+from clear_strategies.merging.conductor import Conductor
+from integration.attachment import HostRendering, Resolution
+from integration.autograd_shot import AutogradShot, ScreenGradientSlot
+from integration.detail import DetailFeature, sh0_offset
+from integration.errors import HostError
+from rasterizers.interface import Camera
+
+_log = logging.getLogger(__name__)
+
+Role = Literal["gate", "detail"]
+"""What an override changes: opacities are multiplied by the gate, colours are offset by f_det."""
+
+# Attributes that hold pixels in the cameras of the supported hosts; each host has some of them.
+_IN_PIXELS: Final = (
+    "image_width", "image_height", "width", "height", "focal_x", "focal_y", "fx", "fy", "cx", "cy",
+)  # fmt: skip
+
+
+@dataclass(slots=True, eq=False)
+class Overrides:
+    """What a proxy changes in its model.
+
+    Args:
+        gate: z, a factor of every opacity; None: opacities stay.
+        detail: f_det, an offset of every colour; None: colours stay.
+        used: the roles that the host has read.
+        active: roles whose getter is running; getters that it calls are not changed a second time.
+    """
+
+    gate: Float[Tensor, " N"] | None = None
+    detail: Float[Tensor, "N 3"] | None = None
+    used: set[Role] = field(default_factory=set)
+    active: set[Role] = field(default_factory=set)
+
+
+def proxy(model: Any, overrides: Overrides, roles: tuple[tuple[str, Role], ...]) -> Any:
+    """An object of the model's class that shares its attributes and applies the overrides.
+
+    Args:
+        roles: names of the model's getters, methods and attributes. Those of role "gate" give opacities (or a tuple that
+            ends with them), those of role "detail" the constant band of the colours. Names that the model does not have
+            are ignored.
+    """
+    result: Any = object.__new__(_proxy_class(type(model), roles))  # type: ignore[arg-type]
+    object.__setattr__(result, "__dict__", vars(model))
+    object.__setattr__(result, "_clear_overrides", overrides)
+    return result
+
+
+@cache
+def _proxy_class(cls: type, roles: tuple[tuple[str, Role], ...]) -> type:
+    members: dict[str, Any] = {"__slots__": ("_clear_overrides",), "__module__": cls.__module__}
+    for name, role in roles:
+        members |= {name: _member(inspect.getattr_static(cls, name, None), name, role)}
+    return type(cls.__name__, (cls,), members)
+
+
+def _member(original: Any, name: str, role: Role) -> Any:
+    """A property or method in place of `original`; its value is overridden once."""
+
+    def overridden(self: Any, get: Callable[[], Any]) -> Any:
+        overrides: Overrides = self._clear_overrides
+        if role in overrides.active:
+            return get()
+        overrides.active.add(role)
+        try:
+            return _apply(get(), overrides, role)
+        finally:
+            overrides.active.discard(role)
+
+    if callable(original):
+        return lambda self, *args, **kwargs: overridden(self, lambda: original(self, *args, **kwargs))
+    if isinstance(original, property):
+        return property(lambda self: overridden(self, lambda: original.__get__(self)))
+    return property(lambda self: overridden(self, lambda: _attribute(self, name)))
+
+
+def _attribute(model: Any, name: str) -> Any:
+    try:
+        return vars(model)[name]
+    except KeyError:
+        raise AttributeError(f"{type(model).__name__} has no {name}") from None
+
+
+def _apply(value: Any, overrides: Overrides, role: Role) -> Any:
+    overrides.used.add(role)
+    if isinstance(value, tuple):  # Mip-Splatting returns (scales, opacities)
+        return (*value[:-1], _apply(value[-1], overrides, role))
+    if role == "gate" and overrides.gate is not None:
+        return value * overrides.gate.to(value).view(-1, *[1] * (value.dim() - 1))
+    if role == "detail" and overrides.detail is not None:
+        return value + sh0_offset(overrides.detail, value)
+    return value
+
+
+class ModelRenderer:
+    """Renders a host's model through a proxy, at LR or HR, and warns once about what the host does not read.
+
+    Args:
+        params: returns the host's current leaves, by gsplat's names.
+        detail: f_det, applied at HR and in renderings without gradients; None: there is none.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        roles: tuple[tuple[str, Role], ...],
+        params: Callable[[], Mapping[str, Tensor]],
+        detail: DetailFeature | None,
+        conductor: Conductor,
+    ) -> None:
+        self._model, self._roles, self._host_params, self._detail = model, roles, params, detail
+        scoring = conductor.owner("score")
+        self._scoring = None if scoring is None else type(scoring).__name__
+        self._warned: set[str] = set()
+
+    def params(self) -> dict[str, Tensor]:
+        """The host's current leaves and f_det."""
+        detail = {} if self._detail is None else {"detail": self._detail.value}
+        return {**self._host_params(), **detail}
+
+    def with_detail(self) -> Any:
+        """The model with colours f_base + f_det, for renderings without gradients."""
+        overrides = Overrides(detail=None if self._detail is None else self._detail.value)
+        return proxy(self._model, overrides, self._roles)
+
+    def render(
+        self,
+        render: Callable[[Any], Any],
+        view: View,
+        resolution: Resolution,
+        gate: Float[Tensor, " N"] | None,
+        to_pixels: Callable[[Mapping[str, Any]], tuple[float, float] | None] = lambda result: None,
+    ) -> HostRendering:
+        """Render the view at LR without f_det, or at HR with it.
+
+        Args:
+            render: the host's function of the model alone.
+            to_pixels: see `host_rendering`.
+        """
+        hr = resolution == "hr"
+        overrides = Overrides(gate, self._detail.value if hr and self._detail is not None else None)
+        result = render(proxy(self._model, overrides, self._roles))
+        if overrides.gate is not None and "gate" not in overrides.used:
+            self.warn_once("render reads none of the model's opacity getters: dropout has no effect.")
+        if overrides.detail is not None and "detail" not in overrides.used:
+            self.warn_once("render does not read the model's constant colours: the detail feature has no effect.")
+        params = self.params() if hr else self._host_params()
+        trained = {name: p for name, p in params.items() if p.requires_grad}
+        rendering = host_rendering(result, (view.hr if hr else view.lr).camera, trained, overrides.gate, to_pixels)
+        if rendering.shot.gradient_slot.tensor.shape[-1] == 4 and self._scoring is not None:
+            self.warn_once(
+                "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
+                "score of %s goes to the first two columns only.", self._scoring,
+            )  # fmt: skip
+        return rendering
+
+    def warn_once(self, message: str, *values: Any) -> None:
+        """Log a warning the first time that it comes up."""
+        if message not in self._warned:
+            _log.warning(message, *values)
+            self._warned.add(message)
+
+
+def host_rendering(
+    result: Any,
+    camera: Camera,
+    params: Mapping[str, Tensor],
+    gate: Float[Tensor, " N"] | None,
+    to_pixels: Callable[[Mapping[str, Any]], tuple[float, float] | None],
+) -> HostRendering:
+    """The result of a host's `render`: a dict with "render" [3, H, W], "viewspace_points" [N, 2 or more], "radii" and
+    "visibility_filter" [N]. Gaussians that the gate drops are marked as not visible in it.
+
+    Args:
+        camera: the camera of the photo at this resolution.
+        to_pixels: returns, for a result, the factors from gradients of its "viewspace_points" to 1/pixel; None: the
+            points are in NDC.
+
+    Raises:
+        HostError: the result has another type, or the image another size.
+    """
+    names = ("render", "viewspace_points", "radii", "visibility_filter")
+    if not isinstance(result, Mapping) or any(name not in result for name in names):
+        found = ", ".join(map(str, result)) if isinstance(result, Mapping) else type(result).__name__
+        raise HostError(f"render must return a dict with {', '.join(names)}, got {found}. Wrap a function that does.")
+    image, centres, radii = (result[name] for name in names[:3])
+    if tuple(image.shape) != (3, camera.height, camera.width):
+        raise HostError(
+            f"render must return an image of {camera.width}x{camera.height} pixels, got shape {tuple(image.shape)}. Train "
+            "at the resolution of the photos."
+        )
+    visible = radii > 0 if radii.dim() == 1 else (radii > 0).all(-1)
+    if gate is not None:
+        kept = gate > 0
+        visible = visible & kept
+        passed = result["visibility_filter"]
+        result = {
+            **result,
+            "radii": radii * kept.view(-1, *[1] * (radii.dim() - 1)).to(radii),
+            "visibility_filter": passed & kept if passed.dtype == torch.bool else passed[kept[passed.reshape(-1)]],
+        }
+    width, height = camera.width, camera.height
+    slot = ScreenGradientSlot(centres, (width, height), to_pixels(result) or (2 / width, 2 / height))
+    means2d = project(params["means"].detach(), camera)
+    return HostRendering(AutogradShot(image.permute(1, 2, 0), means2d, visible, params, slot), image, result)
+
+
+def project(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 2"]:
+    """u_i = π(μ_i) in pixels; finite but meaningless for Gaussians behind the camera."""
+    pose = camera.world_to_camera.to(means)
+    x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+    z = z.clamp_min(torch.finfo(z.dtype).eps)
+    return torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), -1)
+
+
+def enlarged_camera(camera: Any, factor: int) -> Any:
+    """A copy of a host's camera with `factor` times as many pixels per edge; fields of view and projections stay."""
+    larger = copy.copy(camera)
+    for name in _IN_PIXELS:
+        if hasattr(camera, name):
+            setattr(larger, name, getattr(camera, name) * factor)
+    return larger

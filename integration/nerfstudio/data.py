@@ -1,0 +1,87 @@
+"""nerfstudio's training photos as views. Reads nerfstudio's data managers without importing nerfstudio.
+
+The LR side of a view is the photo that splatfacto trains on, undistorted by its data manager. The HR side is an SR image from
+a folder or a network.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.view import View
+from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.priors import Bicubic, Images, Onnx, Prior, cached
+from clear_strategies.errors import DataError
+from integration.views import view
+
+
+def prior(sr: Path | None) -> Prior:
+    """The source of SR images: a folder, an ONNX network, or bicubic interpolation if `sr` is None."""
+    if sr is None:
+        return Bicubic()
+    return cached(Onnx(str(sr))) if sr.suffix.lower() == ".onnx" else Images(str(sr))
+
+
+def views(datamanager: Any, sr: Prior, factor: int, device: torch.device | str = "cpu") -> tuple[View, ...]:
+    """The training views of a `FullImageDatamanager` on `device`, named like their files.
+
+    Args:
+        sr: called once per photo. factor: HR pixels per LR pixel.
+
+    Raises:
+        DataError: two photos have the same stem, a photo has a mask, or an SR image does not fit.
+    """
+    photos = datamanager.cached_train  # read first: it undistorts the photos and corrects the cameras
+    cameras, files = datamanager.train_dataset.cameras, datamanager.train_dataset.image_filenames
+    Ks, poses = cameras.get_intrinsics_matrices(), world_to_camera(cameras.camera_to_worlds)
+    _require_unique_stems(files)
+    found = []
+    for i, photo in enumerate(photos):
+        name = Path(files[i]).name
+        if "mask" in photo:
+            raise DataError(
+                name, "mask", "hides pixels from splatfacto's loss but not from the losses of the SR image",
+                "train without masks",
+            )  # fmt: skip
+        found.append(view(name, over_black(photo["image"]).to(device), poses[i].to(device), Ks[i], sr, factor))
+    return tuple(found)
+
+
+def save_lr(datamanager: Any, folder: Path) -> None:
+    """Write the photos as splatfacto trains on them, as PNG, for an SR tool to enlarge."""
+    files = datamanager.train_dataset.image_filenames
+    _require_unique_stems(files)
+    for file, photo in zip(files, datamanager.cached_train, strict=True):
+        write_png(folder / f"{Path(file).stem}.png", over_black(photo["image"]))
+
+
+def world_to_camera(camera_to_world: Float[Tensor, "*C 3 4"]) -> Float[Tensor, "*C 4 4"]:
+    """World to camera with OpenCV axes, from nerfstudio's poses: camera to world with OpenGL axes (y up, z back)."""
+    R = (camera_to_world[..., :3] * camera_to_world.new_tensor([1, -1, -1])).mT  # scale the columns, then transpose
+    pose = torch.eye(4).to(R).repeat(*R.shape[:-2], 1, 1)
+    pose[..., :3, :3] = R
+    pose[..., :3, 3:] = -R @ camera_to_world[..., 3:]
+    return pose
+
+
+def over_black(image: Tensor) -> Float[Tensor, "H W 3"]:
+    """RGB in [0, 1] of an 8-bit or float photo, composited over black as splatfacto does it."""
+    values = image.float() / 255 if image.dtype == torch.uint8 else image
+    return values[..., :3] * values[..., 3:] if values.shape[-1] == 4 else values
+
+
+def _require_unique_stems(files: Any) -> None:
+    """SR images are found by the stem of their photo."""
+    first: dict[str, Path] = {}
+    for file in map(Path, files):
+        other = first.setdefault(file.stem, file)
+        if other is not file:
+            raise DataError(
+                file, "file name", f"has the stem of {other}, and SR images are found by the stem",
+                "give each photo its own name",
+            )  # fmt: skip

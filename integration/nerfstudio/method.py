@@ -1,0 +1,216 @@
+"""`clear-splatfacto`: splatfacto with the strategies attached; its trainer and viewer are nerfstudio's own.
+
+    ns-train clear-splatfacto --data scene --pipeline.model.sr scene/sr
+
+The `TrainerConfig` is written out, because splatfacto's cannot be imported while nerfstudio collects its methods.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import torch
+from jaxtyping import Float
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
+from nerfstudio.engine.optimizers import AdamOptimizerConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.engine.trainer import TrainerConfig
+from nerfstudio.models import splatfacto
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
+from nerfstudio.pipelines.base_pipeline import VanillaPipelineConfig
+from nerfstudio.plugins.types import MethodSpecification
+from nerfstudio.utils.rich_utils import CONSOLE
+from torch import Tensor
+
+from clear_strategies.errors import SettingError
+from integration.detail import sh0_offset
+from integration.gsplat import Attached, attach
+from integration.nerfstudio.data import prior, save_lr, views
+
+NAMES: Final = {"sh0": "features_dc", "shN": "features_rest"}
+"""gsplat's parameter name -> splatfacto's, where they differ."""
+
+
+@dataclass
+class ClearSplatfactoModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
+    """splatfacto's settings, the strategies' settings, and the source of the SR images.
+
+    Raises:
+        SettingError: a setting of splatfacto does not work with two scales.
+    """
+
+    _target: type = field(default_factory=lambda: ClearSplatfactoModel)
+    clear: str = "clear"
+    """the strategies, as in +strategy= of clear-strategies: clear, gco, gco,svs, baseline ..."""
+    overrides: tuple[str, ...] = ()
+    """settings of the strategies and the objective: strategies.gco.tolerance=0.1 objective=paper ..."""
+    sr: Path | None = None
+    """folder with one SR image per photo (same stem), or an ONNX network; none: bicubic, which adds no detail"""
+    sr_factor: int = 4
+    """HR pixels per LR pixel along an edge"""
+    save_lr: Path | None = None
+    """write the photos here as they are trained on, undistorted, for an SR tool to enlarge"""
+    background_color: Literal["random", "black", "white"] = "black"
+    """black: the background of the SR images"""
+    num_downscales: int = 0
+    """0: LR photos and SR images have one size each"""
+
+    def __post_init__(self) -> None:
+        for name, found, needed, why in (
+            ("num_downscales", self.num_downscales, 0, "LR photos and SR images have one size each"),
+            ("background_color", self.background_color, "black", "both scales are compared over the same colour"),
+            ("camera_optimizer.mode", self.camera_optimizer.mode, "off", "a view is recognised by its pose"),
+            ("use_bilateral_grid", self.use_bilateral_grid, False, "it changes the colours of one scale only"),
+        ):
+            if found != needed:
+                raise SettingError(f"{name}: clear-splatfacto needs {needed}, got {found}: {why}.")
+        for name, least in (("sh_degree", 1), ("sr_factor", 2)):
+            if getattr(self, name) < least:
+                raise SettingError(f"{name}: clear-splatfacto needs at least {least}, got {getattr(self, name)}.")
+
+
+class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
+    """splatfacto with the detail feature f_det, trained with the strategies.
+
+    Attributes:
+        attached: not None from the trainer's request for callbacks until training ends.
+    """
+
+    config: ClearSplatfactoModelConfig
+
+    def populate_modules(self) -> None:
+        super().populate_modules()
+        self.gauss_params["detail"] = torch.nn.Parameter(torch.zeros_like(self.gauss_params["means"]))
+        self.attached: Attached | None = None
+
+    @property
+    def features_dc(self) -> Float[Tensor, "N 3"]:
+        """f_base in training, where LR is rendered; f_base + f_det for the viewer, evaluation and exports."""
+        base: Tensor = self.gauss_params["features_dc"]
+        return base if self.training else base + sh0_offset(self.gauss_params["detail"], base)
+
+    def get_gaussian_param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        groups: dict[str, list[torch.nn.Parameter]] = super().get_gaussian_param_groups()
+        return groups | {"detail": [self.gauss_params["detail"]]}
+
+    def get_training_callbacks(
+        self, training_callback_attributes: TrainingCallbackAttributes
+    ) -> list[TrainingCallback]:
+        self.attached = self._attach(training_callback_attributes)
+        return [
+            *super().get_training_callbacks(training_callback_attributes),
+            TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self._resume),
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._detach),
+        ]
+
+    def get_outputs(self, camera: Any) -> dict[str, Any]:
+        if not self.training or self.attached is None:
+            return super().get_outputs(camera)  # type: ignore[no-any-return]
+        with _rendering_with(self.attached.wrap(splatfacto.rasterization)):
+            return super().get_outputs(camera)  # type: ignore[no-any-return]
+
+    def get_metrics_dict(self, outputs: Any, batch: Any) -> dict[str, Any]:
+        metrics: dict[str, Any] = super().get_metrics_dict(outputs, batch)
+        if self.training and self.attached is not None:
+            metrics |= {f"clear_{name}": value for name, value in self.attached.attachment.log.items()}
+        return metrics
+
+    def _attach(self, host: TrainingCallbackAttributes) -> Attached:
+        from clear_strategies.compose import conductor
+
+        config, trainer, datamanager = self.config, host.trainer, host.pipeline.datamanager
+        if accumulated := {group: n for group, n in trainer.gradient_accumulation_steps.items() if n != 1}:
+            raise SettingError(
+                f"gradient_accumulation_steps: clear-splatfacto merges the gradients of one view per step, got {accumulated}. "
+                "Leave them at 1."
+            )
+        if config.save_lr is not None:
+            save_lr(datamanager, config.save_lr)
+            CONSOLE.log(
+                f"CLEAR: wrote the LR photos to {config.save_lr}; enlarge them x{config.sr_factor} for pipeline.model.sr."
+            )
+        strategies = conductor(config.clear, *config.overrides, iterations=trainer.config.max_num_iterations)
+        sr = prior(config.sr)
+        CONSOLE.log(
+            f"CLEAR: {', '.join(type(s).__name__ for s in strategies.strategies) or 'no strategy'}; "
+            f"SR images x{config.sr_factor}: {sr.label}."
+        )
+        stop = self.strategy.refine_stop_iter
+        end = next((step for step in range(stop) if not strategies.may_densify(step + 1)), stop)
+        if end < stop:
+            CONSOLE.log(f"CLEAR: densification ends at step {end} instead of {stop} (SVS: anchor_start).")
+            self.strategy.refine_stop_iter = end
+        return attach(
+            self.gauss_params, host.optimizers.optimizers, views(datamanager, sr, config.sr_factor, self.device), strategies,
+            strategy=self.strategy, state=self.strategy_state, names=NAMES, seed=trainer.config.machine.seed,
+            loss_scale=host.grad_scaler.get_scale,
+        )  # fmt: skip
+
+    def _resume(self, step: int) -> None:
+        """Continue a resumed training at its iteration."""
+        attached = self.attached
+        if attached is not None and not attached.attachment.counts and step > 0:
+            CONSOLE.log(f"CLEAR: resumed at step {step}; the strategies' per-Gaussian state (SVS's anchor) is lost.")
+            attached.attachment.t = step + 1
+
+    def _detach(self, step: int) -> None:
+        if self.attached is not None:
+            counts = ", ".join(f"{name} {n:,}" for name, n in self.attached.attachment.counts.items())
+            CONSOLE.log(f"CLEAR: detached after step {step}: {counts}.")
+            self.attached.remove()
+            self.attached = None
+
+
+@contextmanager
+def _rendering_with(rasterization: Any) -> Iterator[None]:
+    """Replace gsplat's function in splatfacto's module."""
+    own, splatfacto.rasterization = splatfacto.rasterization, rasterization
+    try:
+        yield
+    finally:
+        splatfacto.rasterization = own
+
+
+def _adam(lr: float, lr_final: float | None = None) -> dict[str, Any]:
+    """The optimizer of splatfacto's group; its rate is constant, or decays to `lr_final` at 30,000 steps."""
+    decay = None if lr_final is None else ExponentialDecaySchedulerConfig(lr_final=lr_final, max_steps=30_000)
+    return {"optimizer": AdamOptimizerConfig(lr=lr, eps=1e-15), "scheduler": decay}
+
+
+clear_splatfacto: Final = MethodSpecification(
+    config=TrainerConfig(
+        method_name="clear-splatfacto",
+        steps_per_eval_image=100,
+        steps_per_eval_batch=0,
+        steps_per_save=2_000,
+        steps_per_eval_all_images=1_000,
+        max_num_iterations=30_000,
+        mixed_precision=False,
+        pipeline=VanillaPipelineConfig(
+            datamanager=FullImageDatamanagerConfig(
+                dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
+            ),
+            model=ClearSplatfactoModelConfig(),
+        ),
+        optimizers={
+            "means": _adam(1.6e-4, 1.6e-6),
+            "features_dc": _adam(2.5e-3),
+            "features_rest": _adam(2.5e-3 / 20),
+            "detail": _adam(2.5e-3),
+            "opacities": _adam(5e-2),
+            "scales": _adam(5e-3),
+            "quats": _adam(1e-3),
+        },
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        vis="viewer",
+    ),
+    description="splatfacto on LR photos and SR images, merged by CLEAR's strategies",
+)
+"""The method as nerfstudio's registry expects it."""

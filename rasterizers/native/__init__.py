@@ -1,0 +1,77 @@
+"""What the compiled packages share: loading the module for this processor's instruction set, and the number of threads.
+
+`src/` holds the C++ headers that both packages (`rasterizers.cpp` and `clear_strategies.kernels`) include.
+"""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from types import ModuleType
+from typing import Final
+
+import torch
+
+from rasterizers.interface import BackendUnavailable
+
+_log = logging.getLogger(__name__)
+
+_ISAS: Final = ("avx512", "avx2", "baseline")  # fastest first
+_OVERRIDE: Final = "CLEAR_ISA"  # environment variable for tests and comparisons
+
+_scopes: list[int] = []  # thread counts of the active `kernel_threads` scopes, innermost last
+
+
+def threads() -> int:
+    """The number of threads that compiled kernels use: that of the innermost `kernel_threads` scope, else torch's."""
+    return _scopes[-1] if _scopes else torch.get_num_threads()
+
+
+@contextmanager
+def kernel_threads(n: int) -> Iterator[None]:
+    """A scope in which compiled kernels use n threads and torch uses one.
+
+    OpenMP threads, torch's included, spin for a while after each operation and would occupy the cores that the kernels
+    need. Torch's operations between the kernels are small, and as fast on one thread.
+    """
+    before = torch.get_num_threads()
+    _scopes.append(n)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        _scopes.pop()
+        torch.set_num_threads(before)
+
+
+@cache
+def load_kernels(package: str) -> ModuleType:
+    """The fastest of `package`'s modules `_avx512`, `_avx2` and `_baseline` that this processor can run.
+
+    Raises:
+        BackendUnavailable: none was compiled, or `CLEAR_ISA` names one that this processor cannot run.
+    """
+    try:
+        baseline = importlib.import_module(f"{package}._baseline")
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"the compiled kernels of {package} are not installed ({error}). This is a pure-Python installation: install a "
+            "C++20 compiler (Debian: apt install g++; macOS: xcode-select --install) and install clear-strategies again."
+        ) from error
+    runs_here = [*baseline.instruction_sets(), "baseline"]
+    wanted = os.environ.get(_OVERRIDE)
+    if wanted and wanted not in runs_here:
+        raise BackendUnavailable(f"{_OVERRIDE}={wanted} cannot run here; this processor has {', '.join(runs_here)}.")
+    for isa in [wanted] if wanted else [isa for isa in _ISAS if isa in runs_here]:
+        try:
+            module = importlib.import_module(f"{package}._{isa}")
+        except ImportError as error:
+            _log.warning("%s was not compiled for %s: %s", package, isa, error)
+            continue
+        _log.debug("%s: kernels for %s.", package, isa)
+        return module
+    raise BackendUnavailable(f"{package} was not compiled for {wanted}; unset {_OVERRIDE}.")

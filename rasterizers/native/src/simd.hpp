@@ -1,0 +1,478 @@
+// `Lanes<T>`: sixteen numbers at a time on every processor, for the 4 x 4 pixels of a block or for sixteen Gaussians.
+//
+// AVX-512 holds sixteen floats in one register; narrower processors use several registers for the same sixteen, so every
+// other file is written once. Arithmetic uses the compiler's vector types; `Native` holds the operations they lack.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+namespace clear {
+
+inline constexpr int kLanes = 16;
+
+#define CLEAR_INLINE inline __attribute__((always_inline))
+#define CLEAR_LAMBDA __attribute__((always_inline))
+
+#if defined(__AVX512F__)
+inline constexpr int kRegisterBytes = 64;
+#elif defined(__AVX2__)
+inline constexpr int kRegisterBytes = 32;
+#else
+inline constexpr int kRegisterBytes = 16;
+#endif
+
+template <class T>
+struct IntegerOf;
+template <>
+struct IntegerOf<float> {
+  using type = std::int32_t;
+};
+template <>
+struct IntegerOf<double> {
+  using type = std::int64_t;
+};
+
+// One register of T: its type, the type of a comparison's result, and the operations that have no operator.
+template <class T>
+struct Native {
+  static constexpr int width = kRegisterBytes / sizeof(T);
+  typedef T Register __attribute__((vector_size(kRegisterBytes)));
+  typedef typename IntegerOf<T>::type Integer __attribute__((vector_size(kRegisterBytes)));
+
+#if defined(__AVX512F__)
+  using Mask = std::uint16_t;  // one bit per lane
+  static constexpr Mask all = Mask((1u << width) - 1);
+  static CLEAR_INLINE Mask less(Register a, Register b) {
+    if constexpr (sizeof(T) == 4) return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ);
+    else return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LT_OQ);
+  }
+  static CLEAR_INLINE Mask less_equal(Register a, Register b) {
+    if constexpr (sizeof(T) == 4) return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ);
+    else return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LE_OQ);
+  }
+  static CLEAR_INLINE Register select(Mask m, Register a, Register b) {
+    if constexpr (sizeof(T) == 4) return (Register)_mm512_mask_mov_ps((__m512)b, m, (__m512)a);
+    else return (Register)_mm512_mask_mov_pd((__m512d)b, __mmask8(m), (__m512d)a);
+  }
+  static CLEAR_INLINE Mask mask_and(Mask a, Mask b) { return a & b; }
+  static CLEAR_INLINE Mask mask_and_not(Mask a, Mask b) { return a & Mask(~b) & all; }
+  static CLEAR_INLINE std::uint32_t bits(Mask m) { return m & all; }
+  static CLEAR_INLINE Mask from_bits(std::uint32_t b) { return Mask(b) & all; }
+  static CLEAR_INLINE Register minimum(Register a, Register b) {
+    if constexpr (sizeof(T) == 4) return (Register)_mm512_min_ps((__m512)a, (__m512)b);
+    else return (Register)_mm512_min_pd((__m512d)a, (__m512d)b);
+  }
+  static CLEAR_INLINE Register maximum(Register a, Register b) {
+    if constexpr (sizeof(T) == 4) return (Register)_mm512_max_ps((__m512)a, (__m512)b);
+    else return (Register)_mm512_max_pd((__m512d)a, (__m512d)b);
+  }
+  static CLEAR_INLINE Register root(Register a) {
+    if constexpr (sizeof(T) == 4) return (Register)_mm512_sqrt_ps((__m512)a);
+    else return (Register)_mm512_sqrt_pd((__m512d)a);
+  }
+  static CLEAR_INLINE Register nearest(Register a) {
+    if constexpr (sizeof(T) == 4) return (Register)_mm512_roundscale_ps((__m512)a, 0);
+    else return (Register)_mm512_roundscale_pd((__m512d)a, 0);
+  }
+  // a · 2^n for an integer n.
+  static CLEAR_INLINE Register scale_by_power(Register a, Register n) {
+    if constexpr (sizeof(T) == 4) return (Register)_mm512_scalef_ps((__m512)a, (__m512)n);
+    else return (Register)_mm512_scalef_pd((__m512d)a, (__m512d)n);
+  }
+  // c - a b, rounded once.
+  static CLEAR_INLINE Register subtract_product(Register c, Register a, Register b) {
+    if constexpr (sizeof(T) == 4) return (Register)_mm512_fnmadd_ps((__m512)a, (__m512)b, (__m512)c);
+    else return (Register)_mm512_fnmadd_pd((__m512d)a, (__m512d)b, (__m512d)c);
+  }
+  // 1/a to about the precision of T.
+  static CLEAR_INLINE Register reciprocal(Register a) {
+    if constexpr (sizeof(T) == 4) {
+      Register r = (Register)_mm512_rcp14_ps((__m512)a);
+      return r * (2.0f - a * r);  // one Newton step: 28 bits
+    } else {
+      return T(1) / a;
+    }
+  }
+#else
+  using Mask = Integer;  // all bits of a lane, or none
+  static CLEAR_INLINE Mask less(Register a, Register b) { return (Mask)(a < b); }
+  static CLEAR_INLINE Mask less_equal(Register a, Register b) { return (Mask)(a <= b); }
+  static CLEAR_INLINE Register select(Mask m, Register a, Register b) { return m ? a : b; }
+  static CLEAR_INLINE Mask mask_and(Mask a, Mask b) { return a & b; }
+  static CLEAR_INLINE Mask mask_and_not(Mask a, Mask b) { return a & ~b; }
+  static CLEAR_INLINE std::uint32_t bits(Mask m) {
+#if defined(__AVX2__)
+    if constexpr (sizeof(T) == 4) return _mm256_movemask_ps((__m256)m);
+    else return _mm256_movemask_pd((__m256d)m);
+#elif defined(__SSE2__)
+    if constexpr (sizeof(T) == 4) return _mm_movemask_ps((__m128)m);
+    else return _mm_movemask_pd((__m128d)m);
+#else
+    std::uint32_t b = 0;
+    for (int i = 0; i < width; ++i) b |= std::uint32_t(m[i] != 0) << i;
+    return b;
+#endif
+  }
+  static CLEAR_INLINE Mask from_bits(std::uint32_t b) {
+    Mask m;
+    for (int i = 0; i < width; ++i) m[i] = -(typename IntegerOf<T>::type)((b >> i) & 1);
+    return m;
+  }
+  // NaN as on x86: the result is the second operand.
+  static CLEAR_INLINE Register minimum(Register a, Register b) {
+#if defined(__AVX2__)
+    if constexpr (sizeof(T) == 4) return (Register)_mm256_min_ps((__m256)a, (__m256)b);
+    else return (Register)_mm256_min_pd((__m256d)a, (__m256d)b);
+#else
+    return a < b ? a : b;
+#endif
+  }
+  static CLEAR_INLINE Register maximum(Register a, Register b) {
+#if defined(__AVX2__)
+    if constexpr (sizeof(T) == 4) return (Register)_mm256_max_ps((__m256)a, (__m256)b);
+    else return (Register)_mm256_max_pd((__m256d)a, (__m256d)b);
+#else
+    return a > b ? a : b;
+#endif
+  }
+  static CLEAR_INLINE Register root(Register a) {
+#if defined(__AVX2__)
+    if constexpr (sizeof(T) == 4) return (Register)_mm256_sqrt_ps((__m256)a);
+    else return (Register)_mm256_sqrt_pd((__m256d)a);
+#else
+    for (int i = 0; i < width; ++i) a[i] = std::sqrt(a[i]);
+    return a;
+#endif
+  }
+  // Rounds by adding and subtracting 1.5 · 2^mantissa; valid for |a| < 2^22 (double: 2^51).
+  static CLEAR_INLINE Register nearest(Register a) {
+    constexpr T big = sizeof(T) == 4 ? T(12582912.0) : T(6755399441055744.0);
+    return (a + big) - big;
+  }
+  static CLEAR_INLINE Register scale_by_power(Register a, Register n) {
+    constexpr int mantissa = sizeof(T) == 4 ? 23 : 52;
+    constexpr T limit = sizeof(T) == 4 ? T(-126) : T(-1022);
+    Integer e = __builtin_convertvector(maximum(n, limit - Register{}), Integer);
+    Integer one = (Integer)(T(1) - Register{});
+    return a * (Register)(one + (e << mantissa));
+  }
+  static CLEAR_INLINE Register subtract_product(Register c, Register a, Register b) {
+#if defined(__AVX2__)
+    if constexpr (sizeof(T) == 4) return (Register)_mm256_fnmadd_ps((__m256)a, (__m256)b, (__m256)c);
+    else return (Register)_mm256_fnmadd_pd((__m256d)a, (__m256d)b, (__m256d)c);
+#else
+    return c - a * b;
+#endif
+  }
+  static CLEAR_INLINE Register reciprocal(Register a) { return T(1) / a; }
+#endif
+};
+
+template <class T>
+struct Mask {
+  static constexpr int registers = kLanes / Native<T>::width;
+  typename Native<T>::Mask r[registers];
+
+  CLEAR_INLINE Mask operator&(const Mask& o) const {
+    Mask m;
+    for (int i = 0; i < registers; ++i) m.r[i] = Native<T>::mask_and(r[i], o.r[i]);
+    return m;
+  }
+  CLEAR_INLINE Mask and_not(const Mask& o) const {
+    Mask m;
+    for (int i = 0; i < registers; ++i) m.r[i] = Native<T>::mask_and_not(r[i], o.r[i]);
+    return m;
+  }
+  CLEAR_INLINE std::uint32_t bits() const {
+    std::uint32_t b = 0;
+    for (int i = 0; i < registers; ++i) b |= Native<T>::bits(r[i]) << (i * Native<T>::width);
+    return b;
+  }
+  CLEAR_INLINE bool any() const { return bits() != 0; }
+  static CLEAR_INLINE Mask from_bits(std::uint32_t b) {
+    Mask m;
+    for (int i = 0; i < registers; ++i) m.r[i] = Native<T>::from_bits(b >> (i * Native<T>::width));
+    return m;
+  }
+};
+
+template <class T>
+struct Lanes {
+  static constexpr int registers = kLanes / Native<T>::width;
+  using Register = typename Native<T>::Register;
+  Register r[registers];
+
+  Lanes() = default;
+  CLEAR_INLINE Lanes(T x) {
+    for (int i = 0; i < registers; ++i) r[i] = x - Register{};  // x - 0 is x, also for -0; compiles to a broadcast
+  }
+  static CLEAR_INLINE Lanes load(const T* p) {
+    // Register by register: one memcpy of several registers would go through the stack.
+    Lanes a;
+    for (int i = 0; i < registers; ++i) std::memcpy(&a.r[i], p + i * Native<T>::width, sizeof(Register));
+    return a;
+  }
+  CLEAR_INLINE void store(T* p) const {
+    for (int i = 0; i < registers; ++i) std::memcpy(p + i * Native<T>::width, &r[i], sizeof(Register));
+  }
+
+#define CLEAR_OPERATOR(op)                                                          \
+  friend CLEAR_INLINE Lanes operator op(const Lanes& a, const Lanes& b) {           \
+    Lanes c;                                                                        \
+    for (int i = 0; i < registers; ++i) c.r[i] = a.r[i] op b.r[i];                  \
+    return c;                                                                       \
+  }                                                                                 \
+  CLEAR_INLINE Lanes& operator op##=(const Lanes & b) {                             \
+    for (int i = 0; i < registers; ++i) r[i] = r[i] op b.r[i];                      \
+    return *this;                                                                   \
+  }
+  CLEAR_OPERATOR(+)
+  CLEAR_OPERATOR(-)
+  CLEAR_OPERATOR(*)
+  CLEAR_OPERATOR(/)
+#undef CLEAR_OPERATOR
+  CLEAR_INLINE Lanes operator-() const { return Lanes(T(0)) - *this; }
+
+#define CLEAR_COMPARISON(name, call)                                                \
+  friend CLEAR_INLINE Mask<T> name(const Lanes& a, const Lanes& b) {                \
+    Mask<T> m;                                                                      \
+    for (int i = 0; i < registers; ++i) m.r[i] = call;                              \
+    return m;                                                                       \
+  }
+  CLEAR_COMPARISON(operator<, Native<T>::less(a.r[i], b.r[i]))
+  CLEAR_COMPARISON(operator<=, Native<T>::less_equal(a.r[i], b.r[i]))
+  CLEAR_COMPARISON(operator>, Native<T>::less(b.r[i], a.r[i]))
+  CLEAR_COMPARISON(operator>=, Native<T>::less_equal(b.r[i], a.r[i]))
+#undef CLEAR_COMPARISON
+};
+
+#define CLEAR_EACH(name, ...)                                                       \
+  Lanes<T> c;                                                                       \
+  for (int i = 0; i < Lanes<T>::registers; ++i) c.r[i] = Native<T>::name(__VA_ARGS__); \
+  return c;
+
+template <class T>
+CLEAR_INLINE Lanes<T> minimum(const Lanes<T>& a, const Lanes<T>& b) {
+  CLEAR_EACH(minimum, a.r[i], b.r[i])
+}
+template <class T>
+CLEAR_INLINE Lanes<T> maximum(const Lanes<T>& a, const Lanes<T>& b) {
+  CLEAR_EACH(maximum, a.r[i], b.r[i])
+}
+template <class T>
+CLEAR_INLINE Lanes<T> root(const Lanes<T>& a) {
+  CLEAR_EACH(root, a.r[i])
+}
+template <class T>
+CLEAR_INLINE Lanes<T> nearest(const Lanes<T>& a) {
+  CLEAR_EACH(nearest, a.r[i])
+}
+template <class T>
+CLEAR_INLINE Lanes<T> scale_by_power(const Lanes<T>& a, const Lanes<T>& n) {
+  CLEAR_EACH(scale_by_power, a.r[i], n.r[i])
+}
+template <class T>
+CLEAR_INLINE Lanes<T> reciprocal(const Lanes<T>& a) {
+  CLEAR_EACH(reciprocal, a.r[i])
+}
+template <class T>
+CLEAR_INLINE Lanes<T> subtract_product(const Lanes<T>& c_, const Lanes<T>& a, const Lanes<T>& b) {
+  CLEAR_EACH(subtract_product, c_.r[i], a.r[i], b.r[i])
+}
+template <class T>
+CLEAR_INLINE Lanes<T> select(const Mask<T>& m, const Lanes<T>& a, const Lanes<T>& b) {
+  CLEAR_EACH(select, m.r[i], a.r[i], b.r[i])
+}
+#undef CLEAR_EACH
+
+// The same sixteen numbers in another precision.
+template <class To, class From>
+CLEAR_INLINE Lanes<To> convert(const Lanes<From>& a) {
+  if constexpr (sizeof(To) == sizeof(From)) {
+    return a;
+  } else {
+    typedef From Given __attribute__((vector_size(sizeof(From) * kLanes)));
+    typedef To Wanted __attribute__((vector_size(sizeof(To) * kLanes)));
+    Given from;
+    std::memcpy(&from, a.r, sizeof from);
+    const Wanted to = __builtin_convertvector(from, Wanted);
+    Lanes<To> out;
+    std::memcpy(out.r, &to, sizeof to);
+    return out;
+  }
+}
+
+template <class T>
+CLEAR_INLINE Lanes<T> absolute(const Lanes<T>& a) {
+  return maximum(a, -a);
+}
+template <class T>
+CLEAR_INLINE Lanes<T> clamp(const Lanes<T>& a, const Lanes<T>& low, const Lanes<T>& high) {
+  return minimum(maximum(a, low), high);
+}
+template <class T>
+CLEAR_INLINE Lanes<T> floor(const Lanes<T>& a) {
+  Lanes<T> n = nearest(a);
+  return n - select(n > a, Lanes<T>(T(1)), Lanes<T>(T(0)));
+}
+template <class T>
+CLEAR_INLINE Lanes<T> where(const Mask<T>& m, const Lanes<T>& a) {
+  return select(m, a, Lanes<T>(T(0)));
+}
+
+// 2^x. In float a polynomial of degree 5 on [-1/2, 1/2], relative error 1e-7; in double, which is for checking, libm.
+template <class T>
+CLEAR_INLINE Lanes<T> exp2(const Lanes<T>& x) {
+  if constexpr (sizeof(T) == 4) {
+    Lanes<T> n = nearest(x), f = x - n;
+    Lanes<T> p = T(1.32647e-3);
+    p = p * f + T(9.67151e-3);
+    p = p * f + T(5.550734e-2);
+    p = p * f + T(2.4022242e-1);
+    p = p * f + T(6.9314698e-1);
+    p = p * f + T(1);
+    return scale_by_power(p, n);
+  } else {
+    T a[kLanes];
+    x.store(a);
+    for (T& v : a) v = std::exp2(v);
+    return Lanes<T>::load(a);
+  }
+}
+
+// log2 x for x > 0.
+template <class T>
+CLEAR_INLINE Lanes<T> log2(const Lanes<T>& x) {
+  T a[kLanes];
+  x.store(a);
+  if constexpr (sizeof(T) == 4) {
+    // x = m 2^e with m in [√½, √2);  log2 m = 2/ln 2 · artanh s,  s = (m - 1)/(m + 1).
+    T mantissa[kLanes], exponent[kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+      std::int32_t bits;
+      std::memcpy(&bits, &a[i], 4);
+      std::int32_t e = (bits - 0x3f3504f3) >> 23;
+      bits -= e << 23;
+      std::memcpy(&mantissa[i], &bits, 4);
+      exponent[i] = T(e);
+    }
+    Lanes<T> m = Lanes<T>::load(mantissa), s = (m - T(1)) / (m + T(1)), s2 = s * s;
+    Lanes<T> p = T(1.0 / 9);
+    p = p * s2 + T(1.0 / 7);
+    p = p * s2 + T(1.0 / 5);
+    p = p * s2 + T(1.0 / 3);
+    p = p * s2 + T(1);
+    return Lanes<T>::load(exponent) + s * p * T(2.8853900817779268);
+  } else {
+    for (T& v : a) v = std::log2(v);
+    return Lanes<T>::load(a);
+  }
+}
+
+#if defined(__AVX512F__)
+// Permutation indices between D consecutive registers of rows of D numbers and D columns, two registers at a time.
+template <int D>
+struct Interleaving {
+  alignas(64) std::int32_t apart[D][D - 1][kLanes], together[D][D - 1][kLanes];
+
+  constexpr Interleaving() : apart{}, together{} {
+    for (int out = 0; out < D; ++out)
+      for (int i = 0; i < kLanes; ++i) {
+        int p = D * i + out, q = kLanes * out + i;  // what column `out` reads, and what register `out` of the rows holds
+        for (int k = 1; k < D; ++k) {
+          apart[out][k - 1][i] = p / kLanes == k ? kLanes + p % kLanes : k == 1 ? p % kLanes : i;
+          together[out][k - 1][i] = q % D == k ? kLanes + q / D : k == 1 ? q / D : i;
+        }
+      }
+  }
+};
+
+template <int D>
+CLEAR_INLINE void rearrange(const std::int32_t (&indices)[D][D - 1][kLanes], const __m512 (&in)[D], __m512 (&out)[D]) {
+  for (int d = 0; d < D; ++d) {
+    out[d] = in[0];
+    for (int k = 1; k < D; ++k) out[d] = _mm512_permutex2var_ps(out[d], _mm512_load_si512(indices[d][k - 1]), in[k]);
+  }
+}
+
+template <int D>
+inline constexpr Interleaving<D> kInterleaving;
+#endif
+
+// Converts sixteen contiguous rows of D numbers to D columns of sixteen, and back.
+template <int D, class T>
+CLEAR_INLINE void split_rows(const T* rows, Lanes<T> (&columns)[D]) {
+#if defined(__AVX512F__)
+  if constexpr (sizeof(T) == 4 && (D == 3 || D == 4)) {
+    __m512 in[D], out[D];
+    for (int d = 0; d < D; ++d) in[d] = _mm512_loadu_ps(rows + kLanes * d);
+    rearrange<D>(kInterleaving<D>.apart, in, out);
+    for (int d = 0; d < D; ++d) columns[d].r[0] = (typename Lanes<T>::Register)out[d];
+    return;
+  }
+#endif
+  T split[D][kLanes];
+  for (int i = 0; i < kLanes; ++i)
+    for (int d = 0; d < D; ++d) split[d][i] = rows[D * i + d];
+  for (int d = 0; d < D; ++d) columns[d] = Lanes<T>::load(split[d]);
+}
+template <int D, class T>
+CLEAR_INLINE void join_rows(T* rows, const Lanes<T> (&columns)[D]) {
+#if defined(__AVX512F__)
+  if constexpr (sizeof(T) == 4 && (D == 3 || D == 4)) {
+    __m512 in[D], out[D];
+    for (int d = 0; d < D; ++d) in[d] = (__m512)columns[d].r[0];
+    rearrange<D>(kInterleaving<D>.together, in, out);
+    for (int d = 0; d < D; ++d) _mm512_storeu_ps(rows + kLanes * d, out[d]);
+    return;
+  }
+#endif
+  T split[D][kLanes];
+  for (int d = 0; d < D; ++d) columns[d].store(split[d]);
+  for (int i = 0; i < kLanes; ++i)
+    for (int d = 0; d < D; ++d) rows[D * i + d] = split[d][i];
+}
+
+// Transposes in place: rows[i] lane j  <->  rows[j] lane i.
+template <class T>
+CLEAR_INLINE void transpose(Lanes<T> (&rows)[kLanes]) {
+#if defined(__AVX512F__)
+  if constexpr (sizeof(T) == 4) {
+    __m512 t[16], u[16];
+    for (int i = 0; i < 8; ++i) {
+      t[2 * i] = _mm512_unpacklo_ps((__m512)rows[2 * i].r[0], (__m512)rows[2 * i + 1].r[0]);
+      t[2 * i + 1] = _mm512_unpackhi_ps((__m512)rows[2 * i].r[0], (__m512)rows[2 * i + 1].r[0]);
+    }
+    for (int i = 0; i < 4; ++i) {  // pairs of pairs: columns 4j + i of rows 4i … 4i + 3, in each 128-bit quarter j
+      const __m512d a = (__m512d)t[4 * i], b = (__m512d)t[4 * i + 1], c = (__m512d)t[4 * i + 2], d = (__m512d)t[4 * i + 3];
+      u[4 * i] = (__m512)_mm512_unpacklo_pd(a, c);
+      u[4 * i + 1] = (__m512)_mm512_unpackhi_pd(a, c);
+      u[4 * i + 2] = (__m512)_mm512_unpacklo_pd(b, d);
+      u[4 * i + 3] = (__m512)_mm512_unpackhi_pd(b, d);
+    }
+    for (int i = 0; i < 4; ++i) {  // then exchange the quarters
+      __m512 even_low = _mm512_shuffle_f32x4(u[i], u[4 + i], 0x88), odd_low = _mm512_shuffle_f32x4(u[i], u[4 + i], 0xdd);
+      __m512 even_high = _mm512_shuffle_f32x4(u[8 + i], u[12 + i], 0x88);
+      __m512 odd_high = _mm512_shuffle_f32x4(u[8 + i], u[12 + i], 0xdd);
+      using Register = typename Lanes<T>::Register;
+      rows[i].r[0] = (Register)_mm512_shuffle_f32x4(even_low, even_high, 0x88);
+      rows[4 + i].r[0] = (Register)_mm512_shuffle_f32x4(odd_low, odd_high, 0x88);
+      rows[8 + i].r[0] = (Register)_mm512_shuffle_f32x4(even_low, even_high, 0xdd);
+      rows[12 + i].r[0] = (Register)_mm512_shuffle_f32x4(odd_low, odd_high, 0xdd);
+    }
+    return;
+  }
+#endif
+  T a[kLanes][kLanes], b[kLanes][kLanes];
+  for (int i = 0; i < kLanes; ++i) rows[i].store(a[i]);
+  for (int i = 0; i < kLanes; ++i)
+    for (int j = 0; j < kLanes; ++j) b[j][i] = a[i][j];
+  for (int i = 0; i < kLanes; ++i) rows[i] = Lanes<T>::load(b[i]);
+}
+
+}  // namespace clear

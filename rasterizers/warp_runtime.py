@@ -1,0 +1,72 @@
+"""What the Warp packages share: a check that Warp runs here, torch tensors as kernel arguments, and torch's stream.
+
+Used by `rasterizers.warp_backend` and by the Warp kernels in `clear_strategies.kernels`. Imports Warp only when called.
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rasterizers.interface import BackendUnavailable
+
+
+def require_warp(what: str, device: str, otherwise: str) -> None:
+    """Check that Warp can run `what`, before it is imported, and silence Warp's output on stdout.
+
+    Args:
+        what: names the caller in the error message.
+        device: "cuda" or "cpu".
+        otherwise: says in the error message what runs without CUDA.
+
+    Raises:
+        BackendUnavailable: Warp is not installed, or there is no CUDA device.
+    """
+    try:
+        import warp as wp
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"{what} needs NVIDIA Warp, which is not installed ({error}); pip install 'clear-strategies[warp]'."
+        ) from error
+    # Warp would print a greeting and a line per compilation to stdout, which belongs to the application.
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    if device == "cuda" and not torch.cuda.is_available():
+        raise BackendUnavailable(
+            f"{what} cannot run on CUDA: torch finds no CUDA device. Install NVIDIA's driver and a torch built for CUDA; "
+            f"{otherwise}."
+        )
+    if device == "cuda" and wp.get_cuda_device_count() == 0:
+        raise BackendUnavailable(
+            f"{what} cannot run on CUDA: torch finds a CUDA device, Warp does not. Update NVIDIA's driver or warp-lang; "
+            f"{otherwise}."
+        )
+
+
+def array(tensor: Tensor | None, dtype: Any = None) -> Any:
+    """The tensor as a kernel argument, without a copy; the caller keeps it alive. None becomes an empty array."""
+    import warp as wp
+
+    return None if tensor is None else wp.from_torch(tensor, dtype, return_ctype=True)
+
+
+def on_stream(device: torch.device) -> AbstractContextManager[Any]:
+    """A scope in which Warp launches on torch's current stream."""
+    import warp as wp
+
+    wp.init()
+    if device.type == "cpu":
+        return nullcontext()
+    scope: AbstractContextManager[Any] = wp.ScopedStream(_stream(torch.cuda.current_stream(device)), sync_enter=False)
+    return scope
+
+
+@cache
+def _stream(stream: torch.cuda.Stream) -> Any:
+    """Torch's stream as a Warp stream. Cached, because Warp keeps the scratch memory of its sort with the stream."""
+    import warp as wp
+
+    return wp.stream_from_torch(stream)

@@ -1,0 +1,76 @@
+"""The benchmark's command line: the files that it writes, and its exit codes. And the data files of docs/benchmarks.md."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+
+from clear_strategies.bench import plots
+from clear_strategies.bench.__main__ import main
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+def test_rasterizers_writes_tables_figure_and_machine(tmp_path, capsys):
+    out = tmp_path / "new" / "folder"
+    asked = ["rasterizers", "--scene", "tiny", "--repeats", "1", "--preset", "fast", "--backend", "torch"]
+    assert main([*asked, "--out", str(out)]) == 0
+    assert list(pd.read_csv(out / "rasterizers_time.csv")["backend"]) == ["torch"]
+    assert len(pd.read_csv(out / "rasterizers_error.csv")) == 2
+    assert len(pd.read_csv(out / "rasterizers_turns.csv")) == 7
+    assert (out / "time_against_error.png").stat().st_size > 5_000
+    machine = json.loads((out / "rasterizers.json").read_text())["machine"]
+    assert {"date", "platform", "python", "torch", "nvidia_gpu_models"} <= set(machine)
+    assert str(tmp_path) not in json.dumps(machine)
+    assert "forward_ms" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["rasterizers", "--scene", "nowhere"], "nowhere: is no scene"),
+        (["rasterizers", "--scene", "tiny", "--backend", "cuda"], "cuda: is no backend"),
+        (["kernels", "--size", "9x9"], "9x9: must be WIDTHxHEIGHT"),
+        (["iteration", "--scene", "nowhere"], "nowhere: is no scene"),
+        (["pareto", "--variants", "magic"], "magic: is no variant"),
+        pytest.param(
+            ["rasterizers", "--device", "cuda"],
+            "no such device",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU"),
+        ),
+    ],
+)
+def test_unusable_input_is_one_line_and_exit_code_2(arguments, message, caplog, tmp_path):
+    assert main([*arguments, "--out", str(tmp_path)]) == 2
+    assert message in caplog.records[-1].getMessage()
+    assert "\n" not in caplog.records[-1].getMessage()
+
+
+def test_a_folder_that_cannot_be_made_is_known_before_measuring(tmp_path, caplog):
+    (tmp_path / "file").touch()
+    assert main(["kernels", "--out", str(tmp_path / "file")]) == 2
+    assert str(tmp_path / "file") in caplog.records[-1].getMessage()
+
+
+@pytest.mark.parametrize(
+    "arguments", [["rasterizers", "--repeats", "0"], ["rasterizers", "--preset", "best"], ["nothing"]]
+)
+def test_bad_arguments_have_exit_code_2(arguments, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+
+
+def test_the_page_links_to_every_published_table_and_both_figures_are_drawn_from_them():
+    data = DOCS / "data" / "benchmarks"
+    linked = set(re.findall(r"\(data/benchmarks/(\w+\.csv)\)", (DOCS / "benchmarks.md").read_text()))
+    assert linked == {path.name for path in data.glob("*.csv")}
+    tables = {path.stem: pd.read_csv(path) for path in data.glob("*.csv")}
+    figure = plots.time_against_error(tables["rasterizers_time"], tables["rasterizers_error"])
+    assert [axis.get_title() for axis in figure.axes] == ["small", "s100k", "s100k-lr", "garden", "s500k"]
+    assert plots.time_against_quality(tables["pareto"], "fern").axes

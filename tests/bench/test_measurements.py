@@ -1,0 +1,190 @@
+"""How the benchmark measures: turns, errors, and what each question times. No test asserts how long anything takes."""
+
+from __future__ import annotations
+
+import importlib
+import math
+
+import pytest
+import torch
+
+import rasterizers
+from clear_strategies.bench import accuracy, iteration, kernels, scenes, step, timing
+from clear_strategies.bench import rasterizers as drawing
+from clear_strategies.bench.results import Results
+from clear_strategies.errors import DataError
+from clear_strategies.merging.objective import Objective
+from clear_strategies.strategies.gco import GCO
+from clear_strategies.strategies.p2g import P2G
+from clear_strategies.strategies.svs import SVS
+
+
+@pytest.fixture(scope="module")
+def tiny() -> scenes.Workload:
+    return scenes.load("tiny")
+
+
+@pytest.fixture(scope="module")
+def reference() -> rasterizers.Rasterizer:
+    return rasterizers.load("torch", preset="fast", **scenes.SETTINGS)
+
+
+def measured(question, **options) -> Results:
+    results = Results("test", lambda line: None)
+    question.measure(results, **options)
+    return results
+
+
+# --- turns ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("device", "warm_ups"), [("cpu", 1), ("cuda", 3)])
+def test_contenders_take_turns_and_warm_ups_do_not_count(device, warm_ups):
+    order = []
+
+    def contender(name: str):
+        def turn():
+            order.append(name)
+            return {"stage": float(len(order))}
+
+        return turn
+
+    turns = timing.interleaved({"a": contender("a"), "b": contender("b")}, 3, device=device)
+    assert order == ["a", "b"] * (3 + warm_ups)
+    first = 2 * warm_ups + 1
+    assert list(turns.query("contender == 'a'")["ms"]) == [first, first + 2, first + 4]
+    assert timing.medians(turns).loc["b", "stage"] == first + 3
+
+
+def test_medians_leave_out_stages_that_a_contender_has_not():
+    turns = timing.interleaved({"a": lambda: {"x": 1.0, "y": 2.0}, "b": lambda: {"x": 3.0}}, 1)
+    table = timing.medians(turns)
+    assert list(table.index) == ["a", "b"]
+    assert list(table.columns) == ["x", "y"]
+    assert math.isnan(table.loc["b", "y"])
+
+
+# --- rasterizers ------------------------------------------------------------------------------------------------------
+
+
+def test_the_tables_hold_every_stage_and_both_errors():
+    tables = measured(drawing, scene=["tiny"], backend=["torch"], preset=["fast"], repeats=1).tables
+    time, error = tables["rasterizers_time"], tables["rasterizers_error"]
+    stages = (drawing.FORWARD, *drawing.BACKWARD, drawing.QUARTER, drawing.TOGETHER, drawing.SEPARATE)
+    assert list(tables["rasterizers_turns"]["stage"]) == list(stages)
+    assert time.loc[0, "k2_over_k1"] == pytest.approx(time.loc[0, "backward_k2_ms"] / time.loc[0, "backward_k1_ms"])
+    same, none = error["means_relative"]
+    assert list(error["truth"]) == [drawing.SAME, drawing.NONE]
+    assert same < 1e-4 < none
+
+
+def test_the_reference_takes_no_part_in_large_scenes():
+    results = Results("test", lambda line: None)
+    with pytest.raises(DataError, match="measures none of these scenes"):
+        drawing.measure(results, scene=["s100k-lr"], backend=["torch"], preset=["fast"], repeats=1)
+    assert any("at most 10,000 Gaussians" in note for note in results.notes)
+
+
+def test_a_quarter_of_the_tiles_is_demanded(tiny):
+    mask = drawing.quarter_of_tiles(rasterizers.load("torch", tile=8), tiny)
+    assert mask.shape == (9, 12)
+    assert int(mask.sum()) == 27
+
+
+def test_unknown_backends_are_refused_and_unavailable_ones_noted(monkeypatch):
+    with pytest.raises(DataError, match=r"cuda.*torch"):
+        drawing.usable(["cuda"], "cpu", print)
+    monkeypatch.setattr(rasterizers, "available", lambda: {"quick": "no compiler", "gsplat": None, "torch": None})
+    notes = []
+    assert drawing.usable(None, "cpu", notes.append) == ["torch"]
+    assert notes == ["quick: no compiler", "gsplat: measured as a peer on CUDA"]
+    with pytest.raises(DataError, match="cannot run here"):
+        drawing.usable(["quick"], "cpu", notes.append)
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+def test_float64_has_no_error_against_itself(tiny):
+    truth = accuracy.truth("torch", tiny, drawing.random_cotangents(tiny)[0], accuracy.NO_CUT_OFFS)
+    assert set(accuracy.errors(truth, truth).values()) == {0.0}
+
+
+def test_errors_are_those_of_their_definitions():
+    def drawn(image: list[float], gradient: list[list[float]]) -> accuracy.Drawn:
+        g = torch.tensor(gradient)
+        gradients = {name: g[:, 0] if name == "opacities" else g for name in accuracy.ATTRIBUTES}
+        return accuracy.Drawn(torch.tensor(image).view(1, -1, 3), gradients)
+
+    truth = drawn([0.0, 0, 0], [[3.0, 4], [0, 0], [1, 0]])
+    found = drawn([0.3, 0, 0], [[3.0, 4], [0, 1], [2, 0]])
+    errors = accuracy.errors(found, truth)
+    assert errors["image_max"] == pytest.approx(0.3)
+    assert errors["image_mean"] == pytest.approx(0.1)
+    assert errors["means_relative"] == pytest.approx(math.sqrt(2 / 26))
+    assert errors["means_median"] == 0.0  # the lower of 0 and 1; the second Gaussian has no gradient
+
+
+def test_finer_cut_offs_have_smaller_errors(tiny):
+    v = drawing.random_cotangents(tiny)[0]
+    truth = accuracy.truth("torch", tiny, v, accuracy.NO_CUT_OFFS)
+    found = []
+    for preset in rasterizers.PRESETS:
+        contestant = drawing.backend_on(tiny, "torch", preset)
+        found.append(accuracy.errors(accuracy.draw(contestant.render, v), truth))
+    for name in accuracy.ATTRIBUTES:
+        fast, accurate, exact = (errors[f"{name}_relative"] for errors in found)
+        assert fast > 3 * accurate > 9 * exact, name
+        assert exact < 1e-4
+
+
+# --- losses and the per-Gaussian step ---------------------------------------------------------------------------------
+
+
+def test_grouped_convolution_is_the_ssim_that_3dgs_trains_with():
+    reference = importlib.import_module("clear_strategies.kernels.losses.reference")
+    x, y = (image.double() for image in kernels.images(40, 30))
+    peer = kernels.grouped_convolution(kernels.batch(x), kernels.batch(y))
+    assert float(peer) == pytest.approx(float(reference.ssim(x, y).value), abs=1e-12)
+
+
+def test_losses_and_the_step_are_measured():
+    tables = measured(kernels, size=["48x32"], repeats=1, gaussians=[50]).tables
+    errors = tables["kernels"].set_index(["loss", "implementation"])["gradient_error"]
+    assert set(tables["kernels"]["loss"]) == {kernels.SSIM, kernels.PHOTOMETRIC, kernels.HAAR}
+    assert errors[kernels.SSIM, "ours, torch"] < 1e-6
+    assert errors[kernels.SSIM, "torch, grouped conv 11x11"] < 1e-3
+    assert {step.READABLE, "torch, fused Adam"} <= set(tables["kernels_step"]["implementation"])
+
+
+def test_the_compiled_and_the_readable_step_are_the_same(tiny, reference):
+    view, recorded = iteration.view_of(tiny, reference), step.RecordedRasterizer(reference)
+    trainings = [iteration.Training(tiny, view, recorded, Objective(), mode) for mode in ("auto", "off")]
+    for training in trainings:
+        training()
+    one, other = (training.state.optimizer.first for training in trainings)
+    for name, moments in one.items():
+        assert float(moments.abs().max()) > 0, name
+        torch.testing.assert_close(moments, other[name], rtol=1e-3, atol=1e-8)
+
+
+# --- an iteration -----------------------------------------------------------------------------------------------------
+
+
+def test_an_iteration_trains_clear_and_moves_nothing(tiny, reference):
+    view = iteration.view_of(tiny, reference)
+    training = iteration.Training(tiny, view, reference, Objective())
+    assert training.state.conductor.strategies == (GCO(), P2G(), SVS())
+    before = {name: t.clone() for name, t in training.state.field.raw().items()}
+    ms = training()
+    assert {"render", "losses LR", "backward HR", iteration.TOTAL} <= set(ms)
+    assert all(torch.equal(t, before[name]) for name, t in training.state.field.raw().items())
+    assert float(training.state.density.count.sum()) > 0
+    assert training.state.history[-1]["lambda_hr"] > 0.9
+
+
+def test_an_iteration_is_measured_with_and_without_hr():
+    table = measured(iteration, scene="tiny", backend="torch", repeats=1).tables["iteration"].set_index("stage")
+    assert list(table.columns) == ["lr_and_hr_ms", "without_l_hf_ms", "lr_only_ms"]
+    assert list(table.index[-2:]) == [iteration.REST, iteration.TOTAL]
+    assert math.isnan(table.loc["backward HR", "lr_only_ms"])

@@ -1,0 +1,128 @@
+"""Random gradients of one view, for comparing the compiled per-Gaussian step with the readable path."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+
+from clear_strategies import SVS, Conductor, Evidence, Objective
+from clear_strategies.core import deferred
+from clear_strategies.merging.conductor import HrGradients
+from clear_strategies.schedules import WarmupDecay
+from clear_strategies.training.compiled_step import Factors
+from clear_strategies.training.field import GaussianField
+from rasterizers.interface import SplatGradients
+
+T = 5  # any iteration at which λ_HR = 1
+HR_COTANGENTS = {"none": 0, "base": 1, "both": 2}
+ATTRIBUTES = ("means", "quats", "scales", "opacities", "screen", "rgb")
+ALWAYS = WarmupDecay(start=0, full=1, decay_from=10, end=10)
+
+
+def as_floats(numbers) -> dict[str, float]:
+    """The numbers as floats, read from the device where they are deferred."""
+    return dict(zip(numbers, deferred.read(list(numbers.values())), strict=True))
+
+
+@dataclass
+class Case:
+    """One view's gradients, and two equal fields: one for the readable path, one for the compiled step."""
+
+    fields: tuple[GaussianField, GaussianField]
+    lr: SplatGradients
+    hr: SplatGradients
+    m: torch.Tensor | float
+    e: Evidence | None
+    visible: torch.Tensor
+    z: torch.Tensor | None
+
+    def factors(self, use: int, hr: str = "both") -> tuple:
+        a = self.fields[use]._activate(self.z)
+        lr = Factors(self.lr, 0, a, self.visible)
+        return lr, self._bundle(
+            *(Factors(self.hr, k, a, self.visible) if k < HR_COTANGENTS[hr] else None for k in (0, 1))
+        )
+
+    def grads(self, use: int, hr: str = "both") -> tuple:
+        a = self.fields[use]._activate(self.z)
+        hf = (a.vjp(self.hr, k, detail=True) if k < HR_COTANGENTS[hr] else None for k in (0, 1))
+        return a.vjp(self.lr, 0, detail=False), self._bundle(*hf)
+
+    def _bundle(self, base, hf) -> HrGradients | None:
+        return None if base is None else HrGradients(base, hf, (1, 1), self.e, self.m)
+
+
+def readable_merge(conductor, params, g_lr, hr, t) -> tuple:
+    """The merged gradient and the conflict ratios of the readable path."""
+    merged = conductor.merge(params, g_lr, hr, t)
+    return merged.grads, merged.conflict
+
+
+ANCHORING = partial(
+    SVS, anchor_strength=0.01,
+    anchor_weights={"means": 1.0, "scales": 1.0, "quats": 1.0, "opacities": 0.1, "sh0": 0.01, "shN": 0.01, "detail": 0.0},
+)  # fmt: skip
+
+
+def case(n=1000, degree=3, kind="random", seed=0, bands=15, gate=False, evidence=True) -> Case:
+    g = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=g)
+
+    parameters = {
+        "means": normal(n, 3), "quats": normal(n, 4), "scales": normal(n, 3) - 3, "opacities": normal(n) * 3,
+        "sh0": normal(n, 1, 3), "shN": normal(n, bands, 3) * 0.1, "detail": normal(n, 3) * 0.1,
+    }  # fmt: skip
+    parameters["shN"][:, (degree + 1) ** 2 - 1 :] = 0
+    fields = tuple(GaussianField(parameters, degree=degree) for _ in range(2))
+    filter_3d = torch.rand(n, generator=g) * 0.05
+    for field in fields:
+        field.filter_3d = filter_3d.clone()
+    basis = normal(n, (degree + 1) ** 2)
+    rows = {"random": 1e-5, "tiny": 1e-30, "huge": 1e20}.get(kind, 1e-5) * torch.ones(n)
+    if kind == "mixed":
+        rows = 10.0 ** (torch.rand(n, generator=g) * 50 - 30)
+
+    def gradients(k):
+        def rowed(*shape):
+            return normal(k, n, *shape) * rows.view(1, n, *[1] * len(shape))
+
+        return SplatGradients(rowed(3), rowed(4), rowed(3), rowed(), rowed(2), rowed(3), basis.clone())
+
+    lr, hr = gradients(1), gradients(2)
+    if kind in ("opposite", "parallel"):
+        sign = -1.0 if kind == "opposite" else 1.0
+        hr = SplatGradients(
+            *(getattr(lr, f).repeat(2, *[1] * (getattr(lr, f).dim() - 1)) * sign for f in ATTRIBUTES), basis
+        )
+    visible = torch.ones(n, dtype=torch.bool)
+    if kind == "sparse":  # most Gaussians are invisible, some are visible at one scale only
+        visible = torch.rand(n, generator=g) < 0.2
+        for s, rows in ((lr, visible), (hr, visible & (torch.rand(n, generator=g) < 0.5))):
+            for name in ATTRIBUTES:
+                getattr(s, name)[:, ~rows] = 0
+    if kind == "zero":
+        for s, name in itertools.product((lr, hr), ATTRIBUTES):
+            getattr(s, name).zero_()
+    if kind == "round":  # equal axes: rotation gradients are rounding
+        lr.quats.mul_(2.0**-30)
+    m = 0.25 + 0.75 * torch.rand(n, generator=g) if evidence else 1.0
+    e = Evidence(torch.rand(n, generator=g), torch.rand(n, generator=g)) if evidence else None
+    z = (torch.rand(n, generator=g) > 0.2).float() / 0.8 if gate else None
+    return Case(fields, lr, hr, m, e, visible, z)
+
+
+def conductors(*makers, anchored=None, hf=0.2, λ=ALWAYS) -> tuple[Conductor, Conductor]:
+    """Two equal conductors; if `anchored` is given, with an anchor that differs a little from that field."""
+    makers = [ANCHORING if make is SVS else make for make in makers]
+    both = tuple(Conductor(*(make() for make in makers), objective=Objective(lambda_hr=λ, lambda_hf=hf)) for _ in "ab")
+    for conductor in both:
+        conductor.on_fit_start(3, 0)
+        for s in conductor.strategies:
+            if isinstance(s, SVS) and anchored is not None:
+                s.after_step({name: p * 1.01 for name, p in anchored.raw().items()}, s.anchor_start)
+    return both

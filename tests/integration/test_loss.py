@@ -1,0 +1,83 @@
+"""`joint_loss` in the smallest host: torch parameters, torch.optim, and a renderer with autograd."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from clear_strategies import GCO, P2G, SVS, Conductor, Objective
+from clear_strategies.schedules import WarmupDecay
+from clear_strategies.training.field import GaussianField
+from integration import AutogradShot, joint_loss, joint_update
+from rasterizers import Splats, autograd
+from tests.helpers import toy
+
+OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
+
+
+class Host:
+    """A trainer that is not ours."""
+
+    def __init__(self, scene):
+        self.field = GaussianField.from_cloud(scene.cloud)
+        self.field.degree = 3
+        self.params = {name: value.clone().requires_grad_() for name, value in self.field.raw().items()}
+
+    def render(self, camera, z=None, detail=True):
+        p = self.params
+        opacities = p["opacities"].sigmoid() if z is None else p["opacities"].sigmoid() * z
+        offset = p["detail"] if detail else torch.zeros_like(p["detail"])
+        splats = Splats(p["means"], p["quats"], p["scales"].exp(), opacities, p["sh0"], p["shN"], offset)
+        shot = autograd.draw(toy.RASTERIZER, splats, camera)
+        params = p if detail else {name: value for name, value in p.items() if name != "detail"}
+        return AutogradShot(shot.image, shot.means2d, shot.visible, params)
+
+
+@pytest.mark.parametrize("strategies", [(), (GCO(),), (P2G(),), (SVS(),), (GCO(), P2G(), SVS())], ids=len)
+def test_backward_gives_the_conductors_gradient(strategies):
+    scene = toy.scene(20)
+    host, view = Host(scene), scene.train[0]
+    conductor = Conductor(*strategies, objective=OBJECTIVE)
+    conductor.on_fit_start(3, 0)
+    z = conductor.gate(5, 20)
+    lr, hr = host.render(view.lr.camera, z, detail=False), host.render(view.hr.camera, z)
+    (2.0 * joint_loss(conductor, host.params, lr, hr, view, 5)).backward()
+
+    ours = Conductor(*strategies, objective=OBJECTIVE)
+    ours.on_fit_start(3, 0)
+    shots = host.field.render_scales(toy.RASTERIZER, view, gate=ours.gate(5, 20))
+    expected = ours.update(host.field.raw(), *shots, view, 5).grads
+    for name, p in host.params.items():
+        scale = float(expected[name].abs().max())
+        assert torch.allclose(p.grad, 2 * expected[name], atol=1e-4 * scale, rtol=1e-3), name
+
+
+def test_its_value_is_the_sum_of_the_losses():
+    scene = toy.scene(20)
+    host, view = Host(scene), scene.train[0]
+    conductor = Conductor(GCO(), objective=OBJECTIVE)
+    lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
+    loss, update = joint_update(conductor, host.params, lr, hr, view, 50)
+    l = update.losses
+    assert float(loss) == pytest.approx(l["lr"] + l["base"] + 0.2 * l["hf"], rel=1e-6)
+    assert update.score.shape == (20,)
+
+
+def test_a_loop_with_joint_loss_reduces_the_loss():
+    scene = toy.scene(20)
+    host = Host(scene)
+    conductor = Conductor(GCO(), P2G(), SVS(), objective=OBJECTIVE)
+    conductor.on_fit_start(3, 0)
+    optimizer = torch.optim.Adam(list(host.params.values()), lr=5e-3, eps=1e-15)
+    losses = []
+    for t in range(1, 25):
+        view = scene.train[t % 3]
+        z = conductor.gate(t, 20)
+        lr, hr = host.render(view.lr.camera, z, detail=False), host.render(view.hr.camera, z)
+        optimizer.zero_grad()
+        loss = joint_loss(conductor, host.params, lr, hr, view, t)
+        loss.backward()
+        optimizer.step()
+        conductor.after_step(host.params, t)
+        losses.append(float(loss))
+    assert sum(losses[-3:]) < 0.9 * sum(losses[:3])

@@ -1,0 +1,198 @@
+"""The parts of the nerfstudio method that need no nerfstudio: reading a data manager, and splatfacto's tensor shapes.
+
+test_nerfstudio_method.py tests the method itself, where nerfstudio is installed.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from clear_strategies import GCO, P2G, Conductor, Objective
+from clear_strategies.data.cameras import pose_from_opengl
+from clear_strategies.data.photo_files import read_image, write_png
+from clear_strategies.data.priors import Bicubic, Cached, Images
+from clear_strategies.errors import DataError
+from clear_strategies.schedules import WarmupDecay
+from integration.gsplat import attach
+from integration.nerfstudio.data import over_black, prior, save_lr, views, world_to_camera
+from tests.helpers import gsplat_host, toy
+from tests.helpers.gsplat_host import Host
+
+HR_FROM_START = WarmupDecay(start=0, full=1, decay_from=100, end=100)
+
+
+class Cameras:
+    """nerfstudio's cameras of two photos: one at (0, 0, 4) looks at the origin, one at (4, 5, 6) along +x."""
+
+    def __init__(self):
+        straight = torch.eye(4)[:3]
+        turned = torch.tensor([[0.0, 0, -1, 4], [0, 1, 0, 5], [1, 0, 0, 6]])
+        self.camera_to_worlds = torch.stack((straight, turned))
+        self.camera_to_worlds[0, 2, 3] = 4
+        self.fx = 30.0
+
+    def get_intrinsics_matrices(self):
+        return torch.tensor([[self.fx, 0, 12], [0, 31, 8], [0, 0, 1]]).expand(2, 3, 3)
+
+
+class DataManager:
+    """nerfstudio's data manager, as far as it is read: the first access undistorts photos and corrects cameras."""
+
+    def __init__(self, files=("a/one.jpg", "a/two.jpg"), **extra):
+        self.train_dataset = SimpleNamespace(cameras=Cameras(), image_filenames=list(files))
+        g = torch.Generator().manual_seed(0)
+        self.photos = [
+            {"image": torch.randint(256, (16, 24, 3), generator=g, dtype=torch.uint8)} | extra for _ in files
+        ]
+
+    @functools.cached_property
+    def cached_train(self):
+        self.train_dataset.cameras.fx = 33.0
+        return self.photos
+
+
+def test_poses_are_converted_from_opengl_to_opencv():
+    straight, turned = world_to_camera(Cameras().camera_to_worlds)
+    assert (straight @ torch.tensor([1.0, 2, 3, 1])).tolist() == [1, -2, 1, 1]  # y down, one unit in front
+    assert (turned @ torch.tensor([6.0, 5, 6, 1])).tolist() == [0, 0, 2, 1]  # the camera looks along +x
+    for pose, given in zip((straight, turned), Cameras().camera_to_worlds, strict=True):
+        assert torch.allclose(pose.double(), pose_from_opengl(Path("transforms.json"), "frame", given.tolist()))
+
+
+def test_views_are_the_photos_that_splatfacto_trains_on():
+    manager = DataManager()
+    first, second = views(manager, Bicubic(), 4)
+    assert [v.name for v in (first, second)] == ["one.jpg", "two.jpg"]
+    assert torch.equal(first.lr.image, manager.photos[0]["image"].float() / 255)
+    camera = second.hr.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (4 * 33, 4 * 31, 48, 32)  # fx as undistorted
+    assert second.hr.image.shape == (64, 96, 3)
+
+
+def test_sr_images_are_found_by_the_photos_stem(tmp_path):
+    for stem in ("one", "two"):
+        write_png(tmp_path / f"{stem}.png", torch.full((64, 96, 3), 0.2 if stem == "one" else 0.4))
+    first, second = views(DataManager(), prior(tmp_path), 4)
+    assert first.hr.image.unique().tolist() == pytest.approx([0.2])
+    assert second.hr.image.unique().tolist() == pytest.approx([0.4])
+    with pytest.raises(DataError, match="96x64, but 2 times"):
+        views(DataManager(), prior(tmp_path), 2)
+
+
+def test_saved_lr_photos_are_the_training_photos(tmp_path):
+    manager = DataManager()
+    save_lr(manager, tmp_path)
+    assert torch.equal((read_image(tmp_path / "two.png") * 255).round().byte(), manager.photos[1]["image"])
+
+
+def test_the_sr_setting_chooses_the_prior(tmp_path):
+    assert isinstance(prior(None), Bicubic)
+    assert isinstance(prior(tmp_path), Images)
+    assert isinstance(prior(tmp_path / "span.ONNX"), Cached)
+
+
+def test_masks_and_equal_stems_are_refused():
+    with pytest.raises(DataError, match="mask"):
+        views(DataManager(mask=torch.ones(16, 24, 1)), Bicubic(), 4)
+    twins = DataManager(files=("a/one.jpg", "b/one.png"))
+    for call in (lambda: views(twins, Bicubic(), 4), lambda: save_lr(twins, None)):
+        with pytest.raises(DataError, match="stem"):
+            call()
+
+
+def test_alpha_is_composited_over_black():
+    eight_bit = torch.tensor([[[255, 102, 0, 51]]], dtype=torch.uint8)
+    assert over_black(eight_bit).flatten().tolist() == pytest.approx([0.2, 0.08, 0])
+    assert over_black(torch.ones(1, 1, 3)).flatten().tolist() == [1, 1, 1]
+
+
+class Splatfacto(Host):
+    """A host with splatfacto's shapes, names and keyword call. Its densifier reads Σ|∂L/∂u|, which only CUDA computes; three
+    times the absolute value of the sum takes its place.
+    """
+
+    names = {"sh0": "features_dc", "shN": "features_rest"}  # noqa: RUF012
+
+    def __init__(self, scene):
+        super().__init__(scene)
+        p = self.splats
+        p["features_dc"], p["features_rest"] = torch.nn.Parameter(p.pop("sh0")[:, 0].detach()), p.pop("shN")
+        p["opacities"] = torch.nn.Parameter(p["opacities"].detach()[:, None])
+        self.optimizers = {k: torch.optim.Adam([x], lr=1e-3) for k, x in p.items()}
+        self.info = {}
+
+    def render(self, camera, step):
+        p = self.splats
+        renders, alphas, self.info = gsplat_host.rasterization(
+            means=p["means"], quats=p["quats"], scales=p["scales"].exp(), opacities=p["opacities"].sigmoid().squeeze(-1),
+            colors=torch.cat((p["features_dc"][:, None], p["features_rest"]), 1), viewmats=camera.world_to_camera[None],
+            Ks=gsplat_host.intrinsics(camera), width=camera.width, height=camera.height, sh_degree=min(3, step), packed=False,
+        )  # fmt: skip
+        self.info["means2d"].retain_grad()
+        return renders, alphas, self.info
+
+
+def with_absgrad(rasterization):
+    @functools.wraps(rasterization)
+    def wrapped(*args, **kwargs):
+        renders, alphas, info = rasterization(*args, **kwargs)
+        info["means2d"].register_hook(lambda g: setattr(info["means2d"], "absgrad", 3 * g.abs()))
+        return renders, alphas, info
+
+    return wrapped
+
+
+def trained(host, scene, *strategies, threshold=None, monkeypatch=None):
+    clear = attach(
+        host.splats, host.optimizers, scene.train, Conductor(*strategies, objective=Objective(lambda_hr=HR_FROM_START)),
+        names=getattr(host, "names", None), strategy=threshold and SimpleNamespace(grow_grad2d=threshold),
+    )  # fmt: skip
+    with monkeypatch.context() as patch:
+        original = gsplat_host.rasterization
+        function = with_absgrad(original) if isinstance(host, Splatfacto) else original
+        patch.setattr(gsplat_host, "rasterization", clear.wrap(function))
+        host.train([scene.train[0].name])
+    clear.remove()
+    return clear
+
+
+def test_splatfactos_shapes_give_the_same_gradients_as_gsplats(monkeypatch):
+    scene = toy.scene(30)
+    scene = replace(scene, train=tuple(replace(v, hr=replace(v.hr, image=v.hr.image.flip(1))) for v in scene.train))
+    splatfacto, plain = Splatfacto(scene), Host(scene)
+    strategies = GCO(), P2G(patch=4)
+    corrected = trained(splatfacto, scene, *strategies, monkeypatch=monkeypatch).attachment.log["corrected"]
+    trained(plain, scene, *strategies, monkeypatch=monkeypatch)
+    assert corrected > 0
+    for name, expected in plain.grads.items():
+        g = splatfacto.grads[Splatfacto.names.get(name, name)]
+        assert torch.allclose(g.reshape(expected.shape), expected, atol=1e-5 * float(expected.abs().max())), name
+
+
+def test_without_a_score_the_absolute_gradient_is_unchanged(monkeypatch):
+    scene = toy.scene(30)
+    host = Splatfacto(scene)
+    clear = trained(host, scene, GCO(), threshold=1e-9, monkeypatch=monkeypatch)
+    means2d = host.info["means2d"]
+    assert clear.attachment.counts["scores written"] == 0
+    assert torch.equal(means2d.absgrad, 3 * means2d.grad.abs())
+
+
+def test_as_many_pass_by_the_score_as_by_the_absolute_gradient(monkeypatch):
+    scene = toy.scene(30)
+    plain = Splatfacto(scene)
+    trained(plain, scene, GCO(), threshold=1.0, monkeypatch=monkeypatch)
+    ndc = torch.tensor([24 / 2, 16 / 2])
+    own = (plain.info["means2d"].absgrad[0] * ndc).norm(dim=-1)
+    threshold = float(own.sort().values[-8] * (1 - 1e-3))  # eight pass
+    host = Splatfacto(scene)
+    clear = trained(host, scene, P2G(patch=4), threshold=threshold, monkeypatch=monkeypatch)
+    written = (host.info["means2d"].absgrad[0] * ndc).norm(dim=-1)
+    assert clear.attachment.counts["scores written"] == 1
+    assert int((written >= threshold).sum()) == 8
