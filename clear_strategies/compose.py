@@ -1,28 +1,64 @@
-"""From conf/ to objects: the one place that turns Hydra's nodes into what they name, for `run` and for hosts.
+"""From conf/ to objects: how a configuration is composed, for `run` and for hosts.
 
 conductor("clear", "strategies.gco.tolerance=0.1", iterations=30_000)
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from inspect import signature
 from pathlib import Path
 from typing import Any, Final
 
 import hydra
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException, InstantiationException
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
+from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from clear_strategies.errors import ClearError, DataError
+from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
+from clear_strategies.settings import build, one_line, with_defaults
 from clear_strategies.strategies.base import Strategy
 
 _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
 CONF: Final = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConductorSettings:
+    """What a conductor is made of.
+
+    Args:
+        strategies: by the names that the configuration gives them.
+        statistics_from: see `Conductor`; written for 10,000 iterations, as every milestone.
+    """
+
+    objective: Objective
+    strategies: Mapping[str, Strategy] = field(default_factory=dict)
+    statistics_from: int | None = signature(Conductor).parameters["statistics_from"].default
+
+    def conductor(self, stretch: float) -> Conductor:
+        """The conductor, its milestones times `stretch`.
+
+        Raises:
+            StrategyConflict: two strategies answer a question that only one may.
+        """
+        return Conductor(
+            *(scaled(strategy, stretch) for strategy in self.strategies.values()),
+            objective=scaled(self.objective, stretch),
+            statistics_from=None if self.statistics_from is None else round(self.statistics_from * stretch),
+        )
 
 
 def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERENCE_ITERATIONS) -> Conductor:
@@ -34,23 +70,45 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
         iterations: of the host; every milestone stretches from 10,000 to it.
 
     Raises:
-        DataError: no strategy or field has that name, or a value is outside its range; the message names it.
+        SettingError: no strategy or field has that name, or a value is outside its range; the message names it.
         StrategyConflict: two strategies answer a question that only one may.
     """
     if iterations < 1:
-        raise ValueError(f"iterations must be at least 1, got {iterations}.")
+        raise SettingError(f"iterations must be at least 1, got {iterations}.")
     names = [name.strip() for name in strategy.split(",")]
-    said = [f"+strategy=[{','.join(names)}]" if len(names) > 1 else f"+strategy={names[0]}", *overrides]
-    return build_conductor(_compose(said), iterations / REFERENCE_ITERATIONS)
+    chosen = f"+strategy=[{','.join(names)}]" if len(names) > 1 else f"+strategy={names[0]}"
+    settings: ConductorSettings = build(tree(_compose([chosen, *overrides]), _TRAINERS))
+    return settings.conductor(iterations / REFERENCE_ITERATIONS)
 
 
-def build_conductor(config: DictConfig, stretch: float) -> Conductor:
-    """The conductor of a composed configuration, its milestones times `stretch`."""
-    return Conductor(
-        *(scaled(s, stretch) for s in strategies(config)),
-        objective=scaled(instantiate(config.objective, "objective"), stretch),
-        statistics_from=round(config.statistics_from * stretch),
-    )
+# Options for both doors, readings=literal above all, set these as well; a host has its own.
+_TRAINERS: Final = ("optim", "skips")
+
+
+def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
+    """A composed configuration as plain values, interpolations resolved.
+
+    Raises:
+        SettingError: an interpolation leads to nothing, or to a value that is missing.
+    """
+    values: dict[str, Any] = OmegaConf.to_container(config)  # type: ignore[assignment]
+    if missing := _first_missing(values):
+        raise SettingError(f"{missing}: is needed and missing. Add {missing}=….")
+    try:
+        values = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    except OmegaConfBaseException as error:
+        raise SettingError(one_line(error)) from error
+    return {key: value for key, value in values.items() if key not in without}
+
+
+def _first_missing(node: Any, key: str = "") -> str | None:
+    """The first key whose value is `???`."""
+    if node == "???":
+        return key
+    if not isinstance(node, dict):
+        return None
+    inner = (_first_missing(value, f"{key}.{name}" if key else str(name)) for name, value in node.items())
+    return next((found for found in inner if found is not None), None)
 
 
 def _compose(overrides: list[str]) -> DictConfig:
@@ -58,46 +116,60 @@ def _compose(overrides: list[str]) -> DictConfig:
     shared = GlobalHydra.instance()
     theirs, shared.hydra = shared.hydra, None
     try:
+        require_each_once(overrides)
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-            return hydra.compose("config", overrides)
+            return hydra.compose("conductor", overrides)
     except (HydraException, OmegaConfBaseException) as error:
-        raise DataError("config", " ".join(overrides), one_line(error), "see conf/ for what there is") from error
+        raise SettingError(f"{' '.join(overrides)}: {one_line(error)}. See conf/ for what there is.") from error
     finally:
         GlobalHydra.instance().hydra = theirs
 
 
-def instantiate(config: Any, key: str, **extra: Any) -> Any:
-    """Build what a config node names, with errors that name the node."""
-    try:
-        return hydra.utils.instantiate(config, _convert_="object", **extra)
-    except InstantiationException as error:
-        cause = error.__cause__
-        if isinstance(cause, ClearError):
-            raise cause from None
-        raise DataError("config", key, one_line(cause or error), "see the field's comment in conf/") from cause
-
-
-def strategies(config: DictConfig) -> Iterator[Strategy]:
-    """Those under `strategies`, in the order of their composition.
+def require_each_once(overrides: Iterable[str]) -> None:
+    """Refuse a strategy that is asked for twice: Hydra merges the two into one without a word.
 
     Raises:
-        DataError: something else than a strategy stands there.
+        SettingError: one is.
     """
-    for name, node in config.strategies.items():
-        strategy = instantiate(node, f"strategies.{name}")
-        if not isinstance(strategy, Strategy):
-            raise DataError(
-                "config", f"strategies.{name}", f"is a {type(strategy).__name__}, not a Strategy",
-                "derive the class from clear_strategies.Strategy",
-            )  # fmt: skip
-        yield strategy
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        if override.key_or_group != "strategy" or override.is_sweep_override():
+            continue
+        value = override.value()
+        names = [name for entry in (value if isinstance(value, list) else [value]) for name in _members(str(entry))]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise SettingError(f"+strategy: must name each strategy once, got {twice} twice in {override.input_line}.")
 
 
-def plain(node: Any) -> dict[str, Any]:
-    """A node as a dict of ordinary values."""
-    found = OmegaConf.to_container(node, resolve=True)
-    return {str(k): v for k, v in found.items()} if isinstance(found, dict) else {}
+def _members(name: str) -> list[str]:
+    """The strategies that an option of conf/strategy consists of."""
+    file = CONF / "strategy" / f"{name}.yaml"
+    if not file.is_file():
+        return [name]
+    parts = OmegaConf.to_container(OmegaConf.load(file)).get("defaults", [])  # type: ignore[union-attr]
+    return [part for part in parts if isinstance(part, str) and not part.startswith(("/", "_"))] or [name]
 
 
-def one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
+class _ConfSource(FileConfigSource):
+    """The files of conf/, each node with a `_target_` filled with the defaults of what it names."""
+
+    @staticmethod
+    def scheme() -> str:
+        return "clear"
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        result = super().load_config(config_path)
+        result.config = OmegaConf.create(with_defaults(OmegaConf.to_container(result.config)))
+        return result
+
+
+class _ReadConf(SearchPathPlugin):
+    """Reads conf/ by `_ConfSource`, for whoever names the folder; other folders are left to Hydra."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for element in search_path.get_path():
+            if element.path is not None and element.path.removeprefix("file://") == str(CONF):
+                element.path = f"{_ConfSource.scheme()}://{CONF}"
+
+
+Plugins.instance().register(_ConfSource)
+Plugins.instance().register(_ReadConf)

@@ -6,7 +6,12 @@ from pathlib import Path
 
 
 class ClearError(Exception):
-    """Base of every error that is told to the user in one line."""
+    """Base of every error that the command line shows in one line, without a traceback."""
+
+    @property
+    def exit_code(self) -> int:
+        """Of the process that ends by it."""
+        return 2
 
 
 class DataError(ClearError, ValueError):
@@ -18,7 +23,11 @@ class DataError(ClearError, ValueError):
 
 
 class SettingError(ClearError, ValueError):
-    """A setting that cannot be used: `field: rule, value found: remedy`."""
+    """A setting that cannot be used. The message gives the rule, the value found and, where it helps, the remedy.
+
+    A class that refuses its own field names the field; `clear_strategies.settings.build` puts the key of the
+    configuration in front.
+    """
 
 
 class StrategyConflict(ClearError, TypeError):

@@ -1,13 +1,22 @@
-"""A conductor from the names on the command line."""
+"""From conf/ to objects: names on the command line, the defaults' one owner, and what is refused."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
 import pytest
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
 
-from clear_strategies.compose import CONF, conductor
-from clear_strategies.errors import DataError, StrategyConflict
+from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies.compose import CONF, conductor, tree
+from clear_strategies.errors import SettingError, StrategyConflict
+from clear_strategies.jobs import device, job
+from clear_strategies.settings import TARGET, with_defaults
 
 
 def names(c):
@@ -39,10 +48,12 @@ def test_milestones_stretch_to_the_hosts_length():
         (("nope",), "strategy/nope"),
         (("gco", "strategies.gco.tau=1"), "strategies.gco.tau"),
         (("gco", "strategies.gco.tolerance=2"), "tolerance must lie in"),
+        (("gco,gco",), "gco twice"),
+        (("gco", "fit.iterations=3"), "fit"),
     ],
 )
 def test_what_does_not_exist_is_named(said, named):
-    with pytest.raises(DataError, match=named):
+    with pytest.raises(SettingError, match=named):
         conductor(*said)
 
 
@@ -63,3 +74,149 @@ def test_a_hydra_application_keeps_its_own_state():
 def test_a_host_of_no_iterations_is_refused():
     with pytest.raises(ValueError, match="at least 1"):
         conductor("gco", iterations=0)
+
+
+def composed(*overrides: str) -> Any:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", list(overrides))
+
+
+def test_clear_on_the_command_line_is_clear_in_python():
+    """The defaults have one owner, the class: strategies, objective and all numbers are the same, field by field."""
+    ours = Conductor(GCO(), P2G(), SVS())
+    run = job.settings_of(tree(composed("+strategy=clear")))
+    for theirs in (conductor("clear"), run.conductor(1.0)):
+        assert theirs.strategies == ours.strategies
+        assert theirs.objective == ours.objective
+        assert theirs.statistics_from == ours.statistics_from
+    kinds = {"optim": run.optim, "mip": run.mip, "fit": run.fit, "views": run.data.views, "cloud": run.data.cloud}
+    assert {k: v for k, v in kinds.items() if k != "fit"} == {k: type(v)() for k, v in kinds.items() if k != "fit"}
+    assert run.fit == job.RunSettings(iterations=700)  # the demo's
+
+
+def test_the_two_sets_of_readings_differ_where_they_say():
+    measured, literal = (job.settings_of(tree(composed(f"+strategy={name}"))) for name in ("clear", "clear_paper"))
+    assert (measured.strategies["p2g"].score_by, literal.strategies["p2g"].score_by) == ("sum", "evidence")
+    assert (measured.objective.lambda_hr.final, literal.objective.lambda_hr.final) == (1.0, 0.1)
+    assert (measured.optim.detail_decay, literal.optim.detail_decay) == (0.002, 0.0)
+    assert (measured.strategies["svs"].anchor_strength, literal.strategies["svs"].anchor_strength) == (0.0, 0.01)
+    assert literal.strategies["svs"].anchor_weights["means"] == 1.0
+    assert literal.strategies["svs"].anchor_weights["detail"] == 0.0
+    assert literal.skips == type(literal.skips)(plateau_window=250)  # nothing is left out
+
+
+def test_p2g_takes_the_operator_that_makes_the_lr_images():
+    assert (
+        job.settings_of(tree(composed("+strategy=p2g", "data.views.downsample=area"))).strategies["p2g"].down == "area"
+    )
+
+
+GROUPS = ("strategy", "rasterizer", "data", "prior", "objective", "density", "optim", "skips", "method")
+NEEDED = {
+    **{
+        f"data={name}": "data.path=here" for name in ("blender", "colmap", "llff", "mipnerf360", "nerfstudio", "photos")
+    },
+    **{f"prior={name}": "prior.path=here" for name in ("dnn_superres", "images", "onnx")},
+    "prior=corrupted": "prior.prior.path=here",
+}
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_every_option_composes_into_settings(group):
+    for name in options(group):
+        chosen = f"{'+' if group in ('strategy', 'method') else ''}{group}={name}"
+        config = composed(chosen, *([NEEDED[chosen]] if chosen in NEEDED else []))
+        assert isinstance(job.settings_of(tree(config)).conductor(1.0), Conductor), name
+
+
+def options(group: str) -> list[str]:
+    return sorted(p.stem for p in (CONF / group).glob("*.yaml") if not p.stem.startswith("_"))
+
+
+def leaves(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    if isinstance(node, dict):
+        for key, value in node.items():
+            yield from leaves(value, (*path, str(key)))
+    else:
+        yield path, node
+
+
+def written() -> Iterator[tuple[Path, tuple[str, ...], Any]]:
+    """Every value in conf/, with its file and its path in the whole configuration."""
+    for file in sorted(CONF.rglob("*.yaml")):
+        group = file.parent.relative_to(CONF).parts
+        if group[:1] == ("hydra",):
+            continue
+        text = file.read_text()
+        header = text.split("\n")[0].removeprefix("# @package ") if text.startswith("# @package") else None
+        package = () if header == "_global_" else (header,) if header else group
+        for path, value in leaves(yaml.safe_load(text) or {}, package):
+            if path[len(package) :][:1] not in (("defaults",), ("hydra",)):
+                yield file, path, value
+
+
+def default_at(path: tuple[str, ...], whole: Any) -> Any:
+    """What the innermost `_target_` above a path gives for it by default; ... where there is none."""
+    node, default = whole, ...
+    for key in path:
+        if isinstance(node, dict) and node.get(TARGET) is not None:
+            default = with_defaults({TARGET: node[TARGET]})
+        default = default.get(key, ...) if isinstance(default, dict) else ...
+        node = node.get(key) if isinstance(node, dict) else None
+    return default
+
+
+def test_no_default_stands_in_a_class_and_in_conf():
+    """A file may give a class's default only where it takes back what another file says."""
+    whole = [OmegaConf.to_container(composed(*o)) for group in GROUPS for name in options(group)
+             for o in [[f"{'+' if group in ('strategy', 'method') else ''}{group}={name}"]]]  # fmt: skip
+    everything = list(written())
+    repeated = []
+    for file, path, value in everything:
+        if path[-1].startswith("_") or value in ("???",):
+            continue
+        if any(value == default_at(path, config) for config in whole):
+            others = [v for f, p, v in everything if p == path and f != file and v != value]
+            if not others:
+                repeated.append(f"{file.relative_to(CONF)}: {'.'.join(path)} = {value!r}")
+    assert not repeated, "\n".join(repeated)
+
+
+REFUSED = {
+    "fit.iterations=2.5": "fit.iterations: must be a whole number, got 2.5",
+    "fit.iterations=0": "fit.iterations must be at least 1",
+    "fit.map_views=-1": "fit.map_views must be at least 0, got -1",
+    "fit.fused=sometimes": "fit.fused: must be auto or every_row or off, got 'sometimes'",
+    "fit.max_degree=true": "fit.max_degree: must be a whole number, got True",
+    "+fit.iteration=1": "Did you mean fit.iterations?",
+    "+typo=1": "typo: clear_strategies.jobs.job.JobSettings has no such setting",
+    "data.views.sizes=pad": "data.views.sizes: must be crop or round, got 'pad'",
+    "data.cloud.voxel=nan": "data.cloud.voxel: must be a finite number, got nan",
+    "+strategy=gco strategies.gco.bound=both": "strategies.gco.bound: must be omega or coefficient, got 'both'",
+    "+strategy=gco strategies.gco.tolerance=7": "strategies.gco.tolerance must lie in [0, 1), got 7",
+    "+strategy=p2g strategies.p2g.score_by=best": "strategies.p2g.score_by: must be evidence or gradient or sum or max",
+    "+strategy=svs strategies.svs.dropout.maximum=1": "strategies.svs.dropout: a dropout rate must lie in [0, 1)",
+    "objective.lambda_hr.start=4000": "objective.lambda_hr.start <= full",
+    "objective.lr_from=both": "objective.lr_from: must be lr or hr, got 'both'",
+    "objective.lambda_hr._target_=clear_strategies.schedules.Ramp": "clear_strategies.schedules.Ramp has no such setting",
+    "density.mode=median": "density.mode: must be quantile or fixed, got 'median'",
+    "+strategies.mine._target_=pathlib.Path": "strategies.mine: must be a Strategy, got a PosixPath",
+    "+strategies.mine._target_=nowhere.Mine": "strategies.mine: nowhere.Mine cannot be imported",
+    "rasterizer.kernel=-1": "kernel must be",
+    "rasterizer.name=cuda": "unknown rasterizer 'cuda'",
+    "rasterizer=torch rasterizer.memory=9": "unknown rasterizer setting 'memory'",
+    "+strategy=gco +data.path=here": "data.path is of no use",
+    "data=llff": "data.path: is needed and missing",
+    "+scene=fern": "data.root: is needed and missing",
+}
+
+
+@pytest.mark.parametrize(("overrides", "message"), REFUSED.items(), ids=list(REFUSED))
+def test_a_setting_that_cannot_be_used_is_named_by_its_key(overrides, message):
+    def settle() -> None:
+        settings = job.settings_of(tree(composed(*overrides.split())))
+        device.drawing(settings.rasterizer, settings.fit.device)
+
+    with pytest.raises(SettingError) as refused:
+        settle()
+    assert message in str(refused.value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -11,12 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 
-from clear_strategies import Conductor, Strategy
-from clear_strategies.run import CONF
 from tests.helpers.malformed import CASES
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -150,7 +146,7 @@ def test_a_sweep_goes_on_after_a_bad_job(tmp_path):
     )
     said = result.stdout + result.stderr
     assert result.returncode == 2
-    assert "tolerance must lie in [0, 1), got 7" in said
+    assert "strategies.gco.tolerance must lie in [0, 1), got 7" in said
     assert "Traceback" not in said
     assert len(list(tmp_path.glob("multirun/*/*/metrics.json"))) == 1
 
@@ -195,41 +191,154 @@ def test_lr_images_are_written_for_an_external_model_whose_results_come_back(tmp
     assert "images sr" in result.stdout + result.stderr
 
 
-BAD_SETTINGS = {
-    "+strategy=gco strategies.gco.bound=both": "bound must be omega or coefficient",
-    "+strategy=p2g strategies.p2g.score_by=best": "score_by must be one of",
-    "+strategy=svs strategies.svs.dropout.maximum=1": "dropout rate must lie in [0, 1)",
-    "objective.lambda_hr.start=4000": "start <= full",
-    "objective.lr_from=both": "lr_from must be lr or hr",
+NOWHERE = ["data=llff", "data.path=nowhere"]  # whoever reads data before the settings are checked complains of this
+REFUSED = {
+    "fit.iterations=abc": "fit.iterations: must be a whole number, got 'abc'",
+    "fit.threads=0": "fit.threads must be at least 1",
+    "fit.typo=1": "Key 'typo' is not in struct",
+    "+fit.typo=1": "fit.typo: clear_strategies.jobs.job.RunSettings has no such setting",
+    "+data.typo=1": "data.typo: ",
+    "data.views.sr_scale=2.5": "data.views.sr_scale: must be a whole number, got 2.5",
+    "prior=onnx": "prior.path: is needed and missing",
+    "prior=demo prior.share=7": "prior: share must lie in [0, 1], got 7",
+    "+strategy=[gco,gco]": "+strategy: must name each strategy once, got gco twice",
+    "+strategy=nope": "Could not find 'strategy/nope'",
+    "+strategy=[gco,splatsure]": "GCO and SplatSuRe both implement correct()",
+    "+strategy=svs strategies.svs.anchor_strength=nan": "strategies.svs.anchor_strength: must be a finite number, got nan",
+    "objective.lambda_hr.peak=nan": "objective.lambda_hr.peak: must be a finite number, got nan",
     "objective.lambda_lr=0": "L_base must act from the first iteration",
-    "data.views.sizes=pad": "data.views.sizes: must be one of crop, round, got 'pad'",
-    "data.views.sr_scale=2.5": "data.views.sr_scale: must be a whole number of at least 1, got 2.5",
-    "data.views.shrink=200": "data.views.shrink: must leave a whole LR pixel",
-    "density.mode=median": "mode must be quantile or fixed",
-    "rasterizer.kernel=-1": "kernel must be",
-    "fit.map_views=-1": "must be at least 0, got -1",
-    "fit.iterations=0": "iterations must be at least 1",
-    "data.views.train=99": "99 training views are asked for",
-    "data=llff": "data.path",
-    "+scene=fern data=llff": "data.root",
-    "prior=onnx": "prior.path",
-    "prior=onnx prior.path=nowhere.onnx": "nowhere.onnx",
-    "prior=images prior.path=nowhere": "nowhere",
-    "data.cloud.init=ply data.cloud.path=nowhere.ply": "nowhere.ply",
-    "fit.resume=nowhere": "no checkpoint is here",
-    "rasterizer.name=cuda": "unknown rasterizer",
-    "rasterizer.preset=best": "unknown preset",
+    "rasterizer.preset=best": "unknown preset 'best'",
+    "rasterizer._target_=nowhere.Mine": "rasterizer: nowhere.Mine cannot be imported",
+    "fit.device=cuda": "fit.device: is cuda, and torch finds no CUDA device",
+    "fit.iterations=[": "no viable alternative at input",
 }
+OF_THE_DATA = {
+    "data=demo data.views.shrink=200": "shrink",
+    "data=llff data.path=nowhere": "nowhere: folder: is not there",
+    "prior=onnx prior.path=nowhere.onnx": "nowhere.onnx",
+    "fit.resume=nowhere": "no checkpoint is here",
+}
+HEAVY = {"cv2", "scipy", "skimage", "kornia", "matplotlib", "open3d"}
+# Each case in a process of its own, forked after the imports, which take most of the time of a short run.
+FORKED = """
+import json, os, sys, traceback
+from clear_strategies.run import main
+for i, case in enumerate(json.load(sys.stdin)):
+    pid = os.fork()
+    if pid == 0:
+        sys.argv = ["run", f"hydra.run.dir=out/{i}", *case]
+        os.dup2(os.open(f"{i}.said", os.O_CREAT | os.O_WRONLY), 1)
+        os.dup2(1, 2)
+        try:
+            main()
+            code = 0
+        except SystemExit as exit:
+            code = exit.code
+        except BaseException:
+            traceback.print_exc()
+            code = 1
+        sys.stdout.flush()
+        sys.stderr.flush()
+        heavy = sorted(sys.modules.keys() & set(os.environ["HEAVY"].split()))
+        with open(f"{i}.json", "w") as file:
+            json.dump([code, heavy], file)
+        os._exit(0)
+    os.waitpid(pid, 0)
+"""
 
 
-@pytest.mark.parametrize(("overrides", "message"), BAD_SETTINGS.items(), ids=list(BAD_SETTINGS))
-def test_bad_settings_get_one_line_and_exit_code_2(overrides, message, tmp_path):
-    quick = [] if "data=" in overrides else [o for o in TINY if o.split("=")[0] not in overrides]
-    result = run(*quick, *overrides.split(), cwd=tmp_path)
-    said = result.stdout + result.stderr
-    assert result.returncode == 2, said
-    assert message in said
-    assert "Traceback" not in said
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory):
+    """How each command line ends: exit code, lines, and the heavy libraries that it imported."""
+    folder = tmp_path_factory.mktemp("ended")
+    cases = {o: [*NOWHERE, *o.split()] for o in REFUSED}
+    cases |= {o: [*(x for x in TINY if "data=" not in o and x.split("=")[0] not in o), *o.split()] for o in OF_THE_DATA}
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "HEAVY": " ".join(HEAVY),
+           "CUDA_VISIBLE_DEVICES": ""}  # fmt: skip
+    subprocess.run([sys.executable, "-c", FORKED], cwd=folder, env=env, input=json.dumps(list(cases.values())), text=True,
+                   timeout=400, check=True)  # fmt: skip
+    found = {}
+    for i, overrides in enumerate(cases):
+        code, heavy = json.loads((folder / f"{i}.json").read_text())
+        found[overrides] = code, (folder / f"{i}.said").read_text().splitlines(), heavy
+    return found
+
+
+@pytest.mark.parametrize(("overrides", "message"), REFUSED.items(), ids=list(REFUSED))
+def test_a_bad_setting_is_one_line_and_exit_code_2_before_data_is_read(overrides, message, ended):
+    code, lines, heavy = ended[overrides]
+    assert code == 2, lines
+    assert len(lines) == 1, lines
+    assert message in lines[0]
+    assert heavy == []
+
+
+@pytest.mark.parametrize(("overrides", "message"), OF_THE_DATA.items(), ids=list(OF_THE_DATA))
+def test_unusable_data_is_told_in_one_sentence_and_exit_code_2(overrides, message, ended):
+    code, lines, _ = ended[overrides]
+    assert code == 2, lines
+    assert message in lines[-1], lines
+    assert not any("Traceback" in line for line in lines)
+
+
+def test_the_exit_codes_of_a_whole_process(tmp_path):
+    """What no fork can show: the time from the start, and the folder that Hydra itself makes."""
+    began = resource.getrusage(resource.RUSAGE_CHILDREN)
+    bad = run("fit.iterations=abc", cwd=tmp_path)
+    took = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert (bad.returncode, (bad.stdout + bad.stderr).count("\n")) == (2, 1), bad.stdout + bad.stderr
+    assert (
+        took.ru_utime + took.ru_stime - began.ru_utime - began.ru_stime < 8
+    )  # 2.4 s here; a wall clock counts others too
+    (tmp_path / "file").touch()
+    for folder in ("file/run", "/proc/run"):  # neither can be made, by root neither
+        unwritable = run(f"hydra.run.dir={folder}", cwd=tmp_path)
+        said = unwritable.stdout + unwritable.stderr
+        assert (unwritable.returncode, said.count("\n")) == (3, 1), said
+        assert folder.split("/")[0] in said or folder in said
+
+
+def test_ctrl_c_while_data_is_prepared_is_one_line(tmp_path):
+    (tmp_path / "slow.py").write_text(
+        "import time\n\n\ndef read():\n    print('reading', flush=True)\n    time.sleep(99)\n"
+    )
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "clear_strategies.run", "hydra.run.dir=out", "~data.reader.width", "~data.reader.height",
+               "~data.reader.views", "~data.reader.train", "data.reader._target_=slow.read"]  # fmt: skip
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        assert process.stdout.readline() == "reading\n"
+        process.send_signal(signal.SIGINT)
+        said, _ = process.communicate(timeout=60)
+    assert process.returncode == 130, said
+    assert said == "stopped by SIGINT before training began. Nothing was saved.\n"
+
+
+def test_without_the_trainers_libraries_the_command_names_the_extra(tmp_path):
+    code = (
+        "import sys, importlib.util as u\n"
+        "whole = u.find_spec\n"
+        "import clear_strategies.jobs.exit_codes as e\n"
+        "e.find_spec = lambda name: None if name in ('cv2', 'scipy') else whole(name)\n"
+        "from clear_strategies.run import main\n"
+        "main()\n"
+    )
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert result.returncode == 2
+    assert "training needs cv2, scipy" in result.stderr
+    assert "pip install 'clear-strategies[train]'" in result.stderr
+
+
+def test_the_package_itself_lists_its_doors(tmp_path):
+    result = run(cwd=tmp_path, module="clear_strategies")
+    assert result.returncode == 0, result.stderr
+    assert [line.split()[0] for line in result.stdout.splitlines()] == [
+        f"clear_strategies.{door}" for door in ("run", "report", "bench")
+    ]
 
 
 @pytest.mark.parametrize("case", CASES[:: max(1, len(CASES) // 12)], ids=lambda c: c.name)
@@ -241,44 +350,3 @@ def test_malformed_data_get_one_line_and_exit_code_2(case, tmp_path):
     assert result.returncode == 2, said
     assert "Traceback" not in said
     assert not list(tmp_path.glob("outputs/**/metrics.json"))
-
-
-def configs(group: str) -> list[str]:
-    return sorted(p.stem for p in (CONF / group).glob("*.yaml") if not p.stem.startswith("_"))
-
-
-@pytest.mark.parametrize("group", ["strategy", "rasterizer", "data", "prior", "objective", "density", "optim"])
-def test_every_config_composes(group):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        for name in configs(group):
-            prefix = "+" if group == "strategy" else ""
-            config = compose("config", [f"{prefix}{group}={name}"])
-            assert config.fit.iterations > 0
-            if group == "strategy":
-                OmegaConf.set_struct(config, False)
-                strategies = [instantiate(s, _convert_="object") for s in config.strategies.values()]
-                assert all(isinstance(s, Strategy) for s in strategies)
-                Conductor(*strategies)
-            if group in ("objective", "density", "optim"):
-                instantiate(config[group], _convert_="object")
-
-
-def test_every_field_of_a_strategy_is_in_its_yaml():
-    from dataclasses import fields
-
-    from clear_strategies import GCO, P2G, SVS
-
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", ["+strategy=clear"])
-    for name, kind in (("gco", GCO), ("p2g", P2G), ("svs", SVS)):
-        assert {f.name for f in fields(kind) if f.init} == set(config.strategies[name]) - {"_target_"}
-
-
-def test_the_two_sets_of_readings_differ_where_they_say():
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        measured, literal = (compose("config", [f"+strategy={name}"]) for name in ("clear", "clear_paper"))
-    assert (measured.strategies.p2g.score_by, literal.strategies.p2g.score_by) == ("sum", "evidence")
-    assert (measured.objective.lambda_hr.final, literal.objective.lambda_hr.final) == (1.0, 0.1)
-    assert (measured.optim.detail_decay, literal.optim.detail_decay) == (0.002, 0.0)
-    assert literal.strategies.svs.anchor_weights.means == 1.0
-    assert literal.strategies.svs.anchor_weights.detail == 0.0

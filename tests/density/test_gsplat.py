@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
 from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, Strategy, Update
 from clear_strategies.core.gradients import Grads
@@ -22,6 +22,7 @@ from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings
 from clear_strategies.density.threshold import topk_threshold
 from clear_strategies.run import CONF
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, scaled
+from clear_strategies.settings import build
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import GaussianField
@@ -452,7 +453,7 @@ def test_any_class_of_that_shape_is_chosen_by_its_name():
         config = compose(
             "config", ["density=gsplat", f"density.strategy._target_={TINY_ONE}", "+density.strategy.wander=3"]
         )
-    made = instantiate(config.density, _convert_="object").densifier(N, extent=1.0, seed=0, white_background=False)
+    made = build(OmegaConf.to_container(config.density)).densifier(N, extent=1.0, seed=0, white_background=False)
     assert (type(made.strategy).__name__, made.strategy.wander) == ("Tiny", 3)
     assert made.strategy.refine_start_iter == 500
 
@@ -460,7 +461,7 @@ def test_any_class_of_that_shape_is_chosen_by_its_name():
 def test_from_the_command_line(tmp_path):
     own = ["density=gsplat", f"density.strategy._target_={TINY_ONE}"]
     if find_spec("gsplat") is not None:
-        own = ["density=gsplat_default", "density.strategy.prune_scale3d=100"]  # so few points are large
+        own = ["density=gsplat_default", "+density.strategy.prune_scale3d=100"]  # so few points are large
     result = run("+strategy=clear", *own, *TINY, "hydra.run.dir=here", cwd=tmp_path)
     said = result.stdout + result.stderr
     assert result.returncode == 0, said

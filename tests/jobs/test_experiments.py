@@ -17,15 +17,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.plugins import Plugins
 from hydra.core.utils import setup_globals
 from hydra.types import RunMode
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import Conductor
 from clear_strategies.data.prepare import ViewSettings
 from clear_strategies.run import CONF
 from clear_strategies.schedules import scaled
+from clear_strategies.settings import build
 from clear_strategies.training.loop import fit, iterate
-from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
@@ -60,10 +59,10 @@ def jobs(*arguments: str) -> tuple[list[dict[str, str]], Callable[[dict[str, str
 
 def pieces(config: DictConfig, stretch: float = 1.0):
     """What `run` builds of a configuration, without data."""
-    build = [instantiate(config[key], _convert_="object") for key in ("objective", "density", "optim")]
-    strategies = [instantiate(s, _convert_="object") for s in config.strategies.values()]
-    mip = MipFilter(**OmegaConf.to_container(config.mip))
-    return [scaled(s, stretch) for s in strategies], *(scaled(thing, stretch) for thing in (*build, mip))
+    values = OmegaConf.to_container(config)
+    built = [build(values[key], key) for key in ("objective", "density", "optim", "mip")]
+    strategies = build(OmegaConf.to_container(config.strategies, resolve=True), "strategies")
+    return [scaled(s, stretch) for s in strategies.values()], *(scaled(thing, stretch) for thing in built)
 
 
 @pytest.mark.parametrize("name", names("method"))
@@ -182,7 +181,7 @@ def test_an_experiment_is_its_scenes_times_seeds_times_rows(experiment):
         assert (c.fit.iterations, c.fit.seed, c.data.path) == (10_000, 0, f"here/{scenes[0]}")
         assert c.hydra.sweep.dir == f"multirun/{experiment}"
         assert c.hydra.sweep.subdir == f"+strategy={job['+strategy']},data.scene={scenes[0]},fit.seed=0"
-        assert isinstance(instantiate(c.data.views, _convert_="object"), ViewSettings)
+        assert isinstance(build(OmegaConf.to_container(c.data.views)), ViewSettings)
         pieces(c)
 
 

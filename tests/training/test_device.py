@@ -8,11 +8,9 @@ a tensor that forgets where it belongs cannot be reckoned with.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -23,8 +21,6 @@ from clear_strategies.core import deferred
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import View
 from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings
-from clear_strategies.errors import DataError
-from clear_strategies.run import CONF, _comparable, _device, _drawn_on, _rasterizer, _restore
 from clear_strategies.training import checkpoint
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.skips import SkipPolicy, Skips
@@ -294,57 +290,3 @@ def test_a_checkpoint_is_taken_to_wherever_the_run_is(tmp_path, no_data, monkeyp
     assert {x.device.type for x in lying(state).values()} == {"meta"}
     assert lying(state).keys() == lying(saved).keys()
     assert state.t == 14
-
-
-@pytest.mark.parametrize(
-    ("asked", "message"), [("tpu", "must be cpu, cuda or null, got 'tpu'"), ("cuda", "torch finds no CUDA device")]
-)
-def test_a_device_that_cannot_be_had_is_refused_in_one_sentence(asked, message, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(DataError, match=message):
-        _device(asked)
-
-
-@pytest.mark.parametrize(
-    ("devices", "asked", "there", "expected"),
-    [({"cpu"}, None, True, "cpu"), ({"cuda"}, None, True, "cuda"), ({"cpu", "cuda"}, None, True, "cuda"),
-     ({"cpu", "cuda"}, None, False, "cpu"), ({"cpu", "cuda"}, "cpu", True, "cpu"), ({"cuda"}, "cuda", True, "cuda")],
-)  # fmt: skip
-def test_null_is_cuda_where_it_is_and_the_rasterizer_draws_there(devices, asked, there, expected, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
-    assert _drawn_on(frozenset(devices), "this", asked) == expected
-
-
-def test_a_rasterizer_of_the_other_device_is_refused_in_one_sentence():
-    with pytest.raises(DataError, match="is cuda, and the rasterizer cpp draws on cpu alone"):
-        _drawn_on(frozenset({"cpu"}), "cpp", "cuda")
-
-
-def test_warp_is_told_the_device_that_was_asked_for(monkeypatch):
-    told = {}
-
-    def load(name, **settings):
-        told[name] = settings
-        return Blank()
-
-    monkeypatch.setattr("rasterizers.load", load)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        for override, expected in (("fit.device=cpu", "cpu"), ("fit.device=null", None)):
-            config = compose("config", ["rasterizer=warp", override])
-            assert _rasterizer(config, (0, 0, 0))[1:] == ("warp", "cpu")
-            assert told["warp"].get("device") == expected
-
-
-def test_going_on_on_another_device_is_said(caplog):
-    state = start(())
-    iterate(state, toy.RASTERIZER)
-    saved = state.checkpoint({})
-    _restore(start(()), saved, Path("there"), {})
-    assert "bit for bit" not in caplog.text
-    _restore(start(()), replace(saved, device="cuda"), Path("there"), {})
-    assert "until now this run trained on cuda, from here on cpu" in caplog.text
-
-
-def test_the_device_is_no_part_of_what_a_resumed_run_must_agree_with():
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        assert "fit.device" not in _comparable(compose("config"))

@@ -1,0 +1,166 @@
+"""Where a job computes: the rasterizer, the device that the field lies on, and the threads."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Final, Literal
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+
+import rasterizers
+from clear_strategies.errors import SettingError
+from clear_strategies.jobs import sweep
+from clear_strategies.settings import TARGET
+from rasterizers.interface import BackendUnavailable, Rasterizer, RasterSettings
+
+_log = logging.getLogger(__name__)
+
+_SHARED: Final = RasterSettings()
+Color = tuple[float, float, float]
+Device = Literal["cpu", "cuda"]
+
+
+@dataclass(frozen=True, slots=True)
+class RasterizerSettings:
+    """A rasterizer of this repository by name, and its settings; None leaves a setting to the backend.
+
+    Args:
+        name: auto, or a name that `rasterizers.load` knows.
+        preset: cut-offs by name, see `rasterizers.PRESETS`; alpha_min and transmittance_min win over it.
+        kernel, near, alpha_min, alpha_max, transmittance_min, tile, antialiased: see `RasterSettings`.
+        background: RGB in [0, 1]; None: the data set's own.
+        memory: MiB that the lists of one image may take (cpp, warp).
+        threads: of the kernels (cpp); None: as many as torch has.
+        lanes: pixel-Gaussian pairs that are blended at a time (torch).
+        device: cpu or cuda (warp); None: that of the job.
+    """
+
+    name: str = "auto"
+    preset: str | None = None
+    kernel: float = _SHARED.kernel
+    near: float = _SHARED.near
+    alpha_min: float | None = None
+    alpha_max: float = _SHARED.alpha_max
+    transmittance_min: float | None = None
+    tile: int | None = None
+    background: Color | None = None
+    antialiased: bool = _SHARED.antialiased
+    memory: int | None = None
+    threads: int | None = None
+    lanes: int | None = None
+    device: str | None = None
+
+    def load(self, device: Device | None) -> tuple[str, Callable[..., Rasterizer]]:
+        """The name of the backend, and a function that makes the rasterizer."""
+        name = self.name
+        settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
+        settings = {key: value for key, value in settings.items() if value is not None}
+        if name == "auto":
+            name = rasterizers.fastest(device)
+        elif name == "warp" and device is not None:
+            settings.setdefault("device", device)
+        return name, functools.partial(rasterizers.load, name, **settings)
+
+
+_OWN: Final = f"{RasterizerSettings.__module__}.{RasterizerSettings.__qualname__}"
+_BY_NAME: Final = ("name", "preset", "memory", "threads", "lanes", "device")
+
+
+def rasterizer_node(node: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration's `rasterizer`; for another class than ours only what every rasterizer has, and its own settings.
+
+    `rasterizer._target_=pkg.Mine` keeps the fields of `RasterSettings`, so that they mean the same for each rasterizer;
+    None leaves one to the class.
+    """
+    if node.get(TARGET) in (None, _OWN):
+        return dict(node)
+    named = [name for name in _BY_NAME if node.get(name) not in (None, "auto")]
+    kept = {key: value for key, value in node.items() if value is not None and (key not in _BY_NAME or key in named)}
+    return {key: value for key, value in kept.items() if key != "name"} | {"_partial_": True}
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """A rasterizer that is ready to draw.
+
+    Args:
+        name: for the plan. device: that it draws on and the field lies on.
+        make: makes the rasterizer anew, with a background.
+    """
+
+    rasterizer: Rasterizer
+    name: str
+    device: Device
+    kernel: float
+    make: Callable[..., Rasterizer]
+
+    def over(self, background: Color) -> Drawing:
+        """The same over the data set's background, unless the settings name one."""
+        keywords = getattr(self.make, "keywords", {})
+        if "background" in keywords:
+            return self
+        rasterizer = self.make(background=background)
+        return Drawing(rasterizer, self.name, self.device, self.kernel, self.make)
+
+
+def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked: Device | None) -> Drawing:
+    """The rasterizer of the settings on the device that was asked for.
+
+    Raises:
+        SettingError: the rasterizer is not installed or refuses a setting, or does not draw on that device.
+    """
+    if asked == "cuda" and not torch.cuda.is_available():
+        raise SettingError(
+            "fit.device: is cuda, and torch finds no CUDA device. Install NVIDIA's driver and a torch built for CUDA, or "
+            "take fit.device=cpu."
+        )
+    try:
+        if isinstance(settings, RasterizerSettings):
+            kernel = settings.kernel
+            name, make = settings.load(asked)
+        else:
+            kernel = settings.keywords.get("kernel", _SHARED.kernel)
+            name, make = settings.func.__name__, settings
+        rasterizer = make()
+    except (ValueError, TypeError, BackendUnavailable) as error:
+        raise SettingError(f"rasterizer: {error}") from error
+    if not isinstance(rasterizer, Rasterizer):
+        raise SettingError(
+            f"rasterizer: {name} is no Rasterizer. rasterizers.testing.check_rasterizer says what is missing."
+        )
+    device = drawn_on(rasterizer.traits.devices, name, asked)
+    return Drawing(rasterizer, name if device == "cpu" else f"{name} on {device}", device, kernel, make)
+
+
+def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer]) -> None:
+    """For `auto`: log why the other backends were not chosen."""
+    if isinstance(settings, RasterizerSettings) and settings.name == "auto":
+        for name, reason in rasterizers.available().items():
+            if reason is not None:
+                _log.info("rasterizer %s is not available: %s", name, reason)
+
+
+def drawn_on(devices: frozenset[str], name: str, asked: Device | None) -> Device:
+    """The device that was asked for, or else the best that this rasterizer draws on."""
+    if asked is None:
+        return "cuda" if "cuda" in devices and torch.cuda.is_available() else "cpu"
+    if asked not in devices:
+        raise SettingError(
+            f"fit.device: is {asked}, and the rasterizer {name} draws on {' or '.join(sorted(devices))} alone. Choose "
+            "another of the two, or leave fit.device=null."
+        )
+    return asked
+
+
+def threads(asked: int | None) -> tuple[int, str]:
+    """How many threads a job has, and why."""
+    if asked is not None:
+        return asked, "fit.threads"
+    launcher = HydraConfig.get().launcher if HydraConfig.initialized() else None
+    jobs = int(launcher.n_jobs) if launcher is not None and "n_jobs" in launcher else 1
+    here = f"of {sweep.cores()} here"
+    return sweep.threads(jobs), here if jobs == 1 else f"{here}, hydra.launcher.n_jobs={jobs}"

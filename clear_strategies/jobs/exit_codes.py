@@ -1,0 +1,59 @@
+"""How a process ends: what the user is told of an error, in one line, and the exit code.
+
+0: done. 2: a setting, a file or a sweep's job cannot be used. 3: the disk is full or read-only. 128 + n: stopped by
+signal n. Any other error is a bug: Python shows its traceback, and exits with 1.
+"""
+
+from __future__ import annotations
+
+import signal
+from importlib.util import find_spec
+from typing import Final, NamedTuple
+
+from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
+
+from clear_strategies.errors import ClearError, SettingError
+from clear_strategies.settings import one_line
+from rasterizers.interface import BackendUnavailable
+
+UNUSABLE: Final = 2
+NO_DISK: Final = 3
+SIGNALS: Final = 128
+
+# What the extra [train] brings beside the core, by the names that are imported.
+_TRAIN: Final = ("PIL", "cv2", "jinja2", "kornia", "matplotlib", "safetensors", "scipy", "skimage", "tqdm")
+
+
+class Ending(NamedTuple):
+    """How the process ends."""
+
+    code: int
+    message: str
+
+
+def describe(error: BaseException) -> Ending | None:
+    """How to end on an error that is the user's to solve; None: it is a bug."""
+    if isinstance(error, ClearError):
+        return Ending(error.exit_code, one_line(error))
+    if isinstance(error, KeyboardInterrupt):
+        return Ending(SIGNALS + signal.SIGINT, "stopped by SIGINT before training began. Nothing was saved.")
+    if isinstance(error, BackendUnavailable | HydraException | OmegaConfBaseException):
+        return Ending(UNUSABLE, one_line(error))  # before OSError: Hydra's error for an option that is not there is one
+    disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it where it cannot open its file
+    if isinstance(disk, OSError):
+        where = f"{disk.filename or 'output'}: {disk.strerror or disk}"
+        return Ending(NO_DISK, f"{where}. Earlier checkpoints are untouched.")
+    return None
+
+
+def require_train() -> None:
+    """Make sure of the trainer's libraries, without importing them.
+
+    Raises:
+        SettingError: one is not installed.
+    """
+    if missing := [name for name in _TRAIN if find_spec(name) is None]:
+        raise SettingError(
+            f"training needs {', '.join(missing)}, which the core does not install: pip install 'clear-strategies[train]'."
+        )

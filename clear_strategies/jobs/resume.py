@@ -1,0 +1,122 @@
+"""Going on with a run that was stopped, and leaving alone one that is finished."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from clear_strategies.data.strict_json import read_object
+from clear_strategies.errors import DataError
+from clear_strategies.training import checkpoint
+from clear_strategies.training.checkpoint import Checkpoint
+from clear_strategies.training.state import TrainState
+
+_log = logging.getLogger(__name__)
+
+AUTO: Final = "auto"  # what fit.resume may be besides a path
+
+# What may differ between a run and the one that it resumes.
+_NOT_COMPARED: Final = {
+    "fit.resume",
+    "fit.device",
+    "fit.threads",
+    "fit.keep",
+    "fit.checkpoint_every",
+    "fit.probe_every",
+    "fit.probe_views",
+    "fit.map_views",
+}
+
+
+def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration, flat and JSON-ready, without what a resumed run may change."""
+
+    def flatten(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
+        if isinstance(value, dict):
+            for key, item in value.items():
+                yield from flatten(f"{prefix}.{key}" if prefix else str(key), item)
+        else:
+            yield prefix, value
+
+    flat = {key: value for key, value in flatten("", values) if key not in _NOT_COMPARED}
+    return dict(json.loads(json.dumps(flat)))  # as it comes back from a file
+
+
+def finished(folder: Path, config: Mapping[str, Any]) -> tuple[float | None] | None:
+    """What the finished run in this folder returned; None where there is none.
+
+    Raises:
+        DataError: it was another configuration's, or its metrics.json is damaged.
+    """
+    path = folder / "metrics.json"
+    if not path.exists():
+        return None
+    metrics = read_object(path)
+    try:
+        _require_same(path, metrics["config"], config)
+        means = metrics["test"]["mean"] or metrics["train"]["mean"]
+        psnr = means["ours"]["psnr"] if means else None
+        date = metrics["provenance"]["date"]
+    except (KeyError, TypeError) as error:
+        raise DataError(path, str(error), "is missing", "remove the file: the run is then trained again") from error
+    score = "no PSNR" if psnr is None else f"PSNR {psnr:.2f} dB"
+    _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, date, score)
+    return (psnr,)
+
+
+def resume(state: TrainState, asked: str | None, folder: Path, config: Mapping[str, Any]) -> None:
+    """Restore what `fit.resume` asks for.
+
+    Args:
+        asked: a run's folder or one of its checkpoints; "auto": the newest checkpoint in `folder` that is whole, or none.
+
+    Raises:
+        DataError: the checkpoint is damaged, or another configuration's.
+    """
+    if asked == AUTO:
+        _resume_newest(state, folder / "checkpoints", config)
+    elif asked is not None:
+        source = Path(asked)
+        restore(state, checkpoint.load(source), source, config)
+
+
+def _resume_newest(state: TrainState, folder: Path, config: Mapping[str, Any]) -> None:
+    found = checkpoint.saved(folder)
+    for source in reversed(found):
+        try:
+            saved = checkpoint.load(source)
+        except DataError as error:
+            _log.warning("%s; trying an earlier one.", error)
+            continue
+        restore(state, saved, source, config)
+        return
+    if found:
+        _log.warning("%s: no checkpoint is whole; starting anew.", folder)
+
+
+def restore(state: TrainState, saved: Checkpoint, source: Path, config: Mapping[str, Any]) -> None:
+    """Go on from a checkpoint of the same configuration."""
+    _require_same(source, saved.config, config)
+    state.restore(saved, source)
+    _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
+    if saved.device != state.device.type:
+        _log.warning(
+            "until now this run trained on %s, from here on %s: what follows is not bit for bit what would have followed.",
+            saved.device, state.device.type,
+        )  # fmt: skip
+
+
+def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    differences = [
+        f"{key}: {then.get(key)!r} then, {now.get(key)!r} now"
+        for key in sorted({*then, *now})
+        if then.get(key) != now.get(key)
+    ]
+    if differences:
+        raise DataError(
+            source, "config", "this is not the configuration that wrote it: " + "; ".join(differences[:5]),
+            "resume with the same overrides, or start anew",
+        )  # fmt: skip

@@ -1,0 +1,266 @@
+"""Settings as plain values, as a configuration file or a command line gives them, and as checked objects.
+
+A node is a dict of plain values. With the key `_target_`, the dotted name of a class or function, it describes one call:
+`defaults` fills in every argument that the node leaves out, from the signature itself, and `build` checks the node and
+makes the call. So a default stands in one place, the class, and nothing is built from a setting that nobody checked.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import importlib
+import inspect
+import math
+import types
+import typing
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, Union, get_args, get_origin
+
+from beartype import BeartypeConf
+from beartype.door import is_bearable
+from beartype.roar import BeartypeDecorHintPep585DeprecationWarning, BeartypeException
+
+from clear_strategies.errors import DataError, SettingError
+from rasterizers.interface import BackendUnavailable
+
+TARGET: Final = "_target_"
+_PARTIAL: Final = "_partial_"  # true: `build` returns a functools.partial, which waits for further arguments
+_RECURSIVE: Final = "_recursive_"  # false: the nodes below stay plain values
+_KEYWORDS: Final = (TARGET, _PARTIAL, _RECURSIVE, "_convert_")
+LISTED: Final = "listed"
+"""False in the metadata of a dataclass field: its default is not written into the node."""
+_MISSING: Final = "???"
+_NUMBERS: Final = BeartypeConf(is_pep484_tower=True)  # an int is accepted where a float is asked for
+_EMPTY: Final = inspect.Parameter.empty
+_ABSENT: Final = object()
+
+
+def with_defaults(node: Any) -> Any:
+    """The node with the defaults of every `_target_` in it, nested dataclasses included; what the node says wins.
+
+    A target that cannot be imported is left as it is: `build` says why, if the node is used at all.
+    """
+    if isinstance(node, list):
+        return [with_defaults(value) for value in node]
+    if not isinstance(node, Mapping):
+        return node
+    if node.get(_RECURSIVE, True):
+        node = {key: with_defaults(value) for key, value in node.items()}
+    try:
+        return _merged(_defaults(_located(node[TARGET])), node) if node.get(TARGET) is not None else dict(node)
+    except (ImportError, AttributeError):
+        return dict(node)
+
+
+def build(node: Any, key: str = "") -> Any:
+    """What a node describes: the result of its call, with the nodes inside it built first.
+
+    Args:
+        key: of the node in the configuration, for messages.
+
+    Raises:
+        SettingError: an unknown or missing key, a value of another type, a number that is not finite, or a value that
+            the class itself refuses. The message begins with the key.
+    """
+    if isinstance(node, Mapping):
+        if node.get(TARGET) is not None:
+            return _called(node, key)
+        return {name: build(value, _joined(key, name)) for name, value in node.items()}
+    if isinstance(node, list):
+        return [build(value, f"{key}[{i}]") for i, value in enumerate(node)]
+    if node == _MISSING:
+        raise SettingError(f"{key}: is needed and missing. Add {key}=….")
+    if isinstance(node, float) and not math.isfinite(node):
+        raise SettingError(f"{key}: must be a finite number, got {node}.")
+    return node
+
+
+def one_line(error: BaseException) -> str:
+    """The message of an error without its line breaks."""
+    return " ".join(str(error).split())
+
+
+def _called(node: Mapping[str, Any], key: str) -> Any:
+    target = node[TARGET]
+    try:
+        function = _located(target)
+    except (ImportError, AttributeError) as error:
+        own = str(target).startswith(("clear_strategies.", "rasterizers."))
+        remedy = "pip install 'clear-strategies[train]'" if own else "Correct its dotted name"
+        raise SettingError(f"{key}: {target} cannot be imported ({one_line(error)}). {remedy}.") from error
+    parameters, hints = _parameters(function), _hints(function)
+    given = {name: value for name, value in node.items() if name not in _KEYWORDS}
+    _refuse_unknown(given, parameters, key, str(target))
+    arguments = {}
+    for name, value in given.items():
+        inner = _joined(key, name)
+        built = build(value, inner) if node.get(_RECURSIVE, True) else value
+        arguments[name] = _of_type(built, hints[name], inner) if name in hints else built
+    partial = functools.partial(function, **arguments)
+    if node.get(_PARTIAL):
+        return partial
+    needed = {name for name, p in parameters.items() if p.default is _EMPTY and p.kind not in _VARIADIC}
+    if missing := sorted(needed - set(arguments)):
+        raise SettingError(f"{_joined(key, missing[0])}: is needed and missing. Add {_joined(key, missing[0])}=….")
+    try:
+        return partial()
+    except DataError:
+        raise
+    except (ValueError, BackendUnavailable) as error:
+        raise SettingError(_with_key(one_line(error), key, parameters)) from error
+
+
+def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
+    """The message with the key of the configuration in front, which is that of the field that the message begins with."""
+    if not key or message.startswith((f"{key}.", f"{key}:")):
+        return message
+    return f"{key}.{message}" if message.partition(" ")[0] in parameters else f"{key}: {message}"
+
+
+_VARIADIC: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+def _located(target: Any) -> Callable[..., Any]:
+    """The class or function of a dotted name.
+
+    Raises:
+        ImportError: it is not there.
+    """
+    if not isinstance(target, str):
+        raise ImportError(f"{target!r} is no dotted name")
+    module, _, name = target.rpartition(".")
+    if not module:
+        raise ImportError("it names no module")
+    found = getattr(importlib.import_module(module), name)
+    if not callable(found):
+        raise ImportError("it is neither a class nor a function")
+    return typing.cast("Callable[..., Any]", found)
+
+
+def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    return {name: p for name, p in inspect.signature(function).parameters.items() if not name.startswith("_")}
+
+
+def _hints(function: Callable[..., Any]) -> dict[str, Any]:
+    """Type annotations by parameter; none where they name something that cannot be looked up."""
+    annotated = function.__init__ if isinstance(function, type) and not is_dataclass(function) else function  # type: ignore[misc]
+    try:
+        return typing.get_type_hints(annotated)
+    except (NameError, TypeError, AttributeError):
+        return {}
+
+
+def _defaults(function: Callable[..., Any]) -> dict[str, Any]:
+    """The node that calls the function with all of its defaults."""
+    declared = {f.name: f for f in fields(function)} if is_dataclass(function) else {}
+    node: dict[str, Any] = {TARGET: None}
+    for name, parameter in _parameters(function).items():
+        default = parameter.default
+        if (own := declared.get(name)) is not None:
+            if not own.metadata.get(LISTED, True):
+                continue
+            default = own.default if own.default_factory is MISSING else own.default_factory()
+        if (value := _plain(default)) is not _ABSENT:
+            node[name] = value
+    return node
+
+
+def _plain(value: Any) -> Any:
+    """A default as a configuration holds it; `_ABSENT` for what no configuration can hold."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, tuple | list):
+        items = [_plain(item) for item in value]
+        return _ABSENT if _ABSENT in items else items
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        kind = type(value)
+        inner = {f.name: _plain(getattr(value, f.name)) for f in fields(value) if f.init}
+        return {TARGET: f"{kind.__module__}.{kind.__qualname__}", **inner}
+    return _ABSENT
+
+
+def _merged(defaults: Mapping[str, Any], node: Mapping[str, Any]) -> dict[str, Any]:
+    """The defaults, replaced by what the node says; a nested node of another `_target_` takes the place of the default."""
+    merged = {**defaults}
+    for key, value in node.items():
+        default = merged.get(key)
+        if isinstance(default, Mapping) and isinstance(value, Mapping):
+            same = value.get(TARGET, default.get(TARGET)) == default.get(TARGET)
+            merged[key] = _merged(default, value) if same else value
+        else:
+            merged[key] = value
+    return merged
+
+
+def _refuse_unknown(
+    given: Mapping[str, Any], parameters: Mapping[str, inspect.Parameter], key: str, target: str
+) -> None:
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
+        return
+    known = [name for name, p in parameters.items() if p.kind not in _VARIADIC]
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, 1)
+            remedy = f"Did you mean {_joined(key, near[0])}?" if near else f"There is {', '.join(known) or 'none'}."
+            raise SettingError(f"{_joined(key, name)}: {target} has no such setting. {remedy}")
+
+
+def _of_type(value: Any, hint: Any, key: str) -> Any:
+    """The value, if it is of the annotated type; a list becomes the tuple that is asked for."""
+    origin = get_origin(hint)
+    if isinstance(value, dict) and isinstance(origin, type) and issubclass(origin, Mapping):
+        return {name: _of_type(entry, get_args(hint)[1], _joined(key, name)) for name, entry in value.items()}
+    if isinstance(value, bool) and not _takes_bool(hint):
+        raise SettingError(f"{key}: must be {_in_words(hint)}, got {value}.")
+    for candidate in (value, tuple(value)) if isinstance(value, list) else (value,):
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", BeartypeDecorHintPep585DeprecationWarning)
+                if is_bearable(candidate, hint, conf=_NUMBERS):
+                    return candidate
+        except BeartypeException:  # a hint that beartype does not know
+            return value
+    shown = repr(value) if isinstance(value, str | int | float | list | Mapping | None) else f"a {type(value).__name__}"
+    raise SettingError(f"{key}: must be {_in_words(hint)}, got {shown}.")
+
+
+def _takes_bool(hint: Any) -> bool:
+    """Whether true and false are values of the annotation; to Python a bool is an int, to a user it is not."""
+    if get_origin(hint) in (Union, types.UnionType):
+        return any(_takes_bool(part) for part in get_args(hint))
+    if get_origin(hint) is Literal:
+        return any(isinstance(value, bool) for value in get_args(hint))
+    return hint in (bool, Any, object) or hint not in (int, float, str, None, types.NoneType)
+
+
+_WORDS: Final[Mapping[Any, str]] = {
+    int: "a whole number", float: "a number", bool: "true or false", str: "text", type(None): "null", Path: "a path",
+}  # fmt: skip
+
+
+def _in_words(hint: Any) -> str:
+    """An annotation for somebody who knows YAML, not Python."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint in _WORDS:
+        return _WORDS[hint]
+    if origin in (Union, types.UnionType):
+        return " or ".join(dict.fromkeys(_in_words(part) for part in inner))
+    if origin is Literal:
+        return " or ".join(str(value) for value in inner)
+    if origin is tuple:
+        return f"a list of {len(inner)} numbers"
+    if isinstance(origin, type) and inner:
+        return "a table of names" if issubclass(origin, Mapping) else f"a list, each entry {_in_words(inner[0])}"
+    return f"a {hint.__name__}" if isinstance(hint, type) else str(hint)
+
+
+def _joined(key: str, name: Any) -> str:
+    return f"{key}.{name}" if key else str(name)

@@ -1,0 +1,99 @@
+"""Where a job computes: which rasterizer, which device, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from clear_strategies.compose import CONF, tree
+from clear_strategies.errors import SettingError
+from clear_strategies.jobs import device, job
+from clear_strategies.jobs.device import RasterizerSettings, drawn_on
+from rasterizers.interface import RasterSettings, Traits
+from rasterizers.reference import ReferenceRasterizer
+
+
+@dataclass(frozen=True)
+class Theirs(ReferenceRasterizer):
+    """A third party's rasterizer, with a setting of its own."""
+
+    sharpness: float = 1.0
+
+
+class Blank:
+    """Draws nothing."""
+
+    tile = 8
+    traits = Traits(frozenset({"cpu", "meta"}), frozenset({torch.float32}), True, True, True)
+
+    def __call__(self, splats, camera, tiles=None): ...
+
+    def render_scales(self, jobs, tiles=None): ...
+
+
+def settings(*overrides: str) -> job.JobSettings:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return job.settings_of(tree(compose("config", list(overrides))))
+
+
+def test_a_device_that_is_not_there_is_refused_in_one_sentence(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SettingError, match=r"fit\.device: is cuda, and torch finds no CUDA device"):
+        device.drawing(RasterizerSettings(), "cuda")
+    with pytest.raises(SettingError, match=r"fit\.device: must be cpu or cuda or null, got 'tpu'"):
+        settings("fit.device=tpu")
+
+
+@pytest.mark.parametrize(
+    ("devices", "asked", "there", "expected"),
+    [({"cpu"}, None, True, "cpu"), ({"cuda"}, None, True, "cuda"), ({"cpu", "cuda"}, None, True, "cuda"),
+     ({"cpu", "cuda"}, None, False, "cpu"), ({"cpu", "cuda"}, "cpu", True, "cpu"), ({"cuda"}, "cuda", True, "cuda")],
+)  # fmt: skip
+def test_null_is_cuda_where_torch_finds_it_and_the_rasterizer_draws_there(devices, asked, there, expected, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
+    assert drawn_on(frozenset(devices), "this", asked) == expected
+
+
+def test_a_rasterizer_of_the_other_device_is_refused_in_one_sentence():
+    with pytest.raises(SettingError, match="is cuda, and the rasterizer cpp draws on cpu alone"):
+        drawn_on(frozenset({"cpu"}), "cpp", "cuda")
+
+
+def test_warp_gets_the_device_of_the_job(monkeypatch):
+    given = {}
+
+    def load(name, **settings):
+        given[name] = settings
+        return Blank()
+
+    monkeypatch.setattr("rasterizers.load", load)
+    for asked, expected in (("cpu", "cpu"), (None, None)):
+        drawing = device.drawing(RasterizerSettings(name="warp"), asked)
+        assert (drawing.name, drawing.device) == ("warp", "cpu")
+        assert given["warp"].get("device") == expected
+
+
+def test_the_shared_settings_have_the_defaults_of_every_rasterizer():
+    shared, ours = RasterSettings(), RasterizerSettings()
+    assert (ours.kernel, ours.near, ours.alpha_max) == (shared.kernel, shared.near, shared.alpha_max)
+    assert ours.antialiased == shared.antialiased
+
+
+def test_a_rasterizer_of_another_package_is_a_target_with_the_same_settings():
+    target = f"rasterizer._target_={__name__}.Theirs"
+    found = settings(target, "rasterizer.kernel=0.3", "+rasterizer.sharpness=2").rasterizer
+    drawing = device.drawing(found, None).over((1.0, 1.0, 1.0))
+    assert (type(drawing.rasterizer), drawing.name, drawing.kernel) == (Theirs, "Theirs", 0.3)
+    assert (drawing.rasterizer.sharpness, drawing.rasterizer.background) == (2, (1.0, 1.0, 1.0))
+    own = device.drawing(settings(target, "rasterizer.background=[0,0,1]").rasterizer, None).over((1.0, 1.0, 1.0))
+    assert own.rasterizer.background == (0, 0, 1)
+    with pytest.raises(SettingError, match=r"rasterizer.sharp: .* Did you mean rasterizer.sharpness\?"):
+        settings(target, "+rasterizer.sharp=2")
+    with pytest.raises(SettingError, match="rasterizer: kernel must be"):
+        device.drawing(settings(target, "rasterizer.kernel=-1").rasterizer, None)
+    with pytest.raises(SettingError, match="rasterizer: Path is no Rasterizer"):
+        device.drawing(device.functools.partial(Path), None)

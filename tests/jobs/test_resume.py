@@ -1,0 +1,39 @@
+"""Resuming a job: what must agree with the run before, and what may differ."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+from clear_strategies.compose import CONF, tree
+from clear_strategies.errors import DataError
+from clear_strategies.jobs import resume
+from clear_strategies.training.loop import iterate
+from tests.helpers import toy
+from tests.training.test_resume import start
+
+
+def compared(*overrides: str):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return resume.comparable(tree(compose("config", list(overrides))))
+
+
+def test_resuming_on_another_device_is_logged(caplog):
+    state = start(())
+    iterate(state, toy.RASTERIZER)
+    saved = state.checkpoint({})
+    resume.restore(start(()), saved, Path("there"), {})
+    assert "bit for bit" not in caplog.text
+    resume.restore(start(()), replace(saved, device="cuda"), Path("there"), {})
+    assert "until now this run trained on cuda, from here on cpu" in caplog.text
+
+
+def test_device_and_threads_may_differ_and_defaults_are_compared_too():
+    assert compared("fit.device=cpu", "fit.threads=1") == compared()
+    assert compared()["fit.seed"] == 0  # a default of the class, which no file gives
+    saved = replace(start(()).checkpoint({}), config=compared("density.every=50"))
+    with pytest.raises(DataError, match=r"density\.every: 50 then, 100 now"):
+        resume.restore(start(()), saved, Path("there"), compared())

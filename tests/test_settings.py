@@ -1,0 +1,126 @@
+"""Settings as plain values: defaults filled in from signatures, and everything checked before a class is called."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import pytest
+
+from clear_strategies.errors import DataError, SettingError
+from clear_strategies.settings import LISTED, TARGET, build, with_defaults
+from rasterizers.interface import BackendUnavailable
+
+
+@dataclass(frozen=True, slots=True)
+class Inner:
+    size: int = 3
+    mode: Literal["a", "b"] = "a"
+
+    def __post_init__(self) -> None:
+        if self.size < 1:
+            raise SettingError(f"size must be at least 1, got {self.size}.")
+        if self.size > 9:
+            raise ValueError("it is too large.")
+
+
+@dataclass(frozen=True, slots=True)
+class Outer:
+    share: float
+    inner: Inner = field(default_factory=Inner)
+    names: Sequence[str] | None = None
+    color: tuple[float, float] = (0.0, 1.0)
+    weights: Mapping[str, float] = field(default_factory=lambda: {"x": 1.0})
+    on: bool | Literal["auto"] = "auto"
+    hidden: str | None = field(default=None, metadata={LISTED: False})
+
+
+def call(root: str, depth: int = 2, *, strict: bool = False, **others: Any) -> Any:
+    return root, depth, strict, others
+
+
+def fails(root: str) -> None:
+    raise {"data": DataError("file", "field", "is bad", "mend it"), "here": BackendUnavailable("it is not here.")}[root]
+
+
+def target(kind: Any, **values: Any) -> dict[str, Any]:
+    return {TARGET: f"{__name__}.{kind.__name__}", **values}
+
+
+def test_defaults_come_from_the_signature_and_the_node_wins():
+    node = with_defaults(target(Outer, inner={"mode": "b"}, weights={"y": 2.0}))
+    inner = {TARGET: f"{Inner.__module__}.Inner", "size": 3, "mode": "b"}
+    assert node == target(Outer, inner=inner, names=None, color=[0.0, 1.0], weights={"x": 1.0, "y": 2.0}, on="auto")
+    assert with_defaults([target(call, depth=7)]) == [target(call, depth=7, strict=False)]
+
+
+def test_another_target_takes_the_place_of_a_nested_default():
+    node = with_defaults(target(Outer, inner=target(call, root="r")))
+    assert node["inner"] == target(call, root="r", depth=2, strict=False)
+
+
+@pytest.mark.parametrize("kept", [{TARGET: None}, {TARGET: "nowhere.Mine", "x": 1}, {"a": {"b": 1}}, "text"])
+def test_what_cannot_be_looked_up_stays_as_it_is(kept):
+    assert with_defaults(kept) == kept
+
+
+def test_nodes_below_recursive_false_stay_plain():
+    node = target(call, root="r", _recursive_=False, inner=target(Inner))
+    assert with_defaults(node)["inner"] == target(Inner)
+    assert build(node) == ("r", 2, False, {"inner": target(Inner)})
+
+
+def test_a_node_is_built_from_the_inside_out():
+    built = build(target(Outer, share=1, color=[0.5, 1], inner=target(Inner, size=4)))
+    assert built == Outer(1, Inner(4), color=(0.5, 1))
+    assert build({"a": [target(Inner)], "b": None}) == {"a": [Inner()], "b": None}
+
+
+def test_a_partial_waits_for_what_is_missing():
+    waiting = build(target(call, depth=5, _partial_=True))
+    assert waiting("r") == ("r", 5, False, {})
+
+
+REFUSED = {
+    "share: must be a number, got 'abc'": {"share": "abc"},
+    "share: must be a number, got True": {"share": True},
+    "share: must be a finite number, got nan": {"share": float("nan")},
+    "share: must be a finite number, got inf": {"share": float("inf")},
+    "share: is needed and missing. Add it.share=….": {},
+    "share: is needed and missing. Add it.share": {"share": "???"},
+    "shape: tests.test_settings.Outer has no such setting. Did you mean it.share?": {"share": 1, "shape": 1},
+    "zzz: tests.test_settings.Outer has no such setting. There is share, inner": {"share": 1, "zzz": 1},
+    "inner: must be a Inner, got 3": {"share": 1, "inner": 3},
+    "inner.size: must be a whole number, got 2.5": {"share": 1, "inner": target(Inner, size=2.5)},
+    "inner.size: must be a whole number, got 2.0": {"share": 1, "inner": target(Inner, size=2.0)},
+    "inner.mode: must be a or b, got 'c'": {"share": 1, "inner": target(Inner, mode="c")},
+    "inner.size must be at least 1, got 0.": {"share": 1, "inner": target(Inner, size=0)},
+    "inner: it is too large.": {"share": 1, "inner": target(Inner, size=10)},
+    "inner: nowhere.Mine cannot be imported": {"share": 1, "inner": {TARGET: "nowhere.Mine"}},
+    "inner: builtins.nothing cannot be imported": {"share": 1, "inner": {TARGET: "builtins.nothing"}},
+    "names: must be a list, each entry text or null, got [1]": {"share": 1, "names": [1]},
+    "color: must be a list of 2 numbers, got [1]": {"share": 1, "color": [1]},
+    "weights.x: must be a number, got 'y'": {"share": 1, "weights": {"x": "y"}},
+    "weights: must be a table of names, got 3": {"share": 1, "weights": 3},
+    "weights.x: must be a finite number, got nan": {"share": 1, "weights": {"x": float("nan")}},
+    "on: must be true or false or auto, got 1": {"share": 1, "on": 1},
+}
+
+
+@pytest.mark.parametrize(("message", "values"), REFUSED.items(), ids=list(REFUSED))
+def test_a_setting_that_cannot_be_used_is_refused_by_its_key(message, values):
+    with pytest.raises(SettingError) as refused:
+        build({"it": target(Outer, **values)})
+    assert str(refused.value).startswith(f"it.{message}")
+
+
+def test_true_and_false_are_taken_where_they_are_asked_for():
+    assert build(target(Outer, share=1.0, on=True)).on is True
+
+
+def test_files_keep_their_own_error_and_a_backend_that_is_not_there_is_a_setting():
+    with pytest.raises(DataError):
+        build({"it": target(fails, root="data")})
+    with pytest.raises(SettingError, match="it: it is not here"):
+        build({"it": target(fails, root="here")})
