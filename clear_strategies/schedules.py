@@ -107,7 +107,12 @@ class WarmupDecay:
 
 @dataclass(frozen=True, slots=True)
 class Ramp:
-    """p_t: linear from 0 to `maximum` at iteration `full` (DropGaussian), or constant.
+    """The dropout rate p_t: linear from 0 to `maximum` at iteration `full` (DropGaussian), or constant.
+
+    Args:
+        maximum: share of Gaussians, in [0, 1).
+        shape: "linear", or "constant", at `maximum` from the first iteration on (F37).
+        full: iteration at which the linear rate reaches `maximum`.
 
     Raises:
         SettingError: `maximum` is outside [0, 1).
@@ -131,7 +136,15 @@ class Ramp:
 
 @dataclass(frozen=True, slots=True)
 class LogLinear:
-    """A learning rate falling from `initial` to `final`, log-linearly, by iteration `end` (3DGS's positions)."""
+    """A learning rate that falls log-linearly, as that of positions in 3DGS.
+
+    Args:
+        initial: rate at the start, > 0. final: rate from `end` on, > 0.
+        end: iteration.
+
+    Raises:
+        SettingError: a rate is not > 0.
+    """
 
     initial: float = 1.6e-4
     final: float = 1.6e-6

@@ -25,12 +25,6 @@ PAGE: Final = "reference/configuration.md"
 GENERATED: Final = frozenset({PAGE})
 OURS: Final = frozenset({"clear_strategies", "rasterizers", "integration"})
 
-# Nodes of conf/config.yaml that the run itself turns into these classes, so that they have no `_target_`.
-CLASSES: Final = {
-    "fit": "clear_strategies.training.loop.FitSettings",
-    "mip": "clear_strategies.training.mip.MipFilter",
-}
-
 
 @dataclass(frozen=True)
 class Setting:
@@ -204,7 +198,7 @@ def _walk(
     key: str, values: Mapping[str, Any], path: str, comments: Mapping[str, str], *, plain: bool
 ) -> Iterator[Section]:
     nodes = {k: v for k, v in values.items() if isinstance(v, DictConfig)}
-    target = values.get("_target_") or (CLASSES.get(key) if plain else None)
+    target = values.get("_target_")
     dotted = {name: f"{path}.{name}" if path else name for name in values}
     leaves = {name: _shown(v) for name, v in values.items() if name not in nodes and not name.startswith("_")}
     notes = {name: comments.get(dotted[name], "") for name in values}
@@ -225,14 +219,24 @@ def _walk(
         )
 
 
+def _is_ours(built: Any) -> bool:
+    return built.__module__.split(".")[0] in OURS
+
+
+def _declaring(built: Any, field: str) -> Any:
+    """The class that declares the field: a base may be another library's, whose own pages describe its fields."""
+    if not inspect.isclass(built):
+        return built
+    return next((base for base in built.__mro__ if field in vars(base).get("__annotations__", {})), built)
+
+
 def _built(
     key: str, target: str, leaves: Mapping[str, str], notes: Mapping[str, str]
 ) -> tuple[Section, dict[str, Any]]:
     """The fields of the class or function that a node is built from; and the defaults that are dataclasses themselves."""
     module, _, name = target.rpartition(".")
     built = getattr(importlib.import_module(module), name)
-    ours = built.__module__.split(".")[0] in OURS
-    summary, described = _docstring(built) if ours else (f"A class of {built.__module__.split('.')[0]}.", {})
+    summary, described = _docstring(built) if _is_ours(built) else (f"A class of {built.__module__.split('.')[0]}.", {})
     hints = _hints(built)
     metadata = {f.name: f.metadata for f in dataclasses.fields(built)} if dataclasses.is_dataclass(built) else {}
     settings: dict[str, Setting] = {}
@@ -242,7 +246,7 @@ def _built(
         if dataclasses.is_dataclass(default) and not isinstance(default, type):
             inner[parameter.name] = default
             continue
-        if not ours and parameter.name not in leaves:
+        if not _is_ours(_declaring(built, parameter.name)) and parameter.name not in leaves:
             continue
         if default is inspect.Parameter.empty and parameter.name not in leaves and (CONF / parameter.name).is_dir():
             continue  # a group of its own

@@ -32,20 +32,21 @@ _FEWEST_ROUNDS: Final = 10
 
 @dataclass(frozen=True, slots=True)
 class DensitySettings:
-    """When Gaussians are cloned, split, pruned and reset. Window bounds are strict: start < t < stop.
+    """When Gaussians are cloned, split, pruned and reset: in iterations start < t < stop.
 
     Args:
-        threshold: on the mean over views of ‖∇_u‖ in NDC units; 3DGS 2e-4, sparse-view forks 5e-4.
-        mode: "quantile" picks as many by the score as the ordinary statistic would pick by the threshold; "fixed"
-            holds the score itself against the threshold. The same where the score is the ordinary one.
-        reduce: a Gaussian's statistic is the "mean" or the "max" over the views since the last round.
-        statistics_from: no statistics before it.
+        threshold: on the mean over views of ‖∇_u‖ in NDC units; 3DGS 2e-4, sparse-view forks 5e-4 (F10).
+        mode: "quantile" picks as many Gaussians by the score as the ordinary statistic picks by the threshold; "fixed"
+            compares the score itself with the threshold. Both are the same where the score is the ordinary one (F9).
+        reduce: a Gaussian's statistic is the "mean" or the "max" over the views since the last round (F12).
+        start, stop: iterations between which the structure changes.
+        statistics_from: iteration before which nothing is accumulated (F11).
         every: iterations between rounds; lowered where fewer than 10 rounds would fit.
-        clone_below: up to this share of the scene's extent a Gaussian is cloned, above it is split.
-        prune_opacity: fainter ones are removed. prune_world: also those larger than this share of the extent; None:
-            never.
-        reset_every: opacities are lowered to 0.01 this often inside the window; 0: never. White backgrounds get one
-            more reset at `start`.
+        clone_below: share of the scene's extent; smaller Gaussians are cloned, larger ones are split.
+        prune_opacity: Gaussians of lower opacity are removed.
+        prune_world: Gaussians larger than this share of the extent are removed; None: never.
+        reset_every: iterations between opacity resets to 0.01; 0: never. White backgrounds get one more reset at `start`
+            (F14).
         max_gaussians: the cap; a warning says when it binds.
         min_gaussians: pruning to fewer is an error.
     """

@@ -1,4 +1,4 @@
-"""The benchmark's command line: the files that it writes, and its exit codes. And the data files of docs/benchmarks.md."""
+"""The benchmark's command line: its files, its exit codes, and the data files of docs/explanation/benchmarks.md."""
 
 from __future__ import annotations
 
@@ -68,7 +68,9 @@ def test_bad_arguments_have_exit_code_2(arguments, capsys):
 
 def test_the_page_links_to_every_published_table_and_both_figures_are_drawn_from_them():
     data = DOCS / "data" / "benchmarks"
-    linked = set(re.findall(r"\(data/benchmarks/(\w+\.csv)\)", (DOCS / "benchmarks.md").read_text()))
+    linked = set(
+        re.findall(r"\(\.\./data/benchmarks/(\w+\.csv)\)", (DOCS / "explanation" / "benchmarks.md").read_text())
+    )
     assert linked == {path.name for path in data.glob("*.csv")}
     tables = {path.stem: pd.read_csv(path) for path in data.glob("*.csv")}
     figure = plots.time_against_error(tables["rasterizers_time"], tables["rasterizers_error"])

@@ -48,7 +48,8 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
 
     Args:
         width, height: of the HR images, px.
-        views: how many, training views included.
+        views: number of views, training views included.
+        train: number of training views, at least 2.
 
     Raises:
         SettingError: a number is outside its range.
