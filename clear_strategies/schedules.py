@@ -109,6 +109,11 @@ class WarmupDecay:
 class Ramp:
     """p_t: linear from 0 to `maximum` at iteration `full` (DropGaussian), or constant.
 
+    Args:
+        maximum: the dropout rate from `full` on, in [0, 1).
+        shape: "linear" up to `full`, or "constant".
+        full: the iteration from which the rate is `maximum`.
+
     Raises:
         SettingError: `maximum` is outside [0, 1).
     """
@@ -131,7 +136,13 @@ class Ramp:
 
 @dataclass(frozen=True, slots=True)
 class LogLinear:
-    """A learning rate falling from `initial` to `final`, log-linearly, by iteration `end` (3DGS's positions)."""
+    """A learning rate falling from `initial` to `final`, log-linearly, by iteration `end` (3DGS's positions).
+
+    Args:
+        initial: at the first iteration; for positions in units of the scene's extent.
+        final: from `end` on.
+        end: the iteration at which `final` is reached.
+    """
 
     initial: float = 1.6e-4
     final: float = 1.6e-6
