@@ -12,7 +12,15 @@ from typing import Any, Final
 import matplotlib as mpl
 
 mpl.use("Agg")
-mpl.rcParams.update({"svg.hashsalt": "clear", "font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
+mpl.rcParams.update(
+    {
+        "svg.hashsalt": "clear",
+        "svg.fonttype": "none",
+        "font.size": 9,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+    }
+)
 
 import matplotlib.pyplot as plt  # noqa: E402 - after the backend was chosen
 

@@ -81,24 +81,24 @@ class Objective:
 
     def lr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:
         """L_LR, and the cotangent of λ_LR L_LR."""
-        shown = self._shown(image)
-        cotangents = shown.new_empty(1, *shown.shape)
-        loss = kernels.photometric(shown, target, self.lambda_ssim, kernels=self.kernels, out=cotangents[0])  # Eq. 4
+        compared = self._clamped(image)
+        cotangents = compared.new_empty(1, *compared.shape)
+        loss = kernels.photometric(compared, target, self.lambda_ssim, kernels=self.kernels, out=cotangents[0])  # Eq. 4
         if self.lambda_lr != 1:
             cotangents *= self.lambda_lr
         return self._losses({"lr": loss}, image, cotangents)
 
     def hr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:
         """L_base and L_HF, two cotangents; L_base alone where λ_HF = 0."""
-        shown, use = self._shown(image), self.kernels
-        cotangents = shown.new_empty(2 if self.lambda_hf > 0 else 1, *shown.shape)
-        base = kernels.photometric(shown, target, self.lambda_ssim_hr, kernels=use, out=cotangents[0])  # Eq. 5
+        compared, use = self._clamped(image), self.kernels
+        cotangents = compared.new_empty(2 if self.lambda_hf > 0 else 1, *compared.shape)
+        base = kernels.photometric(compared, target, self.lambda_ssim_hr, kernels=use, out=cotangents[0])  # Eq. 5
         losses = {"base": base}
         if self.lambda_hf > 0:
-            losses["hf"] = kernels.haar_l1(shown, target, self.haar_levels, kernels=use, out=cotangents[1])  # Eq. 5
+            losses["hf"] = kernels.haar_l1(compared, target, self.haar_levels, kernels=use, out=cotangents[1])  # Eq. 5
         return self._losses(losses, image, cotangents)
 
-    def _shown(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
+    def _clamped(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
         return image.clamp(0, 1) if self.clamp_render else image
 
     def _losses(

@@ -42,7 +42,7 @@ def splats(n: int = 40, seed: int = 0, dtype: torch.dtype = torch.float32, bands
 
 
 def scene(n: int = 40, seed: int = 0, train: int = 3, test: int = 1) -> Scene:
-    """Views of `splats`; the SR reference is the truth with noise of its own in each view."""
+    """Views of `splats`; the SR image is the truth with noise of its own in each view."""
     truth = splats(n, seed)
     views = []
     for i in range(train + test):
