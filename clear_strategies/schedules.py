@@ -136,14 +136,12 @@ class Ramp:
 
 @dataclass(frozen=True, slots=True)
 class LogLinear:
-    """A learning rate that falls log-linearly, as that of positions in 3DGS.
+    """A learning rate falling from `initial` to `final`, log-linearly, by iteration `end` (3DGS's positions).
 
     Args:
-        initial: rate at the start, > 0. final: rate from `end` on, > 0.
-        end: iteration.
-
-    Raises:
-        SettingError: a rate is not > 0.
+        initial: at the first iteration; for positions in units of the scene's extent.
+        final: from `end` on.
+        end: the iteration at which `final` is reached.
     """
 
     initial: float = 1.6e-4

@@ -30,7 +30,12 @@ Params = dict[str, nn.Parameter]
 
 
 class MCMC(MCMCStrategy):  # type: ignore[misc, unused-ignore]  # gsplat has no types
-    """gsplat's MCMCStrategy in torch: dead Gaussians move to live ones, new ones are added, and noise moves all."""
+    """gsplat's MCMCStrategy in torch: dead Gaussians move to live ones, new ones are added, and noise moves all.
+
+    Args:
+        noise_lr: strength of the noise, times the learning rate of the positions.
+        min_opacity: Gaussians below it are dead.
+    """
 
     def step_post_backward(
         self,

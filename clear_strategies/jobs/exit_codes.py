@@ -22,7 +22,7 @@ NO_DISK: Final = 3
 SIGNALS: Final = 128
 
 # What the extra [train] brings beside the core, by the names that are imported.
-_TRAIN: Final = ("PIL", "cv2", "jinja2", "kornia", "matplotlib", "safetensors", "scipy", "skimage", "tqdm")
+_TRAIN: Final = ("cv2", "jinja2", "kornia", "matplotlib", "safetensors", "scipy", "skimage", "tqdm")
 
 
 class Ending(NamedTuple):

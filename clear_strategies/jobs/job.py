@@ -80,11 +80,8 @@ class JobSettings(ConductorSettings):
     method: str | None = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.prior, functools.partial):  # it waits for the photos; its own settings are checked now
-            try:
-                self.prior(truth={})
-            except ValueError as error:
-                raise SettingError(f"prior: {error}") from error
+        if isinstance(self.prior, functools.partial):
+            self.prior(truth={})  # it waits for the photos; its own settings are refused now
 
 
 def settings_of(values: Mapping[str, Any]) -> JobSettings:

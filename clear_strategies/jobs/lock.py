@@ -1,7 +1,9 @@
-"""Floor 0: one writer a folder. A job holds `run.lock` while it writes; what a dead job left is recognised and taken over.
+"""One writer per folder: a job holds `run.lock` while it writes, and takes over the lock of a job that has died.
 
-Dead is known of a process on this host, and of an earlier try of the same Slurm job: Slurm starts a job again only after
-it has ended it. Of another host nothing is known, so its lock is respected.
+The lock says who holds it, so that messages can, and it outlives a file system without `flock`. A process on this host is
+known to be dead; so is an earlier try of the same Slurm job, because Slurm starts a job again only after it has ended. The
+lock of another host is respected, because nothing is known of its processes. (The `filelock` package has no holder's name,
+and decides by `flock` alone, which network file systems of clusters often lack.)
 """
 
 from __future__ import annotations
@@ -25,12 +27,12 @@ NAME: Final = "run.lock"
 
 
 class HeldError(DataError):
-    """A process that runs is at work in the folder."""
+    """Another running process holds the folder."""
 
 
 @contextmanager
 def hold(folder: Path) -> Iterator[None]:
-    """Be the only one who writes into `folder`, which is made if need be.
+    """Hold the lock of `folder`, which is created if it does not exist.
 
     Raises:
         HeldError: another process on this host holds it. DataError: whether its holder still runs cannot be known here.
@@ -57,7 +59,7 @@ def hold(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _alone_with(path: Path) -> Iterator[TextIO]:
-    """The file, made if need be, while no other process reads or writes it: who starts at the same moment waits here."""
+    """Open the lock file, created if it does not exist, while no other process reads or writes it."""
     while True:
         with path.open("a+") as file:
             with suppress(OSError):  # a file system that has no such locks: only starts at the same moment go unnoticed
@@ -108,13 +110,13 @@ def _me() -> dict[str, Any]:
 
 
 def _slurm() -> dict[str, Any]:
-    """Which Slurm job this is, and which try of it."""
+    """The Slurm job of this process, and how often Slurm has restarted it."""
     job, again = os.environ.get("SLURM_JOB_ID"), os.environ.get("SLURM_RESTART_COUNT", "0")
     return {"slurm_job": job, "slurm_restarts": int(again) if again.isdecimal() else 0} if job else {}
 
 
 def _alive(holder: dict[str, Any]) -> bool | None:
-    """Whether who wrote the lock still runs; None: not to be known from here."""
+    """Whether the process that wrote the lock still runs; None: it cannot be known from here."""
     mine = _slurm()
     if mine and holder.get("slurm_job") == mine["slurm_job"] and holder["slurm_restarts"] < mine["slurm_restarts"]:
         return False
@@ -124,7 +126,7 @@ def _alive(holder: dict[str, Any]) -> bool | None:
 
 
 def _started(pid: int) -> str | None:
-    """When the process was started, in ticks since boot, so that a reused number is another process; None: it is gone."""
+    """When the process started, in ticks since boot, which tells a reused process number; None: it has ended."""
     try:
         # The command, in parentheses, may hold anything; after it come the state (field 3) and the rest.
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
@@ -142,7 +144,7 @@ def _started(pid: int) -> str | None:
 
 
 def _parsed(text: str) -> dict[str, Any]:
-    """Of a damaged lock nothing is known."""
+    """The holder; nothing where the lock is damaged."""
     try:
         content = json.loads(text)
     except ValueError:

@@ -1,7 +1,7 @@
-"""Floor 5: what the jobs of one sweep share, in however many processes they run: cores, failures, and when to stop.
+"""What the jobs of one sweep share, in however many processes they run: cores, failures, and the signal to stop.
 
-The process that was started leaves the path of a folder in the environment, which its jobs inherit, on this machine and
-on a cluster; each job that fails leaves a note there. Nothing else passes between them.
+The first process puts the path of a folder into the environment, which its jobs inherit, on this machine and on a cluster.
+Each job that fails writes a note into that folder. The jobs share nothing else.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ _SECONDS_BETWEEN_LOOKS: Final = 0.5  # for the stop; a look is one question to t
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """The notes of one sweep. `folder` is that of the notes, `pid` the process that was started."""
+    """The notes of one sweep, in `folder`; `pid` is the process that began the sweep."""
 
     folder: Path
     pid: int
 
     @classmethod
     def begin(cls, folder: Path) -> Sweep:
-        """In the process that was started, before its first job; `folder` is the sweep's."""
+        """Begin a sweep into `folder`, before its first job."""
         folder.mkdir(parents=True, exist_ok=True)
         notes = tempfile.mkdtemp(prefix=f".sweep_{os.getpid()}_", dir=folder)
         atexit.register(shutil.rmtree, notes, ignore_errors=True)
@@ -46,7 +46,7 @@ class Sweep:
 
     @classmethod
     def current(cls) -> Sweep | None:
-        """The sweep that this process, or the one that started it, is at; None outside of any."""
+        """The sweep that this process belongs to, or None."""
         folder = Path(os.environ.get(_ENVIRONMENT, ""))
         if not folder.name.startswith(".sweep_"):
             return None
@@ -60,11 +60,11 @@ class Sweep:
         files.write_text(self.folder / f"{_FAILED}{job:05d}", message)
 
     def note_left(self, job: int, message: str) -> None:
-        """The job is in the hands of another process."""
+        """Another process holds the job's folder."""
         files.write_text(self.folder / f"{_LEFT}{job:05d}", message)
 
     def stop(self, signum: int) -> None:
-        """Ask the jobs of this sweep to save and end, and no further one to begin."""
+        """Ask the jobs of this sweep to save and end, and start no other."""
         files.write_text(self.folder / _STOP, str(int(signum)))
 
     @property
@@ -119,7 +119,7 @@ class Watch:
 
 
 def cores() -> int:
-    """How many this process may use: its affinity, and within a Slurm job what the job asked for."""
+    """The cores that this process may use: its affinity, and in a Slurm job no more than the job asked for."""
     here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     for name in ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
         if (given := os.environ.get(name, "")).isdecimal():
@@ -128,13 +128,13 @@ def cores() -> int:
 
 
 def threads(jobs: int) -> int:
-    """Of each of so many jobs at once on this machine. At most what torch takes by itself, so OMP_NUM_THREADS counts.
+    """Threads per job when `jobs` run at once on this machine; at most torch's own number, which OMP_NUM_THREADS sets.
 
-    Jobs that share cores must not share them: OpenMP's threads wait by spinning, and two jobs of two threads on two cores
-    run tens of times slower than two of one.
+    Two jobs must not use the same core: OpenMP's threads wait by spinning, so two jobs of two threads on two cores are
+    tens of times slower than two jobs of one thread.
 
     Args:
-        jobs: at once; negative as joblib counts: -1 is one a core, -2 one less.
+        jobs: at once; a negative number counts as joblib does: -1 is one job per core, -2 one fewer.
     """
     here = cores()
     at_once = jobs if jobs > 0 else max(1, here + 1 + jobs)
@@ -143,7 +143,7 @@ def threads(jobs: int) -> int:
 
 @cache
 def _threads_of_torch() -> int:
-    """Before anybody changed it: a process may do several jobs."""
+    """As it was before the first job changed it; a process may do several jobs."""
     import torch
 
     return torch.get_num_threads()

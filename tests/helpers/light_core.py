@@ -16,7 +16,7 @@ import rasterizers
 from clear_strategies import GCO, Conductor, Grads
 from clear_strategies.compose import conductor
 
-TRAINERS = ("cv2", "kornia", "skimage", "matplotlib", "scipy", "open3d", "PIL", "safetensors", "tqdm")
+TRAINERS = ("cv2", "kornia", "skimage", "matplotlib", "scipy", "open3d", "safetensors", "tqdm")
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ class Blank:
     """Draws nothing."""
 
     tile = 8
-    traits = Traits(frozenset({"cpu", "meta"}), frozenset({torch.float32}), True, True, True)
+    traits = Traits(frozenset({"cpu", "meta"}), frozenset({torch.float32}))
 
     def __call__(self, splats, camera, tiles=None): ...
 
