@@ -238,7 +238,7 @@ class RasterSettings:
     """
 
     kernel: float = 0.1
-    near: float = 0.2
+    near: float = 0.01
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
     transmittance_min: float = 1e-4

@@ -87,7 +87,7 @@ def image_size(path: Path, *, max_pixels: int = _MAX_PIXELS) -> tuple[int, int]:
 
 
 def image_folder(root: Path, name: str | None = None) -> Path:
-    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8 (logged).
+    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8.
 
     Raises:
         DataError: it is not there.
@@ -102,9 +102,13 @@ def image_folder(root: Path, name: str | None = None) -> Path:
         return root / name
     if not present:
         raise DataError(root, "images", f"has none of the folders {', '.join(_FOLDERS)}", "name the folder of photos")
-    if len(present) > 1 or present[0] != "images":
-        _log.info("%s: photos are read from %s (there are: %s).", root.name, present[0], ", ".join(present))
     return root / present[0]
+
+
+def folder_note(folder: Path) -> str:
+    """The folder's name, and which others there are, for the plan."""
+    others = [name for name in _FOLDERS if name != folder.name and (folder.parent / name).is_dir()]
+    return f"{folder.name} (there are also {', '.join(others)})" if others else folder.name
 
 
 def list_images(folder: Path) -> list[Path]:

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.prepare import ViewSettings, prepare
+from clear_strategies.data.prepare import ViewSettings, check_headers, prepare
 from clear_strategies.data.priors import Bicubic, DemoPrior, Prior, cached
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import SettingError
@@ -75,6 +75,7 @@ def _photos(capture: Capture) -> dict[str, Callable[[], Any]]:
 def load(data: DataSettings, prior: PriorSettings, seed: int) -> Scene:
     """Read the data set and prepare its views and its initial points."""
     capture = data.reader()
+    check_headers(capture.frames, data.views)  # before the log says anything about photos that cannot be used
     if data.save_lr is not None:
         prior = Bicubic()  # the images that the prior itself reads may not exist yet
     elif isinstance(prior, AutoPrior):

@@ -23,7 +23,7 @@ from torch import Tensor
 from clear_strategies.data.cameras import Lens
 from clear_strategies.data.capture import Capture, Color, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.checks import as_color
-from clear_strategies.data.photo_files import image_folder, inside, list_images
+from clear_strategies.data.photo_files import folder_note, image_folder, inside, list_images
 from clear_strategies.errors import DataError
 from rasterizers.geometry import rotation_matrix
 
@@ -123,7 +123,10 @@ def capture(
         )
         for image in model.images
     ]  # fmt: skip
-    notes = {"poses": f"COLMAP {_label(root, model)} ({model.ending[1:]}), {len(frames)} images", "photos": folder.name}
+    notes = {
+        "poses": f"COLMAP {_label(root, model)} ({model.ending[1:]}), {len(frames)} images",
+        "photos": folder_note(folder),
+    }
     unposed = sorted({p.name for p in list_images(folder)} - {p.name for p in paths.values()})
     if unposed:
         notes["without pose"] = f"{len(unposed)} photos, not used: {', '.join(unposed[:8])}"

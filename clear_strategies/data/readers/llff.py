@@ -15,7 +15,7 @@ from numpy.lib import format as npy_format
 from clear_strategies.data.cameras import Lens, rigid_inverse
 from clear_strategies.data.capture import Capture, Color, Frame, lens_notes, sorted_by_name
 from clear_strategies.data.checks import as_color, require_choice
-from clear_strategies.data.photo_files import image_folder, inside, list_images
+from clear_strategies.data.photo_files import folder_note, image_folder, inside, list_images
 from clear_strategies.data.readers import colmap
 from clear_strategies.errors import DataError
 
@@ -114,7 +114,7 @@ def _from_bounds(root: Path, folder: Path, has_model: bool, background: Color | 
         raise DataError(file, "bounds", f"are {near:g} and {far:g}; 0 < near < far must hold", _REMEDY)
     notes = {
         "poses": f"poses_bounds.npy, {len(frames)} images",
-        "photos": folder.name,
+        "photos": folder_note(folder),
         "depths": f"{near:.4g} to {far:.4g} world units, from poses_bounds.npy",
         **lens_notes(lenses, frames),
     }
