@@ -318,12 +318,12 @@ def test_the_objective_gives_its_losses_in_order():
 
 
 def test_lambda_hr_by_the_papers_milestones():
-    schedule = WarmupDecay()
+    schedule = WarmupDecay(final=0.1)
     expected = {1: 0, 500: 0, 501: 1 / 2500, 1750: 0.5, 3000: 1, 5000: 1, 7500: 0.55, 10_000: 0.1, 20_000: 0.1}
     for t, value in expected.items():
         assert schedule(t) == pytest.approx(value), t
-    assert WarmupDecay(decay="cosine")(7500) == pytest.approx(0.55)
-    assert WarmupDecay(decay="exponential")(7500) == pytest.approx(0.1**0.5)
+    assert WarmupDecay(final=0.1, decay="cosine")(7500) == pytest.approx(0.55)
+    assert WarmupDecay(final=0.1, decay="exponential")(7500) == pytest.approx(0.1**0.5)
 
 
 def test_position_rate_falls_log_linearly():
@@ -332,7 +332,7 @@ def test_position_rate_falls_log_linearly():
 
 
 def test_milestones_stretch_with_the_run_and_nothing_else_does():
-    short = scaled(Objective(), 0.1)
+    short = scaled(Objective(lambda_hr=WarmupDecay(final=0.1)), 0.1)
     assert milestones(short) == {
         "lambda_hr.start": 50, "lambda_hr.full": 300, "lambda_hr.decay_from": 500, "lambda_hr.end": 1000,
     }  # fmt: skip

@@ -55,7 +55,7 @@ class Blank:
     """Draws nothing, anywhere."""
 
     tile = 8
-    traits = Traits(frozenset({"cpu", "meta"}), frozenset({torch.float32}), True, True, True)
+    traits = Traits(frozenset({"cpu", "meta"}), frozenset({torch.float32}))
 
     def __call__(self, splats, camera, tiles=None) -> Rendering:
         like, n = splats.means, len(splats)
@@ -122,7 +122,6 @@ def no_data(monkeypatch):
     """What is made once, from the data, is there already."""
     monkeypatch.setattr(torch, "Generator", Generator)
     monkeypatch.setattr(TrainState, "refilter", lambda self: None)
-    monkeypatch.setattr(P2G, "_patch_evidence", lambda self, view: (view.lr.image.new_zeros(2, 2),) * 2)
 
     def tiles(self: SkipPolicy, view: View, tile: int) -> tuple[Tensor, int]:
         return view.hr.image.new_ones(8, 12, dtype=torch.bool), 1
@@ -134,6 +133,11 @@ def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:
     """A run in its middle, of which all lies on meta but the cameras."""
     monkeypatch.setattr("tests.training.test_resume.SCENE", SCENE.to("meta"))
     state = start(names)
+    for p2g in (s for s in state.conductor.strategies if isinstance(s, P2G)):
+        for view in state.views:  # evidence is computed once a view, at either size of its SR image
+            p2g.cache.update(
+                {(view.name, f): (view.lr.image.new_zeros(2, 2),) * 2 for f in (view.factor, view.factor // 2)}
+            )
     state.compiled_step = None
     state.skip_policy = SkipPolicy(EVERY_SKIP)
     # Statistics are gathered; a round reads, and does not come.
