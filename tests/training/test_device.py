@@ -7,6 +7,7 @@ a tensor that forgets where it belongs cannot be reckoned with.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import pytest
@@ -129,15 +130,18 @@ def no_data(monkeypatch):
     monkeypatch.setattr(SkipPolicy, "_with_detail", tiles)
 
 
+def cache_evidence(state: TrainState) -> None:
+    """P2G's evidence is computed once a view, at either size of its SR image; here it is there already."""
+    for p2g in (s for s in state.conductor.strategies if isinstance(s, P2G)):
+        for view, divisor in itertools.product(state.views, (1, 2)):
+            p2g.cache[view.name, view.factor // divisor] = (view.lr.image.new_zeros(2, 2),) * 2
+
+
 def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:
     """A run in its middle, of which all lies on meta but the cameras."""
     monkeypatch.setattr("tests.training.test_resume.SCENE", SCENE.to("meta"))
     state = start(names)
-    for p2g in (s for s in state.conductor.strategies if isinstance(s, P2G)):
-        for view in state.views:  # evidence is computed once a view, at either size of its SR image
-            p2g.cache.update(
-                {(view.name, f): (view.lr.image.new_zeros(2, 2),) * 2 for f in (view.factor, view.factor // 2)}
-            )
+    cache_evidence(state)
     state.compiled_step = None
     state.skip_policy = SkipPolicy(EVERY_SKIP)
     # Statistics are gathered; a round reads, and does not come.
@@ -182,6 +186,7 @@ def test_other_readings_read_nothing_either(make, no_data, monkeypatch):
     state = on_meta(monkeypatch, ())
     state.conductor = Conductor(make(), objective=state.conductor.objective, statistics_from=1)
     state.conductor.on_fit_start(len(SCENE.train), 0, "meta")
+    cache_evidence(state)
     for view in state.views:  # whose poses are sent once, for either reference
         for t in (1, ITERATIONS):
             seen = state.skip_policy.view(view, t)
