@@ -112,7 +112,7 @@ def _first_missing(node: Any, key: str = "") -> str | None:
 
 
 def _compose(overrides: list[str]) -> DictConfig:
-    # Who calls may be a Hydra application: its own is put back.
+    # The caller may be a Hydra application, whose state is restored afterwards.
     shared = GlobalHydra.instance()
     theirs, shared.hydra = shared.hydra, None
     try:
@@ -126,7 +126,7 @@ def _compose(overrides: list[str]) -> DictConfig:
 
 
 def require_each_once(overrides: Iterable[str]) -> None:
-    """Refuse a strategy that is asked for twice: Hydra merges the two into one without a word.
+    """Refuse a strategy that is named twice: Hydra merges the two into one silently.
 
     Raises:
         SettingError: one is.
@@ -163,7 +163,7 @@ class _ConfSource(FileConfigSource):
 
 
 class _ReadConf(SearchPathPlugin):
-    """Reads conf/ by `_ConfSource`, for whoever names the folder; other folders are left to Hydra."""
+    """Makes Hydra read conf/ by `_ConfSource`; other folders are read as usual."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for element in search_path.get_path():

@@ -66,7 +66,7 @@ def job(config: DictConfig) -> float | None:
 def _end(
     error: BaseException, ending: exit_codes.Ending, config: DictConfig, hydra_config: Any, ours: Sweep | None
 ) -> None:
-    """Say why a job ended, and exit; in a sweep only where the other jobs cannot go on."""
+    """Log why a job ended, and exit; in a sweep only where the other jobs cannot continue."""
     from clear_strategies.jobs.lock import HeldError
 
     code, message = ending.code, ending.message
@@ -82,17 +82,17 @@ def _end(
             ours.stop(signum)  # ending a worker would have joblib kill the others before they have saved
             return
         if signum not in (signal.SIGINT, signal.SIGTERM):
-            signal.raise_signal(signum)  # all is saved: now whoever launched the job may hand it in again
+            signal.raise_signal(signum)  # all is saved: now the launcher's handler may resubmit the job
         sys.exit(code)
     if ours is None or (code == exit_codes.NO_DISK and launcher == "basic"):
         sys.exit(code)
-    ours.note_failure(number, message)  # the other jobs go on, and jobs elsewhere may have another disk
+    ours.note_failure(number, message)  # the other jobs continue, and jobs on other machines may have another disk
 
 
 class SweepCallback(Callback):
-    """A sweep's beginning and end, in the process that was started; `job` is called in between, maybe in others.
+    """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes.
 
-    Hydra pickles it for them, so it remembers nothing.
+    Hydra pickles it for these processes, so it has no state.
     """
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
@@ -118,7 +118,7 @@ class SweepCallback(Callback):
 
 
 def _report(folder: Path) -> None:
-    """The table and the page of what a sweep has finished so far."""
+    """Write the report of the runs that have finished so far."""
     from clear_strategies import report
 
     try:
@@ -128,7 +128,7 @@ def _report(folder: Path) -> None:
 
 
 def _sweep() -> Sweep | None:
-    """The one that this job is of. A single run is of none, whatever the environment says that it was started in."""
+    """The sweep of this job; a single run belongs to none, even if it was started from within a sweep."""
     return Sweep.current() if HydraConfig.get().mode == RunMode.MULTIRUN else None
 
 
@@ -139,7 +139,7 @@ def _launcher(hydra_config: Any) -> str:
 
 
 def _watch() -> Callable[[], None] | None:
-    """For joblib's jobs: looks whether the sweep was stopped, from whichever process."""
+    """For joblib's jobs: checks after each iteration whether the sweep was stopped, by any process."""
     ours = _sweep()
     return sweep.Watch(ours) if ours is not None and _launcher(HydraConfig.get()) == "joblib" else None
 

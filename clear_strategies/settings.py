@@ -1,8 +1,8 @@
-"""Settings as plain values, as a configuration file or a command line gives them, and as checked objects.
+"""From settings as plain values, given by a configuration file or a command line, to checked objects.
 
 A node is a dict of plain values. With the key `_target_`, the dotted name of a class or function, it describes one call:
 `defaults` fills in every argument that the node leaves out, from the signature itself, and `build` checks the node and
-makes the call. So a default stands in one place, the class, and nothing is built from a setting that nobody checked.
+makes the call. So each default is set in one place, the class, and no object is built from an unchecked setting.
 """
 
 from __future__ import annotations
@@ -247,7 +247,7 @@ _WORDS: Final[Mapping[Any, str]] = {
 
 
 def _in_words(hint: Any) -> str:
-    """An annotation for somebody who knows YAML, not Python."""
+    """An annotation in words, for users of YAML."""
     origin, inner = get_origin(hint), get_args(hint)
     if hint in _WORDS:
         return _WORDS[hint]

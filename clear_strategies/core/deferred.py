@@ -1,4 +1,4 @@
-"""Scalars that stay on the device until somebody reads them.
+"""Scalars that stay on the device until they are read.
 
 A scalar on the CPU is read at once. Reading a scalar from CUDA would make the host wait for all queued work. It therefore
 stays a 0-dim tensor, a function of such scalars stays a `Deferred`, and `read` or `resolve` fetch many of them in one

@@ -1,4 +1,4 @@
-"""How a process ends: what the user is told of an error, in one line, and the exit code.
+"""How a process ends: the one-line message of an error, and the exit code.
 
 0: done. 2: a setting, a file or a sweep's job cannot be used. 3: the disk is full or read-only. 128 + n: stopped by
 signal n. Any other error is a bug: Python shows its traceback, and exits with 1.
@@ -33,7 +33,7 @@ class Ending(NamedTuple):
 
 
 def describe(error: BaseException) -> Ending | None:
-    """How to end on an error that is the user's to solve; None: it is a bug."""
+    """The message and exit code of an error that the user can solve; None for a bug."""
     if isinstance(error, ClearError):
         return Ending(error.exit_code, one_line(error))
     if isinstance(error, KeyboardInterrupt):
@@ -48,7 +48,7 @@ def describe(error: BaseException) -> Ending | None:
 
 
 def require_train() -> None:
-    """Make sure of the trainer's libraries, without importing them.
+    """Check that the trainer's libraries are installed, without importing them.
 
     Raises:
         SettingError: one is not installed.

@@ -37,13 +37,13 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunSettings(FitSettings):
-    """What a run knows beside its training.
+    """Settings of a run besides those of its training.
 
     Args:
-        map_views: training views of which maps/ shows where the prior was believed and corrected; 0: none.
-        resume: a run's folder or one of its checkpoints: go on from there, bit for bit. auto: look into the run's own
-            folder, and train nothing where it is finished, go on from its newest checkpoint, or start.
-        device: where field, views and optimizer lie; None: cuda where torch finds it and the rasterizer draws there,
+        map_views: number of training views with maps of reliability and correction in maps/; 0: none.
+        resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: in the run's own folder,
+            train nothing if the run is finished, else continue from its newest checkpoint, else start.
+        device: cpu or cuda, of field, views and optimizer; None: cuda where torch finds it and the rasterizer draws there,
             else cpu. A run may be resumed on another device; its bits then differ.
         threads: of torch and the kernels; None: all cores, divided by the jobs that run at once (joblib, Slurm).
     """

@@ -42,18 +42,18 @@ def hold(folder: Path) -> Iterator[None]:
     mine = json.dumps(_me())
     with _alone_with(path) as file:
         left = file.read()
-        if left:  # or this opening made it
+        if left:  # empty: this call has created it
             _require_stale(path, left)
         try:
             _write(file, mine)
-        except OSError:  # a full disk: half a lock would be nobody's
+        except OSError:  # a full disk: a partial lock names no owner
             path.unlink(missing_ok=True)
             raise
     try:
         yield
     finally:
         with suppress(FileNotFoundError), _alone_with(path) as file:  # the whole folder may be gone
-            if file.read() in (mine, ""):  # empty: it had been taken away, and this opening made it anew
+            if file.read() in (mine, ""):  # empty: it had been removed, and this call created it again
                 path.unlink(missing_ok=True)
 
 
@@ -64,7 +64,7 @@ def _alone_with(path: Path) -> Iterator[TextIO]:
         with path.open("a+") as file:
             with suppress(OSError):  # a file system that has no such locks: only starts at the same moment go unnoticed
                 fcntl.flock(file, fcntl.LOCK_EX)
-            if not _is_at(path, file):  # whoever had it removed it
+            if not _is_at(path, file):  # its owner removed it in the meantime
                 continue
             file.seek(0)
             yield file
@@ -116,7 +116,7 @@ def _slurm() -> dict[str, Any]:
 
 
 def _alive(holder: dict[str, Any]) -> bool | None:
-    """Whether the process that wrote the lock still runs; None: it cannot be known from here."""
+    """Whether the process that wrote the lock still runs; None: this host cannot tell."""
     mine = _slurm()
     if mine and holder.get("slurm_job") == mine["slurm_job"] and holder["slurm_restarts"] < mine["slurm_restarts"]:
         return False

@@ -1,4 +1,4 @@
-"""Going on with a run that was stopped, and leaving alone one that is finished."""
+"""Resuming a run that was stopped, and recognizing one that is finished."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from clear_strategies.training.state import TrainState
 
 _log = logging.getLogger(__name__)
 
-AUTO: Final = "auto"  # what fit.resume may be besides a path
+AUTO: Final = "auto"  # the value of fit.resume that is not a path
 
 # What may differ between a run and the one that it resumes.
 _NOT_COMPARED: Final = {
@@ -94,17 +94,17 @@ def _resume_newest(state: TrainState, folder: Path, config: Mapping[str, Any]) -
         restore(state, saved, source, config)
         return
     if found:
-        _log.warning("%s: no checkpoint is whole; starting anew.", folder)
+        _log.warning("%s: no checkpoint is whole; the run starts from the beginning.", folder)
 
 
 def restore(state: TrainState, saved: Checkpoint, source: Path, config: Mapping[str, Any]) -> None:
-    """Go on from a checkpoint of the same configuration."""
+    """Continue from a checkpoint of the same configuration."""
     _require_same(source, saved.config, config)
     state.restore(saved, source)
     _log.info("resumed from %s: %d iterations are done.", source, saved.t - 1)
     if saved.device != state.device.type:
         _log.warning(
-            "until now this run trained on %s, from here on %s: what follows is not bit for bit what would have followed.",
+            "this run trained on %s until now and continues on %s: its bits differ from those of an uninterrupted run.",
             saved.device, state.device.type,
         )  # fmt: skip
 
@@ -118,5 +118,5 @@ def _require_same(source: Path, then: Mapping[str, Any], now: Mapping[str, Any])
     if differences:
         raise DataError(
             source, "config", "this is not the configuration that wrote it: " + "; ".join(differences[:5]),
-            "resume with the same overrides, or start anew",
+            "resume with the same overrides, or start a new run",
         )  # fmt: skip

@@ -28,7 +28,7 @@ def test_resuming_on_another_device_is_logged(caplog):
     resume.restore(start(()), saved, Path("there"), {})
     assert "bit for bit" not in caplog.text
     resume.restore(start(()), replace(saved, device="cuda"), Path("there"), {})
-    assert "until now this run trained on cuda, from here on cpu" in caplog.text
+    assert "this run trained on cuda until now and continues on cpu" in caplog.text
 
 
 def test_device_and_threads_may_differ_and_defaults_are_compared_too():
