@@ -33,7 +33,6 @@ from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 from tests.test_run import TINY, run
-from tests.training.test_lifecycle import cloud
 
 DEFAULT, MCMC, TINY_ONE = (
     "gsplat.strategy.DefaultStrategy",
@@ -60,7 +59,7 @@ def settings(target: str, strategy: dict[str, Any] | None = None, **changes: Any
 
 def tagged(target: str = TINY_ONE, strategy: dict[str, Any] | None = None, **changes: Any):
     """A field whose every tensor carries its Gaussian's number, with optimizer and the strategy's own state alike."""
-    theta = GaussianField.from_cloud(cloud(N))
+    theta = GaussianField.from_cloud(toy.cloud(N))
     number = torch.arange(N, dtype=torch.float32)
     for name in ("detail", "quats"):
         getattr(theta, name).data[:] = number[:, None] + 1
@@ -425,7 +424,7 @@ def test_our_mcmc_is_gsplats_but_for_its_cuda_kernels(monkeypatch):
     monkeypatch.setattr(ops, "quat_scale_to_covar_preci", covariances)
     left = []
     for kind in (MCMCStrategy, mcmc.MCMC):
-        theta = GaussianField.from_cloud(cloud(60))
+        theta = GaussianField.from_cloud(toy.cloud(60))
         g = torch.Generator().manual_seed(1)
         theta.opacities.data[:] = torch.randn(60, generator=g) * 4
         theta.quats.data[:] = torch.randn(60, 4, generator=g)

@@ -63,3 +63,8 @@ def scene(n: int = 40, seed: int = 0, train: int = 3, test: int = 1) -> Scene:
         test=tuple(v for i, v in enumerate(views) if i in held),
         cloud=cloud,
     )
+
+
+def cloud(n: int = 12, seed: int = 0) -> PointCloud:
+    g = torch.Generator().manual_seed(seed)
+    return PointCloud(torch.randn(n, 3, generator=g), torch.rand(n, 3, generator=g), "random")

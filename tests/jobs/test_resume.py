@@ -13,7 +13,7 @@ from clear_strategies.errors import DataError
 from clear_strategies.jobs import resume
 from clear_strategies.training.loop import iterate
 from tests.helpers import toy
-from tests.training.test_resume import start
+from tests.helpers.short_run import start
 
 
 def compared(*overrides: str):

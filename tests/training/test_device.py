@@ -28,7 +28,7 @@ from clear_strategies.training.skips import SkipPolicy, Skips
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rendering, SplatGradients, Traits
 from tests.helpers import toy
-from tests.training.test_resume import ITERATIONS, SCENE, SUBSETS, start, tensors
+from tests.helpers.short_run import ITERATIONS, SCENE, SUBSETS, start, tensors
 
 STEADY = (8, 12, 13, 14)  # HR coarse; the anchor is taken; HR left out; all there is
 EVERY_SKIP = Skips(coarse_until=9, hr_every=2, hr_every_from=12, flat=0.02)
@@ -139,7 +139,7 @@ def cache_evidence(state: TrainState) -> None:
 
 def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:
     """A run in its middle, of which all lies on meta but the cameras."""
-    monkeypatch.setattr("tests.training.test_resume.SCENE", SCENE.to("meta"))
+    monkeypatch.setattr("tests.helpers.short_run.SCENE", SCENE.to("meta"))
     state = start(names)
     cache_evidence(state)
     state.compiled_step = None

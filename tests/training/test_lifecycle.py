@@ -22,14 +22,9 @@ from rasterizers.geometry import SH_C0
 from tests.helpers import toy
 
 
-def cloud(n=12, seed=0):
-    g = torch.Generator().manual_seed(seed)
-    return PointCloud(torch.randn(n, 3, generator=g), torch.rand(n, 3, generator=g), "random")
-
-
 def tagged(n=12):
     """A field whose every tensor carries its Gaussian's number, with optimizer and statistics alike."""
-    field = GaussianField.from_cloud(cloud(n))
+    field = GaussianField.from_cloud(toy.cloud(n))
     number = torch.arange(n, dtype=torch.float32)
     field.detail.data[:] = number[:, None]
     optimizer = Adam(field.raw(), LearningRates(), extent=1.0)

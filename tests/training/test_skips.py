@@ -15,7 +15,7 @@ from clear_strategies.training.field import GaussianField, filled
 from clear_strategies.training.loop import fit, iterate
 from clear_strategies.training.skips import SkipPolicy, Skips
 from tests.helpers import toy
-from tests.training.test_resume import ITERATIONS, start
+from tests.helpers.short_run import ITERATIONS, start
 
 
 def loss_rows(*losses: float, column: str = "loss_base") -> list[dict[str, float]]:
