@@ -5,6 +5,7 @@ conductor("clear", "strategies.gco.tolerance=0.1", iterations=30_000)
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from inspect import signature
@@ -111,14 +112,28 @@ def _first_missing(node: Any, key: str = "") -> str | None:
     return next((found for found in inner if found is not None), None)
 
 
-def _compose(overrides: list[str]) -> DictConfig:
+def nearest_setting(key: str, arguments: Iterable[str]) -> str | None:
+    """The setting of a run that an unknown key of its command line most resembles; None where there is none like it."""
+    overrides = [a for a in arguments if not a.startswith(("-", "hydra.")) and a.partition("=")[0].lstrip("+") != key]
+    known = _keys(OmegaConf.to_container(_compose(overrides, "config")))
+    return next(iter(difflib.get_close_matches(key, known, 1, 0.8)), None)
+
+
+def _keys(node: Any, prefix: str = "") -> list[str]:
+    """The dotted keys of a tree's leaves."""
+    if not isinstance(node, dict):
+        return [prefix]
+    return [key for name, value in node.items() for key in _keys(value, f"{prefix}.{name}" if prefix else str(name))]
+
+
+def _compose(overrides: list[str], config: str = "conductor") -> DictConfig:
     # The caller may be a Hydra application, whose state is restored afterwards.
     shared = GlobalHydra.instance()
     theirs, shared.hydra = shared.hydra, None
     try:
         require_each_once(overrides)
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-            return hydra.compose("conductor", overrides)
+            return hydra.compose(config, overrides)
     except (HydraException, OmegaConfBaseException) as error:
         raise SettingError(f"{' '.join(overrides)}: {one_line(error)}. See conf/ for what there is.") from error
     finally:

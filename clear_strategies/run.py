@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -21,8 +22,8 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from clear_strategies.compose import CONF, require_each_once
-from clear_strategies.errors import ClearError
+from clear_strategies.compose import CONF, nearest_setting, require_each_once
+from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.jobs import exit_codes, sweep
 from clear_strategies.jobs.sweep import Sweep
 
@@ -38,8 +39,19 @@ def main() -> None:
     except (Exception, KeyboardInterrupt) as error:
         if (ending := exit_codes.describe(error)) is None:
             raise
-        sys.stderr.write(f"{ending.message}\n")  # logging is set up for jobs only
+        sys.stderr.write(f"{_with_nearest_setting(ending.message)}\n")  # logging is set up for jobs only
         sys.exit(ending.code)
+
+
+def _with_nearest_setting(message: str) -> str:
+    """Hydra's message of an override that names no setting, with the name that was probably meant."""
+    if (unknown := re.match(r"Could not override '([^']+)'", message)) is None:
+        return message
+    try:
+        near = nearest_setting(unknown[1], sys.argv[1:])
+    except SettingError:  # another override is wrong as well
+        near = None
+    return f"{unknown[1]}: there is no such setting. " + (f"Did you mean {near}?" if near else "--cfg job lists all.")
 
 
 def job(config: DictConfig) -> float | None:

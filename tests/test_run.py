@@ -195,7 +195,7 @@ NOWHERE = ["data=llff", "data.path=nowhere"]  # whoever reads data before the se
 REFUSED = {
     "fit.iterations=abc": "fit.iterations: must be a whole number, got 'abc'",
     "fit.threads=0": "fit.threads must be at least 1",
-    "fit.typo=1": "Could not override 'fit.typo'",
+    "fit.typo=1": "fit.typo: there is no such setting",
     "+fit.typo=1": "fit.typo: clear_strategies.jobs.job.RunSettings has no such setting",
     "+data.typo=1": "data.typo: ",
     "data.views.sr_scale=2.5": "data.views.sr_scale: must be a whole number, got 2.5",
