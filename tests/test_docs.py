@@ -385,7 +385,7 @@ def test_the_configuration_page_lists_every_choice_and_every_setting():
 
 
 def test_the_architecture_page_shows_the_floors():
-    from tests.test_floors import DOORS, FLOORS
+    from tests.helpers.floors import DOORS, FLOORS
 
     def rows(after: str) -> list[list[set[str]]]:
         text = (DOCS / "explanation" / "architecture.md").read_text().split(after)[1].split("\n\n")[0]

@@ -13,22 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.command_line import ROOT, TINY, run
 from tests.helpers.malformed import CASES
-
-ROOT = Path(__file__).resolve().parents[1]
-TINY = ["data.reader.width=64", "data.reader.height=48", "fit.iterations=12", "fit.max_degree=1", "data.cloud.init=random",
-        "data.cloud.random_points=60", "data.reader.views=5", "data.reader.train=2", "data.views.train=2",
-        "skips=none"]  # fmt: skip
-
-
-def run(
-    *arguments: str, cwd: Path, module: str = "clear_strategies.run", **options
-) -> subprocess.CompletedProcess[str]:
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", module, *arguments]
-    return subprocess.run(
-        command, cwd=cwd, env=env, capture_output=True, text=True, timeout=240, check=False, **options
-    )
 
 
 @pytest.fixture(scope="module")

@@ -114,7 +114,9 @@ class Watch:
         if time.monotonic() < self.next_look:
             return
         self.next_look = time.monotonic() + _SECONDS_BETWEEN_LOOKS
-        if self.sweep.stopped_by is not None:
+        # After a first signal, e.g. a Ctrl-C that reached this worker as well, training has restored the default handler:
+        # it is about to save already, and a second signal would kill it.
+        if self.sweep.stopped_by is not None and callable(signal.getsignal(signal.SIGTERM)):
             signal.raise_signal(signal.SIGTERM)
 
 

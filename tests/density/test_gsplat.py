@@ -32,7 +32,7 @@ from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
-from tests.test_run import TINY, run
+from tests.helpers.command_line import TINY, run
 
 DEFAULT, MCMC, TINY_ONE = (
     "gsplat.strategy.DefaultStrategy",

@@ -28,7 +28,7 @@ from clear_strategies.training.loop import fit, iterate
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
-from tests.test_run import TINY, run
+from tests.helpers.command_line import TINY, run
 
 
 def names(group: str) -> list[str]:

@@ -15,8 +15,9 @@ import pytest
 import torch
 
 from clear_strategies.jobs import sweep
+from clear_strategies.jobs.sweep import Sweep, Watch
 from clear_strategies.training import checkpoint
-from tests.test_run import ROOT, TINY, run
+from tests.helpers.command_line import ROOT, TINY, run
 
 AUTO = ["fit.resume=auto", *TINY]
 SWEEP = ["-m", "hydra.sweep.dir=all", *AUTO]
@@ -255,3 +256,17 @@ def test_a_single_run_started_from_within_a_sweep_is_no_job_of_it(tmp_path, monk
     result = run("strategies.gco.tolerance=7", "+strategy=gco", *TINY, cwd=tmp_path)
     assert result.returncode == 2
     assert not (tmp_path / ".sweep_1_x").exists()
+
+
+def test_a_stopped_sweep_signals_a_job_once_and_does_not_kill_one_that_is_saving(tmp_path, monkeypatch):
+    ours, raised = Sweep(tmp_path, 0), []
+    monkeypatch.setattr(signal, "raise_signal", raised.append)
+    ours.stop(signal.SIGINT)
+    before = signal.signal(signal.SIGTERM, lambda *_: None)  # as while training
+    try:
+        Watch(ours)()
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)  # as after the first signal
+        Watch(ours)()
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert raised == [signal.SIGTERM]

@@ -1,0 +1,33 @@
+"""Which folder of clear_strategies/ may import which, and which heavy libraries it may use."""
+
+from __future__ import annotations
+
+# The floors of clear_strategies/, from the bottom: a folder, the folders that it may import, and the heavy libraries that
+# it may use. docs/explanation/architecture.md shows the same table.
+GROUND = {"errors", "files", "schedules"}
+FLOORS: dict[str, tuple[set[str], set[str]]] = {
+    "errors": (set(), set()),
+    "files": (set(), set()),
+    "schedules": ({"errors"}, set()),
+    "core": (GROUND, {"PIL"}),
+    "kernels": (GROUND | {"core"}, {"warp"}),
+    "strategies": (GROUND | {"core"}, set()),
+    "merging": (GROUND | {"core", "kernels", "strategies"}, set()),
+    "data": (GROUND | {"core"}, {"cv2", "kornia", "open3d", "PIL"}),
+    "training": (GROUND | {"core", "kernels", "strategies", "merging", "data", "density"}, set()),
+    "density": (GROUND | {"core", "strategies", "merging", "data", "training"}, {"gsplat"}),
+    "outputs": (GROUND | {"core", "strategies", "merging", "data", "training", "density"}, set()),
+    "settings": ({"errors"}, set()),
+    "compose": (GROUND | {"settings", "strategies", "merging"}, {"hydra", "omegaconf"}),
+    "jobs": (
+        GROUND | {"settings", "compose", "core", "strategies", "merging", "data", "training", "density", "outputs"},
+        {"hydra", "omegaconf"},
+    ),
+}
+# The doors may import every floor; the first two know Hydra.
+DOORS = {
+    "run": {"hydra", "omegaconf"},
+    "__main__": set(),
+    "report": set(),
+    "bench": set(),
+}
