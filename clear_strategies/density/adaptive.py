@@ -13,7 +13,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from clear_strategies.core.gradients import Shot
-from clear_strategies.density.base import DensityError, require_in_range
+from clear_strategies.density.base import DensityError, require_in_range, structure_marks
 from clear_strategies.density.threshold import count_passing, topk_mask
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Update
@@ -111,9 +111,7 @@ class Density:
 
     @property
     def marks(self) -> Mapping[str, int]:
-        s = self.settings
-        reset = {"opacity reset": s.reset_every} if 0 < s.reset_every < s.stop else {}
-        return {"densify until": s.stop, **reset}
+        return structure_marks(self.settings.stop, self.settings.reset_every)
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
         """Add the scores of this view's visible Gaussians; dropped ones are not visible."""

@@ -72,6 +72,12 @@ class DensifierSettings(Protocol):
         ...
 
 
+def structure_marks(stop: int, reset_every: int) -> dict[str, int]:
+    """The marks that both densifiers have: the end of densification, and the first opacity reset before it."""
+    reset = {"opacity reset": reset_every} if 0 < reset_every < stop else {}
+    return {"densify until": stop, **reset}
+
+
 def cameras_extent(centers: Float[Tensor, "V 3"]) -> float:
     """3DGS's scene size: 1.1 times the largest distance of a training camera from their mean, at least a little."""
     radius = torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from clear_strategies.core.gradients import ATTRIBUTES, Shot
-from clear_strategies.density.base import DensityError, require_in_range
+from clear_strategies.density.base import DensityError, require_in_range, structure_marks
 from clear_strategies.density.threshold import topk_threshold
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.merging.conductor import Update
@@ -169,9 +169,7 @@ class GsplatDensifier:
 
     @property
     def marks(self) -> Mapping[str, int]:
-        s = self.settings
-        reset = {"opacity reset": s.reset_every} if 0 < s.reset_every < s.stop else {}
-        return {"densify until": s.stop, **reset}
+        return structure_marks(self.settings.stop, self.settings.reset_every)
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
         """Keep this view's scores for `step`."""

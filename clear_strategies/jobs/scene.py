@@ -10,7 +10,7 @@ from typing import Any, cast
 
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.prepare import ViewSettings, check_headers, prepare
+from clear_strategies.data.prepare import ViewSettings, prepare
 from clear_strategies.data.priors import Bicubic, DemoPrior, Prior, cached
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import SettingError
@@ -53,15 +53,8 @@ class AutoPrior:
     """The demo's own prior for the demo, bicubic for everything else."""
 
     def of(self, capture: Capture) -> Prior:
-        """The prior for this capture, which the log names."""
-        demo = capture.name == "demo"
-        prior: Prior = DemoPrior(_photos(capture)) if demo else Bicubic()
-        _log.info("prior: auto chose %s.", prior.label)
-        if not demo:
-            _log.warning(
-                "A bicubic prior has no detail that LR has not. For SR images: prior=images prior.path=FOLDER."
-            )
-        return prior
+        """The prior for this capture."""
+        return DemoPrior(_photos(capture)) if capture.name == "demo" else Bicubic()
 
 
 PriorSettings = AutoPrior | Callable[..., Any]
@@ -75,11 +68,19 @@ def _photos(capture: Capture) -> dict[str, Callable[[], Any]]:
 def load(data: DataSettings, prior: PriorSettings, seed: int) -> Scene:
     """Read the data set and prepare its views and its initial points."""
     capture = data.reader()
-    check_headers(capture.frames, data.views)  # before the log says anything about photos that cannot be used
     if data.save_lr is not None:
-        prior = Bicubic()  # the images that the prior itself reads may not exist yet
+        chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
     elif isinstance(prior, AutoPrior):
-        prior = prior.of(capture)
+        chosen = prior.of(capture)
     elif isinstance(prior, functools.partial):
-        prior = prior(truth=_photos(capture))
-    return prepare(capture, data.views, cached(cast("Prior", prior)), data.cloud, seed=seed)
+        chosen = prior(truth=_photos(capture))
+    else:
+        chosen = cast("Prior", prior)
+    scene = prepare(capture, data.views, cached(chosen), data.cloud, seed=seed)
+    if isinstance(prior, AutoPrior) and data.save_lr is None:  # logged once the photos are known to be usable
+        _log.info("prior: auto chose %s.", chosen.label)
+        if isinstance(chosen, Bicubic):
+            _log.warning(
+                "A bicubic prior has no detail that LR has not. For SR images: prior=images prior.path=FOLDER."
+            )
+    return scene

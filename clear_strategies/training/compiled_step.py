@@ -257,9 +257,10 @@ class CompiledStep:
         return anchor
 
     def _above_is_quiet(self, shN: Tensor, active: int, anchor: Tensor | None) -> bool:
-        """Whether bands above the active degree have no momentum and no pull. Looked at again when a tensor is another
-        one (densification, resuming, the anchor); while it is the same, a pass that left them alone left them quiet, and
-        momentum that is there does not end.
+        """Whether bands above the active degree have no momentum and no pull.
+
+        The answer is computed anew when a tensor has been replaced (densification, resuming, the anchor). While the
+        tensors are the same it holds: a pass that skips the bands leaves them quiet, and momentum does not vanish.
         """
         tensors = (self.optimizer.first["shN"], self.optimizer.second["shN"], anchor)
         if self._examined is not None:
