@@ -6,6 +6,7 @@ disagree. Once the structure has settled, an anchor pulls the field towards its 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
@@ -20,6 +21,8 @@ from clear_strategies.errors import AnchorError, SettingError
 from clear_strategies.schedules import Ramp, milestone
 from clear_strategies.strategies.base import Strategy
 
+_log = logging.getLogger(__name__)
+
 # Geometry is held, appearance may still be refined (F40). f_det is held wherever the base colour is, else it drifts (F35).
 ANCHOR_WEIGHTS: Final[Mapping[str, float]] = {
     "means": 1e-4, "scales": 1e-4, "quats": 1e-4, "opacities": 1e-5, "sh0": 1e-6, "shN": 1e-6, "detail": 1e-6,
@@ -32,6 +35,8 @@ class SVS(Strategy):
 
     Args:
         dropout: p_t, the share of Gaussians dropped at iteration t.
+        looks: how often each training view must be seen until `dropout.full` for the whole rate; a run that sees them
+            less often over-fits less, and its rate is lowered in proportion. 0: the rate is never lowered (F37).
         anchor_start: t_a, the iteration at which densification stops and the anchor is taken.
         anchor_strength: λ_stab >= 0; 0 takes no anchor (densification still stops at t_a); the paper's is 0.01 (F40).
         anchor_weights: W by attribute, >= 0, on raw parameters; positions count in units of the extent of the anchored
@@ -44,12 +49,15 @@ class SVS(Strategy):
     """
 
     dropout: Ramp = field(default_factory=Ramp)
+    looks: int = 1_000
     anchor_start: int = milestone(5_000)
     anchor_strength: float = 0.0
     anchor_weights: Mapping[str, float] = field(default_factory=lambda: dict(ANCHOR_WEIGHTS))
     reduction: Literal["sum", "mean"] = "sum"
 
     def __post_init__(self) -> None:
+        if self.looks < 0:
+            raise SettingError(f"looks must be at least 0 per view, got {self.looks}.")
         if not self.anchor_strength >= 0:
             raise SettingError(f"anchor_strength must be >= 0, got {self.anchor_strength}.")
         if self.reduction not in ("sum", "mean"):
@@ -63,10 +71,17 @@ class SVS(Strategy):
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
         self.cache["seed"] = seed
+        self.cache["share"] = self._share_of_rate(n_views)
+        if self.cache["share"] < 1 and self.dropout.maximum > 0:
+            _log.info(
+                "dropout rises to %.3f instead of %.3f: each of the %d training views is seen %d times (svs.looks: %d).",
+                self.dropout.maximum * self.cache["share"], self.dropout.maximum, n_views, self.dropout.full // n_views,
+                self.looks,
+            )  # fmt: skip
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """zᵗ: 0 for dropped Gaussians, 1 / (1 - p_t) for the others; a function of (seed, t)."""
-        p = self.dropout(t)
+        p = self.dropout(t) * self.cache.get("share", 1.0)
         if p == 0:
             return None
         return dropout_mask(n, p, self.cache.get("seed", 0), t, self.device)
@@ -117,6 +132,10 @@ class SVS(Strategy):
         if self.state:
             self._require_same_number(len(parents))
         super().on_resize(parents)
+
+    def _share_of_rate(self, n_views: int) -> float:
+        """How far a run that sees each view `dropout.full` / n_views times needs the rate, in [0, 1]."""
+        return min(1.0, self.dropout.full / (self.looks * max(1, n_views))) if self.looks else 1.0
 
     def _weight(self, name: str) -> float:
         weight = self.anchor_weights[name]

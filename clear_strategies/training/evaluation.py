@@ -16,6 +16,8 @@ from rasterizers.interface import Rasterizer
 PROBING: Final = "probe test views"
 """The stage of the work log in which test views are evaluated."""
 
+_VIEWS_OF_LOSS: Final = 4
+
 
 def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int) -> None:
     """Add the mean PSNR of the test views to the last row of the history."""
@@ -36,6 +38,22 @@ def _probe(state: TrainState, scene: Scene, rasterizer: Rasterizer) -> float | N
         if view.truth is not None:
             values.append(psnr_of(state.field.render(rasterizer, view.hr.camera), view.truth))
     return sum(deferred.read(values)) / len(values) if values else None
+
+
+def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> Number:
+    """Mean loss of training views against what they are trained on, every Gaussian drawn; of the first few views.
+
+    A training loss is no measure of progress: dropout changes it, and so does the order of the views.
+    """
+    objective, losses = state.conductor.objective, []
+    for view in state.views[:_VIEWS_OF_LOSS]:
+        if objective.lambda_hr(state.t) > 0:
+            shown = state.skip_policy.view(view, state.t).hr
+            loss = objective.hr(state.field.render(rasterizer, shown.camera), shown.image).values["base"]
+        else:
+            loss = objective.lr(state.field.render(rasterizer, view.lr.camera), view.lr.image).values["lr"]
+        losses.append(loss)
+    return sum(losses) / len(losses)
 
 
 def psnr_of(image: Tensor, target: Tensor) -> Number:

@@ -22,8 +22,9 @@ from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.merging.conductor import Update
 from clear_strategies.training import checkpoint
-from clear_strategies.training.evaluation import evaluate, psnr_of
+from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
+from clear_strategies.training.skips import PLATEAU_LOSS
 from clear_strategies.training.state import TrainState
 from rasterizers import native
 from rasterizers.interface import Rasterizer
@@ -54,6 +55,9 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
             s.refilter()
     low = images.area_mean(drawn[-1].image, view.factor) if lr is None else lr.image
     s.history.append(_row(s, u, low, view))
+    if s.skip_policy.measured(t):
+        with stage("training views drawn whole"):
+            s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
     s.advance()
     return u
 

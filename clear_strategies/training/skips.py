@@ -8,7 +8,6 @@ nothing. The skips here change the result a little. Each is a setting whose defa
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -25,6 +24,9 @@ from clear_strategies.schedules import milestone
 
 _log = logging.getLogger(__name__)
 
+PLATEAU_LOSS: Final = "loss_views"
+"""The column of the history that tells a plateau: the mean loss of training views, every Gaussian drawn."""
+
 _REDUCED: Final = 2  # the coarse SR image has half the size of the fine one
 
 
@@ -38,10 +40,10 @@ class Skips:
         hr_every_from: iteration, see `hr_every`.
         flat: HR tiles are not rendered where the SR image adds less than this to U(I_LR), mean over the tile, image units
             in [0, 1); only LR trains there. 0: all tiles are rendered.
-        plateau_gain: once the mean loss of the training views over `plateau_window` iterations is not at least this share
-            below that of the window before, training continues at iteration `plateau_to`; 0: never.
-        plateau_window: iterations.
-        plateau_from: iteration two windows before the earliest plateau.
+        plateau_gain: once the loss of the training views, drawn whole, has not fallen by at least this share within
+            `plateau_window` iterations, training continues at iteration `plateau_to`; 0: never.
+        plateau_window: iterations between two measurements.
+        plateau_from: iteration of the earliest measurement.
         plateau_to: iteration from which every run trains: the learning rates fall, and HR is at full size.
 
     Raises:
@@ -122,17 +124,24 @@ class SkipPolicy:
         work_log.skip("HR tiles", "flat SR image (skips.flat)", flat)
         return wanted
 
+    def measured(self, t: int) -> bool:
+        """Whether the training views are drawn whole after iteration t, to find a plateau."""
+        s = self.skips
+        return (
+            s.plateau_gain > 0
+            and s.plateau_window > 0
+            and t % s.plateau_window == 0
+            and s.plateau_from <= t < s.plateau_to
+        )
+
     def settled(self, history: Sequence[dict[str, Number]], t: int) -> bool:
         """Whether the training views have stopped improving by iteration t; `plateau_to` then follows."""
-        s, window = self.skips, self.skips.plateau_window
-        if s.plateau_gain == 0 or window < 1 or t % window or not s.plateau_from + 2 * window <= t < s.plateau_to:
+        window = self.skips.plateau_window
+        if not (self.measured(t) and self.measured(t - window)):
             return False
-        rows = deferred.resolve(history[t - 2 * window : t])
-        column = "loss_base" if any("loss_base" in row for row in rows[window:]) else "loss_lr"
-        before, now = ([row[column] for row in part if column in row] for part in (rows[:window], rows[window:]))
-        if not before or not now:
-            return False
-        return math.fsum(now) / len(now) > (1 - s.plateau_gain) * math.fsum(before) / len(before)
+        rows = deferred.resolve(history)
+        before, now = rows[t - window - 1], rows[t - 1]
+        return now[PLATEAU_LOSS] > (1 - self.skips.plateau_gain) * before[PLATEAU_LOSS]
 
     def _with_detail(self, view: View, tile: int) -> tuple[Bool[Tensor, "th tw"], int]:
         added = (view.hr.image - images.upsample(view.lr.image, view.factor)).abs()

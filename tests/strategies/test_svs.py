@@ -57,6 +57,17 @@ def params(n=20, seed=0):
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(("n_views", "rate"), [(2, 0.2), (4, 0.2), (8, 0.1), (80, 0.01)])
+def test_the_rate_falls_with_the_looks_at_each_view(n_views, rate):
+    svs = SVS(Ramp(0.2, full=4_000), looks=1_000)
+    svs.on_fit_start(n_views, 0)
+    kept = svs.gate(4_000, 100_000) > 0
+    assert float(kept.float().mean()) == pytest.approx(1 - rate, abs=4e-3)
+    as_published = SVS(Ramp(0.2, full=4_000), looks=0)
+    as_published.on_fit_start(n_views, 0)
+    assert float((as_published.gate(4_000, 100_000) > 0).float().mean()) == pytest.approx(0.8, abs=4e-3)
+
+
 def test_anchor_pulls_back_with_twice_the_weighted_distance():
     svs = SVS(anchor_start=10, anchor_strength=0.01, anchor_weights={"scales": 0.5, "opacities": 0.1})
     svs.on_fit_start(3, 0)

@@ -10,16 +10,20 @@ import torch
 from clear_strategies.core import images
 from clear_strategies.core.view import Photo
 from clear_strategies.core.work_log import WorkLog
-from clear_strategies.schedules import scaled
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.objective import Objective
+from clear_strategies.schedules import Ramp, WarmupDecay, scaled
+from clear_strategies.strategies.svs import SVS
+from clear_strategies.training.evaluation import loss_of_views
 from clear_strategies.training.field import GaussianField, filled
 from clear_strategies.training.loop import fit, iterate
-from clear_strategies.training.skips import SkipPolicy, Skips
+from clear_strategies.training.skips import PLATEAU_LOSS, SkipPolicy, Skips
 from tests.helpers import toy
 from tests.helpers.short_run import ITERATIONS, start
 
 
-def loss_rows(*losses: float, column: str = "loss_base") -> list[dict[str, float]]:
-    return [{"t": float(t), column: loss, "loss_lr": 1.0} for t, loss in enumerate(losses, 1)]
+def loss_rows(*losses: float, column: str = PLATEAU_LOSS) -> list[dict[str, float]]:
+    return [{"t": float(t), column: loss} for t, loss in enumerate(losses, 1)]
 
 
 def test_nothing_is_left_out_by_default():
@@ -91,21 +95,29 @@ def test_undrawn_tiles_show_the_reference_and_send_no_gradient():
 
 @pytest.mark.parametrize(("now", "ends"), [(0.99, True), (0.97, False), (1.10, True)])
 def test_a_plateau_is_a_window_that_gains_less_than_asked(now, ends):
-    skip_policy = SkipPolicy(Skips(plateau_gain=0.02, plateau_window=4, plateau_from=0))
+    skip_policy = SkipPolicy(Skips(plateau_gain=0.02, plateau_window=4, plateau_from=4))
     assert skip_policy.settled(loss_rows(*[1.0] * 4, *[now] * 4), 8) is ends
 
 
 def test_a_plateau_begins_neither_early_nor_between_windows_nor_late():
-    skips = Skips(plateau_gain=0.5, plateau_window=4, plateau_from=4, plateau_to=20)
+    skips = Skips(plateau_gain=0.5, plateau_window=4, plateau_from=7, plateau_to=20)
     rows = loss_rows(*[1.0] * 24)
     assert [t for t in range(1, 25) if SkipPolicy(skips).settled(rows, t)] == [12, 16]
 
 
-def test_without_hr_the_lr_loss_decides_and_rows_without_hr_are_left_out():
-    skips = Skips(plateau_gain=0.02, plateau_window=2, plateau_from=0)
-    assert SkipPolicy(skips).settled(loss_rows(1, 1, 1, 1, column="loss_other"), 4)
-    mixed = [{"loss_lr": 9.0}, {"loss_lr": 1.0, "loss_base": 1.0}, {"loss_lr": 1.0}, {"loss_lr": 1.0, "loss_base": 0.5}]
-    assert not SkipPolicy(skips).settled(mixed, 4)
+@pytest.mark.parametrize("peak", [0.0, 1.0])
+def test_the_loss_that_tells_a_plateau_is_of_every_gaussian(peak):
+    objective = Objective(lambda_hr=WarmupDecay(peak=peak, final=peak, start=0, full=0))
+    thinned = Conductor(SVS(Ramp(0.9, "constant"), looks=0), objective=objective)
+    losses = []
+    for conductor in (thinned, Conductor(objective=objective)):
+        state = start(())
+        state.conductor = conductor
+        conductor.on_fit_start(len(state.views), 0)
+        losses.append((loss_of_views(state, toy.RASTERIZER), iterate(state, toy.RASTERIZER).losses["lr"]))
+    (whole, with_dropout), (same, without) = losses
+    assert whole == same
+    assert with_dropout != without
 
 
 def test_every_milestone_stretches_with_the_run():
@@ -118,10 +130,10 @@ def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
     state.skip_policy = SkipPolicy(Skips(plateau_gain=0.99, plateau_window=2, plateau_from=6, plateau_to=17))
     with caplog.at_level("INFO"):
         fit(state, toy.scene(), toy.RASTERIZER)
-    assert [int(row["t"]) for row in state.history] == [*range(1, 11), 18, 19, 20]
+    assert [int(row["t"]) for row in state.history] == [*range(1, 9), 18, 19, 20]
     assert state.optimizer.steps == ITERATIONS  # so the learning rates are those of the end
     assert "training goes on at t=18" in caplog.text
-    assert sum(state.conductor.work_log.entries["iterations"].skipped.values()) == 7
+    assert sum(state.conductor.work_log.entries["iterations"].skipped.values()) == 9
 
 
 @pytest.mark.parametrize("skips", [Skips(coarse_until=12), Skips(hr_every=2, hr_every_from=3), Skips(flat=0.02)])
