@@ -177,9 +177,7 @@ def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = Non
     values = tree(config)
     settings = settings_of(values)
     ours, baseline = _Training.of(settings, values, folder), None
-    if settings.fit.baseline and (why := _why_without_baseline(settings)) is not None:
-        _log.info("fit.baseline: no baseline trains beside this run, %s.", why)
-    elif settings.fit.baseline:
+    if settings.fit.baseline and _why_without_baseline(settings) is None:
         values_without = {**values, "strategies": {}}
         baseline = _Training.of(replace(settings, strategies={}), values_without, folder / BASELINE)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
@@ -221,6 +219,8 @@ def _run(
     state = ours.start(place.there, source)
     drawn = f"{drawing.name}, kernel {drawing.kernel} px²"
     _log.info("%s", plan.describe(loaded, state, ours.chosen, rasterizer=drawn, threads=f"{threads} ({why})"))
+    if settings.fit.baseline and baseline is None:
+        _log.info("fit.baseline: no baseline trains beside this run, %s.", _why_without_baseline(settings))
     ours.remove_earlier_metrics()
     beside = None if baseline is None else _trained_first(baseline, first, place)
     evaluation, seconds = _train(ours, state, place, beside)
