@@ -1,8 +1,9 @@
 """`clear-strategies +strategy=clear`, or `python -m clear_strategies.run`: the door to a whole run.
 
 Composes the configuration, checks every setting, prints the plan, trains, and writes into Hydra's run folder: history.csv,
-conflict.csv, timing.csv, renders/, views/, maps/, contact_sheet.png, curves.png, point_cloud.ply, checkpoints/ and, last, so
-that its presence says that the run is finished, metrics.json. Exit codes: `clear_strategies.jobs.exit_codes`.
+conflict.csv, timing.csv, renders/, views/, maps/, contact_sheet.png, curves.png, point_cloud.ply, checkpoints/, baseline/
+(with `fit.baseline`) and, last, so that its presence says that the run is finished, metrics.json. Exit codes:
+`clear_strategies.jobs.exit_codes`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,18 @@
-"""Draws the pictures of docs/explanation/evidence.md from its CSV files: `python docs/figures.py`."""
+"""The pictures of the documentation.
+
+`python docs/figures.py` draws those of docs/explanation/evidence.md from its CSV files. `python docs/figures.py demo` trains
+the demo, as the README's first command does, and makes its contact sheet the README's picture, docs/images/demo.png; further
+words are overrides of the run.
+"""
 
 from __future__ import annotations
 
 import csv
 import re
+import shutil
+import subprocess
+import sys
+import tempfile
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -131,5 +140,15 @@ def main(folder: Path) -> None:
     changes(folder, "skips_chosen", "left out")
 
 
+def demo(folder: Path, *overrides: str) -> None:
+    with tempfile.TemporaryDirectory() as run:
+        command = [sys.executable, "-m", "clear_strategies.run", "+strategy=clear", *overrides, f"hydra.run.dir={run}"]
+        subprocess.run(command, cwd=DOCS.parent, check=True)  # noqa: S603 - this interpreter
+        shutil.copyfile(Path(run) / "contact_sheet.png", folder / "demo.png")
+
+
 if __name__ == "__main__":
-    main(DOCS / "images")
+    if sys.argv[1:2] == ["demo"]:
+        demo(DOCS / "images", *sys.argv[2:])
+    else:
+        main(DOCS / "images")

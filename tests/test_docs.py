@@ -33,6 +33,7 @@ from hydra.core.utils import setup_globals
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from PIL import Image
 
 from clear_strategies import Conductor, Strategy
 from clear_strategies.compose import CONF
@@ -259,8 +260,8 @@ def composed() -> DictConfig:
 TINY = {"fit.iterations": "10", "data.reader.width": "96", "data.reader.height": "64"}
 
 
-def executed(words: list[str], folder: Path) -> None:
-    """Run a documented command in `folder`; a training is a tiny one."""
+def executed(words: list[str], folder: Path) -> str:
+    """Run a documented command in `folder`; a training is a tiny one. Returns what it printed."""
     arguments = words[1:]
     if words[2] == "clear_strategies.run":
         own = [word for word in arguments[2:] if word.split("=")[0] not in TINY]
@@ -276,6 +277,7 @@ def executed(words: list[str], folder: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, f"{' '.join(words)}: {done.stderr}"
+    return done.stdout
 
 
 @pytest.mark.slow
@@ -291,7 +293,9 @@ def test_the_first_tutorial_works(tmp_path):
 def test_the_readmes_first_run_leaves_the_files_that_the_reference_lists(tmp_path):
     *_, first = commands(blocks(ROOT / "README.md", "bash")[0])
     assert first[:3] == ["python", "-m", "clear_strategies.run"]
-    executed([*first, f"hydra.run.dir={tmp_path}"], tmp_path)
+    printed = executed([*first, f"hydra.run.dir={tmp_path}"], tmp_path)
+    for block in blocks(DOCS / "tutorial" / "first-scene.md", "text"):
+        assert not set(map(without_numbers, block.splitlines())) - set(map(without_numbers, printed.splitlines()))
     table = (DOCS / "reference" / "files.md").read_text().split("`run.lock`")[0]
     listed = [
         re.sub(r"NAME|N+", "*", path) + ("*" if path.endswith("/") else "")
@@ -301,6 +305,20 @@ def test_the_readmes_first_run_leaves_the_files_that_the_reference_lists(tmp_pat
     written = [p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file() and p.name != "run.lock"]
     assert not [path for path in written if not any(fnmatch.fnmatch(path, pattern) for pattern in listed)]
     assert not [pattern for pattern in listed if not any(fnmatch.fnmatch(path, pattern) for path in written)]
+
+
+def without_numbers(line: str) -> str:
+    """The line with `#` for each number and FOLDER for the path at its end; numbers may differ in width."""
+    line = re.sub(r": \S*/\S*$", ": FOLDER", line)
+    return " ".join(re.sub(r"[+-]?\d[\d.,]*", "#", line).split())
+
+
+@pytest.mark.slow
+def test_the_readmes_picture_is_the_contact_sheet_of_the_demo(tmp_path):
+    loaded(DOCS / "figures.py").demo(tmp_path, *(f"{key}={value}" for key, value in TINY.items()))
+    with Image.open(tmp_path / "demo.png") as picture, Image.open(DOCS / "images" / "demo.png") as shown:
+        assert picture.width > picture.height
+        assert shown.format == "PNG"
 
 
 def test_what_has_not_run_on_a_gpu_is_said_once():

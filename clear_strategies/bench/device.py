@@ -181,7 +181,12 @@ def _missing(request: Request, photos: str) -> str | None:
 
 
 def _training(request: Request, name: str, folder: str, overrides: Sequence[str], **options: Any) -> Step:
-    fixed = ("+strategy=clear", f"fit.device={request.device}", f"hydra.run.dir={request.out / folder}")
+    fixed = (
+        "+strategy=clear",
+        "fit.baseline=false",
+        f"fit.device={request.device}",
+        f"hydra.run.dir={request.out / folder}",
+    )
     return Step(name, (sys.executable, "-m", "clear_strategies.run", *fixed, *overrides), **options)
 
 

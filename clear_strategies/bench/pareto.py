@@ -103,7 +103,14 @@ def train(folder: Path, overrides: Sequence[str]) -> str | None:
     root = Path(__file__).resolve().parents[2]
     paths = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
     where = str(folder.resolve()).replace("\\", "\\\\").replace("'", "\\'")
-    command = [sys.executable, "-m", "clear_strategies.run", *overrides, f"hydra.run.dir='{where}'"]
+    command = [
+        sys.executable,
+        "-m",
+        "clear_strategies.run",
+        "fit.baseline=false",
+        *overrides,
+        f"hydra.run.dir='{where}'",
+    ]
     child = subprocess.run(  # noqa: S603 - this interpreter
         command, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True, errors="replace", check=False
     )

@@ -6,22 +6,28 @@ import functools
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from clear_strategies.compose import ConductorSettings, tree
 from clear_strategies.data.prepare import save_lr
+from clear_strategies.data.scene import Scene
 from clear_strategies.density.base import DensifierSettings
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device, resume, scene
 from clear_strategies.jobs.device import Device, RasterizerSettings
 from clear_strategies.jobs.lock import hold
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.outputs import plan, results
+from clear_strategies.outputs import plan, results, score_table
+from clear_strategies.outputs.baseline import FOLDER as BASELINE
+from clear_strategies.outputs.baseline import Baseline
+from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import build
@@ -41,14 +47,19 @@ class RunSettings(FitSettings):
 
     Args:
         map_views: number of training views with maps of reliability and correction in maps/; 0: none.
+        baseline: train first, on the same scene with the same settings, without any strategy, into the folder baseline/ of
+            the run; the contact sheet and the scores then show both. Without effect in a sweep, for a run that has no
+            strategy, and with +method=NAME.
         resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: in the run's own folder,
-            train nothing if the run is finished, else continue from its newest checkpoint, else start.
+            train nothing if the run is finished, else continue from its newest checkpoint, else start. The same holds of
+            the baseline beside it.
         device: cpu or cuda, of field, views and optimizer; None: cuda where torch finds it and the rasterizer draws there,
             else cpu. A run may be resumed on another device; its bits then differ.
         threads: of torch and the kernels; None: all cores, divided by the jobs that run at once (joblib, Slurm).
     """
 
     map_views: int = 3
+    baseline: bool = False
     resume: str | None = None
     device: Device | None = None
     threads: int | None = None
@@ -94,6 +105,66 @@ def settings_of(values: Mapping[str, Any]) -> JobSettings:
     return settings
 
 
+@dataclass(frozen=True, slots=True)
+class _Training:
+    """What is trained: the run, or the baseline beside it.
+
+    Args:
+        compared: the configuration, as from `resume.comparable`.
+        folder: for its files.
+    """
+
+    settings: JobSettings
+    conductor: Conductor
+    compared: Mapping[str, Any]
+    folder: Path
+
+    @classmethod
+    def of(cls, settings: JobSettings, values: Mapping[str, Any], folder: Path) -> _Training:
+        """The training of these settings, and the configuration that they were built of."""
+        return cls(settings, settings.conductor(settings.fit.stretch), resume.comparable(values), folder)
+
+    @property
+    def chosen(self) -> plan.Chosen:
+        return plan.Chosen(self.settings.method, list(self.settings.strategies))
+
+    def start(self, there: Scene, source: str | None) -> TrainState:
+        """The state to train from: the first one, or what `source`, a value of `fit.resume`, leads to."""
+        settings, stretch = self.settings, self.settings.fit.stretch
+        state = TrainState.start(
+            there,
+            self.conductor,
+            settings=scaled(settings.fit, stretch),
+            density=scaled(settings.density, stretch),
+            rates=scaled(settings.optim, stretch),
+            mip=scaled(settings.mip, stretch),
+            skips=scaled(settings.skips, stretch),
+        )
+        resume.resume(state, source, self.folder, self.compared)
+        return state
+
+    def remove_earlier_metrics(self) -> None:
+        metrics = self.folder / "metrics.json"
+        if metrics.exists():
+            _log.warning("%s: of an earlier run; removed, because its presence says that a run is finished.", metrics)
+            metrics.unlink()
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the trainings of a job compute, and on which scene.
+
+    Args:
+        scene: on the CPU. there: the same on the device of `drawing`.
+        watch: called after each iteration.
+    """
+
+    scene: Scene
+    there: Scene
+    drawing: device.Drawing
+    watch: Callable[[], None] | None
+
+
 def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = None) -> float | None:
     """Train one job into `folder`, and return the mean PSNR of the test views, which a sweeper may optimize.
 
@@ -105,21 +176,30 @@ def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = Non
     """
     values = tree(config)
     settings = settings_of(values)
-    conductor = settings.conductor(settings.fit.stretch)
+    ours, baseline = _Training.of(settings, values, folder), None
+    if settings.fit.baseline and _why_without_baseline(settings) is None:
+        values_without = {**values, "strategies": {}}
+        baseline = _Training.of(replace(settings, strategies={}), values_without, folder / BASELINE)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
     with hold(folder):
-        return _run(settings, conductor, drawing, resume.comparable(values), folder, watch)
+        return _run(ours, baseline, drawing, watch)
+
+
+def _why_without_baseline(settings: JobSettings) -> str | None:
+    if settings.method is not None:
+        return f"since +method={settings.method} is one itself"
+    if not settings.strategies:
+        return "since it has no strategy and is the baseline itself"
+    if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
+        return "since it is a job of a sweep, whose report compares the jobs"
+    return None
 
 
 def _run(
-    settings: JobSettings,
-    conductor: Conductor,
-    drawing: device.Drawing,
-    compared: Mapping[str, Any],
-    folder: Path,
-    watch: Callable[[], None] | None,
+    ours: _Training, baseline: _Training | None, drawing: device.Drawing, watch: Callable[[], None] | None
 ) -> float | None:
-    if settings.fit.resume == resume.AUTO and (finished := resume.finished(folder, compared)) is not None:
+    settings = ours.settings
+    if settings.fit.resume == resume.AUTO and (finished := resume.finished(ours.folder, ours.compared)) is not None:
         return finished[0]
     threads, why = device.threads(settings.fit.threads)
     torch.set_num_threads(threads)
@@ -128,39 +208,66 @@ def _run(
         save_lr(loaded, Path(settings.data.save_lr))
         return None
     device.log_choice(settings.rasterizer)
-    drawing, there = drawing.over(loaded.background), loaded.to(drawing.device)
-    stretch = settings.fit.stretch
-    state = TrainState.start(
-        there,
-        conductor,
-        settings=scaled(settings.fit, stretch),
-        density=scaled(settings.density, stretch),
-        rates=scaled(settings.optim, stretch),
-        mip=scaled(settings.mip, stretch),
-        skips=scaled(settings.skips, stretch),
-    )
-    resume.resume(state, settings.fit.resume, folder, compared)
-    chosen = plan.Chosen(settings.method, list(settings.strategies))
+    drawing = drawing.over(loaded.background)
+    place = _Place(loaded, loaded.to(drawing.device), drawing, watch)
+    # Both are made ready before the first trains, so that nothing is refused after it has.
+    source, first = settings.fit.resume, None
+    if baseline is not None:
+        source, of_baseline = resume.of_both(source, ours.compared, baseline.compared)
+        if of_baseline != resume.AUTO or resume.finished(baseline.folder, baseline.compared) is None:
+            first = baseline.start(place.there, of_baseline)
+    state = ours.start(place.there, source)
     drawn = f"{drawing.name}, kernel {drawing.kernel} px²"
-    _log.info("%s", plan.describe(loaded, state, chosen, rasterizer=drawn, threads=f"{threads} ({why})"))
-    metrics = folder / "metrics.json"
-    if metrics.exists():
-        _log.warning("%s: of an earlier run; removed, because its presence says that a run is finished.", metrics)
-        metrics.unlink()
+    _log.info("%s", plan.describe(loaded, state, ours.chosen, rasterizer=drawn, threads=f"{threads} ({why})"))
+    if settings.fit.baseline and baseline is None:
+        _log.info("fit.baseline: no baseline trains beside this run, %s.", _why_without_baseline(settings))
+    ours.remove_earlier_metrics()
+    beside = None if baseline is None else _trained_first(baseline, first, place)
+    evaluation, seconds = _train(ours, state, place, beside)
+    _log.info("%s", score_table.describe(ours.folder, evaluation, seconds, beside))
+    mean = evaluation.mean("test") or evaluation.mean("train")
+    return None if mean is None else mean.psnr
+
+
+def _trained_first(training: _Training, state: TrainState | None, place: _Place) -> Baseline:
+    """The baseline, trained unless it is finished: without a state."""
+    if state is not None:
+        _log.info(
+            "the baseline trains first: no strategy, all else as above (fit.baseline=false leaves it out): %s",
+            training.folder,
+        )
+        training.remove_earlier_metrics()
+        _train(training, state, place)
+    baseline = Baseline.read(training.folder)
+    _log.info("%s", score_table.describe_baseline(baseline))
+    return baseline
+
+
+def _train(
+    training: _Training, state: TrainState, place: _Place, beside: Baseline | None = None
+) -> tuple[Evaluation, float]:
+    """Train to the end and write the files; returns the scores and the seconds of training.
+
+    Args:
+        beside: the baseline to show with it.
+    """
+    settings, rasterizer = training.settings, place.drawing.rasterizer
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
-    with progress_bar(state, watch) as progress:
-        fit(
-            state, there, drawing.rasterizer, checkpoints=folder / "checkpoints", config=compared, progress=progress
-        )  # fmt: skip
-    return results.write_results(
-        folder,
-        loaded,
+    with progress_bar(state, place.watch, training.chosen.title) as progress:
+        checkpoints = training.folder / "checkpoints"
+        fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)
+    seconds = time.perf_counter() - began
+    evaluation = results.write_results(
+        training.folder,
+        place.scene,
         state,
-        drawing.rasterizer,
-        chosen,
-        backend=drawing.name,
+        rasterizer,
+        training.chosen,
+        backend=place.drawing.name,
         down=settings.data.views.downsample,
         map_views=settings.fit.map_views,
-        seconds=time.perf_counter() - began,
-        config=compared,
+        seconds=seconds,
+        config=training.compared,
+        baseline=beside,
     )
+    return evaluation, seconds

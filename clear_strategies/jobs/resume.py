@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
+from clear_strategies.outputs.baseline import FOLDER as BASELINE
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.state import TrainState
@@ -18,9 +19,12 @@ _log = logging.getLogger(__name__)
 
 AUTO: Final = "auto"  # the value of fit.resume that is not a path
 
+_CHECKPOINTS: Final = "checkpoints"
+
 # What may differ between a run and the one that it resumes.
 _NOT_COMPARED: Final = {
     "fit.resume",
+    "fit.baseline",
     "fit.device",
     "fit.threads",
     "fit.keep",
@@ -77,10 +81,41 @@ def resume(state: TrainState, asked: str | None, folder: Path, config: Mapping[s
         DataError: the checkpoint is damaged, or another configuration's.
     """
     if asked == AUTO:
-        _resume_newest(state, folder / "checkpoints", config)
+        _resume_newest(state, folder / _CHECKPOINTS, config)
     elif asked is not None:
         source = Path(asked)
         restore(state, checkpoint.load(source), source, config)
+
+
+def of_both(asked: str | None, run: Mapping[str, Any], baseline: Mapping[str, Any]) -> tuple[str | None, str | None]:
+    """What `fit.resume` means for a run and for the baseline beside it, which trains first.
+
+    A path leads to the run, or, of a run that was stopped while its baseline trained, to that baseline; the run itself
+    then starts from the beginning.
+
+    Args:
+        run, baseline: the configuration of each.
+
+    Raises:
+        DataError: no checkpoint is there, it is damaged, or it is another configuration's.
+    """
+    if asked is None or asked == AUTO:
+        return asked, asked
+    source = Path(asked)
+    beside = _folder_of(source) / BASELINE
+    begun = bool(checkpoint.saved(beside / _CHECKPOINTS))
+    if begun and not checkpoint.saved(_folder_of(source) / _CHECKPOINTS):
+        return None, str(beside)
+    saved = checkpoint.load(source)
+    if saved.config == baseline:
+        return None, asked
+    _require_same(source, saved.config, run)  # now, not after the baseline has trained
+    return asked, str(beside) if begun else None
+
+
+def _folder_of(source: Path) -> Path:
+    """The run's folder, of itself, its folder of checkpoints, or one of these."""
+    return next((path.parent for path in (source, source.parent) if path.name == _CHECKPOINTS), source)
 
 
 def _resume_newest(state: TrainState, folder: Path, config: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""contact_sheet.png: a few test views of one run beside the LR photo, the prior, the truth and the error.
+"""contact_sheet.png: a few test views of one run beside the LR photo, the prior, the baseline, the truth and the error.
 
 Images are laid out in whole pixels: a render is shown pixel for pixel, a small one at a whole multiple, because a resized
 image does not show the detail that this library is about.
@@ -7,9 +7,9 @@ image does not show the detail that this library is about.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,8 @@ from clear_strategies.outputs.figures import FAINT, GAP, LINE, PixelPage, error_
 if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
+OWN_PHOTO: Final = "LR, SR prior (and bicubic in the tables) show the test view's own photo, which training never sees."
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetRow:
@@ -27,13 +29,13 @@ class SheetRow:
 
     Args:
         images: column -> image at HR size; "ours" is among them.
-        caption: written below ours.
+        captions: column -> the line below its image.
     """
 
     name: str
     images: Mapping[str, Float[Tensor, "H W 3"]]
     truth: Float[Tensor, "H W 3"] | None
-    caption: str
+    captions: Mapping[str, str] = field(default_factory=dict)
 
 
 def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str) -> None:
@@ -52,7 +54,7 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str) -> Non
     left, top = 2 * LINE, 5 * LINE
     right = left + len(columns) * (cell_w + GAP)
     with_bar = "error of ours" in columns
-    page = PixelPage(right + 5 * LINE * with_bar, top + len(rows) * (cell_h + 2 * LINE + GAP), title)
+    page = PixelPage(right + 5 * LINE * with_bar, top + len(rows) * (cell_h + 2 * LINE + GAP) + LINE, title)
     for i, column in enumerate(columns):
         page.text(left + i * (cell_w + GAP) + cell_w / 2, top - LINE / 2, column, size=10, ha="center")
 
@@ -69,8 +71,9 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str) -> Non
             if column in shown:
                 _, drawn = page.image(x, y, shown[column], times)
                 error = drawn if column == "error of ours" else error
-            if column == "ours":
-                page.text(x + cell_w / 2, y + cell_h + LINE, row.caption, ha="center")
+            if column in row.captions:
+                page.text(x + cell_w / 2, y + cell_h + LINE, row.captions[column], ha="center")
+    page.text(left, page.height - LINE, OWN_PHOTO, color=FAINT)
     if error is not None:
         page.colour_bar(right, top, cell_h, error, "mean |difference| over RGB")
     save_png(page.figure, path)

@@ -16,11 +16,14 @@ _READ_EVERY: Final = 0.25  # seconds; reading the history's numbers waits for th
 
 
 @contextmanager
-def progress_bar(state: TrainState, after_step: Callable[[], None] | None = None) -> Iterator[Progress]:
+def progress_bar(
+    state: TrainState, after_step: Callable[[], None] | None = None, name: str | None = None
+) -> Iterator[Progress]:
     """A bar with loss, PSNR, number of Gaussians, conflict ratio and remaining time.
 
     Args:
         after_step: called after each iteration.
+        name: of what trains, before the bar.
     """
     from tqdm import tqdm
     from tqdm.contrib.logging import logging_redirect_tqdm
@@ -30,7 +33,7 @@ def progress_bar(state: TrainState, after_step: Callable[[], None] | None = None
     total, done = state.settings.iterations, state.t - 1
     with (
         logging_redirect_tqdm(),
-        tqdm(total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=redraw_every) as bar,
+        tqdm(desc=name, total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=redraw_every) as bar,
     ):
         last_read = -math.inf
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,9 +11,10 @@ from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.work_log import WorkLog
-from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.scene import Scene
 from clear_strategies.outputs import metrics
+from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.contact_sheet import SheetRow, write_contact_sheet
 from clear_strategies.outputs.curves import write_curves
 from clear_strategies.outputs.export import export_ply
@@ -26,18 +26,17 @@ from clear_strategies.outputs.provenance import provenance
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer
 
-_log = logging.getLogger(__name__)
-
 # What a run writes into its folder, in this order.
 FILES: Final[Mapping[str, str]] = {
     ".hydra/": "the configuration and the overrides that the run was started with",
     "run.log": "what the run printed",
     "checkpoints/": "states to resume from (`fit.resume`), the newest `fit.keep` of them",
+    "baseline/": "the baseline that trained beside the run (`fit.baseline`), with all these files of its own",
     "maps/": "where the prior was trusted, and where the photos overruled it, for `fit.map_views` training views",
     "point_cloud.ply": "the field, for any viewer of 3DGS files",
     "renders/": "every test view as rendered, at HR",
     "views/": "LR photo, prior and truth of a few test views",
-    "contact_sheet.png": "a few test views: LR photo, prior, render, truth and error side by side",
+    "contact_sheet.png": "a few test views: LR photo, prior, baseline (if there is one), render, truth and error side by side",
     "curves.png": "losses, PSNR, number of Gaussians, conflict and correction over iterations",
     "history.csv": "one row per iteration: every number that was measured, empty where there was none",
     "conflict.csv": "of history.csv, the iterations that compared LR with HR gradients, and their columns on conflict",
@@ -60,9 +59,9 @@ def write_results(
     map_views: int,
     seconds: float,
     config: Mapping[str, Any],
-) -> float | None:
-    """Evaluate a finished run, write its files and log its scores; returns the mean PSNR of the test views, of the training
-    views where there are no test views.
+    baseline: Baseline | None = None,
+) -> Evaluation:
+    """Evaluate a finished run and write its files; returns its scores.
 
     Args:
         scene: on the CPU, wherever the field is.
@@ -70,6 +69,7 @@ def write_results(
         map_views: how many training views get maps, at most.
         seconds: training time.
         config: the run's configuration, kept in metrics.json.
+        baseline: the one that trained beside it, for the contact sheet and metrics.json.
     """
     field, work_log, history = state.field, state.conductor.work_log, state.history_as_floats()
     with work_log.stage("evaluate"):
@@ -82,7 +82,7 @@ def write_results(
     title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}"
     if scene.synthetic_prior:
         title += " · SYNTHETIC prior"
-    _write_images(folder, scene, evaluation, title)
+    _write_images(folder, scene, evaluation, title, baseline)
     write_curves(folder / "curves.png", history, marks(state), title)
     _write_tables(folder, history, work_log)
     files.write_json(
@@ -98,16 +98,15 @@ def write_results(
             seconds=seconds,
             conflict=_mean_conflict(history),
             synthetic_prior=scene.synthetic_prior,
+            baseline=None if baseline is None else baseline.to_json(),
             config=config,
             provenance=provenance(seed=state.settings.seed, backend=backend, plan=scene.notes),
         ),
     )
-    _log_scores(folder, evaluation, seconds)
-    mean = evaluation.mean("test") or evaluation.mean("train")
-    return None if mean is None else mean.psnr
+    return evaluation
 
 
-def _write_images(folder: Path, scene: Scene, evaluation: Evaluation, title: str) -> None:
+def _write_images(folder: Path, scene: Scene, evaluation: Evaluation, title: str, baseline: Baseline | None) -> None:
     for name, image in evaluation.renders.items():
         write_png(folder / "renders" / f"{Path(name).stem}.png", image)
     rows = []
@@ -115,13 +114,14 @@ def _write_images(folder: Path, scene: Scene, evaluation: Evaluation, title: str
         for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:
                 write_png(folder / "views" / f"{Path(view.name).stem}_{kind}.png", shown)
-        columns = {
-            "LR, enlarged": images.upsample(view.lr.image, view.factor, "nearest"),
-            "SR prior": view.hr.image,
-            "ours": evaluation.renders[view.name],
-        }
-        scores = evaluation.test[view.name]["ours"]
-        rows.append(SheetRow(view.name, columns, view.truth, f"{scores.psnr:.2f} dB, SSIM {scores.ssim:.3f}"))
+        columns = {"LR, enlarged": images.upsample(view.lr.image, view.factor, "nearest"), "SR prior": view.hr.image}
+        scores = {"ours": evaluation.test[view.name]["ours"]}
+        if baseline is not None and view.name in baseline.views:
+            columns["baseline"] = read_image(baseline.render_of(view.name))
+            scores["baseline"] = baseline.views[view.name]
+        columns["ours"] = evaluation.renders[view.name]
+        captions = {column: f"{s.psnr:.2f} dB, SSIM {s.ssim:.3f}" for column, s in scores.items()}
+        rows.append(SheetRow(view.name, columns, view.truth, captions))
     write_contact_sheet(folder / "contact_sheet.png", rows, title)
 
 
@@ -147,14 +147,3 @@ def _mean_conflict(history: Sequence[Mapping[str, float]]) -> dict[str, float]:
         if values:
             means["gaussian" if key == "conflict" else key.removeprefix("conflict_")] = sum(values) / len(values)
     return means
-
-
-def _log_scores(folder: Path, evaluation: Evaluation, seconds: float) -> None:
-    lines = [f"done in {seconds:.0f} s: {folder}"]
-    for part in ("test", "train"):
-        for image in ("ours", "bicubic", "prior"):
-            if (m := evaluation.mean(part, image)) is not None:
-                lines.append(
-                    f"  {part:<5} {image:<8} PSNR {m.psnr:6.2f} dB   SSIM {m.ssim:.4f}   GMSD {m.gmsd:.4f}   blur {m.blur:+.4f}"
-                )
-    _log.info("\n".join(lines))

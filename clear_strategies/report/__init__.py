@@ -1,6 +1,7 @@
 """`python -m clear_strategies.report DIR …`: runs as a table, comparisons and a page.
 
-Every folder at or below DIR with a metrics.json is a run. Runs of a scene that differ only in their seed share a row. Files:
+Every folder at or below DIR with a metrics.json is a run. Runs of a scene that differ only in their seed share a row. A
+baseline that trained beside runs (`fit.baseline`) counts once. Files:
 
 - report.md, report.csv: the table
 - report.html: the table, images, maps and charts, in one file that needs no network

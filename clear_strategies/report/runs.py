@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
+from clear_strategies.outputs import baseline
 
 _log = logging.getLogger(__name__)
 
@@ -20,13 +21,15 @@ SCORES: Final = ("psnr", "ssim", "gmsd", "blur")
 FACTS: Final = ("conflict", "gaussians", "seconds")
 BASELINES: Final = ("bicubic", "prior")
 
+_HYDRA: Final = ".hydra"
 _SEED: Final = "fit.seed="
 # The overrides that name a run; the others are its settings.
 _METHOD, _STRATEGY = "method=", "strategy="
+_STRATEGIES: Final = "strategies."
 # Overrides that change no result. So do paths: the scene has a name.
 _NEUTRAL: Final = (
     "hydra", "fit.resume=", "fit.threads=", "fit.keep=", "fit.checkpoint_every=", "fit.probe_", "fit.map_views=", "scene=",
-    "data.root=",
+    "data.root=", "fit.baseline=",
 )  # fmt: skip
 _PATH: Final = re.compile(r"data\.[\w.]*path=")
 
@@ -45,6 +48,7 @@ class Run:
         views: view -> PSNR of ours, dB, by the names of the files in renders/.
         facts: the numbers in `FACTS`; NaN where unknown.
         plan: what the run printed about its input, by label.
+        config: the configuration, flat, without what changes no result.
     """
 
     folder: Path
@@ -58,6 +62,7 @@ class Run:
     views: Mapping[str, float]
     facts: Mapping[str, float]
     plan: Mapping[str, str]
+    config: Mapping[str, Any]
 
     @classmethod
     def read(cls, folder: Path) -> Run:
@@ -73,7 +78,7 @@ class Run:
             marks = ["synthetic prior"] * bool(content["synthetic_prior"])
             marks += [] if content["test"]["mean"] else ["training views"]
             marks += [f"against {part['against']}"] if "LR" in part.get("against", "HR photos") else []
-            methods = ("ours", *(baseline for baseline in BASELINES if baseline in part["mean"]))
+            methods = ("ours", *(image for image in BASELINES if image in part["mean"]))
             return cls(
                 folder=folder,
                 scene=str(content["scene"]) + (f" ({', '.join(marks)})" if marks else ""),
@@ -90,6 +95,7 @@ class Run:
                     "seconds": _number(content["seconds"]),
                 },
                 plan={str(k): str(v) for k, v in content["provenance"].get("plan", {}).items()},
+                config=dict(content.get("config", {})),
             )
         except KeyError as error:
             raise DataError(path, str(error), "is missing", "train the run again") from error
@@ -98,8 +104,9 @@ class Run:
 
 
 def collect(folders: Iterable[Path]) -> list[Run]:
-    """Every finished run at or below the folders: the jobs of a sweep by number, other runs by path. Unfinished and
-    damaged runs are logged and left out.
+    """Every finished run at or below the folders: the jobs of a sweep by number, other runs by path. A baseline that
+    trained beside a run (`fit.baseline`) comes before it, and once: it is left out, with a message, where another run of
+    the same configuration is there. Unfinished and damaged runs are logged and left out.
 
     Raises:
         DataError: there is no finished run.
@@ -108,10 +115,12 @@ def collect(folders: Iterable[Path]) -> list[Run]:
     found: dict[Path, None] = {}
     for folder in folders:
         runs_here = _sorted(path.parent for path in folder.rglob("metrics.json"))
-        sweeps = list(dict.fromkeys(run.parent for run in runs_here))
-        for run in sorted(runs_here, key=lambda run: (sweeps.index(run.parent), _job(run))):
+        owners = list(dict.fromkeys(map(_owner, runs_here)))
+        sweeps = list(dict.fromkeys(owner.parent for owner in owners))
+        order = {owner: (sweeps.index(owner.parent), _job(owner), i) for i, owner in enumerate(owners)}
+        for run in sorted(runs_here, key=lambda run: (*order[_owner(run)], run == _owner(run))):
             found[run.resolve()] = None
-    for unfinished in _sorted(path.parent for folder in folders for path in folder.rglob(".hydra")):
+    for unfinished in _sorted(path.parent for folder in folders for path in folder.rglob(_HYDRA)):
         if unfinished.resolve() not in found:
             _log.warning("%s: left out, it has no metrics.json: the run did not finish.", unfinished)
     runs = []
@@ -120,10 +129,30 @@ def collect(folders: Iterable[Path]) -> list[Run]:
             runs.append(Run.read(folder))
         except DataError as error:
             _log.warning("%s; left out.", error)
+    runs = _each_baseline_once(runs)
     if not runs:
         names = ", ".join(map(str, folders))
         raise DataError(names, "runs", "there is no finished run here", "give the folder of a run or of a sweep")
     return runs
+
+
+def _each_baseline_once(runs: Sequence[Run]) -> list[Run]:
+    """Without the baselines beside runs that another run repeats: one on its own, else the first of these."""
+    alone = [run for run in runs if _owner(run.folder) == run.folder]
+    kept: list[Run] = []
+    for run in runs:
+        others = [other for other in (*alone, *kept) if other.config and other.config == run.config]
+        if others and run not in alone:
+            _log.info("%s: left out, it is the same training as %s.", run.folder, others[0].folder)
+        else:
+            kept.append(run)
+    return kept
+
+
+def _owner(folder: Path) -> Path:
+    """The run that a baseline trained beside, else the folder itself. Hydra's files are the run's."""
+    beside = folder.name == baseline.FOLDER and not (folder / _HYDRA).is_dir() and (folder.parent / _HYDRA).is_dir()
+    return folder.parent if beside else folder
 
 
 def history(folder: Path) -> list[dict[str, float]]:
@@ -147,16 +176,22 @@ def skips(folder: Path) -> list[dict[str, str]]:
 
 
 def _overrides(folder: Path) -> tuple[str, ...]:
-    """The overrides of the command line, from Hydra's file; empty where there is no such file."""
+    """The overrides of the command line, from Hydra's file; empty where there is no such file. Of a baseline beside a run
+    they are the run's, without its strategies.
+    """
     import yaml  # comes with Hydra
 
-    path = folder / ".hydra" / "overrides.yaml"
+    owner = _owner(folder)
+    path = owner / _HYDRA / "overrides.yaml"
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else []
     except (OSError, ValueError, yaml.YAMLError) as error:
         problem = f"cannot be read ({str(error)[:120]})"
         raise DataError(path, "overrides", problem, "remove it: the run is then named by its strategies") from error
-    return tuple(map(str, content)) if isinstance(content, list) else ()
+    overrides = tuple(map(str, content)) if isinstance(content, list) else ()
+    if owner == folder:
+        return overrides
+    return tuple(o for o in overrides if not o.lstrip("+~").startswith((_STRATEGY, _STRATEGIES)))
 
 
 def _is_setting(override: str) -> bool:
@@ -188,7 +223,7 @@ def _sorted(paths: Iterable[Path]) -> list[Path]:
 def _job(folder: Path) -> int:
     """The run's number in its sweep; 0 for a single run, which then sorts by path."""
     try:
-        content = (folder / ".hydra" / "hydra.yaml").read_text(encoding="utf-8")
+        content = (folder / _HYDRA / "hydra.yaml").read_text(encoding="utf-8")
     except (OSError, ValueError):
         return 0
     number = re.search(r"^    num: (\d+)$", content, re.MULTILINE)

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from clear_strategies.outputs.contact_sheet import SheetRow, write_contact_sheet
+import numpy as np
+import pytest
+import torch
+
+from clear_strategies.outputs.contact_sheet import OWN_PHOTO, SheetRow, write_contact_sheet
+from clear_strategies.outputs.figures import LINE, PixelPage
 from tests.helpers.image_files import holds, random_image, read
 
 
 def row(name: str, seed: int, *, truth: bool = True, size: tuple[int, int] = (40, 60)) -> SheetRow:
     shown = {"LR, enlarged": random_image(seed, *size), "ours": random_image(seed + 1, *size)}
-    return SheetRow(name, shown, random_image(seed + 2, *size) if truth else None, "20.00 dB, SSIM 0.500")
+    return SheetRow(name, shown, random_image(seed + 2, *size) if truth else None, {"ours": "20.00 dB, SSIM 0.500"})
 
 
 def test_large_images_are_shown_pixel_for_pixel(tmp_path: Path) -> None:
@@ -54,6 +59,27 @@ def test_views_of_different_sizes_stand_in_one_sheet(tmp_path: Path) -> None:
     write_contact_sheet(tmp_path / "sheet.png", rows, "scene")
     sheet = read(tmp_path / "sheet.png")
     assert all(holds(sheet, image.numpy()) for shown in rows for image in shown.images.values())
+
+
+def test_the_columns_are_in_the_order_of_the_row(tmp_path: Path) -> None:
+    names = ("LR, enlarged", "SR prior", "baseline", "ours")
+    shown = {name: torch.full((30, 250, 3), 0.1 * i) for i, name in enumerate(names, 1)}
+    truth = torch.full((30, 250, 3), 0.9)
+    write_contact_sheet(tmp_path / "sheet.png", [SheetRow("a", shown, truth)], "scene")
+    middle = read(tmp_path / "sheet.png")[5 * LINE + 15, :, 0].astype(int)
+    levels = [round(255 * level) for level in (0.1, 0.2, 0.3, 0.4, 0.9)]
+    found = [np.flatnonzero(abs(middle - level) <= 1) for level in levels]
+    assert all(len(columns) >= 250 for columns in found)
+    assert [columns[0] for columns in found] == sorted(columns[0] for columns in found)
+
+
+def test_every_caption_and_the_small_print_are_on_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words: list[str] = []
+    monkeypatch.setattr(PixelPage, "text", lambda page, x, y, text, **style: words.append(text))
+    shown = {name: torch.rand(40, 60, 3) for name in ("baseline", "ours")}
+    row = SheetRow("a", shown, None, {"baseline": "20.00 dB", "ours": "21.00 dB"})
+    write_contact_sheet(tmp_path / "sheet.png", [row], "scene · strategy")
+    assert {"scene · strategy", "a", "baseline", "ours", "20.00 dB", "21.00 dB", OWN_PHOTO} <= set(words)
 
 
 def test_no_rows_make_no_sheet(tmp_path: Path) -> None:

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+import torch
 
 from clear_strategies import GCO, P2G, Conductor, files
+from clear_strategies.data.photo_files import write_png
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
+from clear_strategies.outputs.baseline import Baseline
+from clear_strategies.outputs.figures import magnification
+from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen
 from clear_strategies.outputs.results import FILES, write_results
 from clear_strategies.schedules import WarmupDecay
@@ -20,8 +26,9 @@ from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
+from tests.helpers.image_files import holds, read
 
-WRITTEN_BY_OTHERS = {".hydra/", "run.log", "checkpoints/"}
+WRITTEN_BY_OTHERS = {".hydra/", "run.log", "checkpoints/", "baseline/"}
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
 SCENE = toy.scene()
 
@@ -37,10 +44,10 @@ def state() -> TrainState:
     return state
 
 
-def write(folder: Path, state: TrainState, map_views: int = 1) -> float | None:
+def write(folder: Path, state: TrainState, map_views: int = 1, baseline: Baseline | None = None) -> Evaluation:
     return write_results(
         folder, SCENE, state, toy.RASTERIZER, Chosen(None, ["gco", "p2g"]), backend="torch", down="bicubic",
-        map_views=map_views, seconds=1.5, config={"fit": {"seed": 0}},
+        map_views=map_views, seconds=1.5, config={"fit": {"seed": 0}}, baseline=baseline,
     )  # fmt: skip
 
 
@@ -49,14 +56,34 @@ def names(folder: Path) -> set[str]:
 
 
 def test_every_file_of_a_run_is_listed(tmp_path: Path, state: TrainState) -> None:
-    psnr = write(tmp_path, state)
+    evaluation = write(tmp_path, state)
     assert names(tmp_path) == set(FILES) - WRITTEN_BY_OTHERS
     content = json.loads((tmp_path / "metrics.json").read_text())
-    assert psnr == pytest.approx(content["test"]["mean"]["ours"]["psnr"])
+    mean = evaluation.mean("test")
+    assert mean is not None
+    assert content["test"]["mean"]["ours"] == pytest.approx(asdict(mean))
+    assert content["baseline"] is None
     assert (content["scene"], content["strategies"], content["config"]) == ("toy", ["gco", "p2g"], {"fit": {"seed": 0}})
     (view,) = SCENE.test
     assert names(tmp_path / "views") == {f"{view.name}_{kind}.png" for kind in ("lr", "prior", "truth")}
     assert names(tmp_path / "renders") == {f"{view.name}.png"}
+
+
+def test_the_baseline_beside_a_run_is_shown_and_its_means_are_kept(tmp_path: Path, state: TrainState) -> None:
+    write(tmp_path / "run" / "baseline", state)
+    baseline = Baseline.read(tmp_path / "run" / "baseline")
+    (view,) = SCENE.test
+    marked = torch.rand(view.hr.image.shape, generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
+    write_png(baseline.render_of(view.name), marked)
+    write(tmp_path / "run", state, baseline=baseline)
+    content = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert content["baseline"] == {
+        "folder": "baseline", "seconds": 1.5, **{part: content[part]["mean"]["ours"] for part in ("test", "train")},
+    }  # fmt: skip
+    times = round(magnification(marked.shape[1]))
+    assert holds(read(tmp_path / "run" / "contact_sheet.png"), marked.numpy(), times=times)
+    write(tmp_path / "alone", state)
+    assert not holds(read(tmp_path / "alone" / "contact_sheet.png"), marked.numpy(), times=times)
 
 
 def test_conflict_csv_holds_columns_of_history_csv(tmp_path: Path, state: TrainState) -> None:

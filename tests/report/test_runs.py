@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -52,6 +54,55 @@ def test_damaged_and_unfinished_runs_are_left_out_with_a_warning(
 def test_a_run_given_twice_counts_once(tmp_path: Path) -> None:
     make_run(tmp_path / "0", "+strategy=gco")
     assert len(report.collect([tmp_path, tmp_path / "0", tmp_path / "0" / ".." / "0"])) == 1
+
+
+def make_pair(folder: Path, *overrides: str, baseline: float = 20.0, seed: int = 0, **facts: Any) -> Path:
+    """A run of clear with its baseline beside it."""
+    config = {"fit.seed": seed, "of": str(overrides)}
+    beside = make_run(folder / "baseline", psnr=baseline, strategies=[], seed=seed, config=config)
+    shutil.rmtree(beside / ".hydra")
+    return make_run(folder, "+strategy=clear", *overrides, seed=seed, config={**config, "strategies": "clear"}, **facts)
+
+
+def test_a_baseline_beside_a_run_is_a_row_of_its_own_before_it(tmp_path: Path) -> None:
+    own = ("strategies.gco.tolerance=0.1", "~strategies.p2g", "fit.iterations=50", "fit.baseline=true")
+    make_pair(tmp_path / "run", *own, psnr=20.5)
+    baseline, ours = report.collect([tmp_path / "run"])
+    assert (baseline.name, baseline.settings) == ("baseline", ("fit.iterations=50",))
+    assert (ours.name, ours.settings) == ("clear", own[:-1])
+    rows = [row for row in report.compare([baseline, ours]) if not row.is_baseline]
+    assert [row.name for row in rows] == ["baseline", "clear"]
+    assert rows[1].delta is not None
+    assert rows[1].delta.mean == pytest.approx(0.5)
+
+
+def test_the_same_baseline_beside_several_runs_counts_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        make_pair(tmp_path / name, seed=seed)
+    runs = report.collect([tmp_path])
+    assert [(run.name, run.seed) for run in runs] == [
+        ("baseline", 0), ("clear", 0), ("clear", 0), ("baseline", 1), ("clear", 1),
+    ]  # fmt: skip
+    assert (
+        f"{tmp_path / 'b' / 'baseline'}: left out, it is the same training as {tmp_path / 'a' / 'baseline'}"
+        in caplog.text
+    )
+
+
+def test_a_baseline_run_on_its_own_counts_instead_of_one_beside_a_run(tmp_path: Path) -> None:
+    make_pair(tmp_path / "clear", baseline=20.0)
+    make_run(tmp_path / "baseline", "+strategy=baseline", psnr=20.0, strategies=[], config={"fit.seed": 0, "of": "()"})
+    runs = report.collect([tmp_path / "baseline", tmp_path / "clear"])
+    assert [run.folder for run in runs] == [tmp_path / "baseline", tmp_path / "clear"]
+    make_run(tmp_path / "baseline", "+strategy=baseline", strategies=[], config={"fit.seed": 0, "of": "another"})
+    assert len(report.collect([tmp_path / "baseline", tmp_path / "clear"])) == 3
+
+
+def test_a_finished_baseline_beside_an_unfinished_run_counts(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (make_pair(tmp_path / "run") / "metrics.json").unlink()
+    assert [run.name for run in report.collect([tmp_path])] == ["baseline"]
+    assert f"{tmp_path / 'run'}: left out, it has no metrics.json" in caplog.text
 
 
 def test_a_folder_without_runs_is_refused_in_one_line(tmp_path: Path) -> None:

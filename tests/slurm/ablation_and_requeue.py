@@ -24,7 +24,7 @@ from tests.slurm.one_machine import cluster
 ROOT = Path(__file__).resolve().parents[2]
 DEMO = ["data.reader.width=64", "data.reader.height=48", "fit.max_degree=1", "data.cloud.init=random",
         "data.cloud.random_points=60", "data.reader.views=5", "data.reader.train=2", "data.views.train=2",
-        "skips=none"]  # fmt: skip
+        "skips=none", "fit.baseline=false"]  # fmt: skip
 # What a user writes to go from this machine to a cluster.
 SLURM = ["-m", "hydra/launcher=submitit_slurm", "hydra.launcher.cpus_per_task=1", "fit.resume=auto"]
 ABLATION = [*SLURM, "+strategy=baseline,gco,[gco,p2g],clear", "hydra.sweep.dir=ablation", "fit.iterations=300", *DEMO]

@@ -1,0 +1,70 @@
+"""The baseline that trained beside a run (`fit.baseline`), as its folder shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from clear_strategies.data.strict_json import read_object
+from clear_strategies.errors import DataError
+from clear_strategies.outputs.image_scores import ImageScores
+
+FOLDER: Final = "baseline"
+"""Its name, in the folder of the run that it trained beside."""
+_TRAIN_AGAIN: Final = "remove this baseline's metrics.json: it is then trained again"
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """A finished baseline.
+
+    Args:
+        means: part ("test", "train") -> mean scores of its renders; a part without views is not there.
+        views: test view -> scores of its render.
+        seconds: of training.
+    """
+
+    folder: Path
+    means: Mapping[str, ImageScores]
+    views: Mapping[str, ImageScores]
+    seconds: float
+
+    @classmethod
+    def read(cls, folder: Path) -> Baseline:
+        """Read a run's folder.
+
+        Raises:
+            DataError: metrics.json or a render is not there, or damaged.
+        """
+        path = folder / "metrics.json"
+        content = read_object(path)
+        try:
+            parts = {part: content[part]["mean"] for part in ("test", "train")}
+            found = cls(
+                folder=folder,
+                means={part: _scores(mean["ours"]) for part, mean in parts.items() if mean},
+                views={view: _scores(row["ours"]) for view, row in content["test"]["views"].items()},
+                seconds=float(content["seconds"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(path, str(error), "is missing or damaged", _TRAIN_AGAIN) from error
+        for view in found.views:
+            if not found.render_of(view).is_file():
+                raise DataError(found.render_of(view), "file", "is not there", _TRAIN_AGAIN)
+        return found
+
+    def render_of(self, view: str) -> Path:
+        """The file of its render of a test view."""
+        return self.folder / "renders" / f"{Path(view).stem}.png"
+
+    def to_json(self) -> dict[str, Any]:
+        """What metrics.json of the run holds of it."""
+        means = {part: asdict(mean) for part, mean in self.means.items()}
+        return {"folder": self.folder.name, "seconds": self.seconds, **means}
+
+
+def _scores(scores: Mapping[str, Any]) -> ImageScores:
+    """Scores from JSON, where null stands for a number that was not finite."""
+    return ImageScores(**{name: float("nan") if value is None else float(value) for name, value in scores.items()})

@@ -1,0 +1,207 @@
+"""A run and the baseline beside it: what trains, what is resumed, and when there is none."""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+
+from clear_strategies.compose import CONF
+from clear_strategies.data.scene import Scene
+from clear_strategies.errors import DataError
+from clear_strategies.jobs import job, scene
+from clear_strategies.outputs import results
+from clear_strategies.outputs.score_table import OURS_MINUS_BASELINE
+from clear_strategies.training.signals import Interrupted
+from tests.helpers.command_line import TINY
+
+ITERATIONS = 12
+SMALL = [o for o in TINY if not o.startswith("fit.baseline")] + [
+    "fit.map_views=0", "fit.probe_every=0", "fit.checkpoint_every=0", "fit.threads=1", "prior=bicubic",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short() -> Iterator[None]:
+    """Pictures, and reading the same scene again, take most of the time of a short run."""
+    scenes: list[Scene] = []
+    load = scene.load
+
+    def load_once(*settings: Any) -> Scene:
+        if not scenes:
+            scenes.append(load(*settings))
+        return scenes[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene, "load", load_once)
+        for name in ("write_curves", "write_contact_sheet"):
+            patch.setattr(results, name, lambda *arguments: None)
+        yield
+
+
+@pytest.fixture(autouse=True)
+def logged(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+
+
+def train(
+    folder: Path, *overrides: str, strategy: str = "gco", watch: Callable[[], None] | None = None
+) -> float | None:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", [f"+strategy={strategy}", "fit.baseline=true", *SMALL, *overrides])
+    return job.run(config, folder, watch)
+
+
+class Iterations:
+    """Counts iterations, and stops a job after some."""
+
+    def __init__(self, stop_after: int | None = None) -> None:
+        self.done, self.stop_after = 0, stop_after
+
+    def __call__(self) -> None:
+        self.done += 1
+        if self.done == self.stop_after:
+            signal.raise_signal(signal.SIGINT)
+
+
+def stopped(folder: Path, after: int) -> Interrupted:
+    with pytest.raises(Interrupted) as told:
+        train(folder, watch=Iterations(after))
+    return told.value
+
+
+def field(folder: Path) -> bytes:
+    return (folder / "point_cloud.ply").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with its baseline, undisturbed."""
+    folder = tmp_path_factory.mktemp("whole")
+    train(folder)
+    return folder
+
+
+def test_the_baseline_is_the_run_without_strategies_on_the_same_scene(whole, tmp_path, monkeypatch, caplog):
+    loads = []
+    prepare = scene.load
+    monkeypatch.setattr(scene, "load", lambda *arguments: loads.append(arguments) or prepare(*arguments))
+    watch = Iterations()
+    psnr = train(tmp_path / "run", watch=watch)
+    assert (len(loads), watch.done) == (1, 2 * ITERATIONS)
+    train(tmp_path / "alone", strategy="baseline")
+    baseline, alone = (json.loads((tmp_path / f / "metrics.json").read_text()) for f in ("run/baseline", "alone"))
+    assert field(tmp_path / "run" / "baseline") == field(tmp_path / "alone") == field(whole / "baseline")
+    assert baseline["config"] == alone["config"]
+    assert (baseline["strategies"], baseline["baseline"]) == ([], None)
+    ours = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert ours["test"]["mean"]["ours"]["psnr"] == psnr
+    assert ours["baseline"]["test"] == baseline["test"]["mean"]["ours"]
+    assert OURS_MINUS_BASELINE in caplog.text
+    plan, first, done = (caplog.text.index(words) for words in ("initial points", "trains first", "done in"))
+    assert plan < first < done
+
+
+def test_a_run_is_the_same_with_and_without_its_baseline(whole, tmp_path):
+    train(tmp_path, "fit.baseline=false")
+    assert field(tmp_path) == field(whole)
+    assert not (tmp_path / "baseline").exists()
+
+
+def test_a_finished_run_is_not_trained_again_with_auto(whole, caplog):
+    watch = Iterations()
+    psnr = train(whole, "fit.resume=auto", watch=watch)
+    assert (watch.done, psnr) == (0, json.loads((whole / "metrics.json").read_text())["test"]["mean"]["ours"]["psnr"])
+    assert "nothing is trained" in caplog.text
+
+
+@pytest.mark.parametrize("leads_to", ["auto", "run", "baseline", "checkpoint"])
+def test_a_run_that_was_stopped_in_its_baseline_goes_on_there(whole, tmp_path, leads_to, caplog):
+    told = stopped(tmp_path / "cut", 5)
+    assert told.exit_code == 128 + signal.SIGINT
+    assert not list((tmp_path / "cut").rglob("metrics.json"))
+    (saved,) = (tmp_path / "cut" / "baseline" / "checkpoints").iterdir()
+    assert f"fit.resume={saved}" in str(told)
+    paths = {"auto": "auto", "run": tmp_path / "cut", "baseline": tmp_path / "cut" / "baseline", "checkpoint": saved}
+    folder, watch = tmp_path / ("cut" if leads_to == "auto" else "resumed"), Iterations()
+    train(folder, f"fit.resume={paths[leads_to]}", watch=watch)
+    assert watch.done == ITERATIONS - 5 + ITERATIONS
+    assert "5 iterations are done" in caplog.text
+    assert field(folder / "baseline") == field(whole / "baseline")
+    assert field(folder) == field(whole)
+
+
+@pytest.mark.parametrize("leads_to", ["auto", "run", "checkpoints", "checkpoint"])
+def test_a_run_that_was_stopped_after_its_baseline_does_not_train_it_again(whole, tmp_path, leads_to):
+    stopped(tmp_path / "cut", ITERATIONS + 5)
+    assert (tmp_path / "cut" / "baseline" / "metrics.json").is_file()
+    assert not (tmp_path / "cut" / "metrics.json").exists()
+    checkpoints = tmp_path / "cut" / "checkpoints"
+    (saved,) = checkpoints.iterdir()
+    paths = {"auto": "auto", "run": tmp_path / "cut", "checkpoints": checkpoints, "checkpoint": saved}
+    folder, watch = tmp_path / ("cut" if leads_to == "auto" else "resumed"), Iterations()
+    train(folder, f"fit.resume={paths[leads_to]}", watch=watch)
+    assert watch.done == ITERATIONS - 5
+    assert field(folder / "baseline") == field(whole / "baseline")
+    assert field(folder) == field(whole)
+
+
+def test_a_run_without_a_baseline_that_is_resumed_with_one_trains_it(whole, tmp_path):
+    with pytest.raises(Interrupted):
+        train(tmp_path, "fit.baseline=false", watch=Iterations(5))
+    watch = Iterations()
+    train(tmp_path, "fit.resume=auto", watch=watch)
+    assert watch.done == ITERATIONS + ITERATIONS - 5
+    assert field(tmp_path) == field(whole)
+
+
+@pytest.mark.parametrize(("where", "problem"), [("nowhere", "no checkpoint is here"), ("other", "tolerance")])
+def test_what_cannot_be_resumed_is_refused_before_the_baseline_trains(tmp_path, where, problem):
+    if where == "other":
+        train(tmp_path / "other", "fit.baseline=false", "strategies.gco.tolerance=0.1")
+    watch = Iterations()
+    with pytest.raises(DataError, match=problem):
+        train(tmp_path / "run", f"fit.resume={tmp_path / where}", watch=watch)
+    assert watch.done == 0
+
+
+def test_the_metrics_of_an_earlier_run_go_before_the_baseline_trains(tmp_path, caplog):
+    (tmp_path / "metrics.json").write_text("{}")
+    stopped(tmp_path, 5)
+    assert not (tmp_path / "metrics.json").exists()
+    assert "of an earlier run" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("overrides", "why"),
+    [(["+method=srgs"], "since +method=srgs is one itself"), (["~strategies.gco"], "since it has no strategy")],
+)
+def test_what_is_a_baseline_itself_trains_none(tmp_path, overrides, why, caplog):
+    train(tmp_path, *overrides)
+    assert why in caplog.text
+    assert not (tmp_path / "baseline").exists()
+
+
+def test_the_jobs_of_a_sweep_train_none(tmp_path, monkeypatch, caplog):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", ["hydra.mode=MULTIRUN"], return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
+    HydraConfig.instance().set_config(config)
+    train(tmp_path)
+    assert "since it is a job of a sweep" in caplog.text
+    assert not (tmp_path / "baseline").exists()
+
+
+def test_the_demo_trains_it_and_other_data_do_not():
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        trained = {
+            data: compose("config", [f"data={data}"]).fit.baseline for data in ("demo", "llff", "colmap", "photos")
+        }
+    assert trained == {"demo": True, "llff": False, "colmap": False, "photos": False}

@@ -1,0 +1,55 @@
+"""The table of scores at the end of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from clear_strategies.outputs.baseline import Baseline
+from clear_strategies.outputs.image_scores import ImageScores
+from clear_strategies.outputs.metrics import NOTE, Evaluation, Table
+from clear_strategies.outputs.score_table import describe, describe_baseline
+
+OURS, THEIRS, BICUBIC = (
+    ImageScores(23.5, 0.7, 0.1, 0.01), ImageScores(23.09, 0.687, 0.12, -0.02), ImageScores(22.0, 0.5, 0.16, 0.2),
+)  # fmt: skip
+TABLE: Table = {"view": {"ours": OURS, "bicubic": BICUBIC, "prior": BICUBIC}}
+BASELINE = Baseline(Path("run/baseline"), {"test": THEIRS}, {"view": THEIRS}, 11.2)
+
+
+def rows(text: str) -> dict[str, str]:
+    return {line[:25].strip(): line[25:].strip() for line in text.splitlines()[1:]}
+
+
+def test_the_baseline_and_the_difference_stand_beside_ours() -> None:
+    text = describe(Path("run"), Evaluation(TABLE, {}, {}, {}), 12.7, BASELINE)
+    assert text.startswith("done in 13 s (the baseline in 11 s): run\n")
+    found = rows(text)
+    assert list(found)[:5] == [f"test   {n}" for n in ("baseline", "ours", "ours − baseline", "bicubic", "prior")]
+    assert found["test   ours − baseline"].split() == [
+        "PSNR", "+0.41", "dB", "SSIM", "+0.0130", "GMSD", "-0.0200", "blur", "+0.0300",
+    ]  # fmt: skip
+    assert text.splitlines()[-1] == f"  {NOTE}."
+
+
+def test_a_part_that_the_baseline_lacks_has_no_difference() -> None:
+    text = describe(Path("run"), Evaluation({}, TABLE, {}, {}), 12.7, BASELINE)
+    assert "−" not in text
+    assert "train" in text
+
+
+def test_without_a_baseline_the_table_says_nothing_of_one() -> None:
+    text = describe(Path("run"), Evaluation(TABLE, {}, {}, {}), 12.7)
+    assert "baseline" not in text
+    assert len(text.splitlines()) == 5
+
+
+def test_the_note_is_for_the_images_that_it_is_about() -> None:
+    assert NOTE not in describe(Path("run"), Evaluation({"view": {"ours": OURS}}, {}, {}, {}), 1.0)
+
+
+@pytest.mark.parametrize(("means", "said"), [({"test": THEIRS}, ", test views 23.09 dB"), ({}, "")])
+def test_the_baseline_is_told_in_one_line(means: dict[str, ImageScores], said: str) -> None:
+    told = describe_baseline(Baseline(Path("run/baseline"), means, {}, 11.2))
+    assert told == f"the baseline: done in 11 s{said}: run/baseline"
