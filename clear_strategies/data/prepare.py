@@ -21,7 +21,7 @@ from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.checks import refuse, require_choice, require_whole
 from clear_strategies.data.photo_files import image_size, inside, list_images, read_image, write_png
 from clear_strategies.data.points import CloudSettings, initial_cloud, require_source
-from clear_strategies.data.priors import Bicubic, Prior
+from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
@@ -107,7 +107,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     points = initial_cloud(
         cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, background=capture.background, seed=seed
     )
-    sample, photo = train[0], train_frames[0].camera
+    sample, photo, network = train[0], train_frames[0].camera, network_of(prior)
     made = {
         "hr": f"{'PIL ' if views.downsample != 'area' else ''}{views.downsample} of the HR photo"
         if views.lr_folder is None else f"read from {views.lr_folder} (D is taken to be {views.downsample})",
@@ -121,6 +121,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         "sizes": f"photos of {_size(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
         "LR": f"{_size(sample.lr.camera)}, {made}",
         "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), SR images: {sample.sr_source}",
+        **({} if network is None else {"SR network": f"{fingerprint(network)} (SHA-256)"}),
         "the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic, on average",
         "initial points": f"{len(points):,}: {points.source}",
         "points use test views": points.uses_test_views,

