@@ -20,7 +20,7 @@ from clear_strategies.core.view import Photo, View
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.checks import refuse, require_choice, require_whole
 from clear_strategies.data.photo_files import image_size, inside, list_images, read_image, write_png
-from clear_strategies.data.points import CloudSettings, initial_cloud, require_source
+from clear_strategies.data.points import CloudSettings, initial_points, require_source
 from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
@@ -104,9 +104,10 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     train = tuple(_view(frame, capture, views, prior, lr_files, required=True) for frame in train_frames)
     test = tuple(_view(frame, capture, views, prior, lr_files, required=False) for frame in test_frames)
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
-    points = initial_cloud(
+    initial = initial_points(
         cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, background=capture.background, seed=seed
     )
+    points, depths = initial.cloud, {v.name: d for v, d in zip(train, initial.depths, strict=bool(initial.depths))}
     sample, photo, network = train[0], train_frames[0].camera, network_of(prior)
     made = {
         "hr": f"{'PIL ' if views.downsample != 'area' else ''}{views.downsample} of the HR photo"
@@ -127,7 +128,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         "points use test views": points.uses_test_views,
     }
     synthetic = "synthetic" in sample.sr_source
-    return Scene(capture.name, train, test, points, capture.background, synthetic, notes)
+    return Scene(capture.name, train, test, points, capture.background, synthetic, notes, depths)
 
 
 def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Frame]]:

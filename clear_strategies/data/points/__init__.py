@@ -1,4 +1,4 @@
-"""The initial cloud: the points that training starts from. `CloudSettings` lists the choices, `initial_cloud` makes it.
+"""The initial cloud: the points that training starts from. `CloudSettings` lists the choices, `initial_points` makes it.
 
 Every cloud says where its points came from, and whether test views were used for them.
 """
@@ -21,14 +21,25 @@ from clear_strategies.data.points.files import from_ply, from_sfm, from_tracks
 from clear_strategies.data.points.interpolation import densify, pixel_grid
 from clear_strategies.data.points.random import random_cloud
 from clear_strategies.data.points.sift import TriangulationSettings, triangulate
-from clear_strategies.data.scene import PointCloud
+from clear_strategies.data.points.stereo.cloud import points_of, shows
+from clear_strategies.data.points.stereo.filling import fill
+from clear_strategies.data.points.stereo.maps import depth_maps
+from clear_strategies.data.points.stereo.settings import StereoSettings
+from clear_strategies.data.scene import DepthMap, PointCloud
 from clear_strategies.errors import DataError
 
-__all__ = ["CloudSettings", "TriangulationSettings", "initial_cloud", "require_source"]
+__all__ = [
+    "CloudSettings",
+    "InitialPoints",
+    "StereoSettings",
+    "TriangulationSettings",
+    "initial_points",
+    "require_source",
+]
 
 _log = logging.getLogger(__name__)
 
-Init = Literal["auto", "triangulated", "sfm_train", "sfm", "ply", "random"]
+Init = Literal["auto", "stereo", "triangulated", "sfm_train", "sfm", "ply", "random"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +47,18 @@ class CloudSettings:
     """Which points, and how they are processed.
 
     Args:
-        init: "triangulated" from the training LR images under their known poses; "sfm_train": the scene's SfM points
-            that at least `min_views` training views observe (their positions still come from all views); "sfm": all of
-            the scene's SfM points; "ply": a file; "random" in a box; "auto": triangulated if that gives at least
-            `enough` points, else random. Auto never takes points that test views were used for.
+        init: "stereo": from the depth of the training LR images, which are compared with each other under their known
+            poses; "triangulated": from features of the same images; "sfm_train": the scene's SfM points that at least
+            `min_views` training views observe (their positions still come from all views); "sfm": all of the scene's
+            SfM points; "ply": a file; "random" in a box; "auto": stereo if it finds depth in a training view, else
+            triangulated if that gives at least `enough` points, else random. Auto never takes points that test views
+            were used for.
         path: the PLY file for init=ply.
         min_views: training views that must observe a point, for init=sfm_train.
         enough: the fewest triangulated points that init=auto takes.
         densify: add points between those found, at interpolated inverse depth, one every `stride` LR px of each view;
-            "auto": if the cloud has fewer points than those grids. Random points are never densified.
+            "auto": if the cloud has fewer points than those grids. With stereo, true and auto add points only where
+            there is no depth and no other view looks through them. Random points are never densified.
         stride: see `densify`, LR px.
         random_points: how many for init=random.
         box: half-edge of their box around the origin, world units; None: the box that the cameras have in common.
@@ -53,7 +67,8 @@ class CloudSettings:
             neighbours: no point is removed.
         voxel: points are averaged in cubes of this edge, world units; None: they are not.
         max_points: a larger cloud is reduced to this many points, chosen at random.
-        triangulation: for init=triangulated and auto.
+        triangulation: for init=stereo, triangulated and auto.
+        stereo: for init=stereo and auto.
 
     Raises:
         SettingError: a value is outside its range, or init=ply comes without a path.
@@ -72,6 +87,7 @@ class CloudSettings:
     voxel: float | None = None
     max_points: int = 200_000
     triangulation: TriangulationSettings = field(default_factory=TriangulationSettings)
+    stereo: StereoSettings = field(default_factory=StereoSettings)
 
     def __post_init__(self) -> None:
         require_choice("data.cloud.init", self.init, get_args(Init))
@@ -105,7 +121,19 @@ def require_source(settings: CloudSettings, sfm: SfmPoints | None) -> None:
         raise DataError(str(settings.path), "file", "is not there", "set data.cloud.path to a PLY file")
 
 
-def initial_cloud(
+@dataclass(frozen=True, slots=True, eq=False)
+class InitialPoints:
+    """The initial cloud, and the depth maps that it was made of.
+
+    Args:
+        depths: one for each photo, or none where stereo was not asked.
+    """
+
+    cloud: PointCloud
+    depths: tuple[DepthMap, ...] = ()
+
+
+def initial_points(
     settings: CloudSettings,
     photos: Sequence[Photo],
     *,
@@ -113,7 +141,7 @@ def initial_cloud(
     train_ids: Sequence[int] = (),
     background: tuple[float, float, float] | None = None,
     seed: int = 0,
-) -> PointCloud:
+) -> InitialPoints:
     """The cloud a run starts from.
 
     Args:
@@ -126,21 +154,20 @@ def initial_cloud(
         DataError: the scene cannot give this cloud.
     """
     require_source(settings, sfm)
+    depths: tuple[DepthMap, ...] = ()
     match settings.init:
         case "random":
             cloud = None
         case "ply":
-            cloud = from_ply(Path(str(settings.path)))
+            cloud = _cleaned(settings, from_ply(Path(str(settings.path))), photos, background)
         case "sfm" if sfm is not None:
-            cloud = from_sfm(sfm)
+            cloud = _cleaned(settings, from_sfm(sfm), photos, background)
         case "sfm_train" if sfm is not None:
-            cloud = from_tracks(sfm, train_ids, settings.min_views)
+            cloud = _cleaned(settings, from_tracks(sfm, train_ids, settings.min_views), photos, background)
         case _:
-            cloud = _triangulated(settings, photos, sfm)
+            cloud, depths = _from_photos(settings, photos, sfm, background)
     if cloud is None:
         cloud = random_cloud(photos, settings.random_points, seed, settings.box)
-    else:
-        cloud = _densified(settings, _without_outliers(settings, cloud), photos, background)
     if settings.voxel is not None:
         means, colors = voxel_grid(cloud.means, cloud.colors, settings.voxel)
         cloud = replace(cloud, means=means, colors=colors, source=f"{cloud.source}, in voxels of {settings.voxel:g}")
@@ -148,25 +175,82 @@ def initial_cloud(
         chosen = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(seed))[: settings.max_points]
         _log.info("%d of %d points chosen at random (max_points).", settings.max_points, len(cloud))
         cloud = cloud[chosen.sort().values]
-    return cloud
+    return InitialPoints(cloud, depths)
 
 
-def _triangulated(settings: CloudSettings, photos: Sequence[Photo], sfm: SfmPoints | None) -> PointCloud | None:
-    """Points from the training LR images; None where init=auto finds too few."""
-    cloud = triangulate(photos, settings.triangulation)
-    if settings.init == "triangulated":
-        if len(cloud) == 0:
-            problem = f"none could be triangulated from the {len(photos)} training LR images"
-            raise DataError("scene", "points", problem, "use init=random, or more or closer views")
-        return cloud
-    if sfm is not None:
+def _from_photos(
+    settings: CloudSettings,
+    photos: Sequence[Photo],
+    sfm: SfmPoints | None,
+    background: tuple[float, float, float] | None,
+) -> tuple[PointCloud | None, tuple[DepthMap, ...]]:
+    """Points from the training LR images, and their depth maps; None where init=auto finds too few."""
+    auto = settings.init == "auto"
+    if auto and sfm is not None:
         _log.info("init: auto does not use the scene's own points, because test views were used for them.")
-    if len(cloud) >= settings.enough:
-        _log.info("init: auto chose %s.", cloud.source)
+    features = triangulate(photos, settings.triangulation)
+    if settings.init != "triangulated":
+        maps = depth_maps(photos, features.means, settings.stereo, background)
+        cloud = stereo_cloud(features, photos, maps, settings, background)
+        if cloud is not None:
+            if auto:
+                _log.info("init: auto chose %s.", cloud.source)
+            return cloud, tuple(maps)
+        if not auto:
+            problem = f"stereo confirms no depth in any of the {len(photos)} training LR images"
+            raise DataError("scene", "points", problem, "use init=triangulated or random, or closer views")
+        _log.info("init: stereo confirms no depth in any of the %d training LR images.", len(photos))
+    elif len(features) == 0:
+        problem = f"none could be triangulated from the {len(photos)} training LR images"
+        raise DataError("scene", "points", problem, "use init=random, or more or closer views")
+    if auto and len(features) < settings.enough:
+        message = "init: auto chose random points: the training LR images give only %d (data.cloud.enough: %d)."
+        _log.warning(message, len(features), settings.enough)
+        return None, ()
+    if auto:
+        _log.info("init: auto chose %s.", features.source)
+    return _cleaned(settings, features, photos, background), ()
+
+
+def stereo_cloud(
+    features: PointCloud,
+    photos: Sequence[Photo],
+    maps: Sequence[DepthMap],
+    settings: CloudSettings,
+    background: tuple[float, float, float] | None,
+) -> PointCloud | None:
+    """The points of the depth maps, triangulated ones where no map knows depth, and what fills the rest; None: no depth."""
+    if not any(found.coverage > 0 for found in maps):
+        return None
+    stereo = settings.stereo
+    means, colors = points_of(photos, maps, stereo.spacing, stereo.tolerance)
+    known = torch.zeros(len(features), dtype=torch.bool)
+    for photo, found in zip(photos, maps, strict=True):
+        known |= shows(photo, found, features.means)
+    means = torch.cat((means, features.means[~known]))
+    colors = torch.cat((colors, features.colors[~known]))
+    shares = ", ".join(f"{found.coverage:.0%}" for found in maps)
+    silent = sum(found.coverage == 0 for found in maps)
+    source = (
+        f"{len(means):,} points of dense stereo between the {len(photos)} training LR images (depth known at {shares})"
+    )
+    if silent:
+        source += f", {silent} of them interpolated alone"
+    cloud = _without_outliers(settings, PointCloud(means, colors, source))
+    if settings.densify is False:
         return cloud
-    message = "init: auto chose random points: the training LR images give only %d (data.cloud.enough: %d)."
-    _log.warning(message, len(cloud), settings.enough)
-    return None
+    added, shades = fill(cloud.means, photos, maps, settings.stride, background)
+    source = f"{source}, filled by {len(added):,} at interpolated inverse depth"
+    return PointCloud(torch.cat((cloud.means, added)), torch.cat((cloud.colors, shades)), source)
+
+
+def _cleaned(
+    settings: CloudSettings,
+    cloud: PointCloud,
+    photos: Sequence[Photo],
+    background: tuple[float, float, float] | None,
+) -> PointCloud:
+    return _densified(settings, _without_outliers(settings, cloud), photos, background)
 
 
 def _without_outliers(settings: CloudSettings, cloud: PointCloud) -> PointCloud:

@@ -31,16 +31,16 @@ def densify(
     """
     means, colors = [cloud.means], [cloud.colors]
     for i, photo in enumerate(photos):
-        pixels, inverse_depth = _samples(cloud.means, photo, 2 * stride)
-        if len(pixels) < _FEWEST_SAMPLES:
-            _log.warning("view %d is not densified: only %d points project into it.", i, len(pixels))
-            continue
         grid = pixel_grid(photo, stride)
         grid_colors = sample_colors(photo.image, grid)
         if background is not None:
             surface = ((grid_colors - torch.tensor(background)).abs() > 2 / 255).any(dim=1)
             grid, grid_colors = grid[surface], grid_colors[surface]
-        means.append(back_project(photo.camera, grid, 1 / _interpolate(pixels, inverse_depth, grid)))
+        inverse_depth = interpolate_depth(cloud.means, photo, grid, 2 * stride)
+        if inverse_depth is None:
+            _log.warning("view %d is not densified.", i)
+            continue
+        means.append(back_project(photo.camera, grid, 1 / inverse_depth))
         colors.append(grid_colors)
     added = sum(map(len, means[1:]))
     if added == 0:
@@ -48,6 +48,17 @@ def densify(
         return cloud
     source = f"{cloud.source}, densified by {added:,} at interpolated inverse depth"
     return replace(cloud, means=torch.cat(means), colors=torch.cat(colors), source=source)
+
+
+def interpolate_depth(
+    means: Float[Tensor, "N 3"], photo: Photo, at: Float[Tensor, "G 2"], cell: int
+) -> Float[Tensor, " G"] | None:
+    """Inverse depth at these pixels, between the nearest points per square of `cell` pixels; None: fewer than 4 points."""
+    pixels, inverse_depth = _samples(means, photo, cell)
+    if len(pixels) < _FEWEST_SAMPLES:
+        _log.warning("depth of a view cannot be interpolated: only %d points project into it.", len(pixels))
+        return None
+    return _interpolate(pixels, inverse_depth, at)
 
 
 def pixel_grid(photo: Photo, stride: int) -> Float[Tensor, "G 2"]:

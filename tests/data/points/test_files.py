@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies.data.points import CloudSettings, initial_cloud
+from clear_strategies.data.points import CloudSettings, initial_points
 from clear_strategies.data.points.files import from_tracks
 from clear_strategies.errors import DataError
 from tests.helpers.planes import photo, sfm
@@ -25,7 +25,7 @@ def test_points_observed_by_enough_training_views_are_kept(ids: list[int], min_v
 
 def test_sfm_points_are_marked_as_using_test_views_filtered_or_not() -> None:
     for init in ("sfm", "sfm_train"):
-        cloud = initial_cloud(CloudSettings(init=init, densify=False), [photo()], sfm=sfm(), train_ids=[1, 2, 3])
+        cloud = initial_points(CloudSettings(init=init, densify=False), [photo()], sfm=sfm(), train_ids=[1, 2, 3]).cloud
         assert cloud.uses_test_views == "yes"
         assert "all of sparse/0" in cloud.source
 
@@ -37,4 +37,4 @@ def test_missing_points_are_refused_in_one_line() -> None:
     with pytest.raises(DataError, match="come without tracks"):
         from_tracks(replace(sfm(), track_point=none, track_image=none), [1], 1)
     with pytest.raises(DataError, match="there are none, but init=sfm_train"):
-        initial_cloud(CloudSettings(init="sfm_train"), [photo()])
+        initial_points(CloudSettings(init="sfm_train"), [photo()])

@@ -11,7 +11,7 @@ import torch
 
 from clear_strategies.core import images
 from clear_strategies.core.view import Photo
-from clear_strategies.data.points import CloudSettings, initial_cloud
+from clear_strategies.data.points import CloudSettings, initial_points
 from clear_strategies.data.points.projection import project
 from clear_strategies.data.prepare import ViewSettings, split
 from clear_strategies.data.readers import llff
@@ -26,7 +26,7 @@ def flat_photos() -> list[Photo]:
 
 def test_auto_triangulates_where_it_can(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    cloud = initial_cloud(CloudSettings(densify=False), plane_photos(3), sfm=sfm(), train_ids=[1, 2, 3])
+    cloud = initial_points(CloudSettings(densify=False), plane_photos(3), sfm=sfm(), train_ids=[1, 2, 3]).cloud
     assert len(cloud) > 50
     assert cloud.uses_test_views == "no"
     assert "init: auto chose" in caplog.text
@@ -34,7 +34,7 @@ def test_auto_triangulates_where_it_can(caplog: pytest.LogCaptureFixture) -> Non
 
 
 def test_auto_falls_back_to_random_and_logs_it(caplog: pytest.LogCaptureFixture) -> None:
-    cloud = initial_cloud(CloudSettings(random_points=99), flat_photos(), sfm=sfm())
+    cloud = initial_points(CloudSettings(random_points=99), flat_photos(), sfm=sfm()).cloud
     assert len(cloud) == 99
     assert cloud.source.startswith("random")
     assert cloud.uses_test_views == "no"
@@ -43,11 +43,11 @@ def test_auto_falls_back_to_random_and_logs_it(caplog: pytest.LogCaptureFixture)
 
 def test_triangulated_does_not_fall_back() -> None:
     with pytest.raises(DataError, match="none could be triangulated from the 2 training LR images"):
-        initial_cloud(CloudSettings(init="triangulated"), flat_photos())
+        initial_points(CloudSettings(init="triangulated"), flat_photos())
 
 
 def test_the_same_seed_gives_the_same_cloud() -> None:
-    one, two = (initial_cloud(CloudSettings(max_points=300), plane_photos(2), seed=3) for _ in range(2))
+    one, two = (initial_points(CloudSettings(max_points=300), plane_photos(2), seed=3).cloud for _ in range(2))
     assert len(one) == 300
     assert torch.equal(one.means, two.means)
     assert torch.equal(one.colors, two.colors)
@@ -55,7 +55,7 @@ def test_the_same_seed_gives_the_same_cloud() -> None:
 
 def test_a_given_file_is_read(tmp_path: Path) -> None:
     write_points(tmp_path / "fused.ply", cloud_of(torch.rand(5, 3)))
-    cloud = initial_cloud(CloudSettings(init="ply", path=str(tmp_path / "fused.ply"), densify=False), [photo()])
+    cloud = initial_points(CloudSettings(init="ply", path=str(tmp_path / "fused.ply"), densify=False), [photo()]).cloud
     assert len(cloud) == 5
     assert cloud.source == "5 points of fused.ply"
     assert cloud.uses_test_views == "unknown"
@@ -64,7 +64,7 @@ def test_a_given_file_is_read(tmp_path: Path) -> None:
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     write_points(tmp_path / "empty.ply", cloud_of(torch.zeros(0, 3)))
     with pytest.raises(DataError, match="has no points"):
-        initial_cloud(CloudSettings(init="ply", path=str(tmp_path / "empty.ply")), [photo()])
+        initial_points(CloudSettings(init="ply", path=str(tmp_path / "empty.ply")), [photo()])
 
 
 def test_auto_densifies_only_what_is_sparser_than_the_pixel_grid(tmp_path: Path) -> None:
@@ -72,23 +72,23 @@ def test_auto_densifies_only_what_is_sparser_than_the_pixel_grid(tmp_path: Path)
     for count, grows in ((390, True), (410, False)):  # the grid has 20 · 20 = 400
         write_points(file, cloud_of(torch.rand(count, 3) + torch.tensor([-0.5, -0.5, 5])))
         chosen = CloudSettings(init="ply", path=str(file), outlier_neighbours=0)
-        assert (len(initial_cloud(chosen, [view])) > count) == grows
-        assert len(initial_cloud(replace(chosen, densify=True), [view])) > count
-        assert len(initial_cloud(replace(chosen, densify=False), [view])) == count
+        assert (len(initial_points(chosen, [view]).cloud) > count) == grows
+        assert len(initial_points(replace(chosen, densify=True), [view]).cloud) > count
+        assert len(initial_points(replace(chosen, densify=False), [view]).cloud) == count
 
 
 def test_outliers_are_removed_before_densification_and_voxels_averaged_after(tmp_path: Path) -> None:
     stray = torch.cat((torch.rand(50, 3) * 0.1 + torch.tensor([0, 0, 5.0]), torch.tensor([[0, 0, 500.0]])))
     write_points(tmp_path / "p.ply", cloud_of(stray))
     chosen = CloudSettings(init="ply", path=str(tmp_path / "p.ply"))
-    assert initial_cloud(chosen, [photo()]).means[:, 2].max() < 6
-    assert len(initial_cloud(replace(chosen, voxel=1000.0), [photo()])) == 1
+    assert initial_points(chosen, [photo()]).cloud.means[:, 2].max() < 6
+    assert len(initial_points(replace(chosen, voxel=1000.0), [photo()]).cloud) == 1
 
 
 @pytest.mark.parametrize(
     ("wrong", "value", "rule"),
     [
-        ("init", "dense", "must be one of auto, triangulated, sfm_train, sfm, ply, random"),
+        ("init", "dense", "must be one of auto, stereo, triangulated, sfm_train, sfm, ply, random"),
         ("densify", "maybe", "must be one of True, False, auto"),
         ("stride", 0, "must be a whole number of at least 1"),
         ("stride", 1.5, "must be a whole number of at least 1"),
@@ -121,7 +121,8 @@ def test_fern_is_triangulated_from_three_lr_images(shared_data: Path) -> None:
         image = images.downsample(images.crop_to_multiple(frame.load(), 8), 8)
         full = replace(frame.camera, width=image.shape[1] * 8, height=image.shape[0] * 8)
         photos.append(Photo(full.scaled(1 / 8), image))
-    cloud = initial_cloud(CloudSettings(densify=False), photos, sfm=capture.points)
+    chosen = CloudSettings(init="triangulated", densify=False)
+    cloud = initial_points(chosen, photos, sfm=capture.points).cloud
     assert len(cloud) > 200
     assert cloud.uses_test_views == "no"
     assert capture.points is not None

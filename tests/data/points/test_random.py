@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies.core.view import Photo
-from clear_strategies.data.points import CloudSettings, initial_cloud
+from clear_strategies.data.points import CloudSettings, initial_points
 from clear_strategies.data.points.projection import project
 from clear_strategies.data.points.random import common_box, random_cloud
 from rasterizers.interface import Camera
@@ -33,7 +33,9 @@ def test_the_same_seed_gives_the_same_points() -> None:
 
 
 def test_nothing_is_removed_from_or_added_to_random_points() -> None:
-    assert len(initial_cloud(CloudSettings(init="random", random_points=777, outlier_ratio=0.1), [photo()])) == 777
+    assert (
+        len(initial_points(CloudSettings(init="random", random_points=777, outlier_ratio=0.1), [photo()]).cloud) == 777
+    )
 
 
 def test_cameras_around_an_object_have_the_ball_that_they_all_see_in_common() -> None:

@@ -1,0 +1,6 @@
+"""Dense stereo: the depth of every training photo under known poses, from LR images alone.
+
+A plane sweep (`cost`) over source photos chosen by angle and overlap (`sources`), semi-global smoothing (`smoothing`),
+depth between planes (`depth`), and what other photos confirm (`consistency`). `maps` puts them together, `cloud` makes
+points of the maps.
+"""

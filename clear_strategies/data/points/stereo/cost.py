@@ -1,0 +1,105 @@
+"""The cost volume: how unlike a photo the others are at each pixel and depth plane."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from clear_strategies.data.points.stereo.image import Grey
+
+_VARIANCE_FLOOR: Final = 1e-5  # of grey in [0, 1]: windows with less contrast than noise correlate with nothing
+_UNSEEN: Final = 0.5  # cost of a plane that a photo does not see: that of unrelated windows
+_BLOCK: Final = 1 << 21  # pixels times planes that are compared at once
+
+
+def cost_volume(
+    photo: Grey, others: Sequence[Grey], inverse_depths: Float[Tensor, " D"], window: int
+) -> Float[Tensor, "H W D"]:
+    """(1 - ZNCC) / 2 in [0, 1], the mean over the better half of the other photos: the worse half may be occluded.
+
+    ZNCC is the correlation of two windows, E[(a - E a)(b - E b)] / (σ_a σ_b), of the photo and of the other photo drawn
+    through the plane.
+    """
+    height, width = photo.image.shape
+    volume = photo.image.new_empty(height, width, len(inverse_depths))
+    reference = _Windows(photo.image[None], window)
+    for planes in _blocks(len(inverse_depths), max(1, _BLOCK // (height * width))):
+        costs = (_cost(reference, photo, other, inverse_depths[planes], window) for other in others)
+        volume[:, :, planes] = mean_of_lowest(costs, (len(others) + 1) // 2).permute(1, 2, 0)
+    return volume
+
+
+def mean_of_lowest(values: Iterator[Tensor], count: int) -> Tensor:
+    """The mean of the `count` lowest, element by element; only `count` tensors are kept."""
+    lowest: list[Tensor] = []
+    for value in values:
+        rest = value
+        for k, kept in enumerate(lowest):
+            lowest[k], rest = torch.minimum(kept, rest), torch.maximum(kept, rest)
+        if len(lowest) < count:
+            lowest.append(rest)
+    total = lowest[0]
+    for value in lowest[1:]:
+        total = total + value
+    return total / count
+
+
+def _blocks(total: int, size: int) -> Iterator[slice]:
+    return (slice(first, min(first + size, total)) for first in range(0, total, size))
+
+
+class _Windows:
+    """Mean and standard deviation of each pixel's window."""
+
+    def __init__(self, images: Float[Tensor, "P H W"], window: int) -> None:
+        self.images = images
+        self.mean = box_mean(images, window)
+        variance = box_mean(images * images, window) - self.mean * self.mean
+        self.deviation = (variance.clamp_min(0) + _VARIANCE_FLOOR).sqrt()
+
+
+def _cost(
+    reference: _Windows, photo: Grey, other: Grey, inverse_depths: Float[Tensor, " P"], window: int
+) -> Float[Tensor, "P H W"]:
+    drawn, seen = through_planes(photo, other, inverse_depths)
+    windows = _Windows(drawn, window)
+    covariance = box_mean(reference.images * drawn, window) - reference.mean * windows.mean
+    correlation = covariance / (reference.deviation * windows.deviation)
+    return torch.where(seen, (1 - correlation) / 2, _UNSEEN)
+
+
+def through_planes(
+    photo: Grey, other: Grey, inverse_depths: Float[Tensor, " P"]
+) -> tuple[Float[Tensor, "P H W"], Bool[Tensor, "P H W"]]:
+    """(the other photo drawn onto the photo's pixels through each plane, whether the pixel lies inside it).
+
+    A pixel's point at inverse depth d projects to K' (R K⁻¹ x + d t), up to its third coordinate.
+    """
+    rotated, shift = photo.towards(other)
+    x, y, z = (rotated[..., k] + shift[k] * inverse_depths[:, None, None] for k in range(3))
+    height, width = other.image.shape
+    # grid_sample's coordinates: -1 and 1 are the outer borders of the image.
+    u, v = x / (z * (width / 2)) - 1, y / (z * (height / 2)) - 1
+    seen = (z > 0) & (u > -1) & (u < 1) & (v > -1) & (v < 1)
+    grid = torch.stack((u, v), dim=-1).nan_to_num(2, 2, -2).clamp(-2, 2)
+    images = other.image.expand(len(inverse_depths), 1, height, width)
+    drawn = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+    return drawn[:, 0], seen
+
+
+def box_mean(images: Float[Tensor, "P H W"], window: int) -> Float[Tensor, "P H W"]:
+    """The mean over square windows; the border is repeated. Sums have a fixed order."""
+    radius = window // 2
+    padded = torch.nn.functional.pad(images, (radius,) * 4, mode="replicate")
+    height, width = images.shape[1:]
+    rows = padded[:, :height].clone()
+    for k in range(1, window):
+        rows += padded[:, k : k + height]
+    total = rows[:, :, :width].clone()
+    for k in range(1, window):
+        total += rows[:, :, k : k + width]
+    return total.mul_(1 / window**2)

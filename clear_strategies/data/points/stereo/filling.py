@@ -1,0 +1,64 @@
+"""Points where stereo found no depth, at interpolated inverse depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from clear_strategies.core.view import Photo
+from clear_strategies.data.points.interpolation import interpolate_depth, pixel_grid
+from clear_strategies.data.points.projection import back_project, project, sample_colors
+from clear_strategies.data.scene import DepthMap
+
+_NEARER = 0.95  # a filled point in front of this share of another photo's depth floats in free space
+
+
+def fill(
+    means: Float[Tensor, "N 3"],
+    photos: Sequence[Photo],
+    maps: Sequence[DepthMap],
+    stride: int,
+    background: tuple[float, float, float] | None = None,
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    """(positions, colours) of a grid of `stride` px over the unknown parts of each photo.
+
+    A point is left out if it floats in front of the depth that another photo knows.
+
+    Args:
+        means: the points between which inverse depth is interpolated.
+        background: the colour of pixels without a surface.
+    """
+    added, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
+    for i, (photo, found) in enumerate(zip(photos, maps, strict=True)):
+        grid = pixel_grid(photo, stride)
+        x, y = grid.long().unbind(dim=1)
+        grid = grid[~found.known.cpu()[y, x]]
+        shade = sample_colors(photo.image, grid)
+        if background is not None:
+            surface = ((shade - torch.tensor(background)).abs() > 2 / 255).any(dim=1)
+            grid, shade = grid[surface], shade[surface]
+        inverse_depth = interpolate_depth(means, photo, grid, 2 * stride) if len(grid) else None
+        if inverse_depth is None:
+            continue
+        points = back_project(photo.camera, grid, 1 / inverse_depth)
+        kept = torch.ones(len(points), dtype=torch.bool)
+        for j, (other, known) in enumerate(zip(photos, maps, strict=True)):
+            if j != i:
+                kept &= ~floats(points, other, known)
+        added.append(points[kept])
+        colors.append(shade[kept])
+    return torch.cat(added), torch.cat(colors)
+
+
+def floats(points: Float[Tensor, "N 3"], photo: Photo, found: DepthMap) -> Bool[Tensor, " N"]:
+    """Whether the photo looks through the point at a surface behind it."""
+    pixels, depth = project(photo.camera, points)
+    size = torch.tensor([photo.camera.width, photo.camera.height])
+    inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+    result = torch.zeros(len(points), dtype=torch.bool)
+    x, y = pixels[inside].long().unbind(dim=1)
+    result[inside] = depth[inside] < _NEARER * found.depth.cpu()[y, x].double()
+    return result

@@ -1,0 +1,121 @@
+"""The depth map of each photo: swept, smoothed, confirmed, judged."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.view import Photo
+from clear_strategies.data.points.projection import project
+from clear_strategies.data.points.stereo.consistency import confirm
+from clear_strategies.data.points.stereo.depth import Estimate, estimate
+from clear_strategies.data.points.stereo.image import Grey, grey
+from clear_strategies.data.points.stereo.settings import StereoSettings
+from clear_strategies.data.points.stereo.sources import Comparison, comparisons
+from clear_strategies.data.scene import DepthMap
+
+_log = logging.getLogger(__name__)
+
+_MANY_PHOTOS = 6  # from here on, two others must agree
+_ASKED = 8  # the most photos that are asked to confirm one
+_BACKGROUND = 2 / 255  # largest difference of a background pixel from the background's colour
+_FEW_POINTS = 10  # triangulated points in a photo below which they do not judge its depth
+_CLOSE = 0.1  # relative error up to which depth agrees with a triangulated point
+
+
+def depth_maps(
+    photos: Sequence[Photo],
+    points: Float[Tensor, "N 3"],
+    settings: StereoSettings | None = None,
+    background: tuple[float, float, float] | None = None,
+) -> list[DepthMap]:
+    """The depth of each photo where others confirm it; unknown everywhere for photos whose stereo cannot be trusted.
+
+    Args:
+        photos: posed, of any sizes.
+        points: triangulated points, which give the range of depth and judge the result; there may be none.
+        background: the colour of pixels without a surface.
+    """
+    settings = settings or StereoSettings()
+    compared = comparisons(photos, points)
+    estimates = _estimates(photos, compared, settings)
+    needed = settings.agreeing or (2 if len(photos) >= _MANY_PHOTOS else 1)
+    maps = []
+    for i, (photo, mine) in enumerate(zip(photos, estimates, strict=True)):
+        if mine is None:
+            maps.append(_unknown(photo, "no other photo sees the same surfaces from 1 to 45 degrees aside"))
+            continue
+        others = [e for j in compared[i].others[:_ASKED] if (e := estimates[j]) is not None]
+        confirmed = confirm(mine, others, settings)
+        good = confirmed.agreeing >= min(needed, len(others))
+        good &= (mine.correlation >= settings.min_correlation) & (confirmed.agreeing > 0)
+        if background is not None:
+            color = torch.tensor(background).to(photo.image)
+            good &= ((photo.image - color).abs() > _BACKGROUND).any(dim=-1)
+        confidence = mine.correlation.clamp(0, 1) * (confirmed.agreeing.float() / 2).clamp(max=1)
+        depth = torch.where(good, 1 / confirmed.inverse_depth, torch.nan)
+        found = DepthMap(depth, torch.where(good, confidence, 0.0))
+        maps.append(_judged(photo, found, points, settings))
+    return maps
+
+
+def _estimates(
+    photos: Sequence[Photo], compared: Sequence[Comparison], settings: StereoSettings
+) -> list[Estimate | None]:
+    """Each photo's own depth on the grid of its LR pixels; None without photos to compare it with."""
+    greys = [grey(photo, settings.enlarge, settings.max_pixels) for photo in photos]
+    found: list[Estimate | None] = []
+    for i, (photo, comparison) in enumerate(zip(photos, compared, strict=True)):
+        others = [greys[j] for j in comparison.others[: settings.sources]]
+        if not others:
+            found.append(None)
+            continue
+        found.append(_on_photo(estimate(greys[i], others, comparison, settings), photo))
+        _log.debug("stereo: photo %d against %s.", i, comparison.others[: settings.sources])
+    return found
+
+
+def _on_photo(found: Estimate, photo: Photo) -> Estimate:
+    """The estimate of an enlarged or reduced image at the photo's pixels: the best correlated of those it covers."""
+    camera, here = photo.camera, found.image.camera
+    image = Grey(camera, photo.image.new_zeros(camera.height, camera.width))
+    if (camera.height, camera.width) == tuple(found.inverse_depth.shape):
+        return replace(found, image=image)
+    if here.width > camera.width:
+        k = here.width // camera.width
+        best = torch.nn.functional.max_pool2d(found.correlation[None, None], k, return_indices=True)[1][0, 0]
+        return Estimate(image, *(x.reshape(-1)[best] for x in (found.inverse_depth, found.correlation)))
+    row, column = (
+        ((torch.arange(full) + 0.5) * (f / g)).long().clamp(max=last - 1)
+        for full, f, g, last in (
+            (camera.height, here.fy, camera.fy, here.height), (camera.width, here.fx, camera.fx, here.width),
+        )
+    )  # fmt: skip
+    return Estimate(image, *(x[row[:, None], column] for x in (found.inverse_depth, found.correlation)))
+
+
+def _judged(photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"], settings: StereoSettings) -> DepthMap:
+    """The depth map, or an unknown one where it covers too little or contradicts the triangulated points."""
+    if found.coverage < settings.trust:
+        return _unknown(photo, f"its depth is confirmed at only {found.coverage:.1%} of the pixels")
+    pixels, depth = project(photo.camera, points)
+    inside = (depth > 0) & ((pixels >= 0) & (pixels < torch.tensor([photo.camera.width, photo.camera.height]))).all(1)
+    x, y = pixels[inside].long().unbind(dim=1)
+    # An occluded point says nothing, so only points in front of the surface contradict it.
+    ratio = found.depth.cpu()[y, x] / depth[inside]
+    ratio = ratio[ratio.isfinite()]
+    contradictions = float((ratio > 1 + _CLOSE).float().mean()) if len(ratio) >= _FEW_POINTS else 0.0
+    if contradictions > 0.5:
+        return _unknown(photo, f"{contradictions:.0%} of the triangulated points lie in front of its depth")
+    return found
+
+
+def _unknown(photo: Photo, reason: str) -> DepthMap:
+    _log.info("stereo: a photo of %dx%d is left out: %s.", photo.camera.width, photo.camera.height, reason)
+    shape = (photo.camera.height, photo.camera.width)
+    return DepthMap(photo.image.new_full(shape, torch.nan), photo.image.new_zeros(shape))

@@ -1,0 +1,58 @@
+"""The settings of dense stereo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from clear_strategies.data.checks import require_number, require_whole
+
+
+@dataclass(frozen=True, slots=True)
+class StereoSettings:
+    """How the depth of the training photos is found, and which of it becomes points.
+
+    Args:
+        enlarge: factor by which photos are enlarged (bicubic) before they are compared.
+        max_pixels: larger photos are first reduced by a whole factor, so that time and memory are bounded.
+        sources: the most photos that one photo is compared with.
+        plane_step: largest shift in a source photo between neighbouring depth planes, pixels of the compared images.
+        max_planes: the most depth planes of one photo; bounds time and memory.
+        window: edge of the compared windows, pixels of the compared images, odd.
+        small_step, large_step: penalties of the smoothing for neighbouring pixels whose planes differ by one, or by more,
+            in units of the cost, which is 0 for equal windows and 0.5 for unrelated ones.
+        min_correlation: of the windows at the depth that was found, in [0, 1]; a lower one is no evidence.
+        tolerance: largest relative difference between the depths that two photos find of one point.
+        reprojection: largest distance of a pixel from itself after going to the other photo and back, LR px.
+        agreeing: other photos whose depth must agree; None: 2 where there are at least 6 photos, else 1.
+        spacing: distance of the points on the surface, LR px of the photo that sees them.
+        trust: a photo is used whose stereo covers at least this share of its pixels.
+
+    Raises:
+        SettingError: a number is outside its range.
+    """
+
+    enlarge: int = 1
+    max_pixels: int = 250_000
+    sources: int = 4
+    plane_step: float = 0.75
+    max_planes: int = 128
+    window: int = 5
+    small_step: float = 0.08
+    large_step: float = 0.6
+    min_correlation: float = 0.3
+    tolerance: float = 0.02
+    reprojection: float = 1.5
+    agreeing: int | None = None
+    spacing: float = 1.5
+    trust: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name, least in (("enlarge", 1), ("max_pixels", 1), ("sources", 1), ("max_planes", 4), ("window", 3)):
+            require_whole(f"data.cloud.stereo.{name}", getattr(self, name), least=least)
+        if self.agreeing is not None:
+            require_whole("data.cloud.stereo.agreeing", self.agreeing, least=1)
+        for name in ("plane_step", "small_step", "large_step", "tolerance", "reprojection"):
+            require_number(f"data.cloud.stereo.{name}", getattr(self, name), above=0)
+        require_number("data.cloud.stereo.spacing", self.spacing, least=1)
+        for name in ("min_correlation", "trust"):
+            require_number(f"data.cloud.stereo.{name}", getattr(self, name), least=0, most=1)
