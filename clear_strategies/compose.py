@@ -78,7 +78,7 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
         raise SettingError(f"iterations must be at least 1, got {iterations}.")
     names = [name.strip() for name in strategy.split(",")]
     chosen = f"+strategy=[{','.join(names)}]" if len(names) > 1 else f"+strategy={names[0]}"
-    settings: ConductorSettings = build(tree(_compose([chosen, *overrides]), _TRAINERS))
+    settings: ConductorSettings = build(tree(composed([chosen, *overrides]), _TRAINERS))
     return settings.conductor(iterations / REFERENCE_ITERATIONS)
 
 
@@ -115,7 +115,7 @@ def _first_missing(node: Any, key: str = "") -> str | None:
 def nearest_setting(key: str, arguments: Iterable[str]) -> str | None:
     """The setting of a run that an unknown key of its command line most resembles; None where there is none like it."""
     overrides = [a for a in arguments if not a.startswith(("-", "hydra.")) and a.partition("=")[0].lstrip("+") != key]
-    known = _keys(OmegaConf.to_container(_compose(overrides, "config")))
+    known = _keys(OmegaConf.to_container(composed(overrides, "config")))
     return next(iter(difflib.get_close_matches(key, known, 1, 0.8)), None)
 
 
@@ -126,7 +126,12 @@ def _keys(node: Any, prefix: str = "") -> list[str]:
     return [key for name, value in node.items() for key in _keys(value, f"{prefix}.{name}" if prefix else str(name))]
 
 
-def _compose(overrides: list[str], config: str = "conductor") -> DictConfig:
+def composed(overrides: list[str], config: str = "conductor") -> DictConfig:
+    """conf/ with these overrides, from its file `config`: "config" for a run, "conductor" for a host.
+
+    Raises:
+        SettingError: an override names nothing, or is no override.
+    """
     # The caller may be a Hydra application, whose state is restored afterwards.
     shared = GlobalHydra.instance()
     theirs, shared.hydra = shared.hydra, None

@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from clear_strategies.bench import device, iteration, kernels, pareto, rasterizers
+from clear_strategies.bench import device, iteration, kernels, pareto, rasterizers, stereo
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
 from clear_strategies.errors import ClearError
@@ -110,6 +110,16 @@ def parser() -> argparse.ArgumentParser:
     names = [variant.name for variant in pareto.VARIANTS]
     ask.add_argument("--variants", nargs="+", default=names, metavar="NAME", help=f"default: {', '.join(names)}")
 
+    ask = questions.add_parser(
+        "stereo", parents=[common, out], help="error, coverage and seconds of the depth of the training photos"
+    )
+    ask.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="OVERRIDE",
+        help="the data set and its settings, as for a run (default: the demo)",
+    )
+
     ask = questions.add_parser("device", parents=[common, garden], help="all checks that need a GPU, into a folder")
     ask.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder for logs, tables and runs")
     ask.add_argument("--device", default="cuda", choices=["cpu", "cuda"], help="default: cuda")
@@ -125,7 +135,9 @@ def _measure(question: str, options: dict[str, Any], results: Results) -> None:
     elif question == "device":
         device.measure(results, device.Request(**options))
     else:
-        module: Any = {"rasterizers": rasterizers, "kernels": kernels, "iteration": iteration}[question]
+        module: Any = {"rasterizers": rasterizers, "kernels": kernels, "iteration": iteration, "stereo": stereo}[
+            question
+        ]
         module.measure(results, **{name: value for name, value in options.items() if name != "out"})
 
 

@@ -167,6 +167,12 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
     return pool, test
 
 
+def lr_photos(frames: Sequence[Frame], capture: Capture, views: ViewSettings) -> list[Photo]:
+    """The LR photos of these frames, without SR images."""
+    lr_files = check_headers(frames, views)
+    return [_view(frame, capture, views, Bicubic(), lr_files, required=True).lr for frame in frames]
+
+
 def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Path]:
     """Whether these frames can be prepared, as far as headers tell. No photo is decoded.
 

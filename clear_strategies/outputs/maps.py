@@ -7,7 +7,9 @@ Five maps per view, in [0, 1] at each HR pixel:
   together.  Eq. 7, 11
 - `conflict`: 1 where g_LR and g_HR of a Gaussian point apart, else 0.  Eq. 6
 
-The last two render the Gaussians over black with that number as their grey. The maps come from copies of the run's
+Where the cloud came from dense stereo, `depth.png` shows the depth of the view, see `depth_picture`.
+
+The last two of the five render the Gaussians over black with that number as their grey. The maps come from copies of the run's
 strategies; the run does not change.
 """
 
@@ -31,7 +33,9 @@ from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.scene import DepthMap
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.outputs.depth_picture import write_depth
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.strategies.p2g import P2G
@@ -70,13 +74,16 @@ def write_maps(
     rasterizer: Rasterizer,
     *,
     down: DownKernel = "bicubic",
+    depths: Mapping[str, DepthMap] | None = None,
 ) -> None:
     """Write maps.json and, for each view, a folder of 8-bit grey PNGs (value = 255 × number) with the LR photo and the prior
     beside them.
 
     Args:
         views: at least one. The other arguments are those of `view_maps`.
+        depths: of the views' surfaces, by the views' names; views without one get no depth.png.
     """
+    depths = depths or {}
     means: dict[str, Mapping[str, float]] = {}
     for view in views:
         found = view_maps(field, conductor, rasterizer, view, down=down)
@@ -84,6 +91,8 @@ def write_maps(
         own = folder / Path(view.name).stem
         for name, values in {**found.maps, "lr": view.lr.image, "prior": view.hr.image}.items():
             write_png(own / f"{name}.png", values)
+        if view.name in depths:
+            write_depth(own / "depth.png", view.lr, depths[view.name], f"{view.name}: depth by stereo")
     corrector = conductor.owner("correct")
     if corrector is None:
         _log.info("maps: no strategy of this run corrects, so there is no corrected.png.")

@@ -30,6 +30,16 @@ def test_rasterizers_writes_tables_figure_and_machine(tmp_path, capsys):
     assert "forward_ms" in capsys.readouterr().out
 
 
+def test_stereo_measures_the_demos_depth(tmp_path, capsys):
+    smaller = ["data.reader.width=160", "data.reader.height=120"]
+    assert main(["stereo", *smaller, "--out", str(tmp_path)]) == 0
+    table = pd.read_csv(tmp_path / "stereo.csv").set_index("view")
+    assert list(table.columns) == ["coverage", "points", "known", "within 3%", "within 10%"]
+    assert len(table) == 4
+    assert table.loc["all", "within 10%"] > 0.7
+    assert "depth in" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -38,6 +48,7 @@ def test_rasterizers_writes_tables_figure_and_machine(tmp_path, capsys):
         (["kernels", "--size", "9x9"], "9x9: must be WIDTHxHEIGHT"),
         (["iteration", "--scene", "nowhere"], "nowhere: is no scene"),
         (["pareto", "--variants", "magic"], "magic: is no variant"),
+        (["stereo", "data=nowhere"], "data=nowhere"),
         pytest.param(
             ["rasterizers", "--device", "cuda"],
             "no such device",

@@ -15,6 +15,7 @@ from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads, conflict_ratio
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import read_image
+from clear_strategies.data.scene import DepthMap
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs.maps import MAPS, view_maps, write_maps
@@ -168,6 +169,20 @@ def test_a_folder_of_maps_is_complete(tmp_path: Path) -> None:
         found = view_maps(state.field, state.conductor, toy.RASTERIZER, view).maps
         for name in MAPS:
             assert float((read_image(own / f"{name}.png")[..., 0] - found[name]).abs().max()) <= 0.5 / 255 + 1e-6
+
+
+def test_views_with_stereo_show_their_depth(tmp_path: Path) -> None:
+    state = trained()
+    view = state.views[0]
+    shape = view.lr.image.shape[:2]
+    depth = torch.rand(shape) + 1
+    depth[0] = torch.nan
+    found = DepthMap(depth, depth.isfinite().float() * 0.5)
+    nothing = DepthMap(torch.full(shape, torch.nan), torch.zeros(shape))
+    for maps in ({view.name: found}, {view.name: nothing}):
+        write_maps(tmp_path, state.views[:2], state.field, state.conductor, toy.RASTERIZER, depths=maps)
+        assert read_image(tmp_path / view.name / "depth.png").shape[1] > 500
+        assert not (tmp_path / state.views[1].name / "depth.png").exists()
 
 
 def test_without_a_strategy_that_corrects_there_is_no_corrected_map(

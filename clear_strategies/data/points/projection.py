@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rasterizers.interface import Camera
@@ -20,6 +20,12 @@ def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor,
     matrix = projection_matrix(camera)
     homogeneous = points.double() @ matrix[:, :3].T + matrix[:, 3]
     return homogeneous[:, :2] / homogeneous[:, 2:], homogeneous[:, 2]
+
+
+def inside_of(camera: Camera, pixels: Float[Tensor, "N 2"], depth: Float[Tensor, " N"]) -> Bool[Tensor, " N"]:
+    """Whether points that project to these pixels, at these depths, lie in the camera's image."""
+    size = torch.tensor([camera.width, camera.height])
+    return (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
 
 
 def back_project(camera: Camera, pixels: Float[Tensor, "G 2"], depth: Float[Tensor, " G"]) -> Float[Tensor, "G 3"]:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
-from clear_strategies.data.points.projection import back_project, project
+from clear_strategies.data.points.projection import back_project, inside_of, project
 from clear_strategies.data.scene import DepthMap
 
 
@@ -36,9 +36,9 @@ def points_of(
     return torch.cat(means), torch.cat(colors)
 
 
-def squares_of(photo: Photo, spacing: float) -> Int[Tensor, "h w"]:
+def squares_of(found: DepthMap, spacing: float) -> Int[Tensor, "h w"]:
     """The number of each pixel's square."""
-    width, height = photo.camera.width, photo.camera.height
+    height, width = found.depth.shape
     column, row = (((torch.arange(n) + 0.5) / spacing).long() for n in (width, height))
     return row[:, None] * (int(column[-1]) + 1) + column
 
@@ -47,10 +47,10 @@ def covered_squares(
     photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"], spacing: float, tolerance: float
 ) -> Bool[Tensor, " S"]:
     """Which squares hold the projection of a point that lies on the surface."""
-    square = squares_of(photo, spacing)
+    square = squares_of(found, spacing)
     covered = torch.zeros(int(square.max()) + 1, dtype=torch.bool)
     pixels, depth = project(photo.camera, points)
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < torch.tensor([photo.camera.width, photo.camera.height]))).all(1)
+    inside = inside_of(photo.camera, pixels, depth)
     x, y = pixels[inside].long().unbind(dim=1)
     same = (found.depth.cpu()[y, x] / depth[inside] - 1).abs() <= tolerance
     covered[square[y[same], x[same]]] = True
@@ -59,9 +59,7 @@ def covered_squares(
 
 def best_per_square(found: DepthMap, spacing: float, covered: Bool[Tensor, " S"]) -> Int[Tensor, " K"]:
     """The pixel of highest confidence in each square that has depth and is not covered."""
-    height, width = found.depth.shape
-    column, row = (((torch.arange(n) + 0.5) / spacing).long() for n in (width, height))
-    square = (row[:, None] * (int(column[-1]) + 1) + column).reshape(-1)
+    square = squares_of(found, spacing).reshape(-1)
     confidence = found.confidence.cpu().reshape(-1)
     free = torch.nonzero((confidence > 0) & ~covered[square])[:, 0]
     order = free[torch.argsort(confidence[free], descending=True, stable=True)]
@@ -74,7 +72,7 @@ def best_per_square(found: DepthMap, spacing: float, covered: Bool[Tensor, " S"]
 def shows(photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
     """Whether the photo has depth at the pixel of each point."""
     pixels, depth = project(photo.camera, points)
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < torch.tensor([photo.camera.width, photo.camera.height]))).all(1)
+    inside = inside_of(photo.camera, pixels, depth)
     result = torch.zeros(len(points), dtype=torch.bool)
     x, y = pixels[inside].long().unbind(dim=1)
     result[inside] = found.known.cpu()[y, x]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import Photo
 from clear_strategies.data.points.interpolation import interpolate_depth, pixel_grid
-from clear_strategies.data.points.projection import back_project, project, sample_colors
+from clear_strategies.data.points.projection import back_project, inside_of, project, sample_colors
 from clear_strategies.data.scene import DepthMap
 
 _NEARER = 0.95  # a filled point in front of this share of another photo's depth floats in free space
@@ -56,8 +56,7 @@ def fill(
 def floats(points: Float[Tensor, "N 3"], photo: Photo, found: DepthMap) -> Bool[Tensor, " N"]:
     """Whether the photo looks through the point at a surface behind it."""
     pixels, depth = project(photo.camera, points)
-    size = torch.tensor([photo.camera.width, photo.camera.height])
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
+    inside = inside_of(photo.camera, pixels, depth)
     result = torch.zeros(len(points), dtype=torch.bool)
     x, y = pixels[inside].long().unbind(dim=1)
     result[inside] = depth[inside] < _NEARER * found.depth.cpu()[y, x].double()

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
-from clear_strategies.data.points.projection import project
+from clear_strategies.data.points.projection import inside_of, project
 from clear_strategies.data.points.stereo.consistency import confirm
 from clear_strategies.data.points.stereo.depth import Estimate, estimate
 from clear_strategies.data.points.stereo.image import Grey, grey
@@ -104,7 +104,7 @@ def _judged(photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"], setting
     if found.coverage < settings.trust:
         return _unknown(photo, f"its depth is confirmed at only {found.coverage:.1%} of the pixels")
     pixels, depth = project(photo.camera, points)
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < torch.tensor([photo.camera.width, photo.camera.height]))).all(1)
+    inside = inside_of(photo.camera, pixels, depth)
     x, y = pixels[inside].long().unbind(dim=1)
     # An occluded point says nothing, so only points in front of the surface contradict it.
     ratio = found.depth.cpu()[y, x] / depth[inside]

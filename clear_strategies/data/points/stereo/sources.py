@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
-from clear_strategies.data.points.projection import back_project, project
+from clear_strategies.data.points.projection import back_project, inside_of, project
 from clear_strategies.data.points.random import common_box
 from rasterizers.interface import Camera
 
@@ -77,7 +77,7 @@ def plane_count(camera: Camera, others: Sequence[Camera], far: float, near: floa
 
 def _visible(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"]]:
     pixels, depth = project(camera, points)
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < torch.tensor([camera.width, camera.height]))).all(dim=1)
+    inside = inside_of(camera, pixels, depth)
     return points[inside].double(), depth[inside]
 
 
@@ -90,7 +90,7 @@ def _grid(camera: Camera, distance: float) -> Float[Tensor, "36 3"]:
 def _score(camera: Camera, other: Camera, points: Float[Tensor, "M 3"]) -> float:
     """The share of the points that both see, each weighted by how well its angle and its scales suit a comparison."""
     pixels, depth = project(other, points)
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < torch.tensor([other.width, other.height]))).all(dim=1)
+    inside = inside_of(other, pixels, depth)
     a, b = points - camera.center.double(), points - other.center.double()
     sine = torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=-1)
     angle = torch.rad2deg(torch.atan2(sine, (a * b).sum(-1)))

@@ -1,0 +1,97 @@
+"""How right the depth of the training photos is, how much of them it covers, and how long it takes.
+
+The reference is the demo's exact depth, or else the SfM points that a photo observes. These come from all photos, test views
+too; stereo does not see them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import pandas as pd
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from clear_strategies.bench.results import Results
+from clear_strategies.compose import composed, tree
+from clear_strategies.core.view import Photo
+from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.points.projection import inside_of, project
+from clear_strategies.data.points.sift import triangulate
+from clear_strategies.data.points.stereo.maps import depth_maps
+from clear_strategies.data.prepare import lr_photos, split
+from clear_strategies.data.readers import demo
+from clear_strategies.data.scene import DepthMap
+from clear_strategies.jobs.scene import DataSettings
+from clear_strategies.settings import build
+
+_CLOSE: Final = (0.03, 0.10)  # relative errors of depth whose shares the table gives
+
+
+def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
+    """Fill `results` with a row for each training photo, and one for all of them together.
+
+    Raises:
+        SettingError, DataError: the overrides, or the data, cannot be used.
+    """
+    data: DataSettings = build(tree(composed(list(overrides), "config"))["data"], "data")
+    capture = data.reader()
+    frames, _ = split(capture, data.views)
+    photos = lr_photos(frames, capture, data.views)
+    start = time.perf_counter()
+    features = triangulate(photos, data.cloud.triangulation)
+    triangulated = time.perf_counter()
+    maps = depth_maps(photos, features.means, data.cloud.stereo, capture.background)
+    end = time.perf_counter()
+    errors = [_errors(capture, *of_view) for of_view in zip(frames, photos, maps, strict=True)]
+    rows = [{"view": Path(f.name).stem, **_row(e, m)} for f, e, m in zip(frames, errors, maps, strict=True)]
+    known = torch.cat([error for error, _ in errors])
+    asked = sum(total for _, total in errors)
+    coverage = sum(m.coverage for m in maps) / len(maps)
+    rows.append({"view": "all", "coverage": coverage, **_shares(known, asked)})
+    results.tables["stereo"] = pd.DataFrame(rows)
+    size = f"{photos[0].camera.width}x{photos[0].camera.height}"
+    results.note(
+        f"{capture.name}, {len(photos)} photos, the first of {size}: depth in {end - triangulated:.1f} s after "
+        f"{triangulated - start:.1f} s for {len(features)} triangulated points, {torch.get_num_threads()} threads."
+    )
+    if asked == 0:
+        results.note("there is nothing to compare with: the scene has neither SfM points nor known depth.")
+
+
+def _row(errors: tuple[Float[Tensor, " K"], int], found: DepthMap) -> dict[str, float]:
+    return {"coverage": found.coverage, **_shares(*errors)}
+
+
+def _shares(known: Float[Tensor, " K"], asked: int) -> dict[str, float]:
+    """Reference points, the share of them where depth is known, and the shares of these within each relative error."""
+    result = {"points": float(asked), "known": len(known) / asked if asked else float("nan")}
+    for limit in _CLOSE:
+        result[f"within {limit:.0%}"] = float((known <= limit).double().mean())
+    return result
+
+
+def _errors(capture: Capture, frame: Frame, photo: Photo, found: DepthMap) -> tuple[Float[Tensor, " K"], int]:
+    """(|z / z_reference - 1| where the depth is known, the number of reference points)."""
+    pixels, depth = _reference(capture, frame, photo)
+    estimated = found.depth.cpu().double()[pixels[:, 1], pixels[:, 0]]
+    error = (estimated / depth - 1).abs()
+    return error[error.isfinite()], len(depth)
+
+
+def _reference(capture: Capture, frame: Frame, photo: Photo) -> tuple[Int[Tensor, "N 2"], Float[Tensor, " N"]]:
+    """(columns and rows, depth) of what is known of this photo."""
+    if capture.name == "demo":
+        exact = demo.depth(photo.camera).double()
+        row, column = torch.nonzero(exact.isfinite(), as_tuple=True)
+        return torch.stack((column, row), dim=1), exact[row, column]
+    if capture.points is None:
+        return torch.zeros(0, 2, dtype=torch.long), torch.zeros(0, dtype=torch.float64)
+    seen = torch.unique(capture.points.track_point[capture.points.track_image == frame.sfm_id])
+    pixels, depth = project(photo.camera, capture.points.means[seen])
+    inside = inside_of(photo.camera, pixels, depth)
+    return pixels[inside].long(), depth[inside]

@@ -1,0 +1,90 @@
+"""Points from depth maps: their spacing, what several photos see, and what fills the rest."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from clear_strategies.core.view import Photo
+from clear_strategies.data.points import CloudSettings, StereoSettings, initial_points
+from clear_strategies.data.points.stereo.cloud import points_of
+from clear_strategies.data.points.stereo.filling import fill, floats
+from clear_strategies.data.scene import DepthMap
+from clear_strategies.errors import DataError, SettingError
+from tests.helpers.planes import photo, plane_photos
+
+
+def flat(view: Photo, depth: float) -> DepthMap:
+    shape = view.image.shape[:2]
+    return DepthMap(torch.full(shape, depth), torch.ones(shape))
+
+
+def unknown(view: Photo) -> DepthMap:
+    shape = view.image.shape[:2]
+    return DepthMap(torch.full(shape, torch.nan), torch.zeros(shape))
+
+
+@pytest.mark.parametrize(("spacing", "count"), [(1.0, 1600), (2.0, 400), (1.6, 625)])
+def test_there_is_one_point_per_square(spacing: float, count: int) -> None:
+    view = photo()
+    means, colors = points_of([view], [flat(view, 5.0)], spacing, 0.02)
+    assert len(means) == len(colors) == count
+    assert torch.allclose(means[:, 2], torch.tensor(5.0))
+
+
+def test_what_two_photos_see_gets_its_points_once() -> None:
+    views = [photo(), photo()]
+    assert len(points_of(views, [flat(v, 5.0) for v in views], 2.0, 0.02)[0]) == 400
+    apart = [flat(views[0], 5.0), flat(views[1], 6.0)]
+    assert len(points_of(views, apart, 2.0, 0.02)[0]) == 800
+
+
+def test_the_most_confident_pixel_of_a_square_is_taken() -> None:
+    view = photo()
+    found = flat(view, 5.0)
+    found.confidence[:] = 0.5
+    found.depth[1::2, 1::2] = 7.0
+    found.confidence[1::2, 1::2] = 0.6
+    assert (points_of([view], [found], 2.0, 0.02)[0][:, 2] == 7).all()
+
+
+def test_a_point_in_front_of_another_photos_depth_floats() -> None:
+    view = photo()
+    points = torch.tensor([[0.0, 0, 3], [0, 0, 4.9], [0, 0, 7], [9, 9, 3]])
+    assert floats(points, view, flat(view, 5.0)).tolist() == [True, False, False, False]
+
+
+def test_only_unknown_pixels_are_filled_and_never_in_known_free_space() -> None:
+    views = [photo(), photo(0.1)]
+    samples = torch.cat((torch.rand(60, 2) - 0.5, torch.full((60, 1), 3.0)), dim=1)
+    assert len(fill(samples, views, [flat(v, 5.0) for v in views], 2)[0]) == 0
+    assert len(fill(samples, views, [unknown(v) for v in views], 2)[0]) == 800
+    seen = fill(samples, views, [unknown(views[0]), flat(views[1], 5.0)], 2)[0]
+    assert len(seen) < 100
+
+
+def test_auto_takes_stereo_keeps_its_depth_and_says_how_much_is_known(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    found = initial_points(CloudSettings(), plane_photos(3))
+    assert len(found.depths) == 3
+    assert "dense stereo between the 3 training LR images (depth known at" in found.cloud.source
+    assert "init: auto chose" in caplog.text
+    assert ((found.cloud.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.95
+
+
+def test_other_clouds_have_no_depth() -> None:
+    assert initial_points(CloudSettings(init="triangulated"), plane_photos(2)).depths == ()
+
+
+def test_stereo_does_not_fall_back_when_asked_for() -> None:
+    views = [photo(0.0), photo(0.0)]
+    with pytest.raises(DataError, match="stereo confirms no depth in any of the 2 training LR images"):
+        initial_points(CloudSettings(init="stereo"), views)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("window", 4), ("spacing", 0.5), ("trust", 2), ("sources", 0), ("tolerance", 0)]
+)
+def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
+    with pytest.raises(SettingError, match=f"data.cloud.stereo.{name}"):
+        StereoSettings(**{name: value})

@@ -1,0 +1,135 @@
+"""Depth maps: right on surfaces that are known, unknown where nothing tells depth, the same bits every time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from clear_strategies.core.view import Photo
+from clear_strategies.data.points.stereo.maps import depth_maps
+from clear_strategies.data.points.stereo.settings import StereoSettings
+from clear_strategies.data.scene import DepthMap
+from tests.helpers.textured import Surface, bump, camera, cast, slanted
+
+NONE = torch.zeros(0, 3)
+
+
+def photos_of(surface: Surface, count: int = 3, size: tuple[int, int] = (64, 48)) -> list[Photo]:
+    return [cast(surface, camera(0.4 * i - 0.4, 4 * (i - 1), size))[0] for i in range(count)]
+
+
+def same(a: list[DepthMap], b: list[DepthMap]) -> bool:
+    return all(
+        torch.equal(x.depth.nan_to_num(-1), y.depth.nan_to_num(-1)) and torch.equal(x.confidence, y.confidence)
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+@pytest.mark.parametrize("surface", [slanted, bump])
+def test_depth_of_a_known_surface_is_found_from_the_cameras_alone(surface: Surface) -> None:
+    for i, found in enumerate(depth_maps(photos_of(surface), NONE)):
+        exact = cast(surface, camera(0.4 * i - 0.4, 4 * (i - 1)))[1]
+        error = (found.depth / exact - 1).abs()[found.known]
+        assert found.coverage > 0.5
+        assert error.median() < 0.012
+        assert (error < 0.03).float().mean() > 0.97
+
+
+def test_unknown_is_nan_with_confidence_0_and_confidence_lies_in_0_to_1() -> None:
+    for found in depth_maps(photos_of(slanted), NONE):
+        assert torch.equal(found.depth.isnan(), ~found.known)
+        assert float(found.confidence.min()) >= 0
+        assert float(found.confidence.max()) <= 1
+        assert (found.depth[found.known] > 0).all()
+
+
+def test_two_views_are_enough() -> None:
+    assert all(found.coverage > 0.4 for found in depth_maps(photos_of(slanted, 2), NONE))
+
+
+def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
+    photos, threads = photos_of(bump, 2, (200, 170)), torch.get_num_threads()
+    settings = StereoSettings(max_planes=8)
+    found = []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            found.append(depth_maps(photos, NONE, settings))
+    finally:
+        torch.set_num_threads(threads)
+    assert found[0][0].coverage > 0
+    assert same(*found)
+
+
+def test_photos_may_have_different_odd_sizes() -> None:
+    sizes = [(64, 48), (51, 37), (90, 75)]
+    photos = [cast(slanted, camera(0.4 * i - 0.4, 4 * (i - 1), size))[0] for i, size in enumerate(sizes)]
+    for photo, found in zip(photos, depth_maps(photos, NONE), strict=True):
+        assert found.depth.shape == photo.image.shape[:2]
+        assert found.coverage > 0.3
+
+
+@pytest.mark.parametrize("changed", [{"enlarge": 2}, {"max_pixels": 800}])
+def test_compared_images_may_be_larger_or_smaller_than_the_photos(changed: dict[str, int]) -> None:
+    photos = photos_of(slanted, size=(65, 49))
+    for i, found in enumerate(depth_maps(photos, NONE, StereoSettings(**changed))):
+        exact = cast(slanted, camera(0.4 * i - 0.4, 4 * (i - 1), (65, 49)))[1]
+        assert found.depth.shape == exact.shape
+        assert found.coverage > 0.3
+        assert (found.depth / exact - 1).abs()[found.known].median() < 0.02
+
+
+def test_a_textureless_photo_has_no_depth_and_the_log_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    flat = [replace(p, image=torch.full_like(p.image, 0.5)) for p in photos_of(slanted)]
+    assert all(found.coverage == 0 for found in depth_maps(flat, NONE))
+    assert "confirmed at only 0.0% of the pixels" in caplog.text
+
+
+def test_photos_from_one_place_have_no_depth(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    photos = [cast(slanted, camera(0.0, degrees))[0] for degrees in (-5, 0, 5)]
+    assert all(found.coverage == 0 for found in depth_maps(photos, NONE))
+    assert "no other photo sees the same surfaces" in caplog.text
+
+
+def test_photos_60_degrees_apart_are_not_compared() -> None:
+    # Both look at (0, 0, 4).
+    photos = [cast(slanted, camera(side * 2.31, -side * 30.0))[0] for side in (-1, 1)]
+    points = torch.rand(50, 3) * 0.2 + torch.tensor([-0.1, -0.1, 3.9])
+    assert all(found.coverage == 0 for found in depth_maps(photos, points))
+
+
+def test_a_photo_whose_stereo_fails_does_not_spoil_the_others() -> None:
+    photos = photos_of(slanted)
+    photos[2] = replace(photos[2], image=torch.full_like(photos[2].image, 0.5))
+    first, second, third = depth_maps(photos, NONE)
+    assert first.coverage > 0.3
+    assert second.coverage > 0.3
+    assert third.coverage == 0
+
+
+def test_depth_behind_most_triangulated_points_is_not_trusted(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    photos = photos_of(slanted)
+    near = torch.cat((torch.rand(40, 2) - 0.5, torch.full((40, 1), 2.5)), dim=1)
+    far = torch.cat((torch.rand(40, 2) - 0.5, torch.full((40, 1), 6.0)), dim=1)
+    assert depth_maps(photos, torch.cat((near, far[:5])))[1].coverage == 0
+    assert "triangulated points lie in front of its depth" in caplog.text
+
+
+def test_pixels_of_the_background_have_no_depth() -> None:
+    photos = photos_of(slanted)
+    images = [p.image.clone() for p in photos]
+    for image in images:
+        image[:10] = 1.0
+    found = depth_maps([replace(p, image=i) for p, i in zip(photos, images, strict=True)], NONE, None, (1.0, 1.0, 1.0))
+    assert all(not m.known[:10].any() for m in found)
+    assert all(m.coverage > 0.3 for m in found)
+
+
+def test_photos_of_a_few_pixels_do_not_fail() -> None:
+    tiny = [cast(slanted, camera(0.3 * i, 0, (3, 2)))[0] for i in range(2)]
+    assert [m.depth.shape for m in depth_maps(tiny, NONE)] == [(2, 3), (2, 3)]
