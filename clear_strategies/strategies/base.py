@@ -72,7 +72,7 @@ class Strategy:
         raise NotImplementedError
 
     def route(self, evidence: Evidence | None) -> Float[Tensor, " N"]:
-        """How much of its high-frequency gradient does each Gaussian get? m in [0, 1].  Eq. 12"""
+        """How much of its high-frequency gradient does each Gaussian get? m >= 0.  Eq. 12"""
         raise NotImplementedError
 
     def correct(self, lr: Grads, hr: Grads, evidence: Evidence | None) -> Grads:

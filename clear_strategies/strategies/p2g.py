@@ -37,6 +37,8 @@ class P2G(Strategy):
         reliability_scale: τ_r > 0, the mean |D(I_HR) - I_LR| (images in [0, 1]) at which R falls to 1/e; "relative:k" is k
             times the view's own mean, so that R covers its range whatever the prior is.
         floor: q_min in [0, 1], the share of its high-frequency gradient that every Gaussian keeps.
+        normalize: divide m by its mean over the visible Gaussians. Detail then moves to where it is reliable and needed;
+            as printed, m <= 1 only ever takes detail away, 60 % of it on average (F25).
         patch: edge of a patch in LR pixels; in HR pixels it is that times the SR factor.
         down, up: D and U. D should be the operator that made the LR images (F21).
         lookup: "nearest" patch of the projected centre, or "bilinear" between patches (F24).
@@ -51,6 +53,7 @@ class P2G(Strategy):
 
     reliability_scale: float | str = 0.05
     floor: float = 0.25
+    normalize: bool = True
     patch: int = 16
     down: DownKernel = "bicubic"
     up: UpKernel = "bicubic"
@@ -84,10 +87,15 @@ class P2G(Strategy):
         return Evidence(q, a)
 
     def route(self, evidence: Evidence | None) -> Float[Tensor, " N"]:
-        """m_i = q_min + (1 - q_min) w_i."""
+        """m_i = q_min + (1 - q_min) w_i, over its mean where `normalize`; undefined for invisible Gaussians."""
         if evidence is None:
             raise ValueError("P2G routes by evidence, but there is none for this view; call P2G.observe first.")
-        return self.floor + (1 - self.floor) * evidence.weight  # Eq. 12
+        m = self.floor + (1 - self.floor) * evidence.weight  # Eq. 12
+        if not self.normalize:
+            return m
+        visible = evidence.reliability > 0
+        mean = (m * visible).sum() / visible.sum().clamp_min(1)
+        return m / mean.clamp_min(torch.finfo(m.dtype).tiny)
 
     def score(self, evidence: Evidence | None, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
         """S_i = w_i ‖∇_u L_HF‖, alone or joined with the ordinary statistic; None (ordinary) where λ_HF = 0."""

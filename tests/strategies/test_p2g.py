@@ -83,9 +83,21 @@ def test_lifting_takes_the_patch_of_the_centre_and_the_border_outside():
 
 @given(q=st.floats(0, 1, width=32), a=st.floats(0, 1, width=32), floor=st.floats(0, 1))
 @settings(max_examples=50, deadline=None)
-def test_routing_lies_between_the_floor_and_one(q, a, floor):
-    m = P2G(floor=floor).route(Evidence(torch.tensor([q]), torch.tensor([a])))
+def test_routing_as_printed_lies_between_the_floor_and_one(q, a, floor):
+    m = P2G(floor=floor, normalize=False).route(Evidence(torch.tensor([q]), torch.tensor([a])))
     assert float(m) == pytest.approx(floor + (1 - floor) * q * a, rel=1e-5, abs=1e-6)
+
+
+def test_normalized_routing_moves_detail_and_removes_none():
+    q, a = torch.tensor([1.0, 1.0, 0.5, 0.0]), torch.tensor([1.0, 0.2, 0.4, 0.0])  # the last one is invisible
+    printed, m = (P2G(normalize=normalize).route(Evidence(q, a)) for normalize in (False, True))
+    assert float(m[:3].mean()) == pytest.approx(1)
+    assert torch.allclose(m[:3] / m[0], printed[:3] / printed[0])
+
+
+def test_normalized_routing_of_no_visible_gaussian_is_finite():
+    assert bool(P2G().route(Evidence(torch.zeros(3), torch.zeros(3))).isfinite().all())
+    assert bool(P2G(floor=0).route(Evidence(torch.ones(3), torch.zeros(3))).isfinite().all())
 
 
 def test_observation_is_made_once_a_view_and_invisible_gaussians_have_none(caplog):
