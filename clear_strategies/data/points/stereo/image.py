@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import torch
 from jaxtyping import Float
@@ -11,6 +12,8 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.view import Photo
 from rasterizers.interface import Camera
+
+_ENLARGED: Final = 64_000  # the most pixels of an enlarged photo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +47,7 @@ def grey(photo: Photo, enlarge: int, max_pixels: int) -> Grey:
             camera.world_to_camera, camera.fx, camera.fy, camera.cx, camera.cy, image.shape[1], image.shape[0]
         )
         image, camera = images.downsample(image, reduce, "area"), camera.scaled(1 / reduce)
-    elif enlarge > 1 and camera.width * camera.height * enlarge**2 <= max_pixels:
+    elif enlarge > 1 and camera.width * camera.height * enlarge**2 <= min(_ENLARGED, max_pixels):
         image, camera = images.upsample(image, enlarge), camera.scaled(enlarge)
     r, g, b = image.float().unbind(dim=-1)
     return Grey(camera, (r + g + b) / 3)

@@ -21,7 +21,7 @@ from clear_strategies.data.scene import DepthMap
 
 _log = logging.getLogger(__name__)
 
-_MANY_PHOTOS = 6  # from here on, two others must agree
+_MANY_PHOTOS = 12  # from here on, two others must agree
 _ASKED = 8  # the most photos that are asked to confirm one
 _BACKGROUND = 2 / 255  # largest difference of a background pixel from the background's colour
 _FEW_POINTS = 10  # triangulated points in a photo below which they do not judge its depth

@@ -12,7 +12,8 @@ class StereoSettings:
     """How the depth of the training photos is found, and which of it becomes points.
 
     Args:
-        enlarge: factor by which photos are enlarged (bicubic) before they are compared.
+        enlarge: factor by which photos are enlarged (bicubic) before they are compared, if that makes at most 64,000
+            pixels: small photos gain most, large ones would take minutes.
         max_pixels: larger photos are first reduced by a whole factor, so that time and memory are bounded.
         sources: the most photos that one photo is compared with.
         plane_step: largest shift in a source photo between neighbouring depth planes, pixels of the compared images.
@@ -23,7 +24,7 @@ class StereoSettings:
         min_correlation: of the windows at the depth that was found, in [0, 1]; a lower one is no evidence.
         tolerance: largest relative difference between the depths that two photos find of one point.
         reprojection: largest distance of a pixel from itself after going to the other photo and back, LR px.
-        agreeing: other photos whose depth must agree; None: 2 where there are at least 6 photos, else 1.
+        agreeing: other photos whose depth must agree; None: 2 where there are at least 12 photos, else 1.
         spacing: distance of the points on the surface, LR px of the photo that sees them.
         trust: a photo is used whose stereo covers at least this share of its pixels.
 
@@ -31,7 +32,7 @@ class StereoSettings:
         SettingError: a number is outside its range.
     """
 
-    enlarge: int = 1
+    enlarge: int = 2
     max_pixels: int = 250_000
     sources: int = 4
     plane_step: float = 0.75
