@@ -14,6 +14,7 @@ from clear_strategies.data.scene import DepthMap
 from tests.helpers.textured import Surface, bump, camera, cast, slanted
 
 NONE = torch.zeros(0, 3)
+QUICK = StereoSettings(enlarge=1, max_planes=64)
 
 
 def photos_of(surface: Surface, count: int = 3, size: tuple[int, int] = (64, 48)) -> list[Photo]:
@@ -29,7 +30,7 @@ def same(a: list[DepthMap], b: list[DepthMap]) -> bool:
 
 @pytest.mark.parametrize("surface", [slanted, bump])
 def test_depth_of_a_known_surface_is_found_from_the_cameras_alone(surface: Surface) -> None:
-    for i, found in enumerate(depth_maps(photos_of(surface), NONE)):
+    for i, found in enumerate(depth_maps(photos_of(surface), NONE, QUICK)):
         exact = cast(surface, camera(0.4 * i - 0.4, 4 * (i - 1)))[1]
         error = (found.depth / exact - 1).abs()[found.known]
         assert found.coverage > 0.5
@@ -38,7 +39,7 @@ def test_depth_of_a_known_surface_is_found_from_the_cameras_alone(surface: Surfa
 
 
 def test_unknown_is_nan_with_confidence_0_and_confidence_lies_in_0_to_1() -> None:
-    for found in depth_maps(photos_of(slanted), NONE):
+    for found in depth_maps(photos_of(slanted), NONE, QUICK):
         assert torch.equal(found.depth.isnan(), ~found.known)
         assert float(found.confidence.min()) >= 0
         assert float(found.confidence.max()) <= 1
@@ -46,7 +47,7 @@ def test_unknown_is_nan_with_confidence_0_and_confidence_lies_in_0_to_1() -> Non
 
 
 def test_two_views_are_enough() -> None:
-    assert all(found.coverage > 0.4 for found in depth_maps(photos_of(slanted, 2), NONE))
+    assert all(found.coverage > 0.4 for found in depth_maps(photos_of(slanted, 2), NONE, QUICK))
 
 
 def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
@@ -66,12 +67,12 @@ def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
 def test_photos_may_have_different_odd_sizes() -> None:
     sizes = [(64, 48), (51, 37), (90, 75)]
     photos = [cast(slanted, camera(0.4 * i - 0.4, 4 * (i - 1), size))[0] for i, size in enumerate(sizes)]
-    for photo, found in zip(photos, depth_maps(photos, NONE), strict=True):
+    for photo, found in zip(photos, depth_maps(photos, NONE, QUICK), strict=True):
         assert found.depth.shape == photo.image.shape[:2]
         assert found.coverage > 0.3
 
 
-@pytest.mark.parametrize("changed", [{"enlarge": 1}, {"max_pixels": 800}])
+@pytest.mark.parametrize("changed", [{"enlarge": 2, "max_planes": 48}, {"max_pixels": 800}])
 def test_compared_images_may_be_larger_or_smaller_than_the_photos(changed: dict[str, int]) -> None:
     photos = photos_of(slanted, size=(65, 49))
     for i, found in enumerate(depth_maps(photos, NONE, StereoSettings(**changed))):
@@ -84,14 +85,14 @@ def test_compared_images_may_be_larger_or_smaller_than_the_photos(changed: dict[
 def test_a_textureless_photo_has_no_depth_and_the_log_says_so(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     flat = [replace(p, image=torch.full_like(p.image, 0.5)) for p in photos_of(slanted)]
-    assert all(found.coverage == 0 for found in depth_maps(flat, NONE))
+    assert all(found.coverage == 0 for found in depth_maps(flat, NONE, QUICK))
     assert "confirmed at only 0.0% of the pixels" in caplog.text
 
 
 def test_photos_from_one_place_have_no_depth(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     photos = [cast(slanted, camera(0.0, degrees))[0] for degrees in (-5, 0, 5)]
-    assert all(found.coverage == 0 for found in depth_maps(photos, NONE))
+    assert all(found.coverage == 0 for found in depth_maps(photos, NONE, QUICK))
     assert "no other photo sees the same surfaces" in caplog.text
 
 
@@ -99,13 +100,13 @@ def test_photos_60_degrees_apart_are_not_compared() -> None:
     # Both look at (0, 0, 4).
     photos = [cast(slanted, camera(side * 2.31, -side * 30.0))[0] for side in (-1, 1)]
     points = torch.rand(50, 3) * 0.2 + torch.tensor([-0.1, -0.1, 3.9])
-    assert all(found.coverage == 0 for found in depth_maps(photos, points))
+    assert all(found.coverage == 0 for found in depth_maps(photos, points, QUICK))
 
 
 def test_a_photo_whose_stereo_fails_does_not_spoil_the_others() -> None:
     photos = photos_of(slanted)
     photos[2] = replace(photos[2], image=torch.full_like(photos[2].image, 0.5))
-    first, second, third = depth_maps(photos, NONE)
+    first, second, third = depth_maps(photos, NONE, QUICK)
     assert first.coverage > 0.3
     assert second.coverage > 0.3
     assert third.coverage == 0
@@ -116,7 +117,7 @@ def test_depth_behind_most_triangulated_points_is_not_trusted(caplog: pytest.Log
     photos = photos_of(slanted)
     near = torch.cat((torch.rand(40, 2) - 0.5, torch.full((40, 1), 2.5)), dim=1)
     far = torch.cat((torch.rand(40, 2) - 0.5, torch.full((40, 1), 6.0)), dim=1)
-    assert depth_maps(photos, torch.cat((near, far[:5])))[1].coverage == 0
+    assert depth_maps(photos, torch.cat((near, far[:5])), QUICK)[1].coverage == 0
     assert "triangulated points lie in front of its depth" in caplog.text
 
 
@@ -125,11 +126,11 @@ def test_pixels_of_the_background_have_no_depth() -> None:
     images = [p.image.clone() for p in photos]
     for image in images:
         image[:10] = 1.0
-    found = depth_maps([replace(p, image=i) for p, i in zip(photos, images, strict=True)], NONE, None, (1.0, 1.0, 1.0))
+    found = depth_maps([replace(p, image=i) for p, i in zip(photos, images, strict=True)], NONE, QUICK, (1.0, 1.0, 1.0))
     assert all(not m.known[:10].any() for m in found)
     assert all(m.coverage > 0.3 for m in found)
 
 
 def test_photos_of_a_few_pixels_do_not_fail() -> None:
     tiny = [cast(slanted, camera(0.3 * i, 0, (3, 2)))[0] for i in range(2)]
-    assert [m.depth.shape for m in depth_maps(tiny, NONE)] == [(2, 3), (2, 3)]
+    assert [m.depth.shape for m in depth_maps(tiny, NONE, QUICK)] == [(2, 3), (2, 3)]
