@@ -91,7 +91,7 @@ def test_clear_on_the_command_line_is_clear_in_python():
         assert theirs.statistics_from == ours.statistics_from
     kinds = {"optim": run.optim, "mip": run.mip, "fit": run.fit, "views": run.data.views, "cloud": run.data.cloud}
     assert {k: v for k, v in kinds.items() if k != "fit"} == {k: type(v)() for k, v in kinds.items() if k != "fit"}
-    assert run.fit == job.RunSettings(iterations=1_200, baseline=True)  # the demo's
+    assert run.fit == job.RunSettings(iterations=900, baseline=True)  # the demo's
 
 
 def test_the_two_sets_of_readings_differ_where_they_say():
