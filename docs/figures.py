@@ -1,6 +1,6 @@
 """The pictures of the documentation.
 
-`python docs/figures.py` draws those of docs/explanation/evidence.md from its CSV files. `python docs/figures.py demo` trains
+`python docs/figures.py` draws those of docs/explanation/evidence-sparse.md from its CSV files. `python docs/figures.py demo` trains
 the demo, as the README's first command does, and makes its contact sheet the README's picture, docs/images/demo.png; further
 words are overrides of the run.
 """

@@ -432,15 +432,15 @@ def test_the_table_of_hooks_shows_the_hooks_of_a_strategy():
 def test_pictures_are_drawn_from_the_tables(tmp_path):
     figures = loaded(DOCS / "figures.py")
     figures.main(tmp_path)
-    page = (DOCS / "explanation" / "evidence.md").read_text()
+    page = (DOCS / "explanation" / "evidence-sparse.md").read_text()
     named = set(re.findall(r"images/(evidence_\w+\.svg)", page))
     assert named == {path.name for path in tmp_path.iterdir()}
     assert all((DOCS / "images" / picture).exists() for picture in named)
 
 
 def test_numbers_of_a_summary_are_those_of_its_table():
-    """Every row of a small table on the evidence page stands in the CSV file that is linked below it."""
-    page = (DOCS / "explanation" / "evidence.md").read_text()
+    """Every row of a small table on the evidence pages stands in the CSV file that is linked below it."""
+    page = "".join((DOCS / "explanation" / name).read_text() for name in ("evidence.md", "evidence-sparse.md"))
     checked = 0
     for section in page.split("\n## ")[1:]:
         table = re.search(r"^\|.*\n\|[-|]+\|\n((?:\|.*\n)+)", section, re.MULTILINE)

@@ -2,7 +2,7 @@
 
 Exact skips (rows that do not move, tiles that are not requested, HR while λ_HR = 0) are always on, because they change
 nothing. The skips here change the result a little. Each is a setting whose default was chosen by measurement
-(docs/explanation/evidence.md); the plan lists those that are on, and the work log counts the iterations and tiles skipped.
+(docs/explanation/evidence-sparse.md); the plan lists those that are on, and the work log counts the iterations and tiles skipped.
 """
 
 from __future__ import annotations

