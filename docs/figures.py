@@ -1,8 +1,8 @@
 """The pictures of the documentation.
 
-`python docs/figures.py` draws those of docs/explanation/evidence-sparse.md from its CSV files. `python docs/figures.py demo` trains
-the demo, as the README's first command does, and makes its contact sheet the README's picture, docs/images/demo.png; further
-words are overrides of the run.
+`python docs/figures.py` draws those of docs/explanation/evidence-sparse.md from its CSV files. `python docs/figures.py demo`
+trains the demo, as the README's first command does, and makes its contact sheet the README's picture, docs/images/demo.png;
+further words are overrides of the run.
 """
 
 from __future__ import annotations

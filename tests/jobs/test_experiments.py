@@ -133,7 +133,7 @@ def test_what_the_methods_are():
             c.mip.variance,
             c.mip.cameras,
         )
-        assert all(c.strategies[s].anchor_strength == 0 for s in c.strategies if s == "svs")
+        assert all((c.strategies[s].anchor_strength, c.strategies[s].looks) == (0, 0) for s in c.strategies if s == "svs")
         assert ("svs" in c.strategies) == name.startswith("dropgaussian")
         assert ("splatsure" in c.strategies) == name.endswith("splatsure")
     mip, on_lr, on_hr = (0.1, 0.2, "lr"), (0.0, 1.0, "lr"), (0.1, 0.2, "hr")
@@ -191,6 +191,7 @@ EVIDENCE = {
     "evidence_corrupted": (5 * 3 * 4, "Corrupted"),
     "evidence_baselines": (5 * 8, "Onnx"),
     "evidence_skips": (4 * 3 * 2, "Onnx"),
+    "evidence_geometry": (5 * 3 * 2 * 2, "AutoPrior"),
 }
 
 
@@ -205,7 +206,8 @@ def test_the_evidence_differs_in_what_it_sweeps_alone(experiment):
         assert c.prior._target_.endswith(prior)
         assert c.data.path == f"here/{job['+scene']}"
         assert c.fit.resume == "auto"
-        assert (c.skips.coarse_until == 0) == (job.get("skips", "none") == "none")
+        skips = job.get("skips", "measured" if experiment == "evidence_geometry" else "none")
+        assert (c.skips.coarse_until == 0) == (skips == "none")
         pieces(c)
 
 
