@@ -133,7 +133,9 @@ def test_what_the_methods_are():
             c.mip.variance,
             c.mip.cameras,
         )
-        assert all((c.strategies[s].anchor_strength, c.strategies[s].looks) == (0, 0) for s in c.strategies if s == "svs")
+        assert all(
+            (c.strategies[s].anchor_strength, c.strategies[s].looks) == (0, 0) for s in c.strategies if s == "svs"
+        )
         assert ("svs" in c.strategies) == name.startswith("dropgaussian")
         assert ("splatsure" in c.strategies) == name.endswith("splatsure")
     mip, on_lr, on_hr = (0.1, 0.2, "lr"), (0.0, 1.0, "lr"), (0.1, 0.2, "hr")
