@@ -8,8 +8,10 @@ Results have the same bits for any number of threads and any memory budget.
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Final
 
 import torch
@@ -32,7 +34,6 @@ _TRAITS: Final = Traits(
     native_threads=True,
 )
 _BLOCK: Final = 4  # px, the block that the kernels blend at once; tiles are a multiple of it
-_FRAMES: Final = {torch.float32: "Frame32", torch.float64: "Frame64"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +82,11 @@ class CppRasterizer(RasterSettings):
         return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
 
 
+def _kernels(dtype: torch.dtype) -> ModuleType:
+    """The module for this processor; in float64, which is for checks, one module serves all processors."""
+    return load_kernels(__name__) if dtype == torch.float32 else importlib.import_module(f"{__name__}._float64")
+
+
 class _Frame:
     """One projection for several pixel grids: the native frame, and the tensors that its VJP reads again."""
 
@@ -97,7 +103,7 @@ class _Frame:
                 require_tiles(mask, view.width, view.height, settings.tile)
         n, like = len(splats), splats.means
         dtype = like.dtype
-        if dtype not in _FRAMES or like.device.type != "cpu":
+        if dtype not in _TRAITS.dtypes or like.device.type != "cpu":
             raise TypeError(f"the cpp rasterizer draws float32 and float64 on the CPU, got {dtype} on {like.device}.")
         self.settings = settings
         self.threads = settings.threads if settings.threads is not None else threads()
@@ -107,7 +113,7 @@ class _Frame:
         # Referenced here because the native frame does not keep them alive.
         self.opacities = [job.opacities.detach().contiguous() for job, _ in jobs]
         self.offsets = [None if job.rgb_offset is None else job.rgb_offset.detach().contiguous() for job, _ in jobs]
-        self.native = getattr(load_kernels(__name__), _FRAMES[dtype])(
+        self.native = _kernels(dtype).Frame(
             kernel=settings.kernel,
             near=settings.near,
             alpha_min=settings.alpha_min,

@@ -8,7 +8,7 @@
 #include "isa.hpp"
 
 NB_MODULE(CLEAR_MODULE, m) {
-  m.attr("isa") = CLEAR_ISA;
+  m.attr("isa") = CLEAR_NAME;
   m.def("instruction_sets", &clear::instruction_sets);
   clear::bind_losses(m);
   clear::bind_step(m);

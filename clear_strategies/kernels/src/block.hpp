@@ -3,7 +3,7 @@
 
 #include <cstdint>
 
-#include "simd.hpp"
+#include "rows.hpp"
 
 namespace clear {
 
@@ -53,20 +53,6 @@ CLEAR_INLINE Floats multiply_add(const Floats& a, const Floats& b, const Floats&
   return out;
 #else
   return a * b + c;
-#endif
-}
-
-// Lane i = table[indices[i]], indices in 0 … 15.
-CLEAR_INLINE Floats pick(const Floats& table, const std::int32_t* indices) {
-#if defined(__AVX512F__)
-  Floats out;
-  out.r[0] = (Floats::Register)_mm512_permutexvar_ps(_mm512_loadu_si512(indices), (__m512)table.r[0]);
-  return out;
-#else
-  float a[kLanes], b[kLanes];
-  table.store(a);
-  for (int i = 0; i < kLanes; ++i) b[i] = a[indices[i]];
-  return Floats::load(b);
 #endif
 }
 

@@ -1,4 +1,4 @@
-// Python bindings: `Frame` in float32 and in float64. Checks shapes and types and releases the GIL; no arithmetic.
+// Python bindings: `Frame`, in float32 or in float64. Checks shapes and types and releases the GIL; no arithmetic.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -52,9 +52,9 @@ nb::ndarray<nb::pytorch, T> empty(const std::vector<std::size_t>& shape) {
 }
 
 template <class T>
-void bind_frame(nb::module_& m, const char* name) {
+void bind_frame(nb::module_& m) {
   using F = Frame<T>;
-  nb::class_<F>(m, name)
+  nb::class_<F>(m, "Frame")
       .def(
           "__init__",
           [](F* self, double kernel, double near, double alpha_min, double alpha_max, double transmittance_min,
@@ -142,9 +142,12 @@ void bind_frame(nb::module_& m, const char* name) {
 }  // namespace clear
 
 NB_MODULE(CLEAR_MODULE, m) {
-  m.attr("isa") = CLEAR_ISA;
+  m.attr("isa") = CLEAR_NAME;
   m.def("instruction_sets", &clear::instruction_sets);
   nb::exception<clear::OverBudget>(m, "OverBudget", PyExc_MemoryError);
-  clear::bind_frame<float>(m, "Frame32");
-  clear::bind_frame<double>(m, "Frame64");
+#if defined(CLEAR_DOUBLE)
+  clear::bind_frame<double>(m);
+#else
+  clear::bind_frame<float>(m);
+#endif
 }

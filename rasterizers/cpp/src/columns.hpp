@@ -3,6 +3,7 @@
 
 #include <algorithm>
 
+#include "rows.hpp"
 #include "types.hpp"
 
 namespace clear {

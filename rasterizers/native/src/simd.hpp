@@ -15,8 +15,13 @@ namespace clear {
 
 inline constexpr int kLanes = 16;
 
+#if defined(CLEAR_DOUBLE)
+#define CLEAR_INLINE inline  // for checks: quick to compile instead
+#define CLEAR_LAMBDA
+#else
 #define CLEAR_INLINE inline __attribute__((always_inline))
 #define CLEAR_LAMBDA __attribute__((always_inline))
+#endif
 
 #if defined(__AVX512F__)
 inline constexpr int kRegisterBytes = 64;
@@ -372,107 +377,6 @@ CLEAR_INLINE Lanes<T> log2(const Lanes<T>& x) {
     for (T& v : a) v = std::log2(v);
     return Lanes<T>::load(a);
   }
-}
-
-#if defined(__AVX512F__)
-// Permutation indices between D consecutive registers of rows of D numbers and D columns, two registers at a time.
-template <int D>
-struct Interleaving {
-  alignas(64) std::int32_t apart[D][D - 1][kLanes], together[D][D - 1][kLanes];
-
-  constexpr Interleaving() : apart{}, together{} {
-    for (int out = 0; out < D; ++out)
-      for (int i = 0; i < kLanes; ++i) {
-        int p = D * i + out, q = kLanes * out + i;  // what column `out` reads, and what register `out` of the rows holds
-        for (int k = 1; k < D; ++k) {
-          apart[out][k - 1][i] = p / kLanes == k ? kLanes + p % kLanes : k == 1 ? p % kLanes : i;
-          together[out][k - 1][i] = q % D == k ? kLanes + q / D : k == 1 ? q / D : i;
-        }
-      }
-  }
-};
-
-template <int D>
-CLEAR_INLINE void rearrange(const std::int32_t (&indices)[D][D - 1][kLanes], const __m512 (&in)[D], __m512 (&out)[D]) {
-  for (int d = 0; d < D; ++d) {
-    out[d] = in[0];
-    for (int k = 1; k < D; ++k) out[d] = _mm512_permutex2var_ps(out[d], _mm512_load_si512(indices[d][k - 1]), in[k]);
-  }
-}
-
-template <int D>
-inline constexpr Interleaving<D> kInterleaving;
-#endif
-
-// Converts sixteen contiguous rows of D numbers to D columns of sixteen, and back.
-template <int D, class T>
-CLEAR_INLINE void split_rows(const T* rows, Lanes<T> (&columns)[D]) {
-#if defined(__AVX512F__)
-  if constexpr (sizeof(T) == 4 && (D == 3 || D == 4)) {
-    __m512 in[D], out[D];
-    for (int d = 0; d < D; ++d) in[d] = _mm512_loadu_ps(rows + kLanes * d);
-    rearrange<D>(kInterleaving<D>.apart, in, out);
-    for (int d = 0; d < D; ++d) columns[d].r[0] = (typename Lanes<T>::Register)out[d];
-    return;
-  }
-#endif
-  T split[D][kLanes];
-  for (int i = 0; i < kLanes; ++i)
-    for (int d = 0; d < D; ++d) split[d][i] = rows[D * i + d];
-  for (int d = 0; d < D; ++d) columns[d] = Lanes<T>::load(split[d]);
-}
-template <int D, class T>
-CLEAR_INLINE void join_rows(T* rows, const Lanes<T> (&columns)[D]) {
-#if defined(__AVX512F__)
-  if constexpr (sizeof(T) == 4 && (D == 3 || D == 4)) {
-    __m512 in[D], out[D];
-    for (int d = 0; d < D; ++d) in[d] = (__m512)columns[d].r[0];
-    rearrange<D>(kInterleaving<D>.together, in, out);
-    for (int d = 0; d < D; ++d) _mm512_storeu_ps(rows + kLanes * d, out[d]);
-    return;
-  }
-#endif
-  T split[D][kLanes];
-  for (int d = 0; d < D; ++d) columns[d].store(split[d]);
-  for (int i = 0; i < kLanes; ++i)
-    for (int d = 0; d < D; ++d) rows[D * i + d] = split[d][i];
-}
-
-// Transposes in place: rows[i] lane j  <->  rows[j] lane i.
-template <class T>
-CLEAR_INLINE void transpose(Lanes<T> (&rows)[kLanes]) {
-#if defined(__AVX512F__)
-  if constexpr (sizeof(T) == 4) {
-    __m512 t[16], u[16];
-    for (int i = 0; i < 8; ++i) {
-      t[2 * i] = _mm512_unpacklo_ps((__m512)rows[2 * i].r[0], (__m512)rows[2 * i + 1].r[0]);
-      t[2 * i + 1] = _mm512_unpackhi_ps((__m512)rows[2 * i].r[0], (__m512)rows[2 * i + 1].r[0]);
-    }
-    for (int i = 0; i < 4; ++i) {  // pairs of pairs: columns 4j + i of rows 4i … 4i + 3, in each 128-bit quarter j
-      const __m512d a = (__m512d)t[4 * i], b = (__m512d)t[4 * i + 1], c = (__m512d)t[4 * i + 2], d = (__m512d)t[4 * i + 3];
-      u[4 * i] = (__m512)_mm512_unpacklo_pd(a, c);
-      u[4 * i + 1] = (__m512)_mm512_unpackhi_pd(a, c);
-      u[4 * i + 2] = (__m512)_mm512_unpacklo_pd(b, d);
-      u[4 * i + 3] = (__m512)_mm512_unpackhi_pd(b, d);
-    }
-    for (int i = 0; i < 4; ++i) {  // then exchange the quarters
-      __m512 even_low = _mm512_shuffle_f32x4(u[i], u[4 + i], 0x88), odd_low = _mm512_shuffle_f32x4(u[i], u[4 + i], 0xdd);
-      __m512 even_high = _mm512_shuffle_f32x4(u[8 + i], u[12 + i], 0x88);
-      __m512 odd_high = _mm512_shuffle_f32x4(u[8 + i], u[12 + i], 0xdd);
-      using Register = typename Lanes<T>::Register;
-      rows[i].r[0] = (Register)_mm512_shuffle_f32x4(even_low, even_high, 0x88);
-      rows[4 + i].r[0] = (Register)_mm512_shuffle_f32x4(odd_low, odd_high, 0x88);
-      rows[8 + i].r[0] = (Register)_mm512_shuffle_f32x4(even_low, even_high, 0xdd);
-      rows[12 + i].r[0] = (Register)_mm512_shuffle_f32x4(odd_low, odd_high, 0xdd);
-    }
-    return;
-  }
-#endif
-  T a[kLanes][kLanes], b[kLanes][kLanes];
-  for (int i = 0; i < kLanes; ++i) rows[i].store(a[i]);
-  for (int i = 0; i < kLanes; ++i)
-    for (int j = 0; j < kLanes; ++j) b[j][i] = a[i][j];
-  for (int i = 0; i < kLanes; ++i) rows[i] = Lanes<T>::load(b[i]);
 }
 
 }  // namespace clear

@@ -1,0 +1,266 @@
+// Moves numbers between rows and lanes: transposes, interleaved rows such as xyzxyz…, and small tables.
+//
+// The building block is the quad: 16 bytes of a register, four floats. Every processor shuffles two registers quad by quad
+// in one instruction, whatever their width; moving whole quads between registers is the rest. Double, which is for checking,
+// goes through memory.
+#pragma once
+
+#include "simd.hpp"
+
+namespace clear {
+
+inline constexpr int kQuad = 4;
+inline constexpr int kQuads = kRegisterBytes / 16;  // per register
+
+using FloatRegister = Native<float>::Register;
+
+// In every quad: (a[i], a[j], b[k], b[l]).
+struct WithinQuads {
+  template <int i, int j, int k, int l>
+  static CLEAR_INLINE FloatRegister shuffle(FloatRegister a, FloatRegister b) {
+#if defined(__AVX512F__)
+    return (FloatRegister)_mm512_shuffle_ps((__m512)a, (__m512)b, i | j << 2 | k << 4 | l << 6);
+#elif defined(__AVX2__)
+    return (FloatRegister)_mm256_shuffle_ps((__m256)a, (__m256)b, i | j << 2 | k << 4 | l << 6);
+#elif defined(__SSE2__)
+    return (FloatRegister)_mm_shuffle_ps((__m128)a, (__m128)b, i | j << 2 | k << 4 | l << 6);
+#elif defined(__clang__)
+    return __builtin_shufflevector(a, b, i, j, k + kQuad, l + kQuad);
+#else
+    return __builtin_shuffle(a, b, Native<float>::Integer{i, j, k + kQuad, l + kQuad});
+#endif
+  }
+};
+
+#if defined(__AVX512F__)
+// The same with whole quads in place of numbers.
+struct OfQuads {
+  template <int i, int j, int k, int l>
+  static CLEAR_INLINE FloatRegister shuffle(FloatRegister a, FloatRegister b) {
+    return (FloatRegister)_mm512_shuffle_f32x4((__m512)a, (__m512)b, i | j << 2 | k << 4 | l << 6);
+  }
+};
+#endif
+
+// Transposes a 4 x 4 matrix whose rows are a, b, c, d: one of numbers in each quad, or one of quads.
+template <class Matrix>
+CLEAR_INLINE void transpose_four(FloatRegister& a, FloatRegister& b, FloatRegister& c, FloatRegister& d) {
+  const FloatRegister ab0 = Matrix::template shuffle<0, 1, 0, 1>(a, b), ab2 = Matrix::template shuffle<2, 3, 2, 3>(a, b);
+  const FloatRegister cd0 = Matrix::template shuffle<0, 1, 0, 1>(c, d), cd2 = Matrix::template shuffle<2, 3, 2, 3>(c, d);
+  a = Matrix::template shuffle<0, 2, 0, 2>(ab0, cd0), b = Matrix::template shuffle<1, 3, 1, 3>(ab0, cd0);
+  c = Matrix::template shuffle<0, 2, 0, 2>(ab2, cd2), d = Matrix::template shuffle<1, 3, 1, 3>(ab2, cd2);
+}
+
+// Transposes a square of kRegisterBytes / 4 rows, one register each.
+CLEAR_INLINE void transpose_square(FloatRegister (&rows)[Native<float>::width]) {
+  for (int i = 0; i < kQuads; ++i)
+    transpose_four<WithinQuads>(rows[4 * i], rows[4 * i + 1], rows[4 * i + 2], rows[4 * i + 3]);
+  // Quad q of rows[4 i + c] is now quad i of the transpose's row 4 q + c.
+#if defined(__AVX512F__)
+  for (int c = 0; c < kQuad; ++c) transpose_four<OfQuads>(rows[c], rows[4 + c], rows[8 + c], rows[12 + c]);
+#elif defined(__AVX2__)
+  for (int c = 0; c < kQuad; ++c) {
+    const __m256 a = (__m256)rows[c], b = (__m256)rows[4 + c];
+    rows[c] = (FloatRegister)_mm256_permute2f128_ps(a, b, 0x20);
+    rows[4 + c] = (FloatRegister)_mm256_permute2f128_ps(a, b, 0x31);
+  }
+#endif
+}
+
+// Transposes in place: rows[i] lane j  <->  rows[j] lane i.
+template <class T>
+CLEAR_INLINE void transpose(Lanes<T> (&rows)[kLanes]) {
+  if constexpr (sizeof(T) == 4) {
+    constexpr int width = Native<T>::width, squares = Lanes<T>::registers;
+    auto load = [&](int y, int x, FloatRegister (&square)[width]) CLEAR_LAMBDA {
+      for (int i = 0; i < width; ++i) square[i] = rows[width * y + i].r[x];
+      transpose_square(square);
+    };
+    auto store = [&](int y, int x, const FloatRegister (&square)[width]) CLEAR_LAMBDA {
+      for (int i = 0; i < width; ++i) rows[width * y + i].r[x] = square[i];
+    };
+    for (int y = 0; y < squares; ++y)
+      for (int x = 0; x <= y; ++x) {
+        FloatRegister here[width], there[width];
+        load(y, x, here);
+        if (x < y) load(x, y, there), store(y, x, there);
+        store(x, y, here);
+      }
+  } else {
+    T a[kLanes][kLanes], b[kLanes][kLanes];
+    for (int i = 0; i < kLanes; ++i) rows[i].store(a[i]);
+    for (int i = 0; i < kLanes; ++i)
+      for (int j = 0; j < kLanes; ++j) b[j][i] = a[i][j];
+    for (int i = 0; i < kLanes; ++i) rows[i] = Lanes<T>::load(b[i]);
+  }
+}
+
+#if defined(__AVX512F__)
+// AVX-512 chooses any numbers of two registers: indices from D registers of rows of D numbers to D columns, and back.
+template <int D>
+struct Interleaving {
+  alignas(64) std::int32_t apart[D][D - 1][kLanes], together[D][D - 1][kLanes];
+
+  constexpr Interleaving() : apart{}, together{} {
+    for (int out = 0; out < D; ++out)
+      for (int i = 0; i < kLanes; ++i) {
+        int p = D * i + out, q = kLanes * out + i;  // what column `out` reads, and what register `out` of the rows holds
+        for (int k = 1; k < D; ++k) {
+          apart[out][k - 1][i] = p / kLanes == k ? kLanes + p % kLanes : k == 1 ? p % kLanes : i;
+          together[out][k - 1][i] = q % D == k ? kLanes + q / D : k == 1 ? q / D : i;
+        }
+      }
+  }
+};
+
+template <int D>
+CLEAR_INLINE void rearrange(const std::int32_t (&indices)[D][D - 1][kLanes], const FloatRegister (&in)[D],
+                            FloatRegister (&out)[D]) {
+  for (int d = 0; d < D; ++d) {
+    __m512 mixed = (__m512)in[0];
+    for (int k = 1; k < D; ++k)
+      mixed = _mm512_permutex2var_ps(mixed, _mm512_load_si512(indices[d][k - 1]), (__m512)in[k]);
+    out[d] = (FloatRegister)mixed;
+  }
+}
+
+template <int D>
+inline constexpr Interleaving<D> kInterleaving;
+
+// D columns, one register each, from D registers of rows of D numbers.
+template <int D>
+CLEAR_INLINE void split_registers(const float* rows, FloatRegister (&columns)[D]) {
+  FloatRegister in[D];
+  for (int d = 0; d < D; ++d) in[d] = (FloatRegister)_mm512_loadu_ps(rows + kLanes * d);
+  rearrange<D>(kInterleaving<D>.apart, in, columns);
+}
+
+template <int D>
+CLEAR_INLINE void join_registers(float* rows, const FloatRegister (&columns)[D]) {
+  FloatRegister out[D];
+  rearrange<D>(kInterleaving<D>.together, columns, out);
+  for (int d = 0; d < D; ++d) _mm512_storeu_ps(rows + kLanes * d, (__m512)out[d]);
+}
+#else
+// The register whose quad q is the four numbers at p + q · stride.
+CLEAR_INLINE FloatRegister load_quads(const float* p, [[maybe_unused]] int stride) {
+#if defined(__AVX2__)
+  return (FloatRegister)_mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(p + stride), 1);
+#else
+  FloatRegister out;
+  std::memcpy(&out, p, sizeof out);
+  return out;
+#endif
+}
+
+CLEAR_INLINE void store_quads(float* p, [[maybe_unused]] int stride, FloatRegister a) {
+#if defined(__AVX2__)
+  _mm_storeu_ps(p, _mm256_castps256_ps128((__m256)a));
+  _mm_storeu_ps(p + stride, _mm256_extractf128_ps((__m256)a, 1));
+#else
+  std::memcpy(p, &a, sizeof a);
+#endif
+}
+
+// D columns, one register each, from D registers of rows of D numbers.
+template <int D>
+CLEAR_INLINE void split_registers(const float* rows, FloatRegister (&out)[D]) {
+  using Q = WithinQuads;
+  FloatRegister in[D];
+  for (int d = 0; d < D; ++d) in[d] = load_quads(rows + kQuad * d, kQuad * D);
+  if constexpr (D == 2) {
+    out[0] = Q::shuffle<0, 2, 0, 2>(in[0], in[1]), out[1] = Q::shuffle<1, 3, 1, 3>(in[0], in[1]);
+  } else if constexpr (D == 3) {  // x0 y0 z0 x1 | y1 z1 x2 y2 | z2 x3 y3 z3
+    const FloatRegister xy = Q::shuffle<2, 3, 1, 2>(in[1], in[2]), yz = Q::shuffle<1, 2, 0, 1>(in[0], in[1]);
+    out[0] = Q::shuffle<0, 3, 0, 2>(in[0], xy), out[1] = Q::shuffle<0, 2, 1, 3>(yz, xy);
+    out[2] = Q::shuffle<1, 3, 0, 3>(yz, in[2]);
+  } else {
+    for (int d = 0; d < D; ++d) out[d] = in[d];
+    transpose_four<Q>(out[0], out[1], out[2], out[3]);
+  }
+}
+
+template <int D>
+CLEAR_INLINE void join_registers(float* rows, const FloatRegister (&in)[D]) {
+  using Q = WithinQuads;
+  FloatRegister out[D];
+  if constexpr (D == 2) {
+    const FloatRegister even = Q::shuffle<0, 2, 0, 2>(in[0], in[1]), odd = Q::shuffle<1, 3, 1, 3>(in[0], in[1]);
+    out[0] = Q::shuffle<0, 2, 0, 2>(even, odd), out[1] = Q::shuffle<1, 3, 1, 3>(even, odd);
+  } else if constexpr (D == 3) {
+    const FloatRegister xy = Q::shuffle<0, 2, 0, 2>(in[0], in[1]), yz = Q::shuffle<1, 3, 1, 3>(in[1], in[2]);
+    const FloatRegister zx = Q::shuffle<0, 2, 1, 3>(in[2], in[0]);
+    out[0] = Q::shuffle<0, 2, 0, 2>(xy, zx), out[1] = Q::shuffle<0, 2, 1, 3>(yz, xy), out[2] = Q::shuffle<1, 3, 1, 3>(zx, yz);
+  } else {
+    for (int d = 0; d < D; ++d) out[d] = in[d];
+    transpose_four<Q>(out[0], out[1], out[2], out[3]);
+  }
+  for (int d = 0; d < D; ++d) store_quads(rows + kQuad * d, kQuad * D, out[d]);
+}
+#endif
+
+template <int D, class T>
+inline constexpr bool kByRegister = sizeof(T) == 4 && D >= 2 && D <= 4;
+
+// Converts sixteen contiguous rows of D numbers to D columns of sixteen.
+template <int D, class T>
+CLEAR_INLINE void split_rows(const T* rows, Lanes<T> (&columns)[D]) {
+  if constexpr (D == 1) {
+    columns[0] = Lanes<T>::load(rows);
+  } else if constexpr (kByRegister<D, T>) {
+    for (int k = 0; k < Lanes<T>::registers; ++k) {
+      FloatRegister out[D];
+      split_registers<D>(rows + D * Native<T>::width * k, out);
+      for (int d = 0; d < D; ++d) columns[d].r[k] = out[d];
+    }
+  } else {
+    T split[D][kLanes];
+    for (int i = 0; i < kLanes; ++i)
+      for (int d = 0; d < D; ++d) split[d][i] = rows[D * i + d];
+    for (int d = 0; d < D; ++d) columns[d] = Lanes<T>::load(split[d]);
+  }
+}
+
+// … and back.
+template <int D, class T>
+CLEAR_INLINE void join_rows(T* rows, const Lanes<T> (&columns)[D]) {
+  if constexpr (D == 1) {
+    columns[0].store(rows);
+  } else if constexpr (kByRegister<D, T>) {
+    for (int k = 0; k < Lanes<T>::registers; ++k) {
+      FloatRegister in[D];
+      for (int d = 0; d < D; ++d) in[d] = columns[d].r[k];
+      join_registers<D>(rows + D * Native<T>::width * k, in);
+    }
+  } else {
+    T split[D][kLanes];
+    for (int d = 0; d < D; ++d) columns[d].store(split[d]);
+    for (int i = 0; i < kLanes; ++i)
+      for (int d = 0; d < D; ++d) rows[D * i + d] = split[d][i];
+  }
+}
+
+// Lane i = table[indices[i]], indices in 0 … 15.
+CLEAR_INLINE Lanes<float> pick(const Lanes<float>& table, const std::int32_t* indices) {
+#if defined(__AVX512F__)
+  Lanes<float> out;
+  out.r[0] = (FloatRegister)_mm512_permutexvar_ps(_mm512_loadu_si512(indices), (__m512)table.r[0]);
+  return out;
+#elif defined(__AVX2__)
+  Lanes<float> out;
+  for (int k = 0; k < Lanes<float>::registers; ++k) {
+    const __m256i at = _mm256_loadu_si256((const __m256i*)(indices + 8 * k));
+    const __m256 low = _mm256_permutevar8x32_ps((__m256)table.r[0], at);
+    const __m256 high = _mm256_permutevar8x32_ps((__m256)table.r[1], at);
+    out.r[k] = (FloatRegister)_mm256_blendv_ps(low, high, (__m256)_mm256_slli_epi32(at, 28));  // 8 … 15: the sign bit
+  }
+  return out;
+#else
+  float a[kLanes], b[kLanes];
+  table.store(a);
+  for (int i = 0; i < kLanes; ++i) b[i] = a[indices[i]];
+  return Lanes<float>::load(b);
+#endif
+}
+
+}  // namespace clear
