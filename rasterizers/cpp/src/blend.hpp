@@ -128,7 +128,8 @@ struct BlockSums {
   int place[kRows];
 
   // Transposes the rows so that a lane is a Gaussian; a sum over pixels is then fifteen additions for sixteen Gaussians.
-  CLEAR_INLINE void flush(int count, const T (&cotangent)[K][3][kLanes], PairSums<T>* sums) {
+  // Not inlined: two copies beside the loop over Gaussians would exceed the instruction cache.
+  __attribute__((noinline)) void flush(int count, const T (&cotangent)[K][3][kLanes], PairSums<T>* sums) {
     using L = Lanes<T>;
     if (!count) return;
     for (int i = count; i < kRows; ++i) {
