@@ -79,6 +79,9 @@ def parser() -> argparse.ArgumentParser:
     )
     ask.add_argument("--scene", nargs="+", default=list(rasterizers.SCENES), metavar="SCENE", help=scenes)
     ask.add_argument("--backend", nargs="+", metavar="NAME", help="default: all that run here")
+    ask.add_argument(
+        "--isa", nargs="+", choices=["avx512", "avx2", "baseline"], help="modules of cpp (default: the fastest here)"
+    )
     ask.add_argument("--preset", nargs="+", default=list(PRESETS), choices=list(PRESETS), help="default: all")
 
     ask = questions.add_parser(

@@ -13,14 +13,16 @@ def time_against_error(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
         time, error: the tables `rasterizers_time` and `rasterizers_error`.
     """
     without_cut_offs = error[error["truth"] == "no cut-offs"]
-    rows = time.merge(without_cut_offs, on=["scene", "backend", "preset"])
+    rows = time.merge(without_cut_offs, on=["scene", "backend", "module", "preset"])
     rows["ms"] = rows["forward_ms"] + rows["backward_k1_ms"]
     scenes = list(rows["scene"].unique())
     figure = Figure(figsize=(1.2 + 3 * len(scenes), 3.6), layout="constrained")
     axes = figure.subplots(1, len(scenes), squeeze=False, sharey=True)[0]
     for axis, scene in zip(axes, scenes, strict=True):
-        for backend, of_backend in rows[rows["scene"] == scene].groupby("backend", sort=False):
-            axis.semilogy(of_backend["ms"], of_backend["means_relative"], "o-", markersize=4, label=backend)
+        for names, of_backend in rows[rows["scene"] == scene].groupby(["backend", "module"], sort=False):
+            axis.semilogy(
+                of_backend["ms"], of_backend["means_relative"], "o-", markersize=4, label=" ".join(filter(None, names))
+            )
             for row in of_backend.itertuples():
                 point = (row.ms, row.means_relative)
                 axis.annotate(row.preset, point, (6, 4), textcoords="offset points", fontsize=8, color="gray")

@@ -21,6 +21,7 @@ from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.bench.timing import interleaved, medians, milliseconds
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
+from rasterizers.cpp import CppRasterizer
 from rasterizers.interface import PRESETS, Rasterizer
 
 SCENES: Final = ("small", "s100k", "s100k-lr", "s500k")
@@ -30,6 +31,7 @@ BACKWARD: Final = tuple(f"backward_k{k}" for k in range(1, COTANGENTS + 1))
 SAME, NONE = "same cut-offs", "no cut-offs"
 
 REFERENCE: Final = "torch"
+CPP: Final = "cpp"
 REFERENCE_LIMIT: Final = 10_000  # Gaussians; beyond, the pure-torch reference takes minutes per turn
 
 
@@ -38,12 +40,14 @@ class Contestant:
     """A backend, or a peer, at a preset on a scene.
 
     Args:
+        module: the instruction set of its kernels, where it has such.
         render: draws the scene.
         stages: times more stages than forward and backward.
         rules: settings that differ from `SETTINGS`.
     """
 
     backend: str
+    module: str
     preset: str
     render: Callable[[], Any]
     stages: Callable[[WorkLog], None] = lambda work_log: None
@@ -51,7 +55,7 @@ class Contestant:
 
     @property
     def label(self) -> str:
-        return f"{self.backend} {self.preset}"
+        return " ".join(filter(None, (self.backend, self.module, self.preset)))
 
 
 def measure(
@@ -59,6 +63,7 @@ def measure(
     *,
     scene: Sequence[str],
     backend: Sequence[str] | None = None,
+    isa: Sequence[str] | None = None,
     preset: Sequence[str] = tuple(PRESETS),
     repeats: int,
     device: str = "cpu",
@@ -68,8 +73,10 @@ def measure(
 
     Args:
         backend: None: all that run here.
+        isa: instruction sets whose compiled modules are compared; None: the fastest of this processor.
 
     Raises:
+        BackendUnavailable: this processor cannot run one of `isa`.
         DataError: a name is unknown, or nothing that was asked for runs here.
     """
     require_device(device)
@@ -85,7 +92,12 @@ def measure(
     for workload in workloads:
         results.log(f"{workload.name}: {len(workload.splats):,} Gaussians")
         affordable = [b for b in backends if _affordable(b, workload, b, results.note)]
-        contestants = [backend_on(workload, b, p) for b in affordable for p in preset]
+        contestants = [
+            backend_on(workload, b, p, m)
+            for b in affordable
+            for m in (isa if isa and b == CPP else [None])
+            for p in preset
+        ]
         contestants += [peer_on(workload, peer) for peer in others]
         if not contestants:
             continue
@@ -182,9 +194,11 @@ def _affordable(backend: str, workload: Workload, what: str, note: Callable[[str
     return affordable
 
 
-def backend_on(workload: Workload, backend: str, preset: str) -> Contestant:
+def backend_on(workload: Workload, backend: str, preset: str, isa: str | None = None) -> Contestant:
     """One of our backends, with the stages that peers lack: demanded tiles, both scales together."""
-    rasterizer, cotangents = rasterizers.load(backend, preset=preset, **SETTINGS), random_cotangents(workload)
+    kernels = {"isa": isa} if isa else {}
+    rasterizer = rasterizers.load(backend, preset=preset, **kernels, **SETTINGS)
+    cotangents = random_cotangents(workload)
     splats, camera, tiles = workload.splats, workload.camera, quarter_of_tiles(rasterizer, workload)
     lr = camera.scaled(1 / workload.lr_factor) if workload.lr_factor else None
 
@@ -198,11 +212,12 @@ def backend_on(workload: Workload, backend: str, preset: str) -> Contestant:
                 rasterizer(splats, lr)
                 rasterizer(splats, camera)
 
-    return Contestant(backend, preset, lambda: rasterizer(splats, camera), stages)
+    module = rasterizer.module if isinstance(rasterizer, CppRasterizer) else ""
+    return Contestant(backend, module, preset, lambda: rasterizer(splats, camera), stages)
 
 
 def peer_on(workload: Workload, peer: Peer) -> Contestant:
-    return Contestant(peer.name, peers.PRESET, lambda: peer.render(workload), rules=peer.rules)
+    return Contestant(peer.name, "", peers.PRESET, lambda: peer.render(workload), rules=peer.rules)
 
 
 def peak_on_cuda(c: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> float:
@@ -220,7 +235,7 @@ def _time_rows(workload: Workload, contestants: Sequence[Contestant], median: pd
     cotangents = random_cotangents(workload)
     for c in contestants:
         ms = median.loc[c.label].dropna().to_dict()
-        row: dict[str, Any] = {"scene": workload.name, "backend": c.backend, "preset": c.preset}
+        row: dict[str, Any] = {"scene": workload.name, "backend": c.backend, "module": c.module, "preset": c.preset}
         row |= {f"{stage}_ms": value for stage, value in ms.items() if stage != SEPARATE}
         row |= {f"k{k}_over_k1": ms[BACKWARD[k - 1]] / ms[BACKWARD[0]] for k in range(2, COTANGENTS + 1)}
         if QUARTER in ms:
@@ -243,5 +258,11 @@ def _error_rows(workload: Workload, contestants: Sequence[Contestant], backend: 
             key = tuple(sorted(rules.items()))
             if key not in truths:
                 truths[key] = accuracy.truth(backend, workload, cotangent, rules)
-            head = {"scene": workload.name, "backend": c.backend, "preset": c.preset, "truth": against}
+            head = {
+                "scene": workload.name,
+                "backend": c.backend,
+                "module": c.module,
+                "preset": c.preset,
+                "truth": against,
+            }
             yield head | accuracy.errors(found, truths[key])

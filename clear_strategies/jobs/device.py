@@ -35,6 +35,7 @@ class RasterizerSettings:
         background: RGB in [0, 1]; None: the data set's own.
         memory: MiB that the lists of one image may take (cpp, warp).
         threads: of the kernels (cpp); None: as many as torch has.
+        isa: instruction set of the kernels (cpp): avx512, avx2 or baseline; None: the fastest of this processor.
         lanes: pixel-Gaussian pairs that are blended at a time (torch).
         device: cpu or cuda (warp); None: that of the job.
     """
@@ -51,6 +52,7 @@ class RasterizerSettings:
     antialiased: bool = _SHARED.antialiased
     memory: int | None = None
     threads: int | None = None
+    isa: str | None = None
     lanes: int | None = None
     device: str | None = None
 
@@ -67,7 +69,7 @@ class RasterizerSettings:
 
 
 _OWN: Final = f"{RasterizerSettings.__module__}.{RasterizerSettings.__qualname__}"
-_BY_NAME: Final = ("name", "preset", "memory", "threads", "lanes", "device")
+_BY_NAME: Final = ("name", "preset", "memory", "threads", "isa", "lanes", "device")
 
 
 def rasterizer_node(node: Mapping[str, Any]) -> dict[str, Any]:

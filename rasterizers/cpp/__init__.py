@@ -44,15 +44,17 @@ class CppRasterizer(RasterSettings):
         tile: edge of the tile mask's tiles, px, a multiple of 4. Tiles of 32 px are skipped at no cost.
         memory: MiB that the lists of one image may take; beyond it the image is drawn in bands, with the same bits.
         threads: None: `rasterizers.native.threads()`.
+        isa: instruction set of the kernels in float32, "avx512", "avx2" or "baseline"; None: the fastest here.
 
     Raises:
-        BackendUnavailable: the kernels were not compiled.
+        BackendUnavailable: the kernels were not compiled, or this processor cannot run those of `isa`.
         ValueError: a setting is out of range.
     """
 
     tile: int = 32
     memory: int = 4096
     threads: int | None = None
+    isa: str | None = None
 
     def __post_init__(self) -> None:
         RasterSettings.__post_init__(self)
@@ -62,7 +64,12 @@ class CppRasterizer(RasterSettings):
             raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}.")
-        load_kernels(__name__)
+        load_kernels(__name__, self.isa)
+
+    @property
+    def module(self) -> str:
+        """The instruction set of the kernels in float32."""
+        return str(load_kernels(__name__, self.isa).isa)
 
     @property
     def traits(self) -> Traits:
@@ -82,9 +89,9 @@ class CppRasterizer(RasterSettings):
         return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
 
 
-def _kernels(dtype: torch.dtype) -> ModuleType:
-    """The module for this processor; in float64, which is for checks, one module serves all processors."""
-    return load_kernels(__name__) if dtype == torch.float32 else importlib.import_module(f"{__name__}._float64")
+def _kernels(dtype: torch.dtype, isa: str | None) -> ModuleType:
+    """The module for the instruction set; in float64, which is for checks, one module serves all processors."""
+    return load_kernels(__name__, isa) if dtype == torch.float32 else importlib.import_module(f"{__name__}._float64")
 
 
 class _Frame:
@@ -113,7 +120,7 @@ class _Frame:
         # Referenced here because the native frame does not keep them alive.
         self.opacities = [job.opacities.detach().contiguous() for job, _ in jobs]
         self.offsets = [None if job.rgb_offset is None else job.rgb_offset.detach().contiguous() for job, _ in jobs]
-        self.native = _kernels(dtype).Frame(
+        self.native = _kernels(dtype, settings.isa).Frame(
             kernel=settings.kernel,
             near=settings.near,
             alpha_min=settings.alpha_min,

@@ -49,11 +49,14 @@ def kernel_threads(n: int) -> Iterator[None]:
 
 
 @cache
-def load_kernels(package: str) -> ModuleType:
-    """The fastest of `package`'s modules `_avx512`, `_avx2` and `_baseline` that this processor can run.
+def load_kernels(package: str, isa: str | None = None) -> ModuleType:
+    """One of `package`'s modules `_avx512`, `_avx2` and `_baseline`.
+
+    Args:
+        isa: the instruction set; None: what `CLEAR_ISA` names, else the fastest that this processor can run.
 
     Raises:
-        BackendUnavailable: none was compiled, or `CLEAR_ISA` names one that this processor cannot run.
+        BackendUnavailable: none was compiled, or this processor cannot run the one that is asked for.
     """
     try:
         baseline = importlib.import_module(f"{package}._baseline")
@@ -63,15 +66,16 @@ def load_kernels(package: str) -> ModuleType:
             "C++20 compiler (Debian: apt install g++; macOS: xcode-select --install) and install clear-strategies again."
         ) from error
     runs_here = [*baseline.instruction_sets(), "baseline"]
-    wanted = os.environ.get(_OVERRIDE)
+    wanted = isa or os.environ.get(_OVERRIDE)
     if wanted and wanted not in runs_here:
-        raise BackendUnavailable(f"{_OVERRIDE}={wanted} cannot run here; this processor has {', '.join(runs_here)}.")
-    for isa in [wanted] if wanted else [isa for isa in _ISAS if isa in runs_here]:
+        source = "isa" if isa else _OVERRIDE
+        raise BackendUnavailable(f"{source}={wanted} cannot run here; this processor has {', '.join(runs_here)}.")
+    for name in [wanted] if wanted else [name for name in _ISAS if name in runs_here]:
         try:
-            module = importlib.import_module(f"{package}._{isa}")
+            module = importlib.import_module(f"{package}._{name}")
         except ImportError as error:
-            _log.warning("%s was not compiled for %s: %s", package, isa, error)
+            _log.warning("%s was not compiled for %s: %s", package, name, error)
             continue
-        _log.debug("%s: kernels for %s.", package, isa)
+        _log.debug("%s: kernels for %s.", package, name)
         return module
-    raise BackendUnavailable(f"{package} was not compiled for {wanted}; unset {_OVERRIDE}.")
+    raise BackendUnavailable(f"{package} was not compiled for {wanted}; unset {'isa' if isa else _OVERRIDE}.")

@@ -17,6 +17,7 @@ from clear_strategies.merging.objective import Objective
 from clear_strategies.strategies.gco import GCO
 from clear_strategies.strategies.p2g import P2G
 from clear_strategies.strategies.svs import SVS
+from tests.helpers.backends import why_not
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +77,16 @@ def test_the_tables_hold_every_stage_and_both_errors():
     same, none = error["means_relative"]
     assert list(error["truth"]) == [drawing.SAME, drawing.NONE]
     assert same < 1e-4 < none
+
+
+def test_each_row_names_the_module_whose_kernels_ran():
+    if why_not("cpp"):
+        pytest.skip(str(why_not("cpp")))
+    tables = measured(drawing, scene=["tiny"], backend=["cpp"], isa=["baseline"], preset=["fast"], repeats=1).tables
+    for table in ("rasterizers_time", "rasterizers_error"):
+        assert set(tables[table]["module"]) == {"baseline"}
+    fastest = measured(drawing, scene=["tiny"], backend=["cpp"], preset=["fast"], repeats=1).tables["rasterizers_time"]
+    assert fastest.loc[0, "module"] == rasterizers.load("cpp").module
 
 
 def test_the_reference_takes_no_part_in_large_scenes():

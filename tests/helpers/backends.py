@@ -26,14 +26,18 @@ class Backend:
         edges: the tile sizes that it supports, px.
         cases: the number of images that a test with many of them may draw.
         device: where it draws; tensors are copied there and results back, so that tests work on the CPU.
+        isa: the instruction set of compiled kernels in float32; None: the fastest here.
     """
 
     name: str
     edges: tuple[int, ...]
     cases: int
     device: str = "cpu"
+    isa: str | None = None
 
     def __call__(self, **settings: Any) -> Rasterizer:
+        if self.isa:
+            settings = {"isa": self.isa, **settings}
         if self.name != "warp":
             return rasterizers.load(self.name, **settings)
         rasterizer = rasterizers.load(self.name, device=self.device, **settings)
@@ -93,6 +97,8 @@ def moved(tensors, device: str, there: dict[int, torch.Tensor] | None = None):
 
 BACKENDS = {
     "cpp": Backend("cpp", (4, 8, 16, 32, 64), 400),
+    "cpp-avx2": Backend("cpp", (4, 8, 16, 32, 64), 100, isa="avx2"),
+    "cpp-baseline": Backend("cpp", (4, 8, 16, 32, 64), 100, isa="baseline"),
     "warp": Backend("warp", (8, 16, 32, 64), 100),
     "warp-cuda": Backend("warp", (8, 16, 32, 64), 400, "cuda"),
 }
@@ -105,11 +111,12 @@ def why_not(name: str) -> str | None:
 
 
 def backends(*, dtype: torch.dtype | None = None) -> pytest.MarkDecorator:
-    """Run a test for every backend; skip those that do not run, with the reason."""
+    """Run a test for every backend, in float32 for every instruction set; skip those that do not run, with the reason."""
     params = [
         pytest.param(backend, id=name, marks=pytest.mark.skipif(bool(why_not(name)), reason=str(why_not(name))))
         for name, backend in BACKENDS.items()
-        if dtype is None or why_not(name) or dtype in backend().traits.dtypes
+        if (not backend.isa or dtype == torch.float32)
+        and (dtype is None or why_not(name) or dtype in backend().traits.dtypes)
     ]
     return pytest.mark.parametrize("backend", params)
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+import functools
 from dataclasses import replace
 
 import pytest
 
 import rasterizers
 from rasterizers import BackendUnavailable, native
-from rasterizers.testing import scene
+from rasterizers.cpp import CppRasterizer
+from rasterizers.testing import check_rasterizer, scene
 from tests.helpers.agreement import require_same_bits
 from tests.helpers.backends import camera, cotangents, dense_scene, everything, why_not
 
@@ -22,37 +21,31 @@ def cpp(**settings):
     return rasterizers.load("cpp", **settings)
 
 
-@pytest.mark.parametrize("isa", ["baseline", "avx2", "avx512"])
+@pytest.fixture(params=["baseline", "avx2", "avx512"])
+def isa(request):
+    """An instruction set that this processor has."""
+    if request.param not in [*native.load_kernels("rasterizers.cpp").instruction_sets(), "baseline"]:
+        pytest.skip(f"this processor has no {request.param}")
+    return request.param
+
+
 def test_every_instruction_set_passes_the_checks(isa):
-    try:
-        runs_here = [*native.load_kernels("rasterizers.cpp").instruction_sets(), "baseline"]
-    except BackendUnavailable as reason:
-        pytest.skip(str(reason))
-    if isa not in runs_here:
-        pytest.skip(f"this processor has no {isa}")
-    program = (
-        "import torch; torch.set_num_threads(1)\n"
-        "from rasterizers.testing import check_rasterizer; from rasterizers.cpp import CppRasterizer\n"
-        "check_rasterizer(CppRasterizer)\n"
-        "from rasterizers.native import load_kernels; print(load_kernels('rasterizers.cpp').isa)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        env={**os.environ, "CLEAR_ISA": isa},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.strip() == isa
+    assert cpp(isa=isa).module == isa
+    check_rasterizer(functools.partial(CppRasterizer, isa=isa))
 
 
-def test_bits_do_not_depend_on_threads():
+def test_an_instruction_set_that_the_processor_lacks_is_refused():
+    with pytest.raises(BackendUnavailable, match="isa=z80 cannot run here"):
+        cpp(isa="z80")
+
+
+def test_bits_do_not_depend_on_threads(isa):
     splats, view = dense_scene()
     v = cotangents(3, 97, 130)
-    expected = everything(cpp(threads=1)(splats, view), v)
+    expected = everything(cpp(threads=1, isa=isa)(splats, view), v)
     for threads in (2, 3, 4, 8):
         for _ in range(2):
-            require_same_bits(everything(cpp(threads=threads)(splats, view), v), expected)
+            require_same_bits(everything(cpp(threads=threads, isa=isa)(splats, view), v), expected)
 
 
 def test_bits_do_not_depend_on_the_memory_budget():
