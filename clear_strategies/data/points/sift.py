@@ -12,7 +12,7 @@ import itertools
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -26,6 +26,8 @@ from clear_strategies.data.scene import PointCloud
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
+
+_ROWS: Final = 512  # features matched at a time, so that their distances stay in the cache
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,13 +123,15 @@ def match(a: Features, b: Features, ratio: float) -> Int[Tensor, "M 2"]:
     """Indices of mutual nearest neighbours that pass Lowe's ratio test against the second nearest in b."""
     if len(a.pixels) < 1 or len(b.pixels) < 2:
         return torch.zeros(0, 2, dtype=torch.long)
-    # |x - y|² = 2 - 2 x·y: descriptors have length 1.
-    distance = (2 - 2 * a.descriptors @ b.descriptors.T).clamp_min(0).sqrt()
-    nearest, candidate = distance.topk(2, dim=1, largest=False)
-    here = torch.arange(len(a.pixels))
-    mutual = distance.argmin(dim=0)[candidate[:, 0]] == here
-    good = mutual & (nearest[:, 0] < ratio * nearest[:, 1])
-    return torch.stack((here[good], candidate[good, 0]), dim=1)
+    similarity, candidate = (
+        torch.cat(parts)
+        for parts in zip(*((x @ b.descriptors.T).topk(2, dim=1) for x in a.descriptors.split(_ROWS)), strict=True)
+    )
+    distance = (2 - 2 * similarity).clamp_min(0).sqrt()  # |x - y|² = 2 - 2 x·y: descriptors have length 1
+    here = torch.nonzero(distance[:, 0] < ratio * distance[:, 1])[:, 0]
+    there = candidate[here, 0]
+    mutual = (b.descriptors[there] @ a.descriptors.T).argmax(dim=1) == here
+    return torch.stack((here[mutual], there[mutual]), dim=1)
 
 
 def triangulate_pair(
