@@ -72,7 +72,7 @@ template <class T>
 CLEAR_INLINE void transpose(Lanes<T> (&rows)[kLanes]) {
   if constexpr (sizeof(T) == 4) {
     constexpr int width = Native<T>::width, squares = Lanes<T>::registers;
-    auto load = [&](int y, int x, FloatRegister (&square)[width]) CLEAR_LAMBDA {
+    auto transposed = [&](int y, int x, FloatRegister (&square)[width]) CLEAR_LAMBDA {
       for (int i = 0; i < width; ++i) square[i] = rows[width * y + i].r[x];
       transpose_square(square);
     };
@@ -82,8 +82,8 @@ CLEAR_INLINE void transpose(Lanes<T> (&rows)[kLanes]) {
     for (int y = 0; y < squares; ++y)
       for (int x = 0; x <= y; ++x) {
         FloatRegister here[width], there[width];
-        load(y, x, here);
-        if (x < y) load(x, y, there), store(y, x, there);
+        transposed(y, x, here);
+        if (x < y) transposed(x, y, there), store(y, x, there);
         store(x, y, here);
       }
   } else {
