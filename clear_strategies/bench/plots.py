@@ -14,6 +14,7 @@ def time_against_error(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
     """
     without_cut_offs = error[error["truth"] == "no cut-offs"]
     rows = time.merge(without_cut_offs, on=["scene", "backend", "module", "preset"])
+    rows["module"] = rows["module"].fillna("")  # empty in a CSV
     rows["ms"] = rows["forward_ms"] + rows["backward_k1_ms"]
     scenes = list(rows["scene"].unique())
     figure = Figure(figsize=(1.2 + 3 * len(scenes), 3.6), layout="constrained")

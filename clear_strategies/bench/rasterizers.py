@@ -21,7 +21,6 @@ from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.bench.timing import interleaved, medians, milliseconds
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
-from rasterizers.cpp import CppRasterizer
 from rasterizers.interface import PRESETS, Rasterizer
 
 SCENES: Final = ("small", "s100k", "s100k-lr", "s500k")
@@ -212,7 +211,7 @@ def backend_on(workload: Workload, backend: str, preset: str, isa: str | None = 
                 rasterizer(splats, lr)
                 rasterizer(splats, camera)
 
-    module = rasterizer.module if isinstance(rasterizer, CppRasterizer) else ""
+    module = getattr(rasterizer, "module", "")  # the compiled backend has one
     return Contestant(backend, module, preset, lambda: rasterizer(splats, camera), stages)
 
 
