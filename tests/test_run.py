@@ -292,8 +292,9 @@ def test_ctrl_c_while_data_is_prepared_is_one_line(tmp_path):
     command = [sys.executable, "-m", "clear_strategies.run", "hydra.run.dir=out", "~data.reader.width", "~data.reader.height",
                "~data.reader.views", "~data.reader.train", "data.reader._target_=slow.read"]  # fmt: skip
     with subprocess.Popen(
-        command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
+        command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509 - background jobs ignore it
+    ) as process:  # fmt: skip
         assert process.stdout.readline() == "reading\n"
         process.send_signal(signal.SIGINT)
         said, _ = process.communicate(timeout=60)
