@@ -125,7 +125,9 @@ def match(a: Features, b: Features, ratio: float) -> Int[Tensor, "M 2"]:
         return torch.zeros(0, 2, dtype=torch.long)
     similarity, candidate = (
         torch.cat(parts)
-        for parts in zip(*((x @ b.descriptors.T).topk(2, dim=1) for x in a.descriptors.split(_ROWS)), strict=True)
+        for parts in zip(
+            *((x @ b.descriptors.T).topk(2, dim=1) for x in torch.split(a.descriptors, _ROWS)), strict=True
+        )
     )
     distance = (2 - 2 * similarity).clamp_min(0).sqrt()  # |x - y|² = 2 - 2 x·y: descriptors have length 1
     here = torch.nonzero(distance[:, 0] < ratio * distance[:, 1])[:, 0]
