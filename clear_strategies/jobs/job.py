@@ -255,7 +255,7 @@ def _train(
     settings, rasterizer = training.settings, place.drawing.rasterizer
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
     with progress_bar(state, place.watch, training.chosen.title) as progress:
-        checkpoints = training.folder / "checkpoints"
+        checkpoints = training.folder / resume.CHECKPOINTS
         fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)
     seconds = time.perf_counter() - began
     evaluation = results.write_results(

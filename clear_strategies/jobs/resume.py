@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 
 AUTO: Final = "auto"  # the value of fit.resume that is not a path
 
-_CHECKPOINTS: Final = "checkpoints"
+CHECKPOINTS: Final = "checkpoints"
 
 # What may differ between a run and the one that it resumes.
 _NOT_COMPARED: Final = {
@@ -81,7 +81,7 @@ def resume(state: TrainState, asked: str | None, folder: Path, config: Mapping[s
         DataError: the checkpoint is damaged, or another configuration's.
     """
     if asked == AUTO:
-        _resume_newest(state, folder / _CHECKPOINTS, config)
+        _resume_newest(state, folder / CHECKPOINTS, config)
     elif asked is not None:
         source = Path(asked)
         restore(state, checkpoint.load(source), source, config)
@@ -103,8 +103,8 @@ def of_both(asked: str | None, run: Mapping[str, Any], baseline: Mapping[str, An
         return asked, asked
     source = Path(asked)
     beside = _folder_of(source) / BASELINE
-    begun = bool(checkpoint.saved(beside / _CHECKPOINTS))
-    if begun and not checkpoint.saved(_folder_of(source) / _CHECKPOINTS):
+    begun = bool(checkpoint.saved(beside / CHECKPOINTS))
+    if begun and not checkpoint.saved(_folder_of(source) / CHECKPOINTS):
         return None, str(beside)
     saved = checkpoint.load(source)
     if saved.config == baseline:
@@ -115,7 +115,7 @@ def of_both(asked: str | None, run: Mapping[str, Any], baseline: Mapping[str, An
 
 def _folder_of(source: Path) -> Path:
     """The run's folder, of itself, its folder of checkpoints, or one of these."""
-    return next((path.parent for path in (source, source.parent) if path.name == _CHECKPOINTS), source)
+    return next((path.parent for path in (source, source.parent) if path.name == CHECKPOINTS), source)
 
 
 def _resume_newest(state: TrainState, folder: Path, config: Mapping[str, Any]) -> None:
