@@ -7,6 +7,7 @@ from typing import Final
 
 DOORS: Final = {
     "clear_strategies.run": "train: python -m clear_strategies.run +strategy=clear (also: clear-strategies +strategy=clear)",
+    "clear_strategies.run help": "the subcommands: python -m clear_strategies.run train PHOTOS, …",
     "clear_strategies.report": "compare runs: python -m clear_strategies.report FOLDER [FOLDER ...]",
     "clear_strategies.bench": "measure run time against error: python -m clear_strategies.bench --help",
 }

@@ -1,8 +1,9 @@
 """`clear-strategies +strategy=clear`, or `python -m clear_strategies.run`: the door to a whole run.
 
-Composes the configuration, checks every setting, prints the plan, trains, and writes into Hydra's run folder: history.csv,
-conflict.csv, timing.csv, renders/, views/, maps/, contact_sheet.png, curves.png, point_cloud.ply, checkpoints/, baseline/
-(with `fit.baseline`) and, last, so that its presence says that the run is finished, metrics.json. Exit codes:
+`clear-strategies train …` and the other subcommands are in `clear_strategies.commands`. Without one, this composes the
+configuration, checks every setting, prints the plan, trains, and writes into Hydra's run folder: history.csv, conflict.csv,
+timing.csv, renders/, views/, maps/, contact_sheet.png, curves.png, point_cloud.ply, checkpoints/, baseline/ (with
+`fit.baseline`) and, last, so that its presence says that the run is finished, metrics.json. Exit codes:
 `clear_strategies.jobs.exit_codes`.
 """
 
@@ -13,7 +14,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from clear_strategies import commands
 from clear_strategies.compose import CONF, nearest_setting, require_each_once
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.jobs import exit_codes, sweep
@@ -32,16 +34,27 @@ _log = logging.getLogger(__name__)
 
 
 def main() -> None:
-    """The command line."""
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra passes errors on instead of printing them its own way
+    """The command line: a subcommand, or Hydra's."""
     try:
-        exit_codes.require_train()
-        hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
+        (commands.named(sys.argv[1:]) or hydra_main)()
     except (Exception, KeyboardInterrupt) as error:
         if (ending := exit_codes.describe(error)) is None:
             raise
         sys.stderr.write(f"{_with_nearest_setting(ending.message)}\n")  # logging is set up for jobs only
         sys.exit(ending.code)
+
+
+def hydra_main(overrides: Sequence[str] | None = None) -> None:
+    """Hydra's command line.
+
+    Args:
+        overrides: in place of the program's arguments.
+    """
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra passes errors on instead of printing them its own way
+    if overrides is not None:
+        sys.argv[1:] = overrides  # Hydra reads them there
+    exit_codes.require_train()
+    hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
 
 
 def _with_nearest_setting(message: str) -> str:

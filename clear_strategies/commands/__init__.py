@@ -1,0 +1,47 @@
+"""The subcommands of `clear-strategies`: `clear-strategies NAME …`, or `python -m clear_strategies.run NAME …`.
+
+A command is a module of this folder with `main(arguments)`, imported only when it is called. It returns when it is done and
+raises a `ClearError` for what the user can solve. `clear_strategies.run` calls it, and turns errors into exit codes.
+Anything else on the command line is Hydra's.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Final, NamedTuple
+
+
+class Command(NamedTuple):
+    """A row of the table.
+
+    Args:
+        usage: the arguments behind its name.
+        summary: what it does, in one line.
+    """
+
+    usage: str
+    summary: str
+
+
+COMMANDS: Final = {
+    "train": Command("PHOTOS [setting=value …]", "from a folder of photos, or a capture, to a splat and pictures"),
+}
+
+
+def named(arguments: Sequence[str]) -> Callable[[], None] | None:
+    """The call of the command that these arguments of the program name; None where they are Hydra's."""
+    name = arguments[0] if arguments else ""
+    if name == "help":
+        return _help
+    if name not in COMMANDS:
+        return None
+    return lambda: import_module(f"{__name__}.{name}").main(list(arguments[1:]))
+
+
+def _help() -> None:
+    rows = [(f"clear-strategies {name} {row.usage}".rstrip(), row.summary) for name, row in COMMANDS.items()]
+    rows.append(("clear-strategies [setting=value …]", "a run of the whole configuration; --help lists its groups"))
+    width = max(len(left) for left, _ in rows)
+    sys.stdout.writelines(f"{left:<{width}}  {right}\n" for left, right in rows)

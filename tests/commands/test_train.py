@@ -1,0 +1,58 @@
+"""`clear-strategies train PHOTOS`: which reader, which settings, and what it says to a wrong argument."""
+
+from __future__ import annotations
+
+import pytest
+
+from clear_strategies import commands
+from clear_strategies.commands import train
+from clear_strategies.compose import composed
+from clear_strategies.errors import SettingError
+
+
+@pytest.mark.parametrize(
+    ("file", "kind"),
+    [
+        ("transforms_train.json", "blender"),
+        ("transforms.json", "nerfstudio"),
+        ("poses_bounds.npy", "llff"),
+        ("sparse/0/cameras.bin", "colmap"),
+        ("sparse/cameras.txt", "colmap"),
+        ("photo.jpg", "photos"),
+    ],
+)
+def test_the_reader_is_the_one_of_what_lies_in_the_folder(tmp_path, file, kind):
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).touch()
+    assert train.kind(tmp_path) == kind
+
+
+@pytest.mark.parametrize("name", ["plain", "with space", "a=b,c", "it's [here] (1)"])
+def test_a_folder_of_any_name_becomes_data_path(tmp_path, name):
+    folder = tmp_path / name
+    folder.mkdir()
+    from omegaconf import OmegaConf
+
+    config = composed(train.overrides([str(folder), "fit.iterations=7"]), "config")
+    assert OmegaConf.to_container(config)["data"]["path"] == str(folder)
+    assert config.fit.iterations == 7
+    assert set(config.strategies) == {"gco", "p2g", "svs"}
+
+
+def test_strategies_that_are_named_replace_the_whole_method(tmp_path):
+    assert not [o for o in train.overrides([str(tmp_path), "+strategy=gco"]) if o == "+strategy=clear"]
+
+
+@pytest.mark.parametrize("arguments", [[], ["fit.iterations=3"], ["nowhere"], ["--cfg", "job"]])
+def test_a_missing_folder_is_refused_in_one_line(arguments):
+    with pytest.raises(SettingError, match=r"train.*folder"):
+        train.overrides(arguments)
+
+
+def test_the_table_names_modules_that_exist_and_leaves_the_rest_to_hydra(capsys):
+    for name in commands.COMMANDS:
+        assert commands.named([name, "--help"]) is not None
+    assert commands.named(["+strategy=clear"]) is None
+    assert commands.named([]) is None
+    commands.named(["help"])()
+    assert all(name in capsys.readouterr().out for name in commands.COMMANDS)
