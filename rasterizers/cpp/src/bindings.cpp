@@ -100,7 +100,7 @@ void bind_frame(nb::module_& m) {
                targets[i].rgb_offset = offsets[i] ? offsets[i]->data() : nullptr;
                targets[i].means2d = means2d[i].data();
                targets[i].visible = visible[i].data();
-               if (tiles[i]) targets[i].requested = blocks_of_tiles(tiles[i]->data(), edge, int(g[4]), int(g[5]));
+               if (tiles[i]) targets[i].request = Request(tiles[i]->data(), edge, int(g[4]), int(g[5]));
              }
              nb::gil_scoped_release release;
              return self.project(splats, std::move(targets), threads);

@@ -8,16 +8,11 @@
 #include <stdexcept>
 #include <string>
 
+#include "groups.hpp"
 #include "pool.hpp"
-#include "types.hpp"
+#include "request.hpp"
 
 namespace clear {
-
-// A rectangle of bins, both ends included; empty if x1 < x0.
-struct BinRange {
-  std::int16_t x0 = 0, x1 = -1, y0 = 0, y1 = -1;
-  std::int64_t count() const { return x1 < x0 || y1 < y0 ? 0 : std::int64_t(x1 - x0 + 1) * (y1 - y0 + 1); }
-};
 
 // The pairs of a band (some rows of bins). There is one band, unless its pairs would not fit the memory budget.
 struct Bins {
@@ -33,63 +28,63 @@ struct Bins {
 };
 
 // The number of pairs in each row of bins. 64-bit: a million Gaussians that cover the image make 10^9 pairs.
-inline std::vector<std::int64_t> count_pairs(int rows, const Buffer<BinRange>& ranges, std::int64_t n, int threads) {
-  const std::int64_t chunk = 16384, chunks = (n + chunk - 1) / chunk;
-  std::vector<std::int64_t> steps(std::size_t(chunks) * (rows + 1), 0);  // differences from row to row
-  Pool::instance().run(threads, chunks, [&](std::int64_t c) {
-    std::int64_t* step = steps.data() + c * (rows + 1);
-    for (std::int64_t i = c * chunk; i < std::min(n, (c + 1) * chunk); ++i) {
-      const BinRange r = ranges[i];
-      if (!r.count()) continue;
-      step[r.y0] += r.x1 - r.x0 + 1;
-      step[r.y1 + 1] -= r.x1 - r.x0 + 1;
-    }
+inline std::vector<std::int64_t> count_pairs(int rows, const Buffer<BinRange>& ranges, const Drawn& drawn, int threads) {
+  const std::int64_t per_part = 16, parts = (drawn.chunks() + per_part - 1) / per_part;
+  std::vector<std::int64_t> steps(std::size_t(parts) * (rows + 1), 0);  // differences from row to row
+  Pool::instance().run(threads, parts, [&](std::int64_t part) {
+    std::int64_t* step = steps.data() + part * (rows + 1);
+    for (std::int64_t c = part * per_part; c < std::min(drawn.chunks(), (part + 1) * per_part); ++c)
+      for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i) {
+        const BinRange r = ranges[*i];
+        if (!r.count()) continue;
+        step[r.y0] += r.x1 - r.x0 + 1;
+        step[r.y1 + 1] -= r.x1 - r.x0 + 1;
+      }
   });
   std::vector<std::int64_t> pairs(rows);
   std::int64_t running = 0;
   for (int row = 0; row < rows; ++row) {
-    for (std::int64_t c = 0; c < chunks; ++c) running += steps[c * (rows + 1) + row];
+    for (std::int64_t part = 0; part < parts; ++part) running += steps[part * (rows + 1) + row];
     pairs[row] = running;
   }
   return pairs;
 }
 
-// Lists the pairs of rows [first_row, end_row). Bins with `requested[bin]` = 0 are left out; null: none is.
-inline void list_pairs(int columns, int first_row, int end_row, const Buffer<std::uint32_t>& order,
-                       const Buffer<BinRange>& ranges, std::int64_t n, const std::uint64_t* requested, Bins& out, int threads) {
+// Lists the pairs of rows [first_row, end_row) on the requested bins.
+inline void list_pairs(int columns, int first_row, int end_row, const Drawn& drawn, const Buffer<std::uint32_t>& order,
+                       const Buffer<BinRange>& ranges, std::int64_t n, const Request& request, Bins& out, int threads) {
   out.columns = columns, out.first_row = first_row, out.end_row = end_row, out.has_masks = false;
   const int bins = out.bins();
   auto clipped = [&](std::uint32_t i) {
     BinRange r = ranges[i];
-    r.y0 = std::max<int>(r.y0, first_row), r.y1 = std::min<int>(r.y1, end_row - 1);
+    r.y0 = std::max<int>(r.y0, first_row), r.y1 = std::max(std::min<int>(r.y1, end_row - 1), r.y0 - 1);
     return r;
   };
   auto each_bin = [&](const BinRange& r, auto&& visit) {
-    for (int y = r.y0; y <= r.y1; ++y)
-      for (int x = r.x0; x <= r.x1; ++x)
-        if (!requested || requested[y * columns + x]) visit((y - first_row) * columns + x);
+    request.each_bin(r, [&](int x, int y) { visit((y - first_row) * columns + x); });
   };
 
   // Count each Gaussian's pairs.
-  const std::int64_t chunk = 16384, chunks = (n + chunk - 1) / chunk;
-  std::vector<std::int64_t> base(chunks + 1, 0);
+  std::vector<std::int64_t> base(drawn.chunks() + 1, 0);
   out.first.reserve_lost(n + 1);
-  Pool::instance().run(threads, chunks, [&](std::int64_t c) {
+  Pool::instance().run(threads, drawn.chunks(), [&](std::int64_t c) {
     std::int64_t count = 0;
-    for (std::int64_t i = c * chunk; i < std::min(n, (c + 1) * chunk); ++i) {
-      out.first[i] = std::uint32_t(count);
-      BinRange r = clipped(std::uint32_t(i));
-      if (requested) each_bin(r, [&](int) { ++count; });
-      else count += r.count();
-    }
+    for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i) count += request.bins_in(clipped(*i));
     base[c + 1] = count;
   });
-  for (std::int64_t c = 0; c < chunks; ++c) base[c + 1] += base[c];
-  if (base[chunks] > std::int64_t(UINT32_MAX)) throw std::length_error("more than 2^32 pairs in one band");
-  Pool::instance().run(threads, chunks, [&](std::int64_t c) {
-    for (std::int64_t i = c * chunk; i < std::min(n, (c + 1) * chunk); ++i) out.first[i] += std::uint32_t(base[c]);
+  for (std::int64_t c = 0; c < drawn.chunks(); ++c) base[c + 1] += base[c];
+  if (base.back() > std::int64_t(UINT32_MAX)) throw std::length_error("more than 2^32 pairs in one band");
+  Pool::instance().run(threads, drawn.chunks(), [&](std::int64_t c) {
+    std::uint32_t place = std::uint32_t(base[c]);
+    std::uint32_t* next = out.first.data() + c * kChunk;
+    for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i) {
+      std::uint32_t* here = out.first.data() + *i + 1;
+      std::fill(next, here, place);
+      next = here, place += std::uint32_t(request.bins_in(clipped(*i)));
+    }
+    std::fill(next, out.first.data() + std::min(n, (c + 1) * kChunk), place);
   });
-  out.first[n] = std::uint32_t(base[chunks]);
+  out.first[n] = std::uint32_t(base.back());
 
   // List the pairs front to back within each bin: count in parts of the depth order, then scatter part by part. The first
   // pass reads in random order and stores what the second then reads sequentially.

@@ -69,18 +69,6 @@ inline std::uint64_t blocks_in_image(int bin_x, int bin_y, int width, int height
   return all;
 }
 
-// The blocks of the requested tiles, by bin; tiles have `edge` px, a multiple of 4.
-inline std::vector<std::uint64_t> blocks_of_tiles(const bool* tiles, int edge, int width, int height) {
-  const int columns = (width + kBin - 1) / kBin, rows = (height + kBin - 1) / kBin, across = (width + edge - 1) / edge;
-  std::vector<std::uint64_t> requested(std::size_t(columns) * rows, 0);
-  for (int y = 0; y * kBlock < height; ++y)
-    for (int x = 0; x * kBlock < width; ++x)
-      if (tiles[y * kBlock / edge * across + x * kBlock / edge])
-        requested[y / kBlocksAcross * columns + x / kBlocksAcross] |=
-            std::uint64_t(1) << (y % kBlocksAcross * kBlocksAcross + x % kBlocksAcross);
-  return requested;
-}
-
 // Gathers a segment's Gaussians and lists those of each block. Masks are computed once and kept for the backward pass.
 template <class T>
 void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_t first, std::uint64_t requested,

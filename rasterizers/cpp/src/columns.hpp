@@ -3,8 +3,8 @@
 
 #include <algorithm>
 
+#include "groups.hpp"
 #include "rows.hpp"
-#include "types.hpp"
 
 namespace clear {
 
@@ -36,16 +36,40 @@ CLEAR_INLINE Lanes<T> load_row(const T* tensor, std::int64_t row, int count) {
   return columns[0];
 }
 
-// Columns of sixteen rows of `width` numbers at arbitrary addresses; a null row is zeros. Does not read beyond a row.
+// The same for the rows of a group's Gaussians.
+template <int C, class T>
+CLEAR_INLINE void load_rows(const T* tensor, const Group& group, Lanes<T> (&columns)[C]) {
+  if (group.consecutive) return load_rows<C>(tensor, group.rows[0], group.count, columns);
+  T apart[C][kLanes];
+  for (int i = 0; i < kLanes; ++i)
+    for (int c = 0; c < C; ++c) apart[c][i] = tensor[std::int64_t(C) * group.rows[i] + c];
+  for (int c = 0; c < C; ++c) columns[c] = Lanes<T>::load(apart[c]);
+}
+
+template <int C, class T>
+CLEAR_INLINE void store_rows(T* tensor, const Group& group, const Lanes<T> (&columns)[C]) {
+  if (group.consecutive) return store_rows<C>(tensor, group.rows[0], group.count, columns);
+  T joined[C * kLanes];
+  join_rows(joined, columns);
+  for (int i = 0; i < group.count; ++i)
+    std::memcpy(tensor + std::int64_t(C) * group.rows[i], joined + C * i, sizeof(T) * C);
+}
+
+template <class T>
+CLEAR_INLINE Lanes<T> load_row(const T* tensor, const Group& group) {
+  Lanes<T> columns[1];
+  load_rows<1>(tensor, group, columns);
+  return columns[0];
+}
+
+// Columns of sixteen rows of `width` numbers at arbitrary addresses. Does not read beyond a row.
 template <class T>
 CLEAR_INLINE void gather_rows(const T* const (&rows)[kLanes], int width, Lanes<T>* columns) {
   for (int start = 0; start < width; start += kLanes) {
     int first = std::max(0, std::min(start, width - kLanes));  // the last sixteen overlap the previous ones
     Lanes<T> block[kLanes];
     for (int i = 0; i < kLanes; ++i) {
-      if (!rows[i]) {
-        block[i] = T(0);
-      } else if (width >= kLanes) {
+      if (width >= kLanes) {
         block[i] = Lanes<T>::load(rows[i] + first);
       } else {
         T padded[kLanes] = {};
@@ -61,6 +85,17 @@ CLEAR_INLINE void gather_rows(const T* const (&rows)[kLanes], int width, Lanes<T
 // Writes the bits as bools.
 inline void store_bits(bool* out, int count, std::uint32_t bits) {
   for (int i = 0; i < count; ++i) out[i] = (bits >> i) & 1;
+}
+
+// The lanes in whose byte the bit is set.
+CLEAR_INLINE std::uint32_t lanes_with_bit(const std::uint8_t (&bytes)[kLanes], int bit) {
+#if defined(__SSE2__)
+  return std::uint32_t(_mm_movemask_epi8(_mm_slli_epi16(_mm_loadu_si128(reinterpret_cast<const __m128i*>(bytes)), 7 - bit)));
+#else
+  std::uint32_t lanes = 0;
+  for (int i = 0; i < kLanes; ++i) lanes |= std::uint32_t(bytes[i] >> bit & 1) << i;
+  return lanes;
+#endif
 }
 
 }  // namespace clear

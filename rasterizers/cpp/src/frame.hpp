@@ -28,20 +28,12 @@ class Frame {
   bool project(const Splats<T>& splats, std::vector<Target<T>> targets, int threads) {
     views_.clear();
     n_ = splats.n;
-    if (!clear::project(pose_, settings_, splats, targets, palette_, depths_, threads)) return false;
-    // One depth order for all Gaussians that any grid draws.
-    order_by_depth<T>(
-        n_,
-        [&](std::int64_t i) {
-          for (const Target<T>& t : targets)
-            if (t.ranges[i].count()) return true;
-          return false;
-        },
-        depths_, order_, threads);
+    if (!clear::project(pose_, settings_, splats, targets, slopes_, depths_, drawn_, threads)) return false;
+    order_by_depth<T>(drawn_, depths_, order_, threads);  // one for all grids
     for (Target<T>& target : targets) {
       View view;
       view.target = std::move(target);
-      view.pairs_in_row = count_pairs(view.target.grid.rows(), view.target.ranges, n_, threads);
+      view.pairs_in_row = count_pairs(view.target.grid.rows(), view.target.ranges, drawn_, threads);
       views_.push_back(std::move(view));
     }
     return true;
@@ -81,30 +73,31 @@ class Frame {
     }
   }
 
-  // Y of every Gaussian that is visible on some grid, [n, bands + 1]; zeros for the others.
+  // Y of every Gaussian that some grid draws, [n, bands + 1]; zeros for the others.
   void basis(const Splats<T>& splats, T* out, int threads) {
     using L = Lanes<T>;
     const int width = splats.bands + 1;
-    const std::int64_t groups = groups_of(n_), per_task = 64;
-    Pool::instance().run(threads, (groups + per_task - 1) / per_task, [&](std::int64_t task) {
-      for (std::int64_t g = task * per_task; g < std::min(groups, (task + 1) * per_task); ++g) {
-        const std::int64_t first = g * kLanes;
-        const int count = int(std::min<std::int64_t>(kLanes, n_ - first));
+    Pool::instance().run(threads, drawn_.chunks(), [&](std::int64_t chunk) {
+      std::int64_t written = chunk * kChunk;
+      auto zeros_until = [&](std::int64_t row) { std::fill(out + written * width, out + row * width, T(0)); };
+      for (const std::uint32_t* number = drawn_.begin(chunk); number < drawn_.end(chunk); number += kLanes) {
+        const Group group(number, drawn_.end(chunk) - number);
         L mean[3], direction[3], length, Y[kLanes];
-        load_rows<3>(splats.means, first, count, mean);
+        load_rows<3>(splats.means, group, mean);
         direction_of(pose_, mean, direction, length);
         for (L& y : Y) y = T(0);
         each_band<T>(splats.bands, direction,
                      [&](int k, const L& y, const L&, const L&, const L&) CLEAR_LAMBDA { Y[k] = y; });
         transpose(Y);
         T row[kLanes];
-        for (int i = 0; i < count; ++i) {
-          bool shows = false;
-          for (const View& view : views_) shows |= view.target.visible[first + i];
-          (shows ? Y[i] : L(T(0))).store(row);
-          std::copy(row, row + width, out + (first + i) * width);
+        for (int i = 0; i < group.count; ++i) {
+          zeros_until(group.rows[i]);
+          Y[i].store(row);
+          std::copy(row, row + width, out + std::int64_t(group.rows[i]) * width);
+          written = group.rows[i] + 1;
         }
       }
+      zeros_until(std::min(n_, (chunk + 1) * kChunk));
     });
   }
 
@@ -148,8 +141,8 @@ class Frame {
   }
 
   void list(View& view, int first_row, int end_row, int threads) {
-    list_pairs(view.target.grid.columns(), first_row, end_row, order_, view.target.ranges, n_,
-               view.target.requested.empty() ? nullptr : view.target.requested.data(), view.bins, threads);
+    list_pairs(view.target.grid.columns(), first_row, end_row, drawn_, order_, view.target.ranges, n_,
+               view.target.request, view.bins, threads);
   }
 
   // The job of a bin of the band, with its requested blocks.
@@ -166,24 +159,18 @@ class Frame {
             x,
             y,
             inside,
-            view.target.requested.empty() ? inside : inside & view.target.requested[place],
+            inside & view.target.request.blocks(std::int64_t(place)),
             view.ends.data() + place * kBlocks};
   }
 
   template <int K>
   void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
     const std::vector<int> bands = bands_of(view, kBytesPerPair + K * sizeof(PairSums<T>));
-    const std::int64_t groups = groups_of(n_), per_task = 32;
     const bool whole = bands.size() == 2;
     if (!whole) {
       splat_sums_.reserve_lost(std::size_t(n_) * K);
       std::memset(static_cast<void*>(splat_sums_.data()), 0, sizeof(PairSums<T>) * n_ * K);
     }
-    auto each_group = [&](auto&& visit) {
-      Pool::instance().run(threads, (groups + per_task - 1) / per_task, [&](std::int64_t task) {
-        for (std::int64_t g = task * per_task; g < std::min(groups, (task + 1) * per_task); ++g) visit(g);
-      });
-    };
     for (std::size_t b = 0; b + 1 < bands.size(); ++b) {
       if (view.bins.first_row != bands[b] || view.bins.end_row != bands[b + 1]) list(view, bands[b], bands[b + 1], threads);
       pair_sums_.reserve_lost(view.bins.pairs.size() * K);
@@ -191,41 +178,74 @@ class Frame {
                            [&](std::int64_t bin) { blend_vjp_bin<T, K>(job(view, bin), cotangents, pair_sums_.data()); });
       view.bins.has_masks = true;
       if (whole) break;
-      each_group([&](std::int64_t g) {
-        const int count = int(std::min<std::int64_t>(kLanes, n_ - g * kLanes));
-        Lanes<T> rows[K][kLanes];
-        for (int k = 0; k < K; ++k)
-          for (int i = 0; i < count; ++i) rows[k][i] = Lanes<T>::load(&splat_sums_[(g * kLanes + i) * K + k].q);
-        add_pair_sums<T, K>(view.bins, g * kLanes, count, n_, pair_sums_, rows);
-        for (int k = 0; k < K; ++k)
-          for (int i = 0; i < count; ++i) rows[k][i].store(&splat_sums_[(g * kLanes + i) * K + k].q);
-      });
+      Pool::instance().run(threads, chunks_of(n_), [&](std::int64_t chunk) { add_band<K>(view, chunk); });
     }
-    each_group([&](std::int64_t g) {
-      const std::int64_t first = g * kLanes;
-      const int count = int(std::min<std::int64_t>(kLanes, n_ - first));
-      Lanes<T> rows[K][kLanes];
+    Pool::instance().run(threads, chunks_of(n_), [&](std::int64_t chunk) { vjp_of_chunk<K>(view, whole, splats, chunk, out); });
+  }
+
+  // Adds the pair sums of the listed band to the sums of a chunk's Gaussians.
+  template <int K>
+  void add_band(const View& view, std::int64_t chunk) {
+    Lanes<T> rows[K][kLanes];
+    for (const std::uint32_t* number = drawn_.begin(chunk); number < drawn_.end(chunk); number += kLanes) {
+      const Group group(number, drawn_.end(chunk) - number);
+      load_sums<K>(group, rows);
+      add_pair_sums<T, K>(view.bins, group, pair_sums_, rows);
       for (int k = 0; k < K; ++k)
-        for (Lanes<T>& row : rows[k]) row = T(0);
-      std::uint32_t touched = 0;
+        for (int i = 0; i < group.count; ++i) rows[k][i].store(&splat_sums_[std::size_t(group.rows[i]) * K + k].q);
+    }
+  }
+
+  template <int K>
+  void load_sums(const Group& group, Lanes<T> (&rows)[K][kLanes]) const {
+    for (int k = 0; k < K; ++k)
+      for (int i = 0; i < kLanes; ++i) rows[k][i] = Lanes<T>::load(&splat_sums_[std::size_t(group.rows[i]) * K + k].q);
+  }
+
+  // The gradients of a chunk's Gaussians, once the sums of all bands are there.
+  template <int K>
+  void vjp_of_chunk(const View& view, bool whole, const Splats<T>& splats, std::int64_t chunk, const Gradients<T>& out) {
+    constexpr std::int64_t ahead = 6 * kLanes;
+    const std::int64_t first = chunk * kChunk, end = std::min(n_, first + kChunk);
+    auto touched = [&](std::int64_t i) {
+      return whole ? view.bins.first[i + 1] > view.bins.first[i] : view.target.ranges[i].count() > 0;
+    };
+    std::uint32_t numbers[kChunk + ahead];
+    std::int64_t count = 0;
+    for (const std::uint32_t* i = drawn_.begin(chunk); i < drawn_.end(chunk); ++i) numbers[count] = *i, count += touched(*i);
+    const bool sparse = count < (end - first) / 2;
+    if (sparse) {
+      clear_gradients<T, K>(n_, first, end - first, out);
+    } else {  // most of them: contiguous rows are read and written faster than scattered ones
+      count = end - first;
+      for (std::int64_t i = 0; i < kChunk + ahead; ++i) numbers[i] = std::uint32_t(std::min(first + i, n_ - 1));
+    }
+    const std::int64_t known = sparse ? count : count + ahead;
+    for (std::int64_t at = 0; at < count; at += kLanes) {
+      const Group group(numbers + at, count - at);
+      Lanes<T> rows[K][kLanes];
+      fetch_rows(splats, view.target, slopes_, numbers + std::min(known, at + 2 * kLanes),
+                 numbers + std::min(known, at + 3 * kLanes));
       if (whole) {
-        const std::uint32_t* mine = view.bins.first.data() + first;
-        for (int i = 0; i < count; ++i) touched |= std::uint32_t(mine[i + 1] > mine[i]) << i;
-        add_pair_sums<T, K>(view.bins, first, count, n_, pair_sums_, rows);
+        fetch_pair_sums<T, K>(view.bins, numbers + std::min(known, at + ahead),
+                              numbers + std::min(known, at + ahead + kLanes), pair_sums_);
+        for (int k = 0; k < K; ++k)
+          for (Lanes<T>& row : rows[k]) row = T(0);
+        add_pair_sums<T, K>(view.bins, group, pair_sums_, rows);
       } else {
-        for (int i = 0; i < count; ++i) {
-          touched |= std::uint32_t(view.target.ranges[first + i].count() > 0) << i;
-          for (int k = 0; k < K; ++k) rows[k][i] = Lanes<T>::load(&splat_sums_[(first + i) * K + k].q);
-        }
+        load_sums<K>(group, rows);
       }
-      project_vjp_group<T, K>(pose_, settings_, splats, view.target, palette_, g, rows, touched, out);
-    });
+      std::uint32_t bits = 0;
+      for (int i = 0; i < group.count; ++i) bits |= std::uint32_t(sparse || touched(group.rows[i])) << i;
+      project_vjp_group<T, K>(pose_, settings_, splats, view.target, slopes_, group, rows, bits, out);
+    }
   }
 
   Settings<T> settings_;
   Pose pose_;
   std::int64_t budget_, n_ = 0;
-  Palette<T> palette_;
+  Drawn drawn_;
+  Buffer<Slope<T>> slopes_;  // [n]
   Buffer<double> depths_;
   Buffer<std::uint32_t> order_;
   std::vector<View> views_;

@@ -1,10 +1,10 @@
-// Bin, first half: sorts the visible Gaussians front to back. Only these are sorted, never (tile, Gaussian) pairs.
+// Bin, first half: sorts the drawn Gaussians front to back. Only these are sorted, never (tile, Gaussian) pairs.
 #pragma once
 
 #include <bit>
 
+#include "groups.hpp"
 #include "pool.hpp"
-#include "types.hpp"
 
 namespace clear {
 
@@ -48,50 +48,44 @@ inline void sort_by_depth(Buffer<DepthKey>& keys, Buffer<DepthKey>& spare, int t
   }
 }
 
-// Indices of the Gaussians for which `shows(i)`, by depth, then index.
-template <class T, class Shows>
-void order_by_depth(std::int64_t n, Shows&& shows, const Buffer<double>& depths, Buffer<std::uint32_t>& order, int threads) {
-  const std::int64_t chunk = 8192, chunks = (n + chunk - 1) / chunk;
+// The drawn Gaussians by depth, then index.
+template <class T>
+void order_by_depth(const Drawn& drawn, const Buffer<double>& depths, Buffer<std::uint32_t>& order, int threads) {
+  const std::int64_t chunks = drawn.chunks();
   struct Extent {
-    std::int64_t count = 0;
     std::uint64_t low = UINT64_MAX, high = 0;
   };
+  auto bits = [&](std::uint32_t i) { return std::bit_cast<std::uint64_t>(depths[i]); };
   std::vector<Extent> extents(chunks);
-  auto each = [&](std::int64_t c, auto&& visit) {
-    for (std::int64_t i = c * chunk; i < std::min(n, (c + 1) * chunk); ++i)
-      if (shows(i)) visit(i, std::bit_cast<std::uint64_t>(depths[i]));
-  };
   Pool::instance().run(threads, chunks, [&](std::int64_t c) {
     Extent e;
-    each(c, [&](std::int64_t, std::uint64_t depth) {
-      ++e.count, e.low = std::min(e.low, depth), e.high = std::max(e.high, depth);
-    });
+    for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i)
+      e.low = std::min(e.low, bits(*i)), e.high = std::max(e.high, bits(*i));
     extents[c] = e;
   });
   Extent all;
+  std::int64_t count = 0;
   std::vector<std::int64_t> starts(chunks);
   for (std::int64_t c = 0; c < chunks; ++c) {
-    starts[c] = all.count;
-    all = {all.count + extents[c].count, std::min(all.low, extents[c].low), std::max(all.high, extents[c].high)};
+    starts[c] = count, count += drawn.count(c);
+    all = {std::min(all.low, extents[c].low), std::max(all.high, extents[c].high)};
   }
-  order.reserve_lost(all.count);
+  order.reserve_lost(count);
   if constexpr (sizeof(T) == 4) {
     // Keys are the 32 bits below the highest bit in which two depths differ: about 30 significant bits, a float has 24.
-    const int shift = all.count ? std::max(0, int(std::bit_width(all.high - all.low)) - 32) : 0;
+    const int shift = count ? std::max(0, int(std::bit_width(all.high - all.low)) - 32) : 0;
     Buffer<DepthKey> keys, spare;
-    keys.reserve_lost(all.count);
+    keys.reserve_lost(count);
     Pool::instance().run(threads, chunks, [&](std::int64_t c) {
       std::int64_t at = starts[c];
-      each(c, [&](std::int64_t i, std::uint64_t depth) {
-        keys[at++] = {std::uint32_t((depth - all.low) >> shift), std::uint32_t(i)};
-      });
+      for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i)
+        keys[at++] = {std::uint32_t((bits(*i) - all.low) >> shift), *i};
     });
     sort_by_depth(keys, spare, threads);
-    for (std::int64_t i = 0; i < all.count; ++i) order[i] = keys[i].index;
+    for (std::int64_t i = 0; i < count; ++i) order[i] = keys[i].index;
   } else {
-    std::int64_t at = 0;
-    for (std::int64_t c = 0; c < chunks; ++c) each(c, [&](std::int64_t i, std::uint64_t) { order[at++] = std::uint32_t(i); });
-    std::stable_sort(order.data(), order.data() + all.count, [&](auto a, auto b) { return depths[a] < depths[b]; });
+    for (std::int64_t c = 0; c < chunks; ++c) std::copy(drawn.begin(c), drawn.end(c), order.data() + starts[c]);
+    std::stable_sort(order.data(), order.data() + count, [&](auto a, auto b) { return depths[a] < depths[b]; });
   }
 }
 

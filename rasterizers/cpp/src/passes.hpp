@@ -32,9 +32,23 @@ Segment<T>& thread_segment() {
   return segment;
 }
 
+// A bin without a requested block shows the background.
+template <class T>
+void fill_bin(const BinJob<T>& job, T* image, T* alpha) {
+  const int x = job.x * kBin, columns = std::min(kBin, job.grid.width - x);
+  T pixels[3 * kBin];
+  for (int i = 0; i < 3 * kBin; ++i) pixels[i] = job.settings.background[i % 3];
+  for (int y = job.y * kBin; y < std::min(job.grid.height, (job.y + 1) * kBin); ++y) {
+    const std::int64_t at = std::int64_t(y) * job.grid.width + x;
+    std::memcpy(image + 3 * at, pixels, sizeof(T) * 3 * columns);
+    std::fill_n(alpha + at, columns, T(0));
+  }
+}
+
 // Draws the bin's pixels into [height, width, 3] and [height, width]; blocks not requested show the background.
 template <class T>
 void draw_bin(const BinJob<T>& job, T* image, T* alpha) {
+  if (!job.requested) return fill_bin(job, image, alpha);
   using L = Lanes<T>;
   static thread_local BlockColour<T> scratch[kBlocks];
   BlockColour<T>* colours = scratch;

@@ -1,5 +1,7 @@
-// Projects every group of sixteen Gaussians onto each pixel grid of a pose, and computes the colours of the visible ones.
+// Projects every group of sixteen Gaussians onto each pixel grid of a pose, and computes the colours of those that are drawn.
 #pragma once
+
+#include <bit>
 
 #include "bins.hpp"
 #include "colour.hpp"
@@ -8,16 +10,10 @@
 
 namespace clear {
 
-// Colours, before offset and clamp, and ∂rgb/∂mean of the Gaussians that are visible on some grid; by group.
+// ∂rgb/∂mean of a drawn Gaussian, channel by channel: one register, so that any sixteen of them are read by a transpose.
 template <class T>
-struct Palette {
-  static constexpr int kRgb = 3 * kLanes, kSlope = 9 * kLanes;
-  Buffer<T> rgb, slope;  // [groups, 3, 16], [groups, 9, 16]
-
-  void reserve(std::int64_t groups, bool turns) {
-    rgb.reserve_lost(groups * kRgb);
-    slope.reserve_lost(turns ? groups * kSlope : 0);  // without higher bands the colour does not depend on the position
-  }
+struct alignas(kLanes * sizeof(T)) Slope {
+  T numbers[kLanes];
 };
 
 // One pixel grid of a pose: what differs between them, and the result of the projection.
@@ -28,10 +24,10 @@ struct Target {
   const T* rgb_offset;  // [n, 3] or null
   T* means2d;           // out [n, 2]
   bool* visible;        // out [n]
-  std::vector<std::uint64_t> requested;  // the requested blocks of each bin; empty: all
-  Buffer<Ellipse<T>> ellipses;
-  Buffer<BinRange> ranges;    // [n]
-  Buffer<std::uint16_t> lit;  // [groups, 3]: the lanes whose channel was not clamped at 0, and so has a gradient
+  Request request;
+  Buffer<BinRange> ranges;       // [n]; empty if the Gaussian is not drawn
+  Buffer<Ellipse<T>> ellipses;   // [n]; of the drawn Gaussians
+  Buffer<std::uint8_t> lit;      // [n]; bit c: channel c was not clamped at 0, and so has a gradient
 };
 
 // The bins whose pixel centres the ellipses' boxes cover.
@@ -54,21 +50,18 @@ CLEAR_INLINE void bins_of(const Grid<T>& grid, const Lanes<T> (&e)[kLanes], std:
 
 // The visible Gaussians with a requested bin; the ranges of the others become empty.
 template <class T>
-std::uint32_t keep_requested(const Target<T>& target, std::uint32_t shown, BinRange* ranges) {
-  if (target.requested.empty()) return shown;
-  std::uint32_t requested = 0;
-  for (std::uint32_t m = shown; m; m &= m - 1) {
-    const int i = __builtin_ctz(m);
-    bool any = false;
-    for (int y = ranges[i].y0; y <= ranges[i].y1 && !any; ++y)
-      for (int x = ranges[i].x0; x <= ranges[i].x1 && !any; ++x) any = target.requested[y * target.grid.columns() + x] != 0;
-    if (any) requested |= 1u << i;
-    else ranges[i] = BinRange{};
+std::uint32_t keep_requested(const Target<T>& target, std::uint32_t visible, int count, BinRange* ranges) {
+  if (target.request.all()) return visible;
+  std::uint32_t kept = 0;
+  for (int i = 0; i < count; ++i) {
+    const bool any = target.request.bins_in(ranges[i]) > 0;
+    const std::uint64_t keep = -std::uint64_t(any);
+    const auto range = std::bit_cast<std::uint64_t>(ranges[i]), none = std::bit_cast<std::uint64_t>(BinRange{});
+    ranges[i] = std::bit_cast<BinRange>((range & keep) | (none & ~keep));
+    kept |= std::uint32_t(any) << i;
   }
-  return requested;
+  return kept;
 }
-
-inline std::int64_t groups_of(std::int64_t n) { return (n + kLanes - 1) / kLanes; }
 
 // Whether the minimum of A dx² + B dx dy + C dy² over the box of the image's pixel centres is within reach; exact. A convex
 // quadratic has its minimum over a box at its centre if that is inside, else on one of the sides that face the centre.
@@ -116,14 +109,25 @@ CLEAR_INLINE void add_times_zero(const Lanes<T>* columns, int count, Lanes<T>& p
   for (int i = 0; i < count; ++i) poison += columns[i] * Lanes<T>(T(0));
 }
 
-// Returns whether every number that was read is finite.
+// Prefetches a group's rows. They are consecutive, but there are more streams here than the processor foresees.
 template <class T>
-bool project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
-                   Palette<T>& palette, Buffer<double>& depths, std::int64_t group) {
+CLEAR_INLINE void fetch_group(const Splats<T>& splats, std::int64_t first) {
+  auto fetch = [&](const T* rows, int width) {
+    for (std::size_t at = 0; at < sizeof(T) * width * kLanes; at += 64)
+      __builtin_prefetch(reinterpret_cast<const char*>(rows + width * first) + at);
+  };
+  fetch(splats.means, 3), fetch(splats.quats, 4), fetch(splats.scales, 3);
+}
+
+// Projects the sixteen Gaussians from `first` on, and returns those that some grid draws, as bits. `finite` becomes false if
+// a number that was read is not.
+template <class T>
+std::uint32_t project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
+                            Buffer<double>& depths, std::int64_t first, bool& finite) {
   using L = Lanes<T>;
-  const std::int64_t first = group * kLanes;
   const int count = int(std::min<std::int64_t>(kLanes, splats.n - first));
   const std::uint32_t real = (1u << count) - 1;
+  fetch_group(splats, first + 4 * kLanes);
   L mean[3], quat[4], scale[3];
   load_rows<3>(splats.means, first, count, mean);
   load_rows<4>(splats.quats, first, count, quat);
@@ -134,81 +138,116 @@ bool project_group(const Pose& pose, const Settings<T>& s, const Splats<T>& spla
   const Geometry<T> g(pose, targets[0].grid, centre, quat, scale);
 
   centre.z.store(depths.data() + first);
-  Mask<T> in_front = g.z > L(s.near);
-  L ellipse[4][kLanes];
-  std::uint32_t shown[4], any = 0;  // visible, and on a requested bin
-  for (std::size_t i = 0; i < targets.size(); ++i) {
-    Target<T>& target = targets[i];
+  const Mask<T> in_front = g.z > L(s.near);
+  std::uint32_t any = 0;
+  for (Target<T>& target : targets) {
     const L opacity = load_row(target.opacities, first, count);
     add_times_zero(&opacity, 1, poison);
     // The grids of one pose are nearly always scaled copies of each other; they then share the geometry, too.
-    Mask<T> shows = same_view(target.grid, targets[0].grid)
-                        ? ellipse_of(centre, g, target.grid, s, opacity, ellipse[i])
-                        : ellipse_of(centre, Geometry<T>(pose, target.grid, centre, quat, scale), target.grid, s,
-                                     opacity, ellipse[i]);
+    L e[kLanes];
+    const Mask<T> shows = same_view(target.grid, targets[0].grid)
+                              ? ellipse_of(centre, g, target.grid, s, opacity, e)
+                              : ellipse_of(centre, Geometry<T>(pose, target.grid, centre, quat, scale), target.grid, s,
+                                           opacity, e);
     const std::uint32_t visible = shows.bits() & real;
-    const L uv[2] = {where(in_front, ellipse[i][kWholeU] + ellipse[i][kU]),
-                     where(in_front, ellipse[i][kWholeV] + ellipse[i][kV])};
+    const L uv[2] = {where(in_front, e[kWholeU] + e[kU]), where(in_front, e[kWholeV] + e[kV])};
     store_rows<2>(target.means2d, first, count, uv);
     store_bits(target.visible + first, count, visible);
-    bins_of(target.grid, ellipse[i], visible, count, target.ranges.data() + first);
-    any |= shown[i] = keep_requested(target, visible, target.ranges.data() + first);
-  }
-
-  Colour<T> colour;
-  if (any) {
-    L coefficients[3 * 16];
-    const T *base[kLanes], *bands[kLanes];
-    for (int i = 0; i < kLanes; ++i) {
-      bool used = (any >> i) & 1;
-      base[i] = used ? splats.sh0 + 3 * (first + i) : nullptr;
-      bands[i] = used && splats.bands ? splats.shN + splats.shN_stride * (first + i) : nullptr;
-    }
-    gather_rows(base, 3, coefficients);
-    if (splats.bands) gather_rows(bands, 3 * splats.bands, coefficients + 3);
-    add_times_zero(coefficients, 3 + 3 * splats.bands, poison);
-    colour_of(pose, mean, splats.bands, coefficients, colour);
-    for (int c = 0; c < 3; ++c) colour.rgb[c].store(palette.rgb.data() + group * palette.kRgb + c * kLanes);
-    if (splats.bands)
-      for (int c = 0; c < 9; ++c) colour.slope[c].store(palette.slope.data() + group * palette.kSlope + c * kLanes);
-  }
-
-  for (std::size_t i = 0; i < targets.size(); ++i) {
-    L(&e)[kLanes] = ellipse[i];
-    L offset[3] = {T(0), T(0), T(0)};
-    if (targets[i].rgb_offset && shown[i]) load_rows<3>(targets[i].rgb_offset, first, count, offset);
-    add_times_zero(offset, 3, poison);
-    for (int c = 0; c < 3; ++c) {
-      L rgb = any ? colour.rgb[c] + offset[c] : L(T(0));
-      e[kRed + c] = maximum(rgb, L(T(0)));
-      targets[i].lit[3 * group + c] = std::uint16_t((rgb >= L(T(0))).bits());
-    }
-    e[14] = e[15] = T(0);
+    bins_of(target.grid, e, visible, count, target.ranges.data() + first);
+    const std::uint32_t drawn = keep_requested(target, visible, count, target.ranges.data() + first);
+    any |= drawn;
+    if (!drawn) continue;
+    e[kRed] = e[kGreen] = e[kBlue] = e[14] = e[15] = T(0);  // the colour is written by `colour_group`
     transpose(e);
-    T* rows = reinterpret_cast<T*>(targets[i].ellipses.data() + first);
-    for (int k = 0; k < kLanes; ++k) e[k].store(rows + k * kLanes);
+    for (int i = 0; i < count; ++i)
+      if ((drawn >> i) & 1) e[i].store(&target.ellipses[first + i].u);
   }
-  return (poison >= L(T(0))).bits() == 0xffff;
+  finite &= (poison >= L(T(0))).bits() == 0xffff;
+  return any;
 }
 
-// Allocates whole groups; the rows beyond n repeat the last Gaussian and are never listed.
+// Prefetches a Gaussian's coefficients, which `colour_group` reads after the rest of the chunk has been projected.
+template <class T>
+CLEAR_INLINE void fetch_coefficients(const Splats<T>& splats, std::uint32_t number) {
+  const T* row = splats.shN + splats.shN_stride * number;
+  constexpr int line = 64 / sizeof(T);
+  for (int i = 0; i < 3 * splats.bands; i += line) __builtin_prefetch(row + i, 0, 2);
+  if (splats.bands) __builtin_prefetch(row + 3 * splats.bands - 1, 0, 2);
+}
+
+// Writes the colours of a group of drawn Gaussians into their ellipses on every grid.
+template <class T>
+void colour_group(const Pose& pose, const Splats<T>& splats, std::vector<Target<T>>& targets, Buffer<Slope<T>>& slopes,
+                  const Group& group, bool& finite) {
+  using L = Lanes<T>;
+  L mean[3], coefficients[3 * 16], poison = T(0);
+  load_rows<3>(splats.means, group, mean);
+  L base[3];
+  load_rows<3>(splats.sh0, group, base);
+  std::copy(base, base + 3, coefficients);
+  if (splats.bands) {
+    const T* rows[kLanes];
+    for (int i = 0; i < kLanes; ++i) rows[i] = splats.shN + splats.shN_stride * group.rows[i];
+    gather_rows(rows, 3 * splats.bands, coefficients + 3);
+  }
+  add_times_zero(coefficients, 3 + 3 * splats.bands, poison);
+  Colour<T> colour;
+  colour_of(pose, mean, splats.bands, coefficients, colour);
+  for (Target<T>& target : targets) {
+    L rgb[3] = {colour.rgb[0], colour.rgb[1], colour.rgb[2]};
+    if (target.rgb_offset) {
+      L offset[3];
+      load_rows<3>(target.rgb_offset, group, offset);
+      add_times_zero(offset, 3, poison);
+      for (int c = 0; c < 3; ++c) rgb[c] += offset[c];
+    }
+    T clamped[3][kLanes];
+    std::uint32_t lit[3];
+    for (int c = 0; c < 3; ++c) maximum(rgb[c], L(T(0))).store(clamped[c]), lit[c] = (rgb[c] >= L(T(0))).bits();
+    for (int i = 0; i < group.count; ++i) {
+      Ellipse<T>& e = target.ellipses[group.rows[i]];
+      e.r = clamped[0][i], e.g = clamped[1][i], e.b = clamped[2][i];
+      target.lit[group.rows[i]] = std::uint8_t((lit[0] >> i & 1) | (lit[1] >> i & 1) << 1 | (lit[2] >> i & 1) << 2);
+    }
+  }
+  if (splats.bands) {  // without higher bands the colour does not depend on the position
+    L rows[kLanes];
+    for (int c = 0; c < kLanes; ++c) rows[c] = c < 9 ? colour.slope[c] : L(T(0));
+    transpose(rows);
+    for (int i = 0; i < group.count; ++i) rows[i].store(slopes[group.rows[i]].numbers);
+  }
+  finite &= (poison >= L(T(0))).bits() == 0xffff;
+}
+
+// Returns whether every number that was read is finite.
 template <class T>
 bool project(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, std::vector<Target<T>>& targets,
-             Palette<T>& palette, Buffer<double>& depths, int threads) {
-  const std::int64_t groups = groups_of(splats.n), per_task = 64;
-  palette.reserve(groups, splats.bands > 0);
-  depths.reserve_lost(groups * kLanes);
+             Buffer<Slope<T>>& slopes, Buffer<double>& depths, Drawn& drawn, int threads) {
+  const std::int64_t n = splats.n;
+  slopes.reserve_lost(splats.bands ? n : 0);
+  depths.reserve_lost(groups_of(n) * kLanes);  // whole groups are written
+  drawn.reserve(n);
   for (Target<T>& target : targets) {
-    target.ranges.reserve_lost(splats.n);
-    target.ellipses.reserve_lost(groups * kLanes);
-    target.lit.reserve_lost(groups * 3);
+    target.ranges.reserve_lost(n);
+    target.ellipses.reserve_lost(n);
+    target.lit.reserve_lost(n);
   }
-  std::atomic<bool> finite{true};
-  Pool::instance().run(threads, (groups + per_task - 1) / per_task, [&](std::int64_t task) {
-    for (std::int64_t g = task * per_task; g < std::min(groups, (task + 1) * per_task); ++g)
-      if (!project_group(pose, s, splats, targets, palette, depths, g)) finite = false;
+  std::atomic<bool> all_finite{true};
+  Pool::instance().run(threads, chunks_of(n), [&](std::int64_t chunk) {
+    bool finite = true;
+    std::uint32_t* numbers = drawn.open(chunk);
+    std::int64_t count = 0;
+    for (std::int64_t first = chunk * kChunk; first < std::min(n, (chunk + 1) * kChunk); first += kLanes)
+      for (std::uint32_t bits = project_group(pose, s, splats, targets, depths, first, finite); bits; bits &= bits - 1) {
+        numbers[count] = std::uint32_t(first + __builtin_ctz(bits));
+        fetch_coefficients(splats, numbers[count++]);
+      }
+    drawn.close(chunk, count);
+    for (std::int64_t k = 0; k < count; k += kLanes)
+      colour_group(pose, splats, targets, slopes, Group(numbers + k, count - k), finite);
+    if (!finite) all_finite = false;
   });
-  return finite;
+  return all_finite;
 }
 
 }  // namespace clear

@@ -12,43 +12,67 @@ struct Gradients {
   T *means, *quats, *scales, *opacities, *screen, *rgb;
 };
 
-// Adds the pair sums of this band to the K rows of each Gaussian of a group. Their addresses are scattered, so those of
-// later groups are prefetched.
+// Zeroes the gradients of `count` Gaussians.
 template <class T, int K>
-CLEAR_INLINE void add_pair_sums(const Bins& bins, std::int64_t first, int count, std::int64_t n,
-                           const Buffer<PairSums<T>>& pair_sums, Lanes<T> (&rows)[K][kLanes]) {
-  constexpr std::int64_t ahead = 6 * kLanes;
-  const std::uint32_t* mine = bins.first.data();
-  for (std::uint32_t p = mine[std::min(n, first + ahead)]; p < mine[std::min(n, first + ahead + kLanes)]; ++p)
-    for (int k = 0; k < K; ++k) __builtin_prefetch(&pair_sums[std::size_t(bins.where[p]) * K + k], 0, 1);
-  for (int i = 0; i < count; ++i)
-    for (std::uint32_t p = mine[first + i]; p < mine[first + i + 1]; ++p)
+void clear_gradients(std::int64_t n, std::int64_t first, std::int64_t count, const Gradients<T>& out) {
+  auto zero = [&](T* tensor, int width) {
+    for (int k = 0; k < K; ++k) std::memset(tensor + (k * n + first) * width, 0, sizeof(T) * width * count);
+  };
+  zero(out.means, 3), zero(out.quats, 4), zero(out.scales, 3), zero(out.opacities, 1), zero(out.screen, 2), zero(out.rgb, 3);
+}
+
+// Adds the pair sums of this band to the K rows of each Gaussian of the group.
+template <class T, int K>
+CLEAR_INLINE void add_pair_sums(const Bins& bins, const Group& group, const Buffer<PairSums<T>>& pair_sums,
+                                Lanes<T> (&rows)[K][kLanes]) {
+  for (int i = 0; i < group.count; ++i)
+    for (std::uint32_t p = bins.first[group.rows[i]]; p < bins.first[group.rows[i] + 1]; ++p)
       for (int k = 0; k < K; ++k) rows[k][i] += Lanes<T>::load(&pair_sums[std::size_t(bins.where[p]) * K + k].q);
 }
 
+// Prefetches them for Gaussians that follow later: their addresses are scattered.
+template <class T, int K>
+CLEAR_INLINE void fetch_pair_sums(const Bins& bins, const std::uint32_t* number, const std::uint32_t* end,
+                                  const Buffer<PairSums<T>>& pair_sums) {
+  for (; number < end; ++number)
+    for (std::uint32_t p = bins.first[*number]; p < bins.first[*number + 1]; ++p)
+      for (int k = 0; k < K; ++k) __builtin_prefetch(&pair_sums[std::size_t(bins.where[p]) * K + k], 0, 1);
+}
+
+// Prefetches the rows that `project_vjp_group` reads of Gaussians that follow later, where these are not consecutive.
+template <class T>
+CLEAR_INLINE void fetch_rows(const Splats<T>& splats, const Target<T>& target, const Buffer<Slope<T>>& slopes,
+                             const std::uint32_t* number, const std::uint32_t* end) {
+  for (; number < end; ++number) {
+    const std::size_t i = *number;
+    __builtin_prefetch(splats.means + 3 * i), __builtin_prefetch(splats.quats + 4 * i);
+    __builtin_prefetch(splats.scales + 3 * i), __builtin_prefetch(target.opacities + i);
+    __builtin_prefetch(target.lit.data() + i);
+    if (splats.bands) __builtin_prefetch(slopes[i].numbers);
+  }
+}
+
+// The gradients of a group; those of its lanes that are not `touched` are zeros.
 template <class T, int K>
 void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, const Target<T>& target,
-                const Palette<T>& palette, std::int64_t group, Lanes<T> (&rows)[K][kLanes], std::uint32_t touched,
-                const Gradients<T>& out) {
+                       const Buffer<Slope<T>>& slopes, const Group& group, Lanes<T> (&rows)[K][kLanes],
+                       std::uint32_t touched, const Gradients<T>& out) {
   using L = Lanes<T>;
-  const std::int64_t n = splats.n, first = group * kLanes;
-  const int count = int(std::min<std::int64_t>(kLanes, n - first));
-  if (!touched) {
-    auto clear = [&](T* tensor, int width) {
-      for (int k = 0; k < K; ++k) std::memset(tensor + (k * n + first) * width, 0, sizeof(T) * width * count);
-    };
-    clear(out.means, 3), clear(out.quats, 4), clear(out.scales, 3), clear(out.opacities, 1), clear(out.screen, 2);
-    clear(out.rgb, 3);
-    return;
-  }
   const Mask<T> real = Mask<T>::from_bits(touched);
   L mean[3], quat[4], scale[3];
-  load_rows<3>(splats.means, first, count, mean);
-  load_rows<4>(splats.quats, first, count, quat);
-  load_rows<3>(splats.scales, first, count, scale);
-  const L opacity = load_row(target.opacities, first, count);
+  load_rows<3>(splats.means, group, mean);
+  load_rows<4>(splats.quats, group, quat);
+  load_rows<3>(splats.scales, group, scale);
+  const L opacity = load_row(target.opacities, group);
   const Geometry<T> g(pose, target.grid, Centre(pose, mean), quat, scale);
   const Footprint<T> f(g, target.grid, s);
+  std::uint8_t lit[kLanes];
+  for (int i = 0; i < kLanes; ++i) lit[i] = target.lit[group.rows[i]];
+  L slope[kLanes];
+  if (splats.bands) {
+    for (int i = 0; i < kLanes; ++i) slope[i] = L::load(slopes[group.rows[i]].numbers);
+    transpose(slope);
+  }
   for (int k = 0; k < K; ++k) {
     L(&sum)[kLanes] = rows[k];
     transpose(sum);
@@ -56,23 +80,22 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
     project_vjp(pose, target.grid, s, g, f, scale, opacity, sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], gradient);
     L rgb[3];
     for (int c = 0; c < 3; ++c) {
-      rgb[c] = where(Mask<T>::from_bits(target.lit[3 * group + c]), sum[6 + c]);
+      rgb[c] = where(Mask<T>::from_bits(lanes_with_bit(lit, c)), sum[6 + c]);
       if (!splats.bands) continue;
-      const T* slope = palette.slope.data() + group * palette.kSlope + 3 * c * kLanes;
-      for (int axis = 0; axis < 3; ++axis) gradient.mean[axis] += L::load(slope + axis * kLanes) * rgb[c];
+      for (int axis = 0; axis < 3; ++axis) gradient.mean[axis] += slope[3 * c + axis] * rgb[c];
     }
     auto keep = [&](auto& columns) {
       for (L& column : columns) column = where(real, column);
     };
     L alone[1] = {gradient.opacity};
     keep(gradient.mean), keep(gradient.quat), keep(gradient.scale), keep(gradient.screen), keep(rgb), keep(alone);
-    const std::int64_t row = k * n + first;
-    store_rows<3>(out.means, row, count, gradient.mean);
-    store_rows<4>(out.quats, row, count, gradient.quat);
-    store_rows<3>(out.scales, row, count, gradient.scale);
-    store_rows<1>(out.opacities, row, count, alone);
-    store_rows<2>(out.screen, row, count, gradient.screen);
-    store_rows<3>(out.rgb, row, count, rgb);
+    const std::int64_t at = k * splats.n;
+    store_rows<3>(out.means + 3 * at, group, gradient.mean);
+    store_rows<4>(out.quats + 4 * at, group, gradient.quat);
+    store_rows<3>(out.scales + 3 * at, group, gradient.scale);
+    store_rows<1>(out.opacities + at, group, alone);
+    store_rows<2>(out.screen + 2 * at, group, gradient.screen);
+    store_rows<3>(out.rgb + 3 * at, group, rgb);
   }
 }
 
