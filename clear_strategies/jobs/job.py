@@ -37,6 +37,7 @@ from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import Skips
 from clear_strategies.training.state import TrainState
+from clear_strategies.viewing.cameras import write_cameras
 
 _log = logging.getLogger(__name__)
 
@@ -255,6 +256,7 @@ def _train(
     settings, rasterizer = training.settings, place.drawing.rasterizer
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
     with progress_bar(state, place.watch, training.chosen.title) as progress:
+        write_cameras(training.folder, place.scene)
         checkpoints = training.folder / resume.CHECKPOINTS
         fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)
     seconds = time.perf_counter() - began

@@ -1,0 +1,163 @@
+"""A saved splat, opened to be looked at: a run by its newest checkpoint, or a PLY file."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from clear_strategies.data.ply import read_gaussians
+from clear_strategies.errors import DataError, SettingError
+from clear_strategies.jobs import device
+from clear_strategies.jobs.device import Drawing, RasterizerSettings
+from clear_strategies.jobs.resume import CHECKPOINTS
+from clear_strategies.settings import build, with_defaults
+from clear_strategies.training import checkpoint
+from clear_strategies.training.field import GaussianField
+from clear_strategies.viewing import cameras
+from clear_strategies.viewing.cameras import SavedCamera
+from clear_strategies.viewing.look import Painter
+from rasterizers.interface import Camera
+
+_log = logging.getLogger(__name__)
+
+PLY: Final = "point_cloud.ply"
+_MIP_COMMENT: Final = b"SplatRenderMode: mip"
+_FAR: Final = 2.5  # distance of the camera that is made up for a lone PLY file, in radii of the scene
+_SIZE: Final = (1280, 720)  # px, of that camera
+_DEPTH: Final = 3  # cameras.json lies at most so many folders above a PLY file
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedSplat:
+    """A splat that is ready to be drawn.
+
+    Args:
+        folder: of the run, or of the PLY file.
+        source: what was opened, for messages.
+        cameras: of the run; empty where none are known.
+        baked: it comes from a PLY file, where f_det and the 3D filter can no longer be told apart from the rest.
+    """
+
+    folder: Path
+    source: str
+    painter: Painter
+    cameras: Sequence[SavedCamera]
+    baked: bool
+
+    @property
+    def name(self) -> str:
+        """One word for the title of a window."""
+        return self.folder.name or "splat"
+
+    def poses(self) -> list[Camera]:
+        """The training cameras, or, where none are known, one that sees the whole splat."""
+        train = [saved.camera for saved in self.cameras if saved.split == "train"]
+        return train or [saved.camera for saved in self.cameras] or [overview(self.painter.field)]
+
+
+def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
+    """Open a run's folder, one of its checkpoints, or a PLY file.
+
+    Args:
+        rasterizer: by name; None: the one that the run trained with, or else the fastest here.
+
+    Raises:
+        DataError: nothing that can be drawn is there, or it is damaged.
+        SettingError: there is no such rasterizer here.
+    """
+    if path.is_file():
+        return _of_ply(path, rasterizer)
+    folder = next((p.parent for p in (path, path.parent) if p.name == CHECKPOINTS), path)
+    if checkpoint.saved(folder / CHECKPOINTS):
+        return _of_checkpoint(path, folder, rasterizer)
+    found = [folder / PLY, *sorted(folder.glob(f"point_cloud/iteration_*/{PLY}"), key=lambda p: len(p.parent.name))]
+    if (ply := next((p for p in reversed(found) if p.is_file()), None)) is not None:
+        return _of_ply(ply, rasterizer)
+    raise DataError(path, "run", "has neither a checkpoint nor a point_cloud.ply", "give a run's folder or a PLY file")
+
+
+def overview(field: GaussianField) -> Camera:
+    """A camera, upright by OpenCV's axes, that sees most of the opacity."""
+    means, weights = field.means.data.cpu().double(), field.opacities.data.sigmoid().cpu().double()
+    order = means.argsort(dim=0)
+    total = weights[order].cumsum(0) / weights.sum()
+    low, middle, high = (
+        torch.stack([means[order[int(torch.searchsorted(total[:, k].contiguous(), q)), k], k] for k in range(3)])
+        for q in (0.1, 0.5, 0.9)
+    )
+    radius = max(float((high - low).norm()) / 2, 1e-3)
+    pose = np.eye(4)
+    pose[:3, 3] = -(middle.numpy() - [0, 0, _FAR * radius])
+    width, height = _SIZE
+    return Camera(torch.from_numpy(pose), float(height), float(height), width / 2, height / 2, width, height)
+
+
+def _of_checkpoint(path: Path, folder: Path, rasterizer: str | None) -> SavedSplat:
+    saved = checkpoint.load(path)
+    parameters = {name.removeprefix("field/"): v for name, v in saved.tensors.items() if name.startswith("field/")}
+    try:
+        field = GaussianField(parameters, degree=int(saved.facts["degree"]))
+        field.filter_3d = parameters["filter_3d"].clone()
+    except (KeyError, ValueError, TypeError) as error:
+        raise DataError(path, "tensors", f"hold no field ({error})", "give a run of this program") from error
+    known = _cameras_near(folder, 0)
+    own = _unflat(saved.config, "rasterizer")
+    drawing = _drawing(own, rasterizer).over(known[0].background if known else (0.0, 0.0, 0.0))
+    source = f"{folder}, {saved.t - 1} iterations, {len(field):,} Gaussians"
+    return SavedSplat(folder, source, _painter(field, drawing), known, baked=False)
+
+
+def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
+    g = read_gaussians(path)
+    if not len(g):
+        raise DataError(path, "element vertex", "has no Gaussians", "export it again")
+    field = GaussianField(
+        {
+            "means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities, "sh0": g.sh0, "shN": g.shN,
+            "detail": torch.zeros_like(g.means),
+        }
+    )  # fmt: skip
+    field.degree = field.max_degree
+    known = _cameras_near(path.parent, _DEPTH)
+    with path.open("rb") as file:
+        mip = _MIP_COMMENT in file.read(4096)
+    drawing = _drawing({} if mip else {"kernel": 0.3, "antialiased": False}, rasterizer)
+    drawing = drawing.over(known[0].background if known else (0.0, 0.0, 0.0))
+    folder = path.parent
+    return SavedSplat(folder, f"{path}, {len(field):,} Gaussians", _painter(field, drawing), known, baked=True)
+
+
+def _painter(field: GaussianField, drawing: Drawing) -> Painter:
+    return Painter(field.to(drawing.device), drawing.make)
+
+
+def _drawing(node: Mapping[str, Any], name: str | None) -> Drawing:
+    """The rasterizer with the settings of a run, or of the name that was asked for."""
+    defaults = with_defaults({"_target_": f"{RasterizerSettings.__module__}.{RasterizerSettings.__qualname__}"})
+    if name is not None:
+        shared = {key: node[key] for key in ("kernel", "antialiased", "background") if key in node}
+        return device.drawing(build({**defaults, **shared, "name": name}, "rasterizer"), None)
+    try:
+        return device.drawing(build(device.rasterizer_node({**defaults, **node}), "rasterizer"), None)
+    except SettingError as error:
+        _log.warning("%s The fastest rasterizer of this machine draws instead.", error)
+        return device.drawing(build(defaults, "rasterizer"), None)
+
+
+def _cameras_near(folder: Path, above: int) -> list[SavedCamera]:
+    """The cameras.json of a folder, or of one of the folders above it."""
+    for candidate in (folder, *list(folder.resolve().parents)[:above]):
+        if (candidate / cameras.FILE).is_file():
+            return cameras.read_cameras(candidate / cameras.FILE)
+    return []
+
+
+def _unflat(config: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """One node of a flat configuration; its values are no nodes."""
+    return {name.removeprefix(f"{key}."): v for name, v in config.items() if name.startswith(f"{key}.")}

@@ -1,0 +1,81 @@
+"""Frames as a video: H.264 in MP4, which browsers play, and GIF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import UInt8
+from torch import Tensor
+
+from clear_strategies import files
+from clear_strategies.errors import SettingError
+
+GIF_WIDTH: Final = 480  # px, at most
+_GIF_FPS: Final = 15
+_QUALITY: Final = "20"  # x264's CRF: 18 cannot be told from the frames, 23 is its default
+# One palette for the whole GIF, from all of its colours.
+_GIF_FILTER: Final = (
+    "fps={fps},scale='min({width},iw)':-2:flags=lanczos,split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=bayer"
+)
+
+Frame = UInt8[np.ndarray, "H W 3"]
+
+
+def missing() -> str | None:
+    """What is not installed that videos need, with the remedy; None where nothing is."""
+    return None if find_spec("imageio_ffmpeg") is not None else "videos need imageio-ffmpeg: pip install imageio-ffmpeg"
+
+
+def write_videos(paths: Iterable[Path], frames: Iterable[Frame], *, fps: float) -> None:
+    """Write the same frames into every file, `.mp4` or `.gif`, while they come. GIFs are at most `GIF_WIDTH` wide.
+
+    Args:
+        frames: all of one size, with an even height and width.
+
+    Raises:
+        SettingError: imageio-ffmpeg is not installed, a suffix is another one, or there is no frame.
+    """
+    if (lack := missing()) is not None:
+        raise SettingError(f"{lack}.")
+    with ExitStack() as stack:
+        sends: list[Callable[[Any], Any]] = []
+        for frame in frames:
+            if not sends:
+                sends = [_opened(stack, path, frame.shape[1], frame.shape[0], fps) for path in paths]
+            for send in sends:
+                send(np.ascontiguousarray(frame))
+        if not sends:
+            raise SettingError("a video needs at least 1 frame.")
+
+
+def to_bytes(image: Tensor) -> Frame:
+    """A picture in [0, 1] as 8 bits."""
+    return np.asarray((image.clamp(0, 1) * 255).round().byte().cpu().numpy())
+
+
+def _opened(stack: ExitStack, path: Path, width: int, height: int, fps: float) -> Callable[[Any], Any]:
+    """Start ffmpeg on a file that takes its name when the stack ends without an error."""
+    import imageio_ffmpeg
+
+    if path.suffix == ".mp4":
+        options = {
+            "codec": "libx264", "pix_fmt_out": "yuv420p", "quality": None,
+            "output_params": ["-crf", _QUALITY, "-preset", "medium", "-movflags", "+faststart"],
+        }  # fmt: skip
+    elif path.suffix == ".gif":
+        palette = _GIF_FILTER.format(fps=min(fps, _GIF_FPS), width=GIF_WIDTH)
+        options = {"codec": "gif", "pix_fmt_out": "pal8", "quality": None, "output_params": ["-filter_complex", palette, "-loop", "0"]}
+    else:
+        raise SettingError(f"{path}: videos are .mp4 or .gif.")
+    partial = stack.enter_context(files.replacing(path))
+    writer = imageio_ffmpeg.write_frames(
+        str(partial), (width, height), fps=fps, macro_block_size=2, ffmpeg_log_level="error", **options
+    )
+    stack.callback(writer.close)
+    writer.send(None)
+    return writer.send
