@@ -73,11 +73,11 @@ VARIANTS: Final = (
 
 # A variant wins over these: Hydra takes the last override. Probes and checkpoints would count as time.
 _COMMON: Final = (
-    "skips=none", "rasterizer.preset=fast", "fit.probe_every=0", "fit.checkpoint_every=0", "fit.map_views=0",
+    "skips=none", "rasterizer.preset=fast", "fit.probe_every=0", "fit.checkpoint_every=0", "fit.map_views=0", "fit.video=0",
 )  # fmt: skip
 _RESERVED: Final = re.compile(
     r"[+~]*(strategy|skips|rasterizer\.preset|hydra[./].*"
-    r"|fit\.(iterations|seed|threads|resume|probe_every|checkpoint_every|map_views))(=|$)"
+    r"|fit\.(iterations|seed|threads|resume|probe_every|checkpoint_every|map_views|video))(=|$)"
 )
 
 

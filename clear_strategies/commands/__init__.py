@@ -27,6 +27,7 @@ class Command(NamedTuple):
 
 COMMANDS: Final = {
     "train": Command("PHOTOS [setting=value …]", "from a folder of photos, or a capture, to a splat and pictures"),
+    "render": Command("RUN", "pictures and videos of a saved run or a PLY file, along any camera path"),
 }
 
 

@@ -24,7 +24,9 @@ def parser_of(command: str, description: str, *, run: bool = True) -> argparse.A
     """A parser with `--verbose`, and with RUN and `--rasterizer` for commands that open one."""
     parser = _Parser(prog=f"clear-strategies {command}", description=description)
     if run:
-        parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder, one of its checkpoints, or a PLY file")
+        parser.add_argument(
+            "run", type=Path, metavar="RUN", help="a run's folder, one of its checkpoints, or a PLY file"
+        )
         parser.add_argument("--rasterizer", metavar="NAME", help="cpp, torch, warp or gsplat (default: the run's own)")
     parser.add_argument("-v", "--verbose", action="store_true", help="say more")
     return parser

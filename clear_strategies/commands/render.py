@@ -36,9 +36,13 @@ def main(arguments: Sequence[str]) -> None:
     began = time.perf_counter()
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)
-    look = Look(sh=not options.no_sh, detail=not options.no_detail, filter_3d=not options.no_filter, mip=not options.no_mip)
+    look = Look(
+        sh=not options.no_sh, detail=not options.no_detail, filter_3d=not options.no_filter, mip=not options.no_mip
+    )
     if splat.baked and (options.no_detail or options.no_filter):
-        _log.warning("--no-detail and --no-filter have no effect: a PLY file holds f_det and the filter in its Gaussians.")
+        _log.warning(
+            "--no-detail and --no-filter have no effect: a PLY file holds f_det and the filter in its Gaussians."
+        )
     names, where, fps = _cameras(splat, options)
     out = options.out or splat.folder / "rendered"
     written: list[Path] = []

@@ -38,6 +38,7 @@ from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import Skips
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.cameras import write_cameras
+from clear_strategies.viewing.look import Painter
 
 _log = logging.getLogger(__name__)
 
@@ -48,6 +49,7 @@ class RunSettings(FitSettings):
 
     Args:
         map_views: number of training views with maps of reliability and correction in maps/; 0: none.
+        video: frames of path.mp4 and path.gif, a loop through the training cameras, 24 a second; 0: none.
         baseline: train first, on the same scene with the same settings, without any strategy, into the folder baseline/ of
             the run; the contact sheet and the scores then show both. Without effect in a sweep, for a run that has no
             strategy, and with +method=NAME.
@@ -60,6 +62,7 @@ class RunSettings(FitSettings):
     """
 
     map_views: int = 3
+    video: int = 72
     baseline: bool = False
     resume: str | None = None
     device: Device | None = None
@@ -69,6 +72,8 @@ class RunSettings(FitSettings):
         FitSettings.__post_init__(self)
         if self.map_views < 0:
             raise SettingError(f"map_views must be at least 0, got {self.map_views}. 0 writes no maps.")
+        if self.video < 0:
+            raise SettingError(f"video must be at least 0 frames, got {self.video}. 0 writes no video.")
         if self.threads is not None and self.threads < 1:
             raise SettingError(f"threads must be at least 1, got {self.threads}. null takes all cores.")
 
@@ -269,6 +274,8 @@ def _train(
         backend=place.drawing.name,
         down=settings.data.views.downsample,
         map_views=settings.fit.map_views,
+        painter=Painter(state.field, place.drawing.make),
+        video_frames=settings.fit.video,
         seconds=seconds,
         config=training.compared,
         baseline=beside,

@@ -32,6 +32,7 @@ _NOT_COMPARED: Final = {
     "fit.probe_every",
     "fit.probe_views",
     "fit.map_views",
+    "fit.video",
 }
 
 

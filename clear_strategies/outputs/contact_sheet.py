@@ -1,4 +1,4 @@
-"""contact_sheet.png: a few test views of one run beside the LR photo, the prior, the baseline, the truth and the error.
+"""contact_sheet.png: a few views of one run beside the LR photo, the prior, the baseline, the truth and the error.
 
 Images are laid out in whole pixels: a render is shown pixel for pixel, a small one at a whole multiple, because a resized
 image does not show the detail that this library is about.
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
 OWN_PHOTO: Final = "LR, SR prior (and bicubic in the tables) show the test view's own photo, which training never sees."
+TRAINED_ON: Final = (
+    "These are training views, since there are no test views: the run has seen their photos and SR images."
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,9 +41,12 @@ class SheetRow:
     captions: Mapping[str, str] = field(default_factory=dict)
 
 
-def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str) -> None:
+def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: str = OWN_PHOTO) -> None:
     """Draw one row per view: its images and, where the truth is known, the truth and the error of ours. Without rows no
     file is written.
+
+    Args:
+        note: the line below.
     """
     if not rows:
         return
@@ -73,7 +79,7 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str) -> Non
                 error = drawn if column == "error of ours" else error
             if column in row.captions:
                 page.text(x + cell_w / 2, y + cell_h + LINE, row.captions[column], ha="center")
-    page.text(left, page.height - LINE, OWN_PHOTO, color=FAINT)
+    page.text(left, page.height - LINE, note, color=FAINT)
     if error is not None:
         page.colour_bar(right, top, cell_h, error, "mean |difference| over RGB")
     save_png(page.figure, path)

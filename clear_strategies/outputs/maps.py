@@ -7,7 +7,8 @@ Five maps per view, in [0, 1] at each HR pixel:
   together.  Eq. 7, 11
 - `conflict`: 1 where g_LR and g_HR of a Gaussian point apart, else 0.  Eq. 6
 
-Where the cloud came from dense stereo, `depth.png` shows the depth of the view, see `depth_picture`.
+`maps.png` shows them side by side with a legend. Where the cloud came from dense stereo, `depth.png` shows the depth of the
+view, see `depth_picture`.
 
 The last two of the five render the Gaussians over black with that number as their grey. The maps come from copies of the run's
 strategies; the run does not change.
@@ -36,6 +37,7 @@ from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import DepthMap
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs.depth_picture import write_depth
+from clear_strategies.outputs.maps_picture import write_maps_picture
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.strategies.p2g import P2G
@@ -91,6 +93,7 @@ def write_maps(
         own = folder / Path(view.name).stem
         for name, values in {**found.maps, "lr": view.lr.image, "prior": view.hr.image}.items():
             write_png(own / f"{name}.png", values)
+        write_maps_picture(own / "maps.png", view, found.maps, found.means)
         if view.name in depths:
             write_depth(own / "depth.png", view.lr, depths[view.name], f"{view.name}: depth by stereo")
     corrector = conductor.owner("correct")

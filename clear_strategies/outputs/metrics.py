@@ -27,6 +27,7 @@ from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
+from clear_strategies.outputs.figures import spaced
 from clear_strategies.outputs.image_scores import ImageScores, mean_scores, score
 from rasterizers.interface import Camera
 
@@ -37,13 +38,17 @@ NOTE: Final = (
     "that photo allows, not what view synthesis can reach"
 )
 
+TRAIN_RENDERS: Final = 4  # training views whose renders are kept where there are no test views
+
 Table = dict[str, dict[str, ImageScores]]
 """view -> image ("ours", "bicubic", "prior") -> scores."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Scores of all views, what each part was compared with, and the renders of the test views."""
+    """Scores of all views, what each part was compared with, and the renders of the test views; where there are none, those of
+    a few training views.
+    """
 
     test: Table
     train: Table
@@ -62,12 +67,13 @@ def evaluate(
     renders: dict[str, Tensor] = {}
     tables: dict[str, Table] = {"test": {}, "train": {}}
     against = {"test": _against(scene.test), "train": _against(scene.train)}
+    kept = {view.name for view in scene.test or spaced(scene.train, TRAIN_RENDERS)}
     for part, views in (("test", scene.test), ("train", scene.train)):
         for view in views:
             image = render(view.hr.camera).clamp(0, 1)
             if not bool(image.isfinite().all()):
                 _log.warning("%s: its render is not finite and has no scores.", view.name)
-            if part == "test":
+            if view.name in kept:
                 renders[view.name] = image
             tables[part][view.name] = _scores_of(view, image, down)
         if "LR" in against[part]:

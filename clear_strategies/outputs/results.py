@@ -10,20 +10,23 @@ from typing import Any, Final
 from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
+from clear_strategies.core.view import View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.scene import Scene
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.baseline import Baseline
-from clear_strategies.outputs.contact_sheet import SheetRow, write_contact_sheet
+from clear_strategies.outputs.contact_sheet import OWN_PHOTO, TRAINED_ON, SheetRow, write_contact_sheet
 from clear_strategies.outputs.curves import write_curves
 from clear_strategies.outputs.export import export_ply
 from clear_strategies.outputs.figures import spaced
+from clear_strategies.outputs.loop_video import write_depths, write_loop
 from clear_strategies.outputs.maps import write_maps
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen, marks
 from clear_strategies.outputs.provenance import provenance
 from clear_strategies.training.state import TrainState
+from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Rasterizer
 
 # What a run writes into its folder, in this order.
@@ -32,11 +35,16 @@ FILES: Final[Mapping[str, str]] = {
     "run.log": "what the run printed",
     "checkpoints/": "states to resume from (`fit.resume`), the newest `fit.keep` of them",
     "baseline/": "the baseline that trained beside the run (`fit.baseline`), with all these files of its own",
+    "cameras.json": "the cameras, in the layout of Inria's 3DGS, which SuperSplat and SIBR open",
+    "cameras/": "small pictures of the training views, for viewers",
     "maps/": "where the prior was trusted, and where the photos overruled it, for `fit.map_views` training views",
     "point_cloud.ply": "the field, for any viewer of 3DGS files",
-    "renders/": "every test view as rendered, at HR",
-    "views/": "LR photo, prior and truth of a few test views",
-    "contact_sheet.png": "a few test views: LR photo, prior, baseline (if there is one), render, truth and error side by side",
+    "renders/": "every test view as rendered, at HR; a few training views where there are no test views",
+    "depth/": "the depth of the views on the contact sheet, in colours with a legend",
+    "views/": "LR photo, prior and truth of the views on the contact sheet",
+    "path.mp4": "a loop through the training cameras (`fit.video`)",
+    "path.gif": "the same, smaller",
+    "contact_sheet.png": "the same few views: LR photo, prior, baseline (if there is one), render, truth and error side by side",
     "curves.png": "losses, PSNR, number of Gaussians, conflict and correction over iterations",
     "history.csv": "one row per iteration: every number that was measured, empty where there was none",
     "conflict.csv": "of history.csv, the iterations that compared LR with HR gradients, and their columns on conflict",
@@ -44,7 +52,7 @@ FILES: Final[Mapping[str, str]] = {
     "metrics.json": "scores of every view and their means, configuration and provenance; written last",
 }
 
-_SHEET_VIEWS: Final = 4  # test views on the contact sheet and in views/, at most
+_SHEET_VIEWS: Final = 4  # test views on the contact sheet, in views/ and in depth/, at most
 
 
 def write_results(
@@ -57,6 +65,8 @@ def write_results(
     backend: str,
     down: DownKernel,
     map_views: int,
+    painter: Painter,
+    video_frames: int,
     seconds: float,
     config: Mapping[str, Any],
     baseline: Baseline | None = None,
@@ -67,6 +77,8 @@ def write_results(
         scene: on the CPU, wherever the field is.
         down: D, by which the LR images were made.
         map_views: how many training views get maps, at most.
+        painter: of the state's field, for depth and video.
+        video_frames: of the loop through the training cameras; 0: none.
         seconds: training time.
         config: the run's configuration, kept in metrics.json.
         baseline: the one that trained beside it, for the contact sheet and metrics.json.
@@ -83,6 +95,10 @@ def write_results(
     if scene.synthetic_prior:
         title += " · SYNTHETIC prior"
     _write_images(folder, scene, evaluation, title, baseline)
+    with work_log.stage("depth pictures"):
+        write_depths(folder / "depth", _shown(scene), painter)
+    with work_log.stage("video"):
+        write_loop(folder, [view.hr.camera for view in scene.train], painter, video_frames)
     write_curves(folder / "curves.png", history, marks(state), title)
     _write_tables(folder, history, work_log)
     files.write_json(
@@ -109,20 +125,26 @@ def write_results(
 def _write_images(folder: Path, scene: Scene, evaluation: Evaluation, title: str, baseline: Baseline | None) -> None:
     for name, image in evaluation.renders.items():
         write_png(folder / "renders" / f"{Path(name).stem}.png", image)
-    rows = []
-    for view in spaced(scene.test, _SHEET_VIEWS):
+    rows, part = [], evaluation.test if scene.test else evaluation.train
+    for view in _shown(scene):
         for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:
                 write_png(folder / "views" / f"{Path(view.name).stem}_{kind}.png", shown)
         columns = {"LR, enlarged": images.upsample(view.lr.image, view.factor, "nearest"), "SR prior": view.hr.image}
-        scores = {"ours": evaluation.test[view.name]["ours"]}
+        scores = {"ours": part[view.name]["ours"]}
         if baseline is not None and view.name in baseline.views:
             columns["baseline"] = read_image(baseline.render_of(view.name))
             scores["baseline"] = baseline.views[view.name]
         columns["ours"] = evaluation.renders[view.name]
         captions = {column: f"{s.psnr:.2f} dB, SSIM {s.ssim:.3f}" for column, s in scores.items()}
         rows.append(SheetRow(view.name, columns, view.truth, captions))
-    write_contact_sheet(folder / "contact_sheet.png", rows, title)
+    note = OWN_PHOTO if scene.test else TRAINED_ON
+    write_contact_sheet(folder / "contact_sheet.png", rows, title, note)
+
+
+def _shown(scene: Scene) -> Sequence[View]:
+    """The views on the contact sheet."""
+    return spaced(scene.test, _SHEET_VIEWS) if scene.test else spaced(scene.train, metrics.TRAIN_RENDERS)
 
 
 def _write_tables(folder: Path, history: Sequence[Mapping[str, float]], work_log: WorkLog) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -153,7 +153,9 @@ def _small(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
 
 def _saved_camera(path: Path, i: int, entry: Mapping[str, Any]) -> SavedCamera:
     where = f"[{i}]"
-    numbers = {key: strict_json.number(path, f"{where}.{key}", entry.get(key)) for key in ("width", "height", "fx", "fy")}
+    numbers = {
+        key: strict_json.number(path, f"{where}.{key}", entry.get(key)) for key in ("width", "height", "fx", "fy")
+    }
     try:
         rotation = np.array(entry["rotation"], float).reshape(3, 3)
         center = np.array(entry["position"], float).reshape(3)
@@ -161,17 +163,15 @@ def _saved_camera(path: Path, i: int, entry: Mapping[str, Any]) -> SavedCamera:
         raise DataError(path, f"{where}.rotation, position", f"is no pose ({error})", "write the file again") from error
     width, height = round(numbers["width"]), round(numbers["height"])
     pose = rigid_inverse(path, f"{where}.rotation", rotation, center)
-    principal = [
-        strict_json.number(path, f"{where}.{key}", entry.get(key, size / 2))
-        for key, size in (("cx", width), ("cy", height))
-    ]
+    cx = strict_json.number(path, f"{where}.cx", entry.get("cx", width / 2))
+    cy = strict_json.number(path, f"{where}.cy", entry.get("cy", height / 2))
     photo, background = entry.get("photo"), entry.get("background", [0.0, 0.0, 0.0])
     if not (isinstance(background, list) and len(background) == 3):
         raise DataError(path, f"{where}.background", "is no list of three numbers", "write the file again")
     r, g, b = (strict_json.number(path, f"{where}.background", c) for c in background)
     return SavedCamera(
         name=str(entry.get("img_name", i)),
-        camera=_camera(path, where, pose, numbers["fx"], numbers["fy"], *principal, width, height),
+        camera=_camera(path, where, pose, numbers["fx"], numbers["fy"], cx, cy, width, height),
         split="test" if entry.get("split") == "test" else "train",
         scale=max(1, round(strict_json.number(path, f"{where}.scale", entry.get("scale", 1)))),
         photo=path.parent / photo if isinstance(photo, str) and (path.parent / photo).is_file() else None,

@@ -65,9 +65,7 @@ class Painter:
         return torch.where(alpha >= _SOLID, z_sum / alpha.clamp_min(_SOLID), torch.nan).cpu()
 
     @torch.no_grad()
-    def numbers(
-        self, camera: Camera, values: Float[Tensor, " N"], look: Look = AS_MEASURED
-    ) -> Float[Tensor, "H W"]:
+    def numbers(self, camera: Camera, values: Float[Tensor, " N"], look: Look = AS_MEASURED) -> Float[Tensor, "H W"]:
         """A number >= 0 per Gaussian, blended as colours are; 0 where nothing is."""
         return self._numbers(camera, values[:, None].expand(-1, 3).to(self.field.means), look)[..., 0].cpu()
 

@@ -18,12 +18,10 @@ from clear_strategies.errors import SettingError
 GIF_WIDTH: Final = 480  # px, at most
 _GIF_FPS: Final = 15
 _QUALITY: Final = "20"  # x264's CRF: 18 cannot be told from the frames, 23 is its default
-# One palette for the whole GIF, from all of its colours.
-_GIF_FILTER: Final = (
-    "fps={fps},scale='min({width},iw)':-2:flags=lanczos,split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=bayer"
-)
+_SMALLER: Final = "fps={fps},scale='min({width},iw)':-2:flags=lanczos,split[a][b]"
+_ONE_PALETTE: Final = "[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=bayer"  # of all colours of the GIF
 
-Frame = UInt8[np.ndarray, "H W 3"]
+Frame = UInt8[np.ndarray, "_ _ 3"]
 
 
 def missing() -> str | None:
@@ -63,19 +61,20 @@ def _opened(stack: ExitStack, path: Path, width: int, height: int, fps: float) -
     import imageio_ffmpeg
 
     if path.suffix == ".mp4":
-        options = {
-            "codec": "libx264", "pix_fmt_out": "yuv420p", "quality": None,
-            "output_params": ["-crf", _QUALITY, "-preset", "medium", "-movflags", "+faststart"],
-        }  # fmt: skip
+        codec, pixels = "libx264", "yuv420p"
+        extra = ["-crf", _QUALITY, "-preset", "medium", "-movflags", "+faststart"]
     elif path.suffix == ".gif":
-        palette = _GIF_FILTER.format(fps=min(fps, _GIF_FPS), width=GIF_WIDTH)
-        options = {"codec": "gif", "pix_fmt_out": "pal8", "quality": None, "output_params": ["-filter_complex", palette, "-loop", "0"]}
+        codec, pixels = "gif", "pal8"
+        smaller = _SMALLER.format(fps=min(fps, _GIF_FPS), width=GIF_WIDTH)
+        extra = ["-filter_complex", f"{smaller};{_ONE_PALETTE}", "-loop", "0"]
     else:
         raise SettingError(f"{path}: videos are .mp4 or .gif.")
     partial = stack.enter_context(files.replacing(path))
-    writer = imageio_ffmpeg.write_frames(
-        str(partial), (width, height), fps=fps, macro_block_size=2, ffmpeg_log_level="error", **options
-    )
+    writer: Any = imageio_ffmpeg.write_frames(
+        str(partial), (width, height), fps=fps, codec=codec, pix_fmt_out=pixels, quality=None, output_params=extra,
+        macro_block_size=2, ffmpeg_log_level="error",
+    )  # fmt: skip
     stack.callback(writer.close)
     writer.send(None)
-    return writer.send
+    send: Callable[[Any], Any] = writer.send
+    return send

@@ -16,11 +16,13 @@ FLOORS: dict[str, tuple[set[str], set[str]]] = {
     "data": (GROUND | {"core"}, {"cv2", "kornia", "open3d", "PIL"}),
     "training": (GROUND | {"core", "kernels", "strategies", "merging", "data", "density"}, set()),
     "density": (GROUND | {"core", "strategies", "merging", "data", "training"}, {"gsplat"}),
-    "outputs": (GROUND | {"core", "strategies", "merging", "data", "training", "density"}, set()),
+    "viewing": (GROUND | {"core", "data", "training"}, set()),
+    "outputs": (GROUND | {"core", "strategies", "merging", "data", "training", "density", "viewing"}, set()),
     "settings": ({"errors"}, set()),
     "compose": (GROUND | {"settings", "strategies", "merging"}, {"hydra", "omegaconf"}),
     "jobs": (
-        GROUND | {"settings", "compose", "core", "strategies", "merging", "data", "training", "density", "outputs"},
+        GROUND
+        | {"settings", "compose", "core", "strategies", "merging", "data", "training", "density", "viewing", "outputs"},
         {"hydra", "omegaconf"},
     ),
 }

@@ -24,7 +24,7 @@ from tests.helpers.command_line import TINY
 
 ITERATIONS = 12
 SMALL = [o for o in TINY if not o.startswith("fit.baseline")] + [
-    "fit.map_views=0", "fit.probe_every=0", "fit.checkpoint_every=0", "fit.threads=1", "prior=bicubic",
+    "fit.map_views=0", "fit.video=0", "fit.probe_every=0", "fit.checkpoint_every=0", "fit.threads=1", "prior=bicubic",
 ]  # fmt: skip
 
 

@@ -164,7 +164,7 @@ def test_a_folder_of_maps_is_complete(tmp_path: Path) -> None:
     assert set(content["views"]) == {view.name for view in state.views[:2]}
     for view in state.views[:2]:
         own = tmp_path / view.name
-        assert {path.name for path in own.iterdir()} == {f"{name}.png" for name in (*MAPS, "lr", "prior")}
+        assert {path.name for path in own.iterdir()} == {f"{name}.png" for name in (*MAPS, "lr", "prior", "maps")}
         assert set(content["views"][view.name]) == set(MAPS)
         found = view_maps(state.field, state.conductor, toy.RASTERIZER, view).maps
         for name in MAPS:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,7 @@ import torch
 
 from clear_strategies import GCO, P2G, Conductor, files
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs.baseline import Baseline
@@ -25,10 +26,11 @@ from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
+from clear_strategies.viewing.look import Painter
 from tests.helpers import toy
 from tests.helpers.image_files import holds, read
 
-WRITTEN_BY_OTHERS = {".hydra/", "run.log", "checkpoints/", "baseline/"}
+WRITTEN_BY_OTHERS = {".hydra/", "run.log", "checkpoints/", "baseline/", "cameras.json", "cameras/"}
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
 SCENE = toy.scene()
 
@@ -44,10 +46,19 @@ def state() -> TrainState:
     return state
 
 
-def write(folder: Path, state: TrainState, map_views: int = 1, baseline: Baseline | None = None) -> Evaluation:
+def write(
+    folder: Path,
+    state: TrainState,
+    map_views: int = 1,
+    baseline: Baseline | None = None,
+    *,
+    scene: Scene = SCENE,
+    video: int = 2,
+) -> Evaluation:
     return write_results(
-        folder, SCENE, state, toy.RASTERIZER, Chosen(None, ["gco", "p2g"]), backend="torch", down="bicubic",
-        map_views=map_views, seconds=1.5, config={"fit": {"seed": 0}}, baseline=baseline,
+        folder, scene, state, toy.RASTERIZER, Chosen(None, ["gco", "p2g"]), backend="torch", down="bicubic",
+        map_views=map_views, painter=Painter(state.field, lambda **_: toy.RASTERIZER), video_frames=video, seconds=1.5,
+        config={"fit": {"seed": 0}}, baseline=baseline,
     )  # fmt: skip
 
 
@@ -100,6 +111,27 @@ def test_conflict_csv_holds_columns_of_history_csv(tmp_path: Path, state: TrainS
 def test_no_map_views_means_no_maps(tmp_path: Path, state: TrainState) -> None:
     write(tmp_path, state, map_views=0)
     assert not (tmp_path / "maps").exists()
+
+
+def test_a_run_without_test_views_shows_training_views(tmp_path: Path, state: TrainState) -> None:
+    scene = replace(SCENE, test=(), train=SCENE.train * 2)
+    write(tmp_path, state, map_views=0, scene=scene, video=0)
+    assert names(tmp_path / "renders") == {f"{view.name}.png" for view in SCENE.train}
+    assert names(tmp_path / "depth") == names(tmp_path / "renders")
+    shown = read(tmp_path / "contact_sheet.png")
+    times = round(magnification(SCENE.train[0].hr.image.shape[1]))
+    assert holds(shown, SCENE.train[0].hr.image.numpy(), times=times)
+    assert not (tmp_path / "path.mp4").exists()
+
+
+def test_a_video_that_cannot_be_written_is_named(
+    tmp_path: Path, state: TrainState, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("clear_strategies.viewing.video.find_spec", lambda _: None)
+    with caplog.at_level("INFO"):
+        write(tmp_path, state, map_views=0)
+    assert "pip install imageio-ffmpeg" in caplog.text
+    assert not (tmp_path / "path.mp4").exists()
 
 
 def test_metrics_json_is_missing_where_another_file_could_not_be_written(

@@ -1,0 +1,49 @@
+"""path.mp4, path.gif and depth/: a run as it looks between and from its cameras."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import torch
+
+from clear_strategies.core.view import View
+from clear_strategies.data.photo_files import write_png
+from clear_strategies.viewing import cameras, film, paths, video
+from clear_strategies.viewing.film import DepthScale
+from clear_strategies.viewing.look import Painter
+from rasterizers.interface import Camera
+
+_log = logging.getLogger(__name__)
+
+_LONGEST: Final = 960  # px: a frame takes a fraction of a second, and the file a few MB
+
+
+def write_loop(folder: Path, train: Sequence[Camera], painter: Painter, frames: int) -> None:
+    """Write the video of a loop through the training cameras; without imageio-ffmpeg none, with a message."""
+    if not frames:
+        return
+    if (lack := video.missing()) is not None:
+        _log.info("no video of the camera path is written: %s.", lack)
+        return
+    began = time.perf_counter()
+    where = [cameras.at_most(camera, _LONGEST) for camera in paths.through(train, frames)]
+    video.write_videos([folder / "path.mp4", folder / "path.gif"], film.color_frames(painter, where), fps=film.FPS)
+    _log.info(
+        "path.mp4, path.gif: %d frames of %dx%d in %.1f s (fit.video=0 writes none).",
+        frames, where[0].width, where[0].height, time.perf_counter() - began,
+    )  # fmt: skip
+
+
+def write_depths(folder: Path, views: Sequence[View], painter: Painter) -> None:
+    """Write the depth of views as rendered, all in the same colours, each with the legend."""
+    where = [cameras.at_most(view.hr.camera, _LONGEST) for view in views]
+    if not where:
+        return
+    scale = DepthScale.of(painter, where)
+    for view, camera in zip(views, where, strict=True):
+        picture = scale.picture(painter.depth(camera))
+        write_png(folder / f"{Path(view.name).stem}.png", torch.from_numpy(picture) / 255)

@@ -1,0 +1,100 @@
+"""A saved run is drawn as it was evaluated, from its checkpoint and from its PLY file."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+import torch
+
+import rasterizers
+from clear_strategies.errors import DataError, SettingError
+from clear_strategies.jobs.saved import open_splat, overview
+from tests.helpers import saved_run, toy
+
+CAMERA = toy.camera(0.2)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    return folder, saved_run.write(folder)
+
+
+def exact(field):
+    return field.render(rasterizers.load("torch"), CAMERA).clamp(0, 1)
+
+
+def test_a_run_its_checkpoints_and_one_of_them_open_alike(run):
+    folder, field = run
+    for path in (folder, folder / "checkpoints", folder / "checkpoints" / "step_0000001"):
+        splat = open_splat(path)
+        assert torch.equal(splat.painter.color(CAMERA), exact(field))
+        assert [saved.split for saved in splat.cameras] == ["train"] * 3 + ["test"]
+        assert splat.folder == folder
+        assert not splat.baked
+        assert len(splat.poses()) == 3
+
+
+def test_a_ply_file_looks_the_same(run):
+    folder, field = run
+    splat = open_splat(folder / "point_cloud.ply", "torch")
+    torch.testing.assert_close(splat.painter.color(CAMERA), exact(field), atol=2e-5, rtol=0)
+    assert splat.baked
+    assert len(splat.cameras) == 4
+
+
+def test_a_ply_file_of_3dgs_is_drawn_with_its_blur(run, tmp_path):
+    folder, _ = run
+    content = (folder / "point_cloud.ply").read_bytes()
+    (tmp_path / "a.ply").write_bytes(content.replace(b"comment SplatRenderMode: mip\n", b""))
+    plain, mip = (open_splat(path, "torch").painter for path in (tmp_path / "a.ply", folder / "point_cloud.ply"))
+    rasterizer = rasterizers.load("torch", kernel=0.3, antialiased=False)
+    assert torch.equal(plain.color(CAMERA), mip.field.render(rasterizer, CAMERA).clamp(0, 1))
+
+
+def test_a_lone_ply_file_has_a_camera_that_sees_it(run, tmp_path):
+    folder, field = run
+    shutil.copy(folder / "point_cloud.ply", tmp_path)
+    splat = open_splat(tmp_path)
+    assert not splat.cameras
+    (camera,) = splat.poses()
+    assert float(splat.painter.numbers(camera, torch.ones(len(field))).max()) > 0.2
+    points = field.means.data.double() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    u = points[:, 0] / points[:, 2] * camera.fx + camera.cx
+    assert float(((u > 0) & (u < camera.width) & (points[:, 2] > 0)).double().mean()) > 0.8
+
+
+def test_the_inria_layout_of_a_model_is_found(run, tmp_path):
+    folder, _ = run
+    for iteration in (7000, 30000):
+        own = tmp_path / "point_cloud" / f"iteration_{iteration}"
+        own.mkdir(parents=True)
+        shutil.copy(folder / "point_cloud.ply", own)
+    shutil.copy(folder / "cameras.json", tmp_path)
+    splat = open_splat(tmp_path)
+    assert "iteration_30000" in splat.source
+    assert len(splat.cameras) == 4
+
+
+def test_a_rasterizer_that_is_not_here_gives_way(run, tmp_path, caplog):
+    folder, _ = run
+    shutil.copytree(folder, tmp_path / "run")
+    for manifest in (tmp_path / "run" / "checkpoints").rglob("manifest.json"):
+        manifest.write_text(manifest.read_text().replace('"rasterizer.name": "torch"', '"rasterizer.name": "theirs"'))
+    assert open_splat(tmp_path / "run").painter.color(CAMERA).isfinite().all()
+    assert "draws instead" in caplog.text
+    with pytest.raises(SettingError, match="nothing"):
+        open_splat(folder, "nothing")
+
+
+def test_what_holds_no_splat_is_refused(tmp_path):
+    with pytest.raises(DataError, match="neither a checkpoint nor"):
+        open_splat(tmp_path)
+    with pytest.raises(DataError):
+        open_splat(tmp_path / "nothing.ply")
+
+
+def test_the_overview_is_upright(run):
+    pose = overview(run[1]).world_to_camera[:3, :3]
+    assert torch.equal(pose, torch.eye(3, dtype=pose.dtype))

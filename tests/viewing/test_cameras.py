@@ -1,0 +1,101 @@
+"""Cameras as files: what a run writes is what is read, and other programs' paths are understood."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from clear_strategies.data.photo_files import image_size
+from clear_strategies.errors import DataError
+from clear_strategies.viewing import cameras
+from tests.helpers import toy
+
+SCENE = toy.scene(train=3, test=1)
+
+
+def same(a, b):
+    torch.testing.assert_close(a.world_to_camera.double(), b.world_to_camera.double(), atol=1e-6, rtol=0)
+    assert (a.fx, a.fy, a.cx, a.cy, a.width, a.height) == pytest.approx((b.fx, b.fy, b.cx, b.cy, b.width, b.height))
+
+
+def test_what_a_run_writes_is_what_is_read(tmp_path):
+    cameras.write_cameras(tmp_path, SCENE)
+    found = cameras.read_cameras(tmp_path / cameras.FILE)
+    assert [saved.name for saved in found] == [view.name for view in (*SCENE.train, *SCENE.test)]
+    assert [saved.split for saved in found] == ["train"] * 3 + ["test"]
+    for saved, view in zip(found, (*SCENE.train, *SCENE.test), strict=True):
+        same(saved.camera, view.hr.camera)
+        assert saved.scale == toy.FACTOR
+    assert found[0].photo is not None
+    assert image_size(found[0].photo) == (24, 16)
+    assert found[3].photo is None
+
+
+def test_inrias_cameras_are_read(tmp_path):
+    entry = {
+        "id": 0, "img_name": "a", "width": 40, "height": 20, "position": [0, 0, -4], "rotation": np.eye(3).tolist(),
+        "fx": 50, "fy": 50,
+    }  # fmt: skip
+    (tmp_path / "cameras.json").write_text(json.dumps([entry]))
+    (found,) = cameras.read_cameras(tmp_path / "cameras.json")
+    assert (found.camera.cx, found.camera.cy) == (20, 10)
+    assert found.camera.center.tolist() == [0, 0, -4]
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_the_path_of_a_viewer_is_read(tmp_path, flat):
+    # OpenGL: x right, y up, z back; four units in front of the origin.
+    matrix = np.diag([1.0, -1.0, -1.0, 1.0])
+    matrix[2, 3] = -4
+    entry = {"camera_to_world": matrix.flatten().tolist() if flat else matrix.tolist(), "fov": 90, "aspect": 2}
+    content = {"render_width": 96, "render_height": 64, "fps": 12, "camera_path": [entry, entry]}
+    (tmp_path / "path.json").write_text(json.dumps(content))
+    found, fps = cameras.read_path(tmp_path / "path.json", (10, 10))
+    assert (len(found), fps) == (2, 12)
+    torch.testing.assert_close(found[0].world_to_camera.float(), toy.camera(0.0).world_to_camera)
+    assert found[0].fy == pytest.approx(32)
+
+
+def test_a_transforms_file_is_a_path(tmp_path):
+    content = {"camera_angle_x": math.pi / 2, "frames": [{"transform_matrix": np.eye(4).tolist()}]}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    (found,), fps = cameras.read_path(tmp_path / "transforms.json", (100, 50))
+    assert fps is None
+    assert (found.fx, found.width, found.height) == (pytest.approx(50), 100, 50)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[]",
+        "[1]",
+        "{}",
+        '{"frames": []}',
+        '{"camera_path": []}',
+        '{"camera_path": [{"fov": 50}]}',
+        "[{}]",
+        "[{",
+        "nonsense",
+    ],
+)
+def test_what_is_no_path_is_refused_in_one_line(tmp_path, content):
+    (tmp_path / "path.json").write_text(content)
+    with pytest.raises(DataError, match=r"path\.json"):
+        cameras.read_path(tmp_path / "path.json", (100, 50))
+
+
+def test_a_path_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(DataError, match="cannot be read"):
+        cameras.read_path(tmp_path / "no.json", (100, 50))
+
+
+@pytest.mark.parametrize(("longest", "size"), [(None, (96, 64)), (48, (48, 32)), (31, (32, 20)), (1000, (96, 64))])
+def test_videos_have_even_sizes(longest, size):
+    camera = cameras.at_most(toy.camera(0.1), longest)
+    assert (camera.width, camera.height) == size
+    assert camera.fx / camera.width == pytest.approx(1.1)

@@ -1,0 +1,82 @@
+"""What a painter shows is what the metrics see, and what it leaves out is left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import rasterizers
+from clear_strategies.training.field import GaussianField
+from clear_strategies.viewing.film import DepthScale
+from clear_strategies.viewing.look import Look, Painter
+from tests.helpers import saved_run, toy
+
+CAMERA = toy.camera(0.2)
+
+
+def make(**settings):
+    return rasterizers.load("torch", **{"background": (0.2, 0.4, 0.6), **settings})
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory) -> GaussianField:
+    return saved_run.write(tmp_path_factory.mktemp("run"))
+
+
+def test_the_picture_is_the_one_that_is_measured(field):
+    exact = field.render(make(), CAMERA).clamp(0, 1)
+    assert torch.equal(Painter(field, make).color(CAMERA), exact)
+
+
+@pytest.mark.parametrize("part", ["sh", "detail", "filter_3d", "mip"])
+def test_each_part_can_be_left_out(field, part):
+    painter = Painter(field, make)
+    without = painter.color(CAMERA, Look(**{part: False}))
+    assert (without - painter.color(CAMERA)).abs().max() > 1e-3
+    changed = GaussianField({**field.raw()}, degree=0 if part == "sh" else field.degree)
+    changed.filter_3d = field.filter_3d * (part != "filter_3d")
+    changed.detail.data *= part != "detail"
+    rasterizer = make(kernel=0.3, antialiased=False) if part == "mip" else make()
+    torch.testing.assert_close(without, changed.render(rasterizer, CAMERA).clamp(0, 1), atol=1e-6, rtol=0)
+
+
+def test_depth_is_the_distance_of_what_is_seen():
+    """A wall of opaque Gaussians at z = 5, over a background that must not count."""
+    x, y = torch.meshgrid(torch.linspace(-2, 2, 24), torch.linspace(-2, 2, 24), indexing="ij")
+    n = x.numel()
+    wall = GaussianField(
+        {
+            "means": torch.stack([x.flatten(), y.flatten(), torch.full((n,), 1.0)], 1),
+            "quats": torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4), "scales": torch.full((n, 3), -2.0),
+            "opacities": torch.full((n,), 6.0), "sh0": torch.ones(n, 1, 3), "shN": torch.zeros(n, 0, 3),
+            "detail": torch.zeros(n, 3),
+        }
+    )  # fmt: skip
+    depth = Painter(wall, make).depth(toy.camera(0.0))
+    torch.testing.assert_close(depth[20:40, 30:60], torch.full((20, 30), 5.0), atol=0.02, rtol=0)
+
+
+def test_depth_is_unknown_where_nothing_is(field):
+    turned = replace(CAMERA, world_to_camera=torch.diag(torch.tensor([1.0, -1, -1, 1])) @ CAMERA.world_to_camera)
+    depth = Painter(field, make).depth(turned)
+    assert depth.isnan().all()
+    picture = DepthScale.of(Painter(field, make), [turned]).picture(depth)
+    assert (picture[0, 0] == 204).all()
+
+
+def test_numbers_are_blended_over_black(field):
+    painter = Painter(field, make)
+    ones = painter.numbers(CAMERA, torch.ones(len(field)))
+    assert float(ones.min()) >= 0
+    assert float(ones.max()) <= 1 + 1e-6
+    torch.testing.assert_close(painter.numbers(CAMERA, torch.full((len(field),), 0.5)), ones / 2)
+
+
+def test_the_colours_of_depth_have_a_legend():
+    scale = DepthScale(1.0, 3.0)
+    picture = scale.picture(torch.full((10, 200), 2.0))
+    assert picture.shape == (50, 200, 3)
+    assert len({tuple(pixel) for pixel in picture[:10].reshape(-1, 3)}) == 1
+    assert len({tuple(pixel) for pixel in picture[10:].reshape(-1, 3)}) > 50

@@ -1,0 +1,58 @@
+"""Videos hold the frames that were written, and nothing is left of one that broke."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from clear_strategies.errors import SettingError
+from clear_strategies.viewing import video
+
+FRAMES = [np.full((32, 48, 3), 20 * i, np.uint8) for i in range(10)]
+
+
+def read(path):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    reader = ffmpeg.read_frames(str(path))
+    width, height = next(reader)["size"]
+    return np.stack([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader])
+
+
+def test_an_mp4_holds_the_frames(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    video.write_videos([tmp_path / "a.mp4"], FRAMES, fps=10)
+    found = read(tmp_path / "a.mp4")
+    assert found.shape == (10, 32, 48, 3)
+    assert np.abs(found.mean((1, 2, 3)) - np.arange(10) * 20).max() < 4
+
+
+def test_a_gif_is_written_beside_it(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+    video.write_videos([tmp_path / "a.mp4", tmp_path / "a.gif"], iter(FRAMES), fps=10)
+    assert (tmp_path / "a.gif").read_bytes()[:6] == b"GIF89a"
+    assert {path.name for path in tmp_path.iterdir()} == {"a.mp4", "a.gif"}
+
+
+def test_a_video_that_breaks_leaves_nothing(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+
+    def broken():
+        yield FRAMES[0]
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        video.write_videos([tmp_path / "a.mp4"], broken(), fps=10)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "frames"), [("a.avi", FRAMES), ("a.mp4", [])])
+def test_what_gives_no_video_is_refused(tmp_path, name, frames):
+    pytest.importorskip("imageio_ffmpeg")
+    with pytest.raises(SettingError):
+        video.write_videos([tmp_path / name], frames, fps=10)
+
+
+def test_a_missing_library_is_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(video, "find_spec", lambda _: None)
+    with pytest.raises(SettingError, match="pip install imageio-ffmpeg"):
+        video.write_videos([tmp_path / "a.mp4"], FRAMES, fps=10)
