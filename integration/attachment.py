@@ -3,9 +3,10 @@
 One training iteration:
 
 1. The host renders. The gate zᵗ is sampled, Î_HR is rendered and its gradients are taken. Then Î_LR is rendered with the
-   same zᵗ and returned to the host.
+   same zᵗ and the same random numbers, and returned to the host.
 2. The host calls `backward()` on its own loss, whatever it is: that is the LR side. When this pass ends, `.grad` of every
-   parameter becomes the merged gradient, and the tensor that the densifier reads holds the score.
+   parameter becomes the merged gradient. If a strategy has a densification score, the tensor that the densifier reads
+   holds it; otherwise the densifier's statistic stays the host's own.
 3. Gradient clipping, unscaling, the optimizer step and densification are the host's, in any order.
 
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
@@ -17,9 +18,10 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -38,6 +40,8 @@ from integration.host_score import ScoreScaler, score_for_host
 _log = logging.getLogger(__name__)
 
 Resolution = Literal["lr", "hr"]
+
+_LOGGED_EVERY: Final = 500  # merges between two lines of the log
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,6 +113,7 @@ class Attachment:
         self._scaler = None if threshold is None else ScoreScaler(threshold)
         self._n = len(params()["means"])
         self._passes = 0  # backward passes of this iteration
+        self._merges_before_step = 0  # at the host's last step
         self._pending: tuple[HostRendering, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
         self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
         self._logged: dict[str, Number] = {}
@@ -128,13 +133,48 @@ class Attachment:
         hr_grads = None
         if conductor.wants_hr(t):
             self.counts["HR renders"] += 1
-            hr_grads = conductor.hr_gradients(render_at("hr", z).shot, view)
+            with _random_state_kept(self.params()["means"].device):
+                hr_rendering = render_at("hr", z)
+            hr_grads = conductor.hr_gradients(hr_rendering.shot, view)
         rendering = render_at("lr", z)
         if rendering.output.requires_grad:
             self._pending = rendering, hr_grads
             rendering.output.register_hook(self._on_backward)  # type: ignore[no-untyped-call]
         self.counts["LR renders"] += 1
         return rendering.returned
+
+    def before_step(self) -> None:
+        """For a hook before the host's optimizer step: count the steps in which no strategy took part.
+
+        Raises:
+            HostError: the host steps for the first time, and none of its renderings was recognised.
+        """
+        if self.removed:
+            return
+        merges = self.counts["merges"]
+        if not merges:
+            raise HostError(
+                "the host makes its first optimizer step, but none of its renderings was recognised as that of a training "
+                "view, so that no strategy would take part. Check that the training loop renders with the function that "
+                "was replaced, and with the cameras that were passed."
+            )
+        if merges == self._merges_before_step:
+            self.counts["steps of the host alone"] += 1
+        self._merges_before_step = merges
+
+    def state_dict(self) -> dict[str, Any]:
+        """The iteration, and what the strategies store per Gaussian, for the host's checkpoint."""
+        return {"t": self.t, "passes": self._passes, "strategies": self.conductor.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state; the host has loaded its parameters already."""
+        self.t, self._passes = int(state["t"]), int(state["passes"])
+        self.conductor.load_state_dict(state["strategies"])
+        self._n = len(self.params()["means"])
+
+    def summary(self) -> str:
+        """What was done how often, e.g. for the end of a log."""
+        return ", ".join(f"{n:,} {what}" for what, n in self.counts.items()) or "nothing was done"
 
     @property
     def log(self) -> dict[str, float]:
@@ -216,6 +256,10 @@ class Attachment:
         losses = {} if hr_grads is None else hr_grads.losses
         self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **self.conductor.logs()}
         self._logged |= conflict_columns(merged.conflict)
+        if self.counts["merges"] % _LOGGED_EVERY == 0:
+            values = self.log
+            losses_now = ", ".join(f"L_{name} {values[name]:.4f}" for name in losses) or "no HR"
+            _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
 
     def _grad_of_this_pass(self, name: str, p: Tensor) -> Tensor:
         if p.grad is None or p.grad.is_sparse:
@@ -235,7 +279,19 @@ class Attachment:
             return
         screen_lr = to_ndc(slot.per_gaussian(gradient, self._n), slot.size)
         score, ordinary = self.conductor.scores(screen_lr, hr_grads, self.t)
-        written = score_for_host(slot, score, ordinary, shot.visible, self._scaler, grad_scale)
+        if (
+            score is ordinary
+        ):  # no strategy has a score: the densifier keeps the statistic that its threshold is meant for
+            return
+        own = torch.linalg.vector_norm(screen_lr, dim=-1)
+        written = score_for_host(slot, score, own, shot.visible, self._scaler, grad_scale)
         if written is not None:
             slot.write(grad_scale * written)
-        self.counts["scores written"] += score is not ordinary
+            self.counts["scores written"] += 1
+
+
+@contextmanager
+def _random_state_kept(device: torch.device) -> Iterator[None]:
+    """Restore torch's random generators, so that a dropout inside the host's render drops the same at both scales."""
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        yield

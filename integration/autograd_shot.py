@@ -23,12 +23,14 @@ class ScreenGradientSlot:
         to_pixels: factors from the tensor's gradient to a gradient in 1/pixel: (1, 1) in gsplat, whose tensor is in
             pixels; (2 / width, 2 / height) in 3DGS, whose tensor is in NDC.
         rows: the Gaussian of each row; None: row i is Gaussian i.
+        ranked: a column after the second that the host only ranks Gaussians by (Mip-Splatting's absolute gradient).
     """
 
     tensor: Tensor
     size: tuple[int, int]
     to_pixels: tuple[float, float] = (1.0, 1.0)
     rows: Int[Tensor, " M"] | None = None
+    ranked: int | None = None
 
     def per_gaussian(self, gradient: Tensor, n: int) -> Float[Tensor, "N 2"]:
         """∇_u of all N Gaussians in 1/pixel, from a gradient of the tensor."""
@@ -43,13 +45,15 @@ class ScreenGradientSlot:
     def write(self, norms: Float[Tensor, " N"]) -> None:
         """Set the tensor's `.grad` (and gsplat's `.absgrad`) so that its row norms in NDC units are `norms`.
 
-        Columns after the second keep the host's values: some hosts store absolute gradients there.
+        Columns after the second keep the host's values, some store absolute gradients there; only `ranked` is written too.
         """
         gradient = torch.zeros_like(self.tensor)
         if self.tensor.grad is not None:
             gradient[..., 2:] = self.tensor.grad[..., 2:]
         rows = norms if self.rows is None else norms[self.rows]
         gradient.view(-1, gradient.shape[-1])[:, 0] = rows.to(gradient) * (2 / self.size[0] / self.to_pixels[0])
+        if self.ranked is not None:
+            gradient[..., self.ranked] = gradient[..., 0]
         self.tensor.grad = gradient
         if hasattr(self.tensor, "absgrad"):
             self.tensor.absgrad = gradient
@@ -81,12 +85,14 @@ class AutogradShot:
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         """One backward pass through the host's graph per cotangent; the graph is kept."""
         slot = self.gradient_slot
-        inputs = [*self.params.values(), slot.tensor]
+        projected = [slot.tensor] if slot.tensor.requires_grad else []  # gsplat's 3DGUT draws without projected centres
         results = []
         for cotangent in cotangents:
-            *gradients, screen = torch.autograd.grad(
-                self.image, inputs, cotangent, retain_graph=True, allow_unused=True, materialize_grads=True
-            )
-            values = dict(zip(self.params, gradients, strict=True))
+            gradients = torch.autograd.grad(
+                self.image, [*self.params.values(), *projected], cotangent, retain_graph=True, allow_unused=True,
+                materialize_grads=True,
+            )  # fmt: skip
+            values = dict(zip(self.params, gradients, strict=False))
+            screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
         return results

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -76,6 +77,27 @@ class DetailFeature:
         """One optimizer step, if there is a gradient; called when the host steps."""
         self._adam.step()
         self._adam.zero_grad(set_to_none=True)
+
+    def state_dict(self) -> dict[str, Any]:
+        """f_det and the moments of its Adam, for the host's checkpoint."""
+        return {"value": self.value.detach().clone(), "adam": self._adam.state_dict()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state; the host has loaded its parameters already.
+
+        Raises:
+            HostError: the state holds another number of Gaussians.
+        """
+        self._known, self._parents = self._compared(), None
+        means = self._known["means"]
+        if len(state["value"]) != len(means):
+            raise HostError(
+                f"the checkpoint holds f_det of {len(state['value']):,} Gaussians, but {len(means):,} Gaussians were loaded. "
+                "Load both from one checkpoint."
+            )
+        self._value = torch.nn.Parameter(state["value"].to(means))
+        self._adam = detail_adam(self._value)
+        self._adam.load_state_dict(state["adam"])
 
     def _compared(self) -> dict[str, Tensor]:
         params = self._params()

@@ -88,15 +88,6 @@ def score_for_host(
     return score if score is ordinary or scaler is None else scaler(score, ordinary, visible)
 
 
-def warn_if_densification_outlasts(conductor: Conductor, until: int | None, setting: str) -> None:
-    """Warn if the host's `setting` lets densification continue after a strategy ends it."""
-    if until is not None and conductor.may_densify(0) and not conductor.may_densify(until - 1):
-        _log.warning(
-            "the host densifies until %s=%d, but a strategy ends densification earlier (SVS: anchor_start). Lower %s to "
-            "that iteration.", setting, until, setting,
-        )  # fmt: skip
-
-
 def warn_if_score_is_unused(conductor: Conductor, densifier: Any, threshold: float | None) -> None:
     """Warn if a strategy has a score, but the host's densifier has no threshold on the screen gradient."""
     scoring = conductor.owner("score")

@@ -3,7 +3,7 @@
     model:
       density:
         class_path: integration.lightning.ClearDensityController
-        init_args: {clear: clear, sr: data/fern/sr_x4}
+        init_args: {strategies: clear, sr: data/fern/sr_x4}
 
 The wrapped controller (`base`) is the one that the host would build, so names in checkpoints stay the same. Only that host
 can import this module, which derives from its `DensityController`.
@@ -13,21 +13,22 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 import torch
 from internal.density_controllers.density_controller import DensityController
-from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment, HostRendering, Resolution
-from integration.detail import DetailFeature
+from integration.densification import end_with_strategies
+from integration.detail import DetailFeature, sh0_offset
 from integration.errors import HostError
-from integration.host_score import warn_if_densification_outlasts, warn_if_score_is_unused
+from integration.host_score import warn_if_score_is_unused
 from integration.model_proxy import ModelRenderer, Role, enlarged_camera
 from integration.views import SuperResolve, sr_source, view
 
@@ -42,6 +43,9 @@ _ROLES: Final[tuple[tuple[str, Role], ...]] = (
     ("shs_dc", "detail"),
     ("get_shs_dc", "detail"),
 )
+_SH0: Final = f"gaussian_model.gaussians.{_NAMES['sh0']}"
+_STATE: Final = "clear"
+"""Key of our state in the host's checkpoints."""
 
 
 @dataclass
@@ -52,7 +56,7 @@ class ClearDensityController(DensityController):  # type: ignore[misc]
 
     Args:
         base: the controller that densifies; None: the host's VanillaDensityController.
-        clear: strategies of conf/: "clear", "gco", "gco,svs" …
+        strategies: names of conf/strategy: "clear", "gco", "gco,svs" …
         overrides: settings, e.g. "strategies.gco.tolerance=0.1".
         sr: folder of SR images, named like the photos; None: HR is not used.
         suffix: what the SR tool appended to the names, e.g. "_x4".
@@ -61,7 +65,7 @@ class ClearDensityController(DensityController):  # type: ignore[misc]
     """
 
     base: DensityController | None = None
-    clear: str = "clear"
+    strategies: str = "clear"
     overrides: list[str] = field(default_factory=list)
     sr: str | None = None
     suffix: str = ""
@@ -91,6 +95,8 @@ class ClearDensityController(DensityController):  # type: ignore[misc]
 class Attached:
     """CLEAR in one LightningModule.
 
+    The module's `forward` is replaced, and not the renderer's: the host pickles its renderer with every checkpoint.
+
     Attributes:
         attachment: None before the first training step, which is the first to have parameters and optimizers.
     """
@@ -98,42 +104,59 @@ class Attached:
     def __init__(self, settings: ClearDensityController, density: Any, module: Any) -> None:
         from clear_strategies.compose import conductor
 
-        if not module.trainer.max_steps > 0:
+        trainer = module.trainer
+        if not trainer.max_steps > 0:
             raise HostError(
-                f"schedules need the number of steps, got max_steps={module.trainer.max_steps}. Set trainer.max_steps."
+                f"schedules need the number of steps, got max_steps={trainer.max_steps}. Set trainer.max_steps."
+            )
+        if getattr(trainer, "world_size", 1) > 1:
+            raise HostError(f"one process trains, got {trainer.world_size}. Set trainer.devices=1.")
+        if str(getattr(trainer, "precision", "32")).startswith(("16", "bf16")):
+            raise HostError(
+                f"gradients are merged in 32 bits, got precision={trainer.precision}. Set trainer.precision=32."
             )
         self._settings, self._density, self._module = settings, density, module
-        self._conductor: Conductor = conductor(settings.clear, *settings.overrides, iterations=module.trainer.max_steps)
+        self._conductor: Conductor = conductor(settings.strategies, *settings.overrides, iterations=trainer.max_steps)
         self._sr, self._factor = sr_source(_sr_images(settings), self._conductor, settings.factor)
+        end_with_strategies(self._conductor, density, "densify_until_iter")
         self._views: dict[str, View] = {}
-        self._photo: tuple[str, Tensor] | None = None  # name and pixels of the current step's photo
+        self._masks: dict[str, Tensor | None] = {}
+        self._photo: str | None = None  # name of the photo, inside a training step
+        self._resumed: Mapping[str, Any] = {}
+        self._sh0_holds_detail = False  # while the host writes its files
         self.attachment: Attachment | None = None
+        _replace(module, "forward", self._forward)
         _replace(module, "training_step", self._training_step)
         _replace(module, "save_gaussians", self._save_with_detail)
-        _replace(module.renderer, "training_forward", self._training_forward)
-        _replace(module.renderer, "forward", self._forward_with_detail)
+        _replace(module, "on_save_checkpoint", self._save_state)
+        _replace(module, "on_load_checkpoint", self._load_state)
+        module.on_train_start_hooks.append(lambda *_: self._show_detail_in_viewer())
         module.on_train_batch_end_hooks.append(lambda *_: self._detail.step())
+        module.extra_train_metrics.append(self._add_metrics)
 
     def _attach(self) -> Attachment:
-        steps_done, settings = self._module.trainer.global_step, self._settings
+        module, settings = self._module, self._settings
         threshold = getattr(self._density, "densify_grad_threshold", None)
         warn_if_score_is_unused(self._conductor, self._density, threshold)
-        until = getattr(self._density, "densify_until_iter", None)
-        warn_if_densification_outlasts(self._conductor, until, "densify_until_iter")
+        if missing := [name for name in _NAMES.values() if name not in module.gaussian_model.gaussians]:
+            raise HostError(
+                f"the Gaussians have no {missing[0]}, as those of a VanillaGaussian have. Use a model with spherical harmonics."
+            )
         self._detail = DetailFeature(self._host_params)
         self._renderer = ModelRenderer(
-            self._module.gaussian_model, _ROLES, self._host_params, self._detail if settings.detail else None,
-            self._conductor,
-        )  # fmt: skip
-        names = self._module.trainer.datamodule.dataparser_outputs.train_set.image_names
+            module.gaussian_model, _ROLES, self._host_params, self._detail if settings.detail else None, self._conductor
+        )
+        self._views_from_dataset(module.trainer.train_dataloader.dataset)
         attachment = Attachment(
-            self._conductor, self._renderer.params, n_views=len(names), seed=settings.seed, threshold=threshold,
+            self._conductor, self._renderer.params, n_views=len(self._views), seed=settings.seed, threshold=threshold,
             poll_parents=lambda: self._detail.poll_parents(self._conductor.state_dict),
         )  # fmt: skip
-        if steps_done:
-            _log.warning(
-                "resumed at step %d: f_det and the strategies' per-Gaussian state start again from zero.", steps_done
-            )
+        module.gaussian_optimizers[0].register_step_pre_hook(lambda *_: attachment.before_step())
+        if self._resumed:
+            self._detail.load_state_dict(self._resumed["detail"])
+            attachment.load_state_dict(self._resumed["attachment"])
+        elif steps_done := module.trainer.global_step:
+            _log.warning("resumed at step %d from a checkpoint without CLEAR: f_det starts from zero.", steps_done)
             attachment.t = steps_done + 1
         return attachment
 
@@ -141,48 +164,79 @@ class Attached:
         gaussians = self._module.gaussian_model.gaussians
         return {name: gaussians[host_name] for name, host_name in _NAMES.items()}
 
+    def _views_from_dataset(self, dataset: Any) -> None:
+        """Every training photo as its dataset loads it: undistorted, over the background, with its mask."""
+        device = self._host_params()["means"].device
+        for i in range(len(dataset)):
+            camera, (name, image, mask), _ = dataset[i]
+            if name in self._views:
+                raise HostError(f"two training photos are called {name!r}. Give each its own name.")
+            fx, fy, cx, cy = (float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy"))
+            K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+            pixels = image.permute(1, 2, 0).to(device)
+            shown = None if mask is None else mask[0].to(device).float()
+            pose = camera.world_to_camera.T
+            self._views[name] = view(name, pixels, pose, K, self._sr, self._factor, mask=shown)
+            self._masks[name] = shown
+
     def _training_step(self, original: Callable[..., Any], batch: Any, *args: Any, **kwargs: Any) -> Any:
-        _, (name, image, mask), _ = batch
-        self._photo = name, image
+        _, (name, _, _), _ = batch
         if self.attachment is None:
             self.attachment = self._attach()
-        if mask is not None:
-            self._renderer.warn_once("masks apply to the photos only: SR images are compared as a whole.")
-        return original(batch, *args, **kwargs)
+        self._photo = name
+        try:
+            return original(batch, *args, **kwargs)
+        finally:
+            self._photo = None
 
-    def _training_forward(
-        self,
-        original: Callable[..., Any],
-        step: int,
-        module: Any,
-        viewpoint_camera: Any,
-        pc: Any,
-        *args: Any,
-        **kwargs: Any,
-    ) -> Any:
-        if self.attachment is None or self._photo is None:
-            return original(step, module, viewpoint_camera, pc, *args, **kwargs)
-        current = self._view(viewpoint_camera, *self._photo)
+    def _forward(self, original: Callable[..., Any], camera: Any, *args: Any, **kwargs: Any) -> Any:
+        """Both scales in a training step; f_base + f_det in any other rendering."""
+        if self.attachment is None:
+            return original(camera, *args, **kwargs)
+        if self._photo is None or not self._module.training:
+            with self._using(self._renderer.with_detail()):
+                return original(camera, *args, **kwargs)
+        current, mask = self._views[self._photo], self._masks[self._photo]
 
         def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
-            camera = enlarged_camera(viewpoint_camera, current.factor) if resolution == "hr" else viewpoint_camera
-            return self._renderer.render(
-                lambda model: original(step, module, camera, model, *args, **kwargs),
-                current,
-                resolution,
-                gate,
-                _to_pixels,
-            )
+            sized = enlarged_camera(camera, current.factor) if resolution == "hr" else camera
+
+            def render(model: Any) -> Any:
+                with self._using(model):
+                    return original(sized, *args, **kwargs)
+
+            return self._renderer.render(render, current, resolution, gate, _to_pixels, mask)
 
         return self.attachment.render_view(current, render_at)
 
-    def _forward_with_detail(
-        self, original: Callable[..., Any], viewpoint_camera: Any, pc: Any, *args: Any, **kwargs: Any
-    ) -> Any:
-        """`forward`, with f_det in renderings without gradients."""
-        evaluated = pc is self._module.gaussian_model and not torch.is_grad_enabled()
-        model = self._renderer.with_detail() if evaluated and self.attachment is not None else pc
-        return original(viewpoint_camera, model, *args, **kwargs)
+    @contextmanager
+    def _using(self, model: Any) -> Iterator[None]:
+        """The module renders another model."""
+        own, self._module.gaussian_model = self._module.gaussian_model, model
+        try:
+            yield
+        finally:
+            self._module.gaussian_model = own
+
+    def _show_detail_in_viewer(self) -> None:
+        """The host's viewer calls the renderer itself."""
+        viewer = getattr(self._module, "web_viewer", None)
+        if viewer is not None:
+            _replace(
+                viewer, "process_all_render_requests",
+                lambda original, _, *args: original(
+                    self._module.gaussian_model if self.attachment is None else self._renderer.with_detail(), *args
+                ),
+            )  # fmt: skip
+
+    def _add_metrics(
+        self, outputs: Any, batch: Any, model: Any, step: int, module: Any, metrics: Any, prog_bar: Any
+    ) -> None:
+        """The HR losses of the last step, in the host's log and progress bar."""
+        if self.attachment is not None:
+            for name, value in self.attachment.log.items():
+                metrics[f"clear_{name}"] = torch.as_tensor(value)
+                prog_bar[f"clear_{name}"] = name == "base"
 
     @torch.no_grad()
     def _save_with_detail(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -192,18 +246,31 @@ class Attached:
         sh0 = self._host_params()["sh0"]
         trained = sh0.clone()
         sh0 += self._detail.offset(sh0)
+        self._sh0_holds_detail = True
         try:
             return original(*args, **kwargs)
         finally:
+            self._sh0_holds_detail = False
             sh0.copy_(trained)
 
-    def _view(self, camera: Any, name: str, image: Float[Tensor, "3 h w"]) -> View:
-        if name not in self._views:
-            fx, fy, cx, cy = (float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy"))
-            K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-            pixels = image.permute(1, 2, 0)
-            self._views[name] = view(name, pixels, camera.world_to_camera.T, K, self._sr, self._factor)
-        return self._views[name]
+    def _save_state(self, original: Callable[..., Any], checkpoint: dict[str, Any]) -> None:
+        """A checkpoint's colours are f_base + f_det, for every program that reads it; our own state lies beside."""
+        original(checkpoint)
+        if self.attachment is None:
+            return
+        checkpoint[_STATE] = {"detail": self._detail.state_dict(), "attachment": self.attachment.state_dict()}
+        if not self._sh0_holds_detail:
+            sh0 = checkpoint["state_dict"][_SH0]
+            checkpoint["state_dict"][_SH0] = sh0 + self._detail.offset(sh0)
+
+    def _load_state(self, original: Callable[..., Any], checkpoint: dict[str, Any]) -> None:
+        """Training continues with f_base and f_det, which the colours of a checkpoint hold as their sum."""
+        self._resumed = checkpoint.get(_STATE, {})
+        if self._resumed:
+            sh0 = checkpoint["state_dict"][_SH0]
+            detail = self._resumed["detail"]["value"].to(sh0)
+            checkpoint["state_dict"][_SH0] = sh0 - sh0_offset(detail, sh0)
+        original(checkpoint)
 
 
 def _sr_images(settings: ClearDensityController) -> SuperResolve | None:

@@ -8,7 +8,7 @@ import copy
 import inspect
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Final, Literal
 
@@ -22,6 +22,7 @@ from integration.attachment import HostRendering, Resolution
 from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 from integration.detail import DetailFeature, sh0_offset
 from integration.errors import HostError
+from integration.views import enlarged_mask
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -117,7 +118,7 @@ class ModelRenderer:
 
     Args:
         params: returns the host's current leaves, by gsplat's names.
-        detail: f_det, applied at HR and in renderings without gradients; None: there is none.
+        detail: f_det, applied at HR and in renderings that do not train; None: there is none.
     """
 
     def __init__(
@@ -139,8 +140,8 @@ class ModelRenderer:
         return {**self._host_params(), **detail}
 
     def with_detail(self) -> Any:
-        """The model with colours f_base + f_det, for renderings without gradients."""
-        overrides = Overrides(detail=None if self._detail is None else self._detail.value)
+        """The model with colours f_base + f_det, for renderings that do not train: evaluation, viewers."""
+        overrides = Overrides(detail=None if self._detail is None else self._detail.value.detach())
         return proxy(self._model, overrides, self._roles)
 
     def render(
@@ -150,12 +151,14 @@ class ModelRenderer:
         resolution: Resolution,
         gate: Float[Tensor, " N"] | None,
         to_pixels: Callable[[Mapping[str, Any]], tuple[float, float] | None] = lambda result: None,
+        mask: Float[Tensor, "h w"] | None = None,
     ) -> HostRendering:
         """Render the view at LR without f_det, or at HR with it.
 
         Args:
             render: the host's function of the model alone.
             to_pixels: see `host_rendering`.
+            mask: what the host multiplies its LR image by after rendering; the HR image is multiplied by it here.
         """
         hr = resolution == "hr"
         overrides = Overrides(gate, self._detail.value if hr and self._detail is not None else None)
@@ -167,7 +170,15 @@ class ModelRenderer:
         params = self.params() if hr else self._host_params()
         trained = {name: p for name, p in params.items() if p.requires_grad}
         rendering = host_rendering(result, (view.hr if hr else view.lr).camera, trained, overrides.gate, to_pixels)
-        if rendering.shot.gradient_slot.tensor.shape[-1] == 4 and self._scoring is not None:
+        if hr and mask is not None:
+            shot = rendering.shot
+            masked = shot.image * enlarged_mask(mask.to(shot.image), view.factor)[..., None]
+            rendering = replace(rendering, shot=replace(shot, image=masked))
+        slot = rendering.shot.gradient_slot
+        if slot.tensor.shape[-1] == 3 and hasattr(self._model, "xyz_gradient_accum_abs"):
+            # Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts.
+            rendering = replace(rendering, shot=replace(rendering.shot, slot=replace(slot, ranked=2)))
+        elif slot.tensor.shape[-1] == 4 and self._scoring is not None:
             self.warn_once(
                 "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
                 "score of %s goes to the first two columns only.", self._scoring,

@@ -25,6 +25,7 @@ def view(
     K: Float[Tensor, "3 3"],
     sr: SuperResolve,
     factor: int = 4,
+    mask: Float[Tensor, "h w"] | None = None,
 ) -> View:
     """One training view of a host, on the device of its image.
 
@@ -33,6 +34,8 @@ def view(
         world_to_camera: OpenCV axes (x right, y down, z forward).
         K: focal lengths and principal point in pixels of `image`; pixel (0, 0) spans [0, 1)².
         sr: gives the SR image. factor: HR pixels per LR pixel.
+        mask: what the host's loss multiplies its rendering by, in [0, 1]. Photo and SR image are multiplied by it, so that
+            a pixel that the host hides is hidden at both scales; the HR rendering must be as well, see `enlarged_mask`.
 
     Raises:
         DataError: the SR image is not `factor` times as large as the photo.
@@ -49,9 +52,16 @@ def view(
             name, "SR image", f"is {sr_image.shape[1]}x{sr_image.shape[0]}, but {factor} times {w}x{h} is "
             f"{w * factor}x{h * factor}", "super-resolve the images that the host trains on",
         )  # fmt: skip
+    if mask is not None:
+        image, sr_image = image * mask[..., None], sr_image * enlarged_mask(mask, factor)[..., None]
     return View(
         name, Photo(camera, image), Photo(camera.scaled(factor), sr_image), sr_source=getattr(sr, "label", "unknown")
     )
+
+
+def enlarged_mask(mask: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "H W"]:
+    """The mask at HR: every HR pixel has the value of the LR pixel that it lies in."""
+    return mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
 
 
 def sr_source(sr: SuperResolve | str | Path | None, conductor: Conductor, factor: int) -> tuple[SuperResolve, int]:

@@ -217,7 +217,7 @@ def lr_size(camera: Camera, views: ViewSettings) -> tuple[int, int]:
 def save_lr(scene: Scene, folder: Path) -> None:
     """Write the training and test LR images as PNG for an external SR model; prior=images reads its results."""
     for view in (*scene.train, *scene.test):
-        write_png(folder / f"{Path(view.name).stem}.png", view.lr.image)
+        write_png((folder / view.name).with_suffix(".png"), view.lr.image)
     _log.info(
         "%d LR images written to %s. Super-resolve them, then train with prior=images prior.path=<results>.",
         len(scene.train) + len(scene.test),

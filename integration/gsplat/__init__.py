@@ -1,10 +1,13 @@
-"""CLEAR in a gsplat loop: wrap its `rasterization`, and keep everything else.
+"""CLEAR in gsplat: one line in its examples/simple_trainer.py, before `cli(main, cfg, verbose=True)`,
+
+    install(Runner, sr="sr_x4")
+
+none (`python -m integration.gsplat --sr sr_x4 simple_trainer.py default --data_dir data`), or two in a loop of your own:
 
     clear = attach(splats, optimizers, views, conductor, strategy=strategy, state=strategy_state)
     rasterization = clear.wrap(rasterization)
 
-`ClearStrategy` takes the place of gsplat's `DefaultStrategy` instead. gsplat is imported for `ClearStrategy` only. The names,
-shapes and order of calls that `attach` relies on are those of gsplat 1.4 (radii [C, N]) and 1.5 (radii [C, N, 2]).
+The names, shapes and order of calls that `attach` relies on are those of gsplat 1.4 (radii [C, N]) and later (radii [C, N, 2]).
 """
 
 from __future__ import annotations
@@ -12,16 +15,17 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from integration.gsplat.attached import ROWS, Attached, attach
+from integration.gsplat.data import save_lr, views_from_dataset
 
 if TYPE_CHECKING:
-    from integration.gsplat.strategy import ClearStrategy
+    from integration.gsplat.simple_trainer import install
 
-__all__ = ["ROWS", "Attached", "ClearStrategy", "attach"]
+__all__ = ["ROWS", "Attached", "attach", "install", "save_lr", "views_from_dataset"]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "ClearStrategy":
-        from integration.gsplat.strategy import ClearStrategy
+    if name == "install":  # brings Hydra
+        from integration.gsplat.simple_trainer import install
 
-        return ClearStrategy
+        return install
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

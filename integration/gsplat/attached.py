@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import functools
 import inspect
-import logging
-import sys
-from collections.abc import Callable, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from contextlib import contextmanager
 from typing import Any, Final
 
 import torch
@@ -17,12 +16,13 @@ from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment, HostRendering, Resolution
 from integration.autograd_shot import AutogradShot, ScreenGradientSlot
+from integration.densification import require_end
 from integration.detail import detail_adam, sh0_offset
 from integration.errors import HostError
-from integration.host_score import warn_if_densification_outlasts, warn_if_score_is_unused
+from integration.host_score import warn_if_score_is_unused
+from integration.replacing import Replaced
+from integration.views import enlarged_mask
 from rasterizers.geometry import SH_C0
-
-_log = logging.getLogger(__name__)
 
 ROWS: Final = "clear_rows"
 """Key in a gsplat strategy's `state`: the row of each Gaussian before the structure last changed. gsplat gathers every tensor
@@ -40,16 +40,18 @@ class Attached:
 
     Args:
         params: gsplat's dict of leaves. optimizers: one for each of them.
-        views: all training views. A rendering is matched to a view by its pose.
+        views: all training views. A rendering is that of the view named by `rendering`, else of the one with its pose.
         strategy, state: gsplat's densification strategy and its state. The strategy's threshold scales P2G's score, and
             the state records every change of structure. None: a loop without densification.
         detail: add the detail feature f_det as `params["detail"]`, with an Adam of its own. gsplat's strategies clone,
             split and prune it like any other parameter.
         names: gsplat's parameter name -> the host's, where they differ (nerfstudio: sh0 is features_dc).
         loss_scale, accumulation: see `Attachment`.
+        masks: [h, w] by the name of a view, what the host multiplies the LR image by after rendering.
 
     Raises:
         ValueError: there is no view, or a parameter is missing.
+        SettingError: densification outlasts the anchor.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class Attached:
         seed: int = 0,
         loss_scale: Callable[[], float] | None = None,
         accumulation: int = 1,
+        masks: Mapping[str, Tensor] | None = None,
     ) -> None:
         if not views:
             raise ValueError(
@@ -83,12 +86,17 @@ class Attached:
         self._unchanged_rows: Tensor | None = None
         self._number_rows()
         self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).to(means)
-        self._warned_of_pose = False
-        self._replaced: list[tuple[Any, str, Any]] = []
+        self._masks = dict(masks or {})
+        self._named: View | None = None  # by `rendering`
+        self._replaced: list[Replaced] = []
+        require_end(conductor, _refine_stop(strategy), "refine_stop_iter", first=0)
         self.attachment = Attachment(
             conductor, self.params, n_views=len(self._views), seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=None if state is None else self._poll_parents, threshold=_threshold(strategy, conductor),
         )  # fmt: skip
+        self._hook = optimizers[self._host_name("means")].register_step_pre_hook(
+            lambda *_: self.attachment.before_step()
+        )
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
@@ -115,10 +123,10 @@ class Attached:
             if self.attachment.removed:
                 return rasterization(**call)
             if not torch.is_grad_enabled():
-                return rasterization(**self._with_detail(call))
-            view = self._find_view(call["viewmats"])
-            if view is None:
-                return rasterization(**call)
+                return rasterization(**self._with_detail(call, trained=False))
+            view = self._named or self._find_view(call["viewmats"])
+            if view is None:  # a viewer, a camera without a photo
+                return rasterization(**self._with_detail(call, trained=False))
 
             def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
                 return self._render(rasterization, call, view, resolution, gate)
@@ -128,14 +136,19 @@ class Attached:
         setattr(wrapped, _ATTACHED, self)
         return wrapped
 
+    @contextmanager
+    def rendering(self, view: View | None) -> Iterator[None]:
+        """Renderings with gradients are those of this view, whatever their pose (pose optimization, pose noise)."""
+        before, self._named = self._named, view
+        try:
+            yield
+        finally:
+            self._named = before
+
     def replace_everywhere(self, rasterization: Rasterization) -> Rasterization:
         """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
         wrapped = self.wrap(rasterization)
-        for module in list(sys.modules.values()):
-            for name, value in list(vars(module).items()) if hasattr(module, "__dict__") else ():
-                if value is rasterization:
-                    setattr(module, name, wrapped)
-                    self._replaced.append((module, name, rasterization))
+        self._replaced.append(Replaced(rasterization, wrapped))
         return wrapped
 
     @torch.no_grad()
@@ -149,8 +162,9 @@ class Attached:
     def remove(self) -> None:
         """Restore the loop; f_det stays a parameter, see `fold_detail`."""
         self.attachment.remove()
-        for module, name, original in self._replaced:
-            setattr(module, name, original)
+        self._hook.remove()
+        for replaced in self._replaced:
+            replaced.undo()
         self._replaced.clear()
         if self._state is not None:
             self._state.pop(ROWS, None)
@@ -185,16 +199,11 @@ class Attached:
                 "and average."
             )
         distance = (self._poses - poses).abs().amax((1, 2))
-        nearest = int(distance.argmin())
-        if float(distance[nearest]) > _SAME_POSE * max(1.0, float(poses.abs().max())):
-            if not self._warned_of_pose:
-                _log.warning(
-                    "a camera has the pose of none of the %d views; its renderings are left unchanged.",
-                    len(self._views),
-                )
-                self._warned_of_pose = True
-            return None
-        return self._views[nearest]
+        same = (distance <= _SAME_POSE * max(1.0, float(poses.abs().max()))).nonzero()[:, 0].tolist()
+        if len(same) > 1:
+            names = " and ".join(self._views[i].name for i in same[:2])
+            raise HostError(f"{names} have the same pose. Say which is rendered: with clear.rendering(view): …")
+        return self._views[same[0]] if same else None
 
     def _render(
         self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, resolution: Resolution, gate: Tensor | None
@@ -203,7 +212,7 @@ class Attached:
         if gate is not None:
             call["opacities"] = call["opacities"] * gate.to(call["opacities"])
         if resolution == "hr":
-            call, factor = self._with_detail(call), view.factor
+            call, factor = self._with_detail(call, trained=True), view.factor
             call |= {
                 "Ks": _scaled(call["Ks"], factor),
                 "width": call["width"] * factor,
@@ -236,15 +245,18 @@ class Attached:
         if resolution == "lr":
             params.pop("detail", None)
         image = renders[..., :3].reshape(size[1], size[0], 3)
+        if resolution == "hr" and (mask := self._masks.get(view.name)) is not None:
+            image = image * enlarged_mask(mask.to(image), view.factor)[..., None]
         shot = AutogradShot(image, means2d, visible, params, ScreenGradientSlot(info["means2d"], size, rows=rows))
         return HostRendering(shot, renders, (renders, alphas, info))
 
-    def _with_detail(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """The same call with colours f_base + f_det."""
+    def _with_detail(self, arguments: Mapping[str, Any], *, trained: bool) -> dict[str, Any]:
+        """The same call with colours f_base + f_det; f_det gets a gradient only if it is trained by the rendering."""
         call = dict(arguments)
         if "detail" not in self._params or len(call["means"]) != len(self._params["detail"]):
             return call  # only a part of the scene is rendered, and it is unknown which
-        detail, colors = self._params["detail"], call["colors"]
+        colors = call["colors"]
+        detail = (self._params["detail"] if trained else self._params["detail"].detach()).to(colors)
         if call.get("sh_degree") is None:
             call["colors"] = colors + detail
         else:
@@ -259,9 +271,12 @@ def _threshold(strategy: Any, conductor: Conductor) -> float | None:
     """The densification threshold of gsplat's strategy; warns about what the strategy does not follow."""
     threshold = getattr(strategy, "grow_grad2d", None)
     warn_if_score_is_unused(conductor, strategy, threshold)
-    if not getattr(strategy, "follows_may_densify", False):
-        warn_if_densification_outlasts(conductor, getattr(strategy, "refine_stop_iter", None), "refine_stop_iter")
     return None if threshold is None else float(threshold)
+
+
+def _refine_stop(strategy: Any) -> int | None:
+    stop = getattr(strategy, "refine_stop_iter", None)
+    return None if stop is None else int(stop)
 
 
 def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, ...]:

@@ -1,8 +1,6 @@
-"""CLEAR in the `train.py` of Inria's 3DGS and of its forks: two lines after `gaussians.training_setup(opt)`,
+"""CLEAR in the `train.py` of Inria's 3DGS and of its forks: one line after `gaussians.training_setup(opt)`,
 
-    clear = attach(gaussians, scene.getTrainCameras(), conductor("clear", iterations=opt.iterations), sr="sr_x4",
-                   threshold=opt.densify_grad_threshold, densify_until=opt.densify_until_iter)
-    render = clear.wrap(render)
+    install(gaussians, scene, opt, sr="sr_x4")
 
 or none:
 
@@ -11,6 +9,22 @@ or none:
 Only names that all these repositories share are used, and only their own train.py imports them.
 """
 
-from integration.inria.attached import THRESHOLD, Attached, Render, attach
+from __future__ import annotations
 
-__all__ = ["THRESHOLD", "Attached", "Render", "attach"]
+from typing import TYPE_CHECKING, Any
+
+from integration.inria.attached import THRESHOLD, Attached, Render, attach
+from integration.inria.cameras import save_lr, views_from_cameras
+
+if TYPE_CHECKING:
+    from integration.inria.from_options import install
+
+__all__ = ["THRESHOLD", "Attached", "Render", "attach", "install", "save_lr", "views_from_cameras"]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "install":  # brings Hydra
+        from integration.inria.from_options import install
+
+        return install
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

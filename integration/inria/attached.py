@@ -1,4 +1,4 @@
-"""`attach` for 3DGS-style loops: a `GaussianModel`, its optimizer, its cameras, and `render`."""
+"""CLEAR in a 3DGS-style loop: a `GaussianModel`, its optimizer, its cameras, and `render`."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment, HostRendering, Resolution
+from integration.densification import require_end
 from integration.detail import DetailFeature
 from integration.errors import HostError
-from integration.host_score import warn_if_densification_outlasts
+from integration.host_score import warn_if_score_is_unused
+from integration.inria.cameras import HostView, HostViews
 from integration.model_proxy import ModelRenderer, Role, enlarged_camera
-from integration.views import SuperResolve, sr_source, view
+from integration.replacing import Replaced
+from integration.views import SuperResolve, sr_source
 
 Render = Callable[..., Any]
 
@@ -32,29 +33,32 @@ _ROLES: Final[tuple[tuple[str, Role], ...]] = (
     ("get_scaling_n_opacity_with_3D_filter", "gate"),
     ("_features_dc", "detail"),
 )
+_SAVERS: Final = ("save_ply", "save_fused_ply")
+_STATE: Final = "clear"
+"""Key of our state in the optimizer's state, which the host's checkpoints hold."""
 
 THRESHOLD: Final = 2e-4
 """3DGS's default of densify_grad_threshold."""
 
 
 class Attached:
-    """The strategies of a conductor in a 3DGS-style loop; `attach` makes one, after `gaussians.training_setup(opt)`.
+    """The strategies of a conductor in a 3DGS-style loop; `install` makes one from the host's own options.
 
     Args:
-        gaussians: the host's GaussianModel.
+        gaussians: the host's GaussianModel, after `training_setup`.
         cameras: all training cameras (`scene.getTrainCameras()`), each with its photo.
         sr: the folder of the SR images, or a function that makes them (`clear_strategies.data.priors` has some). None:
             there are none, for strategies and objectives that do not use HR.
         factor: HR pixels per LR pixel.
         threshold: opt.densify_grad_threshold, which scales P2G's score; None: a loop without densification.
-        densify_until: opt.densify_until_iter, for a warning where a strategy ends densification earlier.
+        densify_until: opt.densify_until_iter; refused where an anchor would be taken before.
         detail: train the detail feature f_det beside the host's parameters.
 
     Attributes:
-        views: the training views by the name of their photo.
+        views: the training views, by name and by camera.
 
     Raises:
-        SettingError: HR is used, but there is no `sr`.
+        SettingError: HR is used, but there is no `sr`; or densification outlasts the anchor.
         ValueError: there is no camera, or two cameras have the same name.
         DataError: an SR image is missing, or is not `factor` times as large as its photo.
         HostError: `gaussians` is not a GaussianModel as in 3DGS.
@@ -79,54 +83,57 @@ class Attached:
                 f"{type(gaussians).__name__} has no {missing[0]}, which a GaussianModel has in 3DGS. Attach after "
                 "gaussians.training_setup(opt)."
             )
-        if isinstance(getattr(gaussians.save_ply, "__self__", None), Attached):
+        if "save_ply" in vars(gaussians):
             raise HostError("these gaussians are attached already; remove() the attachment that did it first.")
-        self._model = gaussians
-        self.views = self._views_of(cameras, *sr_source(sr, conductor, factor))
+        require_end(conductor, densify_until, "densify_until_iter")
+        warn_if_score_is_unused(conductor, gaussians, threshold)
+        self._model, self._conductor = gaussians, conductor
+        self.views = HostViews(cameras, *sr_source(sr, conductor, factor), gaussians._xyz.device)
         self._detail = DetailFeature(self._host_params)
         self._renderer = ModelRenderer(
             gaussians, _ROLES, self._host_params, self._detail if detail else None, conductor
         )
-        warn_if_densification_outlasts(conductor, densify_until, "densify_until_iter")
         self.attachment = Attachment(
             conductor, self.params, n_views=len(self.views), seed=seed, threshold=threshold,
             poll_parents=lambda: self._detail.poll_parents(conductor.state_dict),
         )  # fmt: skip
-        self._optimizer, self._save_ply = gaussians.optimizer, gaussians.save_ply
-        self._step_hook = gaussians.optimizer.register_step_post_hook(lambda *_: self._detail.step())
-        gaussians.save_ply = self._save_ply_with_detail
+        self._originals = {
+            name: getattr(gaussians, name) for name in (*_SAVERS, "training_setup") if hasattr(gaussians, name)
+        }
+        for name in _SAVERS:
+            if name in self._originals:
+                setattr(gaussians, name, functools.partial(self._save_with_detail, self._originals[name]))
+        gaussians.training_setup = self._training_setup
+        self._replaced: Replaced | None = None
+        self._hooks: list[Any] = []
+        self._hook_optimizer()
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
         return self._renderer.params()
 
     def wrap(self, render: Render) -> Render:
-        """`render` that renders training cameras at both scales, and shows f_det in renderings without gradients."""
+        """`render` that renders training cameras at both scales, and shows f_base + f_det anywhere else."""
 
         @functools.wraps(render)
         def wrapped(viewpoint_camera: Any, pc: Any, *args: Any, **kwargs: Any) -> Any:
             if self.attachment.removed or pc is not self._model:
                 return render(viewpoint_camera, pc, *args, **kwargs)
-            if not torch.is_grad_enabled():
+            found = self.views.find(viewpoint_camera) if torch.is_grad_enabled() else None
+            if found is None:  # evaluation, a viewer, a camera without a photo
                 return render(viewpoint_camera, self._renderer.with_detail(), *args, **kwargs)
-            found = self._find_view(viewpoint_camera)
-            if found is None:
-                return render(viewpoint_camera, pc, *args, **kwargs)
-            if pc.optimizer is not self._optimizer:
-                raise HostError("gaussians has a new optimizer. Attach after the last training_setup or restore.")
             if kwargs.get("subpixel_offset") is not None:
                 raise HostError(
                     "rays are jittered, and two scales of a view cannot share that. Train without ray_jitter."
                 )
+            return self._render_view(render, viewpoint_camera, found, args, kwargs)
 
-            def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
-                camera = enlarged_camera(viewpoint_camera, found.factor) if resolution == "hr" else viewpoint_camera
-                return self._renderer.render(
-                    lambda model: render(camera, model, *args, **kwargs), found, resolution, gate
-                )
+        return wrapped
 
-            return self.attachment.render_view(found, render_at)
-
+    def replace_everywhere(self, render: Render) -> Render:
+        """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
+        wrapped = self.wrap(render)
+        self._replaced = Replaced(render, wrapped)
         return wrapped
 
     @torch.no_grad()
@@ -138,57 +145,66 @@ class Attached:
     def remove(self) -> None:
         """Restore the loop; f_det is no longer shown, see `fold_detail`."""
         self.attachment.remove()
-        self._step_hook.remove()
-        vars(self._model).pop("save_ply", None)  # the instance's replacement of its class's method
+        for hook in self._hooks:
+            hook.remove()
+        for name in self._originals:  # the instance's replacements of its class's methods
+            vars(self._model).pop(name, None)
+        if self._replaced is not None:
+            self._replaced.undo()
+
+    def _render_view(self, render: Render, camera: Any, host_view: HostView, args: Any, kwargs: Any) -> Any:
+        view = host_view.view
+        if self._model.optimizer is not self._optimizer:
+            self._hook_optimizer()
+
+        def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
+            sized = enlarged_camera(camera, view.factor) if resolution == "hr" else camera
+            return self._renderer.render(
+                lambda model: render(sized, model, *args, **kwargs), view, resolution, gate, mask=host_view.mask
+            )
+
+        return self.attachment.render_view(view, render_at)
 
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}
 
-    def _views_of(self, cameras: Sequence[Any], sr: SuperResolve, factor: int) -> dict[str, View]:
-        if not cameras:
-            raise ValueError("at least one training camera is needed, got none. Pass scene.getTrainCameras().")
-        views: dict[str, View] = {}
-        for camera in cameras:
-            name = camera.image_name
-            if name in views:
-                raise ValueError(f"two training cameras are called {name!r}. Give every photo its own name.")
-            image = camera.original_image.permute(1, 2, 0).to(self._model._xyz.device)
-            pose = camera.world_view_transform.T
-            views[name] = view(_file_name(name), image, pose, intrinsics(camera), sr, factor)
-        return views
+    def _training_setup(self, *args: Any, **kwargs: Any) -> Any:
+        """The host starts again with a new optimizer, as `restore` does with the parameters of a checkpoint."""
+        result = self._originals["training_setup"](*args, **kwargs)
+        self._hook_optimizer()
+        return result
 
-    def _find_view(self, camera: Any) -> View | None:
-        name = getattr(camera, "image_name", None)
-        if name not in self.views:
-            self._renderer.warn_once(
-                "a camera (%s) is none of the %d views; its renderings are left unchanged.", name, len(self.views)
+    def _hook_optimizer(self) -> None:
+        for hook in self._hooks:
+            hook.remove()
+        self._optimizer = optimizer = self._model.optimizer
+        self._hooks = [
+            optimizer.register_step_pre_hook(lambda *_: self.attachment.before_step()),
+            optimizer.register_step_post_hook(lambda *_: self._detail.step()),
+            optimizer.register_state_dict_post_hook(self._save_state),
+            optimizer.register_load_state_dict_pre_hook(self._load_state),
+        ]
+
+    def _save_state(self, _: Any, stored: dict[str, Any]) -> None:
+        stored[_STATE] = {"detail": self._detail.state_dict(), "attachment": self.attachment.state_dict()}
+
+    def _load_state(self, _: Any, stored: dict[str, Any]) -> None:
+        if _STATE not in stored:
+            raise HostError(
+                "the checkpoint was written without CLEAR: it holds neither the iteration nor f_det. Start from the "
+                "beginning, or from a checkpoint of a run with CLEAR."
             )
-        return self.views.get(name)  # type: ignore[arg-type]
+        self._detail.load_state_dict(stored[_STATE]["detail"])
+        self.attachment.load_state_dict(stored[_STATE]["attachment"])
 
-    def _save_ply_with_detail(self, *args: Any, **kwargs: Any) -> Any:
+    def _save_with_detail(self, save: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """`save_ply` with f_det in the colours of the file."""
         trained = self._model._features_dc
         self._model._features_dc = torch.nn.Parameter(trained.detach() + self._detail.offset(trained))
         try:
-            return self._save_ply(*args, **kwargs)
+            return save(*args, **kwargs)
         finally:
             self._model._features_dc = trained
 
 
 attach = Attached
-
-
-def intrinsics(camera: Any) -> Float[Tensor, "3 3"]:
-    """K in pixels, from the host's projection (for row vectors, to NDC)."""
-    pose, full = (m.detach().double().cpu() for m in (camera.world_view_transform, camera.full_proj_transform))
-    projection = torch.linalg.solve(pose, full)
-    w, h = camera.image_width / 2, camera.image_height / 2
-    fx, fy, cx, cy = projection[0, 0], projection[1, 1], projection[2, 0], projection[2, 1]
-    return torch.tensor([[fx * w, 0, (cx + 1) * w], [0, fy * h, (cy + 1) * h], [0, 0, 1]], dtype=torch.float64)
-
-
-def _file_name(image_name: str) -> str:
-    """A name with an image suffix; a suffix is added where the host has dropped it, even if the name contains dots."""
-    from clear_strategies.data.photo_files import SUFFIXES
-
-    return image_name if Path(image_name).suffix.lower() in SUFFIXES else f"{image_name}.png"

@@ -18,3 +18,12 @@ def options(host, folder, **settings):
     for name, value in settings.items():
         setattr(opt, name, value)
     return opt
+
+
+def loop(host, clear, opt, gaussians, scene, **settings):
+    """The host's loop with its global `render` replaced; the host's own function is back afterwards."""
+    own, host.render = host.render, clear.wrap(host.render)
+    try:
+        host.loop(opt, gaussians, scene, **settings)
+    finally:
+        host.render = own

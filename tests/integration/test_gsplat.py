@@ -8,13 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 import torch
-import yaml
 
 import rasterizers
-from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, Objective, Strategy
-from clear_strategies.compose import conductor as compose_conductor
+from clear_strategies import GCO, P2G, SVS, Conductor, Objective, Strategy
 from clear_strategies.core.view import Photo, View
 from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.errors import SettingError
 from clear_strategies.schedules import LogLinear, WarmupDecay, scaled
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
@@ -224,18 +223,63 @@ def test_remove_restores_the_loop(attached):
         assert torch.equal(p, host.splats[name])
 
 
-def test_unknown_cameras_pass_through_and_wrong_sizes_are_refused(attached, caplog):
+def test_other_cameras_show_the_detail_feature_and_wrong_sizes_are_refused(attached):
     scene = toy.scene(20)
     host = Host(scene)
     clear = attached(host, scene, Conductor())
+    host.splats["detail"].data += 0.2
     elsewhere = toy.camera(1.2).scaled(0.25)
-    with caplog.at_level(logging.WARNING):
-        host.render(elsewhere, 0)
-        host.render(elsewhere, 0)
-    assert caplog.text.count("the pose of none of the 3 views") == 1
+    with torch.no_grad():
+        evaluated = host.render(elsewhere, 0)[0]
+    shown = host.render(elsewhere, 0)[0]
+    assert torch.equal(shown, evaluated)
+    shown.sum().backward()
+    assert host.splats["detail"].grad is None
     assert clear.attachment.counts["LR renders"] == 0
     with pytest.raises(HostError, match=r"rendered at 96x64, but its photo has 24x16"):
         host.render(scene.train[0].hr.camera, 0)
+
+
+def test_a_step_that_follows_no_recognised_rendering_is_an_error(attached):
+    scene = toy.scene(20)
+    host = Host(scene)
+    moved = tuple(replace(v, lr=replace(v.lr, camera=toy.camera(1.2).scaled(0.25))) for v in scene.train[:1])
+    attached(host, replace(scene, train=moved), Conductor())
+    with pytest.raises(HostError, match="none of its renderings was recognised"):
+        host.train([scene.train[0].name])
+
+
+def test_a_pose_that_two_views_share_is_refused_unless_the_view_is_named(attached):
+    scene = toy.scene(20)
+    first, second = scene.train[:2]
+    twins = replace(scene, train=(first, replace(second, lr=first.lr, hr=first.hr)))
+    host = Host(scene)
+    clear = attached(host, twins, Conductor(objective=Objective(lambda_hr=HR_FROM_START)))
+    with pytest.raises(HostError, match=f"{first.name} and {second.name} have the same pose"):
+        host.render(first.lr.camera, 0)
+    with clear.rendering(twins.train[1]):
+        host.render(first.lr.camera, 0)
+    assert clear.attachment.counts["HR renders"] == 1
+
+
+def test_a_renderer_without_projected_centres_trains_without_a_score(attached, monkeypatch):
+    """The renderer of gsplat's 3DGUT (with_ut, with_eval3d) has no gradient of the projected centres."""
+
+    @functools.wraps(autograd.rasterization)
+    def unprojected(*args, **kwargs):
+        renders, alphas, info = autograd.rasterization(*args, backend="torch", **kwargs)
+        return renders, alphas, {**info, "means2d": info["means2d"].detach()}
+
+    monkeypatch.setattr(gsplat_host, "rasterization", unprojected)
+    scene = toy.scene(20)
+    host = Host(scene)
+    objective = Objective(lambda_hr=HR_FROM_START)
+    clear = attach(host.splats, host.optimizers, scene.train, Conductor(*subset("clear"), objective=objective))
+    clear.replace_everywhere(unprojected)
+    host.train([v.name for v in scene.train])
+    clear.remove()
+    assert clear.attachment.counts["merges"] == 3
+    assert float(host.splats["detail"].abs().max()) > 0
 
 
 def test_a_function_with_other_parameters_is_refused():
@@ -378,36 +422,12 @@ class TestWithGsplat:
         for name, g in new.items():
             assert torch.equal(host.grads[name], g), name
 
-    def test_densification_after_the_anchor_raises_an_error_with_the_remedy(self, attached):
+    def test_densification_after_the_anchor_is_refused_before_the_first_step(self, attached):
         early = SVS(anchor_start=5, anchor_strength=0.01)
-        with pytest.raises(AnchorError, match=r"anchor was taken at t=5 for .*gsplat: refine_stop_iter"):
+        with pytest.raises(SettingError, match=r"must end before the anchor is taken, got 24. Set refine_stop_iter=4"):
             self.run(attached, (early,))
 
-    def test_densification_beyond_the_anchor_is_warned_of_at_the_start(self, attached, caplog):
+    def test_densification_beyond_a_strategys_end_is_warned_of_at_the_start(self, attached, caplog):
         with caplog.at_level(logging.WARNING):
-            self.run(attached, (SVS(anchor_start=10, anchor_strength=0.01),), steps=1)
+            self.run(attached, (SVS(anchor_start=10),), steps=1)
         assert "densifies until refine_stop_iter=24" in caplog.text
-
-    def test_clear_strategy_is_a_default_strategy_that_attaches_itself(self, caplog):
-        from gsplat.strategy import DefaultStrategy
-
-        from integration.gsplat import ClearStrategy
-
-        scene = toy.scene(40)
-        clear = ClearStrategy(
-            refine_start_iter=4, refine_every=5, grow_grad2d=2e-4, views=scene.train,
-            conductor=compose_conductor("clear", "strategies.p2g.patch=4", "strategies.svs.anchor_strength=0.01", iterations=30),
-            rasterization=gsplat_host.rasterization,
-        )  # fmt: skip
-        assert isinstance(clear, DefaultStrategy)
-        assert len(yaml.dump({"strategy": clear})) < 3_000  # simple_trainer writes it to cfg.yml, without photos
-        try:
-            host = Host(scene, extent=4.0, strategy=clear)
-            host.train([scene.train[i % 3].name for i in range(30)])
-        finally:
-            clear.attached.remove()
-        sizes = len(host.splats["means"])
-        assert sizes > 40
-        assert "densifies until" not in caplog.text  # the strategy ends densification itself
-        assert clear.attached.attachment.t == 30
-        assert clear.attached.attachment.conductor.state_dict()["SVS.means"].shape == (sizes, 3)  # anchored at t = 15

@@ -1,50 +1,115 @@
-"""`python -m integration.inria train.py …`: CLEAR in a 3DGS-style train.py without any change to it."""
+"""CLEAR in a 3DGS-style train.py: by one line in it, or by `python -m integration.inria train.py …` without any change."""
 
 from __future__ import annotations
 
 import logging
+import runpy
+import sys
 
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file
 
-from clear_strategies.compose import conductor
-from integration.inria import attach
+from integration import HostError
 from integration.inria.__main__ import main
+from integration.inria.from_options import install
 from tests.helpers.inria import FOLDER, N, options
 
+SETUP = "    gaussians.training_setup(opt)\n"
+ROWS = ["strategies.p2g.patch=4", "objective.lambda_hr.start=0", "objective.lambda_hr.full=0"]
+ROWS_SET = [f"--overrides={row}" for row in ROWS]
 
-def test_two_lines_and_none_give_the_same_file(inria_host, inria_capture, caplog):
-    settings = ["strategies.p2g.patch=4", "strategies.svs.anchor_strength=0"]
-    opt = options(inria_host, inria_capture, iterations=12, densify_until_iter=9)
-    gaussians, scene = inria_host.setup(opt)
-    clear = attach(
-        gaussians, scene.getTrainCameras(), conductor("clear", *settings, iterations=12), sr=inria_capture / "sr",
-        threshold=opt.densify_grad_threshold, densify_until=opt.densify_until_iter,
-    )  # fmt: skip
-    inria_host.training(opt, gaussians, scene, clear.wrap(inria_host.render))
-    gaussians.save_ply(inria_capture / "two.ply")
 
+def edited_train(folder, line, monkeypatch):
+    """The host's train.py with one line after `training_setup`, run as a script; returns its names."""
+    source = (FOLDER / "train.py").read_text()
+    assert source.count(SETUP) == 2  # in `training`, and in `setup` for the tests
+    text = "from integration.inria import install\n" + source.replace(SETUP, f"{SETUP}    {line}\n", 1)
+    (folder / "edited.py").write_text(text)
+    arguments = [
+        "-s",
+        str(folder),
+        "--save",
+        str(folder / "edited.ply"),
+        "--iterations",
+        "12",
+        "--densify_until_iter",
+        "9",
+    ]
+    monkeypatch.setattr(sys, "argv", ["edited.py", *arguments])
+    return runpy.run_path(str(folder / "edited.py"), run_name="__main__")
+
+
+def test_one_line_and_none_give_the_same_file(inria_host, inria_capture, caplog, monkeypatch):
+    settings = [*ROWS, "strategies.svs.anchor_start=7500"]
+    sr = str(inria_capture / "sr")
     command = [
-        "--sr", str(inria_capture / "sr"), *(f"--set={s}" for s in settings),
+        "--sr", sr, *(f"--overrides={s}" for s in settings),
         str(FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(inria_capture / "none.ply"),
         "--iterations", "12", "--densify_until_iter", "9",
     ]  # fmt: skip
     with caplog.at_level(logging.INFO):
         assert main(command) == 0
     assert "12 merges" in caplog.text
-    two, none = load_file(inria_capture / "two.ply"), load_file(inria_capture / "none.ply")
-    assert len(two["xyz"]) != N  # the host has densified
-    for name, rows in two.items():
-        assert torch.equal(rows, none[name]), name
     assert not hasattr(inria_host.render, "__wrapped__")
+    edited_train(inria_capture, f"install(gaussians, scene, opt, overrides={settings!r}, sr={sr!r})", monkeypatch)
+    one, none = load_file(inria_capture / "edited.ply"), load_file(inria_capture / "none.ply")
+    assert len(one["xyz"]) != N  # the host has densified
+    for name, rows in one.items():
+        assert torch.equal(rows, none[name]), name
+
+
+def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture):
+    """Its defaults are not on the command line: 30 iterations, densification until 24."""
+    opt = options(inria_host, inria_capture)
+    gaussians, scene = inria_host.setup(opt)
+    clear = install(gaussians, scene, opt, strategies="clear_paper", overrides=ROWS[:1], sr=inria_capture / "sr")
+    conductor = clear.attachment.conductor
+    assert opt.densify_until_iter == 15  # clear_paper takes its anchor at half of the iterations
+    assert conductor.may_densify(14)
+    assert not conductor.may_densify(15)
+    assert conductor.objective.lambda_hr(9) == conductor.objective.lambda_hr.peak  # full at 3,000 of 10,000
+    with pytest.raises(HostError, match="has no iterations"):
+        install(gaussians, scene, object(), sr=inria_capture / "sr")
+
+
+def test_a_run_continues_from_the_hosts_checkpoint_as_if_it_had_not_stopped(inria_host, inria_capture):
+    def run(name, *arguments):
+        script = [str(FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(inria_capture / name)]
+        common = ["--iterations", "8", "--densify_until_iter", "0", "--sh_interval", "1"]
+        assert main(["--sr", str(inria_capture / "sr"), *ROWS_SET, *script, *common, *arguments]) == 0
+
+    run("whole.ply", "--checkpoint", str(inria_capture / "5.pth"), "--checkpoint_iteration", "5")
+    run("resumed.ply", "--start_checkpoint", str(inria_capture / "5.pth"))
+    whole, resumed = (load_file(inria_capture / f"{name}.ply") for name in ("whole", "resumed"))
+    for name, rows in whole.items():
+        assert torch.allclose(rows, resumed[name], atol=1e-5), name
+
+
+def test_a_checkpoint_without_clear_is_refused(inria_host, inria_capture, caplog):
+    opt = options(inria_host, inria_capture)
+    gaussians, _ = inria_host.setup(opt)
+    torch.save((gaussians.capture(), 3), inria_capture / "3.pth")
+    command = ["--sr", str(inria_capture / "sr"), str(FOLDER / "train.py"), "-s", str(inria_capture)]
+    assert main([*command, "--start_checkpoint", str(inria_capture / "3.pth")]) == 2
+    assert "written without CLEAR" in caplog.text
+
+
+def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(inria_host, inria_capture):
+    with pytest.raises(SystemExit) as stopped:
+        main(["--save-lr", str(inria_capture / "lr"), str(FOLDER / "train.py"), "-s", str(inria_capture)])
+    assert stopped.value.code == 0
+    written = sorted((inria_capture / "lr").iterdir())
+    assert [file.name for file in written] == sorted(f.name for f in (inria_capture / "images").iterdir())
+    assert Image.open(written[0]).size == (24, 16)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--clear", "nobody"], "nobody"),
-        (["--set", "strategies.gco.tolerance=2"], "tolerance must lie in"),
+        (["--strategies", "nobody"], "nobody"),
+        (["--overrides", "strategies.gco.tolerance=2"], "tolerance must lie in"),
         ([], "sr: must be the folder of the SR images"),
     ],
 )
@@ -53,14 +118,12 @@ def test_wrong_arguments_are_refused_before_the_host_starts(arguments, message, 
     assert message in caplog.text
 
 
-def test_a_missing_script_and_the_hosts_checkpoints_are_refused(inria_capture, caplog):
+def test_a_missing_script_is_refused(inria_capture, caplog):
     assert main(["--sr", str(inria_capture), str(inria_capture / "train.py")]) == 2
     assert "is not there" in caplog.text
-    assert main(["--sr", str(inria_capture), "--", str(FOLDER / "train.py"), "--start_checkpoint", "chkpnt.pth"]) == 2
-    assert "without --start_checkpoint" in caplog.text
 
 
-def test_a_train_py_that_renders_nothing_is_an_error(inria_capture, inria_host, caplog):
+def test_a_train_py_that_trains_nothing_is_an_error(inria_capture, inria_host, caplog):
     (inria_capture / "train.py").write_text("import gaussian_renderer")
     assert main(["--sr", str(inria_capture / "sr"), str(inria_capture / "train.py")]) == 1
-    assert "CLEAR had no effect" in caplog.text
+    assert "trained without CLEAR" in caplog.text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import io
 import sys
 from collections import Counter
 from pathlib import Path
@@ -35,7 +36,10 @@ def host(monkeypatch):
         numbers = (torch.tensor(x) for x in (c.fx, c.fy, c.cx, c.cy, c.width, c.height))
         camera = splatting.Camera(*numbers, c.world_to_camera.T)
         photos.append((f"images/{view.name}.png", camera, view.lr.image.permute(2, 0, 1)))
-    yield SimpleNamespace(splatting=splatting, controller=controller, scene=scene, photos=photos)
+    vanilla = importlib.import_module(
+        "internal.density_controllers.vanilla_density_controller"
+    ).VanillaDensityController
+    yield SimpleNamespace(splatting=splatting, controller=controller, vanilla=vanilla, scene=scene, photos=photos)
     for name in [m for m in sys.modules if m.split(".")[0] == "internal" or m == "integration.lightning"]:
         del sys.modules[name]
 
@@ -47,11 +51,15 @@ def sr(host, tmp_path):
     return str(tmp_path)
 
 
-def fitted(host, density, steps, pixels=True, start=0, mask=None):
+def fitted(host, density, steps, pixels=True, start=0, mask=None, checkpoint=None):
     torch.manual_seed(0)
     module = host.splatting.GaussianSplatting(host.scene.cloud, density, host.splatting.Renderer(pixels))
-    host.splatting.fit(module, host.photos, steps, start, mask)
+    host.splatting.fit(module, host.photos, steps, start, mask, checkpoint)
     return module
+
+
+def sh0_of(detail):
+    return detail[:, None] / SH_C0
 
 
 def attachment_of(module):
@@ -59,8 +67,8 @@ def attachment_of(module):
 
 
 def test_it_trains_with_the_hosts_density_controller(host, sr):
-    settings = {"sr": sr, "suffix": "_x4", "overrides": HR_FROM_START}
-    module = fitted(host, host.controller(**settings), 16)
+    to_the_end = [*HR_FROM_START, "strategies.svs.anchor_start=10000"]  # the strategies let the host densify
+    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=to_the_end), 16)
     n = module.gaussian_model.n_gaussians
     attachment = attachment_of(module)
     assert n != N
@@ -86,7 +94,7 @@ def test_it_trains_with_the_hosts_density_controller(host, sr):
 def test_centres_in_pixels_and_in_ndc_give_the_same_densification(host, sr):
     norms = []
     for pixels in (True, False):
-        settings = {"sr": sr, "suffix": "_x4", "clear": "p2g", "overrides": HR_FROM_START}
+        settings = {"sr": sr, "suffix": "_x4", "strategies": "p2g", "overrides": HR_FROM_START}
         module = fitted(host, host.controller(**settings), 1, pixels)
         size = torch.tensor([[12.0, 8.0]]) if pixels else 1.0
         norms.append((module.points.grad[:, :2] * size).norm(dim=-1))
@@ -98,7 +106,7 @@ def test_each_strategy_alone_changes_what_it_should(host, sr):
     def gradients(*clear, **settings):
         overrides = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", *settings.pop("overrides", ())]
         name = clear[0] if clear else "baseline"
-        density = host.controller(clear=name, sr=sr, suffix="_x4", overrides=overrides)
+        density = host.controller(strategies=name, sr=sr, suffix="_x4", overrides=overrides)
         module = fitted(host, density, 1)
         return module.grads, attachment_of(module)
 
@@ -117,15 +125,17 @@ def test_each_strategy_alone_changes_what_it_should(host, sr):
 
 def test_without_hr_no_sr_images_are_needed(host):
     off = ["objective.lambda_hr.peak=0", "objective.lambda_hr.final=0"]
-    module = fitted(host, host.controller(clear="svs", overrides=off), 3)
+    module = fitted(host, host.controller(strategies="svs", overrides=off), 3)
     assert attachment_of(module).counts == {"LR renders": 3, "merges": 3}
     with pytest.raises(SettingError, match="sr: must be the folder of the SR images"):
-        fitted(host, host.controller(clear="svs"), 3)
+        fitted(host, host.controller(strategies="svs"), 3)
 
 
 def test_a_score_without_a_threshold_is_warned_of(host, sr, caplog):
     base = importlib.import_module("internal.density_controllers.density_controller").DensityController()
-    fitted(host, host.controller(base=base, clear="p2g", sr=sr, suffix="_x4", overrides=["strategies.p2g.patch=4"]), 1)
+    fitted(
+        host, host.controller(base=base, strategies="p2g", sr=sr, suffix="_x4", overrides=["strategies.p2g.patch=4"]), 1
+    )
     assert (
         "DensityController does not read the screen gradient: the densification score of P2G has no effect"
         in caplog.text
@@ -137,10 +147,52 @@ def test_max_steps_must_be_set(host, sr):
         fitted(host, host.controller(sr=sr, suffix="_x4"), -1)
 
 
-def test_a_resumed_run_continues_at_its_step_and_warns_of_the_lost_state(host, sr, caplog):
+def test_a_run_saves_its_checkpoint_and_continues_from_it_as_if_it_had_not_stopped(host, sr):
+    """The host pickles its live renderer with every checkpoint, so nothing may hang on it."""
+    settings = {"sr": sr, "suffix": "_x4", "overrides": HR_FROM_START}
+    quiet = host.vanilla(densify_until_iter=0)
+    whole = fitted(host, host.controller(base=quiet, **settings), 8)
+    module = fitted(host, host.controller(base=quiet, **settings), 5)
+    stored = torch.load(io.BytesIO(module.checkpoint), weights_only=False)
+    folded = module.gaussian_model.gaussians["shs_dc"] + sh0_of(attachment_of(module).params()["detail"])
+    assert torch.allclose(stored["state_dict"]["gaussian_model.gaussians.shs_dc"], folded, atol=1e-6)
+    assert torch.equal(torch.load(io.BytesIO(module.save_checkpoint()), weights_only=False)["clear"]["detail"]["value"],
+                       attachment_of(module).params()["detail"])  # fmt: skip
+
+    resumed = fitted(host, host.controller(base=quiet, **settings), 8, checkpoint=module.checkpoint)
+    assert attachment_of(resumed).t == attachment_of(whole).t == 8
+    for name, p in whole.gaussian_model.gaussians.items():
+        assert torch.allclose(p, resumed.gaussian_model.gaussians[name], atol=1e-4), name
+    assert torch.allclose(attachment_of(whole).params()["detail"], attachment_of(resumed).params()["detail"], atol=1e-4)
+
+
+def test_a_masked_pixel_is_hidden_at_both_scales(host, sr):
+    """A gradient of a hidden half would come from the SR image alone."""
+    mask = torch.zeros(3, 16, 24)
     module = fitted(
-        host, host.controller(sr=sr, suffix="_x4", overrides=HR_FROM_START), 4, start=3, mask=torch.zeros(1)
+        host, host.controller(strategies="gco", sr=sr, suffix="_x4", overrides=HR_FROM_START[:2]), 1, mask=mask
     )
+    assert all(float(g.abs().max()) == 0 for g in module.grads.values())
+    assert attachment_of(module).log["base"] == 0
+
+
+def test_losses_of_hr_are_in_the_hosts_log(host, sr):
+    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=HR_FROM_START), 3)
+    assert float(module.logged["clear_base"]) > 0
+
+
+def test_densification_ends_when_a_strategy_ends_it(host, sr):
+    module = fitted(host, host.controller(sr=sr, suffix="_x4", strategies="svs"), 16)
+    assert module.density_controller.config.densify_until_iter == 8
+
+
+def test_two_photos_of_one_name_and_several_processes_are_refused(host, sr):
+    host.photos.append(host.photos[0])
+    with pytest.raises(HostError, match="two training photos are called"):
+        fitted(host, host.controller(sr=sr, suffix="_x4"), 1)
+
+
+def test_a_resumed_run_without_our_state_continues_at_its_step_and_warns(host, sr, caplog):
+    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=HR_FROM_START), 4, start=3)
     assert attachment_of(module).t == 4
-    assert "resumed at step 3" in caplog.text
-    assert "masks apply to the photos only" in caplog.text
+    assert "resumed at step 3 from a checkpoint without CLEAR" in caplog.text

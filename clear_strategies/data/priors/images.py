@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from jaxtyping import Float
@@ -18,16 +18,20 @@ from clear_strategies.errors import DataError
 class Images:
     """A folder with one file per view: `<the view's name without its ending>[suffix].<png, jpg …>`.
 
+    A view whose name has a folder (cam1/0001.png) has its file in the subfolder of that name, or in `path` itself.
+
     Args:
         path: the folder.
         suffix: what the SR program appended to the file names, e.g. "_x4".
 
     Raises:
         SettingError: no path is given.
+        DataError: at a call, if a view has no file, or shares one with another view.
     """
 
     path: str = ""
     suffix: str = ""
+    _view_of: dict[Path, Path] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         require_path(self.path, "the folder of the SR images")
@@ -51,6 +55,8 @@ class Images:
 
     def _file(self, name: str) -> Path:
         folder, stem = Path(self.path), Path(name).stem + self.suffix
+        if (folder / Path(name).parent).is_dir():
+            folder /= Path(name).parent
         found = [file for file in list_images(folder) if file.stem == stem]
         if not found:
             raise DataError(
@@ -60,4 +66,10 @@ class Images:
         if len(found) > 1:
             twins = " and ".join(file.name for file in found)
             raise DataError(folder, Path(name).stem, f"has {twins} for one view", "keep one of them")
+        view = Path(name).with_suffix("")
+        if (other := self._view_of.setdefault(found[0], view)) != view:
+            raise DataError(
+                found[0], "SR image", f"would be that of two views, {other} and {view}",
+                "put the SR images into subfolders like those of the photos",
+            )  # fmt: skip
         return found[0]

@@ -22,6 +22,24 @@ def test_images_are_found_by_the_views_stem_and_the_suffix(tmp_path: Path) -> No
     assert torch.equal(Images(str(tmp_path), suffix="_x4")("train/a", lr, 4), read_image(tmp_path / "a_x4.png"))
 
 
+def test_views_of_two_folders_have_their_images_in_two_folders(tmp_path: Path) -> None:
+    lr, seeds = photo(6, 8), {"cam1/0001.png": 1, "cam2/0001.png": 2}
+    for name, seed in seeds.items():
+        write_png(tmp_path / name, images.upsample(photo(6, 8, seed), 4))
+    found = Images(str(tmp_path))
+    for name in seeds:
+        assert torch.equal(found(name, lr, 4), read_image(tmp_path / name)), name
+
+
+def test_one_image_for_two_views_is_refused(tmp_path: Path) -> None:
+    write_png(tmp_path / "0001.png", photo(24, 32))
+    found = Images(str(tmp_path))
+    found("cam1/0001.png", photo(6, 8), 4)
+    found("cam1/0001.png", photo(6, 8), 4)
+    with pytest.raises(DataError, match=r"would be that of two views, cam1/0001 and cam2/0001"):
+        found("cam2/0001.png", photo(6, 8), 4)
+
+
 def test_images_of_another_size_are_refused_naming_both(tmp_path: Path) -> None:
     write_png(tmp_path / "a.png", photo(12, 16))
     with pytest.raises(DataError, match=r"a\.png: size: is 16x12, but 4 times the LR image is 32x24"):

@@ -34,9 +34,23 @@ def densify(gaussians, opt, iteration, package):
         gaussians.reset_opacity()
 
 
-def training(opt, gaussians, scene, render, names=None, between=lambda iteration: None):
+def training(opt):
+    """As in 3DGS, everything happens in this function, and `render` is the name of the module."""
+    gaussians = GaussianModel()
+    scene = Scene(opt.source_path, gaussians)
+    gaussians.training_setup(opt)
+    first = 0
+    if opt.start_checkpoint:
+        model_params, first = torch.load(opt.start_checkpoint, weights_only=False)
+        gaussians.restore(model_params, opt)
+    loop(opt, gaussians, scene, first=first)
+    if opt.save:
+        gaussians.save_ply(opt.save)
+
+
+def loop(opt, gaussians, scene, names=None, between=lambda iteration: None, first=0):
     background, pipe = torch.zeros(3), None
-    for iteration in range(1, opt.iterations + 1):
+    for iteration in range(first + 1, opt.iterations + 1):
         if iteration % opt.sh_interval == 0:
             gaussians.oneupSHdegree()
         cameras = scene.getTrainCameras()
@@ -45,7 +59,10 @@ def training(opt, gaussians, scene, render, names=None, between=lambda iteration
         else:
             (camera,) = (c for c in cameras if c.image_name == names[iteration - 1])
         package = render(camera, gaussians, pipe, background)
-        loss = Photometric.apply(package["render"], camera.original_image)
+        image = package["render"]
+        if camera.alpha_mask is not None:
+            image *= camera.alpha_mask
+        loss = Photometric.apply(image, camera.original_image)
         loss.backward()
         between(iteration)
         if not opt.step_first:
@@ -56,6 +73,8 @@ def training(opt, gaussians, scene, render, names=None, between=lambda iteration
         if opt.step_first:
             with torch.no_grad():
                 densify(gaussians, opt, iteration, package)
+        if iteration == opt.checkpoint_iteration:
+            torch.save((gaussians.capture(), iteration), opt.checkpoint)
 
 
 def parser():
@@ -72,10 +91,14 @@ def parser():
     p.add_argument("--opacity_reset_interval", type=int, default=1000)
     p.add_argument("--sh_interval", type=int, default=10)
     p.add_argument("--step_first", action="store_true")
+    p.add_argument("--start_checkpoint")
+    p.add_argument("--checkpoint")
+    p.add_argument("--checkpoint_iteration", type=int)
     return p
 
 
 def setup(opt):
+    """The first lines of `training`, for tests that attach by hand."""
     torch.manual_seed(0)
     gaussians = GaussianModel()
     scene = Scene(opt.source_path, gaussians)
@@ -83,12 +106,6 @@ def setup(opt):
     return gaussians, scene
 
 
-def main():
-    opt = parser().parse_args()
-    gaussians, scene = setup(opt)
-    training(opt, gaussians, scene, render)
-    gaussians.save_ply(opt.save)
-
-
 if __name__ == "__main__":
-    main()
+    torch.manual_seed(0)
+    training(parser().parse_args())

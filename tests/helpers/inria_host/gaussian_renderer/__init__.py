@@ -4,6 +4,7 @@ import torch
 
 from rasterizers import Camera, Splats, autograd, load
 
+ABSOLUTE = False
 RASTERIZER = load("torch", near=0.01, kernel=0.3, antialiased=False)
 
 
@@ -21,10 +22,12 @@ class _InNdc(torch.autograd.Function):
         ndc[:, :2] = g * g.new_tensor(ctx.size) / 2
         if ctx.columns == 4:  # some forks keep absolute gradients here
             ndc[:, 2:] = 3 * ndc[:, :2].abs()
+        elif ABSOLUTE:  # and Mip-Splatting keeps their norm in the third column
+            ndc[:, 2] = 3 * ndc[:, :2].norm(dim=1)
         return ndc, None, None
 
 
-def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3, indices=False):
+def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3, indices=False, dropout=0.0):
     w, h = viewpoint_camera.image_width, viewpoint_camera.image_height
     focal = [size / 2 / torch.tan(torch.tensor(fov, dtype=torch.float64) / 2)
              for size, fov in ((w, viewpoint_camera.FoVx), (h, viewpoint_camera.FoVy))]  # fmt: skip
@@ -36,7 +39,8 @@ def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3
     features = pc.get_features
     bands = (pc.active_sh_degree + 1) ** 2
     scales = pc.get_scaling * scaling_modifier
-    splats = Splats(xyz, pc.get_rotation, scales, pc.get_opacity[:, 0], features[:, :1], features[:, 1:bands])
+    opacity = torch.nn.functional.dropout(pc.get_opacity[:, 0], dropout)  # DropGaussian's render does this itself
+    splats = Splats(xyz, pc.get_rotation, scales, opacity, features[:, :1], features[:, 1:bands])
     drawn = autograd.draw(RASTERIZER, splats, camera, _InNdc.apply(dummy, w, h))
     return {
         "render": drawn.image.permute(2, 0, 1),

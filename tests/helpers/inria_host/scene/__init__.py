@@ -15,7 +15,7 @@ __all__ = ["Camera", "GaussianModel", "Scene", "write"]
 
 class Camera:
     def __init__(self, image_name, original_image, pose, fov_x, fov_y):
-        self.image_name, self.original_image = image_name, original_image
+        self.image_name, self.original_image, self.alpha_mask = image_name, original_image, None
         _, self.image_height, self.image_width = original_image.shape
         self.FoVx, self.FoVy = fov_x, fov_y
         self.world_view_transform = pose.T

@@ -36,6 +36,18 @@ class GaussianModel:
         groups = [{"params": [getattr(self, a)], "lr": rates[name], "name": name} for name, a in GROUPS.items()]
         self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
 
+    def capture(self):
+        tensors = [getattr(self, a) for a in GROUPS.values()]
+        return (self.active_sh_degree, *tensors, self.xyz_gradient_accum, self.denom, self.optimizer.state_dict())
+
+    def restore(self, model_args, opt):
+        self.active_sh_degree, *tensors, accum, denom, optimizer = model_args
+        for attribute, tensor in zip(GROUPS.values(), tensors, strict=True):
+            setattr(self, attribute, tensor)
+        self.training_setup(opt)
+        self.xyz_gradient_accum, self.denom = accum, denom
+        self.optimizer.load_state_dict(optimizer)
+
     @property
     def get_xyz(self):
         return self._xyz

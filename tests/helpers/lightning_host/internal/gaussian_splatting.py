@@ -1,5 +1,6 @@
 """The module with its model, renderer and cameras, and the calls of a lightning Trainer."""
 
+import io
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -87,7 +88,11 @@ class GaussianSplatting(torch.nn.Module):
         super().__init__()
         self.gaussian_model, self.renderer = VanillaGaussianModel(cloud), renderer
         self.density_controller = density.instantiate()
-        self.on_train_batch_end_hooks = []
+        self.hparams = {
+            "renderer": renderer,
+            "density": density,
+        }  # as LightningModule.save_hyperparameters() keeps them
+        self.on_train_start_hooks, self.on_train_batch_end_hooks, self.extra_train_metrics = [], [], []
         self.saved = []
         self.grads = {}
 
@@ -98,13 +103,19 @@ class GaussianSplatting(torch.nn.Module):
         return self.renderer(camera, self.gaussian_model, bg_color=torch.zeros(3))
 
     def training_step(self, batch, batch_idx):
-        camera, (_, gt_image, _), _ = batch
+        camera, (_, gt_image, masked_pixels), _ = batch
         global_step = self.trainer.global_step + 1
         for optimizer in self.gaussian_optimizers:
             optimizer.zero_grad(set_to_none=True)
         outputs = self(camera)
+        metrics, prog_bar = {}, {}
+        for hook in self.extra_train_metrics:
+            hook(outputs, batch, self.gaussian_model, global_step, self, metrics, prog_bar)
+        self.logged = metrics
         arguments = (outputs, batch, self.gaussian_model, self.gaussian_optimizers, global_step, self)
         self.density_controller.before_backward(*arguments)
+        if masked_pixels is not None:
+            outputs["render"], gt_image = outputs["render"] * masked_pixels, gt_image * masked_pixels
         image = outputs["render"].permute(1, 2, 0)
         loss = losses.photometric(image.detach(), gt_image.permute(1, 2, 0), 0.2, kernels="torch")
         (image * loss.gradient).sum().backward()
@@ -114,20 +125,46 @@ class GaussianSplatting(torch.nn.Module):
         for optimizer in self.gaussian_optimizers:
             optimizer.step()
 
+    def on_save_checkpoint(self, checkpoint):
+        pass
+
+    def on_load_checkpoint(self, checkpoint):
+        pass
+
+    def save_checkpoint(self):
+        """The bytes of a checkpoint, as a lightning Trainer writes them: hyperparameters are pickled."""
+        checkpoint = {
+            "global_step": self.trainer.global_step, "hyper_parameters": self.hparams, "state_dict": self.state_dict(),
+            "optimizer_states": [o.state_dict() for o in self.gaussian_optimizers],
+        }  # fmt: skip
+        self.on_save_checkpoint(checkpoint)
+        file = io.BytesIO()
+        torch.save(checkpoint, file)
+        return file.getvalue()
+
     def save_gaussians(self):
         self.saved.append(self.gaussian_model.gaussians["shs_dc"].detach().clone())
+        self.checkpoint = self.save_checkpoint()
 
 
-def fit(module, photos, steps, start=0, mask=None):
-    """Setup, optimizers and one batch per step, from step `start`; each photo is (name, camera, image)."""
-    outputs = SimpleNamespace(train_set=SimpleNamespace(image_names=[name for name, _, _ in photos]))
-    datamodule = SimpleNamespace(dataparser_outputs=outputs)
-    module.trainer = SimpleNamespace(global_step=start, max_steps=steps, datamodule=datamodule)
+def fit(module, photos, steps, start=0, mask=None, checkpoint=None):
+    """Setup, optimizers and one batch per step, from step `start` or a checkpoint; each photo is (name, camera, image)."""
+    batches = [(camera, (name, image, mask), None) for name, camera, image in photos]
+    loader = SimpleNamespace(dataset=batches)
+    module.trainer = SimpleNamespace(global_step=start, max_steps=steps, train_dataloader=loader)
     module.density_controller.setup("fit", module)
     module.gaussian_optimizers = module.gaussian_model.training_setup()
+    if checkpoint is not None:
+        stored = torch.load(io.BytesIO(checkpoint), weights_only=False)
+        module.on_load_checkpoint(stored)
+        module.load_state_dict(stored["state_dict"])
+        for optimizer, state in zip(module.gaussian_optimizers, stored["optimizer_states"], strict=True):
+            optimizer.load_state_dict(state)
+        module.trainer.global_step = stored["global_step"]
+    for hook in module.on_train_start_hooks:
+        hook(module.gaussian_model, module)
     while module.trainer.global_step < steps:
-        name, camera, image = photos[module.trainer.global_step % len(photos)]
-        module.training_step((camera, (name, image, mask), None), 0)
+        module.training_step(batches[module.trainer.global_step % len(batches)], 0)
         module.trainer.global_step += 1
         for hook in module.on_train_batch_end_hooks:
             hook(None, None, module.gaussian_model, module.trainer.global_step, module)

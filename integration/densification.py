@@ -1,0 +1,54 @@
+"""The end of a host's densification, which a strategy may bring forward (SVS: anchor_start)."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from clear_strategies.errors import SettingError
+from clear_strategies.merging.conductor import Conductor
+
+_log = logging.getLogger(__name__)
+
+
+def end_with_strategies(conductor: Conductor, settings: Any, name: str, first: int = 1) -> None:
+    """Lower `settings.<name>`, from which on the host no longer densifies, to the iteration at which a strategy ends it.
+
+    Args:
+        settings: an object of the host that its loop reads at every iteration; without such a field nothing is done.
+        first: the host's number of its first iteration, 0 or 1.
+    """
+    until = getattr(settings, name, None)
+    if until is None:
+        return
+    end = end_of_densification(conductor, int(until), first)
+    if end < until:
+        _log.info("densification ends at %s=%d instead of %d (SVS: anchor_start).", name, end, until)
+        setattr(settings, name, end)
+
+
+def require_end(conductor: Conductor, until: int | None, name: str, first: int = 1) -> None:
+    """Refuse, or warn, where the host's densification outlasts the strategies' and cannot be ended from here.
+
+    Args:
+        until: the host's setting `name`, from which on it no longer densifies; None: unknown.
+
+    Raises:
+        SettingError: a strategy takes an anchor before the structure stops changing.
+    """
+    if until is None or (end := end_of_densification(conductor, until, first)) == until:
+        return
+    if any("anchor" in strategy.marks() for strategy in conductor.strategies):
+        raise SettingError(
+            f"{name}: densification must end before the anchor is taken, got {until}. Set {name}={end}, or raise "
+            "strategies.svs.anchor_start."
+        )
+    _log.warning(
+        "the host densifies until %s=%d, but a strategy ends densification at %d (SVS: anchor_start). Lower %s to that "
+        "iteration.", name, until, end, name,
+    )  # fmt: skip
+
+
+def end_of_densification(conductor: Conductor, until: int, first: int = 1) -> int:
+    """The first iteration, in the host's count, at which a strategy no longer allows densification; at most `until`."""
+    return next((i for i in range(first, until) if not conductor.may_densify(i + 1 - first)), until)

@@ -1,0 +1,140 @@
+"""`install`: one line in gsplat's examples/simple_trainer.py, with every schedule read from its own configuration."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from clear_strategies.compose import conductor
+from clear_strategies.data.priors import Images
+from clear_strategies.errors import SettingError
+from integration.densification import end_with_strategies
+from integration.detail import sh0_offset
+from integration.errors import HostError
+from integration.gsplat.attached import Attached
+from integration.gsplat.data import masks_from_dataset, views_from_dataset
+from integration.replacing import Replaced
+from integration.views import SuperResolve, sr_source
+
+_log = logging.getLogger(__name__)
+
+_NEEDED: Final = {
+    "batch_size": (1, "gradients of one view are merged per step"),
+    "patch_size": (None, "SR images have the size of whole photos"),
+    "sparse_grad": (False, "the gradients of all Gaussians are merged"),
+    "app_opt": (False, "its colours are no spherical harmonics"),
+    "random_bkgd": (False, "the background is composed after rendering, at one scale only"),
+    "use_bilateral_grid": (False, "it changes the colours of one scale only"),
+    "use_fused_bilagrid": (False, "it changes the colours of one scale only"),
+    "post_processing": (None, "it changes the colours of one scale only"),
+    "compression": (None, "its format has no place for the detail feature"),
+    "data_type": ("colmap", "other datasets have other cameras"),
+}
+"""Fields of the trainer's Config: what CLEAR needs, and why."""
+
+
+def install(
+    runner_class: Any,
+    *,
+    strategies: str = "clear",
+    overrides: Sequence[str] = (),
+    sr: SuperResolve | str | Path | None = None,
+    suffix: str = "",
+    factor: int = 4,
+    seed: int = 0,
+    installed: Callable[[Attached], None] = lambda attached: None,
+) -> None:
+    """Train every later `Runner` of simple_trainer.py with CLEAR.
+
+    When its `train` begins, the strategies are attached to its splats, and gsplat's `rasterization` and `export_splats`
+    are replaced wherever they were imported. A view is recognised by its `image_id`, so poses may be optimized.
+
+    Args:
+        runner_class: simple_trainer's `Runner`. Its Config stretches the schedules (`max_steps`), and
+            `strategy.refine_stop_iter` is lowered to the step at which a strategy ends densification.
+        strategies: names of conf/strategy: "clear", "gco", "gco,svs" …
+        overrides: settings, e.g. "strategies.gco.tolerance=0.1", "objective=lr_only".
+        sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names.
+        factor: HR pixels per LR pixel.
+        installed: called with every attachment.
+    """
+    images = Images(str(sr), suffix) if isinstance(sr, str | Path) else sr
+    train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
+
+    @functools.wraps(train)
+    def train_with_clear(runner: Any) -> Any:
+        require_supported(runner.cfg, runner.world_size)
+        chosen = conductor(strategies, *overrides, iterations=runner.cfg.max_steps)
+        end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
+        source, scale = sr_source(images, chosen, factor)
+        runner.clear = _Installed(
+            runner, views_from_dataset(runner.trainset, source, scale, runner.device), chosen, seed
+        )
+        installed(runner.clear.attached)
+        result = train(runner)
+        _log.info("%s.", runner.clear.attached.attachment.summary())
+        return result
+
+    @functools.wraps(rasterize_splats)
+    def rasterize_the_view(runner: Any, *args: Any, image_ids: Tensor | None = None, **kwargs: Any) -> Any:
+        if image_ids is not None:
+            kwargs["image_ids"] = image_ids
+        clear = getattr(runner, "clear", None)
+        if clear is None or image_ids is None or not torch.is_grad_enabled():
+            return rasterize_splats(runner, *args, **kwargs)
+        with clear.attached.rendering(clear.views[int(image_ids)]):
+            return rasterize_splats(runner, *args, **kwargs)
+
+    runner_class.train, runner_class.rasterize_splats = train_with_clear, rasterize_the_view
+
+
+def require_supported(config: Any, processes: int = 1) -> None:
+    """Refuse options of simple_trainer that do not work with two scales.
+
+    Raises:
+        SettingError: one of them is set; the message says why.
+    """
+    for name, (needed, why) in _NEEDED.items():
+        found = getattr(config, name, needed)
+        if found != needed:
+            raise SettingError(f"{name}: CLEAR needs {needed}, got {found}: {why}.")
+    if processes > 1:
+        raise SettingError(f"CLEAR trains in one process, got {processes}. Set CUDA_VISIBLE_DEVICES to one device.")
+
+
+class _Installed:
+    """CLEAR in one Runner; its files hold f_base + f_det."""
+
+    def __init__(self, runner: Any, views: Any, chosen: Any, seed: int) -> None:
+        rendering = sys.modules["gsplat.rendering"]
+        self.views, self._splats = views, runner.splats
+        self.attached = Attached(
+            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, state=runner.strategy_state,
+            seed=seed, masks=masks_from_dataset(runner.trainset),
+        )  # fmt: skip
+        self.attached.replace_everywhere(rendering.rasterization)
+        export = getattr(sys.modules["gsplat"], "export_splats", None)
+        if export is not None:
+            Replaced(export, functools.wraps(export)(functools.partial(self._export, export)))
+        runner.splats.register_state_dict_post_hook(functools.partial(self._fold))  # torch marks it by an attribute
+
+    def _export(self, export: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """`export_splats` of the trained splats, with f_det in their constant band."""
+        if "sh0" not in kwargs:
+            raise HostError("export_splats must be called with sh0=…, as simple_trainer does.")
+        sh0, detail = kwargs["sh0"], self._splats["detail"]
+        if len(sh0) == len(detail):
+            kwargs["sh0"] = sh0.detach() + sh0_offset(detail.detach(), sh0)
+        return export(*args, **kwargs)
+
+    def _fold(self, _: Any, stored: dict[str, Any], prefix: str, *__: Any) -> None:
+        """A checkpoint's sh0 is f_base + f_det, and it has the keys that the trainer's evaluation expects."""
+        detail = stored.pop(f"{prefix}detail")
+        stored[f"{prefix}sh0"] = stored[f"{prefix}sh0"] + sh0_offset(detail, stored[f"{prefix}sh0"])

@@ -1,0 +1,145 @@
+"""Cameras of a 3DGS-style trainer as views."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.view import View
+from clear_strategies.data.photo_files import SUFFIXES, write_png
+from clear_strategies.errors import DataError
+from integration.views import SuperResolve, view
+
+_log = logging.getLogger(__name__)
+
+_SAME_POSE = 1e-6  # largest difference between the entries of the poses of one camera and its copy
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HostView:
+    """A training camera of the host, and its view.
+
+    Args:
+        mask: what the host multiplies the LR image by after rendering; None: nothing is hidden.
+    """
+
+    camera: Any
+    view: View
+    mask: Float[Tensor, "h w"] | None = None
+
+
+class HostViews:
+    """The training views of a 3DGS-style trainer, found by their camera objects.
+
+    Args:
+        cameras: all training cameras (`scene.getTrainCameras()`), each with its photo.
+        sr: gives the SR images. factor: HR pixels per LR pixel.
+        device: of the Gaussians.
+
+    Raises:
+        ValueError: there is no camera, or one is listed twice.
+        DataError: an SR image is missing, or is not `factor` times as large as its photo.
+    """
+
+    def __init__(
+        self, cameras: Sequence[Any], sr: SuperResolve, factor: int, device: torch.device | str = "cpu"
+    ) -> None:
+        if not cameras:
+            raise ValueError("at least one training camera is needed, got none. Pass scene.getTrainCameras().")
+        names = [camera.image_name for camera in cameras]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(
+                f"two training cameras are called {twice!r}, so their SR images cannot be told apart. Give every photo its "
+                "own name; this trainer ignores folders."
+            )
+        self.all = tuple(_host_view(camera, sr, factor, device) for camera in cameras)
+        self._by_camera = {id(host_view.camera): host_view for host_view in self.all}
+        self._by_name = dict(zip(names, self.all, strict=True))
+
+    def __len__(self) -> int:
+        return len(self.all)
+
+    def __getitem__(self, name: str) -> View:
+        """The view of the photo of that name."""
+        return self._by_name[name].view
+
+    def find(self, camera: Any) -> HostView | None:
+        """The view of a training camera, or of a copy: a camera of the same name and pose. None: it is another camera."""
+        found = self._by_camera.get(id(camera))
+        if found is not None:
+            return found
+        named = self._by_name.get(getattr(camera, "image_name", None))  # type: ignore[arg-type]
+        if named is None:
+            return None
+        poses = (named.camera.world_view_transform, camera.world_view_transform)
+        same = float((poses[0] - poses[1].to(poses[0])).abs().max()) <= _SAME_POSE
+        return named if same else None
+
+
+def views_from_cameras(
+    cameras: Sequence[Any], sr: SuperResolve, factor: int = 4, device: torch.device | str = "cpu"
+) -> tuple[View, ...]:
+    """The training views of a 3DGS-style trainer, e.g. of `scene.getTrainCameras()`; see `HostViews`."""
+    return tuple(host_view.view for host_view in HostViews(cameras, sr, factor, device).all)
+
+
+def save_lr(cameras: Sequence[Any], folder: Path | str) -> None:
+    """Write the photos as the trainer uses them (its -r, its masks), as PNG, for an SR tool to enlarge.
+
+    Raises:
+        DataError: two photos would have the same file.
+    """
+    written: set[Path] = set()
+    for camera in cameras:
+        file = (Path(folder) / file_name(camera.image_name)).with_suffix(".png")
+        if file in written:
+            raise DataError(
+                file, "file name", "is that of two photos",
+                "give every photo its own name; this trainer ignores folders and endings",
+            )  # fmt: skip
+        image, mask = camera.original_image.permute(1, 2, 0), mask_of(camera)
+        write_png(file, image if mask is None else image * mask[..., None])
+        written.add(file)
+    _log.info(
+        "%d LR photos written to %s. Enlarge them and pass the folder of the results as sr.", len(written), folder
+    )
+
+
+def mask_of(camera: Any) -> Float[Tensor, "h w"] | None:
+    """`alpha_mask`, which 3DGS multiplies its rendering by: the photo's alpha, and with --train_test_exp the half of a
+    test photo that stays unseen. None: it hides nothing.
+    """
+    mask = getattr(camera, "alpha_mask", None)
+    if mask is None or bool((mask == 1).all()):
+        return None
+    found: Tensor = mask[0]
+    return found
+
+
+def intrinsics(camera: Any) -> Float[Tensor, "3 3"]:
+    """K in pixels, from the host's projection (for row vectors, to NDC)."""
+    pose, full = (m.detach().double().cpu() for m in (camera.world_view_transform, camera.full_proj_transform))
+    projection = torch.linalg.solve(pose, full)
+    w, h = camera.image_width / 2, camera.image_height / 2
+    fx, fy, cx, cy = projection[0, 0], projection[1, 1], projection[2, 0], projection[2, 1]
+    return torch.tensor([[fx * w, 0, (cx + 1) * w], [0, fy * h, (cy + 1) * h], [0, 0, 1]], dtype=torch.float64)
+
+
+def file_name(image_name: str) -> str:
+    """A name with an image suffix; a suffix is added where the host has dropped it, even if the name contains dots."""
+    return image_name if Path(image_name).suffix.lower() in SUFFIXES else f"{image_name}.png"
+
+
+def _host_view(camera: Any, sr: SuperResolve, factor: int, device: torch.device | str) -> HostView:
+    image, pose = camera.original_image.permute(1, 2, 0).to(device), camera.world_view_transform.T
+    mask = mask_of(camera)
+    mask = None if mask is None else mask.to(image)
+    made = view(file_name(camera.image_name), image, pose, intrinsics(camera), sr, factor, mask=mask)
+    return HostView(camera, made, mask)

@@ -1,0 +1,63 @@
+"""`install`: one line in a 3DGS-style train.py, with every schedule read from the host's own options."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from clear_strategies.compose import conductor
+from clear_strategies.data.priors import Images
+from integration.densification import end_with_strategies
+from integration.errors import HostError
+from integration.inria.attached import Attached
+from integration.views import SuperResolve
+
+
+def install(
+    gaussians: Any,
+    scene: Any,
+    opt: Any,
+    *,
+    strategies: str = "clear",
+    overrides: Sequence[str] = (),
+    sr: SuperResolve | str | Path | None = None,
+    suffix: str = "",
+    factor: int = 4,
+    seed: int = 0,
+) -> Attached:
+    """Train the host's Gaussians with CLEAR; `gaussian_renderer.render` is replaced wherever it was imported.
+
+    Args:
+        gaussians: the GaussianModel, after `training_setup(opt)` and before a checkpoint is restored.
+        scene: the Scene with the training cameras.
+        opt: the options that the host passed to `training_setup`. `iterations` stretches the schedules,
+            `densify_grad_threshold` scales P2G's score, and `densify_until_iter` is lowered to the iteration at which a
+            strategy ends densification.
+        strategies: names of conf/strategy: "clear", "gco", "gco,svs" …
+        overrides: settings, e.g. "strategies.gco.tolerance=0.1", "objective=lr_only".
+        sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names.
+        factor: HR pixels per LR pixel.
+
+    Raises:
+        HostError: the host has another shape than 3DGS.
+        SettingError, DataError, ValueError: see `Attached`.
+    """
+    iterations = getattr(opt, "iterations", None)
+    if iterations is None:
+        raise HostError(f"{type(opt).__name__} has no iterations, which the options of training_setup have in 3DGS.")
+    chosen = conductor(strategies, *overrides, iterations=int(iterations))
+    end_with_strategies(chosen, opt, "densify_until_iter")
+    if isinstance(sr, str | Path):
+        sr = Images(str(sr), suffix)
+    attached = Attached(
+        gaussians, scene.getTrainCameras(), chosen, sr=sr, factor=factor, seed=seed,
+        threshold=getattr(opt, "densify_grad_threshold", None), densify_until=getattr(opt, "densify_until_iter", None),
+    )  # fmt: skip
+    renderer = sys.modules.get("gaussian_renderer")
+    if renderer is None or not hasattr(renderer, "render"):
+        attached.remove()
+        raise HostError("no module gaussian_renderer with a function render has been imported, which 3DGS has.")
+    attached.replace_everywhere(renderer.render)
+    return attached

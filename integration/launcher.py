@@ -1,0 +1,68 @@
+"""The command line that all launchers share: CLEAR's options, the host's script, and the script's own arguments."""
+
+from __future__ import annotations
+
+import argparse
+import runpy
+import sys
+from pathlib import Path
+from typing import Any
+
+from clear_strategies.compose import conductor
+from clear_strategies.data.priors import Images
+from clear_strategies.errors import DataError
+from integration.views import sr_source
+
+
+def parser(module: str, description: str) -> argparse.ArgumentParser:
+    """The arguments of `python -m <module> [options] script [its arguments]`."""
+    made = argparse.ArgumentParser(prog=f"python -m {module}", description=description)
+    add = made.add_argument
+    add("--strategies", default="clear", metavar="NAMES", help="of conf/strategy: clear, gco, gco,svs … (%(default)s)")
+    add(
+        "--overrides", action="append", default=[], metavar="KEY=VALUE",
+        help="e.g. strategies.gco.tolerance=0.1; repeatable",
+    )  # fmt: skip
+    add("--sr", metavar="FOLDER", help="SR images, named like the photos")
+    add("--suffix", default="", help="what the SR tool appended to the names, e.g. _x4")
+    add("--factor", type=int, default=4, help="HR pixels per LR pixel (%(default)s)")
+    add(
+        "--save-lr", metavar="FOLDER",
+        help="write the photos as they are trained on (reduced, masked) for an SR tool to enlarge; then stop",
+    )  # fmt: skip
+    add("script", type=Path, help="the host's script")
+    add("rest", nargs=argparse.REMAINDER, help="the arguments of the script")
+    return made
+
+
+class Launch:
+    """One run of a host's script.
+
+    Attributes:
+        settings: the arguments of `install`.
+
+    Raises:
+        DataError: the script is missing.
+        SettingError: the configuration is refused, or HR is used without SR images.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.script, self.arguments, self.save_lr = options.script, options.rest, options.save_lr
+        if not self.script.is_file():
+            raise DataError(self.script, "script", "is not there", "give the training script of your trainer")
+        sr = None if options.sr is None else Images(options.sr, options.suffix)
+        self.settings: dict[str, Any] = {
+            "strategies": options.strategies, "overrides": options.overrides, "sr": sr, "factor": options.factor,
+        }  # fmt: skip
+        if self.save_lr is None:  # raises now and not after the host has loaded its scene
+            sr_source(sr, conductor(options.strategies, *options.overrides), options.factor)
+
+
+def run_script(launch: Launch) -> None:
+    """Run the script with `sys.argv` and `sys.path` as in `python script …`."""
+    before = sys.argv, list(sys.path)
+    sys.argv, sys.path[:0] = [str(launch.script), *launch.arguments], [str(launch.script.parent.resolve())]
+    try:
+        runpy.run_path(str(launch.script), run_name="__main__")
+    finally:
+        sys.argv, sys.path[:] = before

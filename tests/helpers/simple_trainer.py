@@ -1,0 +1,120 @@
+"""A stand-in for gsplat's examples/simple_trainer.py, in its shape: a Runner whose renderings go by `image_id`, a checkpoint
+and a PLY at the end. On a CPU; contains nothing of CLEAR.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from gsplat import export_splats
+from gsplat.distributed import cli
+from gsplat.rendering import rasterization
+from gsplat.strategy import DefaultStrategy
+
+from clear_strategies.training.field import GaussianField
+from tests.helpers import toy
+from tests.helpers.gsplat_host import Photometric, intrinsics
+
+
+@dataclass
+class Config:
+    result_dir: str
+    max_steps: int = 8
+    pose_noise: float = 0.0
+    app_opt: bool = False
+    strategy: Any = field(
+        default_factory=lambda: DefaultStrategy(
+            refine_start_iter=2, refine_stop_iter=7, refine_every=3, grow_grad2d=2e-4
+        )
+    )
+
+
+class Parser:
+    def __init__(self, scene):
+        self.scene = scene
+        self.image_names = ["test.png", *(f"{view.name}.png" for view in scene.train)]
+
+
+class Dataset:
+    def __init__(self, parser):
+        self.parser, self.indices = parser, list(range(1, len(parser.image_names)))
+
+    def __len__(self):
+        return len(self.indices)
+
+    def __getitem__(self, item):
+        photo = self.parser.scene.train[item].lr
+        return {
+            "K": intrinsics(photo.camera)[0].float(), "camtoworld": torch.linalg.inv(photo.camera.world_to_camera),
+            "image": photo.image * 255, "image_id": item,
+        }  # fmt: skip
+
+
+class Runner:
+    def __init__(self, local_rank, world_rank, world_size, cfg):
+        torch.manual_seed(42)
+        self.cfg, self.world_size, self.device = cfg, world_size, "cpu"
+        self.parser = Parser(toy.scene(24))
+        self.trainset = Dataset(self.parser)
+        raw = GaussianField.from_cloud(self.parser.scene.cloud).raw()
+        rates = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+        self.splats = torch.nn.ParameterDict({name: torch.nn.Parameter(raw[name].clone()) for name in rates})
+        self.optimizers = {n: torch.optim.Adam([self.splats[n]], lr=lr, eps=1e-15) for n, lr in rates.items()}
+        cfg.strategy.check_sanity(self.splats, self.optimizers)
+        self.strategy_state = cfg.strategy.initialize_state(scene_scale=4.0)
+        self.render = self.rasterize_splats  # 1.6 hands the bound method to its Stage
+
+    def rasterize_splats(self, camtoworlds, Ks, width, height, masks=None, **kwargs):
+        kwargs.pop("image_ids", None)
+        p = self.splats
+        return rasterization(
+            means=p["means"], quats=p["quats"], scales=torch.exp(p["scales"]), opacities=torch.sigmoid(p["opacities"]),
+            colors=torch.cat([p["sh0"], p["shN"]], 1), viewmats=torch.linalg.inv(camtoworlds), Ks=Ks, width=width,
+            height=height, packed=False, **kwargs,
+        )  # fmt: skip
+
+    def train(self):
+        cfg = self.cfg
+        for step in range(cfg.max_steps):
+            data = self.trainset[step % len(self.trainset)]
+            pose, pixels = data["camtoworld"][None], data["image"][None] / 255
+            if cfg.pose_noise:
+                pose = pose + cfg.pose_noise * torch.randn_like(pose) * (torch.arange(4) < 3)[:, None]
+            renders, _, info = self.render(
+                camtoworlds=pose, Ks=data["K"][None], width=24, height=16, sh_degree=3,
+                image_ids=torch.tensor([data["image_id"]]),
+            )  # fmt: skip
+            cfg.strategy.step_pre_backward(self.splats, self.optimizers, self.strategy_state, step, info)
+            Photometric.apply(renders[0], pixels[0]).backward()
+            for optimizer in self.optimizers.values():
+                optimizer.step()
+                optimizer.zero_grad(set_to_none=True)
+            cfg.strategy.step_post_backward(self.splats, self.optimizers, self.strategy_state, step, info, packed=False)
+        torch.save({"step": cfg.max_steps, "splats": self.splats.state_dict()}, f"{cfg.result_dir}/ckpt.pt")
+        names = ("means", "scales", "quats", "opacities", "sh0", "shN")
+        export_splats(**{n: self.splats[n] for n in names}, format="ply", save_to=f"{cfg.result_dir}/cloud.ply")
+        torch.save(self.eval(), f"{cfg.result_dir}/image.pt")
+
+    @torch.no_grad()
+    def eval(self):
+        data = self.trainset[0]
+        return self.render(camtoworlds=data["camtoworld"][None], Ks=data["K"][None], width=24, height=16, sh_degree=3)[
+            0
+        ]
+
+
+def main(local_rank, world_rank, world_size, cfg):
+    Runner(local_rank, world_rank, world_size, cfg).train()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--result_dir")
+    parser.add_argument("--max_steps", type=int, default=8)
+    parser.add_argument("--pose_noise", type=float, default=0.0)
+    parser.add_argument("--app_opt", action="store_true")
+    cfg = Config(**vars(parser.parse_args()))
+    cli(main, cfg, verbose=True)

@@ -1,0 +1,118 @@
+"""CLEAR in a trainer of the shape of gsplat's examples/simple_trainer.py: `python -m integration.gsplat simple_trainer.py`."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from clear_strategies.core import images
+from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.ply import read_gaussians
+from clear_strategies.errors import SettingError
+from tests.helpers import gsplat_host, toy
+
+gsplat = pytest.importorskip("gsplat", reason="pip install gsplat")
+SCRIPT = Path(__file__).parents[1] / "helpers" / "simple_trainer.py"
+FROM_START = [
+    f"--overrides={x}" for x in ("objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4")
+]
+
+
+@pytest.fixture
+def trainer(monkeypatch, tmp_path):
+    """`run(options of CLEAR, options of the trainer)`, the exit status; files go to `folder`."""
+    import gsplat.distributed
+    import gsplat.rendering
+
+    from integration.gsplat.__main__ import main
+
+    # a function of its own, since CLEAR replaces it in every module
+    monkeypatch.setattr(gsplat.rendering, "rasterization", functools.partial(gsplat_host.rasterization))
+    monkeypatch.setattr(gsplat.distributed, "cli", lambda fn, cfg, verbose=False: fn(0, 0, 1, cfg))
+    export = gsplat.export_splats
+    monkeypatch.setattr(gsplat, "export_splats", export)
+    for view in toy.scene(24).train:
+        write_png(tmp_path / "sr" / f"{view.name}.png", images.quantize(view.hr.image))
+
+    def run(clear, *trainers):
+        monkeypatch.setattr(gsplat.rendering, "rasterization", functools.partial(gsplat_host.rasterization))
+        monkeypatch.setattr(gsplat, "export_splats", export)
+        return main([*clear, str(SCRIPT), "--result_dir", str(tmp_path), *trainers])
+
+    return SimpleNamespace(run=run, folder=tmp_path, sr=["--sr", str(tmp_path / "sr")])
+
+
+def rendered(splats):
+    """The first training view from six tensors of gsplat's names."""
+    photo = toy.scene(24).train[0].lr
+    return gsplat_host.rasterization(
+        splats["means"], splats["quats"], splats["scales"].exp(), splats["opacities"].sigmoid(),
+        torch.cat((splats["sh0"], splats["shN"]), 1), photo.camera.world_to_camera[None],
+        gsplat_host.intrinsics(photo.camera).float(), 24, 16, sh_degree=3,
+    )[0]  # fmt: skip
+
+
+def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(trainer, caplog):
+    with caplog.at_level(logging.INFO):
+        assert trainer.run([*trainer.sr, *FROM_START]) == 0
+    assert "8 merges" in caplog.text
+    assert "refine_stop_iter=3 instead of 7" in caplog.text  # SVS ends densification at half of the steps
+    evaluated = torch.load(trainer.folder / "image.pt")
+    splats = torch.load(trainer.folder / "ckpt.pt")["splats"]
+    assert set(splats) == {"means", "quats", "scales", "opacities", "sh0", "shN"}
+    assert torch.allclose(rendered(splats), evaluated, atol=1e-5)
+    stored = read_gaussians(trainer.folder / "cloud.ply")
+    assert torch.allclose(stored.sh0.reshape(-1, 3), splats["sh0"].reshape(-1, 3), atol=1e-6)
+
+
+def test_views_are_recognised_by_their_index_when_poses_are_noisy(trainer, caplog):
+    with caplog.at_level(logging.INFO):
+        assert trainer.run([*trainer.sr, *FROM_START], "--pose_noise", "0.01") == 0
+    assert "8 merges" in caplog.text
+
+
+def test_options_that_do_not_work_with_two_scales_are_refused_before_the_first_step(trainer, caplog):
+    assert trainer.run(trainer.sr, "--app_opt") == 2
+    assert "app_opt: CLEAR needs False, got True: its colours are no spherical harmonics." in caplog.text
+    assert not (trainer.folder / "ckpt.pt").exists()
+    from integration.gsplat.simple_trainer import require_supported
+
+    with pytest.raises(SettingError, match="one process, got 2"):
+        require_supported(SimpleNamespace(), 2)
+
+
+def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(trainer):
+    with pytest.raises(SystemExit) as stopped:
+        trainer.run(["--save-lr", str(trainer.folder / "lr")])
+    assert stopped.value.code == 0
+    assert len(list((trainer.folder / "lr").iterdir())) == 3
+
+
+def test_a_script_without_a_runner_that_trains_exits_with_an_error(trainer, caplog, tmp_path, monkeypatch):
+    script = tmp_path / "other.py"
+    script.write_text("from gsplat.distributed import cli\ncli(lambda *_: None, None)")
+    monkeypatch.setattr("tests.integration.test_gsplat_simple_trainer.SCRIPT", script)
+    assert trainer.run(trainer.sr) == 2
+    assert "has no Runner" in caplog.text
+    script.write_text("")
+    assert trainer.run(trainer.sr) == 1
+    assert "trained without CLEAR" in caplog.text
+
+
+def test_one_line_before_cli_does_the_same(trainer, monkeypatch, caplog):
+    line = f"install(Runner, sr={str(trainer.folder / 'sr')!r})"
+    text = SCRIPT.read_text().replace("    cli(main, cfg", f"    {line}\n    cli(main, cfg")
+    edited = trainer.folder / "edited.py"
+    edited.write_text(
+        "from integration.gsplat import install\n" + text.replace("from __future__ import annotations\n", "")
+    )
+    monkeypatch.setattr("sys.argv", ["edited.py", "--result_dir", str(trainer.folder)])
+    with caplog.at_level(logging.INFO):
+        runpy.run_path(str(edited), run_name="__main__")
+    assert "8 merges" in caplog.text
