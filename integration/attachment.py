@@ -257,8 +257,8 @@ class Attachment:
         self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **self.conductor.logs()}
         self._logged |= conflict_columns(merged.conflict)
         if self.counts["merges"] % _LOGGED_EVERY == 0:
-            values = self.log
-            losses_now = ", ".join(f"L_{name} {values[name]:.4f}" for name in losses) or "no HR"
+            now = self.log
+            losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
             _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
 
     def _grad_of_this_pass(self, name: str, p: Tensor) -> Tensor:

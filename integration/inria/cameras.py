@@ -61,7 +61,7 @@ class HostViews:
             )
         self.all = tuple(_host_view(camera, sr, factor, device) for camera in cameras)
         self._by_camera = {id(host_view.camera): host_view for host_view in self.all}
-        self._by_name = dict(zip(names, self.all, strict=True))
+        self._by_name: dict[str | None, HostView] = dict(zip(names, self.all, strict=True))
 
     def __len__(self) -> int:
         return len(self.all)
@@ -75,7 +75,7 @@ class HostViews:
         found = self._by_camera.get(id(camera))
         if found is not None:
             return found
-        named = self._by_name.get(getattr(camera, "image_name", None))  # type: ignore[arg-type]
+        named = self._by_name.get(getattr(camera, "image_name", None))
         if named is None:
             return None
         poses = (named.camera.world_view_transform, camera.world_view_transform)
