@@ -34,6 +34,7 @@ from clear_strategies.settings import build
 from clear_strategies.training.loop import fit
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.pseudo_views import PseudoViewSettings
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import Skips
 from clear_strategies.training.state import TrainState
@@ -94,6 +95,7 @@ class JobSettings(ConductorSettings):
     skips: Skips
     fit: RunSettings = field(default_factory=RunSettings)
     mip: MipFilter = field(default_factory=MipFilter)
+    pseudo_views: PseudoViewSettings = field(default_factory=PseudoViewSettings)
     method: str | None = None
 
     def __post_init__(self) -> None:
@@ -146,6 +148,7 @@ class _Training:
             rates=scaled(settings.optim, stretch),
             mip=scaled(settings.mip, stretch),
             skips=scaled(settings.skips, stretch),
+            pseudo_views=settings.pseudo_views,
         )
         resume.resume(state, source, self.folder, self.compared)
         return state

@@ -55,6 +55,8 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, *, rasterizer: str
             lines[f"milestones of {type(s).__name__}"] = ", ".join(f"{name} {t}" for name, t in found.items())
     if found := milestones(state.density.settings):
         lines[f"milestones of {state.density.name}"] = ", ".join(f"{name} {t}" for name, t in found.items())
+    if (beside := state.pseudo_views.says()) is not None:
+        lines["pseudo views"] = beside
     lines["skipped"] = "; ".join(_skipped(state)) or "nothing"
     _warn_of_idle_strategies(conductor)
     width = max(map(len, lines))

@@ -122,6 +122,11 @@ class GaussianField(nn.Module):
             shots[True].image = filled(shots[True].image, tiles, view.hr.image, rasterizer.tile)
         return shots.get(False), shots.get(True)
 
+    def shot(self, rasterizer: Rasterizer, camera: Camera) -> FieldShot:
+        """A rendering to learn from, of all Gaussians, without f_det."""
+        active = self._activate(None)
+        return FieldShot(rasterizer(active.splats(detail=False), camera), active, detail=False)
+
     def render(self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True) -> Float[Tensor, "H W 3"]:
         """An image for evaluation: no dropout, f = base + det, not clamped."""
         return rasterizer(self._activate(None).splats(detail=detail), camera).image

@@ -21,7 +21,7 @@ from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.merging.conductor import Update
-from clear_strategies.training import checkpoint
+from clear_strategies.training import checkpoint, pseudo_views
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training.skips import PLATEAU_LOSS
@@ -46,6 +46,10 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         with stage("optimizer"):
             s.optimizer.step(θ.raw(), u.grads, torch.stack([shot.visible for shot in drawn]).any(0))
             θ.constrain()
+    beside, loss_beside = s.pseudo_views.due(t, s.settings.seed), None
+    if beside is not None:
+        with stage("pseudo view"):
+            loss_beside = pseudo_views.step(s, rasterizer, beside)
     ask.after_step(θ.raw(), t)  # θᵃ at t = t_a  Eq. 16       SVS
     s.density.accumulate(u, drawn[-1], t)  # S^dens         Eq. 14
     with stage("density and filter"):
@@ -55,6 +59,8 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
             s.refilter()
     low = images.area_mean(drawn[-1].image, view.factor) if lr is None else lr.image
     s.history.append(_row(s, u, low, view))
+    if loss_beside is not None:
+        s.history[-1][pseudo_views.LOSS] = loss_beside
     if s.skip_policy.measured(t):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)

@@ -24,6 +24,7 @@ from clear_strategies.training.compiled_step import CompiledStep, compiled_step_
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
+from clear_strategies.training.pseudo_views import PseudoViews, PseudoViewSettings
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import SkipPolicy, Skips
 
@@ -54,6 +55,7 @@ class TrainState:
     history: list[dict[str, Number]] = field(default_factory=list)
     compiled_step: CompiledStep | None = None
     skip_policy: SkipPolicy = field(default_factory=SkipPolicy)
+    pseudo_views: PseudoViews = field(default_factory=PseudoViews)
 
     @classmethod
     def start(
@@ -66,6 +68,7 @@ class TrainState:
         rates: LearningRates,
         mip: MipFilter,
         skips: Skips | None = None,
+        pseudo_views: PseudoViewSettings | None = None,
     ) -> TrainState:
         """The state before the first iteration, on the device of the scene's views.
 
@@ -92,6 +95,7 @@ class TrainState:
             scene.train,
             compiled_step=step,
             skip_policy=SkipPolicy(skips),
+            pseudo_views=PseudoViews.of(scene, pseudo_views or PseudoViewSettings(), settings.seed),
         )
         state.refilter()
         return state

@@ -7,16 +7,20 @@ happen: 3 warm-up starts, 2 to 12 densify and prune, 6 and 12 reset, 8 warm, 12 
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective
+from clear_strategies.data.scene import DepthMap, Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.base import cameras_extent
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
+from clear_strategies.training.compiled_step import FusedMode
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.pseudo_views import PseudoViewSettings
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
@@ -35,7 +39,20 @@ def _size_that_prunes_the_two_largest() -> float:
 PRUNE_WORLD = _size_that_prunes_the_two_largest()
 
 
-def start(names: tuple[str, ...], iterations: int = ITERATIONS) -> TrainState:
+def with_depth(scene: Scene, depth: float = 4.0) -> Scene:
+    """The scene with the same depth at every pixel of its training views."""
+    shape = SCENE.train[0].lr.image.shape[:2]
+    known = DepthMap(torch.full(shape, depth), torch.ones(shape))
+    return replace(scene, depths={view.name: known for view in scene.train})
+
+
+def start(
+    names: tuple[str, ...],
+    iterations: int = ITERATIONS,
+    *,
+    beside: PseudoViewSettings | None = None,
+    fused: FusedMode = "auto",
+) -> TrainState:
     make = {
         "gco": GCO,
         "p2g": P2G,
@@ -48,10 +65,16 @@ def start(names: tuple[str, ...], iterations: int = ITERATIONS) -> TrainState:
     }
     objective = Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
     return TrainState.start(
-        SCENE,
+        SCENE if beside is None else with_depth(SCENE),
         Conductor(*(make[name]() for name in names), objective=objective, statistics_from=1),
         settings=FitSettings(
-            iterations=iterations, scale_schedule=False, degree_every=6, probe_every=0, checkpoint_every=0, seed=5
+            iterations=iterations,
+            scale_schedule=False,
+            degree_every=6,
+            probe_every=0,
+            checkpoint_every=0,
+            seed=5,
+            fused=fused,
         ),
         density=DensitySettings(
             start=1,
@@ -67,6 +90,7 @@ def start(names: tuple[str, ...], iterations: int = ITERATIONS) -> TrainState:
         ),
         rates=LearningRates(means=LogLinear(end=ITERATIONS), detail_decay=0.01),
         mip=MipFilter(every=7, last=1),
+        pseudo_views=beside,
     )
 
 

@@ -12,6 +12,7 @@ import torch
 from clear_strategies import DataError
 from clear_strategies.training import checkpoint
 from clear_strategies.training.loop import fit, iterate
+from clear_strategies.training.pseudo_views import PseudoViewSettings
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
@@ -25,9 +26,14 @@ def without_time(history: list[dict[str, float]]) -> str:
     return json.dumps([{k: v for k, v in row.items() if k != "seconds"} for row in history])
 
 
-@pytest.mark.parametrize("names", SUBSETS, ids=lambda s: "+".join(s) or "none")
-def test_resuming_is_bitwise(names, tmp_path, caplog):
-    whole = start(names)
+CASES = [(names, None) for names in SUBSETS] + [(("gco", "p2g", "svs"), PseudoViewSettings(every=2, count=8))]
+
+
+@pytest.mark.parametrize(
+    ("names", "beside"), CASES, ids=lambda x: "+".join(x) or "none" if isinstance(x, tuple) else x and "pseudo views"
+)
+def test_resuming_is_bitwise(names, beside, tmp_path, caplog):
+    whole = start(names, beside=beside)
     saved = {}
     with caplog.at_level(logging.INFO):
         for t in range(1, ITERATIONS + 1):
@@ -37,7 +43,7 @@ def test_resuming_is_bitwise(names, tmp_path, caplog):
     _assert_that_everything_happened(whole, names, caplog.text)
     expected, history = tensors(whole), without_time(whole.history)
     for t, path in saved.items():
-        resumed = start(names)
+        resumed = start(names, beside=beside)
         resumed.restore(checkpoint.load(path), path)
         assert resumed.t == t
         while resumed.t <= ITERATIONS:

@@ -1,0 +1,174 @@
+"""Pseudo views: what cameras beside the training cameras would see, as far as stereo depth and the LR photos tell.
+
+A few photos leave much space that no camera looks through closely, and a Gaussian there costs nothing while it hides
+behind the borders of the photos. Each pseudo view is a training camera moved aside. Its depth is that of the nearest
+photos' surfaces, its colours are those of the photos that see the same surface; where no photo does, nothing is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from clear_strategies.core import images
+from clear_strategies.core.view import Photo
+from clear_strategies.data.points.projection import back_project, inside_of, project, sample_colors
+from clear_strategies.data.scene import DepthMap
+from rasterizers.interface import Camera
+
+_SOURCES: Final = 4  # the nearest photos that a pseudo view is made of
+_ALONG: Final = 0.3  # movements along the viewing direction are this much shorter: going close leaves holes
+_SEAM: Final = 2 / 255  # largest difference of a background pixel from the background's colour
+_NEIGHBOURS: Final = 3  # of a pixel and the eight around it, those that must be known, or it is an outlier
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PseudoView:
+    """A picture that was not taken.
+
+    Args:
+        photo: the colours, 0 where unknown, and the camera.
+        known: where photos tell the colour.
+    """
+
+    photo: Photo
+    known: Bool[Tensor, "h w"]
+
+    def to(self, device: torch.device | str) -> PseudoView:
+        """The same pseudo view on `device`."""
+        return PseudoView(self.photo.to(device), self.known.to(device))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Source:
+    """A photo with depth: the points it shows, and the depth that vouches for them, 0 where it cannot."""
+
+    photo: Photo
+    points: Float[Tensor, "N 3"]
+    depth: Float[Tensor, "h w"]
+    median: float
+
+
+def pseudo_views(
+    photos: Mapping[str, Photo],
+    depths: Mapping[str, DepthMap],
+    *,
+    count: int,
+    reach: float,
+    tolerance: float,
+    max_pixels: int,
+    background: tuple[float, float, float],
+    seed: int,
+) -> list[PseudoView]:
+    """`count` pseudo views, the training cameras taken in turn; none where fewer than two photos have depth.
+
+    Args:
+        photos, depths: by the photos' names; on the CPU.
+        reach: largest distance of a pseudo camera from its photo's, as a multiple of the photo's median depth.
+        tolerance: relative difference of depth up to which a photo shows a point.
+        max_pixels: larger photos are reduced by a whole factor first.
+        background: of the scene; its colour belongs to no surface.
+    """
+    sources = [
+        _source(*_reduced(photo, depths[name], max_pixels), background)
+        for name, photo in photos.items()
+        if name in depths and bool(depths[name].known.any())
+    ]
+    if len(sources) < 2:
+        return []
+    generator = torch.Generator().manual_seed(seed)
+    made = []
+    for i in range(count):
+        source = sources[i % len(sources)]
+        camera = moved_aside(source.photo.camera, source.median, reach, generator)
+        made.append(_warped(camera, sources, tolerance))
+    return made
+
+
+def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.Generator) -> Camera:
+    """The camera moved by up to `reach` × `distance`, and turned to keep in its middle what it saw there at `distance`."""
+    direction = torch.randn(3, generator=generator, dtype=torch.float64)
+    direction = (
+        direction / torch.linalg.vector_norm(direction) * torch.rand((), generator=generator, dtype=torch.float64)
+    )
+    direction[2] *= _ALONG
+    pose = camera.world_to_camera.double()
+    axes, centre = pose[:3, :3], camera.center.double()
+    aim = centre + axes[2] * distance
+    centre = centre + axes.T @ (direction * reach * distance)
+    z = torch.nn.functional.normalize(aim - centre, dim=0)
+    x = torch.nn.functional.normalize(torch.linalg.cross(axes[1], z), dim=0)
+    axes = torch.stack((x, torch.linalg.cross(z, x), z))
+    turned = torch.eye(4, dtype=torch.float64)
+    turned[:3, :3], turned[:3, 3] = axes, -axes @ centre
+    return replace(camera, world_to_camera=turned.to(camera.world_to_camera))
+
+
+def _reduced(photo: Photo, found: DepthMap, max_pixels: int) -> tuple[Photo, DepthMap]:
+    """Both at the size of the first whole factor that leaves at most `max_pixels`; the depth of each block's middle."""
+    factor = max(1, math.ceil(math.sqrt(photo.camera.width * photo.camera.height / max_pixels)))
+    if factor == 1:
+        return photo, found
+    image = images.area_mean(images.crop_to_multiple(photo.image, factor), factor)
+    camera = replace(photo.camera, width=image.shape[1] * factor, height=image.shape[0] * factor).scaled(1 / factor)
+    depth, confidence = (
+        values[factor // 2 :: factor, factor // 2 :: factor][: camera.height, : camera.width]
+        for values in (found.depth, found.confidence)
+    )
+    return Photo(camera, image), DepthMap(depth, confidence)
+
+
+def _source(photo: Photo, found: DepthMap, background: tuple[float, float, float]) -> _Source:
+    """Pixels beside the background are mixed with it: they give points but no colour."""
+    known, depth = found.known, torch.nan_to_num(found.depth)
+    points = back_project(photo.camera, _centres(photo.camera)[known], depth[known].double())
+    blank = ((photo.image - torch.tensor(background)).abs() <= _SEAM).all(dim=-1)
+    beside = torch.nn.functional.max_pool2d(blank[None, None].float(), 3, 1, 1)[0, 0] > 0
+    return _Source(photo, points, torch.where(known & ~beside, depth, 0.0), float(depth[known].median()))
+
+
+def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> PseudoView:
+    away = torch.stack([torch.linalg.vector_norm(s.photo.camera.center - camera.center) for s in sources])
+    nearest = [sources[i] for i in away.argsort()[:_SOURCES].tolist()]
+    depth = _front(camera, torch.cat([s.points for s in nearest]))
+    known = depth.isfinite()
+    points = back_project(camera, _centres(camera)[known], depth[known])
+    color, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
+    for s in nearest:
+        pixels, z = project(s.photo.camera, points)
+        inside = inside_of(s.photo.camera, pixels, z)
+        column, row = torch.where(inside[:, None], pixels, 0.0).long().unbind(dim=1)
+        sees = inside & ((s.depth[row, column] / z - 1).abs() <= tolerance)
+        w = sees / (s.photo.camera.center - camera.center).square().sum().clamp_min(1e-12)  # the nearest tells most
+        color += w[:, None] * sample_colors(s.photo.image, pixels)
+        weight += w
+    image = torch.zeros(camera.height, camera.width, 3)
+    image[known] = color / weight.clamp_min(torch.finfo(weight.dtype).tiny)[:, None]
+    known[known.clone()] = weight > 0
+    around = 9 * torch.nn.functional.avg_pool2d(known[None, None].float(), 3, 1, 1)[0, 0]
+    known &= around >= _NEIGHBOURS - 0.5
+    return PseudoView(Photo(camera, torch.where(known[..., None], image, 0.0).clamp(0, 1)), known)
+
+
+def _front(camera: Camera, points: Float[Tensor, "N 3"]) -> Float[Tensor, "h w"]:
+    """The depth of the frontmost point, float64, infinite without one. A point covers 2 × 2 pixels, so surfaces have no holes."""
+    pixels, depth = project(camera, points)
+    front = torch.full((camera.height * camera.width,), torch.inf, dtype=torch.float64)
+    for x in (-0.5, 0.5):
+        for y in (-0.5, 0.5):
+            at = pixels + torch.tensor([x, y])
+            inside = inside_of(camera, at, depth)
+            column, row = at[inside].long().unbind(dim=1)
+            front.scatter_reduce_(0, row * camera.width + column, depth[inside], "amin")
+    return front.reshape(camera.height, camera.width)
+
+
+def _centres(camera: Camera) -> Float[Tensor, "h w 2"]:
+    row, column = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
+    return torch.stack((column, row), dim=-1).double() + 0.5
