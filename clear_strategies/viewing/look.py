@@ -69,6 +69,11 @@ class Painter:
         """A number >= 0 per Gaussian, blended as colours are; 0 where nothing is."""
         return self._numbers(camera, values[:, None].expand(-1, 3).to(self.field.means), look)[..., 0].cpu()
 
+    @torch.no_grad()
+    def points(self, camera: Camera, rgb: Float[Tensor, "N 3"], look: Look = AS_MEASURED) -> Float[Tensor, "H W 3"]:
+        """The Gaussians in other colours, RGB in [0, 1], over black."""
+        return self._numbers(camera, rgb.to(self.field.means), look).clamp(0, 1).cpu()
+
     def _numbers(self, camera: Camera, rgb: Float[Tensor, "N 3"], look: Look) -> Float[Tensor, "H W 3"]:
         """Render the Gaussians with these colours over black."""
         splats = self._splats(look)

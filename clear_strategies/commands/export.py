@@ -1,0 +1,49 @@
+"""`clear-strategies export RUN --to FORMAT`: a saved run as a file for viewers."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from clear_strategies.commands.options import log_to_terminal, parser_of
+from clear_strategies.errors import SettingError
+from clear_strategies.jobs.saved import open_splat
+from clear_strategies.outputs.export import gaussians_of
+from clear_strategies.outputs.formats import FORMATS, write_format
+
+_log = logging.getLogger(__name__)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Write what the arguments ask for.
+
+    Raises:
+        DataError, SettingError: the run or an argument cannot be used, or a format needs what is not installed.
+    """
+    parser = parser_of(
+        "export", "Write a saved run, or a PLY file, in a format of viewers; f_det and the 3D filter included."
+    )
+    parser.add_argument(
+        "--to", required=True, choices=FORMATS, help="; ".join(f"{name}: {what}" for name, what in FORMATS.items())
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="where it goes (default: RUN/NAME.FORMAT)")
+    parser.add_argument(
+        "--sh",
+        type=int,
+        choices=range(4),
+        default=3,
+        metavar="0..3",
+        help="degree of view-dependent colour that is kept (3)",
+    )
+    options = parser.parse_args(arguments)
+    log_to_terminal(verbose=options.verbose)
+    splat = open_splat(options.run, options.rasterizer)
+    g = gaussians_of(splat.painter.field)
+    g = replace(g, shN=g.shN[:, : (options.sh + 1) ** 2 - 1])
+    out = options.out or splat.folder / f"{splat.name}.{options.to}"
+    if out.suffix != f".{options.to}":
+        raise SettingError(f"--out: must end in .{options.to}, got {out.name}.")
+    write_format(out, g, options.to)
+    _log.info("%s: %s Gaussians, %.1f MB", out, f"{len(g):,}", out.stat().st_size / 1e6)

@@ -1,0 +1,56 @@
+"""`clear-strategies view RUN`: a saved run, or any PLY file, in the browser."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import webbrowser
+from collections.abc import Sequence
+
+from clear_strategies.commands.options import log_to_terminal, parser_of
+from clear_strategies.jobs.saved import open_splat
+from clear_strategies.viewing import live, page, points
+
+_log = logging.getLogger(__name__)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Open the viewer and serve it until Ctrl-C; or write the page.
+
+    Raises:
+        DataError, SettingError: the run cannot be opened, or the viewer's libraries are not installed.
+    """
+    parser = parser_of("view", "Look at a saved run, or a PLY file, in the browser. The run's own rasterizer draws.")
+    parser.add_argument("--port", type=int, default=8080, help="%(default)s, or the next one that is free")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="%(default)s: this machine only; 0.0.0.0: every machine that reaches this one",
+    )
+    parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
+    parser.add_argument(
+        "--page",
+        action="store_true",
+        help=f"write {page.FILE}, which turns without a server and without a network, and stop",
+    )
+    options = parser.parse_args(arguments)
+    log_to_terminal(verbose=options.verbose)
+    live.require_viewer()
+    splat = open_splat(options.run, options.rasterizer)
+    _log.info("%s", splat.source)
+    if options.page:
+        page.write_page(splat.folder, splat.painter.field, splat.poses())
+        _log.info("%s", splat.folder / page.FILE)
+        return
+    from clear_strategies.viewing.server import Screen, SplatViewer
+
+    run = None if splat.baked else splat.folder
+    colors = functools.cache(lambda: points.colors(splat.painter, run, splat.cameras))
+    viewer = SplatViewer(
+        Screen(splat.painter, splat.cameras, colors), title=splat.name, names=points.names(run), port=options.port,
+        host=options.host, out=splat.folder / "rendered",
+    )  # fmt: skip
+    _log.info("%s (Ctrl-C ends it)", viewer.address)
+    if not options.no_browser:
+        webbrowser.open(viewer.address)
+    viewer.serve_until_stopped()

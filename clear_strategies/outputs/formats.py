@@ -1,0 +1,107 @@
+"""A splat in the formats of viewers on the web: .splat by this module, .spz and .sog by PlayCanvas's splat-transform.
+
+splat-transform is a program of npm (MIT). One that is on the PATH is taken; else `npx` downloads it once.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+
+from clear_strategies import files
+from clear_strategies.data.ply import GaussianPly, write_gaussians
+from clear_strategies.errors import SettingError
+from rasterizers.geometry import SH_C0
+
+_log = logging.getLogger(__name__)
+
+FORMATS: Final = {
+    "ply": "the standard layout of 3DGS; nothing is lost",
+    "splat": "32 bytes a Gaussian, 8-bit colours that do not depend on the direction",
+    "spz": "Niantic's: a tenth of the PLY, view-dependent colour included; needs Node.js",
+    "sog": "PlayCanvas's: a twentieth of the PLY; needs Node.js, and without a GPU minutes for large splats",
+}
+_CONVERTER: Final = "@playcanvas/splat-transform@2"
+_SPZ_VERSION: Final = "3"  # 4, the converter's default, is too new for most readers
+
+
+def write_format(path: Path, g: GaussianPly, form: str) -> None:
+    """Write the Gaussians as one of `FORMATS`, atomically.
+
+    Raises:
+        SettingError: there is no such format, or what it needs is not installed or failed.
+    """
+    if form not in FORMATS:
+        raise SettingError(f"--to must be one of {', '.join(FORMATS)}, got {form}.")
+    if form == "ply":
+        write_gaussians(path, g)
+    elif form == "splat":
+        files.write_bytes(path, splat_bytes(g))
+    else:
+        _convert(path, g, form)
+
+
+def splat_bytes(g: GaussianPly) -> bytes:
+    """The .splat file: position and scales as float32, RGBA and quaternion as bytes; the most visible Gaussians first."""
+    alpha = g.opacities.sigmoid()
+    order = (alpha.log() + g.scales.sum(1)).argsort(descending=True, stable=True)
+    rgba = torch.cat([g.sh0[:, 0] * SH_C0 + 0.5, alpha[:, None]], dim=1)
+    quats = torch.nn.functional.normalize(g.quats, dim=1)
+    table = np.zeros(len(g), [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+    for name, values in (
+        ("means", g.means),
+        ("scales", g.scales.exp()),
+        ("rgba", (rgba.clamp(0, 1) * 255).round()),
+        ("quats", (quats * 128 + 128).round().clamp(0, 255)),
+    ):
+        table[name] = values[order].cpu().numpy()
+    return table.tobytes()
+
+
+def converter() -> list[str]:
+    """The command of splat-transform.
+
+    Raises:
+        SettingError: neither it nor npx is installed.
+    """
+    if (found := shutil.which("splat-transform")) is not None:
+        return [found]
+    if (npx := shutil.which("npx")) is not None:
+        _log.info("npx runs %s; the first time it downloads about 70 MB.", _CONVERTER)
+        return [npx, "--yes", _CONVERTER]
+    raise SettingError(
+        "spz and sog are written by PlayCanvas's splat-transform, which needs Node.js 20 or later: install it from "
+        "nodejs.org, or choose --to ply or --to splat."
+    )
+
+
+def _convert(path: Path, g: GaussianPly, form: str) -> None:
+    command = converter()
+    if form == "sog" and not torch.cuda.is_available():
+        _log.info(
+            "sog sorts colours into clusters; without a GPU this takes minutes for large splats (--sh 0 is fast)."
+        )
+    options = ["--spz-version", _SPZ_VERSION] if form == "spz" else ["--gpu", "cpu"]
+    options = options if form == "spz" or not torch.cuda.is_available() else []
+    with files.replacing(path.with_suffix(f".{form}")) as target, tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "splat.ply"
+        write_gaussians(source, g)
+        _run([*command, "--quiet", "--overwrite", *options, str(source), str(target)])
+        if not target.is_file():
+            raise SettingError(f"{command[0]} wrote no {form} file. Choose another format, or install it anew.")
+
+
+def _run(command: Sequence[str]) -> None:
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True)  # noqa: S603
+    except subprocess.CalledProcessError as error:
+        said = " ".join((error.stderr or error.stdout or "").split())[-300:]
+        raise SettingError(f"{Path(command[0]).name} failed: {said}. Choose another format.") from error

@@ -1,0 +1,80 @@
+"""What the Gaussians can be coloured by: f_det, opacity, and the evidence maps of training views carried over to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.data import strict_json
+from clear_strategies.data.photo_files import read_image
+from clear_strategies.viewing.cameras import SavedCamera
+from clear_strategies.viewing.look import Painter
+from rasterizers.interface import Camera
+
+MAPS: Final = ("reliability", "demand", "weight", "corrected", "conflict")
+_UNSEEN: Final = 0.25  # grey of Gaussians that no map shows
+_BEHIND: Final = 0.05  # a Gaussian this share of its depth behind the surface is not on the map
+_TOP: Final = 0.98  # quantile of |f_det| at the end of its colours
+
+
+def names(folder: Path | None) -> list[str]:
+    """What there is to choose from, of a run in this folder."""
+    maps = [name for name in MAPS if folder is not None and any(folder.glob(f"maps/*/{name}.png"))]
+    return ["opacity", "f_det", *maps]
+
+
+def colors(painter: Painter, folder: Path | None, cameras: Sequence[SavedCamera]) -> dict[str, Float[Tensor, "N 3"]]:
+    """RGB of each Gaussian by these names; viridis from 0 to 1, f_det up to its 98 % quantile, grey where a map says nothing."""
+    field = painter.field
+    detail = field.detail.data.norm(dim=1).cpu()
+    top = float(np.quantile(detail.numpy(), _TOP)) if len(detail) else 0.0
+    values = {"opacity": field.filtered_opacities().data.cpu(), "f_det": detail / max(top, 1e-9)}
+    if folder is not None:
+        for name in names(folder)[2:]:
+            values[name] = on_gaussians(painter, _maps(folder, name, cameras))
+    return {name: _viridis(value) for name, value in values.items()}
+
+
+def on_gaussians(painter: Painter, maps: Sequence[tuple[Camera, Float[Tensor, "H W"]]]) -> Float[Tensor, " N"]:
+    """The mean of the maps where each Gaussian appears in them; nan for those that none shows."""
+    means = painter.field.means.data.cpu().double()
+    total, count = torch.zeros(len(means)), torch.zeros(len(means))
+    for camera, values in maps:
+        pose = camera.world_to_camera.double()
+        x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
+        column = (camera.fx * x / z + camera.cx).floor()
+        row = (camera.fy * y / z + camera.cy).floor()
+        inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        at = (row[inside].long(), column[inside].long())
+        surface = painter.depth(camera)[at]
+        shown = inside.clone()
+        shown[inside] = z[inside].float() <= surface * (1 + _BEHIND)  # false where no depth is known
+        at = (row[shown].long(), column[shown].long())
+        total[shown] += values[at].float()
+        count[shown] += 1
+    return torch.where(count > 0, total / count.clamp_min(1), torch.nan)
+
+
+def _maps(folder: Path, name: str, cameras: Sequence[SavedCamera]) -> list[tuple[Camera, Float[Tensor, "H W"]]]:
+    by_name: Mapping[str, Camera] = {saved.name: saved.camera for saved in cameras}
+    views = strict_json.read_object(folder / "maps" / "maps.json").get("views", {})
+    found = []
+    for view in views:
+        path = folder / "maps" / Path(view).stem / f"{name}.png"
+        if view in by_name and path.is_file():
+            camera = by_name[view]
+            found.append((camera, read_image(path, expect=(camera.width, camera.height))[..., 0]))
+    return found
+
+
+def _viridis(values: Float[Tensor, " N"]) -> Float[Tensor, "N 3"]:
+    from matplotlib import colormaps
+
+    rgb = torch.from_numpy(colormaps["viridis"](values.clamp(0, 1).nan_to_num().numpy())[:, :3]).float()
+    return torch.where(values.isnan()[:, None], torch.full_like(rgb, _UNSEEN), rgb)

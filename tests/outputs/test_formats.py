@@ -1,0 +1,105 @@
+"""Files for viewers hold the splat as it was measured; another program reads them."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+
+from clear_strategies.commands import export
+from clear_strategies.data.ply import read_gaussians
+from clear_strategies.errors import SettingError
+from clear_strategies.outputs import formats
+from rasterizers.geometry import SH_C0
+from tests.helpers import saved_run
+
+LAYOUT = [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]
+by_another_program = pytest.mark.skipif(
+    shutil.which("splat-transform") is None, reason="npm install -g @playcanvas/splat-transform"
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    return folder, saved_run.write(folder)
+
+
+def sorted_by_x(values, x):
+    return values[np.argsort(x, kind="stable")]
+
+
+def test_a_splat_file_holds_position_scale_colour_and_rotation(run, tmp_path):
+    folder, field = run
+    export.main([str(folder), "--to", "splat", "--out", str(tmp_path / "a.splat")])
+    table = np.frombuffer((tmp_path / "a.splat").read_bytes(), LAYOUT)
+    exact = field.baked()
+    order = np.argsort(exact.means[:, 0].numpy(), kind="stable")
+    found = sorted_by_x(table, table["means"][:, 0])
+    np.testing.assert_array_equal(found["means"], exact.means.numpy()[order])
+    np.testing.assert_allclose(found["scales"], exact.scales.numpy()[order], rtol=1e-5)
+    color = (exact.sh0[:, 0] * SH_C0 + 0.5 + exact.rgb_offset).clamp(0, 1).numpy()[order]
+    np.testing.assert_allclose(found["rgba"][:, :3] / 255, color, atol=0.51 / 255)
+    np.testing.assert_allclose(found["rgba"][:, 3] / 255, exact.opacities.numpy()[order], atol=0.51 / 255)
+    quats = torch.nn.functional.normalize(exact.quats, dim=1).numpy()[order]
+    np.testing.assert_allclose((found["quats"].astype(float) - 128) / 128, quats, atol=1.01 / 128)
+
+
+def test_the_largest_and_most_opaque_come_first(run):
+    g = read_gaussians(run[0] / "point_cloud.ply")
+    table = np.frombuffer(formats.splat_bytes(g), LAYOUT)
+    weight = table["scales"].prod(1) * table["rgba"][:, 3]
+    assert weight[:10].min() > weight[-10:].max()
+
+
+def test_a_ply_is_the_one_of_the_run(run, tmp_path):
+    folder, _ = run
+    export.main([str(folder), "--to", "ply", "--out", str(tmp_path / "a.ply")])
+    assert (tmp_path / "a.ply").read_bytes() == (folder / "point_cloud.ply").read_bytes()
+    export.main([str(folder), "--to", "ply", "--sh", "1"])
+    assert read_gaussians(folder / f"{folder.name}.ply").shN.shape[1] == 3
+
+
+@by_another_program
+@pytest.mark.parametrize("form", ["ply", "splat", "spz", "sog"])
+def test_another_program_reads_what_is_written(run, tmp_path, form):
+    folder, field = run
+    export.main([str(folder), "--to", form, "--out", str(tmp_path / f"a.{form}")])
+    subprocess.run(
+        ["splat-transform", "-q", "-w", str(tmp_path / f"a.{form}"), str(tmp_path / "back.ply")],
+        check=True, capture_output=True, timeout=120,
+    )  # fmt: skip
+    back, exact = read_gaussians(tmp_path / "back.ply"), field.baked()
+    assert len(back) == len(field)
+    x, order = np.sort(back.means[:, 0].numpy()), np.argsort(exact.means[:, 0].numpy())
+    np.testing.assert_allclose(x, exact.means[:, 0].numpy()[order], atol=2e-3)
+    opacity = sorted_by_x(back.opacities.sigmoid().numpy(), back.means[:, 0].numpy())
+    np.testing.assert_allclose(opacity, exact.opacities.numpy()[order], atol=0.02)
+
+
+def test_a_format_without_its_program_names_the_remedy(run, monkeypatch):
+    monkeypatch.setattr(formats.shutil, "which", lambda _: None)
+    with pytest.raises(SettingError, match=r"Node\.js 20 or later: install it from nodejs\.org, or choose --to ply"):
+        export.main([str(run[0]), "--to", "spz"])
+
+
+def test_a_program_that_fails_leaves_no_file_and_is_quoted(run, tmp_path, monkeypatch):
+    broken = tmp_path / "splat-transform"
+    broken.write_text("#!/bin/sh\necho it broke >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setattr(formats.shutil, "which", lambda _: str(broken))
+    with pytest.raises(SettingError, match="splat-transform failed: it broke"):
+        export.main([str(run[0]), "--to", "spz", "--out", str(tmp_path / "a.spz")])
+    assert not (tmp_path / "a.spz").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["--to", "obj"], "invalid choice"), (["--to", "ply", "--out", "a.spz"], "must end in .ply"), ([], "--to")],
+)
+def test_wrong_arguments_are_refused_in_one_line(run, arguments, message):
+    with pytest.raises(SettingError, match=message):
+        export.main([str(run[0]), *arguments])

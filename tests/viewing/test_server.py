@@ -1,0 +1,94 @@
+"""What the viewer draws is what its panel asks for."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from clear_strategies.jobs.saved import open_splat
+from clear_strategies.viewing import points, video
+from clear_strategies.viewing.look import Look
+from tests.helpers import saved_run, toy
+
+server = pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
+
+CAMERA = toy.camera(0.2)
+POSE = np.linalg.inv(CAMERA.world_to_camera.double().numpy())
+FOV = 2 * math.atan(CAMERA.height / 2 / CAMERA.fy)
+
+
+@pytest.fixture(scope="module")
+def splat(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    saved_run.write(folder)
+    return open_splat(folder)
+
+
+@pytest.fixture
+def screen(splat):
+    return server.Screen(
+        splat.painter, splat.cameras, lambda: points.colors(splat.painter, splat.folder, splat.cameras)
+    )
+
+
+def close(found, exact):
+    assert found.shape == exact.shape
+    assert np.abs(found.astype(int) - exact).max() <= 1
+
+
+def test_the_window_shows_what_is_measured(screen, splat):
+    close(screen.draw(server.View(), POSE, FOV, (96, 64)), video.to_bytes(splat.painter.color(CAMERA)))
+
+
+def test_switches_reach_the_picture(screen, splat):
+    look = Look(detail=False, sh=False)
+    found = screen.draw(server.View(look=look), POSE, FOV, (96, 64))
+    close(found, video.to_bytes(splat.painter.color(CAMERA, look)))
+
+
+def test_the_grid_of_lr_has_the_pixels_of_an_lr_camera_each_a_square(screen, splat):
+    found = screen.draw(server.View(grid="LR pixels"), POSE, FOV, (960, 640))
+    times = math.ceil(1024 / 24)
+    assert found.shape == (16 * times, 24 * times, 3)
+    close(found[::times, ::times], video.to_bytes(splat.painter.color(CAMERA.scaled(1 / 4))))
+    assert (found[:times, :times] == found[0, 0]).all()
+
+
+def test_depth_and_coverage_are_pictures(screen):
+    for show in ("depth", "coverage"):
+        assert screen.draw(server.View(show=show), POSE, FOV, (96, 64)).shape == (64, 96, 3)
+
+
+def test_points_are_coloured_by_what_is_known_of_them(screen, splat):
+    found = screen.draw(server.View(show="opacity"), POSE, FOV, (96, 64))
+    colors = points.colors(splat.painter, None, ())["opacity"]
+    close(found, video.to_bytes(splat.painter.points(CAMERA, colors)))
+
+
+def test_a_map_is_carried_over_to_the_gaussians_that_it_shows(splat):
+    camera = splat.poses()[0]
+    half = torch.zeros(64, 96)
+    half[:, 48:] = 1
+    values = points.on_gaussians(splat.painter, [(camera, half)])
+    means = splat.painter.field.means.data.double()
+    x, _, z = (means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]).unbind(1)
+    right = x / z * camera.fx + camera.cx >= 48
+    known = values.isfinite()
+    assert 0 < int(known.sum()) <= len(values)
+    assert torch.equal(values[known] > 0.5, right[known])
+    assert points.on_gaussians(splat.painter, []).isnan().all()
+
+
+def test_the_viewer_opens_and_closes(splat, screen):
+    viewer = server.SplatViewer(screen, title="toy", names=["opacity"], port=8321, out=splat.folder)
+    try:
+        assert viewer.address.startswith("http://127.0.0.1:")
+        assert viewer.view() == server.View()
+        viewer._switches["detail"].value = False
+        assert not viewer.view().look.detail
+        assert not viewer.paused
+    finally:
+        viewer.close()
