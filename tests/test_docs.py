@@ -106,6 +106,8 @@ PYTHON = [
 # Commands of other programs: nothing of them is checked, but that extras exist.
 FOREIGN = r"(python3? -m (venv|pip)|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|cd) ?"
 
+READ_BY_ARGPARSE = ("render", "export", "view", "doctor")  # subcommands; the others read Hydra's words
+
 
 class Parsed(Exception):
     """Raised once a command line was understood."""
@@ -114,7 +116,9 @@ class Parsed(Exception):
 @pytest.mark.parametrize("words", COMMANDS)
 def test_commands_are_understood(words, monkeypatch):
     line = " ".join(words)
-    if words[:3] == ["python", "-m", "clear_strategies.run"] or words[0] == "clear-strategies":
+    if words[0] == "clear-strategies" and words[1] in READ_BY_ARGPARSE:
+        require_parsable("clear_strategies.run", words[1:], monkeypatch)
+    elif words[:3] == ["python", "-m", "clear_strategies.run"] or words[0] == "clear-strategies":
         require_composable(words[1:] if words[0] == "clear-strategies" else words[3:])
     elif words[:3] == ["python", "-m", "pytest"]:
         paths = [word for word in words[3:] if "/" in word]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,9 @@ from clear_strategies.training.pseudo_views import PseudoViewSettings
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import Skips
 from clear_strategies.training.state import TrainState
-from clear_strategies.viewing.cameras import write_cameras
+from clear_strategies.viewing import live
+from clear_strategies.viewing.cameras import FILE as CAMERAS
+from clear_strategies.viewing.cameras import read_cameras, write_cameras
 from clear_strategies.viewing.look import Painter
 
 _log = logging.getLogger(__name__)
@@ -51,6 +54,7 @@ class RunSettings(FitSettings):
     Args:
         map_views: number of training views with maps of reliability and correction in maps/; 0: none.
         video: frames of path.mp4 and path.gif, a loop through the training cameras, 24 a second; 0: none.
+        viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
         baseline: train first, on the same scene with the same settings, without any strategy, into the folder baseline/ of
             the run; the contact sheet and the scores then show both. Without effect in a sweep, for a run that has no
             strategy, and with +method=NAME.
@@ -64,6 +68,7 @@ class RunSettings(FitSettings):
 
     map_views: int = 3
     video: int = 72
+    viewer: bool = False
     baseline: bool = False
     resume: str | None = None
     device: Device | None = None
@@ -186,6 +191,8 @@ def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = Non
     """
     values = tree(config)
     settings = settings_of(values)
+    if settings.fit.viewer:
+        live.require_viewer()
     ours, baseline = _Training.of(settings, values, folder), None
     if settings.fit.baseline and _why_without_baseline(settings) is None:
         values_without = {**values, "strategies": {}}
@@ -253,6 +260,24 @@ def _trained_first(training: _Training, state: TrainState | None, place: _Place)
     return baseline
 
 
+@contextmanager
+def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[Callable[[], None] | None]:
+    """What is called after each iteration: the job's watch and, with `fit.viewer`, the viewer's turn."""
+    if not training.settings.fit.viewer:
+        yield place.watch
+        return
+    painter = Painter(state.field, place.drawing.make)
+    saved, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"
+    with live.watched(painter, saved, title, lambda address: _log.info("look while it trains: %s", address)) as turn:
+
+        def after_step() -> None:
+            if place.watch is not None:
+                place.watch()
+            turn(state.t - 1)
+
+        yield after_step
+
+
 def _train(
     training: _Training, state: TrainState, place: _Place, beside: Baseline | None = None
 ) -> tuple[Evaluation, float]:
@@ -263,7 +288,8 @@ def _train(
     """
     settings, rasterizer = training.settings, place.drawing.rasterizer
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
-    with progress_bar(state, place.watch, training.chosen.title) as progress:
+    watched = _watched(training, state, place)
+    with watched as after_step, progress_bar(state, after_step, training.chosen.title) as progress:
         write_cameras(training.folder, place.scene)
         checkpoints = training.folder / resume.CHECKPOINTS
         fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)

@@ -33,6 +33,7 @@ _NOT_COMPARED: Final = {
     "fit.probe_views",
     "fit.map_views",
     "fit.video",
+    "fit.viewer",
 }
 
 

@@ -27,7 +27,7 @@ FORMATS: Final = {
     "ply": "the standard layout of 3DGS; nothing is lost",
     "splat": "32 bytes a Gaussian, 8-bit colours that do not depend on the direction",
     "spz": "Niantic's: a tenth of the PLY, view-dependent colour included; needs Node.js",
-    "sog": "PlayCanvas's: a twentieth of the PLY; needs Node.js, and without a GPU minutes for large splats",
+    "sog": "PlayCanvas's: view-dependent colour included; needs Node.js, and without a GPU minutes for large splats",
 }
 _CONVERTER: Final = "@playcanvas/splat-transform@2"
 _SPZ_VERSION: Final = "3"  # 4, the converter's default, is too new for most readers

@@ -29,7 +29,7 @@ _STRATEGIES: Final = "strategies."
 # Overrides that change no result. So do paths: the scene has a name.
 _NEUTRAL: Final = (
     "hydra", "fit.resume=", "fit.threads=", "fit.keep=", "fit.checkpoint_every=", "fit.probe_", "fit.map_views=", "fit.video=",
-    "scene=",     "data.root=", "fit.baseline=",
+    "fit.viewer=", "scene=",     "data.root=", "fit.baseline=",
 )  # fmt: skip
 _PATH: Final = re.compile(r"data\.[\w.]*path=")
 

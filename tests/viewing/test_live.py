@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import threading
+from http.client import HTTPConnection
 
 import pytest
 
 from clear_strategies.errors import SettingError
+from clear_strategies.jobs.saved import open_splat
 from clear_strategies.viewing import live
 from clear_strategies.viewing.live import Turns
+from tests.helpers import saved_run
 
 
 def asked(turns: Turns, function) -> tuple[threading.Thread, list]:
@@ -62,3 +65,21 @@ def test_missing_libraries_are_named(monkeypatch):
     monkeypatch.setattr(live, "find_spec", lambda name: None if name == "viser" else object())
     with pytest.raises(SettingError, match=r"the viewer needs viser: pip install 'clear-strategies\[view\]'"):
         live.require_viewer()
+
+
+def answer(address: str) -> bytes:
+    connection = HTTPConnection(address.removeprefix("http://"), timeout=20)
+    connection.request("GET", "/")
+    return connection.getresponse().read()
+
+
+def test_a_viewer_is_there_while_a_run_trains(tmp_path):
+    pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
+    saved_run.write(tmp_path)
+    splat, addresses = open_splat(tmp_path), []
+    with live.watched(splat.painter, splat.cameras, "toy", addresses.append) as after_step:
+        after_step(1)
+        assert b"<html" in answer(addresses[0])
+        after_step(2)
+    with pytest.raises(OSError, match="refused"):
+        answer(addresses[0])
