@@ -30,6 +30,13 @@ CLEAR_INLINE Floats load_some(const float* values, int count) {
   return Floats::load(a);
 }
 
+// Prefetches sixteen rows. There are more tensors here than a processor follows by itself.
+CLEAR_INLINE void fetch_rows(const float* tensor, std::int64_t row, int width) {
+  if (!tensor) return;
+  const char* begin = reinterpret_cast<const char*>(tensor + row * width);
+  for (int at = 0; at < int(sizeof(float)) * kLanes * width; at += 64) __builtin_prefetch(begin + at, 0, 2);
+}
+
 CLEAR_INLINE Doubles widen(const Floats& a) { return convert<double>(a); }
 CLEAR_INLINE Floats narrow(const Doubles& a) { return convert<float>(a); }
 

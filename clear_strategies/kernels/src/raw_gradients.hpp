@@ -131,4 +131,17 @@ CLEAR_INLINE void load(const Gradients& g, std::int64_t i, int count, Block& b) 
   route(b.hr.rgb, b.hf.rgb, b.m, g.lambda_hf);
 }
 
+// Prefetches what `load` reads.
+CLEAR_INLINE void fetch(const Gradients& g, std::int64_t i) {
+  const Activation& a = g.activation;
+  fetch_rows(a.scales, i, 3), fetch_rows(a.filtered, i, 3), fetch_rows(a.filter, i, 1), fetch_rows(a.sigmoid, i, 1);
+  fetch_rows(a.factor, i, 1), fetch_rows(g.route, i, 1);
+  for (const SplatGradient* loss : {&g.lr, &g.base, &g.hf}) {
+    fetch_rows(loss->means, i, 3), fetch_rows(loss->quats, i, 4), fetch_rows(loss->scales, i, 3);
+    fetch_rows(loss->opacities, i, 1), fetch_rows(loss->rgb, i, 3);
+  }
+  fetch_rows(g.lr.basis, i, g.bases);
+  if (g.base.basis != g.lr.basis) fetch_rows(g.base.basis, i, g.bases);
+}
+
 }  // namespace clear

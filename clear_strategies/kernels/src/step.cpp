@@ -28,6 +28,7 @@ Comparison compare_chunk(const Gradients& g, double* norm_products, std::int64_t
   Doubles norm_lr[kGroups], norm_hr[kGroups];
   for (int k = 0; k < kGroups; ++k) norm_lr[k] = norm_hr[k] = 0.0;
   each_sixteen(g.n, number, [&](std::int64_t i, int count) {
+    fetch(g, i + kLanes);
     Block b;
     load(g, i, count, b);
     Products p[kGroups + 1];
@@ -109,6 +110,9 @@ class ChunkStep {
   const RowPlan plan;
 
   void sixteen(std::int64_t i, int count, Stepped& done, Tally& tally) const {
+    fetch(g, i + kLanes);
+    for (const Attribute* a : {&s.means, &s.quats, &s.scales, &s.opacities, &s.sh0, &s.detail, &s.shN})
+      for (const float* tensor : {a->p, a->m, a->v}) fetch_rows(tensor, i + kLanes, a->width);
     Block b;
     load(g, i, count, b);
     std::uint32_t rows = first_bits(count);
