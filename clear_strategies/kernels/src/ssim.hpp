@@ -61,8 +61,19 @@ static_assert(kRing >= kSpan && kHalo >= kReach * kChannels && kHalo % kLanes ==
 inline constexpr int kTileWidth = 256;
 inline constexpr int kTileHeight = 128;
 
+// One register rather than sixteen numbers: with few registers, what these loops keep fits only in this way.
+using Register = Native<float>::Register;
+inline constexpr int kWidth = Native<float>::width;
+
+CLEAR_INLINE Register load(const float* p) {
+  Register a;
+  std::memcpy(&a, p, sizeof a);
+  return a;
+}
+CLEAR_INLINE void store(float* p, const Register& a) { std::memcpy(p, &a, sizeof a); }
+
 // How many of a group's rows fit the registers.
-inline constexpr int kTogether = kRegisterBytes == 64 ? 4 : 1;
+inline constexpr int kTogether = kRegisterBytes == 64 ? 4 : 2;
 
 // The last kRing rows of something.
 struct Ring {
@@ -96,19 +107,19 @@ struct Columns {
 template <int Rows>
 void down_columns(const Columns& in, int first, int width, float* const* mean_s, float* const* mean_e,
                   float* const* var_s, float* const* var_e) {
-  for (int i = 0; i < width; i += kLanes) {
-    Floats s0 = Floats::load(in.s_origin + i), e0 = Floats::load(in.e_origin + i);
-    Floats ms[Rows], me[Rows], vs[Rows], ve[Rows];
+  for (int i = 0; i < width; i += kWidth) {
+    Register s0 = load(in.s_origin + i), e0 = load(in.e_origin + i);
+    Register ms[Rows], me[Rows], vs[Rows], ve[Rows];
 #pragma GCC unroll 4
-    for (int r = 0; r < Rows; ++r) ms[r] = me[r] = vs[r] = ve[r] = Floats(0.0f);
+    for (int r = 0; r < Rows; ++r) ms[r] = me[r] = vs[r] = ve[r] = Register{};
 #pragma GCC unroll 16
     for (int k = 0; k < Rows + kTaps - 1; ++k) {
-      Floats s = Floats::load(in.s[first + k] + i) - s0, e = Floats::load(in.e[first + k] + i) - e0;
-      Floats ss = s * s, ee = e * e;
+      Register s = load(in.s[first + k] + i) - s0, e = load(in.e[first + k] + i) - e0;
+      Register ss = s * s, ee = e * e;
 #pragma GCC unroll 4
       for (int r = 0; r < Rows; ++r) {
         if (k < r || k - r >= kTaps) continue;
-        Floats w = kWindow[k - r];
+        const float w = kWindow[k - r];
         ms[r] += w * s;
         me[r] += w * e;
         vs[r] += w * ss;
@@ -117,10 +128,10 @@ void down_columns(const Columns& in, int first, int width, float* const* mean_s,
     }
 #pragma GCC unroll 4
     for (int r = 0; r < Rows; ++r) {
-      (s0 + ms[r]).store(mean_s[first + r] + i);
-      (e0 + me[r]).store(mean_e[first + r] + i);
-      (vs[r] - ms[r] * ms[r]).store(var_s[first + r] + i);
-      (ve[r] - me[r] * me[r]).store(var_e[first + r] + i);
+      store(mean_s[first + r] + i, s0 + ms[r]);
+      store(mean_e[first + r] + i, e0 + me[r]);
+      store(var_s[first + r] + i, vs[r] - ms[r] * ms[r]);
+      store(var_e[first + r] + i, ve[r] - me[r] * me[r]);
     }
   }
 }
@@ -134,34 +145,36 @@ struct MapRow {
 // numbers before the maps.
 inline void along_row(const float* mean_s, const float* mean_e, const float* var_s, const float* var_e, int width,
                       const MapRow& out) {
-  for (int i = 0; i < width; i += kLanes) {
+  for (int i = 0; i < width; i += kWidth) {
     int at = i + kHalo;
-    Floats s0 = Floats::load(mean_s + at), e0 = Floats::load(mean_e + at), w0 = kWindow[kReach];
-    Floats ms(0.0f), me(0.0f), vs = w0 * Floats::load(var_s + at), ve = w0 * Floats::load(var_e + at);
+    Register s0 = load(mean_s + at), e0 = load(mean_e + at), w0 = kWindow[kReach] - Register{};
+    Register ms{}, me{}, vs = w0 * load(var_s + at), ve = w0 * load(var_e + at);
 #pragma GCC unroll 16
     for (int k = 0; k < kTaps; ++k) {
       if (k == kReach) continue;
       int from = at + (k - kReach) * kChannels;
-      Floats w = kWindow[k];
-      Floats s = Floats::load(mean_s + from) - s0, e = Floats::load(mean_e + from) - e0;
+      const float w = kWindow[k];
+      Register s = load(mean_s + from) - s0, e = load(mean_e + from) - e0;
       ms += w * s;
       me += w * e;
-      vs += w * (Floats::load(var_s + from) + s * s);
-      ve += w * (Floats::load(var_e + from) + e * e);
+      vs += w * (load(var_s + from) + s * s);
+      ve += w * (load(var_e + from) + e * e);
     }
     vs -= ms * ms;
     ve -= me * me;
     ms += s0;
     me += e0;
-    Floats half = 0.5f, one = 1.0f, two = 2.0f, me2 = me * me;
-    Floats over_B1 = reciprocal((ms * ms + me2) * half + kC1), over_B2 = reciprocal((vs + ve) * half + kC2);
-    Floats u = me2 * over_B1, n = ve * over_B2, scale = (one - u) * over_B2;
-    ms.store(out.mean_s + i);
-    me.store(out.mean_e + i);
-    ((one - n) * (two * me + u * (ms - me)) * over_B1).store(out.a + i);
-    (scale * n).store(out.b + i);
-    (scale * (two - n)).store(out.c + i);
-    (u + n - u * n).store(out.dissimilarity + i);
+    const float half = 0.5f, one = 1.0f, two = 2.0f;
+    const Register me2 = me * me;
+    const Register over_B1 = Native<float>::reciprocal((ms * ms + me2) * half + kC1);
+    const Register over_B2 = Native<float>::reciprocal((vs + ve) * half + kC2);
+    Register u = me2 * over_B1, n = ve * over_B2, scale = (one - u) * over_B2;
+    store(out.mean_s + i, ms);
+    store(out.mean_e + i, me);
+    store(out.a + i, (one - n) * (two * me + u * (ms - me)) * over_B1);
+    store(out.b + i, scale * n);
+    store(out.c + i, scale * (two - n));
+    store(out.dissimilarity + i, u + n - u * n);
   }
 }
 
@@ -174,20 +187,20 @@ struct Maps {
 // The gradient's column sums: Σ w [a + b (s0 - μs) + c (e0 - μe)], Σ w b and Σ w c.
 template <int Rows>
 void down_maps(const Maps& in, int first, int width, float* const* sum_a, float* const* sum_b, float* const* sum_c) {
-  for (int i = 0; i < width; i += kLanes) {
-    Floats s0 = Floats::load(in.s_origin + i), e0 = Floats::load(in.e_origin + i);
-    Floats A[Rows], B[Rows], C[Rows];
+  for (int i = 0; i < width; i += kWidth) {
+    Register s0 = load(in.s_origin + i), e0 = load(in.e_origin + i);
+    Register A[Rows], B[Rows], C[Rows];
 #pragma GCC unroll 4
-    for (int r = 0; r < Rows; ++r) A[r] = B[r] = C[r] = Floats(0.0f);
+    for (int r = 0; r < Rows; ++r) A[r] = B[r] = C[r] = Register{};
 #pragma GCC unroll 16
     for (int k = 0; k < Rows + kTaps - 1; ++k) {
-      Floats b = Floats::load(in.b[first + k] + i), c = Floats::load(in.c[first + k] + i);
-      Floats a = Floats::load(in.a[first + k] + i) + b * (s0 - Floats::load(in.mean_s[first + k] + i)) +
-                 c * (e0 - Floats::load(in.mean_e[first + k] + i));
+      Register b = load(in.b[first + k] + i), c = load(in.c[first + k] + i);
+      Register a = load(in.a[first + k] + i) + b * (s0 - load(in.mean_s[first + k] + i)) +
+                 c * (e0 - load(in.mean_e[first + k] + i));
 #pragma GCC unroll 4
       for (int r = 0; r < Rows; ++r) {
         if (k < r || k - r >= kTaps) continue;
-        Floats w = kWindow[k - r];
+        const float w = kWindow[k - r];
         A[r] += w * a;
         B[r] += w * b;
         C[r] += w * c;
@@ -195,9 +208,9 @@ void down_maps(const Maps& in, int first, int width, float* const* sum_a, float*
     }
 #pragma GCC unroll 4
     for (int r = 0; r < Rows; ++r) {
-      A[r].store(sum_a[first + r] + i);
-      B[r].store(sum_b[first + r] + i);
-      C[r].store(sum_c[first + r] + i);
+      store(sum_a[first + r] + i, A[r]);
+      store(sum_b[first + r] + i, B[r]);
+      store(sum_c[first + r] + i, C[r]);
     }
   }
 }
