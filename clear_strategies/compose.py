@@ -6,6 +6,7 @@ conductor("clear", "strategies.gco.tolerance=0.1", iterations=30_000)
 from __future__ import annotations
 
 import difflib
+import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from inspect import signature
@@ -30,6 +31,8 @@ from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
 from clear_strategies.settings import build, one_line, with_defaults
 from clear_strategies.strategies.base import Strategy
+
+_log = logging.getLogger(__name__)
 
 _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
@@ -78,12 +81,15 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
         raise SettingError(f"iterations must be at least 1, got {iterations}.")
     names = [name.strip() for name in strategy.split(",")]
     chosen = f"+strategy=[{','.join(names)}]" if len(names) > 1 else f"+strategy={names[0]}"
-    settings: ConductorSettings = build(tree(composed([chosen, *overrides]), _TRAINERS))
+    config = composed([chosen, *overrides])
+    if "pseudo_views" in config:
+        _log.warning("%s: a trainer other than this package's makes no pseudo views; the rest takes part.", strategy)
+    settings: ConductorSettings = build(tree(config, _TRAINERS))
     return settings.conductor(iterations / REFERENCE_ITERATIONS)
 
 
 # Options for both doors, readings=literal above all, set these as well; a host has its own.
-_TRAINERS: Final = ("optim", "skips")
+_TRAINERS: Final = ("optim", "skips", "pseudo_views")
 
 
 def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:

@@ -220,3 +220,9 @@ def test_a_setting_that_cannot_be_used_is_named_by_its_key(overrides, message):
     with pytest.raises(SettingError) as refused:
         settle()
     assert message in str(refused.value)
+
+
+def test_a_host_gets_the_strategies_of_best_and_is_told_that_it_makes_no_pseudo_views(caplog):
+    best, clear = conductor("best"), conductor("clear")
+    assert [type(s) for s in best.strategies] == [type(s) for s in clear.strategies]
+    assert "pseudo views" in caplog.text

@@ -8,7 +8,7 @@ photos' surfaces, its colours are those of the photos that see the same surface;
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -25,6 +25,7 @@ from rasterizers.interface import Camera
 _SOURCES: Final = 4  # the nearest photos that a pseudo view is made of
 _ALONG: Final = 0.3  # movements along the viewing direction are this much shorter: going close leaves holes
 _SEAM: Final = 2 / 255  # largest difference of a background pixel from the background's colour
+_CUT_OUT: Final = 0.25  # share of background pixels from which the photos show an object cut out of its surroundings
 _NEIGHBOURS: Final = 3  # of a pixel and the eight around it, those that must be known, or it is an outlier
 
 
@@ -91,6 +92,12 @@ def pseudo_views(
     return made
 
 
+def cut_out(photos: Iterable[Photo], background: tuple[float, float, float]) -> bool:
+    """Whether the photos show an object cut out of its surroundings: a good part of them is the background's colour."""
+    shares = [float(_blank(photo, background).float().mean()) for photo in photos]
+    return bool(shares) and sum(shares) / len(shares) >= _CUT_OUT
+
+
 def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.Generator) -> Camera:
     """The camera moved by up to `reach` × `distance`, and turned to keep in its middle what it saw there at `distance`."""
     direction = torch.randn(3, generator=generator, dtype=torch.float64)
@@ -128,9 +135,12 @@ def _source(photo: Photo, found: DepthMap, background: tuple[float, float, float
     """Pixels beside the background are mixed with it: they give points but no colour."""
     known, depth = found.known, torch.nan_to_num(found.depth)
     points = back_project(photo.camera, _centres(photo.camera)[known], depth[known].double())
-    blank = ((photo.image - torch.tensor(background)).abs() <= _SEAM).all(dim=-1)
-    beside = torch.nn.functional.max_pool2d(blank[None, None].float(), 3, 1, 1)[0, 0] > 0
+    beside = torch.nn.functional.max_pool2d(_blank(photo, background)[None, None].float(), 3, 1, 1)[0, 0] > 0
     return _Source(photo, points, torch.where(known & ~beside, depth, 0.0), float(depth[known].median()))
+
+
+def _blank(photo: Photo, background: tuple[float, float, float]) -> Bool[Tensor, "h w"]:
+    return ((photo.image - torch.tensor(background)).abs() <= _SEAM).all(dim=-1)
 
 
 def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> PseudoView:

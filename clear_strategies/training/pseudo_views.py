@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from clear_strategies.core.deferred import Number
-from clear_strategies.data.pseudo_views import PseudoView, pseudo_views
+from clear_strategies.data.pseudo_views import PseudoView, cut_out, pseudo_views
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import SettingError
 from rasterizers.interface import Rasterizer
@@ -70,11 +70,18 @@ class PseudoViews:
 
     @classmethod
     def of(cls, scene: Scene, settings: PseudoViewSettings, seed: int) -> PseudoViews:
-        """Make them, on the device of the scene's views; a warning where the scene has no depth to make them of."""
+        """Make them, on the device of the scene's views; none, and a message, where the scene needs none or has no depth."""
         if settings.every == 0:
             return cls(settings)
+        photos = {view.name: view.lr.to("cpu") for view in scene.train}
+        if cut_out(photos.values(), scene.background):
+            _log.info(
+                "no pseudo views are made: the photos show an object before a plain background, and where a photo shows "
+                "the background nothing can hide."
+            )
+            return cls(settings)
         made = pseudo_views(
-            {view.name: view.lr.to("cpu") for view in scene.train},
+            photos,
             scene.depths,
             count=settings.count,
             reach=settings.reach,

@@ -105,6 +105,18 @@ def test_the_warning_names_the_remedy(caplog):
     assert not caplog.text
 
 
+def test_an_object_cut_out_of_its_surroundings_needs_none(caplog):
+    white = [
+        replace(view, lr=replace(view.lr, image=torch.where(torch.arange(24)[None, :, None] < 12, view.lr.image, 1.0)))
+        for view in SCENE.train
+    ]
+    scene = with_depth(replace(SCENE, train=tuple(white), background=(1.0, 1.0, 1.0)))
+    with caplog.at_level(logging.INFO):
+        assert PseudoViews.of(scene, BESIDE, seed=5).says() is None
+    assert "plain background" in caplog.text
+    assert PseudoViews.of(replace(scene, background=(0.5, 0.5, 0.5)), BESIDE, seed=5).says() is not None
+
+
 @pytest.mark.parametrize(
     "bad", [{"every": -1}, {"count": 0}, {"reach": 0.0}, {"weight": 0.0}, {"tolerance": -1.0}, {"max_pixels": 0}]
 )
