@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         launch = Launch(options)
         _install_at_the_end(launch, attached)
         run_script(launch)
-    except (ClearError, ValueError) as error:
+    except ClearError as error:
         _log.error("%s", error)
         return 2
     if not any(a.attachment.counts["merges"] for a in attached):

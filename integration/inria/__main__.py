@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         run = _Run(Launch(options))
         run.start()
-    except (ClearError, ValueError) as error:
+    except ClearError as error:
         _log.error("%s", error)
         return 2
     if run.attached is None or not run.attached.attachment.counts["merges"]:

@@ -58,9 +58,8 @@ class Attached:
         views: the training views, by name and by camera.
 
     Raises:
-        SettingError: HR is used, but there is no `sr`; or densification outlasts the anchor.
-        ValueError: there is no camera, or two cameras have the same name.
-        DataError: an SR image is missing, or is not `factor` times as large as its photo.
+        SettingError: HR is used, but there is no `sr`; there is no camera; densification outlasts the anchor.
+        DataError: two cameras have one name; an SR image is missing, or is not `factor` times as large as its photo.
         HostError: `gaussians` is not a GaussianModel as in 3DGS.
     """
 

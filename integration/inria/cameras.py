@@ -14,7 +14,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import SUFFIXES, write_png
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, SettingError
 from integration.views import SuperResolve, view
 
 _log = logging.getLogger(__name__)
@@ -44,21 +44,21 @@ class HostViews:
         device: of the Gaussians.
 
     Raises:
-        ValueError: there is no camera, or one is listed twice.
-        DataError: an SR image is missing, or is not `factor` times as large as its photo.
+        SettingError: there is no camera.
+        DataError: two cameras have one name; an SR image is missing, or is not `factor` times as large as its photo.
     """
 
     def __init__(
         self, cameras: Sequence[Any], sr: SuperResolve, factor: int, device: torch.device | str = "cpu"
     ) -> None:
         if not cameras:
-            raise ValueError("at least one training camera is needed, got none. Pass scene.getTrainCameras().")
+            raise SettingError("cameras: at least one training camera is needed, got none. Pass scene.getTrainCameras().")
         names = [camera.image_name for camera in cameras]
         if twice := next((name for name in names if names.count(name) > 1), None):
-            raise ValueError(
-                f"two training cameras are called {twice!r}, so their SR images cannot be told apart. Give every photo its "
-                "own name; this trainer ignores folders."
-            )
+            raise DataError(
+                twice, "training cameras", "two have this name, so their SR images cannot be told apart",
+                "give every photo its own name; this trainer ignores folders",
+            )  # fmt: skip
         self.all = tuple(_host_view(camera, sr, factor, device) for camera in cameras)
         self._by_camera = {id(host_view.camera): host_view for host_view in self.all}
         self._by_name: dict[str | None, HostView] = dict(zip(names, self.all, strict=True))

@@ -42,7 +42,7 @@ def install(
 
     Raises:
         HostError: the host has another shape than 3DGS.
-        SettingError, DataError, ValueError: see `Attached`.
+        SettingError, DataError: see `Attached`.
     """
     iterations = getattr(opt, "iterations", None)
     if iterations is None:

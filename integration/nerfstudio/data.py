@@ -16,7 +16,7 @@ from torch import Tensor
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors import Bicubic, Images, Onnx, Prior, cached
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, SettingError
 from integration.views import view
 
 
@@ -27,7 +27,9 @@ def prior(sr: Path | None) -> Prior:
     return cached(Onnx(str(sr))) if sr.suffix.lower() == ".onnx" else Images(str(sr))
 
 
-def views(datamanager: Any, sr: Prior, factor: int, device: torch.device | str = "cpu") -> tuple[View, ...]:
+def views_from_datamanager(
+    datamanager: Any, sr: Prior, factor: int, device: torch.device | str = "cpu"
+) -> tuple[View, ...]:
     """The training views of a `FullImageDatamanager` on `device`, named like their files.
 
     Args:
@@ -35,8 +37,9 @@ def views(datamanager: Any, sr: Prior, factor: int, device: torch.device | str =
 
     Raises:
         DataError: two photos have the same stem, a photo has a mask, or an SR image does not fit.
+        SettingError: the photos are not kept in memory.
     """
-    photos = datamanager.cached_train  # read first: it undistorts the photos and corrects the cameras
+    photos = _cached(datamanager)  # read first: it undistorts the photos and corrects the cameras
     cameras, files = datamanager.train_dataset.cameras, datamanager.train_dataset.image_filenames
     Ks, poses = cameras.get_intrinsics_matrices(), world_to_camera(cameras.camera_to_worlds)
     _require_unique_stems(files)
@@ -56,7 +59,7 @@ def save_lr(datamanager: Any, folder: Path) -> None:
     """Write the photos as splatfacto trains on them, as PNG, for an SR tool to enlarge."""
     files = datamanager.train_dataset.image_filenames
     _require_unique_stems(files)
-    for file, photo in zip(files, datamanager.cached_train, strict=True):
+    for file, photo in zip(files, _cached(datamanager), strict=True):
         write_png(folder / f"{Path(file).stem}.png", over_black(photo["image"]))
 
 
@@ -73,6 +76,15 @@ def over_black(image: Tensor) -> Float[Tensor, "H W 3"]:
     """RGB in [0, 1] of an 8-bit or float photo, composited over black as splatfacto does it."""
     values = image.float() / 255 if image.dtype == torch.uint8 else image
     return values[..., :3] * values[..., 3:] if values.shape[-1] == 4 else values
+
+
+def _cached(datamanager: Any) -> Any:
+    """The undistorted photos, which nerfstudio keeps in memory."""
+    if getattr(getattr(datamanager, "config", None), "cache_images", "cpu") == "disk":
+        raise SettingError(
+            "cache_images: clear-splatfacto needs cpu or gpu, got disk: every photo is read once, before training begins."
+        )
+    return datamanager.cached_train
 
 
 def _require_unique_stems(files: Any) -> None:

@@ -30,9 +30,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from clear_strategies.errors import SettingError
+from integration.densification import end_of_densification
 from integration.detail import sh0_offset
 from integration.gsplat import Attached, attach
-from integration.nerfstudio.data import prior, save_lr, views
+from integration.nerfstudio.data import prior, save_lr, views_from_datamanager
 
 NAMES: Final = {"sh0": "features_dc", "shN": "features_rest"}
 """gsplat's parameter name -> splatfacto's, where they differ."""
@@ -47,13 +48,13 @@ class ClearSplatfactoModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
     """
 
     _target: type = field(default_factory=lambda: ClearSplatfactoModel)
-    clear: str = "clear"
-    """the strategies, as in +strategy= of clear-strategies: clear, gco, gco,svs, baseline ..."""
+    strategies: str = "clear"
+    """their names, as in +strategy= of clear-strategies: clear, gco, gco,svs, baseline ..."""
     overrides: tuple[str, ...] = ()
     """settings of the strategies and the objective: strategies.gco.tolerance=0.1 objective=paper ..."""
     sr: Path | None = None
     """folder with one SR image per photo (same stem), or an ONNX network; none: bicubic, which adds no detail"""
-    sr_factor: int = 4
+    factor: int = 4
     """HR pixels per LR pixel along an edge"""
     save_lr: Path | None = None
     """write the photos here as they are trained on, undistorted, for an SR tool to enlarge"""
@@ -71,7 +72,7 @@ class ClearSplatfactoModelConfig(SplatfactoModelConfig):  # type: ignore[misc]
         ):
             if found != needed:
                 raise SettingError(f"{name}: clear-splatfacto needs {needed}, got {found}: {why}.")
-        for name, least in (("sh_degree", 1), ("sr_factor", 2)):
+        for name, least in (("sh_degree", 1), ("factor", 2)):
             if getattr(self, name) < least:
                 raise SettingError(f"{name}: clear-splatfacto needs at least {least}, got {getattr(self, name)}.")
 
@@ -134,21 +135,22 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         if config.save_lr is not None:
             save_lr(datamanager, config.save_lr)
             CONSOLE.log(
-                f"CLEAR: wrote the LR photos to {config.save_lr}; enlarge them x{config.sr_factor} for pipeline.model.sr."
+                f"CLEAR: wrote the LR photos to {config.save_lr}; enlarge them x{config.factor} for pipeline.model.sr."
             )
-        strategies = conductor(config.clear, *config.overrides, iterations=trainer.config.max_num_iterations)
+        chosen = conductor(config.strategies, *config.overrides, iterations=trainer.config.max_num_iterations)
         sr = prior(config.sr)
         CONSOLE.log(
-            f"CLEAR: {', '.join(type(s).__name__ for s in strategies.strategies) or 'no strategy'}; "
-            f"SR images x{config.sr_factor}: {sr.label}."
+            f"CLEAR: {', '.join(type(s).__name__ for s in chosen.strategies) or 'no strategy'}; "
+            f"SR images x{config.factor}: {sr.label}."
         )
         stop = self.strategy.refine_stop_iter
-        end = next((step for step in range(stop) if not strategies.may_densify(step + 1)), stop)
+        end = end_of_densification(chosen, stop, first=0)
         if end < stop:
             CONSOLE.log(f"CLEAR: densification ends at step {end} instead of {stop} (SVS: anchor_start).")
             self.strategy.refine_stop_iter = end
         return attach(
-            self.gauss_params, host.optimizers.optimizers, views(datamanager, sr, config.sr_factor, self.device), strategies,
+            self.gauss_params, host.optimizers.optimizers, views_from_datamanager(datamanager, sr, config.factor, self.device),
+            chosen,
             strategy=self.strategy, state=self.strategy_state, names=NAMES, seed=trainer.config.machine.seed,
             loss_scale=host.grad_scaler.get_scale,
         )  # fmt: skip

@@ -475,9 +475,9 @@ def test_unsupported_calls_are_refused(inria_host, inria_capture):
 
 def test_views_need_unique_names_and_sr_images_of_the_right_size(inria_host, inria_capture):
     gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
-    with pytest.raises(ValueError, match="at least one training camera"):
+    with pytest.raises(SettingError, match="at least one training camera"):
         attach(gaussians, [], Conductor(), sr=inria_capture / "sr")
-    with pytest.raises(ValueError, match="two training cameras are called 'view0'"):
+    with pytest.raises(DataError, match="view0: training cameras: two have this name"):
         attach(gaussians, [scene.cameras[0]] * 2, Conductor(), sr=inria_capture / "sr")
     with pytest.raises(DataError, match="2 times the LR image is 48x32"):
         attach(gaussians, scene.cameras, Conductor(), sr=inria_capture / "sr", factor=2)

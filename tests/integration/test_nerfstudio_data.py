@@ -17,10 +17,10 @@ from clear_strategies import GCO, P2G, Conductor, Objective
 from clear_strategies.data.cameras import pose_from_opengl
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.priors import Bicubic, Cached, Images
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, SettingError
 from clear_strategies.schedules import WarmupDecay
 from integration.gsplat import attach
-from integration.nerfstudio.data import over_black, prior, save_lr, views, world_to_camera
+from integration.nerfstudio.data import over_black, prior, save_lr, views_from_datamanager, world_to_camera
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
 
@@ -67,7 +67,7 @@ def test_poses_are_converted_from_opengl_to_opencv():
 
 def test_views_are_the_photos_that_splatfacto_trains_on():
     manager = DataManager()
-    first, second = views(manager, Bicubic(), 4)
+    first, second = views_from_datamanager(manager, Bicubic(), 4)
     assert [v.name for v in (first, second)] == ["one.jpg", "two.jpg"]
     assert torch.equal(first.lr.image, manager.photos[0]["image"].float() / 255)
     camera = second.hr.camera
@@ -78,11 +78,11 @@ def test_views_are_the_photos_that_splatfacto_trains_on():
 def test_sr_images_are_found_by_the_photos_stem(tmp_path):
     for stem in ("one", "two"):
         write_png(tmp_path / f"{stem}.png", torch.full((64, 96, 3), 0.2 if stem == "one" else 0.4))
-    first, second = views(DataManager(), prior(tmp_path), 4)
+    first, second = views_from_datamanager(DataManager(), prior(tmp_path), 4)
     assert first.hr.image.unique().tolist() == pytest.approx([0.2])
     assert second.hr.image.unique().tolist() == pytest.approx([0.4])
     with pytest.raises(DataError, match="96x64, but 2 times"):
-        views(DataManager(), prior(tmp_path), 2)
+        views_from_datamanager(DataManager(), prior(tmp_path), 2)
 
 
 def test_saved_lr_photos_are_the_training_photos(tmp_path):
@@ -99,11 +99,18 @@ def test_the_sr_setting_chooses_the_prior(tmp_path):
 
 def test_masks_and_equal_stems_are_refused():
     with pytest.raises(DataError, match="mask"):
-        views(DataManager(mask=torch.ones(16, 24, 1)), Bicubic(), 4)
+        views_from_datamanager(DataManager(mask=torch.ones(16, 24, 1)), Bicubic(), 4)
     twins = DataManager(files=("a/one.jpg", "b/one.png"))
-    for call in (lambda: views(twins, Bicubic(), 4), lambda: save_lr(twins, None)):
+    for call in (lambda: views_from_datamanager(twins, Bicubic(), 4), lambda: save_lr(twins, None)):
         with pytest.raises(DataError, match="stem"):
             call()
+
+
+def test_photos_that_stay_on_disk_are_refused():
+    manager = DataManager()
+    manager.config = SimpleNamespace(cache_images="disk")
+    with pytest.raises(SettingError, match="cache_images: clear-splatfacto needs cpu or gpu, got disk"):
+        views_from_datamanager(manager, Bicubic(), 4)
 
 
 def test_alpha_is_composited_over_black():

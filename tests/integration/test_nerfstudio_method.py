@@ -136,11 +136,11 @@ def test_the_command_line_has_its_settings():
     from nerfstudio.configs.method_configs import AnnotatedBaseConfigUnion
 
     line = (
-        "clear-splatfacto --data scene --pipeline.model.clear gco,svs --pipeline.model.sr scene/sr "
+        "clear-splatfacto --data scene --pipeline.model.strategies gco,svs --pipeline.model.sr scene/sr "
         "--pipeline.model.overrides strategies.gco.tolerance=0.1 objective=paper"
     )
     model = tyro.cli(AnnotatedBaseConfigUnion, args=line.split()).pipeline.model
-    assert (model.clear, model.sr) == ("gco,svs", Path("scene/sr"))
+    assert (model.strategies, model.sr) == ("gco,svs", Path("scene/sr"))
     assert model.overrides == ("strategies.gco.tolerance=0.1", "objective=paper")
 
 
@@ -151,7 +151,7 @@ def test_the_command_line_has_its_settings():
         {"background_color": "random"},
         {"use_bilateral_grid": True},
         {"sh_degree": 0},
-        {"sr_factor": 1},
+        {"factor": 1},
     ],
     ids=lambda setting: next(iter(setting)),
 )
@@ -161,14 +161,14 @@ def test_settings_that_do_not_work_with_two_scales_are_refused(setting):
 
 
 def test_the_configuration_can_be_written_and_read(capture, tmp_path):
-    config = configured(capture, tmp_path, clear="gco")
+    config = configured(capture, tmp_path, strategies="gco")
     assert yaml.load(yaml.dump(config), Loader=yaml.Loader).pipeline.model == config.pipeline.model  # noqa: S506
 
 
 @pytest.mark.parametrize("clear", ["gco", "p2g", "svs", "clear"])
 def test_nerfstudios_trainer_trains_it(capture, tmp_path, clear):
     overrides = ("strategies.p2g.patch=4",) if clear in ("p2g", "clear") else ()
-    host = trainer(configured(capture, tmp_path, clear=clear, overrides=overrides, densify_grad_thresh=1e-4))
+    host = trainer(configured(capture, tmp_path, strategies=clear, overrides=overrides, densify_grad_thresh=1e-4))
     model = host.pipeline.model
     attachment, before = model.attached.attachment, {k: p.detach().clone() for k, p in model.gauss_params.items()}
     assert isinstance(model, ClearSplatfactoModel)
@@ -193,7 +193,7 @@ def test_nerfstudios_trainer_trains_it(capture, tmp_path, clear):
 def test_with_hr_weight_0_it_is_splatfacto_to_the_bit(capture, tmp_path):
     nothing = ("objective.lambda_hr.peak=0", "objective.lambda_hr.final=0")
     fields = {"densify_grad_thresh": 1e-4}
-    ours = trainer(configured(capture, tmp_path / "ours", clear="baseline", overrides=nothing, **fields))
+    ours = trainer(configured(capture, tmp_path / "ours", strategies="baseline", overrides=nothing, **fields))
     model = splatfacto.SplatfactoModelConfig(num_downscales=0, background_color="black")
     plain = trainer(configured(capture, tmp_path / "plain", model, **fields))
     for host in (ours, plain):
@@ -229,7 +229,7 @@ def test_evaluation_and_exports_use_the_detail_feature(capture, tmp_path):
 
 
 def test_the_scalars_of_the_iteration_are_among_the_metrics(capture, tmp_path):
-    host = trainer(configured(capture, tmp_path, clear="gco"))
+    host = trainer(configured(capture, tmp_path, strategies="gco"))
     for step in range(5):
         before_iteration(host, step)
         _, _, metrics = host.train_iteration(step)
@@ -238,7 +238,7 @@ def test_the_scalars_of_the_iteration_are_among_the_metrics(capture, tmp_path):
 
 
 def test_a_resumed_training_continues_at_its_iteration(capture, tmp_path):
-    host = trainer(configured(capture, tmp_path, clear="gco"))
+    host = trainer(configured(capture, tmp_path, strategies="gco"))
     before_iteration(host, 7)
     host.train_iteration(7)
     before_iteration(host, 8)
