@@ -1,0 +1,1 @@
+"""In place of the CUDA module of 3DGS-style trainers."""
