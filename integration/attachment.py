@@ -34,6 +34,7 @@ from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor, HrGradients, only
 from integration.autograd_shot import AutogradShot
+from integration.detail import keep_from_drifting
 from integration.errors import HostError
 from integration.host_score import ScoreScaler, score_for_host
 
@@ -243,6 +244,8 @@ class Attachment:
         values = {name: p.detach() for name, p in trained.items()}
         hr_trained = None if hr_grads is None else only(hr_grads, trained)
         merged = self.conductor.merge(values, g_lr, hr_trained, self.t)
+        if "detail" in merged.grads:
+            keep_from_drifting(trained["detail"], self.accumulation)
         for name, p in trained.items():
             # Without HR the gradient of f_det is 0 and not None, so that its Adam counts every step.
             g = merged.grads[name] * grad_scale if name in merged.grads else torch.zeros_like(p)

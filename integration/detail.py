@@ -21,6 +21,16 @@ def detail_adam(detail: torch.nn.Parameter) -> torch.optim.Adam:
     return torch.optim.Adam([detail], lr=rates.detail, eps=rates.eps)
 
 
+def keep_from_drifting(detail: Float[Tensor, "N 3"], accumulation: int = 1) -> None:
+    """Lose the share of f_det that our trainer loses per step: L_HF does not change with a constant added to the colours,
+    so that nothing else would hold the mean of f_det.
+
+    Args:
+        accumulation: merges per step of the host.
+    """
+    detail.mul_(1 - LearningRates().detail_decay / accumulation)
+
+
 def sh0_offset(detail: Float[Tensor, "N 3"], sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
     """f_det as an offset of the constant SH band."""
     return (detail / SH_C0).view_as(sh0)

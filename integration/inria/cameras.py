@@ -52,7 +52,9 @@ class HostViews:
         self, cameras: Sequence[Any], sr: SuperResolve, factor: int, device: torch.device | str = "cpu"
     ) -> None:
         if not cameras:
-            raise SettingError("cameras: at least one training camera is needed, got none. Pass scene.getTrainCameras().")
+            raise SettingError(
+                "cameras: at least one training camera is needed, got none. Pass scene.getTrainCameras()."
+            )
         names = [camera.image_name for camera in cameras]
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise DataError(

@@ -75,7 +75,7 @@ def test_fifty_steps_equal_those_of_our_own_trainer(name, attached):
     own = TrainState.start(
         scene, conductor(name), settings=FitSettings(iterations=STEPS, degree_every=1, fused="off", scale_schedule=False),
         density=DensitySettings(start=1_000, stop=1_001),
-        rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1), detail_decay=0.0, eps=EPS),
+        rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1), eps=EPS),
         mip=MipFilter(variance=0),
     )  # fmt: skip
     own.field.double()

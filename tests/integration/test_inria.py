@@ -99,7 +99,7 @@ def test_its_steps_equal_those_of_our_own_trainer(inria_host, inria_capture):
         replace(toy_scene, train=views), conductors[1],
         settings=FitSettings(iterations=STEPS, degree_every=1, fused="off", scale_schedule=False),
         density=DensitySettings(start=1_000, stop=1_001),
-        rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1), detail_decay=0.0),
+        rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1)),
         mip=MipFilter(variance=0),
     )  # fmt: skip
     own.field.double()
