@@ -6,6 +6,7 @@ minors of the factor T of Σ = T Tᵀ (Cauchy-Binet), which has only positive te
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -100,13 +101,17 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings) -> Project
         row_x = (camera.fx * axes[:, 0] + jx[:, None] * axes[:, 2]) / z[:, None]
         row_y = (camera.fy * axes[:, 1] + jy[:, None] * axes[:, 2]) / z[:, None]
 
-        a, b, c = (row_x * row_x).sum(-1), (row_x * row_y).sum(-1), (row_y * row_y).sum(-1)
-        root_det = torch.linalg.vector_norm(torch.linalg.cross(row_x, row_y), dim=-1)  # √det Σ', det = Σ minors²
-        k = settings.kernel
-        det = root_det * root_det + k * (a + c) + k * k
-        conics = torch.stack((c + k, -b, a + k), dim=-1) / det[:, None]
+        # Lengths in units of the larger of T's largest entry and √kernel, so that fourth powers neither over- nor underflow.
+        # The unit cancels, so it needs no gradient.
+        unit = torch.cat((row_x, row_y), dim=-1).detach().abs().amax(-1).clamp_min(math.sqrt(settings.kernel))
+        tx, ty, k = row_x / unit[:, None], row_y / unit[:, None], settings.kernel / unit / unit
+        a, b, c = (tx * tx).sum(-1), (tx * ty).sum(-1), (ty * ty).sum(-1)
+        area = torch.linalg.vector_norm(torch.linalg.cross(tx, ty), dim=-1)  # √det(T Tᵀ), det = Σ minors²
+        blur = k * (a + c) + k * k
+        det = area * area + blur  # det Σ'
+        conics = torch.stack((c + k, -b, a + k), dim=-1) / (det * unit * unit)[:, None]
         if settings.antialiased:
-            opacities = opacities * root_det * torch.rsqrt(det)
+            opacities = opacities * _compensation(area, blur)
 
         basis = spherical_harmonics(_directions(means, camera.center.to(means)), splats.shN.shape[1])
         coefficients = torch.cat((splats.sh0.detach()[rows], splats.shN.detach()[rows]), dim=1)
@@ -120,7 +125,7 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings) -> Project
     with torch.no_grad():
         # alpha >= alpha_min  <=>  exponent <= power_max, with a margin; `blend` applies the exact cut-off per pixel.
         power_max = (opacities / settings.alpha_min).log() * (1 + 1e-3) + 1e-3
-        half = torch.sqrt(2 * power_max.clamp_min(0)[:, None] * torch.stack((a + k, c + k), dim=-1))
+        half = torch.sqrt(2 * power_max.clamp_min(0)[:, None] * torch.stack((a + k, c + k), dim=-1)) * unit[:, None]
     return Projection(
         len(splats),
         rows,
@@ -142,6 +147,17 @@ def _candidates(splats: Splats, pose: Float[Tensor, "4 4"], settings: RasterSett
     depth = splats.means.detach() @ pose[2, :3] + pose[2, 3]
     keep: Tensor = (depth > settings.near) & (splats.opacities.detach() >= settings.alpha_min)
     return torch.nonzero(keep)[:, 0]
+
+
+def _compensation(area: Float[Tensor, " M"], blur: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
+    """ρ = area / √(area² + blur), the opacity factor of Mip-Splatting.
+
+    For a large footprint ρ is 1 - blur / 2 area², whose gradient would be the difference of two numbers near 1 / area;
+    1 / √(1 + blur / area²) has no such difference.
+    """
+    large = area * area > blur
+    share = blur / torch.where(large, area, 1.0).square()
+    return torch.where(large, torch.rsqrt(1 + share), area * torch.rsqrt(torch.where(large, 1.0, area * area + blur)))
 
 
 def _jacobian(tan_x: Tensor, tan_y: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:

@@ -175,3 +175,21 @@ def test_an_unknown_backend_is_refused():
 def test_lanes_must_be_positive():
     with pytest.raises(ValueError, match="lanes"):
         ReferenceRasterizer(lanes=0)
+
+
+@pytest.mark.parametrize("pixels", [1e3, 1e5, 1e7, 1e9])
+@pytest.mark.parametrize("shape", [(1.0, 0.7, 0.4), (1.0, 0.01, 0.01)])
+def test_float32_gradients_of_huge_footprints_agree_with_float64(pixels, shape):
+    """The opacity's compensation is then 1 minus a tiny number, whose gradient must not be a difference of large ones."""
+    camera = Camera(torch.eye(4), 100.0, 100.0, 33.0, 24.0, 65, 47)
+    v = torch.randn(1, 47, 65, 3, generator=torch.Generator().manual_seed(0))
+    splats = replace(
+        one(0.6, z=1.0, dtype=torch.float32),
+        means=torch.tensor([[0.05, -0.02, 1.0]]),
+        quats=torch.tensor([[0.8, -0.3, 0.5, 0.2]]),
+        scales=torch.tensor([shape]) * pixels / 100,
+    )
+    found, exact = (ReferenceRasterizer()(s, camera).vjp(v.to(s.means)) for s in (splats, to(splats, torch.float64)))
+    for name in ("means", "quats", "scales", "opacities", "sh0", "screen"):
+        a, b = getattr(found, name).double(), getattr(exact, name)
+        assert float((a - b).norm()) <= 2e-5 * float(b.norm()), name
