@@ -3,12 +3,51 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.interface import Camera, Splats
+from rasterizers.interface import Camera, Splats, Traits
+
+
+_SHAPES: Final = {
+    "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (None, 3), "rgb_offset": (3,),
+}  # fmt: skip
+_BANDS: Final = (0, 3, 8, 15)
+
+
+def require_splats(splats: Splats, traits: Traits) -> None:
+    """Refuse splats whose tensors differ in dtype, device or number of rows, or that the backend does not draw.
+
+    Raises:
+        TypeError: a tensor's dtype or device is not the backend's, or is not that of the means.
+        ValueError: a tensor has another shape than `Splats` says.
+    """
+    means = splats.means
+    if means.dtype not in traits.dtypes or means.device.type not in traits.devices:
+        drawn = " and ".join(sorted(str(dtype).removeprefix("torch.") for dtype in traits.dtypes))
+        raise TypeError(
+            f"this rasterizer draws {drawn} tensors on {' or '.join(sorted(traits.devices))}, "
+            f"got splats.means of {_kind(means)}; move the splats there, or load another backend."
+        )
+    for name, row in _SHAPES.items():
+        value = getattr(splats, name)
+        if value is None:
+            continue
+        if value.dtype != means.dtype or value.device != means.device:
+            raise TypeError(f"splats.{name} must be {_kind(means)}, as splats.means is, got {_kind(value)}.")
+        shape, expected = tuple(value.shape), (len(means), *row)
+        if len(shape) != len(expected) or any(e is not None and s != e for s, e in zip(shape, expected, strict=True)):
+            written = ", ".join("B" if size is None else str(size) for size in expected)
+            raise ValueError(f"splats.{name} must have the shape [{written}], got {list(shape)}.")
+    if (bands := splats.shN.shape[1]) not in _BANDS:
+        raise ValueError(f"splats.shN must hold 0, 3, 8 or 15 bands, got {bands}.")
+
+
+def _kind(tensor: Tensor) -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
 
 
 def require_finite(splats: Splats) -> None:

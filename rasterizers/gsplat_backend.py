@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import refine_mask, require_cotangents, require_finite, require_tiles
+from rasterizers.checks import refine_mask, require_cotangents, require_finite, require_splats, require_tiles
 from rasterizers.geometry import SH_C0, spherical_harmonics
 from rasterizers.interface import (
     BackendUnavailable,
@@ -79,14 +79,12 @@ class GsplatRasterizer(RasterSettings):
         """Draw.
 
         Raises:
-            ValueError: the splats are on another device, not float32 or not finite, or the tile mask has a wrong shape.
+            TypeError: the splats are on another device, or not float32.
+            ValueError: they are not finite, or a tensor or the tile mask has a wrong shape.
         """
         if tiles is not None:
             require_tiles(tiles, camera.width, camera.height, self.tile)
-        if splats.means.device.type != self.device or splats.means.dtype != torch.float32:
-            raise ValueError(
-                f"gsplat draws float32 tensors on {self.device}, got {splats.means.dtype} on {splats.means.device}."
-            )
+        require_splats(splats, self.traits)
         require_finite(splats)
         names = ("means", "quats", "scales", "opacities", "sh0", "shN")
         with torch.enable_grad():

@@ -22,6 +22,7 @@ from rasterizers.checks import (
     packed_rows,
     require_cotangents,
     require_finite,
+    require_splats,
     require_tiles,
     same_gaussians_and_pose,
 )
@@ -33,6 +34,7 @@ _TRAITS: Final = Traits(
     dtypes=frozenset({torch.float32, torch.float64}),
     native_threads=True,
 )
+_LONGEST_SIDE: Final = 32 << 15  # px: bins of 32 px are numbered in 16 bits
 _BLOCK: Final = 4  # px, the block that the kernels blend at once; tiles are a multiple of it
 
 
@@ -42,7 +44,8 @@ class CppRasterizer(RasterSettings):
 
     Args:
         tile: edge of the tile mask's tiles, px, a multiple of 4. Tiles of 32 px are skipped at no cost.
-        memory: MiB that the lists of one image may take; beyond it the image is drawn in bands, with the same bits.
+        memory: MiB that the lists of one image, and of its gradients, may take; beyond it the image is drawn in parts, with
+            the same bits. `MemoryError` before anything is drawn, where a single part of 32 px is beyond it.
         threads: None: `rasterizers.native.threads()`.
         isa: instruction set of the kernels in float32, "avx512", "avx2" or "baseline"; None: the fastest here.
 
@@ -89,6 +92,13 @@ class CppRasterizer(RasterSettings):
         return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
 
 
+def _require_side(camera: Camera) -> None:
+    if max(camera.width, camera.height) > _LONGEST_SIDE:
+        raise ValueError(
+            f"the cpp rasterizer draws images of up to {_LONGEST_SIDE} px a side, got {camera.width}x{camera.height}."
+        )
+
+
 def _kernels(dtype: torch.dtype, isa: str | None) -> ModuleType:
     """The module for the instruction set; in float64, which is for checks, one module serves all processors."""
     return load_kernels(__name__, isa) if dtype == torch.float32 else importlib.import_module(f"{__name__}._float64")
@@ -108,10 +118,10 @@ class _Frame:
         for mask, (_, view) in zip(masks, jobs, strict=True):
             if mask is not None:
                 require_tiles(mask, view.width, view.height, settings.tile)
-        n, like = len(splats), splats.means
-        dtype = like.dtype
-        if dtype not in _TRAITS.dtypes or like.device.type != "cpu":
-            raise TypeError(f"the cpp rasterizer draws float32 and float64 on the CPU, got {dtype} on {like.device}.")
+        for job, view in jobs:
+            require_splats(job, _TRAITS)
+            _require_side(view)
+        n = len(splats)
         self.settings = settings
         self.threads = settings.threads if settings.threads is not None else threads()
         self.cameras = [camera for _, camera in jobs]
@@ -120,7 +130,7 @@ class _Frame:
         # Referenced here because the native frame does not keep them alive.
         self.opacities = [job.opacities.detach().contiguous() for job, _ in jobs]
         self.offsets = [None if job.rgb_offset is None else job.rgb_offset.detach().contiguous() for job, _ in jobs]
-        self.native = _kernels(dtype, settings.isa).Frame(
+        self.native = _kernels(splats.means.dtype, settings.isa).Frame(
             kernel=settings.kernel,
             near=settings.near,
             alpha_min=settings.alpha_min,

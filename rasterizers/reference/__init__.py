@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import require_cotangents, require_finite
+from rasterizers.checks import require_cotangents, require_finite, require_splats
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.reference.blend import blend, blend_vjp
 from rasterizers.reference.projection import Projection, project
@@ -50,6 +50,7 @@ class ReferenceRasterizer(RasterSettings):
         return _TRAITS
 
     def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
+        require_splats(splats, _TRAITS)
         require_finite(splats)
         grid = TileGrid(camera.width, camera.height, self.tile)
         projection = project(splats, camera, self)

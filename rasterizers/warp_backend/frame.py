@@ -21,7 +21,14 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import packed_rows, refine_mask, require_cotangents, require_finite, require_tiles
+from rasterizers.checks import (
+    packed_rows,
+    refine_mask,
+    require_cotangents,
+    require_finite,
+    require_splats,
+    require_tiles,
+)
 from rasterizers.interface import Camera, SplatGradients, Splats
 from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
@@ -83,13 +90,9 @@ class Frame:
         for mask, (_, view) in zip(tiles, jobs, strict=True):
             if mask is not None:
                 require_tiles(mask, view.width, view.height, settings.tile)
-        like = splats.means
-        if like.dtype != torch.float32 or like.device.type != settings.device:
-            raise TypeError(
-                f"this warp rasterizer draws float32 on {settings.device}, got {like.dtype} on {like.device}. "
-                "Move the splats there, or load it with another device."
-            )
-        self.settings, self.jobs, self.n, self.like = settings, jobs, len(splats), like.detach()
+        for job, _ in jobs:
+            require_splats(job, settings.traits)
+        self.settings, self.jobs, self.n, self.like = settings, jobs, len(splats), splats.means.detach()
         self.pose, self.cuts = _pose_struct(camera), _cuts_struct(settings)
         self.means, self.quats, self.scales = (
             x.detach().contiguous() for x in (splats.means, splats.quats, splats.scales)

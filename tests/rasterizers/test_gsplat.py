@@ -77,7 +77,7 @@ def test_render_scales_draws_each_job():
 def test_other_cut_offs_and_other_devices_are_refused():
     with pytest.raises(ValueError, match="alpha_min must stay"):
         both(alpha_min=1 / 4096)
-    with pytest.raises(ValueError, match="on cuda, got"):
+    with pytest.raises(TypeError, match="on cuda, got"):
         GsplatRasterizer(rasterization=STAND_IN)(toy.splats(5), toy.camera(0.0))
 
 

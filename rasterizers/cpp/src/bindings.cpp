@@ -1,4 +1,7 @@
 // Python bindings: `Frame`, in float32 or in float64. Checks shapes and types and releases the GIL; no arithmetic.
+//
+// Tensors are taken with `noconvert`: nanobind would pass a converted copy, which is freed when the call returns, while the
+// frame keeps pointers into it.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
@@ -20,6 +23,8 @@ template <class T, std::int64_t... shape>
 using Write = nb::ndarray<T, nb::shape<shape...>, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Rows = nb::ndarray<const T, nb::shape<-1, -1, 3>, nb::device::cpu>;  // shN: rows need not be contiguous to each other
+
+inline auto tensor(const char* name) { return nb::arg(name).noconvert(); }
 
 inline void require(bool holds, const char* rule) {
   if (!holds) throw nb::value_error(rule);
@@ -95,7 +100,7 @@ void bind_frame(nb::module_& m) {
                require(opacities[i].shape(0) == n && means2d[i].shape(0) == n && visible[i].shape(0) == n &&
                            (!offsets[i] || offsets[i]->shape(0) == n),
                        "every tensor of a pixel grid must have one row per Gaussian");
-               targets[i].grid = {T(g[0]), T(g[1]), T(g[2]), T(g[3]), int(g[4]), int(g[5])};
+               targets[i].grid = {g[0], g[1], g[2], g[3], int(g[4]), int(g[5])};
                targets[i].opacities = opacities[i].data();
                targets[i].rgb_offset = offsets[i] ? offsets[i]->data() : nullptr;
                targets[i].means2d = means2d[i].data();
@@ -105,9 +110,9 @@ void bind_frame(nb::module_& m) {
              nb::gil_scoped_release release;
              return self.project(splats, std::move(targets), threads);
            },
-           nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("sh0"), nb::arg("shN"), nb::arg("grids"),
-           nb::arg("opacities"), nb::arg("offsets"), nb::arg("means2d"), nb::arg("visible"), nb::arg("tiles"),
-           nb::arg("edge"), nb::arg("threads"))
+           tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"), tensor("shN"), nb::arg("grids"),
+           tensor("opacities"), tensor("offsets"), tensor("means2d"), tensor("visible"), tensor("tiles"), nb::arg("edge"),
+           nb::arg("threads"))
       .def_static("empty", &empty<T>, nb::rv_policy::reference)
       .def("pairs", &F::pairs)
       .def("draw",
@@ -116,7 +121,7 @@ void bind_frame(nb::module_& m) {
              nb::gil_scoped_release release;
              self.draw(i, pixels, cover, threads);
            },
-           nb::arg("grid"), nb::arg("image"), nb::arg("alpha"), nb::arg("threads"))
+           nb::arg("grid"), tensor("image"), tensor("alpha"), nb::arg("threads"))
       .def("vjp",
            [](F& self, int i, Read<T, -1, -1, -1, 3> cotangents, Read<T, -1, 3> means, Read<T, -1, 4> quats,
               Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1, 3> d_means,
@@ -129,14 +134,19 @@ void bind_frame(nb::module_& m) {
              const T* v = cotangents.data();
              nb::gil_scoped_release release;
              self.vjp(i, K, v, splats, out, threads);
-           })
+           },
+           nb::arg("grid"), tensor("cotangents"), tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"),
+           tensor("shN"), tensor("d_means"), tensor("d_quats"), tensor("d_scales"), tensor("d_opacities"),
+           tensor("d_screen"), tensor("d_rgb"), nb::arg("threads"))
       .def("basis", [](F& self, Read<T, -1, 3> means, Read<T, -1, 4> quats, Read<T, -1, 3> scales,
                        Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1> out, int threads) {
         Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
         T* y = out.data();
         nb::gil_scoped_release release;
         self.basis(splats, y, threads);
-      });
+      },
+      tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"), tensor("shN"), tensor("out"),
+      nb::arg("threads"));
 }
 
 }  // namespace clear

@@ -1,0 +1,82 @@
+"""The tensors of `Splats` have one dtype, one device and one row per Gaussian; every backend refuses others in a sentence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from rasterizers.cpp import CppRasterizer
+from rasterizers.interface import Splats
+from rasterizers.reference import ReferenceRasterizer
+from rasterizers.testing import scene
+from tests.helpers.backends import BACKENDS, camera, why_not
+
+OTHERS = ("quats", "scales", "opacities", "sh0", "shN", "rgb_offset")
+ROWS = ("opacities", "rgb_offset", "shN", "quats", "scales", "sh0")
+
+
+@pytest.fixture(params=["torch", *BACKENDS])
+def draw(request):
+    if request.param == "torch":
+        return ReferenceRasterizer()
+    if reason := why_not(request.param):
+        pytest.skip(reason)
+    return BACKENDS[request.param]()
+
+
+def changed(name: str, change) -> Splats:
+    """Splats with a wrong tensor. Under pytest jaxtyping would refuse it in the constructor; elsewhere nobody does."""
+    splats = scene(20)
+    object.__setattr__(splats, name, change(getattr(splats, name)))
+    return splats
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_tensor_of_another_dtype_is_refused(draw, name):
+    with pytest.raises(TypeError, match=f"^splats.{name} must be float32 on .*, as splats.means is, got float64 on .*$"):
+        draw(changed(name, torch.Tensor.double), camera())
+
+
+def test_a_tensor_of_another_dtype_in_a_second_job_is_refused(draw):
+    splats = scene(20)
+    other = replace(splats, opacities=splats.opacities.double())
+    jobs = [(splats, camera()), (other, camera().scaled(1))]
+    with pytest.raises(TypeError, match="splats.opacities must be float32"):
+        draw.render_scales(jobs)
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_a_tensor_with_another_number_of_rows_is_refused(draw, name):
+    with pytest.raises(ValueError, match=rf"^splats.{name} must have the shape \[20.*, got \[19.*$"):
+        draw(changed(name, lambda x: x[:-1]), camera())
+
+
+def test_a_tensor_on_another_device_is_refused(draw):
+    with pytest.raises(TypeError, match="splats.scales must be float32 on cpu.* got float32 on meta"):
+        draw(changed("scales", lambda x: x.to("meta")), camera())
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.int64])
+def test_a_dtype_that_no_backend_draws_is_refused(draw, dtype):
+    with pytest.raises(TypeError, match="draws float32.* got splats.means of "):
+        draw(changed("means", lambda x: x.to(dtype)), camera())
+
+
+def test_bands_that_no_degree_has_are_refused(draw):
+    with pytest.raises(ValueError, match="splats.shN must hold 0, 3, 8 or 15 bands, got 5"):
+        draw(changed("shN", lambda x: x.new_zeros(20, 5, 3)), camera())
+
+
+@pytest.mark.skipif(bool(why_not("cpp")), reason=str(why_not("cpp")))
+def test_the_compiled_module_takes_no_converted_copy():
+    """nanobind's converted copy is freed when the call returns, and the frame would read freed memory later."""
+    frame = CppRasterizer()(scene(20), camera())._frame
+    with pytest.raises(TypeError, match="incompatible function arguments"):
+        frame.native.draw(0, torch.empty(47, 65, 3, dtype=torch.float64), torch.empty(47, 65), 1)
+    wide = [opacities.double() for opacities in frame.opacities]
+    with pytest.raises(TypeError, match="incompatible function arguments"):
+        frame.native.project(
+            *frame.shared, [[9.0, 9.0, 5.0, 5.0, 65.0, 47.0]], wide, [None], frame.means2d, frame.visible, [None], 32, 1
+        )
