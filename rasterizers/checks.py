@@ -11,7 +11,6 @@ from torch import Tensor
 
 from rasterizers.interface import Camera, Splats, Traits
 
-
 _SHAPES: Final = {
     "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (None, 3), "rgb_offset": (3,),
 }  # fmt: skip

@@ -108,7 +108,7 @@ std::vector<double> drawn(int threads) {
   std::vector<T> means2d(2 * n), image(width * height * 3), alpha(width * height);
   const std::unique_ptr<bool[]> visible(new bool[n]);
   std::vector<Target<T>> targets(1);
-  targets[0].grid = {T(90), T(90), T(48), T(33), width, height};
+  targets[0].grid = {90, 90, 48, 33, width, height};
   targets[0].opacities = opacities.data(), targets[0].rgb_offset = offset.data();
   targets[0].means2d = means2d.data(), targets[0].visible = visible.get();
 

@@ -286,10 +286,16 @@ def test_numbers_that_are_not_finite_are_refused(backend, name, bad):
         backend()(replace(splats, **{name: value}), camera())
 
 
+@pytest.mark.parametrize("factor", [2, 3, 4, 5, 6, 7])
 @backends()
-def test_half_precision_is_refused(backend):
-    with pytest.raises(TypeError, match="draws float32"):
-        backend()(to(scene(3), torch.float16), camera())
+def test_two_scales_are_drawn_as_if_alone(backend, factor):
+    """Whatever the factor: 1/3 is no number of floating point, so the fields of view differ in their last bits."""
+    splats, large = scene(600, bands=3, seed=3), camera(31 * factor, 23 * factor)
+    views, rasterizer = (large.scaled(1 / factor), large), backend()
+    together = rasterizer.render_scales([(splats, view) for view in views])
+    for shared, view in zip(together, views, strict=True):
+        v = cotangents(2, view.height, view.width)
+        require_same_bits(everything(shared, v)[:-1], everything(rasterizer(splats, view), v)[:-1])  # basis: of both
 
 
 @pytest.mark.parametrize(("setting", "rule"), [({"tile": 6}, "multiple of [48]"), ({"memory": 0}, "at least 1 MiB")])

@@ -6,9 +6,10 @@ import functools
 from dataclasses import replace
 
 import pytest
+import torch
 
 import rasterizers
-from rasterizers import BackendUnavailable, native
+from rasterizers import BackendUnavailable, Camera, native
 from rasterizers.cpp import CppRasterizer
 from rasterizers.testing import check_rasterizer, scene
 from tests.helpers.agreement import require_same_bits
@@ -56,6 +57,41 @@ def test_bits_do_not_depend_on_the_memory_budget():
     bands = cpp(memory=4)(splats, view)
     assert bands._frame.native.pairs(0) * 16 > 4 << 20  # it needs several bands
     require_same_bits(everything(bands, v), one_band)
+
+
+def covering(n):
+    """Gaussians that each cover the whole image."""
+    splats = scene(n, bands=0, seed=2)
+    return replace(
+        splats, scales=torch.full_like(splats.scales, 50.0), opacities=torch.full_like(splats.opacities, 0.01)
+    )
+
+
+def test_a_row_beyond_the_budget_is_drawn_in_parts():
+    splats, view = covering(3000), camera(400, 40)
+    v = cotangents(3, 40, 400)
+    assert 3000 * 13 * 16 < 1 << 20 < 3000 * 13 * (16 + 3 * 64)  # a row of bins fits forward, and not backward
+    parts = everything(cpp(memory=1)(splats, view), v)
+    require_same_bits(parts, everything(cpp()(splats, view), v))
+
+
+def test_what_the_gradients_need_is_refused_before_the_image_is_drawn():
+    splats, view = covering(6000), camera(64, 40)
+    with pytest.raises(
+        MemoryError, match=r"^one bin of 32 px holds 6000 Gaussians, whose image and gradients need 2 MiB"
+    ):
+        cpp(memory=1)(splats, view)
+    cpp(memory=2)(splats, view).vjp(cotangents(3, 40, 64))
+
+
+@pytest.mark.parametrize("size", [(1 << 20, 1), (1, 1 << 20)])
+def test_the_longest_side_is_drawn_and_a_longer_one_refused(size):
+    splats = covering(3)
+    drawn = cpp()(splats, Camera(torch.eye(4), 10.0, 10.0, 1.0, 1.0, *size)).alpha
+    assert float(drawn.flatten()[0]) > 0
+    assert float(drawn.flatten()[-1]) == 0  # the far end sees past them
+    with pytest.raises(ValueError, match="up to 1048576 px a side"):
+        cpp()(splats, Camera(torch.eye(4), 10.0, 10.0, 1.0, 1.0, *(side + (side > 1) for side in size)))
 
 
 def test_threads_out_of_range_are_refused():

@@ -35,7 +35,9 @@ def changed(name: str, change) -> Splats:
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_tensor_of_another_dtype_is_refused(draw, name):
-    with pytest.raises(TypeError, match=f"^splats.{name} must be float32 on .*, as splats.means is, got float64 on .*$"):
+    with pytest.raises(
+        TypeError, match=f"^splats.{name} must be float32 on .*, as splats.means is, got float64 on .*$"
+    ):
         draw(changed(name, torch.Tensor.double), camera())
 
 
@@ -43,7 +45,7 @@ def test_a_tensor_of_another_dtype_in_a_second_job_is_refused(draw):
     splats = scene(20)
     other = replace(splats, opacities=splats.opacities.double())
     jobs = [(splats, camera()), (other, camera().scaled(1))]
-    with pytest.raises(TypeError, match="splats.opacities must be float32"):
+    with pytest.raises(TypeError, match=r"splats.opacities must be float32"):
         draw.render_scales(jobs)
 
 
@@ -54,24 +56,24 @@ def test_a_tensor_with_another_number_of_rows_is_refused(draw, name):
 
 
 def test_a_tensor_on_another_device_is_refused(draw):
-    with pytest.raises(TypeError, match="splats.scales must be float32 on cpu.* got float32 on meta"):
+    with pytest.raises(TypeError, match=r"splats.scales must be float32 on cpu.* got float32 on meta"):
         draw(changed("scales", lambda x: x.to("meta")), camera())
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.int64])
 def test_a_dtype_that_no_backend_draws_is_refused(draw, dtype):
-    with pytest.raises(TypeError, match="draws float32.* got splats.means of "):
+    with pytest.raises(TypeError, match=r"draws float32.* got splats.means of "):
         draw(changed("means", lambda x: x.to(dtype)), camera())
 
 
 def test_bands_that_no_degree_has_are_refused(draw):
-    with pytest.raises(ValueError, match="splats.shN must hold 0, 3, 8 or 15 bands, got 5"):
+    with pytest.raises(ValueError, match=r"splats.shN must hold 0, 3, 8 or 15 bands, got 5"):
         draw(changed("shN", lambda x: x.new_zeros(20, 5, 3)), camera())
 
 
 @pytest.mark.skipif(bool(why_not("cpp")), reason=str(why_not("cpp")))
 def test_the_compiled_module_takes_no_converted_copy():
-    """nanobind's converted copy is freed when the call returns, and the frame would read freed memory later."""
+    """Nanobind's converted copy is freed when the call returns, and the frame would read freed memory later."""
     frame = CppRasterizer()(scene(20), camera())._frame
     with pytest.raises(TypeError, match="incompatible function arguments"):
         frame.native.draw(0, torch.empty(47, 65, 3, dtype=torch.float64), torch.empty(47, 65), 1)

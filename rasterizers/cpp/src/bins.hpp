@@ -14,17 +14,25 @@
 
 namespace clear {
 
-// The pairs of a band (some rows of bins). There is one band, unless its pairs would not fit the memory budget.
+// A rectangle of bins whose pairs are listed at once, ends excluded: whole rows of bins, or a part of one row. There is one
+// band, unless its pairs would not fit the memory budget.
+struct Band {
+  int x0 = 0, x1 = 0, y0 = 0, y1 = 0;
+  int columns() const { return x1 - x0; }
+  int bins() const { return columns() * (y1 - y0); }
+  bool operator==(const Band& other) const { return x0 == other.x0 && x1 == other.x1 && y0 == other.y0 && y1 == other.y1; }
+  bool operator!=(const Band& other) const { return !(*this == other); }
+};
+
+// The pairs of a band.
 struct Bins {
-  int columns = 0, first_row = 0, end_row = 0;
+  Band band;
   Buffer<std::uint32_t> pairs;        // the Gaussian of each pair; by bin, then depth, then index
   std::vector<std::int64_t> starts;   // [bins of the band + 1]
   Buffer<std::uint64_t> masks;        // by pair: the blocks of its bin that its ellipse reaches (set by blocks.hpp)
   Buffer<std::uint32_t> first;        // [n + 1]: Gaussian i's pairs are where[first[i]] … where[first[i + 1] - 1]
   Buffer<std::uint32_t> where;        // indices into `pairs` by Gaussian, from its top left bin on
   bool has_masks = false;
-
-  int bins() const { return columns * (end_row - first_row); }
 };
 
 // The number of pairs in each row of bins. 64-bit: a million Gaussians that cover the image make 10^9 pairs.
@@ -50,18 +58,32 @@ inline std::vector<std::int64_t> count_pairs(int rows, const Buffer<BinRange>& r
   return pairs;
 }
 
-// Lists the pairs of rows [first_row, end_row) on the requested bins.
-inline void list_pairs(int columns, int first_row, int end_row, const Drawn& drawn, const Buffer<std::uint32_t>& order,
+// The number of pairs in each bin of a row.
+inline std::vector<std::int64_t> count_pairs_in_row(int row, int columns, const Buffer<BinRange>& ranges, const Drawn& drawn) {
+  std::vector<std::int64_t> pairs(columns + 1, 0);  // differences from bin to bin
+  for (std::int64_t c = 0; c < drawn.chunks(); ++c)
+    for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i) {
+      const BinRange r = ranges[*i];
+      if (r.count() && r.y0 <= row && row <= r.y1) ++pairs[r.x0], --pairs[r.x1 + 1];
+    }
+  for (int x = 1; x < columns; ++x) pairs[x] += pairs[x - 1];
+  pairs.pop_back();
+  return pairs;
+}
+
+// Lists the pairs of a band on the requested bins.
+inline void list_pairs(const Band& band, const Drawn& drawn, const Buffer<std::uint32_t>& order,
                        const Buffer<BinRange>& ranges, std::int64_t n, const Request& request, Bins& out, int threads) {
-  out.columns = columns, out.first_row = first_row, out.end_row = end_row, out.has_masks = false;
-  const int bins = out.bins();
+  out.band = band, out.has_masks = false;
+  const int bins = band.bins();
   auto clipped = [&](std::uint32_t i) {
     BinRange r = ranges[i];
-    r.y0 = std::max<int>(r.y0, first_row), r.y1 = std::max(std::min<int>(r.y1, end_row - 1), r.y0 - 1);
+    r.x0 = std::max<int>(r.x0, band.x0), r.x1 = std::max(std::min<int>(r.x1, band.x1 - 1), r.x0 - 1);
+    r.y0 = std::max<int>(r.y0, band.y0), r.y1 = std::max(std::min<int>(r.y1, band.y1 - 1), r.y0 - 1);
     return r;
   };
   auto each_bin = [&](const BinRange& r, auto&& visit) {
-    request.each_bin(r, [&](int x, int y) { visit((y - first_row) * columns + x); });
+    request.each_bin(r, [&](int x, int y) { visit((y - band.y0) * band.columns() + x - band.x0); });
   };
 
   // Count each Gaussian's pairs.

@@ -78,7 +78,8 @@ void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_
   out.first = first;
   const std::uint32_t* pairs = bins.pairs.data() + begin;
   std::uint64_t* masks = bins.masks.data() + begin;
-  const T X = T(bin % bins.columns * kBin), Y = T((bins.first_row + bin / bins.columns) * kBin);
+  const Band& band = bins.band;
+  const T X = T((band.x0 + bin % band.columns()) * kBin), Y = T((band.y0 + bin / band.columns()) * kBin);
   std::uint16_t* next[kBlocks];
   for (int b = 0; b < kBlocks; ++b) next[b] = out.places.data() + std::size_t(b) * kListStride;
   constexpr int ahead = 24;

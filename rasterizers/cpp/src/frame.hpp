@@ -3,8 +3,8 @@
 //   forward:   project -> order -> (for each band: list pairs -> blend)
 //   backward:  (for each band: list pairs -> blend_vjp) -> project_vjp
 //
-// A band is some rows of bins. There is one, unless its pairs would not fit the memory budget; the image is then drawn
-// band by band, with the same bits.
+// A band is some rows of bins, or a part of one. There is one, unless its pairs would not fit the memory budget; the image
+// is then drawn band by band, with the same bits. What the backward pass needs is checked before the forward pass begins.
 #pragma once
 
 #include "order.hpp"
@@ -49,10 +49,10 @@ class Frame {
     View& view = views_.at(i);
     const Grid<T>& grid = view.target.grid;
     view.ends.reserve_lost(std::size_t(grid.columns()) * grid.rows() * kBlocks);
-    const std::vector<int> bands = bands_of(view, kBytesPerPair);
-    for (std::size_t b = 0; b + 1 < bands.size(); ++b) {
-      list(view, bands[b], bands[b + 1], threads);
-      Pool::instance().run(threads, view.bins.bins(), [&](std::int64_t bin) { draw_bin(job(view, bin), image, alpha); });
+    bands_of(view, kBytesPerPair + kMostCotangents * sizeof(PairSums<T>));  // throws now where the gradients would not fit
+    for (const Band& band : bands_of(view, kBytesPerPair)) {
+      list(view, band, threads);
+      Pool::instance().run(threads, band.bins(), [&](std::int64_t bin) { draw_bin(job(view, bin), image, alpha); });
       view.bins.has_masks = true;
     }
   }
@@ -62,7 +62,7 @@ class Frame {
     View& view = views_.at(i);
     const std::int64_t image = std::int64_t(view.target.grid.width) * view.target.grid.height * 3;
     for (int k = 0; k < K;) {
-      const int now = std::min(3, K - k);
+      const int now = std::min(kMostCotangents, K - k);
       const std::int64_t at = k * n_;
       Gradients<T> part{out.means + 3 * at,     out.quats + 4 * at,  out.scales + 3 * at,
                         out.opacities + at, out.screen + 2 * at, out.rgb + 3 * at};
@@ -104,6 +104,7 @@ class Frame {
  private:
   // `Bins::pairs`, `where` and `masks`.
   static constexpr std::int64_t kBytesPerPair = 2 * sizeof(std::uint32_t) + sizeof(std::uint64_t);
+  static constexpr int kMostCotangents = 3;  // of one backward pass
 
   struct View {
     Target<T> target;
@@ -112,43 +113,59 @@ class Frame {
     Bins bins;                          // the last listed band
   };
 
-  // Splits the rows of bins into bands whose pairs fit the budget: [0, …, rows].
-  std::vector<int> bands_of(const View& view, std::int64_t bytes_per_pair) const {
-    std::vector<int> bands = {0};
+  // Splits the image into bands whose pairs fit the budget: rows of bins, and a row that does not fit into parts of it.
+  std::vector<Band> bands_of(const View& view, std::int64_t bytes_per_pair) const {
+    const std::int64_t most = std::min(budget_ / bytes_per_pair, std::int64_t(UINT32_MAX));
+    const int columns = view.target.grid.columns(), rows = int(view.pairs_in_row.size());
+    std::vector<Band> bands;
+    int first = 0;
     std::int64_t held = 0;
-    const int rows = int(view.pairs_in_row.size());
     for (int row = 0; row < rows; ++row) {
-      const std::int64_t here = view.pairs_in_row[row] * bytes_per_pair;
-      if (here > budget_ || view.pairs_in_row[row] > std::int64_t(UINT32_MAX)) refuse(view, row, here);
-      if (held && (held + here > budget_ || (held + here) / bytes_per_pair > std::int64_t(UINT32_MAX)))
-        bands.push_back(row), held = 0;
+      const std::int64_t here = view.pairs_in_row[row];
+      if (held + here > most && row > first) bands.push_back({0, columns, first, row}), first = row, held = 0;
       held += here;
+      if (here <= most) continue;
+      split_row(view, row, most, bytes_per_pair, bands);
+      first = row + 1, held = 0;
     }
-    bands.push_back(rows);
+    if (first < rows) bands.push_back({0, columns, first, rows});
     return bands;
   }
 
-  [[noreturn]] void refuse(const View& view, int row, std::int64_t bytes) const {
+  void split_row(const View& view, int row, std::int64_t most, std::int64_t bytes_per_pair, std::vector<Band>& bands) const {
+    const std::vector<std::int64_t> pairs = count_pairs_in_row(row, view.target.grid.columns(), view.target.ranges, drawn_);
+    const int columns = int(pairs.size());
+    int first = 0;
+    std::int64_t held = 0;
+    for (int x = 0; x < columns; ++x) {
+      if (pairs[x] > most) refuse(view, pairs[x], bytes_per_pair);
+      if (held + pairs[x] > most) bands.push_back({first, x, row, row + 1}), first = x, held = 0;
+      held += pairs[x];
+    }
+    bands.push_back({first, columns, row, row + 1});
+  }
+
+  [[noreturn]] void refuse(const View& view, std::int64_t pairs, std::int64_t bytes_per_pair) const {
     std::int64_t largest = 0;
     for (std::int64_t i = 0; i < n_; ++i)
       if (view.target.ranges[i].count() > view.target.ranges[largest].count()) largest = i;
     const Ellipse<T>& e = view.target.ellipses[largest];
-    throw OverBudget("one row of bins (32 px) holds " + std::to_string(view.pairs_in_row[row]) +
-                     " pairs of Gaussian and bin, " + std::to_string(bytes >> 20) + " MiB of the " +
-                     std::to_string(budget_ >> 20) + " MiB that `memory` allows. The largest Gaussian is number " +
+    throw OverBudget("one bin of 32 px holds " + std::to_string(pairs) + " Gaussians, whose image and gradients need " +
+                     std::to_string(((pairs * bytes_per_pair) >> 20) + 1) + " MiB, and `memory` allows " +
+                     std::to_string(budget_ >> 20) + " MiB. The largest Gaussian is number " +
                      std::to_string(largest) + ", " + std::to_string(std::int64_t(std::min<T>(2 * e.half_x, T(1e9)))) +
                      " px wide. Raise `memory`, or remove Gaussians that large.");
   }
 
-  void list(View& view, int first_row, int end_row, int threads) {
-    list_pairs(view.target.grid.columns(), first_row, end_row, drawn_, order_, view.target.ranges, n_,
-               view.target.request, view.bins, threads);
+  void list(View& view, const Band& band, int threads) {
+    list_pairs(band, drawn_, order_, view.target.ranges, n_, view.target.request, view.bins, threads);
   }
 
   // The job of a bin of the band, with its requested blocks.
   BinJob<T> job(View& view, std::int64_t bin) const {
     const Grid<T>& s = view.target.grid;
-    const int x = int(bin) % view.bins.columns, y = view.bins.first_row + int(bin) / view.bins.columns;
+    const Band& band = view.bins.band;
+    const int x = band.x0 + int(bin) % band.columns(), y = band.y0 + int(bin) / band.columns();
     const std::size_t place = std::size_t(y) * s.columns() + x;
     const std::uint64_t inside = blocks_in_image(x, y, s.width, s.height);
     return {settings_,
@@ -165,16 +182,16 @@ class Frame {
 
   template <int K>
   void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
-    const std::vector<int> bands = bands_of(view, kBytesPerPair + K * sizeof(PairSums<T>));
-    const bool whole = bands.size() == 2;
+    const std::vector<Band> bands = bands_of(view, kBytesPerPair + K * sizeof(PairSums<T>));
+    const bool whole = bands.size() == 1;
     if (!whole) {
       splat_sums_.reserve_lost(std::size_t(n_) * K);
       std::memset(static_cast<void*>(splat_sums_.data()), 0, sizeof(PairSums<T>) * n_ * K);
     }
-    for (std::size_t b = 0; b + 1 < bands.size(); ++b) {
-      if (view.bins.first_row != bands[b] || view.bins.end_row != bands[b + 1]) list(view, bands[b], bands[b + 1], threads);
+    for (const Band& band : bands) {
+      if (view.bins.band != band) list(view, band, threads);
       pair_sums_.reserve_lost(view.bins.pairs.size() * K);
-      Pool::instance().run(threads, view.bins.bins(),
+      Pool::instance().run(threads, band.bins(),
                            [&](std::int64_t bin) { blend_vjp_bin<T, K>(job(view, bin), cotangents, pair_sums_.data()); });
       view.bins.has_masks = true;
       if (whole) break;

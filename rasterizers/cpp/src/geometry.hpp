@@ -69,13 +69,18 @@ struct Geometry {
     x = convert<T>(centre.x), y = convert<T>(centre.y), z = convert<T>(centre.z);
     inverse_z = L(T(1)) / z;
     tan_x = convert<T>(centre.tan_x), tan_y = convert<T>(centre.tan_y);
-    lim_x = clamp(tan_x, L(grid.left()), L(grid.right()));
-    lim_y = clamp(tan_y, L(grid.top()), L(grid.bottom()));
 
     rotation(quat);
     for (int i = 0; i < 3; ++i)
       for (int k = 0; k < 3; ++k)
         axes[3 * i + k] = (W[3 * i] * R[k] + W[3 * i + 1] * R[3 + k] + W[3 * i + 2] * R[6 + k]) * scale[k];
+    place(grid);
+  }
+
+  // What depends on the tangents at which this grid clamps.
+  CLEAR_INLINE void place(const Grid<T>& grid) {
+    lim_x = clamp(tan_x, L(grid.left), L(grid.right));
+    lim_y = clamp(tan_y, L(grid.top), L(grid.bottom));
     for (int k = 0; k < 3; ++k) {
       row_x[k] = (axes[k] - lim_x * axes[6 + k]) * inverse_z;
       row_y[k] = (axes[3 + k] - lim_y * axes[6 + k]) * inverse_z;
@@ -190,8 +195,8 @@ CLEAR_INLINE void project_vjp(const Pose& pose, const Grid<T>& grid, const Setti
     slope_y -= g.axes[6 + k] * gy;
     over_z += f.X[k] * dX[k] + f.Y[k] * dY[k];
   }
-  L dtx = L(grid.fx) * du + where((g.tan_x >= L(grid.left())) & (g.tan_x <= L(grid.right())), slope_x);
-  L dty = L(grid.fy) * dv + where((g.tan_y >= L(grid.top())) & (g.tan_y <= L(grid.bottom())), slope_y);
+  L dtx = L(grid.fx) * du + where((g.tan_x >= L(grid.left)) & (g.tan_x <= L(grid.right)), slope_x);
+  L dty = L(grid.fy) * dv + where((g.tan_y >= L(grid.top)) & (g.tan_y <= L(grid.bottom)), slope_y);
   L dx = dtx * g.inverse_z, dy = dty * g.inverse_z;
   L dz = -(dtx * g.tan_x + dty * g.tan_y + over_z) * g.inverse_z;
   for (int k = 0; k < 3; ++k) out.mean[k] = L(W[k]) * dx + L(W[3 + k]) * dy + L(W[6 + k]) * dz;

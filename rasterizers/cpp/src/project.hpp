@@ -135,7 +135,8 @@ std::uint32_t project_group(const Pose& pose, const Settings<T>& s, const Splats
   L poison = T(0);
   add_times_zero(mean, 3, poison), add_times_zero(quat, 4, poison), add_times_zero(scale, 3, poison);
   const Centre centre(pose, mean);
-  const Geometry<T> g(pose, targets[0].grid, centre, quat, scale);
+  Geometry<T> g(pose, targets[0].grid, centre, quat, scale);
+  const Grid<T>* placed = &targets[0].grid;
 
   centre.z.store(depths.data() + first);
   const Mask<T> in_front = g.z > L(s.near);
@@ -143,12 +144,11 @@ std::uint32_t project_group(const Pose& pose, const Settings<T>& s, const Splats
   for (Target<T>& target : targets) {
     const L opacity = load_row(target.opacities, first, count);
     add_times_zero(&opacity, 1, poison);
-    // The grids of one pose are nearly always scaled copies of each other; they then share the geometry, too.
+    // The grids of one pose are nearly always scaled copies of each other; they then share the geometry, too. There is one
+    // call, because two copies of inlined code may round differently.
+    if (!same_view(target.grid, *placed)) g.place(target.grid), placed = &target.grid;
     L e[kLanes];
-    const Mask<T> shows = same_view(target.grid, targets[0].grid)
-                              ? ellipse_of(centre, g, target.grid, s, opacity, e)
-                              : ellipse_of(centre, Geometry<T>(pose, target.grid, centre, quat, scale), target.grid, s,
-                                           opacity, e);
+    const Mask<T> shows = ellipse_of(centre, g, target.grid, s, opacity, e);
     const std::uint32_t visible = shows.bits() & real;
     const L uv[2] = {where(in_front, e[kWholeU] + e[kU]), where(in_front, e[kWholeV] + e[kV])};
     store_rows<2>(target.means2d, first, count, uv);

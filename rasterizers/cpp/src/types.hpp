@@ -30,24 +30,28 @@ struct Pose {
   double R[9], t[3], center[3];
 };
 
-// One pixel grid of a pose, and the tangents at which the Jacobian is clamped.
+// One pixel grid of a pose, and the tangents at which the Jacobian is clamped. These are computed in double, so that scaled
+// copies of a camera have the same ones.
 template <class T>
 struct Grid {
   T fx, fy, cx, cy;
   int width, height;
+  T left, right, top, bottom;
+
+  Grid() = default;
+  Grid(double fx, double fy, double cx, double cy, int width, int height)
+      : fx(T(fx)), fy(T(fy)), cx(T(cx)), cy(T(cy)), width(width), height(height),
+        left(T(-cx / fx - kMargin * width / (2 * fx))), right(T((width - cx) / fx + kMargin * width / (2 * fx))),
+        top(T(-cy / fy - kMargin * height / (2 * fy))), bottom(T((height - cy) / fy + kMargin * height / (2 * fy))) {}
 
   int columns() const { return (width + kBin - 1) / kBin; }
   int rows() const { return (height + kBin - 1) / kBin; }
-  static constexpr T kMargin = T(0.3);  // share of the half field of view beyond the image
-  T left() const { return -cx / fx - kMargin * T(width) / (2 * fx); }
-  T right() const { return (T(width) - cx) / fx + kMargin * T(width) / (2 * fx); }
-  T top() const { return -cy / fy - kMargin * T(height) / (2 * fy); }
-  T bottom() const { return (T(height) - cy) / fy + kMargin * T(height) / (2 * fy); }
+  static constexpr double kMargin = 0.3;  // share of the half field of view beyond the image
 };
 
 template <class T>
 bool same_view(const Grid<T>& a, const Grid<T>& b) {
-  return a.left() == b.left() && a.right() == b.right() && a.top() == b.top() && a.bottom() == b.bottom();
+  return a.left == b.left && a.right == b.right && a.top == b.top && a.bottom == b.bottom;
 }
 
 // The tensors of rasterizers.interface.Splats that are shared by all grids.
