@@ -34,6 +34,10 @@ class StrategyConflict(ClearError, TypeError):
     """Two strategies answer a question that only one may answer."""
 
 
+class DivergedError(ClearError, FloatingPointError):
+    """A number is NaN or infinite. The message names the tensor, the Gaussian, the view and the iteration."""
+
+
 class AnchorError(ClearError, RuntimeError):
     """The number of Gaussians changed after their anchor was taken (Eq. 16)."""
 

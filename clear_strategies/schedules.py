@@ -15,6 +15,9 @@ from clear_strategies.errors import SettingError
 REFERENCE_ITERATIONS: Final = 10_000
 _MILESTONE: Final = "milestone"
 
+LARGEST_RATE: Final = 100.0
+"""The largest learning rate: a step changes a logit or a log scale by about the rate, and all of their range is 40."""
+
 Settings = TypeVar("Settings")
 
 
@@ -81,8 +84,8 @@ class WarmupDecay:
                 "start <= full <= decay_from <= end must hold, got "
                 f"{self.start}, {self.full}, {self.decay_from}, {self.end}."
             )
-        if not (self.peak >= 0 and self.final >= 0):
-            raise SettingError(f"weights must be >= 0, got peak={self.peak}, final={self.final}.")
+        if not (0 <= self.peak < math.inf and 0 <= self.final < math.inf):
+            raise SettingError(f"weights must be >= 0 and finite, got peak={self.peak}, final={self.final}.")
         if self.decay not in ("linear", "cosine", "exponential"):
             raise SettingError(f"decay must be linear, cosine or exponential, got {self.decay!r}.")
         if self.decay == "exponential" and not (self.final > 0 and self.peak > 0):
@@ -149,8 +152,10 @@ class LogLinear:
     end: int = milestone(10_000)
 
     def __post_init__(self) -> None:
-        if not (self.initial > 0 and self.final > 0):
-            raise SettingError(f"learning rates must be > 0, got {self.initial} and {self.final}.")
+        if not (0 < self.initial <= LARGEST_RATE and 0 < self.final <= LARGEST_RATE):
+            raise SettingError(
+                f"learning rates must lie in (0, {LARGEST_RATE:g}], got {self.initial} and {self.final}."
+            )
 
     def __call__(self, t: int) -> float:
         share = min(max(t / max(self.end, 1), 0.0), 1.0)

@@ -32,6 +32,10 @@ class Grads(dict[str, Tensor]):
         super().__init__(values or {})
         self.screen = screen
 
+    def table(self) -> Mapping[str, Tensor]:
+        """What must be finite before a step, by name."""
+        return self
+
     def __add__(self, other: Mapping[str, Tensor]) -> Grads:
         total = Grads(self)
         for name, value in other.items():

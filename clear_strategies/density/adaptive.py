@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Shot
 from clear_strategies.density.base import DensityError, require_in_range, structure_marks
 from clear_strategies.density.threshold import count_passing, topk_mask
@@ -148,8 +149,11 @@ class Density:
 
         Raises:
             DensityError: fewer than min_gaussians would be left.
+            DivergedError: a parameter is not finite.
         """
         s, n = self.settings, len(field)
+        # NaN fails every comparison: such a Gaussian would be pruned as if it were faint.
+        require_finite(f"t={t}: before densification, the parameter", field.raw())
         chosen = self._chosen()
         largest = field.scales.data.exp().amax(-1)
         split = chosen & (largest > s.clone_below * self.extent)

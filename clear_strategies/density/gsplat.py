@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import ATTRIBUTES, Shot
 from clear_strategies.density.base import DensityError, require_in_range, structure_marks
 from clear_strategies.density.threshold import topk_threshold
@@ -182,6 +183,7 @@ class GsplatDensifier:
 
         Raises:
             DensityError: it left too few Gaussians, or rows that do not belong together.
+            DivergedError: a parameter was not finite.
         """
         seen, self._view_scores = self._view_scores, None
         if seen is None:
@@ -191,6 +193,7 @@ class GsplatDensifier:
         self.ordinary += torch.where(seen.visible, seen.ordinary, 0.0)
         self.count += seen.visible
         rates = optimizer.rates.at(optimizer.steps, optimizer.extent)
+        before = field.raw()
         params, optimizers = lend(field, optimizer, rates)
         if not self._checked:
             self._check(params, optimizers)
@@ -202,6 +205,8 @@ class GsplatDensifier:
             self.strategy.step_pre_backward(params, optimizers, self.state, t, info)
             self.strategy.step_post_backward(params, optimizers, self.state, t, info, **rest)
         moved = not lent.unchanged(params[_ROWS])
+        if moved:  # NaN fails every comparison: such a Gaussian would be pruned as if it were faint
+            require_finite(f"t={t}: before densification, the parameter", before)
         parents = take_back(field, optimizer, params, optimizers, self.kind, moved=moved)
         self._remark(t, seen, info, optimizer)
         changed = moved and not torch.equal(parents, torch.arange(n, device=parents.device))

@@ -16,6 +16,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.deferred import Number, Scalar
 from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, Shot, conflict_ratio, to_ndc
 from clear_strategies.core.view import View
 from clear_strategies.core.work_log import WorkLog
@@ -34,6 +35,10 @@ class ScreenGradient(Protocol):
 
     @property
     def screen(self) -> Float[Tensor, "N 2"] | None: ...
+
+    def table(self) -> Mapping[str, Tensor]:
+        """What must be finite before a step, one row per Gaussian, by name."""
+        ...
 
 
 G = TypeVar("G", bound=ScreenGradient)
@@ -208,6 +213,7 @@ class Conductor:
 
         Raises:
             ValueError: a scale that the objective needs was not rendered.
+            DivergedError: a loss or a gradient is not finite; neither `params` nor the optimizer have changed.
         """
         o, stage = self.objective, self.work_log.stage
         vjp: Callable[..., Sequence[Any]] = _vjp if stepper is None else stepper.vjp
@@ -221,6 +227,8 @@ class Conductor:
         with stage("losses LR"):
             low = rendered.image.detach()
             l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, view.lr.image)  # Eq. 4
+        where = f"t={t}, view {view.name}"
+        require_finite_losses(where, l_lr.values, {"the LR photo": view.lr.image, "the LR render": low})
         g_lr: Any = None
         from_hr: HrGradients[Any] | None = None
         if not reduced:
@@ -231,21 +239,23 @@ class Conductor:
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            g_mean, from_hr = self._backward_hr(hr, view, vjp, through_mean)
+            g_mean, from_hr = self._backward_hr(hr, view, vjp, where, through_mean)
             g_lr = g_mean if reduced else g_lr
         with stage("strategies" if stepper is None else stepper.stage):
             score, ordinary = self.scores(to_ndc(_screen(g_lr), _size(rendered.image)), from_hr, t)  # S^dens   Eq. 14
             if stepper is None:
                 merged = self.merge(params, g_lr, from_hr, t)
+                require_finite(f"{where}: the merged gradient", merged.grads)
                 grads, conflict = merged.grads, merged.conflict
             else:
+                _require_finite_parts(where, g_lr, from_hr)
                 grads, conflict = None, stepper.step(params, g_lr, from_hr, t)
         e, losses = (None, {}) if from_hr is None else (from_hr.evidence, from_hr.losses)
         return Update(grads, score, ordinary, e, conflict, {**l_lr.values, **losses}, self.logs())
 
     def hr_gradients(self, hr: Shot, view: View) -> HrGradients[Grads]:
         """Compare Î_HR with the SR image, backpropagate both losses in one pass, and ask for the evidence."""
-        return self._backward_hr(hr, view, _vjp)[1]
+        return self._backward_hr(hr, view, _vjp, f"view {view.name}")[1]
 
     def merge(self, params: Mapping[str, Tensor], g_lr: Grads, hr: HrGradients[Grads] | None, t: int) -> Merged:
         """The merge: g_LR + λ_HR ĝ_HR + λ∇L_stab.
@@ -327,12 +337,22 @@ class Conductor:
         return {name: value for s in self.strategies for name, value in s.logs.items()}
 
     def _backward_hr(
-        self, hr: Shot, view: View, vjp: Callable[..., Sequence[Any]], lr_cotangents: Tensor | None = None
+        self,
+        hr: Shot,
+        view: View,
+        vjp: Callable[..., Sequence[Any]],
+        where: str,
+        lr_cotangents: Tensor | None = None,
     ) -> tuple[Any | None, HrGradients[Any]]:
-        """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
+        """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses.
+
+        Args:
+            where: for messages.
+        """
         stage = self.work_log.stage
         with stage("losses HR"):
             losses = self.objective.hr(hr.image.detach(), view.hr.image)  # Eq. 5
+        require_finite_losses(where, losses.values, {"the SR image": view.hr.image, "the HR render": hr.image})
         with stage("backward HR"):  # one pass for all cotangents
             both = losses.cotangents if lr_cotangents is None else torch.cat((lr_cotangents, losses.cotangents))
             gradients = list(vjp(hr, both))
@@ -364,6 +384,20 @@ class Conductor:
             else:
                 total = total + g
         return total
+
+
+def _require_finite_parts(where: str, g_lr: Any, hr: HrGradients[Any] | None) -> None:
+    """Check what a `Stepper` merges: the gradients, and the weights of the strategies."""
+    parts: dict[str, Mapping[str, Tensor]] = {"∇L_LR": g_lr.table()}
+    if hr is not None:
+        parts |= {"∇L_base": hr.base.table()} | ({} if hr.hf is None else {"∇L_HF": hr.hf.table()})
+        weights = {} if hr.evidence is None else {"reliability": hr.evidence.reliability}
+        parts["the evidence"] = weights | ({"m": hr.m} if isinstance(hr.m, Tensor) else {})
+    checked: set[int] = set()  # both scales may share a tensor, e.g. the basis
+    for part, tensors in parts.items():
+        new = {name: x for name, x in tensors.items() if id(x) not in checked}
+        require_finite(f"{where}: {part}", new)
+        checked |= {id(x) for x in new.values()}
 
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:

@@ -20,6 +20,7 @@ from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
+from clear_strategies.errors import DivergedError
 from clear_strategies.merging.conductor import Update
 from clear_strategies.training import checkpoint, pseudo_views
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
@@ -95,7 +96,7 @@ def fit(
 
     Raises:
         Interrupted: after a signal, once the step is done and saved.
-        DivergedError: a parameter became NaN or infinite; the message names it.
+        DivergedError: a loss, a gradient or a parameter became NaN or infinite; the state before that step is saved.
     """
     settings = state.settings
 
@@ -109,7 +110,10 @@ def fit(
         ended = state.ended
         while not ended:
             done = state.t
-            iterate(state, rasterizer)
+            try:
+                iterate(state, rasterizer)
+            except DivergedError as error:
+                raise DivergedError(f"{error} {_what_to_do(save())}") from error
             ended = state.ended
             state.history[-1]["seconds"] = time.perf_counter() - began
             if settings.probe_every and (done % settings.probe_every == 0 or ended):
@@ -119,12 +123,15 @@ def fit(
             if pending:
                 raise Interrupted(foremost(pending), save(), state.t)
             if settings.checkpoint_every and done % settings.checkpoint_every == 0 and not ended:
-                state.require_finite()
                 save()
-    state.require_finite()
     save()
     state.history_as_floats()
     return state
+
+
+def _what_to_do(saved: Path | None) -> str:
+    where = "" if saved is None else f"The state before that step is {saved}. "
+    return f"{where}Check that view's photos, or lower the learning rates."
 
 
 def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Number]:

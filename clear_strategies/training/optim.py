@@ -12,7 +12,7 @@ from torch import Tensor
 
 from clear_strategies.core.gradients import ATTRIBUTES
 from clear_strategies.errors import SettingError
-from clear_strategies.schedules import LogLinear
+from clear_strategies.schedules import LARGEST_RATE, LogLinear
 
 BETA1: Final = 0.9
 BETA2: Final = 0.999
@@ -47,9 +47,11 @@ class LearningRates:
     rows: Literal["all", "visible"] = "all"
 
     def __post_init__(self) -> None:
-        for name in ("quats", "scales", "opacities", "sh0", "shN", "detail", "eps"):
-            if not getattr(self, name) >= 0:
-                raise SettingError(f"{name} must be >= 0, got {getattr(self, name)}.")
+        for name in ("quats", "scales", "opacities", "sh0", "shN", "detail"):
+            if not 0 <= getattr(self, name) <= LARGEST_RATE:
+                raise SettingError(f"{name} must lie in [0, {LARGEST_RATE:g}], got {getattr(self, name)}.")
+        if not 0 <= self.eps < 1:
+            raise SettingError(f"eps must lie in [0, 1), got {self.eps}.")
         if not 0 <= self.detail_decay < 1:
             raise SettingError(f"detail_decay must lie in [0, 1), got {self.detail_decay}.")
         if self.rows not in ("all", "visible"):

@@ -14,10 +14,11 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
+from clear_strategies.core.finite import is_finite, rows_not_finite
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.base import Densifier, DensifierSettings, cameras_extent
-from clear_strategies.errors import ClearError, DataError
+from clear_strategies.errors import DataError, DivergedError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
@@ -29,10 +30,6 @@ from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import SkipPolicy, Skips
 
 _log = logging.getLogger(__name__)
-
-
-class DivergedError(ClearError, FloatingPointError):
-    """A parameter is no longer a finite number; the last checkpoint is from before that."""
 
 
 @dataclass(slots=True)
@@ -157,6 +154,12 @@ class TrainState:
         return self.t % self.mip.every == 0 and self.t <= self.settings.iterations - self.mip.last
 
     def checkpoint(self, config: Mapping[str, Any]) -> Checkpoint:
+        """What a run needs to continue.
+
+        Raises:
+            DivergedError: a parameter or moment is not finite, so that nobody saves it.
+        """
+        self.require_finite()
         tensors: dict[str, Tensor] = {}
         for prefix, table in (
             ("field", {**self.field.raw(), "filter_3d": self.field.filter_3d}),
@@ -188,6 +191,7 @@ class TrainState:
             tables.setdefault(prefix, {})[rest] = value
         try:
             parameters, device = tables["field"], self.device
+            self._require_rows(tables, saved)
             self.field = GaussianField(parameters, degree=int(saved.facts["degree"])).to(device)
             self.field.filter_3d = parameters["filter_3d"].to(device, copy=True)
             self.optimizer.load_state_dict(tables["optimizer"], int(saved.facts["optimizer_steps"]))
@@ -201,12 +205,36 @@ class TrainState:
         self.t = saved.t
         self.history = [dict(row) for row in saved.history]
 
+    def _require_rows(self, tables: Mapping[str, Mapping[str, Tensor]], saved: Checkpoint) -> None:
+        """Check what is restored: as many rows everywhere as there are means, each as wide as here, of the same type.
+
+        Raises:
+            ValueError, KeyError: it is not.
+        """
+        if not (1 <= saved.t <= self.settings.iterations + 1 and saved.facts["degree"] <= self.field.max_degree):
+            raise ValueError(f"t={saved.t} and degree={saved.facts['degree']:g} do not occur in it")
+        field, n = tables["field"], len(tables["field"]["means"])
+        for name, here in self.field.raw().items():
+            rows = {name: field[name]} | {
+                f"{m}.{name}": tables["optimizer"][f"{m}.{name}"] for m in ("first", "second")
+            }
+            for key, x in rows.items():
+                if x.dtype != here.dtype or tuple(x.shape) != (n, *here.shape[1:]):
+                    raise ValueError(f"{key} is {x.dtype} {tuple(x.shape)}, not {here.dtype} {(n, *here.shape[1:])}")
+        if any(len(x) != n for x in (field["filter_3d"], *tables["density"].values()) if x.dim()):
+            raise ValueError(f"a tensor has not one row for each of {n} Gaussians")
+
     def require_finite(self) -> None:
-        for name, value in self.field.raw().items():
-            finite = torch.isfinite(value)
-            if not bool(finite.all()):
-                bad = (~finite).flatten(1).any(1) if value.dim() > 1 else ~finite
-                raise DivergedError(
-                    f"t={self.t - 1}: {name} of {int(bad.sum())} Gaussians is not finite, first Gaussian "
-                    f"{int(bad.nonzero()[0])}. The last checkpoint is from before that; lower the learning rates."
-                )
+        """Check the parameters and Adam's moments; reads the device.
+
+        Raises:
+            DivergedError: names the tensor and the first such Gaussian.
+        """
+        first, second = self.optimizer.first, self.optimizer.second
+        for kind, table in (("", self.field.raw()), ("first moment of ", first), ("second moment of ", second)):
+            for name, value in table.items():
+                if not is_finite(value):
+                    raise DivergedError(
+                        f"before t={self.t}: {kind}{name} {rows_not_finite(value)}. The last checkpoint is from before "
+                        "that; lower the learning rates."
+                    )

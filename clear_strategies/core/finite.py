@@ -1,0 +1,66 @@
+"""NaN and infinity are found before they reach a parameter: one sum per tensor, and a search only where that is not finite.
+
+A device's numbers are not read here, since that would make the host wait; `TrainState.require_finite` checks the parameters
+there before every save.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
+from clear_strategies.errors import DivergedError
+
+
+def is_finite(x: Tensor) -> bool:
+    """Whether every number is finite. The sum of finite numbers may overflow, which is checked one by one."""
+    return x.numel() == 0 or math.isfinite(float(x.sum())) or bool(torch.isfinite(x).all())
+
+
+def require_finite(where: str, tensors: Mapping[str, Tensor]) -> None:
+    """Check tensors with one row per Gaussian; those on a device are not read.
+
+    Args:
+        where: what they belong to, e.g. "t=12, view b.jpg: ∇L_LR". tensors: by name.
+
+    Raises:
+        DivergedError: names the tensor and the first such Gaussian.
+    """
+    for name, x in tensors.items():
+        if deferred.is_immediate(x) and not is_finite(x):
+            raise DivergedError(f"{where} of {name} {rows_not_finite(x)}.")
+
+
+def rows_not_finite(x: Tensor) -> str:
+    """In words, which rows of a tensor are not finite."""
+    bad = ~torch.isfinite(x)
+    rows = bad.flatten(1).any(1) if x.dim() > 1 else bad
+    return f"is not finite for {int(rows.sum())} Gaussians, first Gaussian {int(rows.nonzero()[0])}"
+
+
+def require_finite_losses(where: str, losses: Mapping[str, Number], images: Mapping[str, Tensor]) -> None:
+    """Check the losses of a view; those on a device are not read.
+
+    Args:
+        images: what they compare, [H, W, 3] by name, searched where a loss is not finite.
+
+    Raises:
+        DivergedError: names the loss, and the first pixel that is not finite.
+    """
+    for name, value in losses.items():
+        if not isinstance(value, float) or math.isfinite(value):
+            continue
+        for image, x in images.items():
+            if not is_finite(x):
+                bad = (~torch.isfinite(x)).any(-1)
+                row, column = bad.nonzero()[0].tolist()
+                raise DivergedError(
+                    f"{where}: the loss {name} is {value}, since {image} is not finite at {int(bad.sum())} pixels, first "
+                    f"pixel ({column}, {row})."
+                )
+        raise DivergedError(f"{where}: the loss {name} is {value} although both images are finite.")

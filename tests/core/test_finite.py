@@ -1,0 +1,140 @@
+"""What is not finite is found before a step, named, and never reaches a parameter or a checkpoint."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from clear_strategies.core.finite import is_finite
+from clear_strategies.density.adaptive import Density
+from clear_strategies.errors import DivergedError, SettingError
+from clear_strategies.schedules import LogLinear
+from clear_strategies.training import checkpoint
+from clear_strategies.training.field import FieldShot
+from clear_strategies.training.loop import fit, iterate
+from clear_strategies.training.optim import LearningRates
+from tests.helpers import toy
+from tests.helpers.short_run import SCENE, start, tensors
+
+BAD = (float("nan"), float("inf"), -float("inf"))
+NAMES = ("gco", "p2g", "svs")
+
+
+def without_a_pixel(bad: float, scale: str):
+    """The toy scene; one pixel of one photo of every view is not finite."""
+
+    def spoil(view):
+        photo = getattr(view, scale)
+        image = photo.image.clone()
+        image[3, 5, 1] = bad
+        return replace(view, **{scale: replace(photo, image=image)})
+
+    return replace(SCENE, train=tuple(spoil(view) for view in SCENE.train))
+
+
+def assert_same(before, after):
+    assert before.keys() == after.keys()
+    for name, value in before.items():
+        assert torch.equal(value, after[name]), name
+
+
+def test_a_sum_that_overflows_is_finite_where_its_numbers_are():
+    assert is_finite(torch.full((4,), 3e38))
+    assert is_finite(torch.zeros(0))
+    assert not any(is_finite(torch.tensor([1.0, bad])) for bad in BAD)
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("fused", ["compiled", "readable"])
+@pytest.mark.parametrize("scale", ["lr", "hr"])
+def test_a_pixel_that_is_not_finite_is_named_before_the_step(scale, fused, bad):
+    state = start(NAMES)
+    if fused == "readable":
+        state.compiled_step = None
+    for _ in range(5):  # HR takes part from iteration 4
+        iterate(state, toy.RASTERIZER)
+    state.views = without_a_pixel(bad, scale).train
+    before = {name: value.clone() for name, value in tensors(state).items()}
+    photo = {"lr": "the LR photo", "hr": "the SR image"}[scale]
+    with pytest.raises(
+        DivergedError, match=rf"^t=6, view view\d: the loss .*{photo} is not finite.*first pixel \(5, 3\)"
+    ):
+        iterate(state, toy.RASTERIZER)
+    assert state.t == 6
+    assert_same(before, tensors(state))
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "rgb"])
+@pytest.mark.parametrize("fused", ["compiled", "readable"])
+def test_a_gradient_that_is_not_finite_is_named_before_the_step(fused, name, bad, monkeypatch):
+    state = start(NAMES)
+    if fused == "readable":
+        state.compiled_step = None
+    for _ in range(5):
+        iterate(state, toy.RASTERIZER)
+    before = {key: value.clone() for key, value in tensors(state).items()}
+    init = FieldShot.__init__
+
+    def spoiled(self, *arguments, **options):
+        init(self, *arguments, **options)
+        vjp = self.gradients
+
+        def gradients(cotangents):
+            g = vjp(cotangents)
+            rows = getattr(g, name).clone()
+            rows[0, 7] = bad
+            return replace(g, **{name: rows})
+
+        self.gradients = gradients
+
+    monkeypatch.setattr(FieldShot, "__init__", spoiled)
+    with pytest.raises(DivergedError, match=r"^t=6, view view\d: .* is not finite for 1 Gaussians, first Gaussian 7"):
+        iterate(state, toy.RASTERIZER)
+    assert_same(before, tensors(state))
+
+
+def test_a_run_that_meets_nan_saves_the_state_before_and_says_where(tmp_path):
+    state = start(NAMES)
+    for _ in range(5):
+        iterate(state, toy.RASTERIZER)
+    state.views = without_a_pixel(float("nan"), "hr").train
+    with pytest.raises(
+        DivergedError, match=r"first pixel \(5, 3\). The state before that step is .*step_0000006. Check"
+    ):
+        fit(state, SCENE, toy.RASTERIZER, checkpoints=tmp_path)
+    assert checkpoint.load(tmp_path).t == 6
+
+
+@pytest.mark.parametrize("moments", ["first", "second"])
+def test_moments_that_are_not_finite_are_never_saved(moments):
+    state = start(())
+    iterate(state, toy.RASTERIZER)
+    getattr(state.optimizer, moments)["scales"][4, 1] = float("inf")
+    with pytest.raises(DivergedError, match=f"before t=2: {moments} moment of scales .* first Gaussian 4"):
+        state.checkpoint({})
+
+
+def test_a_field_that_is_not_finite_is_never_saved():
+    state = start(())
+    state.field.quats.data[2, 0] = float("nan")
+    with pytest.raises(DivergedError, match="before t=1: quats is not finite for 1 Gaussians, first Gaussian 2"):
+        state.checkpoint({})
+
+
+def test_gaussians_that_are_not_finite_do_not_vanish_as_faint():
+    state = start(())
+    assert isinstance(state.density, Density)
+    state.field.opacities.data[3] = float("nan")
+    with pytest.raises(DivergedError, match=r"before densification, the parameter of opacities .* first Gaussian 3"):
+        state.density.restructure(state.field, state.optimizer, 5)
+
+
+@pytest.mark.parametrize("rate", [1e30, float("inf"), float("nan"), -1.0])
+def test_learning_rates_beyond_use_are_refused(rate):
+    with pytest.raises(SettingError, match=r"scales must lie in \[0, 100\]"):
+        LearningRates(scales=rate)
+    with pytest.raises(SettingError, match=r"must lie in \(0, 100\]"):
+        LogLinear(initial=rate)
