@@ -38,9 +38,12 @@ class GCO(Strategy):
     Args:
         tolerance: τ_c in [0, 1): cosines down to -τ_c are no conflict.
         weight_min, weight_max: bounds of ω where a conflict is corrected, 0 <= min <= max <= 1.
-        bound: what the bounds limit: "omega", or the "coefficient" ω|d|/‖g_LR‖² (F28).
-        eps: "relative:r" scales ε with the mean gradient norms of the group, so that no change of the losses' unit
-            changes a decision; "absolute:x" takes the paper's symbol literally (1e-8 finds almost no conflict, F27).
+        bound: what the bounds limit: "omega", or the "coefficient" ω|d|/‖g_LR‖² (F28), whose lower bound makes the
+            correction jump by weight_min ‖g_LR‖ where the cosine passes -τ_c.
+        eps: "relative:0", the default, has no ε: norms and products are in float64, where those of float32 gradients do not
+            vanish, and a zero norm is no conflict. "relative:r" scales ε with the mean gradient norms of the group, so
+            that no change of the losses' unit changes a decision; one huge gradient then raises ε for all. "absolute:x"
+            takes the paper's symbol literally (1e-8 finds almost no conflict, F27).
         groups: the attributes that are compared and corrected, each separately.
 
     The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
@@ -54,7 +57,7 @@ class GCO(Strategy):
     weight_min: float = 0.05
     weight_max: float = 0.75
     bound: Literal["omega", "coefficient"] = "omega"
-    eps: str = "relative:1e-12"
+    eps: str = "relative:0"
     groups: Sequence[str] = CONFLICT_GROUPS
 
     def __post_init__(self) -> None:
@@ -141,7 +144,7 @@ class GCO(Strategy):
     def epsilons(self, mean_lr: Scalar, mean_hr: Scalar) -> tuple[Scalar, Scalar]:
         """ε of the cosine and of the correction, in gradient², from the mean norms over the compared Gaussians."""
         kind, value = _parse_eps(self.eps)
-        if kind == "absolute":
+        if kind == "absolute" or value == 0:
             return value, value
         return value * mean_lr * mean_hr, value * mean_lr**2
 
@@ -169,7 +172,7 @@ class GCO(Strategy):
         """Warns where ε hides conflicts: below 20 ε a conflict is weakened; below τ/(1 - τ) ε none is found."""
         if margin < self.tolerance / (1 - self.tolerance) and self._first(f"eps cannot {group}"):
             _log.warning(
-                "GCO cannot fire for %s: the median of |g_LR||g_HR| is %.2g of eps=%s. Use eps=relative:1e-12.",
+                "GCO cannot fire for %s: the median of |g_LR||g_HR| is %.2g of eps=%s. Use eps=relative:0.",
                 group, margin, self.eps,
             )  # fmt: skip
         elif margin < 20 and self._first(f"eps weak {group}"):

@@ -19,7 +19,7 @@ from torch import Tensor
 from clear_strategies.core import deferred
 from clear_strategies.core.evidence import Evidence, Lookup, Outside, PatchMaps, lift
 from clear_strategies.core.gradients import Shot
-from clear_strategies.core.images import DownKernel, UpKernel, downsample, patch_means, upsample
+from clear_strategies.core.images import DownKernel, UpKernel, downsample, patch_means, quantize, upsample
 from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import ScreenGradients, Strategy
@@ -156,7 +156,9 @@ def patch_evidence(
     reduced = downsample(hr, factor, down)
     disagreement = (reduced - lr).abs()
     R = torch.exp(-patch_means(disagreement, patch) / _tau_r(reliability_scale, float(disagreement.mean())))
-    residual = (hr - upsample(reduced, factor, up)).abs()
+    # All kernels of D but "area" round to 8 bits. What that loses of an SR image with more of them is no detail.
+    shown = hr if down == "area" else quantize(hr)
+    residual = (shown - upsample(reduced, factor, up)).abs()
     A = (patch_means(residual, patch * factor) / (2 * residual.mean() + detail_eps)).clamp(0, 1)
     return R, A
 

@@ -198,3 +198,20 @@ def test_the_rival_reading_bounds_the_coefficient():
 def test_settings_outside_their_range_are_refused(setting, message):
     with pytest.raises(ValueError, match=message):
         GCO(**setting)
+
+
+@pytest.mark.parametrize("huge", [1e10, 1e20, 1e30])
+def test_one_huge_gradient_hides_no_conflict_of_the_others(huge):
+    """Every other Gaussian is in full conflict, whatever one of them does."""
+    g_lr = torch.randn(100, 3, generator=torch.Generator().manual_seed(0)) * 1e-5
+    g_hr = -g_lr
+    g_lr[0] = g_hr[0] = huge
+    corrected = GCO().correct(Grads({"means": g_lr}), Grads({"means": g_hr}), None)["means"]
+    assert bool((corrected[1:] != g_hr[1:]).any(1).all())
+    assert torch.equal(corrected[0], g_hr[0])
+
+
+def test_no_conflict_is_missed_where_norms_spread_over_ten_decades():
+    g_lr = torch.randn(1000, 3, generator=torch.Generator().manual_seed(1)) * torch.logspace(-12, -2, 1000)[:, None]
+    corrected = GCO().correct(Grads({"means": g_lr}), Grads({"means": -g_lr}), None)["means"]
+    assert bool((corrected != -g_lr).any(1).all())

@@ -143,3 +143,11 @@ def test_settings_outside_their_range_are_refused(setting):
     (name,) = setting
     with pytest.raises(ValueError, match=name):
         P2G(**setting)
+
+
+@pytest.mark.parametrize("grey", [0.3, 0.5, 0.5 / 255, 0.123456, 1.0])
+@pytest.mark.parametrize("down", ["bicubic", "bilinear", "lanczos", "area"])
+def test_a_flat_image_asks_for_no_detail_on_and_off_the_8_bit_grid(grey, down):
+    hr = torch.full((64, 64, 3), grey)
+    _, A = patch_evidence(torch.full((16, 16, 3), grey), hr, 4, down=down)
+    assert float(A.max()) < 1e-3
