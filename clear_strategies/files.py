@@ -5,18 +5,28 @@ from __future__ import annotations
 import csv
 import io
 import json
+import logging
 import math
 import os
+import shutil
+import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+from clear_strategies.errors import DataError
+
+_log = logging.getLogger(__name__)
+
+_PARTIAL: Final = ".partial"
+_LARGEST: Final = 64 << 30
 
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file beside the target, flush it to disk, then rename it to the target."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = partial_of(path)
     try:
         with partial.open("wb") as file:
             file.write(data)
@@ -31,12 +41,46 @@ def write_bytes(path: Path, data: bytes) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """The path that a library writes to in place of `path`, with the same suffix; renamed to it afterwards, or removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    partial = path.with_name(f".{path.stem}.{os.getpid()}{_PARTIAL}{path.suffix}")
     try:
         yield partial
         partial.replace(path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def partial_of(path: Path) -> Path:
+    """Where this process writes what will be renamed to `path`."""
+    return path.with_name(f".{path.name}.{os.getpid()}{_PARTIAL}")
+
+
+def require_regular(path: Path, *, most: int = _LARGEST) -> None:
+    """Refuse what is no regular file: a pipe blocks for ever, and a device such as /dev/zero has no end.
+
+    What is not there, or cannot be looked at, is left to whoever opens it.
+
+    Raises:
+        DataError: it is a pipe, a device or a socket, or has more than `most` bytes.
+    """
+    try:
+        found = path.stat()
+    except OSError:
+        return
+    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+        raise DataError(path, "file", "is a pipe, a device or a socket", "give a regular file")
+    if found.st_size > most:
+        raise DataError(path, "size", f"is more than {most >> 20} MiB", "check the path")
+
+
+def sweep(folder: Path) -> None:
+    """Remove what processes that died left of their writes in a run's folder. Call it while no other process writes there."""
+    for depth in ("", "*/", "*/*/"):
+        for left in folder.glob(f"{depth}.*{_PARTIAL}*"):
+            if left.is_dir() and not left.is_symlink():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
+            _log.info("%s: removed, a process died while it wrote this.", left)
 
 
 def write_text(path: Path, text: str) -> None:

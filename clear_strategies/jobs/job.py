@@ -16,6 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from clear_strategies import files
 from clear_strategies.compose import ConductorSettings, tree
 from clear_strategies.data.prepare import save_lr
 from clear_strategies.data.scene import Scene
@@ -199,6 +200,7 @@ def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = Non
         baseline = _Training.of(replace(settings, strategies={}), values_without, folder / BASELINE)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
     with hold(folder):
+        files.sweep(folder)
         return _run(ours, baseline, drawing, watch)
 
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
+from clear_strategies.outputs import metrics
 from clear_strategies.outputs.baseline import FOLDER as BASELINE
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import Checkpoint
@@ -17,6 +17,7 @@ from clear_strategies.training.state import TrainState
 
 _log = logging.getLogger(__name__)
 
+_TRAIN_AGAIN: Final = "remove the file: the run is then trained again"
 AUTO: Final = "auto"  # the value of fit.resume that is not a path
 
 CHECKPOINTS: Final = "checkpoints"
@@ -60,14 +61,14 @@ def finished(folder: Path, config: Mapping[str, Any]) -> tuple[float | None] | N
     path = folder / "metrics.json"
     if not path.exists():
         return None
-    metrics = read_object(path)
+    content = metrics.read(path, _TRAIN_AGAIN)
     try:
-        _require_same(path, metrics["config"], config)
-        means = metrics["test"]["mean"] or metrics["train"]["mean"]
+        _require_same(path, content["config"], config)
+        means = content["test"]["mean"] or content["train"]["mean"]
         psnr = means["ours"]["psnr"] if means else None
-        date = metrics["provenance"]["date"]
-    except (KeyError, TypeError) as error:
-        raise DataError(path, str(error), "is missing", "remove the file: the run is then trained again") from error
+        date = content["provenance"]["date"]
+    except KeyError as error:
+        raise DataError(path, str(error), "is missing", _TRAIN_AGAIN) from error
     score = "no PSNR" if psnr is None else f"PSNR {psnr:.2f} dB"
     _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, date, score)
     return (psnr,)

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
+from clear_strategies.outputs import metrics
 from clear_strategies.outputs.image_scores import ImageScores
 
 FOLDER: Final = "baseline"
@@ -39,7 +39,7 @@ class Baseline:
             DataError: metrics.json or a render is not there, or damaged.
         """
         path = folder / "metrics.json"
-        content = read_object(path)
+        content = metrics.read(path, _TRAIN_AGAIN)
         try:
             parts = {part: content[part]["mean"] for part in ("test", "train")}
             found = cls(
@@ -48,7 +48,7 @@ class Baseline:
                 views={view: _scores(row["ours"]) for view, row in content["test"]["views"].items()},
                 seconds=float(content["seconds"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError) as error:
             raise DataError(path, str(error), "is missing or damaged", _TRAIN_AGAIN) from error
         for view in found.views:
             if not found.render_of(view).is_file():

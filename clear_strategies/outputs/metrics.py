@@ -18,6 +18,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from jaxtyping import Float
@@ -26,7 +27,9 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import View
+from clear_strategies.data import json_shapes as shapes
 from clear_strategies.data.scene import Scene
+from clear_strategies.data.strict_json import read_object
 from clear_strategies.outputs.figures import spaced
 from clear_strategies.outputs.image_scores import ImageScores, mean_scores, score
 from rasterizers.interface import Camera
@@ -39,6 +42,35 @@ NOTE: Final = (
 )
 
 TRAIN_RENDERS: Final = 4  # training views whose renders are kept where there are no test views
+_TABLE: Final = shapes.table(shapes.number(null=True))
+_PART: Final = shapes.record(against=shapes.text(), views=shapes.table(shapes.table(_TABLE)), mean=shapes.table(_TABLE))
+SHAPE: Final = shapes.record(
+    scene=shapes.text(),
+    strategies=shapes.each(shapes.text()),
+    seed=shapes.whole(-shapes.LARGEST),
+    iterations=shapes.whole(),
+    gaussians=shapes.whole(),
+    seconds=shapes.number(least=0),
+    conflict=_TABLE,
+    synthetic_prior=shapes.flag,
+    test=_PART,
+    train=_PART,
+    provenance=shapes.record({"date": shapes.text(), "plan": shapes.table(shapes.anything)}),
+    optional={"config": shapes.table(shapes.anything), "method": shapes.text(null=True)},
+)
+"""What metrics.json of a finished run holds, for everybody who reads one."""
+
+
+def read(path: Path, remedy: str) -> dict[str, Any]:
+    """The content of metrics.json.
+
+    Raises:
+        DataError: it cannot be read, or is not that of a finished run; the message ends with `remedy`.
+    """
+    content = read_object(path)
+    shapes.require(path, content, SHAPE, remedy)
+    return content
+
 
 Table = dict[str, dict[str, ImageScores]]
 """view -> image ("ours", "bicubic", "prior") -> scores."""

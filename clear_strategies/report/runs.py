@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
-from clear_strategies.outputs import baseline
+from clear_strategies.outputs import baseline, metrics
 
 _log = logging.getLogger(__name__)
 
@@ -72,7 +71,7 @@ class Run:
             DataError: metrics.json or .hydra/overrides.yaml is damaged.
         """
         path = folder / "metrics.json"
-        content, overrides = read_object(path), _overrides(folder)
+        content, overrides = metrics.read(path, "train the run again"), _overrides(folder)
         try:
             part = content["test"] if content["test"]["mean"] else content["train"]
             marks = ["synthetic prior"] * bool(content["synthetic_prior"])

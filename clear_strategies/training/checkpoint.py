@@ -1,13 +1,14 @@
 """Checkpoints: written whole or not at all, and verified before they are used.
 
-A checkpoint is a folder: `tensors.safetensors`, `history.json`, and `manifest.json` with the SHA-256 of both. It is
-written under another name, flushed, then renamed; older checkpoints beyond `keep` are removed only after that. Nothing is
-unpickled.
+A checkpoint is a folder: `tensors.safetensors`, `history.json`, and `manifest.json` with the SHA-256 of both and of itself.
+It is written under another name, flushed, then renamed; older checkpoints beyond `keep`, and an earlier one of the same
+iteration, are removed only after that. Nothing is unpickled.
 """
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import logging
 import os
@@ -19,13 +20,30 @@ from typing import Any, Final
 
 from torch import Tensor
 
+from clear_strategies.data import json_shapes as shapes
 from clear_strategies.errors import DataError
+from clear_strategies.files import partial_of
 
 _log = logging.getLogger(__name__)
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 _TENSORS, _HISTORY, _MANIFEST = "tensors.safetensors", "history.json", "manifest.json"
 _PREFIX: Final = "step_"
+_SEAL: Final = "sha256_of_manifest"
+
+_HISTORY_SHAPE: Final = shapes.each(shapes.table(shapes.real))
+_MANIFEST_SHAPE: Final = shapes.record(
+    t=shapes.whole(1, 10**9),
+    config=shapes.table(shapes.anything),
+    facts=shapes.record(optimizer_steps=shapes.whole(0, 10**9), degree=shapes.whole(0, 3)),
+    work_log=shapes.table(
+        shapes.record(
+            runs=shapes.whole(), seconds=shapes.number(least=0), skipped=shapes.table(shapes.whole()),
+        )
+    ),
+    device=shapes.one_of("cpu", "cuda"),
+    sha256=shapes.record({}, **{_TENSORS: shapes.text(), _HISTORY: shapes.text()}),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +75,7 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
     from safetensors.torch import save as to_bytes
 
     folder.mkdir(parents=True, exist_ok=True)
-    target = folder / f"{_PREFIX}{checkpoint.t:07d}"
+    target = _free_name(folder / f"{_PREFIX}{checkpoint.t:07d}")
     tensors = {name: value.detach().cpu().contiguous() for name, value in checkpoint.tensors.items()}
     files = {_TENSORS: to_bytes(tensors), _HISTORY: json.dumps(checkpoint.history).encode()}
     manifest = {
@@ -69,27 +87,49 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
         "device": checkpoint.device,
         "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
     }
-    files[_MANIFEST] = json.dumps(manifest, indent=1).encode()
+    files[_MANIFEST] = _sealed(manifest).encode()
 
-    partial = folder / f".{target.name}.{os.getpid()}.partial"
+    partial = partial_of(target)
     shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir()
         for name, data in files.items():
             _write_durably(partial / name, data)
-        if target.exists():  # the same step again, after a resume
-            shutil.rmtree(target)
+        _flush_folder(partial)
         partial.rename(target)
         _flush_folder(folder)
-    except OSError:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
-    all_of_them = saved(folder)
-    # Checkpoints of later iterations belong to another run, or to a try that this run does not continue.
-    until, beyond = [p for p in all_of_them if p <= target], [p for p in all_of_them if p > target]
-    for old in (*until[:-keep], *beyond):
-        shutil.rmtree(old, ignore_errors=True)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)  # exists only after an exception or Ctrl-C above
+    earlier, later = _others(folder, target, checkpoint.t)
+    for old in (*earlier[: max(0, len(earlier) + 1 - keep)], *later):
+        _remove(old)
     return target
+
+
+def _free_name(target: Path) -> Path:
+    """`target`, or where that is taken, by the same step before a resume, another name that sorts right after it."""
+    names = itertools.chain([target], (target.with_name(f"{target.name}_{n}") for n in itertools.count(2)))
+    return next(path for path in names if not path.exists())
+
+
+def _others(folder: Path, target: Path, t: int) -> tuple[list[Path], list[Path]]:
+    """The checkpoints of earlier iterations, and those that `target` takes the place of: of the same iteration, and of
+    later ones, which belong to another run or to a try that this run does not continue.
+    """
+    others = [path for path in saved(folder) if path != target]
+    bound = f"{_PREFIX}{t:07d}"
+    return [path for path in others if path.name < bound], [path for path in others if path.name >= bound]
+
+
+def _remove(old: Path) -> None:
+    """Renamed first: a checkpoint that is half removed must not look like one."""
+    gone = partial_of(old)
+    try:
+        old.rename(gone)
+    except OSError:  # the folder has become read-only; the new checkpoint is in place
+        _log.warning("%s: cannot be removed.", old)
+        return
+    shutil.rmtree(gone, ignore_errors=True)
 
 
 def saved(folder: Path) -> list[Path]:
@@ -103,26 +143,30 @@ def load(path: Path) -> Checkpoint:
     Raises:
         DataError: nothing is there, a file is missing or altered, or the format is newer than this version.
     """
+    from safetensors import SafetensorError
     from safetensors.torch import load as from_bytes
 
     path = _newest(path)
     manifest = _manifest(path)
     files = {}
     for name in (_TENSORS, _HISTORY):
-        try:
-            files[name] = (path / name).read_bytes()
-        except OSError as error:
-            raise DataError(path / name, "file", f"cannot be read ({error.strerror})", _USE_ANOTHER) from error
-        if hashlib.sha256(files[name]).hexdigest() != manifest["sha256"].get(name):
+        files[name] = _read(path / name)
+        if hashlib.sha256(files[name]).hexdigest() != manifest["sha256"][name]:
             raise DataError(path / name, "sha256", "is not what the manifest says: the file was altered", _USE_ANOTHER)
+    try:
+        tensors = from_bytes(files[_TENSORS])
+    except (SafetensorError, ValueError, KeyError, AttributeError, RuntimeError) as error:
+        raise DataError(path / _TENSORS, "tensors", f"are no safetensors ({error})", _USE_ANOTHER) from error
+    history = _json(path / _HISTORY, files[_HISTORY])
+    shapes.require(path / _HISTORY, history, _HISTORY_SHAPE, _USE_ANOTHER)
     return Checkpoint(
-        t=manifest["t"],
-        tensors=from_bytes(files[_TENSORS]),
+        t=int(manifest["t"]),
+        tensors=tensors,
         config=manifest["config"],
         facts=manifest["facts"],
-        history=json.loads(files[_HISTORY]),
-        work_log=manifest.get("work_log", {}),
-        device=manifest.get("device", "cpu"),
+        history=history,
+        work_log=manifest["work_log"],
+        device=manifest["device"],
     )
 
 
@@ -131,20 +175,38 @@ _USE_ANOTHER: Final = "resume from another checkpoint of the run, or start a new
 
 def _manifest(path: Path) -> dict[str, Any]:
     file = path / _MANIFEST
+    data = _read(file)
+    manifest = _json(file, data)
+    if not isinstance(manifest, dict):
+        raise DataError(file, "json", f"must be an object, got a {type(manifest).__name__}", _USE_ANOTHER)
+    if manifest.get("format") != FORMAT:
+        problem = f"is {manifest.get('format')!r}, this version reads {FORMAT}"
+        raise DataError(file, "format", problem[:120], "use the version of clear-strategies that wrote it")
+    content = {key: value for key, value in manifest.items() if key != _SEAL}
+    if _sealed(content).encode() != data:
+        raise DataError(file, _SEAL, "is not that of the file: it was altered", _USE_ANOTHER)
+    shapes.require(file, content, _MANIFEST_SHAPE, _USE_ANOTHER)
+    return content
+
+
+def _sealed(manifest: Mapping[str, Any]) -> str:
+    """The manifest's text with the hash of its own content. No other text is accepted, so every altered bit is found."""
+    digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
+    return json.dumps({**manifest, _SEAL: digest}, indent=1)
+
+
+def _read(file: Path) -> bytes:
     try:
-        manifest = json.loads(file.read_text())
+        return file.read_bytes()
     except OSError as error:
         raise DataError(file, "file", f"cannot be read ({error.strerror})", _USE_ANOTHER) from error
+
+
+def _json(file: Path, data: bytes) -> Any:
+    try:
+        return json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise DataError(file, "json", f"is not valid JSON ({error})", _USE_ANOTHER) from error
-    kinds = {"format": int, "t": int, "config": dict, "facts": dict, "sha256": dict}
-    for key, kind in kinds.items():
-        if not isinstance(manifest, dict) or not isinstance(manifest.get(key), kind):
-            raise DataError(file, key, f"is missing or no {kind.__name__}", _USE_ANOTHER)
-    if manifest["format"] != FORMAT:
-        problem = f"is {manifest['format']}, this version reads {FORMAT}"
-        raise DataError(file, "format", problem, "use the version of clear-strategies that wrote it")
-    return dict(manifest)
+        raise DataError(file, "json", f"is not valid JSON ({str(error)[:120]})", _USE_ANOTHER) from error
 
 
 def _newest(path: Path) -> Path:

@@ -7,7 +7,7 @@ from __future__ import annotations
 GROUND = {"errors", "files", "schedules"}
 FLOORS: dict[str, tuple[set[str], set[str]]] = {
     "errors": (set(), set()),
-    "files": (set(), set()),
+    "files": ({"errors"}, set()),
     "schedules": ({"errors"}, set()),
     "core": (GROUND, {"PIL"}),
     "kernels": (GROUND | {"core"}, {"warp"}),
