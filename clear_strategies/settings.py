@@ -12,6 +12,7 @@ import functools
 import importlib
 import inspect
 import math
+import sys
 import types
 import typing
 import warnings
@@ -51,7 +52,9 @@ def with_defaults(node: Any) -> Any:
     if node.get(_RECURSIVE, True):
         node = {key: with_defaults(value) for key, value in node.items()}
     try:
-        return _merged(_defaults(_located(node[TARGET])), node) if node.get(TARGET) is not None else dict(node)
+        if node.get(TARGET) is None or _foreign(node[TARGET]):
+            return dict(node)
+        return _merged(_defaults(_located(node[TARGET])), node)
     except (ImportError, AttributeError):
         return dict(node)
 
@@ -86,12 +89,14 @@ def one_line(error: BaseException) -> str:
 
 def _called(node: Mapping[str, Any], key: str) -> Any:
     target = node[TARGET]
+    _require_name(target, key)
     try:
         function = _located(target)
     except (ImportError, AttributeError) as error:
         own = str(target).startswith(("clear_strategies.", "rasterizers."))
         remedy = "pip install 'clear-strategies[train]'" if own else "Correct its dotted name"
         raise SettingError(f"{key}: {target} cannot be imported ({one_line(error)}). {remedy}.") from error
+    _require_buildable(function, target, key)
     parameters, hints = _parameters(function), _hints(function)
     given = {name: value for name, value in node.items() if name not in _KEYWORDS}
     _refuse_unknown(given, parameters, key, str(target))
@@ -122,6 +127,46 @@ def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
 
 
 _VARIADIC: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+# Libraries that the package itself uses. They hold nothing that a setting could stand for, and much that writes files or
+# runs programs.
+_LIBRARIES: Final = {
+    "PIL", "beartype", "cv2", "hydra", "jaxtyping", "jinja2", "joblib", "kornia", "matplotlib", "numpy", "omegaconf",
+    "open3d", "pandas", "pip", "pytest", "safetensors", "scipy", "setuptools", "skimage", "submitit", "torch", "torchvision",
+    "tqdm", "yaml",
+}  # fmt: skip
+_OWN: Final = ("clear_strategies", "rasterizers", "integration")
+_READERS: Final = "clear_strategies.data.readers."
+
+
+def _foreign(name: Any) -> bool:
+    """Whether a dotted name is Python's own or a library's, which is not even imported."""
+    root = str(name).partition(".")[0]
+    return root in sys.stdlib_module_names or root in _LIBRARIES or root == "builtins"
+
+
+def _require_name(target: Any, key: str) -> None:
+    if _foreign(target):
+        raise SettingError(
+            f"{key}: {TARGET} must name a class of this package or of a plug-in for it, got {str(target)[:80]}."
+        )
+
+
+def _require_buildable(function: Callable[..., Any], target: Any, key: str) -> None:
+    """Refuse what is no class, or no function that reads data, before it is called.
+
+    Raises:
+        SettingError: it is Python's own or a library's under another name, a method, or a function of this package that is
+            no reader.
+    """
+    home = str(getattr(function, "__module__", ""))
+    _require_name(home, key)
+    own = home.partition(".")[0] in _OWN
+    method = "." in getattr(function, "__qualname__", "").rpartition("<locals>.")[2]
+    plain = inspect.isfunction(function) and not method and (not own or home.startswith(_READERS))
+    if not (inspect.isclass(function) or plain):
+        raise SettingError(f"{key}: {str(target)[:80]} is no class, and no function that reads data.")
 
 
 def _located(target: Any) -> Callable[..., Any]:

@@ -29,6 +29,9 @@ class BackendUnavailable(RuntimeError):
     """A backend that cannot run on this machine. The message says why, and what to install."""
 
 
+_RIGID: Final = 1e-3  # files keep few digits
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
     """A pinhole camera, OpenCV axes (x right, y down, z forward).
@@ -40,7 +43,8 @@ class Camera:
         fx, fy, cx, cy: focal lengths and principal point, in pixels of a `width` × `height` image.
 
     Raises:
-        ValueError: a size or focal length is not positive, or a number is not finite.
+        ValueError: a size or focal length is not positive, a number is not finite, or the transform is not rigid within
+            1e-3.
     """
 
     world_to_camera: Float[Tensor, "4 4"]
@@ -57,6 +61,11 @@ class Camera:
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not (all(map(math.isfinite, intrinsics)) and bool(self.world_to_camera.isfinite().all())):
             raise ValueError(f"a camera's numbers must be finite, got {self!r}.")
+        if not _is_rigid(self.world_to_camera):
+            raise ValueError(
+                "world_to_camera must be a rotation and a translation, without scale or reflection, and its last row "
+                f"0 0 0 1, got {self.world_to_camera.tolist()}."
+            )
         if not (self.fx > 0 and self.fy > 0 and self.width > 0 and self.height > 0):
             raise ValueError(
                 "focal lengths and image sizes must be positive, got "
@@ -90,6 +99,19 @@ class Camera:
             width=round(width),
             height=round(height),
         )
+
+
+def _is_rigid(world_to_camera: Float[Tensor, "4 4"]) -> bool:
+    rows = world_to_camera.detach().double().tolist()
+    (a, b, c), last = [row[:3] for row in rows[:3]], rows[3]
+
+    def dot(u: list[float], v: list[float]) -> float:
+        return sum(x * y for x, y in zip(u, v, strict=True))
+
+    across = [b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]]
+    products = [dot(a, a) - 1, dot(b, b) - 1, dot(c, c) - 1, dot(a, b), dot(a, c), dot(b, c), dot(a, across) - 1]
+    affine = [last[0], last[1], last[2], last[3] - 1]
+    return all(abs(x) <= _RIGID for x in (*products, *affine))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,6 +15,8 @@ from torch import Tensor
 
 from clear_strategies.errors import DataError
 
+FARTHEST: Final = 1e12
+"""The largest coordinate, world units: float32 cannot resolve a scene beyond it."""
 _LARGEST_SIDE: Final = 1 << 20
 _BORDER_SAMPLES: Final = 33
 
@@ -195,4 +197,4 @@ def _is_row(row: object) -> bool:
 
 
 def _is_number(x: object) -> bool:
-    return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < 1e18
+    return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < FARTHEST

@@ -23,7 +23,7 @@ from PIL import Image
 from torch import Tensor
 
 from clear_strategies.errors import DataError
-from clear_strategies.files import write_bytes
+from clear_strategies.files import require_regular, write_bytes
 
 _log = logging.getLogger(__name__)
 
@@ -32,6 +32,8 @@ _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
 _MAX_PIXELS: Final = 100_000_000
 _FOLDERS: Final = ("images", "images_2", "images_4", "images_8")
 _LONGEST_NAME: Final = 1024
+_LARGE: Final = 1 << 24  # pixels; smaller images may be drawings, which compress without limit
+_BOMB: Final = 200
 _EXIF_ORIENTATION: Final = 0x0112
 
 
@@ -151,7 +153,8 @@ def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) ->
     Raises:
         DataError: the name is absolute or leads out of `root`.
     """
-    if not 0 < len(name) <= _LONGEST_NAME or "\0" in name:
+    parts = name.replace("\\", "/").split("/")
+    if not 0 < len(name) <= _LONGEST_NAME or "\0" in name or max(len(p.encode(errors="replace")) for p in parts) > 255:
         raise DataError(
             file, "file name", f"{name[:80]!r} is no file name", "name an image inside the data set's folder"
         )
@@ -174,6 +177,7 @@ def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) ->
 
 @contextmanager
 def _opened(path: Path, max_pixels: int) -> Iterator[Image.Image]:
+    require_regular(path)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # PIL's warnings: our own size limit follows, and damage fails on decoding
@@ -192,6 +196,9 @@ def _opened(path: Path, max_pixels: int) -> Iterator[Image.Image]:
                 f"{image.width}x{image.height} is more than {max_pixels:,} pixels",
                 "downsample the images before training",
             )
+        if image.width * image.height > _LARGE and image.width * image.height * 3 > _BOMB * path.stat().st_size:
+            problem = f"{image.width}x{image.height} pixels are more than {_BOMB} times the file, as in no photo"
+            raise DataError(path, "size", problem, "use the camera's own file")
         # A PNG may keep its EXIF block behind the pixels; `read_image` checks again after decoding them.
         if image.format != "PNG" or "exif" in image.info:
             _refuse_rotated(path, image)

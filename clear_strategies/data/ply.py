@@ -21,7 +21,7 @@ from torch import Tensor
 
 from clear_strategies.data.scene import PointCloud
 from clear_strategies.errors import DataError
-from clear_strategies.files import write_bytes
+from clear_strategies.files import require_regular, write_bytes
 from rasterizers.geometry import SH_C0
 
 _log = logging.getLogger(__name__)
@@ -184,6 +184,7 @@ class _Header:
 
 def _read_vertices(path: Path) -> np.ndarray:
     """The vertex element as a structured array."""
+    require_regular(path)
     try:
         with path.open("rb") as file:
             header = _parse_header(path, file.read(_LONGEST_HEADER))
@@ -212,7 +213,7 @@ def _read_ascii(path: Path, header: _Header, body: bytes) -> np.ndarray:
     except ValueError as error:
         raise DataError(path, "element vertex", f"is not numeric ({error})", "export it again") from error
     table = np.zeros(vertex.count, vertex.dtype)
-    for name, column in zip(_names(table), numbers.reshape(vertex.count, len(_names(table))).T, strict=True):
+    for name, column in zip(_names(table), numbers.reshape(-1, len(_names(table))).T, strict=True):
         kind = table.dtype[name]
         if kind.kind in "iu":
             limits = np.iinfo(kind)

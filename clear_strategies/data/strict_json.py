@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from clear_strategies.errors import DataError
+from clear_strategies.files import require_regular
 
 _LARGEST: Final = 256 << 20
 
@@ -35,9 +36,8 @@ def read_object(path: Path) -> dict[str, Any]:
             raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)!r} occurs twice in one object")
         return value
 
+    require_regular(path, most=_LARGEST)
     try:
-        if path.stat().st_size > _LARGEST:
-            raise DataError(path, "size", f"is more than {_LARGEST >> 20} MiB", "check the path")
         value = json.loads(
             path.read_text("utf-8"),
             parse_constant=refuse_constant,

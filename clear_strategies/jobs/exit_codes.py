@@ -1,7 +1,7 @@
 """How a process ends: the one-line message of an error, and the exit code.
 
-0: done. 2: a setting, a file or a sweep's job cannot be used. 3: the disk is full or read-only. 128 + n: stopped by
-signal n. Any other error is a bug: Python shows its traceback, and exits with 1.
+0: done. 2: a setting, a file or a sweep's job cannot be used, or memory ran out. 3: the disk is full or read-only.
+128 + n: stopped by signal n. Any other error is a bug: Python shows its traceback, and exits with 1.
 """
 
 from __future__ import annotations
@@ -16,6 +16,11 @@ from omegaconf.errors import OmegaConfBaseException
 from clear_strategies.errors import ClearError, SettingError
 from clear_strategies.settings import one_line
 from rasterizers.interface import BackendUnavailable
+
+_NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
+_LESS_MEMORY: Final = (
+    "Lower density.max_gaussians or raise data.views.shrink; rasterizer.memory bounds the rasterizer's lists."
+)
 
 UNUSABLE: Final = 2
 NO_DISK: Final = 3
@@ -40,6 +45,8 @@ def describe(error: BaseException) -> Ending | None:
         return Ending(SIGNALS + signal.SIGINT, "stopped by SIGINT before training began. Nothing was saved.")
     if isinstance(error, BackendUnavailable | HydraException | OmegaConfBaseException):
         return Ending(UNUSABLE, one_line(error))  # before OSError: Hydra's error for an option that is not there is one
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
+        return Ending(UNUSABLE, f"out of memory: {one_line(error) or 'Python had none left'} {_LESS_MEMORY}")
     disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it where it cannot open its file
     if isinstance(disk, OSError):
         where = f"{disk.filename or 'output'}: {disk.strerror or disk}"

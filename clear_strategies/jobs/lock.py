@@ -61,7 +61,7 @@ def hold(folder: Path) -> Iterator[None]:
 def _alone_with(path: Path) -> Iterator[TextIO]:
     """Open the lock file, created if it does not exist, while no other process reads or writes it."""
     while True:
-        with path.open("a+") as file:
+        with _opened(path) as file:
             with suppress(OSError):  # a file system that has no such locks: only starts at the same moment go unnoticed
                 fcntl.flock(file, fcntl.LOCK_EX)
             if not _is_at(path, file):  # its owner removed it in the meantime
@@ -69,6 +69,18 @@ def _alone_with(path: Path) -> Iterator[TextIO]:
             file.seek(0)
             yield file
             return
+
+
+def _opened(path: Path) -> TextIO:
+    """The lock file, for reading and writing; a link in its place would lead the lock out of the folder.
+
+    Raises:
+        DataError: it is a link or no regular file.
+    """
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        raise DataError(path, "lock", "is a link or no regular file", "remove it, if no other run made it")
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0), 0o666)
+    return os.fdopen(descriptor, "a+")
 
 
 def _is_at(path: Path, file: TextIO) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 import statistics
 from collections.abc import Mapping, Sequence
@@ -35,7 +36,7 @@ class Table:
 
     @property
     def markdown(self) -> str:
-        return "\n".join((*aligned(self.columns), "", *self.notes, ""))
+        return "\n".join((*aligned(self.columns), "", *(html.escape(note, quote=False) for note in self.notes), ""))
 
 
 def layout(rows: Sequence[Row], *, beside: Mapping[str, Columns] | None = None, notes: Sequence[str] = ()) -> Table:
@@ -78,13 +79,18 @@ def record(row: Row) -> dict[str, Any]:
 
 def aligned(columns: Mapping[str, Sequence[str]]) -> list[str]:
     """The lines of a Markdown table whose columns also align in a terminal."""
-    escaped = [[cell.replace("|", "\\|") for cell in (name, *cells)] for name, cells in columns.items()]
+    escaped = [[_plain(cell) for cell in (name, *cells)] for name, cells in columns.items()]
     widths = [max(map(len, cells)) for cells in escaped]
     lines = [
         "| " + " | ".join(f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True)) + " |"
         for cells in zip(*escaped, strict=True)
     ]
     return [lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]]
+
+
+def _plain(cell: str) -> str:
+    """A cell that Markdown shows as it is: names of scenes and methods come from files, and Markdown may hold HTML."""
+    return html.escape(" ".join(cell.split()), quote=False).replace("|", "\\|")
 
 
 def _notes(rows: Sequence[Row], cells: Columns) -> list[str]:

@@ -20,11 +20,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.cameras import Lens
+from clear_strategies.data.cameras import FARTHEST, Lens
 from clear_strategies.data.capture import Capture, Color, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.checks import as_color
 from clear_strategies.data.photo_files import folder_note, image_folder, inside, list_images
 from clear_strategies.errors import DataError
+from clear_strategies.files import require_regular
 from rasterizers.geometry import rotation_matrix
 
 _log = logging.getLogger(__name__)
@@ -39,7 +40,6 @@ _WRITE_AGAIN: Final = "export the model again"
 _LONGEST_NAME: Final = 4096
 _NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
 _WHOLE: Final = re.compile(r"-?[0-9]{1,18}")
-_FARTHEST: Final = 1e12  # from the origin, world units; float32 cannot resolve a scene beyond it
 _UNEVEN: Final = 1e-6  # a quaternion's length may differ from 1 by this much without a note
 
 
@@ -234,13 +234,14 @@ def _photo(folder: Path, name: str, listing: Path, allow_outside: bool) -> Path:
         raise DataError(
             listing, name, f"is not in {folder}", "set data.reader.images to the folder that the model was made from"
         )
-    return twins[0]
+    return inside(folder, twins[0].relative_to(folder).as_posix(), file=listing, allow_outside=allow_outside)
 
 
 class _Bytes:
     """A file's bytes, read from front to back; reading past the end is an error."""
 
     def __init__(self, path: Path) -> None:
+        require_regular(path)
         try:
             self.data = path.read_bytes()
         except OSError as error:
@@ -391,7 +392,7 @@ def _points_txt(path: Path) -> Points:
 
 
 def _checked_points(path: Path, means: np.ndarray, colors: np.ndarray, track: list[np.ndarray]) -> Points:
-    near = (np.abs(means) < _FARTHEST).all(1)
+    near = (np.abs(means) < FARTHEST).all(1)
     if not near.all():
         bad = int(np.flatnonzero(~near)[0])
         raise DataError(path, f"point {bad}", "is not finite", "remove the point")
@@ -417,7 +418,7 @@ def _lens(path: Path, where: str, model: str, width: int, height: int, p: tuple[
 
 
 def _image(path: Path, number: int, pose: tuple[float, ...], camera: int, name: str) -> Image:
-    if not all(abs(x) < _FARTHEST for x in pose):
+    if not all(abs(x) < FARTHEST for x in pose):
         raise DataError(path, name or f"image {number}", "has a pose that is not finite", _WRITE_AGAIN)
     norm = math.sqrt(sum(x * x for x in pose[:4]))
     if not 0.5 < norm < 2:
@@ -434,6 +435,7 @@ def _put(path: Path, table: dict[int, Any], number: int, value: Any) -> None:
 
 
 def _raw_lines(path: Path) -> list[tuple[int, str]]:
+    require_regular(path)
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:

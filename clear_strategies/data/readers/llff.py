@@ -18,6 +18,7 @@ from clear_strategies.data.checks import as_color, require_choice
 from clear_strategies.data.photo_files import folder_note, image_folder, inside, list_images
 from clear_strategies.data.readers import colmap
 from clear_strategies.errors import DataError
+from clear_strategies.files import require_regular
 
 _log = logging.getLogger(__name__)
 
@@ -139,6 +140,7 @@ def _ids_by_order(model: colmap.Model | None, n: int) -> list[int | None]:
 
 def _read_table(file: Path) -> np.ndarray:
     """[n, 17] float64; the header is held against the file's size before anything is allocated."""
+    require_regular(file)
     try:
         data = file.read_bytes()
     except OSError as error:
