@@ -1,0 +1,83 @@
+"""Single Gaussians over the whole range of scales, depths, opacities and quaternion norms, against float64."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import torch
+
+from rasterizers import Camera, Rasterizer, Splats
+from rasterizers.reference import ReferenceRasterizer
+from rasterizers.testing import gradient_of, to
+from tests.stress.rows import Row, Worst
+
+SCALES = [10.0**k for k in range(-8, 9)]
+DEPTHS = [10.0**k for k in range(-6, 7)]
+LOGITS = (-100.0, -15.0, -5.0, 0.0, 5.0, 15.0, 100.0)
+NORMS = [10.0**k for k in (-20, -15, -10, -5, 0, 5, 10, 15, 20)]
+NAMES = ("means", "quats", "scales", "opacities", "sh0")
+_IMAGE, _GRADIENT = 1e-4, 1e-3
+_FLIP = 8e-3  # a pixel at which rounding flips a cut-off
+
+# The rotation does not matter for a ball, so the axes differ. The direction is off the camera's axis.
+_SHAPE = torch.tensor([[1.0, 0.7, 0.4]])
+_QUATERNION = torch.tensor([[0.8, -0.3, 0.5, 0.2]])
+_CAMERA = Camera(torch.eye(4), 12.0, 12.0, 4.2, 4.7, 9, 9)
+_CLEAN = {"alpha_min": 1e-7, "transmittance_min": 1e-9}
+
+
+def cases(every: int = 1) -> Iterator[tuple[str, Splats]]:
+    """All 13,923 of the table in STRESS, or every n-th."""
+    table = itertools.product(SCALES, DEPTHS, LOGITS, NORMS)
+    for scale, depth, logit, norm in itertools.islice(table, 0, None, every):
+        opacity = torch.sigmoid(torch.tensor([logit]))
+        yield (
+            f"scale {scale:g}, depth {depth:g}, logit {logit:g}, norm {norm:g}",
+            Splats(
+                means=torch.tensor([[0.05, -0.03, 1.0]]) * depth,
+                quats=_QUATERNION * norm,
+                scales=_SHAPE * scale,
+                opacities=opacity,
+                sh0=torch.tensor([[[0.9, 0.2, -0.5]]]),
+                shN=torch.zeros(1, 0, 3),
+            ),
+        )
+
+
+def measure(name: str, draw: Rasterizer, *, every: int = 1) -> list[Row]:
+    """The image and the gradients of every case.
+
+    The rotation's gradient is measured against the quaternion's own scale: ‖g_quat‖ · ‖q‖, which does not depend on ‖q‖.
+    """
+    exact = ReferenceRasterizer(**_CLEAN)
+    v = torch.randn(1, 9, 9, 3, generator=torch.Generator().manual_seed(0))
+    image, gradient = Worst(), Worst()
+    for where, splats in cases(every):
+        found, right = draw(splats, _CAMERA), exact(to(splats, torch.float64), _CAMERA)
+        error = (found.image.double() - right.image).abs()
+        image.add(float(error.max()), where)
+        if not bool(right.visible.any()):
+            continue
+        ours, theirs = found.vjp(v), right.vjp(v.double())
+        gradient.add(_gradient_error(ours, theirs, splats), where)
+    return [
+        image.row("single Gaussians: image", name, _IMAGE),
+        gradient.row("single Gaussians: gradient", name, _GRADIENT),
+    ]
+
+
+def _gradient_error(ours, theirs, splats: Splats) -> float:
+    """The largest relative error over the attributes, each in units that its own scale removes: g · parameter."""
+    units = {"means": splats.means, "quats": splats.quats, "scales": splats.scales, "opacities": splats.opacities}
+    errors, sizes = [], []
+    for name in NAMES:
+        unit = units.get(name, torch.ones(1)).double().abs().amax()
+        a, b = gradient_of(ours, name).double() * unit, gradient_of(theirs, name) * unit
+        errors.append(float(torch.linalg.vector_norm(a - b)))
+        sizes.append(float(torch.linalg.vector_norm(b)))
+    scale = max(sizes)
+    if scale == 0:
+        return max(errors)
+    return max(errors) / scale if all(map(math.isfinite, errors)) else math.inf
