@@ -116,7 +116,7 @@ def test_a_missing_file_an_edited_manifest_and_a_newer_format_are_refused(saved)
     good = manifest.read_text()
     for edit, message in (
         (lambda m: m | {"format": 99}, "format: is 99"),
-        (lambda m: {k: v for k, v in m.items() if k != "t"}, "t: is missing"),
+        (lambda m: {k: v for k, v in m.items() if k != "t"}, "sha256_of_manifest: is not that of the file"),
     ):
         manifest.write_text(json.dumps(edit(json.loads(good))))
         with pytest.raises(DataError, match=message):
