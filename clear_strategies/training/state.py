@@ -221,8 +221,10 @@ class TrainState:
             for key, x in rows.items():
                 if x.dtype != here.dtype or tuple(x.shape) != (n, *here.shape[1:]):
                     raise ValueError(f"{key} is {x.dtype} {tuple(x.shape)}, not {here.dtype} {(n, *here.shape[1:])}")
-        if any(len(x) != n for x in (field["filter_3d"], *tables["density"].values()) if x.dim()):
-            raise ValueError(f"a tensor has not one row for each of {n} Gaussians")
+        statistics = {name: x for name, x in tables["density"].items() if name in ("score", "ordinary", "count")}
+        per_row = (field["filter_3d"], *statistics.values())
+        if any(tuple(x.shape) != (n,) for x in per_row):
+            raise ValueError(f"filter_3d or a statistic has not one number for each of {n} Gaussians")
 
     def require_finite(self) -> None:
         """Check the parameters and Adam's moments; reads the device.

@@ -234,7 +234,9 @@ def _photo(folder: Path, name: str, listing: Path, allow_outside: bool) -> Path:
         raise DataError(
             listing, name, f"is not in {folder}", "set data.reader.images to the folder that the model was made from"
         )
-    return inside(folder, twins[0].relative_to(folder).as_posix(), file=listing, allow_outside=allow_outside)
+    if not allow_outside:
+        inside(folder, twins[0].relative_to(folder).as_posix(), file=listing)
+    return twins[0]
 
 
 class _Bytes:
