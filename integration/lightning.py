@@ -29,6 +29,7 @@ from integration.densification import end_with_strategies
 from integration.detail import DetailFeature, sh0_offset
 from integration.errors import HostError
 from integration.host_score import warn_if_score_is_unused
+from integration.log import show_log
 from integration.model_proxy import ModelRenderer, Role, enlarged_camera
 from integration.views import SuperResolve, sr_source, view
 
@@ -74,6 +75,7 @@ class ClearDensityController(DensityController):  # type: ignore[misc]
     seed: int = 0
 
     def instantiate(self, *args: Any, **kwargs: Any) -> Any:
+        show_log()
         base = self.base
         if base is None:
             from internal.density_controllers.vanilla_density_controller import VanillaDensityController

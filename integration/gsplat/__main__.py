@@ -19,13 +19,14 @@ from integration.gsplat.attached import Attached
 from integration.gsplat.data import save_lr
 from integration.gsplat.simple_trainer import install
 from integration.launcher import Launch, parser, run_script
+from integration.log import show_log
 
 _log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run simple_trainer.py with CLEAR; returns the exit status."""
-    logging.basicConfig(level=logging.INFO, format="[clear] %(message)s")
+    show_log()
     options = parser("integration.gsplat", "Run gsplat's simple_trainer.py with CLEAR.").parse_args(arguments)
     attached: list[Attached] = []
     try:

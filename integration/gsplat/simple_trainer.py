@@ -20,6 +20,7 @@ from integration.detail import sh0_offset
 from integration.errors import HostError
 from integration.gsplat.attached import Attached
 from integration.gsplat.data import masks_from_dataset, views_from_dataset
+from integration.log import show_log
 from integration.replacing import Replaced
 from integration.views import SuperResolve, sr_source
 
@@ -65,6 +66,7 @@ def install(
         factor: HR pixels per LR pixel.
         installed: called with every attachment.
     """
+    show_log()
     images = Images(str(sr), suffix) if isinstance(sr, str | Path) else sr
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
 

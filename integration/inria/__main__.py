@@ -18,13 +18,14 @@ from integration.errors import HostError
 from integration.inria import Attached, save_lr
 from integration.inria.from_options import install
 from integration.launcher import Launch, parser, run_script
+from integration.log import show_log
 
 _log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a train.py with CLEAR; returns the exit status."""
-    logging.basicConfig(level=logging.INFO, format="[clear] %(message)s")
+    show_log()
     options = parser("integration.inria", "Run the train.py of a 3DGS-style trainer with CLEAR.").parse_args(arguments)
     try:
         run = _Run(Launch(options))

@@ -12,6 +12,7 @@ from clear_strategies.data.priors import Images
 from integration.densification import end_with_strategies
 from integration.errors import HostError
 from integration.inria.attached import Attached
+from integration.log import show_log
 from integration.views import SuperResolve
 
 
@@ -44,6 +45,7 @@ def install(
         HostError: the host has another shape than 3DGS.
         SettingError, DataError: see `Attached`.
     """
+    show_log()
     iterations = getattr(opt, "iterations", None)
     if iterations is None:
         raise HostError(f"{type(opt).__name__} has no iterations, which the options of training_setup have in 3DGS.")
