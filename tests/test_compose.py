@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 
 from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies.compose import CONF, conductor, tree
+from clear_strategies.data.prepare import ViewSettings
 from clear_strategies.errors import SettingError, StrategyConflict
 from clear_strategies.jobs import device, job
 from clear_strategies.settings import TARGET, with_defaults
@@ -89,8 +90,9 @@ def test_clear_on_the_command_line_is_clear_in_python():
         assert theirs.strategies == ours.strategies
         assert theirs.objective == ours.objective
         assert theirs.statistics_from == ours.statistics_from
-    kinds = {"optim": run.optim, "mip": run.mip, "fit": run.fit, "views": run.data.views, "cloud": run.data.cloud}
-    assert {k: v for k, v in kinds.items() if k != "fit"} == {k: type(v)() for k, v in kinds.items() if k != "fit"}
+    kinds = {"optim": run.optim, "mip": run.mip, "cloud": run.data.cloud}
+    assert kinds == {k: type(v)() for k, v in kinds.items()}
+    assert run.data.views == ViewSettings(photos_are="hr")  # the demo's
     assert run.fit == job.RunSettings(iterations=900, baseline=True)  # the demo's
 
 
@@ -113,9 +115,7 @@ def test_p2g_takes_the_operator_that_makes_the_lr_images():
 
 GROUPS = ("strategy", "rasterizer", "data", "prior", "objective", "density", "optim", "skips", "method")
 NEEDED = {
-    **{
-        f"data={name}": "data.path=here" for name in ("blender", "colmap", "llff", "mipnerf360", "nerfstudio", "photos")
-    },
+    **{f"data={name}": "data.path=here" for name in ("blender", "colmap", "llff", "nerfstudio", "photos")},
     **{f"prior={name}": "prior.path=here" for name in ("dnn_superres", "images", "onnx")},
     "prior=corrupted": "prior.prior.path=here",
 }

@@ -5,26 +5,33 @@ The reader is the one of what lies in the folder. Everything behind the folder g
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from clear_strategies import run
+from clear_strategies.data.photo_files import SUFFIXES
 from clear_strategies.errors import SettingError
 
-_USAGE: Final = """clear-strategies train PHOTOS [setting=value …]
+# The photos are trained on at up to two megapixels, where an iteration takes about half a second of a core.
+_ITERATIONS: Final = 1000
+_USAGE: Final = f"""clear-strategies train PHOTOS [setting=value …]
 
 PHOTOS is a folder of photos, or a capture: COLMAP's sparse/, a transforms.json, a poses_bounds.npy or a Blender scene in it.
-It trains the whole method (+strategy=clear) on all photos; settings change that, e.g.
+It trains the whole method (+strategy=clear) on all photos for fit.iterations={_ITERATIONS}; settings change that, e.g.
 
   clear-strategies train photos/ fit.iterations=3000
-  clear-strategies train photos/ data.views.test_every=8
+  clear-strategies train photos/ data.views.test_every=8          every 8th photo is kept for testing
+  clear-strategies train photos/ data.views.max_hr_megapixels=8   sharper, slower, more memory
+  clear-strategies train photos/ data.missing=skip data.broken=skip
 
 `clear-strategies --cfg job data=photos` lists all settings.
 """
-# What decides which strategies train, so that the default must not.
+# What decides which strategies train, and for how long, so that the defaults must not.
 _CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
+_CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "+protocol=", "+scene=")
 
 
 def main(arguments: list[str]) -> None:
@@ -36,7 +43,9 @@ def main(arguments: list[str]) -> None:
     if "--help" in arguments or "-h" in arguments:
         sys.stdout.write(_USAGE)
         return
-    run.hydra_main(overrides(arguments))
+    settings = overrides(arguments)
+    sys.stdout.write(f"clear-strategies {shlex.join(settings)}\n")
+    run.hydra_main(settings)
 
 
 def overrides(arguments: Sequence[str]) -> list[str]:
@@ -48,24 +57,31 @@ def overrides(arguments: Sequence[str]) -> list[str]:
     if not arguments or arguments[0].startswith(("-", "+", "~")):
         raise SettingError("train needs a folder of photos first: clear-strategies train PHOTOS [setting=value …].")
     path, rest = Path(arguments[0]), list(arguments[1:])
+    if path.name == "transforms.json":
+        path = path.parent
     if not path.is_dir():
         raise SettingError(f"train: {path} is no folder. Name the folder of the photos, or of the capture.")
     chosen = [] if any(override.startswith(_CHOOSE_STRATEGIES) for override in rest) else ["+strategy=clear"]
-    return [*chosen, f"data={kind(path)}", f"data.path={_quoted(str(path))}", *rest]
+    chosen += (
+        [] if any(override.startswith(_CHOOSE_ITERATIONS) for override in rest) else [f"fit.iterations={_ITERATIONS}"]
+    )
+    reader, root = detect(path)
+    return [*chosen, f"data={reader}", f"data.path={_quoted(str(root))}", *rest]
 
 
-def kind(folder: Path) -> str:
-    """The choice of conf/data for what lies in the folder."""
+def detect(folder: Path) -> tuple[str, Path]:
+    """The choice of conf/data for what lies in the folder, and the path that its reader takes."""
     if (folder / "transforms_train.json").is_file():
-        return "blender"
+        return "blender", folder
     if (folder / "transforms.json").is_file():
-        return "nerfstudio"
+        return "nerfstudio", folder
     if (folder / "poses_bounds.npy").is_file():
-        return "llff"
+        return "llff", folder
     for candidate in ("sparse/0", "sparse", "colmap/sparse/0", "."):
         if any((folder / candidate / f"cameras.{ending}").is_file() for ending in ("bin", "txt")):
-            return "colmap"
-    return "photos"
+            return "colmap", folder
+    has_photos = any(file.suffix.lower() in SUFFIXES for file in folder.iterdir())
+    return "photos", folder / "images" if not has_photos and (folder / "images").is_dir() else folder
 
 
 def _quoted(value: str) -> str:

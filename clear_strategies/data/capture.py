@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.data.cameras import Lens
-from clear_strategies.data.photo_files import image_size, read_image
+from clear_strategies.data.photo_files import image_size, is_turned, read_image
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
 
@@ -47,6 +47,7 @@ class Frame:
         lens: Lens,
         pose: Float[Tensor, "4 4"],
         *,
+        upright: bool | None = None,
         background: Color | None = None,
         split: str | None = None,
         sfm_id: int | None = None,
@@ -56,16 +57,19 @@ class Frame:
         Args:
             lens: for the photo at any size.
             pose: world to camera, OpenCV axes.
+            upright: the lens is that of the photo as its EXIF block turns it; None: the shape of a photo on its side tells
+                whether its lens is, and other turned photos are refused.
             background: behind transparent pixels; None: black, logged.
 
         Raises:
             DataError: the photo is not there, or has another aspect ratio than the lens.
         """
-        width, height = image_size(path)
+        turn = _turned_as(path, lens) if upright is None else upright
+        width, height = image_size(path, turn=turn)
         fitted = lens.resized(width, height, path)
         pinhole = fitted.undistorted(path)
         camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
-        return Frame(name, camera, partial(_load, path, fitted, pinhole, background), split=split, sfm_id=sfm_id)
+        return Frame(name, camera, partial(_load, path, fitted, pinhole, background, turn), split=split, sfm_id=sfm_id)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,6 +135,14 @@ def lens_notes(lenses: Sequence[Lens], frames: Sequence[Frame]) -> dict[str, str
     return notes
 
 
-def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None) -> Float[Tensor, "H W 3"]:
-    image = read_image(path, background=background, expect=(lens.width, lens.height))
+def _turned_as(path: Path, lens: Lens) -> bool | None:
+    """As `read_image` takes it, for a photo whose lens may be that of the stored or of the upright pixels."""
+    if lens.width == lens.height or not is_turned(path):
+        return None
+    width, height = image_size(path, turn=False)
+    return (width > height) != (lens.width > lens.height)
+
+
+def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None, turn: bool | None) -> Float[Tensor, "H W 3"]:
+    image = read_image(path, background=background, expect=(lens.width, lens.height), turn=turn)
     return lens.undistort(image, pinhole) if lens.distorts else image

@@ -1,8 +1,8 @@
 """Image files, read and written. What cannot be read exactly is refused, with a remedy.
 
 The content of a file decides its kind. A truncated file is an error, not an image with a grey bottom. 16 bits stay 16
-bits. Alpha is composited over a stated background. A photo with an EXIF rotation is refused, because programs disagree
-on whether the camera's pose includes it.
+bits. Alpha is composited over a stated background. Whether a photo is turned as its EXIF block says is for the caller to
+decide, because programs disagree on whether a camera's pose includes the turn.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import io
 import logging
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -27,14 +27,28 @@ from clear_strategies.files import require_regular, write_bytes
 
 _log = logging.getLogger(__name__)
 
-SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
+SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", ".heif")
 _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
+_HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # bytes 8 to 12, behind "ftyp"
 _MAX_PIXELS: Final = 100_000_000
 _FOLDERS: Final = ("images", "images_2", "images_4", "images_8")
 _LONGEST_NAME: Final = 1024
 _LARGE: Final = 1 << 24  # pixels; smaller images may be drawings, which compress without limit
 _BOMB: Final = 200
 _EXIF_ORIENTATION: Final = 0x0112
+_EXIF_PHOTO: Final = 0x8769
+# What makes [H, W, C] pixels upright, by their EXIF orientation.
+_TURNS: Final[dict[int, Callable[[np.ndarray], np.ndarray]]] = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.swapaxes(0, 1),
+    6: lambda a: a.swapaxes(0, 1)[:, ::-1],
+    7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
+    8: lambda a: a.swapaxes(0, 1)[::-1],
+}
+_ON_THE_SIDE: Final = (5, 6, 7, 8)
 
 
 def read_image(
@@ -43,6 +57,7 @@ def read_image(
     background: tuple[float, float, float] | None = None,
     expect: tuple[int, int] | None = None,
     max_pixels: int = _MAX_PIXELS,
+    turn: bool | None = None,
 ) -> Float[Tensor, "H W 3"]:
     """RGB in [0, 1], float32.
 
@@ -50,26 +65,33 @@ def read_image(
         background: RGB in [0, 1] behind (straight) alpha: rgb · alpha + background · (1 - alpha). None: black, logged.
         expect: (width, height) the image must have.
         max_pixels: a larger image is refused before it is decoded.
+        turn: an image that its EXIF block says is stored turned: True turns it upright, False keeps the stored pixels, None
+            refuses it.
 
     Raises:
-        DataError: the file is no PNG, JPEG, WebP or TIFF, is damaged or too large, or the image is rotated by EXIF, has
+        DataError: the file is no PNG, JPEG, WebP, TIFF or HEIC, is damaged or too large, or the image is turned by EXIF, has
             an unknown colour mode, or has another size.
     """
-    with _opened(path, max_pixels) as image:
-        if expect is not None and image.size != expect:
+    with _opened(path, max_pixels, turn) as image:
+        size = _upright(image.size, orientation_of(image)) if turn else image.size
+        if expect is not None and size != expect:
             raise DataError(
                 path,
                 "size",
-                f"is {image.width}x{image.height} where {expect[0]}x{expect[1]} is expected",
+                f"is {size[0]}x{size[1]} where {expect[0]}x{expect[1]} is expected",
                 "use images of the size the cameras were made for",
             )
         sixteen_bits = ";16" in str(getattr(image, "tile", ""))  # the layout in the file, unknown after decoding
         try:
             image.load()
         except Exception as error:  # PIL's decoders raise many types of error on damaged bytes
-            raise DataError(path, "pixels", f"cannot be decoded ({error})", "replace the damaged file") from error
-        _refuse_rotated(path, image)
+            remedy = "replace the damaged file, or go on without it: data.broken=skip"
+            raise DataError(path, "pixels", f"cannot be decoded ({error})", remedy) from error
+        if turn is None:
+            _refuse_turned(path, image)
         pixels = _to_float(path, image, sixteen_bits)
+        if turn:
+            pixels = _TURNS[orientation_of(image)](pixels)
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
     if alpha.size and alpha.min() < 1:
         if background is None:
@@ -78,14 +100,49 @@ def read_image(
     return torch.from_numpy(np.ascontiguousarray(rgb))
 
 
-def image_size(path: Path, *, max_pixels: int = _MAX_PIXELS) -> tuple[int, int]:
-    """(width, height), from the header only.
+def image_size(path: Path, *, max_pixels: int = _MAX_PIXELS, turn: bool | None = None) -> tuple[int, int]:
+    """(width, height), from the header only; `turn` as for `read_image`.
 
     Raises:
         DataError: as `read_image`, as far as the header tells.
     """
-    with _opened(path, max_pixels) as image:
-        return image.size
+    with _opened(path, max_pixels, turn) as image:
+        return _upright(image.size, orientation_of(image)) if turn else image.size
+
+
+def orientation_of(image: Image.Image) -> int:
+    """The EXIF orientation of an opened image, 1 to 8; 1, upright, where there is none or it cannot be read."""
+    try:
+        orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+    except Exception as error:  # PIL raises many types of error on damaged blocks
+        _log.info("%s: its EXIF block cannot be read (%s) and is not used.", image.filename, error)  # type: ignore[attr-defined]
+        return 1
+    return orientation if orientation in _TURNS else 1
+
+
+def exif_of(path: Path) -> dict[int, Any]:
+    """The tags of an image's EXIF block, those of its photo part included; empty where it cannot be read.
+
+    Raises:
+        DataError: as `image_size`.
+    """
+    with _opened(path, _MAX_PIXELS, False) as image:
+        try:
+            block = image.getexif()
+            return {**block, **block.get_ifd(_EXIF_PHOTO)}
+        except Exception as error:  # as above
+            _log.info("%s: its EXIF block cannot be read (%s) and is not used.", path.name, error)
+            return {}
+
+
+def is_turned(path: Path) -> bool:
+    """Whether the EXIF block says that the image lies on its side: its width and height are swapped when it is upright.
+
+    Raises:
+        DataError: as `image_size`.
+    """
+    with _opened(path, _MAX_PIXELS, False) as image:
+        return orientation_of(image) in _ON_THE_SIDE
 
 
 def image_folder(root: Path, name: str | None = None) -> Path:
@@ -114,14 +171,16 @@ def folder_note(folder: Path) -> str:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder, by their suffix, in order of names. Other files are ignored.
+    """The image files of a folder, by their suffix, in order of names. Other files and hidden ones are ignored.
 
     Raises:
         DataError: the folder is not there, or holds no image.
     """
     if not folder.is_dir():
         raise DataError(folder, "folder", "is not there", "check the path")
-    found = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file())
+    found = sorted(
+        p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file() and not p.name.startswith(".")
+    )
     if not found:
         raise DataError(folder, "images", f"holds no image ({', '.join(SUFFIXES)})", "check the path")
     return found
@@ -141,6 +200,14 @@ def jpeg(image: Float[Tensor, "H W 3"], quality: int = 90) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="JPEG", quality=quality, subsampling=0)
     return buffer.getvalue()
+
+
+def write_jpeg(
+    path: Path, image: Float[Tensor, "H W 3"], size: tuple[int, int], kernel: Image.Resampling, quality: int = 95
+) -> None:
+    """A JPEG of another size, (width, height)."""
+    pixels = Image.fromarray((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+    pixels.resize(size, kernel).save(path, quality=quality, subsampling=0)
 
 
 def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) -> Path:
@@ -170,24 +237,24 @@ def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) ->
             file,
             "file name",
             f"{name!r} leads out of {root}",
-            "keep the images inside the data set's folder, or allow files outside of it",
+            "keep the images inside the data set's folder, or follow it: data.reader.allow_outside=true",
         )
     return root / name
 
 
 @contextmanager
-def _opened(path: Path, max_pixels: int) -> Iterator[Image.Image]:
+def _opened(path: Path, max_pixels: int, turn: bool | None) -> Iterator[Image.Image]:
     require_regular(path)
+    formats = (*_FORMATS, "HEIF") if _is_heif(path) else _FORMATS
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # PIL's warnings: our own size limit follows, and damage fails on decoding
-            image = Image.open(path, formats=_FORMATS)
+            image = Image.open(path, formats=formats)
     except FileNotFoundError as error:
         raise DataError(path, "file", "is not there", "check the path") from error
     except Exception as error:  # PIL raises many types of error on damaged headers
-        raise DataError(
-            path, "file", f"is no readable image ({type(error).__name__})", f"use one of {', '.join(_FORMATS)}"
-        ) from error
+        remedy = f"use one of {', '.join(_FORMATS)}, or go on without the file: data.broken=skip"
+        raise DataError(path, "file", f"is no readable image ({type(error).__name__})", remedy) from error
     with image:
         if image.width * image.height > max_pixels:
             raise DataError(
@@ -200,24 +267,45 @@ def _opened(path: Path, max_pixels: int) -> Iterator[Image.Image]:
             problem = f"{image.width}x{image.height} pixels are more than {_BOMB} times the file, as in no photo"
             raise DataError(path, "size", problem, "use the camera's own file")
         # A PNG may keep its EXIF block behind the pixels; `read_image` checks again after decoding them.
-        if image.format != "PNG" or "exif" in image.info:
-            _refuse_rotated(path, image)
+        if turn is None and (image.format != "PNG" or "exif" in image.info):
+            _refuse_turned(path, image)
         yield image
 
 
-def _refuse_rotated(path: Path, image: Image.Image) -> None:
+def _is_heif(path: Path) -> bool:
+    """Whether the content is HEIC or HEIF; PIL can then open it.
+
+    Raises:
+        DataError: pillow-heif is not installed.
+    """
     try:
-        orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
-    except Exception as error:  # as above
-        _log.info("%s: its EXIF block cannot be read (%s) and is not used.", path.name, error)
-        return
-    if orientation not in (0, 1):
+        with path.open("rb") as file:
+            head = file.read(12)
+    except OSError:
+        return False  # opening it as an image says why
+    if head[4:8] != b"ftyp" or head[8:] not in _HEIF_BRANDS:
+        return False
+    try:
+        import pillow_heif
+    except ImportError as error:
+        remedy = "pip install 'clear-strategies[heic]', or save the photo as JPEG"
+        raise DataError(path, "HEIC", "needs pillow-heif, which is not installed", remedy) from error
+    pillow_heif.register_heif_opener()  # which turns images upright, and says so in their EXIF block
+    return True
+
+
+def _refuse_turned(path: Path, image: Image.Image) -> None:
+    if (orientation := orientation_of(image)) != 1:
         raise DataError(
             path,
             "EXIF orientation",
-            f"is {orientation}: the photo is stored rotated, and its pose may not include that",
-            "rotate the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result",
+            f"is {orientation}: the photo is stored turned, and its pose may not include that",
+            "turn the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result",
         )
+
+
+def _upright(size: tuple[int, int], orientation: int) -> tuple[int, int]:
+    return (size[1], size[0]) if orientation in _ON_THE_SIDE else size
 
 
 def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.ndarray, "H W C"]:

@@ -18,7 +18,7 @@ from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.checks import refuse, require_choice, require_whole
+from clear_strategies.data.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.data.photo_files import image_size, inside, list_images, read_image, write_png
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
 from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 _ROUNDING: Final = 0.5  # grey levels: the largest difference that rounding to 8 bits makes
 
 Sizes = Literal["crop", "round"]
-PhotosAre = Literal["hr", "lr"]
+PhotosAre = Literal["lr", "hr", "both"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +41,19 @@ class ViewSettings:
     Args:
         train: the number of training views, evenly spaced among those that are not for testing; None: all of them.
         train_names: exactly these training views instead, by file name without its ending.
-        test_every: every view of this number, in order of names, is for testing, unless the data set has its own split.
+        test_every: every view of this number, in order of names, is for testing, unless the data set has its own split;
+            None or 0: none is.
+        own_split: keep to the data set's own split, if it has one; false: all of its views are alike.
         test_limit: at most this many test views, evenly spaced; None: all.
-        sr_scale: HR pixels per LR pixel.
+        sr_scale: HR pixels per LR pixel, at most: see `max_hr_megapixels`.
+        max_hr_megapixels: of a view at HR, with photos_are=lr. Larger ones are trained at twice the photos instead, or with
+            the photos, reduced to it, as the HR side: `clear_strategies.data.hr_limit`. None: no limit.
         shrink: the photos are first reduced by this whole factor (LLFF at 1/8 and 1/2 of its full size: 2).
         sizes: what happens to photos whose sizes are no multiples of shrink · sr_scale. "crop": they lose a few pixels
             at the right and the bottom. "round": they are resized to sr_scale · round(size / (shrink · sr_scale)).
-        photos_are: "hr": the photos are the truth at HR, and LR is made from them, as in the papers. "lr": they are the
-            LR observations, and HR is unknown.
+        photos_are: "lr": the photos are the LR observations, and HR is unknown. "hr": they are the truth at HR, which
+            training never sees, and LR is made from them, as in the papers. "both": they are trained on at HR, in place of
+            SR images, and LR is made from them.
         downsample: D, the operator that makes LR.
         lr_folder: ready-made LR images by the photos' names, instead of making them.
 
@@ -56,14 +61,16 @@ class ViewSettings:
         SettingError: a value is outside its range, or contradicts another.
     """
 
-    train: int | None = 3
+    train: int | None = None
     train_names: Sequence[str] | None = None
-    test_every: int = 8
+    test_every: int | None = None
+    own_split: bool = True
     test_limit: int | None = None
     sr_scale: int = 4
+    max_hr_megapixels: float | None = 2.1  # 1920x1080 fits
     shrink: int = 1
     sizes: Sizes = "crop"
-    photos_are: PhotosAre = "hr"
+    photos_are: PhotosAre = "lr"
     downsample: DownKernel = "bicubic"
     lr_folder: str | None = None
 
@@ -78,15 +85,18 @@ class ViewSettings:
             require_whole("data.views.train", self.train, least=1)
         if self.test_limit is not None:
             require_whole("data.views.test_limit", self.test_limit, least=0)
-        require_whole("data.views.test_every", self.test_every, least=2)
+        if self.test_every not in (None, 0):
+            require_whole("data.views.test_every", self.test_every, least=2)
         require_whole("data.views.sr_scale", self.sr_scale, least=1)
+        if self.max_hr_megapixels is not None:
+            require_number("data.views.max_hr_megapixels", self.max_hr_megapixels, above=0)
         require_whole("data.views.shrink", self.shrink, least=1)
         require_choice("data.views.sizes", self.sizes, get_args(Sizes))
         require_choice("data.views.photos_are", self.photos_are, get_args(PhotosAre))
         require_choice("data.views.downsample", self.downsample, get_args(DownKernel))
         if self.photos_are == "lr" and self.lr_folder:
-            rule = "must be null with photos_are=lr, because the photos are the LR images"
-            refuse("data.views.lr_folder", rule, self.lr_folder, "data.views.lr_folder=null")
+            rule = "must be null with photos_are=lr, the default, because the photos are the LR images"
+            refuse("data.views.lr_folder", rule, self.lr_folder, "data.views.photos_are=hr")
 
 
 def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSettings, *, seed: int = 0) -> Scene:
@@ -100,25 +110,32 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     """
     train_frames, test_frames = split(capture, views)
     lr_files = check_headers(train_frames + test_frames, views)
+    held_out = len(train_frames) < len(capture.frames)  # so the capture's points may know what training must not
     require_source(cloud, capture.points)
     train = tuple(_view(frame, capture, views, prior, lr_files, required=True) for frame in train_frames)
     test = tuple(_view(frame, capture, views, prior, lr_files, required=False) for frame in test_frames)
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
     initial = initial_points(
-        cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, background=capture.background, seed=seed
-    )
+        cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, sfm_is_train=not held_out,
+        background=capture.background, seed=seed,
+    )  # fmt: skip
     points, depths = initial.cloud, {v.name: d for v, d in zip(train, initial.depths, strict=bool(initial.depths))}
     sample, photo, network = train[0], train_frames[0].camera, network_of(prior)
     made = {
         "hr": f"{'PIL ' if views.downsample != 'area' else ''}{views.downsample} of the HR photo"
         if views.lr_folder is None else f"read from {views.lr_folder} (D is taken to be {views.downsample})",
         "lr": "the photos themselves; HR is unknown",
+        "both": f"PIL {views.downsample} of the photos",
     }[views.photos_are]  # fmt: skip
+    unused = len(capture.frames) - len(train) - len(test)
     notes = {
         "scene": f"{capture.name}, {len(capture.frames)} photos",
         **capture.notes,
         "train views": _names(train),
-        "test views": _names(test),
+        "test views": _names(test)
+        if test
+        else "none: all are trained on (data.views.test_every=8 keeps every 8th for testing)",
+        **({"not used": f"{unused} photos, by data.views"} if unused and not test else {}),
         "sizes": f"photos of {_size(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
         "LR": f"{_size(sample.lr.camera)}, {made}",
         "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), SR images: {sample.sr_source}",
@@ -138,12 +155,14 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
         DataError: a named view does not exist, or there are too few.
     """
     frames = list(capture.frames)
-    own_split = any(f.split for f in frames)
+    own_split = views.own_split and any(f.split for f in frames)
     if own_split:
         pool, test = [f for f in frames if f.split == "train"], [f for f in frames if f.split == "test"]
-    else:
+    elif views.test_every:
         test = frames[:: views.test_every]
         pool = [f for i, f in enumerate(frames) if i % views.test_every]
+    else:
+        pool, test = frames, []
     if views.train_names is not None:
         by_name = {Path(f.name).stem: f for f in (pool if own_split else frames)}
         missing = [name for name in views.train_names if name not in by_name]
@@ -186,7 +205,7 @@ def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Pat
     for frame in frames:
         if min(lr_size(frame.camera, views)) < 1:
             rule = f"must leave a whole LR pixel of the photo {frame.name} of {_size(frame.camera)}"
-            if views.photos_are == "hr":
+            if views.photos_are != "lr":
                 rule += f" at sr_scale={views.sr_scale}"
             refuse("data.views.shrink", rule, views.shrink, "lower data.views.shrink")
     if views.lr_folder is None:
@@ -209,7 +228,7 @@ def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Pat
 
 def lr_size(camera: Camera, views: ViewSettings) -> tuple[int, int]:
     """(width, height) of the LR photo of a camera whose photo has its own size."""
-    step = views.shrink * (views.sr_scale if views.photos_are == "hr" else 1)
+    step = views.shrink * (1 if views.photos_are == "lr" else views.sr_scale)
     width, height = (round(s / step) if views.sizes == "round" else s // step for s in (camera.width, camera.height))
     return width, height
 
@@ -251,6 +270,8 @@ def _view(
             lr = Photo(lr_camera, read_image(lr_files[frame.name], background=capture.background, expect=size))
         else:
             lr = Photo(lr_camera, images.downsample(truth, views.sr_scale, views.downsample))
+    if views.photos_are == "both" and truth is not None:
+        return View(frame.name, lr, Photo(hr_camera, truth), truth=truth, sr_source="none, the photos themselves")
     try:
         sr, sr_source = prior(frame.name, lr.image, views.sr_scale), prior.label
     except DataError as missing:
@@ -265,7 +286,7 @@ def _view(
 def _reduced(frame: Frame, views: ViewSettings) -> Photo:
     """The photo reduced by `shrink`, with sizes that are whole at both scales; see `ViewSettings.sizes`."""
     image, camera = frame.load(), frame.camera
-    multiple = views.sr_scale if views.photos_are == "hr" else 1
+    multiple = 1 if views.photos_are == "lr" else views.sr_scale
     if views.sizes == "round":
         width, height = (multiple * size for size in lr_size(camera, views))
         camera = resized(camera, width, height)

@@ -9,11 +9,13 @@ from dataclasses import dataclass, field
 from typing import Any, Final, cast
 
 from clear_strategies.data.capture import Capture
+from clear_strategies.data.hr_limit import within_limit
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import ViewSettings, prepare
 from clear_strategies.data.priors import Bicubic, DemoPrior, Ncnn, Prior, cached, network_of
 from clear_strategies.data.priors.ncnn import factors, missing_packages
 from clear_strategies.data.scene import Scene
+from clear_strategies.data.usable import Fault, require_faults
 from clear_strategies.errors import SettingError
 from clear_strategies.settings import LISTED
 
@@ -33,6 +35,8 @@ class DataSettings:
 
     Args:
         reader: reads the capture; called once every setting has been checked.
+        missing: photos that the data set names and that are not there: refuse, or skip them.
+        broken: photos that cannot be decoded: refuse, or skip them.
         save_lr: write the LR images to this folder, for an external SR model, and stop.
         path, root, scene: for the interpolations of conf/: the scene's folder, the folder of the scenes' folders, and the
             name of one of them.
@@ -41,12 +45,15 @@ class DataSettings:
     reader: Callable[[], Any]
     views: ViewSettings = field(default_factory=ViewSettings)
     cloud: CloudSettings = field(default_factory=CloudSettings)
+    missing: Fault = "refuse"
+    broken: Fault = "refuse"
     save_lr: str | None = None
     path: str | None = _variable()
     root: str | None = _variable()
     scene: str | None = _variable()
 
     def __post_init__(self) -> None:
+        require_faults(self.missing, self.broken)
         if self.path is not None and "root" not in getattr(self.reader, "keywords", {}):
             raise SettingError("path is of no use: this data set is read from no folder. Choose another, data=….")
 
@@ -85,22 +92,31 @@ def _photos(capture: Capture) -> dict[str, Callable[[], Any]]:
 
 def load(data: DataSettings, prior: PriorSettings, seed: int) -> Scene:
     """Read the data set and prepare its views and its initial points."""
-    capture = data.reader()
+    auto = isinstance(prior, AutoPrior) and data.save_lr is None
+    capture, views = within_limit(data.reader(), data.views, reaches=_reach(prior, auto), super_resolve=not auto)
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
     elif isinstance(prior, AutoPrior):
-        chosen = prior.of(capture, data.views.sr_scale)
+        chosen = prior.of(capture, views.sr_scale)
     elif isinstance(prior, functools.partial):
         chosen = prior(truth=_photos(capture))
     else:
         chosen = cast("Prior", prior)
-    scene = prepare(capture, data.views, cached(chosen), data.cloud, seed=seed)
-    if isinstance(prior, AutoPrior) and data.save_lr is None:  # logged once the photos are known to be usable
+    scene = prepare(capture, views, cached(chosen), data.cloud, seed=seed)
+    if auto and views.photos_are != "both":  # logged once the photos are known to be usable
         if isinstance(chosen, Bicubic):
-            _log.warning("prior: auto chose %s. %s.", chosen.label, _remedy(data.views.sr_scale))
+            _log.warning("prior: auto chose %s. %s.", chosen.label, _remedy(views.sr_scale))
         else:
             _log.info("prior: auto chose %s.", chosen.label)
     return scene
+
+
+def _reach(prior: PriorSettings, auto: bool) -> Callable[[int], bool]:
+    """Whether a prior enlarges by a factor; of an unknown one only `sr_scale` is expected."""
+    network = network_of(prior)
+    if isinstance(network, Ncnn):
+        return lambda factor: factor in factors(network.model)
+    return lambda _: auto or isinstance(prior, Bicubic)
 
 
 def _remedy(factor: int) -> str:

@@ -138,4 +138,7 @@ def _scores_of(view: View, image: Float[Tensor, "H W 3"], down: DownKernel) -> d
         shown = {"ours": image, "prior": view.hr.image}
         return {name: score(images.downsample(i, view.factor, down), view.lr.image) for name, i in shown.items()}
     bicubic = images.upsample(view.lr.image, view.factor)
-    return {name: score(i, view.truth) for name, i in (("ours", image), ("bicubic", bicubic), ("prior", view.hr.image))}
+    shown = {"ours": image, "bicubic": bicubic}
+    if view.hr.image is not view.truth:  # photos_are=both: the photos stand in for SR images
+        shown["prior"] = view.hr.image
+    return {name: score(i, view.truth) for name, i in shown.items()}

@@ -38,7 +38,7 @@ def main(iterations: int, strategies: str | None) -> float:
     """Train on the demo; returns the mean PSNR of its test views at HR in dB."""
     capture = demo.read(width=256, height=192, views=12, train=3)
     sr = DemoPrior(truth={frame.name: frame.load for frame in capture.frames})
-    scene = prepare(capture, ViewSettings(), sr, CloudSettings())
+    scene = prepare(capture, ViewSettings(train=3, test_every=8, photos_are="hr"), sr, CloudSettings())
     photos = {v.name: v.lr for v in scene.train}  # what a host has: LR photos and their cameras
 
     start = GaussianField.from_cloud(scene.cloud).raw()

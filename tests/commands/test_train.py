@@ -24,7 +24,12 @@ from clear_strategies.errors import SettingError
 def test_the_reader_is_the_one_of_what_lies_in_the_folder(tmp_path, file, kind):
     (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / file).touch()
-    assert train.kind(tmp_path) == kind
+    assert train.detect(tmp_path) == (kind, tmp_path)
+
+
+def test_photos_in_a_folder_called_images_are_found(tmp_path):
+    (tmp_path / "images").mkdir()
+    assert train.detect(tmp_path) == ("photos", tmp_path / "images")
 
 
 @pytest.mark.parametrize("name", ["plain", "with space", "a=b,c", "it's [here] (1)"])
@@ -40,7 +45,9 @@ def test_a_folder_of_any_name_becomes_data_path(tmp_path, name):
 
 
 def test_strategies_that_are_named_replace_the_whole_method(tmp_path):
-    assert not [o for o in train.overrides([str(tmp_path), "+strategy=gco"]) if o == "+strategy=clear"]
+    assert "+strategy=clear" not in train.overrides([str(tmp_path), "+strategy=gco"])
+    assert "+strategy=clear" in train.overrides([str(tmp_path)])
+    assert not any(o.startswith("fit.iterations") for o in train.overrides([str(tmp_path), "+protocol=llff_x4"]))
 
 
 @pytest.mark.parametrize("arguments", [[], ["fit.iterations=3"], ["nowhere"], ["--cfg", "job"]])
@@ -55,4 +62,5 @@ def test_the_table_names_modules_that_exist_and_leaves_the_rest_to_hydra(capsys)
     assert commands.named(["+strategy=clear"]) is None
     assert commands.named([]) is None
     commands.named(["help"])()
-    assert all(name in capsys.readouterr().out for name in commands.COMMANDS)
+    said = capsys.readouterr().out
+    assert all(name in said for name in commands.COMMANDS)

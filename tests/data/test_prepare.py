@@ -48,6 +48,11 @@ SIZES = {
 POINTS = CloudSettings(init="random", random_points=50)
 
 
+def papers(**settings) -> ViewSettings:
+    """The papers' protocols: conf/protocol/_papers.yaml."""
+    return ViewSettings(**{"train": 3, "test_every": 8, "photos_are": "hr", **settings})
+
+
 def capture(n: int = 3, width: int = 16, height: int = 16, image: torch.Tensor | None = None) -> Capture:
     """N photos side by side; gradients unless an image is given."""
     if image is None:
@@ -68,7 +73,7 @@ def indices(frames: list[Frame]) -> list[int]:
 @pytest.mark.parametrize("scene", LLFF)
 def test_llff_trains_and_tests_on_the_papers_views(scene):
     n, expected, n_test = LLFF[scene]
-    train, test = split(capture(n), ViewSettings(train=3))
+    train, test = split(capture(n), papers())
     assert indices(train) == expected
     assert indices(test) == list(range(0, n, 8))
     assert len(test) == n_test
@@ -77,7 +82,7 @@ def test_llff_trains_and_tests_on_the_papers_views(scene):
 @pytest.mark.parametrize("scene", MIP360)
 def test_mip360_trains_on_24_views_evenly_spaced_in_the_pool(scene):
     n, n_pool, n_test = MIP360[scene]
-    train, test = split(capture(n), ViewSettings(train=24))
+    train, test = split(capture(n), papers(train=24))
     pool = [i for i in range(n) if i % 8]
     assert (len(pool), len(test), len(train)) == (n_pool, n_test, 24)
     assert indices(train)[0] == pool[0]
@@ -90,13 +95,13 @@ def test_mip360_trains_on_24_views_evenly_spaced_in_the_pool(scene):
 def test_photos_get_the_published_sizes(scene):
     full, lr, hr = SIZES[scene]
     photo = Camera(torch.eye(4), 1.0, 1.0, 1.0, 1.0, *full)
-    assert lr_size(photo, ViewSettings(shrink=2, sizes="round")) == lr
+    assert lr_size(photo, papers(shrink=2, sizes="round")) == lr
     camera = resized(photo, *hr)
     assert (camera.scaled(1 / 4).width, camera.scaled(1 / 4).height) == lr
 
 
 def made(sizes: str, width: int = 57, height: int = 43, **settings):
-    views = ViewSettings(train=1, sizes=sizes, **settings)
+    views = papers(train=1, sizes=sizes, **settings)
     return prepare(capture(2, width, height), views, Bicubic(), CloudSettings(init="random", random_points=20)).train[0]
 
 
@@ -139,7 +144,7 @@ def undecodable(n: int = 2, width: int = 57, height: int = 43) -> Capture:
 @pytest.mark.parametrize("sizes", ["crop", "round"])
 @pytest.mark.parametrize("photos_are", ["hr", "lr"])
 def test_a_photo_that_becomes_smaller_than_an_lr_pixel_is_refused_by_its_header(sizes, photos_are):
-    views = ViewSettings(train=1, shrink=200, sizes=sizes, photos_are=photos_are)
+    views = papers(train=1, shrink=200, sizes=sizes, photos_are=photos_are)
     with pytest.raises(
         SettingError, match=r"data\.views\.shrink: must leave a whole LR pixel .* of 57x43.*, got 200: "
     ):
@@ -147,7 +152,7 @@ def test_a_photo_that_becomes_smaller_than_an_lr_pixel_is_refused_by_its_header(
 
 
 def test_the_largest_shrink_leaves_one_lr_pixel():
-    views = ViewSettings(train=1, shrink=10)
+    views = papers(train=1, shrink=10)
     check_headers(undecodable().frames, views)
     assert lr_size(undecodable().frames[0].camera, views) == (1, 1)
 
@@ -158,7 +163,7 @@ def test_ready_made_lr_images_are_checked_by_their_headers(size, tmp_path):
     if size is not None:
         write_png(tmp_path / "0001.png", torch.zeros(size[1], size[0], 3))
     with pytest.raises(DataError, match="has no LR image" if size is None else "is 5x5 where 14x10 is expected"):
-        prepare(undecodable(), ViewSettings(train=1, lr_folder=str(tmp_path)), Bicubic(), POINTS)
+        prepare(undecodable(), papers(train=1, lr_folder=str(tmp_path)), Bicubic(), POINTS)
 
 
 def test_ready_made_lr_images_are_used(tmp_path):
@@ -171,7 +176,7 @@ def test_ready_made_lr_images_are_used(tmp_path):
 @pytest.mark.parametrize("init", ["sfm", "sfm_train", "ply"])
 def test_points_that_do_not_exist_are_refused_before_a_photo_is_decoded(init):
     with pytest.raises(DataError, match=r"there are none|is not there"):
-        prepare(undecodable(), ViewSettings(train=1), Bicubic(), CloudSettings(init=init, path="nowhere.ply"))
+        prepare(undecodable(), papers(train=1), Bicubic(), CloudSettings(init=init, path="nowhere.ply"))
 
 
 @pytest.mark.parametrize(
@@ -198,7 +203,7 @@ def test_lr_photos_and_an_lr_folder_contradict_each_other():
 def added(prior, caplog) -> tuple[float, str]:
     capture = demo.read(width=64, height=48, views=5, train=2)
     with caplog.at_level(logging.WARNING):
-        scene = prepare(capture, ViewSettings(train=2), prior(capture), POINTS)
+        scene = prepare(capture, papers(train=2), prior(capture), POINTS)
     return float(scene.notes["the SR images add"].split()[0]), caplog.text
 
 

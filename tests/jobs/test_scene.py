@@ -26,7 +26,7 @@ def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
     unused = max(i for i, frame in enumerate(capture.frames) if frame.split == "test")
     tiny = replace(capture.frames[unused], camera=capture.frames[unused].camera.scaled(1 / 16))
     frames = tuple(tiny if i == unused else frame for i, frame in enumerate(capture.frames))
-    views = ViewSettings(train=2, test_limit=1)
+    views = ViewSettings(train=2, test_limit=1, photos_are="hr")
     with caplog.at_level(logging.INFO):
         scene = load(DataSettings(reader=lambda: replace(capture, frames=frames), views=views), AutoPrior(), 0)
     assert tiny.name not in {view.name for view in (*scene.train, *scene.test)}
@@ -36,7 +36,7 @@ def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
 def of_photos(factor: int = 4) -> Scene:
     """The demo's photos as a data set that is not the demo."""
     capture = replace(demo.read(width=96, height=48, views=4, train=2), name="mine")
-    views = ViewSettings(train=2, sr_scale=factor)
+    views = ViewSettings(train=2, sr_scale=factor, photos_are="hr")
     data = DataSettings(reader=lambda: capture, views=views, cloud=CloudSettings(init="random", random_points=20))
     return load(data, AutoPrior(), 0)
 

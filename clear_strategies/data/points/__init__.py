@@ -139,6 +139,7 @@ def initial_points(
     *,
     sfm: SfmPoints | None = None,
     train_ids: Sequence[int] = (),
+    sfm_is_train: bool = False,
     background: tuple[float, float, float] | None = None,
     seed: int = 0,
 ) -> InitialPoints:
@@ -148,6 +149,7 @@ def initial_points(
         photos: the training views at LR.
         sfm: the scene's SfM points, if it has some.
         train_ids: their ids of the training frames.
+        sfm_is_train: every photo of the capture trains, so that init=auto may use the SfM points in place of triangulating.
         background: the colour of pixels without a surface (Blender's white), RGB in [0, 1].
 
     Raises:
@@ -165,7 +167,8 @@ def initial_points(
         case "sfm_train" if sfm is not None:
             cloud = _cleaned(settings, from_tracks(sfm, train_ids, settings.min_views), photos, background)
         case _:
-            cloud, depths = _from_photos(settings, photos, sfm, background)
+            known = _of_training_alone(settings, sfm, train_ids) if sfm_is_train else None
+            cloud, depths = _from_photos(settings, photos, sfm, known, background)
     if cloud is None:
         cloud = random_cloud(photos, settings.random_points, seed, settings.box)
     if settings.voxel is not None:
@@ -178,17 +181,33 @@ def initial_points(
     return InitialPoints(cloud, depths)
 
 
+def _of_training_alone(settings: CloudSettings, sfm: SfmPoints | None, train_ids: Sequence[int]) -> PointCloud | None:
+    """For init=auto, the SfM points of a capture that has no other photos than the training views; None: too few."""
+    if settings.init != "auto" or sfm is None or len(sfm.means) == 0:
+        return None
+    try:
+        cloud = from_tracks(sfm, train_ids, settings.min_views) if len(sfm.track_point) else from_sfm(sfm)
+    except DataError:  # none of them has two observers
+        return None
+    return replace(cloud, uses_test_views="no") if len(cloud) >= settings.enough else None
+
+
 def _from_photos(
     settings: CloudSettings,
     photos: Sequence[Photo],
     sfm: SfmPoints | None,
+    known: PointCloud | None,
     background: tuple[float, float, float] | None,
 ) -> tuple[PointCloud | None, tuple[DepthMap, ...]]:
-    """Points from the training LR images, and their depth maps; None where init=auto finds too few."""
+    """Points from the training LR images, and their depth maps; None where init=auto finds too few.
+
+    Args:
+        known: SfM points of the training views alone; with them nothing is triangulated.
+    """
     auto = settings.init == "auto"
-    if auto and sfm is not None:
+    if auto and sfm is not None and known is None:
         _log.info("init: auto does not use the scene's own points, because test views were used for them.")
-    features = triangulate(photos, settings.triangulation)
+    features = triangulate(photos, settings.triangulation) if known is None else known
     if settings.init != "triangulated":
         maps = depth_maps(photos, features.means, settings.stereo, background)
         cloud = stereo_cloud(features, photos, maps, settings, background)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -12,6 +14,7 @@ from clear_strategies.data.cameras import Lens, pose_from_opengl
 from clear_strategies.data.capture import Capture, Color, Frame, sorted_by_name
 from clear_strategies.data.checks import as_color
 from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
+from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -19,13 +22,23 @@ _log = logging.getLogger(__name__)
 _WHITE: Final = (1.0, 1.0, 1.0)
 
 
-def read(root: str | Path, *, background: Color = _WHITE) -> Capture:
+def read(
+    root: str | Path,
+    *,
+    background: Color = _WHITE,
+    allow_outside: bool = False,
+    missing: Fault = "refuse",
+    broken: Fault = "refuse",
+) -> Capture:
     """Read a scene folder. Frames are named by their file (r_2), test frames with the prefix "test/".
 
     Frames keep the order of the JSON files, which is the protocols' numbering. By name, r_10 would come before r_2.
 
     Args:
         background: RGB in [0, 1], behind transparent pixels.
+        allow_outside: follow file names and links that lead out of the folder.
+        missing: frames whose photo is not there: "refuse" or "skip".
+        broken: photos that cannot be decoded: "refuse" or "skip".
 
     Raises:
         SettingError: the background is no colour.
@@ -34,10 +47,11 @@ def read(root: str | Path, *, background: Color = _WHITE) -> Capture:
     root, background = Path(root), as_color("data.reader.background", background)
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
-    frames = _frames(root, root / "transforms_train.json", "train", background)
+    faults = partial(usable, path_of=lambda entry: entry[0], missing=missing, broken=broken)
+    frames = _frames(root, root / "transforms_train.json", "train", background, allow_outside, faults)
     files = ["transforms_train.json"]
     if (root / "transforms_test.json").exists():
-        frames += _frames(root, root / "transforms_test.json", "test", background)
+        frames += _frames(root, root / "transforms_test.json", "test", background, allow_outside, faults)
         files.append("transforms_test.json")
     else:
         _log.warning("%s has no transforms_test.json: there are no test views.", root)
@@ -47,16 +61,25 @@ def read(root: str | Path, *, background: Color = _WHITE) -> Capture:
     return Capture(root.resolve().name, tuple(frames), None, background, notes)
 
 
-def _frames(root: Path, file: Path, split: str, background: Color) -> list[Frame]:
+def _frames(
+    root: Path,
+    file: Path,
+    split: str,
+    background: Color,
+    allow_outside: bool,
+    faults: Callable[[Path, list[tuple[Path, int]]], list[tuple[Path, int]]],
+) -> list[Frame]:
     content = strict_json.read_object(file)
     angle = strict_json.number(file, "camera_angle_x", content.get("camera_angle_x"))
     if not 0 < angle < math.pi:
         raise DataError(file, "camera_angle_x", f"is {angle:g}; it must lie in (0, pi) radians", "correct the field")
-    frames = []
-    for i, frame in enumerate(strict_json.frames_of(file, content)):
-        name = strict_json.file_path(file, i, frame)
-        path = inside(root, name if name.lower().endswith(SUFFIXES) else f"{name}.png", file=file)
-        pose = pose_from_opengl(file, f"frames[{i}].transform_matrix", frame.get("transform_matrix"))
+    frames, entries, photos = [], strict_json.frames_of(file, content), []
+    for i, entry in enumerate(entries):
+        name = strict_json.file_path(file, i, entry)
+        name = name if name.lower().endswith(SUFFIXES) else f"{name}.png"
+        photos.append((inside(root, name, file=file, allow_outside=allow_outside), i))
+    for path, i in faults(file, photos):
+        pose = pose_from_opengl(file, f"frames[{i}].transform_matrix", entries[i].get("transform_matrix"))
         width, height = image_size(path)
         focal = width / (2 * math.tan(angle / 2))
         lens = Lens(width, height, focal, focal, width / 2, height / 2).check(file, "camera_angle_x")

@@ -24,6 +24,7 @@ from clear_strategies.data.cameras import FARTHEST, Lens
 from clear_strategies.data.capture import Capture, Color, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.checks import as_color
 from clear_strategies.data.photo_files import folder_note, image_folder, inside, list_images
+from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 from clear_strategies.files import require_regular
 from rasterizers.geometry import rotation_matrix
@@ -80,6 +81,8 @@ def read(
     *,
     background: Color | None = None,
     allow_outside: bool = False,
+    missing: Fault = "refuse",
+    broken: Fault = "refuse",
 ) -> Capture:
     """Read a scene folder with a sparse model in sparse/0, sparse, colmap/sparse/0 or the folder itself.
 
@@ -88,6 +91,8 @@ def read(
             None: the first that exists of images, images_2, images_4, images_8.
         background: RGB in [0, 1] behind transparent pixels; None: black.
         allow_outside: follow file names and links that lead out of that folder.
+        missing: photos of the model that are not there: "refuse" or "skip".
+        broken: photos that cannot be decoded: "refuse" or "skip".
 
     Raises:
         SettingError: the background is no colour.
@@ -100,7 +105,11 @@ def read(
     folder = image_folder(root, images)
     listing = model.folder / f"images{model.ending}"
     paths = {image.name: _photo(folder, image.name, listing, allow_outside) for image in model.images}
-    return capture(root, model, folder, paths, background=background)
+    if not any(path.is_file() for path in paths.values()):
+        first = model.images[0].name
+        remedy = "set data.reader.images to the folder that the model was made from"
+        raise DataError(listing, first, f"is not in {folder}, and no other photo is", remedy)
+    return capture(root, model, folder, paths, background=background, missing=missing, broken=broken)
 
 
 def capture(
@@ -110,28 +119,37 @@ def capture(
     paths: Mapping[str, Path],
     *,
     background: Color | None = None,
+    upright: bool | None = None,
+    missing: Fault = "refuse",
+    broken: Fault = "refuse",
 ) -> Capture:
     """The capture of a model and its photos: `paths` by the model's names, below `folder`.
+
+    Args:
+        upright: see `Frame.of_photo`.
 
     Raises:
         DataError: an image cannot be used.
     """
+    listing = model.folder / f"images{model.ending}"
+    kept = usable(listing, model.images, lambda image: paths[image.name], missing=missing, broken=broken)
     frames = [
         Frame.of_photo(
             paths[image.name].relative_to(folder).as_posix(), paths[image.name], model.lenses[image.camera],
-            pose_of(image), background=background, sfm_id=image.id,
+            pose_of(image), upright=upright, background=background, sfm_id=image.id,
         )
-        for image in model.images
+        for image in kept
     ]  # fmt: skip
+    some_of = f" of its {len(model.images)}" if len(frames) < len(model.images) else ""
     notes = {
-        "poses": f"COLMAP {_label(root, model)} ({model.ending[1:]}), {len(frames)} images",
+        "poses": f"COLMAP {_label(root, model)} ({model.ending[1:]}), {len(frames)}{some_of} images",
         "photos": folder_note(folder),
     }
     unposed = sorted({p.name for p in list_images(folder)} - {p.name for p in paths.values()})
     if unposed:
         notes["without pose"] = f"{len(unposed)} photos, not used: {', '.join(unposed[:8])}"
         _log.info("%s: %d photos have no pose and are not used: %s.", root, len(unposed), ", ".join(unposed[:8]))
-    notes |= lens_notes([model.lenses[image.camera] for image in model.images], frames)
+    notes |= lens_notes([model.lenses[image.camera] for image in kept], frames)
     uneven = sum(abs(math.hypot(*image.quat) - 1) > _UNEVEN for image in model.images)
     if uneven:
         notes["rotations"] = f"{uneven} quaternions were not of length 1 and were normalised"
@@ -225,15 +243,16 @@ def _is_model(folder: Path) -> bool:
 
 
 def _photo(folder: Path, name: str, listing: Path, allow_outside: bool) -> Path:
-    """The photo of this name, else the only one of the same stem: images_4 often holds PNG files for JPG names."""
+    """The photo of this name, else the only one of the same stem: images_4 often holds PNG files for JPG names.
+
+    The path of a missing photo leads to no file.
+    """
     path = inside(folder, name, file=listing, allow_outside=allow_outside)
     if path.is_file():
         return path
     twins = [p for p in path.parent.glob("*") if p.stem == path.stem and p.is_file()]
     if len(twins) != 1:
-        raise DataError(
-            listing, name, f"is not in {folder}", "set data.reader.images to the folder that the model was made from"
-        )
+        return path
     if not allow_outside:
         inside(folder, twins[0].relative_to(folder).as_posix(), file=listing)
     return twins[0]

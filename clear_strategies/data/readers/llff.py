@@ -17,6 +17,7 @@ from clear_strategies.data.capture import Capture, Color, Frame, lens_notes, sor
 from clear_strategies.data.checks import as_color, require_choice
 from clear_strategies.data.photo_files import folder_note, image_folder, inside, list_images
 from clear_strategies.data.readers import colmap
+from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 from clear_strategies.files import require_regular
 
@@ -43,6 +44,9 @@ def read(
     poses: str = "auto",
     *,
     background: Color | None = None,
+    allow_outside: bool = False,
+    missing: Fault = "refuse",
+    broken: Fault = "refuse",
 ) -> Capture:
     """Read an LLFF scene folder.
 
@@ -50,6 +54,9 @@ def read(
         images: folder of the photos below root; None: the first that exists of images, images_2, images_4, images_8.
         poses: "colmap" (sparse/0), "poses_bounds", or "auto": COLMAP's if it has a model.
         background: RGB in [0, 1] behind transparent pixels; None: black.
+        allow_outside: follow links that lead out of the photos' folder.
+        missing: photos of COLMAP's model that are not there: "refuse" or "skip".
+        broken: photos that cannot be decoded: "refuse" or "skip".
 
     Raises:
         SettingError: `poses` or the background is none of these.
@@ -64,16 +71,19 @@ def read(
     folder = image_folder(root, images)
     has_model = any((root / layout).is_dir() for layout in ("sparse", "colmap/sparse"))
     if poses == "colmap" or (poses == "auto" and has_model):
-        return _from_colmap(root, folder, background)
-    return _from_bounds(root, folder, has_model, background)
+        return _from_colmap(root, folder, background, allow_outside, missing, broken)
+    return _from_bounds(root, folder, has_model, background, allow_outside, broken)
 
 
-def _from_colmap(root: Path, folder: Path, background: Color | None) -> Capture:
+def _from_colmap(
+    root: Path, folder: Path, background: Color | None, allow_outside: bool, missing: Fault, broken: Fault
+) -> Capture:
     model = colmap.read_model(colmap.find_model(root))
     registered = sorted(image.name for image in model.images)
-    files = {p.name: inside(folder, p.name, file=folder) for p in list_images(folder)}
-    if all(name in files for name in registered):
-        return colmap.capture(root, model, folder, {name: files[name] for name in registered}, background=background)
+    files = {p.name: inside(folder, p.name, file=folder, allow_outside=allow_outside) for p in list_images(folder)}
+    if any(name in files for name in registered):
+        paths = {name: files.get(name, folder / name) for name in registered}
+        return colmap.capture(root, model, folder, paths, background=background, missing=missing, broken=broken)
     # LLFF's scripts rename the photos of images_4 and the like, in the order of the originals.
     if len(files) != len(registered):
         raise DataError(
@@ -81,12 +91,14 @@ def _from_colmap(root: Path, folder: Path, background: Color | None) -> Capture:
             "set data.reader.images to the folder that the model was made from",
         )  # fmt: skip
     ordered = dict(zip(registered, (files[name] for name in sorted(files)), strict=True))
-    found = colmap.capture(root, model, folder, ordered, background=background)
+    found = colmap.capture(root, model, folder, ordered, background=background, broken=broken)
     first = f"{registered[0]} is {ordered[registered[0]].name}"
     return replace(found, notes={**found.notes, "names": f"photos matched to the model's by order ({first})"})
 
 
-def _from_bounds(root: Path, folder: Path, has_model: bool, background: Color | None) -> Capture:
+def _from_bounds(
+    root: Path, folder: Path, has_model: bool, background: Color | None, allow_outside: bool, broken: Fault
+) -> Capture:
     file = root / "poses_bounds.npy"
     table = _read_table(file)
     paths = list_images(folder)
@@ -100,14 +112,16 @@ def _from_bounds(root: Path, folder: Path, has_model: bool, background: Color | 
     model = colmap.read_model(colmap.find_model(root)) if has_model else None
     ids = _ids_by_order(model, len(paths))
     frames, lenses = [], []
-    for i, (row, path) in enumerate(zip(table, paths, strict=True)):
+    kept = usable(folder, range(len(paths)), lambda i: paths[i], missing="refuse", broken=broken)
+    for i in kept:
+        row, path = table[i], paths[i]
         pose = row[:15].reshape(3, 5)
         height, width, focal = pose[:, 4]
         down, right, back = pose[:, 0], pose[:, 1], pose[:, 2]  # LLFF's axes
         rotation = np.stack((right, down, -back), axis=1)
         lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2).check(file, f"row {i}")
         world_to_camera = rigid_inverse(file, f"row {i}", rotation, pose[:, 3])
-        inside(folder, path.name, file=folder)
+        inside(folder, path.name, file=folder, allow_outside=allow_outside)
         lenses.append(lens)
         frames.append(Frame.of_photo(path.name, path, lens, world_to_camera, background=background, sfm_id=ids[i]))
     near, far = table[:, 15].min(), table[:, 16].max()

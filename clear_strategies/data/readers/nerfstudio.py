@@ -17,6 +17,7 @@ from clear_strategies.data.capture import Capture, Color, Frame, SfmPoints, lens
 from clear_strategies.data.checks import as_color
 from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
 from clear_strategies.data.ply import read_points
+from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -37,12 +38,21 @@ _INTRINSICS: Final = (
 _SPLITS: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
 
 
-def read(root: str | Path, *, background: Color | None = None, allow_outside: bool = False) -> Capture:
+def read(
+    root: str | Path,
+    *,
+    background: Color | None = None,
+    allow_outside: bool = False,
+    missing: Fault = "refuse",
+    broken: Fault = "refuse",
+) -> Capture:
     """Read a folder with transforms.json, or that file. Poses are taken as they are, `applied_transform` included.
 
     Args:
         background: RGB in [0, 1] behind transparent pixels; None: black.
         allow_outside: follow file names and links that lead out of the folder.
+        missing: frames whose photo is not there: "refuse" or "skip".
+        broken: photos that cannot be decoded: "refuse" or "skip".
 
     Raises:
         SettingError: the background is no colour.
@@ -60,17 +70,18 @@ def read(root: str | Path, *, background: Color | None = None, allow_outside: bo
     short = _short_names(names)
     shared: dict[str, Any] = {key: content[key] for key in _INTRINSICS if key in content}
     lenses, frames = [], []
-    for i, (name, entry) in enumerate(zip(names, entries, strict=True)):
-        where = f"frames[{i}]"
-        path = _photo(folder, name, file, allow_outside)
+    paths = [_photo(folder, name, file, allow_outside) for name in names]
+    kept = usable(file, range(len(entries)), lambda i: paths[i], missing=missing, broken=broken)
+    for i in kept:
+        where, name, entry, path = f"frames[{i}]", names[i], entries[i], paths[i]
         pose = pose_from_opengl(file, f"{where}.transform_matrix", entry.get("transform_matrix"))
         lens = _lens(file, where, {**shared, **entry}, path)
         lenses.append(lens)
         frames.append(Frame.of_photo(short[i], path, lens, pose, background=background, split=splits.get(name)))
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(lenses, frames)}
     if splits:
-        notes["split"] = _split_note(file, names, splits)
-    masked = sum("mask_path" in entry for entry in entries)
+        notes["split"] = _split_note(file, names, [names[i] for i in kept], splits)
+    masked = sum("mask_path" in entries[i] for i in kept)
     if masked:
         _log.warning("%s: masks (of %d frames) are not used.", file, masked)
         notes["masks"] = f"not used ({masked} frames have one)"
@@ -112,7 +123,8 @@ def _lens(file: Path, where: str, values: Mapping[str, Any], image: Path) -> Len
             )
         return size / (2 * math.tan(angle / 2))
 
-    real_width, real_height = image_size(image)
+    # Of a turned photo only given sizes tell whether they are those of the stored pixels.
+    real_width, real_height = (0, 0) if "w" in values and "h" in values else image_size(image)
     width, height = number("w", float(real_width)), number("h", float(real_height))
     fx = focal("fl_x", "camera_angle_x", width, None)
     fy = focal("fl_y", "camera_angle_y", height, fx)
@@ -147,15 +159,16 @@ def _splits(file: Path, content: Mapping[str, Any]) -> dict[str, str]:
     return splits
 
 
-def _split_note(file: Path, names: Sequence[str], splits: Mapping[str, str]) -> str:
-    """How many frames the file's own lists assign to each side. Frames in none of them are logged."""
+def _split_note(file: Path, names: Sequence[str], kept: Sequence[str], splits: Mapping[str, str]) -> str:
+    """How many of the frames `kept` the file's own lists assign to each side. Frames in none of them are logged."""
     missing = sorted(set(splits) - set(names))
     if missing:
         raise DataError(file, "split", f"lists {missing[0]!r}, which is no frame's file_path", "correct the lists")
-    counts = {side: sum(splits.get(name) == side for name in names) for side in ("train", "test")}
-    neither = len(names) - sum(counts.values())
+    counts = {side: sum(splits.get(name) == side for name in kept) for side in ("train", "test")}
+    neither = len(kept) - sum(counts.values())
     if neither:
-        _log.warning("%s: %d frames are in none of its split lists and are not used.", file, neither)
+        message = "%s: %d frames are in none of its split lists and are not used; data.views.own_split=false uses them."
+        _log.warning(message, file, neither)
     return f"the file's own: {counts['train']} train, {counts['test']} test, {neither} in neither"
 
 

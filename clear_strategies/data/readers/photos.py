@@ -4,134 +4,126 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import tempfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from clear_strategies.data.capture import Capture
-from clear_strategies.data.checks import require_whole
+from clear_strategies.data.checks import require_number, require_whole
+from clear_strategies.data.exif import Exif, read_exif
 from clear_strategies.data.photo_files import image_size, inside, list_images
 from clear_strategies.data.priors import cache_folder
-from clear_strategies.data.readers import colmap
+from clear_strategies.data.readers import colmap, sfm
+from clear_strategies.data.usable import Fault, some, usable
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
 
-_FEWEST: Final = 3
-_MORE: Final = "take more photos that overlap by two thirds, with the same camera and zoom, of a scene with texture"
+_STOPS: Final = 0.5  # differences of exposure above this are said
 
 
 def read(
-    root: str | Path, cache: str | Path | None = None, *, max_side: int = 3200, threads: int = -1, seed: int = 0
+    root: str | Path,
+    cache: str | Path | None = None,
+    *,
+    max_side: int = 1600,
+    max_features: int = 8192,
+    least_placed: float = 0.5,
+    threads: int = -1,
+    seed: int = 0,
+    allow_outside: bool = False,
+    missing: Fault = "refuse",
+    broken: Fault = "refuse",
 ) -> Capture:
     """Read a folder of photos of one scene. Poses are estimated from all of them and kept in a cache.
 
     Args:
         cache: folder of the poses; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Not in the photos' folder.
         max_side: features are extracted from photos reduced to this many pixels.
+        max_features: of a photo, the strongest; memory and time of matching grow with its square.
+        least_placed: the least share of the photos whose poses must be found.
         threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
         seed: of COLMAP's random samples.
+        allow_outside: follow links that lead out of the folder.
+        missing: photos whose link leads nowhere: "refuse" or "skip".
+        broken: photos that cannot be decoded: "refuse" or "skip".
 
     Raises:
         SettingError: a number is outside its range.
-        DataError: too few photos, none can be related to each other, or pycolmap is not installed.
+        DataError: too few photos, too few can be related to each other, or pycolmap is not installed.
     """
     require_whole("data.reader.max_side", max_side, least=1)
+    require_whole("data.reader.max_features", max_features, least=1)
+    require_number("data.reader.least_placed", least_placed, above=0, most=1)
     require_whole("data.reader.threads", threads, least=-1)
     require_whole("data.reader.seed", seed, least=0)
     root = Path(root)
-    paths = list_images(root)
-    if len(paths) < _FEWEST:
-        raise DataError(root, "images", f"there are {len(paths)}, poses need at least {_FEWEST}", _MORE)
-    sizes = [image_size(inside(root, path.name, file=root)) for path in paths]  # refuses bad ones before the long work
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
-    folder = base / _key(paths, max_side, seed)
+    listed = _once_each([inside(root, p.name, file=root, allow_outside=allow_outside) for p in list_images(root)])
+    paths = usable(root, listed, lambda path: path, missing=missing, broken=broken)
+    if len(paths) < sfm.FEWEST:
+        raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", sfm.MORE)
+    photos = {path: read_exif(path) for path in paths}  # refuses bad ones before the long work
+    for path in paths:
+        image_size(path, turn=True)
+    folder = base / _key(paths, max_side, max_features, seed)
     if (folder / "cameras.bin").is_file():
         _log.info("%s: poses from the cache %s.", root, folder)
     else:
-        _reconstruct(
-            root, paths, folder, same_camera=len(set(sizes)) == 1, max_side=max_side, threads=threads, seed=seed
-        )
-    model = colmap.read_model(folder)
-    found = colmap.capture(root, model, root, {image.name: root / image.name for image in model.images})
+        settings = sfm.SfmSettings(max_side, max_features, least_placed, threads, seed)
+        sfm.reconstruct(root, photos, folder, settings)
+    return _capture(root, paths, photos, colmap.read_model(folder))
+
+
+def _capture(root: Path, paths: Sequence[Path], photos: Mapping[Path, Exif], model: colmap.Model) -> Capture:
+    """The photos with their poses; the model knows them by their numbers."""
+    by_copy = {sfm.copy_name(i): path for i, path in enumerate(paths)}
+    found = colmap.capture(root, model, root, {image.name: by_copy[image.name] for image in model.images}, upright=True)
+    placed = {frame.name for frame in found.frames}
+    sfm.unplaced_warning(root, [path.name for path in paths if path.name not in placed], len(paths))
     notes = {
         **found.notes,
-        "poses": f"estimated by pycolmap from all {len(paths)} photos, {len(found.frames)} could be placed",
+        "poses": f"estimated by pycolmap from all {len(paths)} photos, {len(placed)} could be placed",
         "photos": root.name,
+        **_exposure(photos),
     }
-    label = "estimated here by pycolmap"
-    return replace(found, points=colmap.sfm_points(model, label), notes=notes)
+    return replace(found, points=colmap.sfm_points(model, "estimated here by pycolmap"), notes=notes)
 
 
-def _reconstruct(
-    root: Path, paths: list[Path], folder: Path, *, same_camera: bool, max_side: int, threads: int, seed: int
-) -> None:
-    """Run SfM in a temporary folder beside the result, then move the largest model there."""
-    pycolmap = _pycolmap()
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    _log.info(
-        "%s: estimating the poses of %d photos. This takes seconds to minutes per pair of photos.", root, len(paths)
-    )
-    try:
-        with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work:
-            best = _map(pycolmap, root, paths, Path(work), same_camera, max_side, threads, seed)
-            placed = best.num_reg_images() if best is not None else 0
-            if placed < _FEWEST:
-                raise DataError(
-                    root, "poses", f"only {placed} of {len(paths)} photos could be related to each other", _MORE
-                )
-            result = Path(work) / "result"
-            result.mkdir()
-            best.write_binary(str(result))
-            result.rename(folder)
-    except (RuntimeError, OSError) as error:
-        raise DataError(root, "poses", f"structure-from-motion failed ({error})", _MORE) from error
-    _log.info("%s: %d of %d photos could be placed.", root, placed, len(paths))
+def _once_each(paths: Sequence[Path]) -> list[Path]:
+    """Without the second file of a photo that a phone has saved twice, as HEIC and as JPEG."""
+    others = [path for path in paths if path.suffix.lower() not in (".heic", ".heif")]
+    stems = {path.stem for path in others}
+    twice = [path.name for path in paths if path not in others and path.stem in stems]
+    if twice:
+        _log.info("%d photos are there twice; their HEIC files are not used: %s.", len(twice), some(twice))
+    kept = [path for path in paths if path.name not in twice]
+    same = [stem for stem, count in Counter(path.stem for path in kept).items() if count > 1]
+    if same:
+        raise DataError(kept[0].parent, "file name", f"{same[0]!r} has several files", "keep one file of each photo")
+    return kept
 
 
-def _map(
-    pycolmap: Any, root: Path, paths: list[Path], work: Path, same_camera: bool, max_side: int, threads: int, seed: int
-) -> Any:
-    """COLMAP's incremental pipeline: features, all pairs, mapping. The model with the most photos, or None."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value  # its progress is hundreds of lines
-    try:
-        pycolmap.set_random_seed(seed)
-        extraction = pycolmap.FeatureExtractionOptions()
-        extraction.max_image_size, extraction.num_threads, extraction.use_gpu = max_side, threads, False
-        matching = pycolmap.FeatureMatchingOptions()
-        matching.num_threads, matching.use_gpu = threads, False
-        mapping = pycolmap.IncrementalPipelineOptions()
-        mapping.num_threads, mapping.random_seed = threads, seed
-        database = work / "database.db"
-        mode = pycolmap.CameraMode.SINGLE if same_camera else pycolmap.CameraMode.AUTO
-        names = [path.name for path in paths]
-        pycolmap.extract_features(
-            database, root, image_names=names, camera_mode=mode, extraction_options=extraction,
-            device=pycolmap.Device.cpu,
-        )  # fmt: skip
-        pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
-        models = pycolmap.incremental_mapping(database, root, work, options=mapping)
-    finally:
-        pycolmap.logging.minloglevel = level
-    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+def _exposure(photos: Mapping[Path, Exif]) -> dict[str, str]:
+    """A note where EXIF says that exposures differ: nothing here corrects that."""
+    known = {path.name: exif.exposure for path, exif in photos.items() if exif.exposure is not None}
+    if len(known) < 2:
+        return {}
+    low, high = min(known, key=lambda name: known[name]), max(known, key=lambda name: known[name])
+    stops = known[high] - known[low]
+    if stops <= _STOPS:
+        return {}
+    text = f"differs by {stops:.1f} stops between {low} and {high} (EXIF)"
+    _log.warning("the photos' exposure %s: brightness that jumps between views costs detail. Lock it next time.", text)
+    return {"exposure": text}
 
 
-def _pycolmap() -> Any:
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise DataError(
-            "data=photos", "pycolmap", f"cannot be imported ({error})", "pip install 'clear-strategies[colmap]'"
-        ) from error
-    return pycolmap
-
-
-def _key(paths: list[Path], *settings: int) -> str:
-    digest = hashlib.sha256(repr(settings).encode())
+def _key(paths: Sequence[Path], *settings: int) -> str:
+    digest = hashlib.sha256(repr(("upright copies", *settings)).encode())
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:24]

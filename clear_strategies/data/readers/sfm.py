@@ -1,0 +1,211 @@
+"""Structure from motion on the CPU through pycolmap: a sparse model from photos alone, with bounded memory and progress.
+
+COLMAP reads copies of the photos: upright, of any format that we read, and no larger than needed. A camera is shared by the
+photos of one size and one focal length in EXIF, which is where its own starts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import sqlite3
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from PIL import Image as Picture
+
+from clear_strategies.data.exif import Exif
+from clear_strategies.data.photo_files import read_image, write_jpeg
+from clear_strategies.data.usable import some
+from clear_strategies.errors import DataError
+
+_log = logging.getLogger(__name__)
+
+FEWEST: Final = 3
+MORE: Final = "take more photos that overlap by two thirds, with the same camera and zoom, of a scene with texture"
+_EVERY: Final = 10.0  # seconds between lines of progress
+_MEGA: Final = 1 << 20
+_DISTANCES: Final = 4  # bytes of each pair of features that are compared
+
+
+@dataclass(frozen=True, slots=True)
+class SfmSettings:
+    """How poses are estimated.
+
+    Args:
+        max_side: features are extracted from photos reduced to this many pixels.
+        max_features: of a photo, the strongest; memory and time of matching grow with its square.
+        least_placed: the least share of the photos that must be placed, in (0, 1].
+        threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
+        seed: of COLMAP's random samples.
+    """
+
+    max_side: int
+    max_features: int
+    least_placed: float
+    threads: int
+    seed: int
+
+
+def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings: SfmSettings) -> None:
+    """Estimate the poses of these photos and write the model with most of them to `folder`, under their numbers' names.
+
+    Raises:
+        DataError: pycolmap is not installed, or too few photos can be placed.
+    """
+    pycolmap = _pycolmap()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    count, features = len(photos), settings.max_features
+    pairs = count * (count - 1) // 2
+    _log.info(
+        "%s: estimating the poses of %d photos: up to %d features each, %d pairs, about %d MB a thread in matching.",
+        root, count, features, pairs, 2 * _DISTANCES * features**2 // _MEGA,
+    )  # fmt: skip
+    try:
+        with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work:
+            models = _map(pycolmap, photos, Path(work), settings)
+            models.sort(key=lambda model: model.num_reg_images(), reverse=True)
+            sizes = [model.num_reg_images() for model in models]
+            _require_placed(root, sizes, count, settings.least_placed)
+            result = Path(work) / "result"
+            result.mkdir()
+            models[0].write_binary(str(result))
+            result.rename(folder)
+    except (RuntimeError, OSError) as error:
+        raise DataError(root, "poses", f"structure-from-motion failed ({error})", MORE) from error
+    if len(sizes) > 1:
+        groups = ", ".join(map(str, sizes))
+        _log.warning(
+            "%s: the photos fall into groups that nothing connects (%s photos); the largest is used.", root, groups
+        )
+
+
+def copy_name(index: int) -> str:
+    """The name under which COLMAP knows the photo of this number."""
+    return f"{index:05d}.jpg"
+
+
+def _require_placed(root: Path, sizes: Sequence[int], count: int, least: float) -> None:
+    placed = sizes[0] if sizes else 0
+    if placed >= max(FEWEST, least * count):
+        return
+    remedy = MORE
+    if placed >= FEWEST:
+        remedy += f"; or go on with the {placed}: data.reader.least_placed={placed / count:.2g}"
+    raise DataError(root, "poses", f"only {placed} of {count} photos could be related to each other", remedy)
+
+
+def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSettings) -> list[Any]:
+    """COLMAP's incremental pipeline: features, all pairs, mapping. Every model that it finds."""
+    copies, database, count = work / "copies", work / "database.db", len(photos)
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value  # its progress is hundreds of lines
+    try:
+        pycolmap.set_random_seed(settings.seed)
+        groups = _write_copies(photos, copies, settings.max_side)
+        extraction = pycolmap.FeatureExtractionOptions()
+        extraction.num_threads, extraction.use_gpu = settings.threads, False
+        extraction.sift.max_num_features = settings.max_features
+        with _progress(database, "keypoints", "features", "photos", count):
+            for (width, height, focal), names in groups.items():
+                reader = pycolmap.ImageReaderOptions()
+                if focal is not None:
+                    reader.camera_params = f"{focal},{width / 2},{height / 2},0"  # of SIMPLE_RADIAL, its default
+                pycolmap.extract_features(
+                    database, copies, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE,
+                    reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
+                )  # fmt: skip
+        matching = pycolmap.FeatureMatchingOptions()
+        matching.num_threads, matching.use_gpu = settings.threads, False
+        with _progress(database, "two_view_geometries", "matching", "pairs", count * (count - 1) // 2):
+            pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
+        mapping = pycolmap.IncrementalPipelineOptions()
+        mapping.num_threads, mapping.random_seed = settings.threads, settings.seed
+        # COLMAP's thresholds are for hundreds of photos. Of ten photos around a table these place six where those place four.
+        mapping.mapper.init_min_num_inliers, mapping.mapper.init_min_tri_angle = 50, 8.0
+        mapping.mapper.abs_pose_min_num_inliers = 15
+        _log.info("placing the photos.")
+        models = pycolmap.incremental_mapping(
+            database, copies, work, options=mapping, next_image_callback=_placing(count)
+        )
+    finally:
+        pycolmap.logging.minloglevel = level
+    return list(models.values())
+
+
+def _write_copies(
+    photos: Mapping[Path, Exif], folder: Path, max_side: int
+) -> dict[tuple[int, int, float | None], list[str]]:
+    """Copies for COLMAP; their names by width, height and focal length (pixels of the copy, or None)."""
+    folder.mkdir()
+    groups: dict[tuple[int, int, float | None], list[str]] = {}
+    for i, (path, exif) in enumerate(photos.items()):
+        image = read_image(path, turn=True)
+        height, width = image.shape[:2]
+        scale = min(1.0, max_side / max(width, height))
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        write_jpeg(folder / copy_name(i), image, size, Picture.Resampling.LANCZOS)
+        focal = None if exif.focal35 is None else round(exif.focal_pixels(*size), 2)
+        groups.setdefault((*size, focal), []).append(copy_name(i))
+    known = sum(len(names) for (_, _, focal), names in groups.items() if focal is not None)
+    _log.info("%d cameras; the focal length of %d of %d photos is in EXIF.", len(groups), known, len(photos))
+    return groups
+
+
+def _placing(count: int) -> Callable[[], None]:
+    """Counts the photos that COLMAP places. It may begin anew with other photos, so the count is of attempts."""
+    attempts = 0
+
+    def note() -> None:
+        nonlocal attempts
+        attempts += 1
+        if attempts % max(1, count // 10) == 0:
+            _log.info("placing the photos: %d, of %d.", attempts + 2, count)  # it starts from a pair
+
+    return note
+
+
+@contextlib.contextmanager
+def _progress(database: Path, table: str, what: str, unit: str, total: int) -> Iterator[None]:
+    """Log every few seconds how many rows a table of COLMAP's database has: its calls return only at their end."""
+    done = threading.Event()
+
+    def watch() -> None:
+        while not done.wait(_EVERY):
+            with (
+                contextlib.suppress(sqlite3.Error),
+                contextlib.closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as connection,
+            ):
+                rows = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]  # noqa: S608
+                _log.info("%s: %d of %d %s.", what, rows, total, unit)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+def _pycolmap() -> Any:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise DataError(
+            "data=photos", "pycolmap", f"cannot be imported ({error})", "pip install 'clear-strategies[colmap]'"
+        ) from error
+    return pycolmap
+
+
+def unplaced_warning(root: Path, missing: Sequence[str], count: int) -> None:
+    """Say which photos the model leaves out."""
+    if missing:
+        _log.warning(
+            "%s: %d of %d photos could be placed (%.0f%%); not used: %s. Photos with more overlap could be.",
+            root, count - len(missing), count, 100 * (count - len(missing)) / count, some(missing),
+        )  # fmt: skip
