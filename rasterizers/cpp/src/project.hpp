@@ -169,10 +169,11 @@ std::uint32_t project_group(const Pose& pose, const Settings<T>& s, const Splats
 // Prefetches a Gaussian's coefficients, which `colour_group` reads after the rest of the chunk has been projected.
 template <class T>
 CLEAR_INLINE void fetch_coefficients(const Splats<T>& splats, std::uint32_t number) {
+  if (!splats.bands) return;
   const T* row = splats.shN + splats.shN_stride * number;
   constexpr int line = 64 / sizeof(T);
   for (int i = 0; i < 3 * splats.bands; i += line) __builtin_prefetch(row + i, 0, 2);
-  if (splats.bands) __builtin_prefetch(row + 3 * splats.bands - 1, 0, 2);
+  __builtin_prefetch(row + 3 * splats.bands - 1, 0, 2);
 }
 
 // Writes the colours of a group of drawn Gaussians into their ellipses on every grid.
