@@ -28,7 +28,7 @@ class Command(NamedTuple):
 COMMANDS: Final = {
     "train": Command("PHOTOS [setting=value …]", "from a folder of photos, or a capture, to a splat and pictures"),
     "render": Command("RUN", "pictures and videos of a saved run or a PLY file, along any camera path"),
-    "export": Command("RUN --to FORMAT", "a saved run as a file for viewers: ply, splat, spz or sog"),
+    "export": Command("RUN --to FORMAT", "a saved run as a file for viewers: ply, splat, spz, sog, or a page (html)"),
     "view": Command("RUN", "an interactive viewer in the browser of a saved run or a PLY file"),
     "doctor": Command("", "what this machine has, what works, and what is missing"),
 }

@@ -11,7 +11,8 @@ from clear_strategies.commands.options import log_to_terminal, parser_of
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
 from clear_strategies.outputs.export import gaussians_of
-from clear_strategies.outputs.formats import FORMATS, write_format
+from clear_strategies.outputs.formats import FORMATS, Start, write_format
+from clear_strategies.viewing import paths
 
 _log = logging.getLogger(__name__)
 
@@ -45,5 +46,7 @@ def main(arguments: Sequence[str]) -> None:
     out = options.out or splat.folder / f"{splat.name}.{options.to}"
     if out.suffix != f".{options.to}":
         raise SettingError(f"--out: must end in .{options.to}, got {out.name}.")
-    write_format(out, g, options.to)
+    poses = splat.poses()
+    background = splat.cameras[0].background if splat.cameras else (0.0, 0.0, 0.0)
+    write_format(out, g, options.to, Start(poses[0], paths.look_at(poses), background))
     _log.info("%s: %s Gaussians, %.1f MB", out, f"{len(g):,}", out.stat().st_size / 1e6)

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 
 from clear_strategies.commands.options import log_to_terminal, parser_of
 from clear_strategies.jobs.saved import open_splat
-from clear_strategies.viewing import live, page, points
+from clear_strategies.viewing import live, points
 
 _log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Open the viewer and serve it until Ctrl-C; or write the page.
+    """Open the viewer and serve it until Ctrl-C.
 
     Raises:
         DataError, SettingError: the run cannot be opened, or the viewer's libraries are not installed.
@@ -28,20 +28,11 @@ def main(arguments: Sequence[str]) -> None:
         help="%(default)s: this machine only; 0.0.0.0: every machine that reaches this one",
     )
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
-    parser.add_argument(
-        "--page",
-        action="store_true",
-        help=f"write {page.FILE}, which turns without a server and without a network, and stop",
-    )
     options = parser.parse_args(arguments)
     log_to_terminal(verbose=options.verbose)
     live.require_viewer()
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)
-    if options.page:
-        page.write_page(splat.folder, splat.painter.field, splat.poses())
-        _log.info("%s", splat.folder / page.FILE)
-        return
     from clear_strategies.viewing.server import Screen, SplatViewer
 
     run = None if splat.baked else splat.folder

@@ -1,25 +1,30 @@
-"""A splat in the formats of viewers on the web: .splat by this module, .spz and .sog by PlayCanvas's splat-transform.
+"""A splat in the formats of viewers on the web: .splat by this module, the others by PlayCanvas's splat-transform.
 
 splat-transform is a program of npm (MIT). One that is on the PATH is taken; else `npx` downloads it once.
 """
 
 from __future__ import annotations
 
+import json
 import logging
+import math
 import shutil
 import subprocess
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from clear_strategies import files
 from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.errors import SettingError
 from rasterizers.geometry import SH_C0
+from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -28,13 +33,44 @@ FORMATS: Final = {
     "splat": "32 bytes a Gaussian, 8-bit colours that do not depend on the direction",
     "spz": "Niantic's: a tenth of the PLY, view-dependent colour included; needs Node.js",
     "sog": "PlayCanvas's: view-dependent colour included; needs Node.js, and without a GPU minutes for large splats",
+    "html": "a page with PlayCanvas's viewer and a sog in it: no server, no network",
 }
 _CONVERTER: Final = "@playcanvas/splat-transform@2"
 _SPZ_VERSION: Final = "3"  # 4, the converter's default, is too new for most readers
 
 
-def write_format(path: Path, g: GaussianPly, form: str) -> None:
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Where a page begins: at a camera, looking at a point, over a background.
+
+    Args:
+        focus: world units. background: RGB in [0, 1].
+    """
+
+    camera: Camera
+    focus: Float[np.ndarray, " 3"]
+    background: tuple[float, float, float]
+
+    def settings(self) -> dict[str, Any]:
+        """For PlayCanvas's viewer, which turns 3DGS files by 180° around z: y then points up."""
+        center, turn = self.camera.center.double().cpu().numpy(), np.array([-1.0, -1.0, 1.0])
+        return {
+            "camera": {
+                "fov": math.degrees(2 * math.atan(self.camera.height / 2 / self.camera.fy)),
+                "position": (center * turn).tolist(),
+                "target": (self.focus * turn).tolist(),
+                "startAnim": "none",
+            },
+            "background": {"color": list(self.background)},
+            "animTracks": [],
+        }
+
+
+def write_format(path: Path, g: GaussianPly, form: str, start: Start) -> None:
     """Write the Gaussians as one of `FORMATS`, atomically.
+
+    Args:
+        start: of the page; the other formats hold no camera.
 
     Raises:
         SettingError: there is no such format, or what it needs is not installed or failed.
@@ -46,7 +82,7 @@ def write_format(path: Path, g: GaussianPly, form: str) -> None:
     elif form == "splat":
         files.write_bytes(path, splat_bytes(g))
     else:
-        _convert(path, g, form)
+        _convert(path, g, form, start)
 
 
 def splat_bytes(g: GaussianPly) -> bytes:
@@ -78,22 +114,26 @@ def converter() -> list[str]:
         _log.info("npx runs %s; the first time it downloads about 70 MB.", _CONVERTER)
         return [npx, "--yes", _CONVERTER]
     raise SettingError(
-        "spz and sog are written by PlayCanvas's splat-transform, which needs Node.js 20 or later: install it from "
+        "spz, sog and html are written by PlayCanvas's splat-transform, which needs Node.js 20 or later: install it from "
         "nodejs.org, or choose --to ply or --to splat."
     )
 
 
-def _convert(path: Path, g: GaussianPly, form: str) -> None:
+def _convert(path: Path, g: GaussianPly, form: str, start: Start) -> None:
     command = converter()
-    if form == "sog" and not torch.cuda.is_available():
+    if form != "spz" and not torch.cuda.is_available():
         _log.info(
-            "sog sorts colours into clusters; without a GPU this takes minutes for large splats (--sh 0 is fast)."
+            "sog and html sort colours into clusters; without a GPU this takes minutes for large splats (--sh 0 is fast)."
         )
     options = ["--spz-version", _SPZ_VERSION] if form == "spz" else ["--gpu", "cpu"]
     options = options if form == "spz" or not torch.cuda.is_available() else []
     with files.replacing(path.with_suffix(f".{form}")) as target, tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "splat.ply"
         write_gaussians(source, g)
+        if form == "html":
+            viewer = Path(folder) / "viewer.json"
+            viewer.write_text(json.dumps(start.settings()))
+            options += ["--viewer-settings", str(viewer)]
         _run([*command, "--quiet", "--overwrite", *options, str(source), str(target)])
         if not target.is_file():
             raise SettingError(f"{command[0]} wrote no {form} file. Choose another format, or install it anew.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 import subprocess
 
@@ -78,6 +80,16 @@ def test_another_program_reads_what_is_written(run, tmp_path, form):
     np.testing.assert_allclose(x, exact.means[:, 0].numpy()[order], atol=2e-3)
     opacity = sorted_by_x(back.opacities.sigmoid().numpy(), back.means[:, 0].numpy())
     np.testing.assert_allclose(opacity, exact.opacities.numpy()[order], atol=0.02)
+
+
+@by_another_program
+def test_a_page_needs_no_network_and_begins_at_a_camera(run, tmp_path):
+    folder, _ = run
+    export.main([str(folder), "--to", "html", "--out", str(tmp_path / "a.html")])
+    text = (tmp_path / "a.html").read_text()
+    assert not re.search(r"(?:src|href)=[\"']https?://", text)
+    x, y, z = saved_run.SCENE.train[0].hr.camera.center.tolist()
+    assert json.dumps([-x, -y, z])[1:12] in text
 
 
 def test_a_format_without_its_program_names_the_remedy(run, monkeypatch):
