@@ -82,7 +82,7 @@ class Runner:
             data = self.trainset[step % len(self.trainset)]
             pose, pixels = data["camtoworld"][None], data["image"][None] / 255
             if cfg.pose_noise:
-                pose = pose + cfg.pose_noise * torch.randn_like(pose) * (torch.arange(4) < 3)[:, None]
+                pose[:, :3, 3] += cfg.pose_noise * torch.randn(1, 3)
             renders, _, info = self.render(
                 camtoworlds=pose, Ks=data["K"][None], width=24, height=16, sh_degree=3,
                 image_ids=torch.tensor([data["image_id"]]),
