@@ -289,10 +289,10 @@ def _train(
         beside: the baseline to show with it.
     """
     settings, rasterizer = training.settings, place.drawing.rasterizer
+    write_cameras(training.folder, place.scene)
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
     watched = _watched(training, state, place)
     with watched as after_step, progress_bar(state, after_step, training.chosen.title) as progress:
-        write_cameras(training.folder, place.scene)
         checkpoints = training.folder / resume.CHECKPOINTS
         fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)
     seconds = time.perf_counter() - began
