@@ -12,6 +12,10 @@ from clear_strategies.outputs.image_scores import ImageScores
 from clear_strategies.outputs.metrics import NOTE, Evaluation
 
 OURS_MINUS_BASELINE: Final = "ours − baseline"
+_LEGEND: Final = (
+    "  PSNR, SSIM: more is better; GMSD, the error of edges: less; blur, above 0 softer than the photo and below it harder: "
+    "closer to 0."
+)
 
 
 def describe(folder: Path, evaluation: Evaluation, seconds: float, baseline: Baseline | None = None) -> str:
@@ -21,7 +25,10 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, baseline: Bas
     width = max((len(image) for _, image, _ in rows), default=0)
     lines = [f"  {part:<5}  {image:<{width}}  {numbers}" for part, image, numbers in rows]
     note = f"  {NOTE}." if any(image in ("bicubic", "prior") for _, image, _ in rows) else ""
-    return "\n".join([f"done in {seconds:.0f} s{beside}: {folder}", *lines, *filter(None, [note])])
+    next_ = f"  look next: {folder / 'contact_sheet.png'}, or clear-strategies view {folder}"
+    return "\n".join(
+        [f"done in {seconds:.0f} s{beside}: {folder}", *lines, *filter(None, [_LEGEND if lines else "", note]), next_]
+    )
 
 
 def describe_baseline(baseline: Baseline) -> str:

@@ -30,7 +30,10 @@ def test_the_baseline_and_the_difference_stand_beside_ours() -> None:
     assert found["test   ours − baseline"].split() == [
         "PSNR", "+0.41", "dB", "SSIM", "+0.0130", "GMSD", "-0.0200", "blur", "+0.0300",
     ]  # fmt: skip
-    assert text.splitlines()[-1] == f"  {NOTE}."
+    *_, meanings, note, look_next = text.splitlines()
+    assert "GMSD" in meanings
+    assert note == f"  {NOTE}."
+    assert look_next == "  look next: run/contact_sheet.png, or clear-strategies view run"
 
 
 def test_a_part_that_the_baseline_lacks_has_no_difference() -> None:
@@ -42,7 +45,7 @@ def test_a_part_that_the_baseline_lacks_has_no_difference() -> None:
 def test_without_a_baseline_the_table_says_nothing_of_one() -> None:
     text = describe(Path("run"), Evaluation(TABLE, {}, {}, {}), 12.7)
     assert "baseline" not in text
-    assert len(text.splitlines()) == 5
+    assert len(text.splitlines()) == 7
 
 
 def test_the_note_is_for_the_images_that_it_is_about() -> None:
