@@ -81,3 +81,9 @@ def test_without_pycolmap_the_extra_is_named(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(DataError, match=r"clear-strategies\[colmap\]"):
         photos.read(flat_photos(tmp_path / "photos", 3), tmp_path / "cache")
+
+
+def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_takes_them() -> None:
+    with pytest.raises(DataError, match=r"only 4 of 10 photos .*overlap.* data\.reader\.least_placed=0\.4"):
+        photos.sfm._require_placed(Path("mine"), [4, 2], 10, 0.5)
+    photos.sfm._require_placed(Path("mine"), [6, 3], 10, 0.5)
