@@ -21,7 +21,7 @@ from integration.gsplat.simple_trainer import install
 from integration.launcher import Launch, parser, run_script
 from integration.log import show_log
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("integration.gsplat")  # __name__ is "__main__" here
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -20,7 +20,7 @@ from integration.inria.from_options import install
 from integration.launcher import Launch, parser, run_script
 from integration.log import show_log
 
-_log = logging.getLogger(__name__)
+_log = logging.getLogger("integration.inria")  # __name__ is "__main__" here
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
