@@ -15,7 +15,7 @@ from typing import Any
 
 import torch
 
-from clear_strategies.bench import device, iteration, kernels, pareto, rasterizers, stereo
+from clear_strategies.bench import device, evidence, iteration, kernels, pareto, rasterizers, stereo
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
 from clear_strategies.errors import ClearError
@@ -123,6 +123,16 @@ def parser() -> argparse.ArgumentParser:
         help="the data set and its settings, as for a run (default: the demo)",
     )
 
+    ask = questions.add_parser(
+        "evidence", parents=[common, out], help="how well reliability finds the known errors of a corrupted prior"
+    )
+    ask.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="OVERRIDE",
+        help="the data set and its prior, as for a run (default: the demo)",
+    )
+
     ask = questions.add_parser("device", parents=[common, garden], help="all checks that need a GPU, into a folder")
     ask.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder for logs, tables and runs")
     ask.add_argument("--device", default="cuda", choices=["cpu", "cuda"], help="default: cuda")
@@ -138,9 +148,8 @@ def _measure(question: str, options: dict[str, Any], results: Results) -> None:
     elif question == "device":
         device.measure(results, device.Request(**options))
     else:
-        module: Any = {"rasterizers": rasterizers, "kernels": kernels, "iteration": iteration, "stereo": stereo}[
-            question
-        ]
+        asked = {"rasterizers": rasterizers, "kernels": kernels, "iteration": iteration, "stereo": stereo}
+        module: Any = {**asked, "evidence": evidence}[question]
         module.measure(results, **{name: value for name, value in options.items() if name != "out"})
 
 

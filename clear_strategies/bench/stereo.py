@@ -18,14 +18,13 @@ from torch import Tensor
 
 from clear_strategies.bench.results import Results
 from clear_strategies.compose import composed, tree
-from clear_strategies.core.view import Photo
+from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.points.projection import inside_of, project
 from clear_strategies.data.points.sift import triangulate
 from clear_strategies.data.points.stereo.maps import depth_maps
 from clear_strategies.data.prepare import lr_photos, split
 from clear_strategies.data.readers import demo
-from clear_strategies.data.scene import DepthMap
 from clear_strategies.jobs.scene import DataSettings
 from clear_strategies.settings import build
 

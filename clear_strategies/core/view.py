@@ -1,11 +1,11 @@
-"""A view of a scene at two scales: the photos at LR and HR, and their cameras."""
+"""A view of a scene at two scales: the photos at LR and HR, their cameras, and the depth of what they show."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rasterizers.interface import Camera
@@ -32,6 +32,33 @@ class Photo:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class DepthMap:
+    """The depth of a photo's surfaces, as far as it is known.
+
+    Args:
+        depth: z in world units at each LR pixel's centre; nan where unknown.
+        confidence: in [0, 1]; 0 where unknown.
+    """
+
+    depth: Float[Tensor, "h w"]
+    confidence: Float[Tensor, "h w"]
+
+    @property
+    def known(self) -> Bool[Tensor, "h w"]:
+        """Where there is depth."""
+        return self.confidence > 0
+
+    @property
+    def coverage(self) -> float:
+        """The share of pixels with depth."""
+        return float(self.known.float().mean())
+
+    def to(self, device: torch.device | str) -> DepthMap:
+        """The same map on `device`."""
+        return DepthMap(self.depth.to(device), self.confidence.to(device))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class View:
     """One view v: I_LR^v, I_HR^v and C^v at both scales; HR is exactly an integer times LR.
 
@@ -40,6 +67,7 @@ class View:
         hr: the super-resolved (SR) image of the prior; never the truth.
         truth: the real photo at HR, for evaluation only; training never uses it.
         sr_source: the prior's label, e.g. "onnx span_x4.onnx".
+        depth: of the LR photo's surfaces, from stereo; None where nobody asked for it, e.g. in test views.
     """
 
     name: str
@@ -47,6 +75,7 @@ class View:
     hr: Photo
     truth: Float[Tensor, "H W 3"] | None = None
     sr_source: str = "unknown"
+    depth: DepthMap | None = None
 
     @property
     def factor(self) -> int:
@@ -56,4 +85,5 @@ class View:
     def to(self, device: torch.device | str) -> View:
         """The same view with its images on `device`."""
         truth = None if self.truth is None else self.truth.to(device)
-        return replace(self, lr=self.lr.to(device), hr=self.hr.to(device), truth=truth)
+        depth = None if self.depth is None else self.depth.to(device)
+        return replace(self, lr=self.lr.to(device), hr=self.hr.to(device), truth=truth, depth=depth)

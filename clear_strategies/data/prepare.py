@@ -119,7 +119,9 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, sfm_is_train=not held_out,
         background=capture.background, seed=seed,
     )  # fmt: skip
-    points, depths = initial.cloud, {v.name: d for v, d in zip(train, initial.depths, strict=bool(initial.depths))}
+    points = initial.cloud
+    if initial.depths:
+        train = tuple(replace(v, depth=depth) for v, depth in zip(train, initial.depths, strict=True))
     sample, photo, network = train[0], train_frames[0].camera, network_of(prior)
     made = {
         "hr": f"{'PIL ' if views.downsample != 'area' else ''}{views.downsample} of the HR photo"
@@ -145,7 +147,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         "points use test views": points.uses_test_views,
     }
     synthetic = "synthetic" in sample.sr_source
-    return Scene(capture.name, train, test, points, capture.background, synthetic, notes, depths)
+    return Scene(capture.name, train, test, points, capture.background, synthetic, notes)
 
 
 def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Frame]]:

@@ -17,9 +17,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.core.view import Photo
+from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.points.projection import back_project, inside_of, project, sample_colors
-from clear_strategies.data.scene import DepthMap
 from rasterizers.interface import Camera
 
 _SOURCES: Final = 4  # the nearest photos that a pseudo view is made of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.view import View
@@ -34,33 +34,6 @@ class PointCloud:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DepthMap:
-    """The depth of a photo's surfaces, as far as it is known.
-
-    Args:
-        depth: z in world units at each LR pixel's centre; nan where unknown.
-        confidence: in [0, 1]; 0 where unknown.
-    """
-
-    depth: Float[Tensor, "h w"]
-    confidence: Float[Tensor, "h w"]
-
-    @property
-    def known(self) -> Bool[Tensor, "h w"]:
-        """Where there is depth."""
-        return self.confidence > 0
-
-    @property
-    def coverage(self) -> float:
-        """The share of pixels with depth."""
-        return float(self.known.float().mean())
-
-    def to(self, device: torch.device | str) -> DepthMap:
-        """The same map on `device`."""
-        return DepthMap(self.depth.to(device), self.confidence.to(device))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Scene:
     """The input of a run.
 
@@ -68,7 +41,6 @@ class Scene:
         background: the colour behind the Gaussians, RGB in [0, 1].
         synthetic_prior: the SR images contain errors made on purpose, or the truth (the demo); reports say so.
         notes: label -> fact, in the order in which the plan prints them and the provenance keeps them.
-        depths: of the training views' surfaces by the views' names, from stereo; empty where the cloud came from elsewhere.
     """
 
     name: str
@@ -78,7 +50,6 @@ class Scene:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     synthetic_prior: bool = False
     notes: dict[str, str] = field(default_factory=dict)
-    depths: dict[str, DepthMap] = field(default_factory=dict)
 
     @property
     def device(self) -> torch.device:

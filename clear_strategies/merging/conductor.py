@@ -164,12 +164,21 @@ class Conductor:
             if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, "regularize", "may_densify", "after_step")):
                 _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
 
-    def on_fit_start(self, n_views: int, seed: int, device: torch.device | str = "cpu") -> None:
-        """Once, before the first iteration. `device` is that of the field."""
+    def on_fit_start(
+        self, n_views: int, seed: int, device: torch.device | str = "cpu", views: Sequence[View] = ()
+    ) -> None:
+        """Once, before the first iteration.
+
+        Args:
+            device: of the field. views: all training views, where the caller has them.
+        """
         self.work_log.device = torch.device(device)
         for s in self.strategies:
             s.on_fit_start(n_views, seed)
             s.to(device)
+            if s.wants_views():
+                with self.work_log.stage("views compared"):
+                    s.on_views(views)
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Final
 
-from clear_strategies.core.view import Photo
-from clear_strategies.data.scene import DepthMap
+from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.outputs import figures
 
 _EXTREMES: Final = (0.02, 0.98)  # quantiles of depth at the ends of the colours

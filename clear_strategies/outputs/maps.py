@@ -34,7 +34,6 @@ from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.data.scene import DepthMap
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs.depth_picture import write_depth
 from clear_strategies.outputs.maps_picture import write_maps_picture
@@ -76,16 +75,13 @@ def write_maps(
     rasterizer: Rasterizer,
     *,
     down: DownKernel = "bicubic",
-    depths: Mapping[str, DepthMap] | None = None,
 ) -> None:
     """Write maps.json and, for each view, a folder of 8-bit grey PNGs (value = 255 × number) with the LR photo and the prior
     beside them.
 
     Args:
-        views: at least one. The other arguments are those of `view_maps`.
-        depths: of the views' surfaces, by the views' names; views without one get no depth.png.
+        views: at least one; those without depth get no depth.png. The other arguments are those of `view_maps`.
     """
-    depths = depths or {}
     means: dict[str, Mapping[str, float]] = {}
     for view in views:
         found = view_maps(field, conductor, rasterizer, view, down=down)
@@ -94,8 +90,8 @@ def write_maps(
         for name, values in {**found.maps, "lr": view.lr.image, "prior": view.hr.image}.items():
             write_png(own / f"{name}.png", values)
         write_maps_picture(own / "maps.png", view, found.maps, found.means)
-        if view.name in depths:
-            write_depth(own / "depth.png", view.lr, depths[view.name], f"{view.name}: depth by stereo")
+        if view.depth is not None:
+            write_depth(own / "depth.png", view.lr, view.depth, f"{view.name}: depth by stereo")
     corrector = conductor.owner("correct")
     if corrector is None:
         _log.info("maps: no strategy of this run corrects, so there is no corrected.png.")

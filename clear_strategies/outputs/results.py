@@ -88,7 +88,7 @@ def write_results(
         evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera).cpu(), down=down)
     with work_log.stage("maps"):
         if mapped := spaced(state.views, map_views):
-            write_maps(folder / "maps", mapped, field, state.conductor, rasterizer, down=down, depths=scene.depths)
+            write_maps(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
     export_ply(folder / "point_cloud.ply", field)
 
     title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}"

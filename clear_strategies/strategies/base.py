@@ -63,6 +63,14 @@ class Strategy:
         self.cache.clear()
         self.logs.clear()
 
+    def on_views(self, views: Sequence[Any]) -> None:
+        """Compare the training views with each other, once, after `on_fit_start`; only asked where `wants_views` says so.
+
+        Args:
+            views: of a run; a host that does not have them all at the start gives none.
+        """
+        raise NotImplementedError
+
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """Before render: which Gaussians take part? z >= 0 multiplies the opacity; None: all of them.  Eq. 15"""
         raise NotImplementedError
@@ -108,6 +116,10 @@ class Strategy:
             lambda_hr: the largest λ_HR(t) of the run.
         """
         return None
+
+    def wants_views(self) -> bool:
+        """Whether these settings compare the training views with each other, see `on_views`."""
+        return False
 
     def skipped(self) -> Sequence[str]:
         """The parts of the strategy that its settings switch off, a phrase each."""

@@ -82,7 +82,7 @@ class PseudoViews:
             return cls(settings)
         made = pseudo_views(
             photos,
-            scene.depths,
+            {view.name: view.depth.to("cpu") for view in scene.train if view.depth is not None},
             count=settings.count,
             reach=settings.reach,
             tolerance=settings.tolerance,

@@ -80,7 +80,7 @@ class TrainState:
             len(theta), extent=extent, seed=settings.seed, white_background=white, device=device
         )
         optimizer = Adam(theta.raw(), rates, extent)
-        conductor.on_fit_start(len(scene.train), settings.seed, device)
+        conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
         step = compiled_step_for(conductor, optimizer, settings.fused)
         state = cls(
             theta,

@@ -12,7 +12,8 @@ from dataclasses import replace
 import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective
-from clear_strategies.data.scene import DepthMap, Scene
+from clear_strategies.core.view import DepthMap
+from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.base import cameras_extent
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
@@ -43,7 +44,7 @@ def with_depth(scene: Scene, depth: float = 4.0) -> Scene:
     """The scene with the same depth at every pixel of its training views."""
     shape = SCENE.train[0].lr.image.shape[:2]
     known = DepthMap(torch.full(shape, depth), torch.ones(shape))
-    return replace(scene, depths={view.name: known for view in scene.train})
+    return replace(scene, train=tuple(replace(view, depth=known) for view in scene.train))
 
 
 def start(

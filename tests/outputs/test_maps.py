@@ -13,9 +13,8 @@ from torch import Tensor
 from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads, conflict_ratio
-from clear_strategies.core.view import View
+from clear_strategies.core.view import DepthMap, View
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.data.scene import DepthMap
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs.maps import MAPS, view_maps, write_maps
@@ -179,8 +178,9 @@ def test_views_with_stereo_show_their_depth(tmp_path: Path) -> None:
     depth[0] = torch.nan
     found = DepthMap(depth, depth.isfinite().float() * 0.5)
     nothing = DepthMap(torch.full(shape, torch.nan), torch.zeros(shape))
-    for maps in ({view.name: found}, {view.name: nothing}):
-        write_maps(tmp_path, state.views[:2], state.field, state.conductor, toy.RASTERIZER, depths=maps)
+    for depth_map in (found, nothing):
+        views = [replace(view, depth=depth_map), state.views[1]]
+        write_maps(tmp_path, views, state.field, state.conductor, toy.RASTERIZER)
         assert read_image(tmp_path / view.name / "depth.png").shape[1] > 500
         assert not (tmp_path / state.views[1].name / "depth.png").exists()
 

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 
 import torch
 
-from clear_strategies.core.view import Photo
+from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import SfmPoints
 from clear_strategies.data.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.data.points.cleaning import remove_outliers, voxel_grid
@@ -25,7 +25,7 @@ from clear_strategies.data.points.stereo.cloud import points_of, shows
 from clear_strategies.data.points.stereo.filling import fill
 from clear_strategies.data.points.stereo.maps import depth_maps
 from clear_strategies.data.points.stereo.settings import StereoSettings
-from clear_strategies.data.scene import DepthMap, PointCloud
+from clear_strategies.data.scene import PointCloud
 from clear_strategies.errors import DataError
 
 __all__ = [

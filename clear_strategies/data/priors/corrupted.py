@@ -10,10 +10,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import images
@@ -21,6 +23,9 @@ from clear_strategies.data.checks import require_number, require_whole
 from clear_strategies.data.priors.cache import cached
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
+
+_KINDS: Final = 4  # of errors, see `SeededErrors.corrupt`
+_ROUNDS: Final = 20  # of back-projection: the LR pixels then agree to less than a grey level
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +37,8 @@ class SeededErrors:
         strength: of the errors, >= 0; 0: none.
         patch: edge of a patch, HR px; 64 is the patch of P2G's reliability.
         seed: of the errors; not the run's.
+        hidden: leave of the errors only what the LR photo cannot show: the wrong patches shrink to the same LR pixels as
+            the right ones would. No comparison with the photo finds them, only other views do.
 
     Raises:
         SettingError: a number is outside its range.
@@ -41,6 +48,7 @@ class SeededErrors:
     strength: float = 1.0
     patch: int = 64
     seed: int = 0
+    hidden: bool = False
 
     def __post_init__(self) -> None:
         require_number("prior.share", self.share, least=0, most=1)
@@ -57,23 +65,57 @@ class SeededErrors:
         elsewhere in the image. The other two disagree with LR, which reliability measures: doubled content, and
         sharpened content of another shade.
         """
-        rng = np.random.default_rng([self.seed, *name.encode()])
+        shift, wrong = self._drawn(name, image.shape[0], image.shape[1], factor)
         detail = image - images.upsample(lr, factor)
-        shift = rng.integers(2, max(factor, 2) + 1, 2) * rng.choice((-1, 1), 2)
         errors = (
             -1.4 * detail,
             detail.flip(0, 1) - detail,
-            0.6 * (image.roll(shift.tolist(), (0, 1)) - image),
+            0.6 * (image.roll(shift, (0, 1)) - image),
             0.8 * detail,  # and a shade, different in each patch, below
         )
-        corners = list(itertools.product(*(range(0, size, self.patch) for size in image.shape[:2])))
-        result = image.clone()
-        for which in rng.permutation(len(corners))[: round(self.share * len(corners))]:
-            top, left = corners[which]
+        result, touched = image.clone(), torch.zeros_like(image[..., :1])
+        for top, left, kind, shade in wrong:
             box = (slice(top, top + self.patch), slice(left, left + self.patch))
-            kind, shade = rng.integers(len(errors)), torch.from_numpy(rng.uniform(-0.12, 0.12, 3)).to(image)
-            result[box] += self.strength * (errors[kind][box] + (shade if kind == len(errors) - 1 else 0))
-        return images.quantize(result)
+            result[box] += self.strength * (errors[kind][box] + (shade.to(image) if kind == len(errors) - 1 else 0))
+            touched[box] = 1
+        return images.quantize(back_projected(result, image, touched, factor) if self.hidden else result)
+
+    def wrong(self, height: int, width: int, factor: int, name: str) -> Bool[Tensor, "ph pw"]:
+        """Which patches of the image called `name` have errors; height and width are its HR pixels."""
+        mask = torch.zeros(-(-height // self.patch), -(-width // self.patch), dtype=torch.bool)
+        for top, left, _, _ in self._drawn(name, height, width, factor)[1]:
+            mask[top // self.patch, left // self.patch] = True
+        return mask
+
+    def _drawn(
+        self, name: str, height: int, width: int, factor: int
+    ) -> tuple[list[int], list[tuple[int, int, int, Float[Tensor, " 3"]]]]:
+        """The shift of doubled content, and top, left, kind and shade of each wrong patch."""
+        rng = np.random.default_rng([self.seed, *name.encode()])
+        shift = rng.integers(2, max(factor, 2) + 1, 2) * rng.choice((-1, 1), 2)
+        corners = list(itertools.product(*(range(0, size, self.patch) for size in (height, width))))
+        chosen = rng.permutation(len(corners))[: round(self.share * len(corners))]
+        wrong = [
+            (*corners[which], int(rng.integers(_KINDS)), torch.from_numpy(rng.uniform(-0.12, 0.12, 3)))
+            for which in chosen
+        ]
+        return shift.tolist(), wrong
+
+
+def back_projected(
+    result: Float[Tensor, "H W 3"], image: Float[Tensor, "H W 3"], touched: Float[Tensor, "H W 1"], factor: int
+) -> Float[Tensor, "H W 3"]:
+    """`result` moved, where it was touched, until it shrinks to the LR pixels of `image` (iterated back-projection)."""
+
+    def resized(values: Tensor, scale: float) -> Tensor:
+        batch = values.permute(2, 0, 1)[None]
+        return F.interpolate(batch, scale_factor=scale, mode="bicubic", antialias=True, align_corners=False)[0].permute(
+            1, 2, 0
+        )
+
+    for _ in range(_ROUNDS):
+        result = result + touched * resized(resized(image - result, 1 / factor), factor)
+    return result
 
 
 @dataclass(frozen=True, slots=True)

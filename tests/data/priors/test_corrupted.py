@@ -171,3 +171,20 @@ def test_the_demo_prior_does_not_change_the_truth_and_crops_it_as_hr_is_cropped(
 def test_a_truth_of_another_size_is_refused_in_one_line() -> None:
     with pytest.raises(DataError, match=r"a: truth: is 64x64 where HR is 32x32: use the photos at their own size"):
         DemoPrior({"a": lambda: torch.rand(64, 64, 3)})("a", torch.rand(8, 8, 3), 4)
+
+
+def test_hidden_errors_shrink_to_the_same_lr_pixels_and_are_still_wrong():
+    lr = random_lr()
+    right = Sharp()("a", lr, 4)
+    seen, hidden = (Corrupted(Sharp(), patch=32, hidden=h)("a", lr, 4) for h in (False, True))
+    mask = Corrupted(Sharp(), patch=32, hidden=True).wrong(96, 128, 4, "a")
+    change = images.patch_means((hidden - right).abs(), 32)
+    assert torch.equal(change > 0, mask)
+    assert float(change[mask].min()) > 2 / 255
+    apart = [(images.downsample(sr, 4) - images.downsample(right, 4)).abs().mean() for sr in (seen, hidden)]
+    assert float(apart[1]) < 0.25 * float(apart[0])
+
+
+def test_the_mask_is_that_of_the_errors():
+    lr, prior = random_lr(), Corrupted(Sharp(), share=0.25, patch=32)
+    assert torch.equal(prior.wrong(96, 128, 4, "a"), wrong_patches(prior, "a", lr))

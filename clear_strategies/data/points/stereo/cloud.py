@@ -8,9 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.core.view import Photo
+from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.points.projection import back_project, inside_of, project
-from clear_strategies.data.scene import DepthMap
 
 
 def points_of(

@@ -8,10 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from clear_strategies.core.view import Photo
+from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.points.interpolation import interpolate_depth, pixel_grid
 from clear_strategies.data.points.projection import back_project, inside_of, project, sample_colors
-from clear_strategies.data.scene import DepthMap
 
 _NEARER = 0.95  # a filled point in front of this share of another photo's depth floats in free space
 

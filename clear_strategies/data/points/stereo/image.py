@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
+from clear_strategies.core.projection import towards
 from clear_strategies.core.view import Photo
 from rasterizers.interface import Camera
 
@@ -25,14 +25,8 @@ class Grey:
 
     def towards(self, other: Grey) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, " 3"]]:
         """(K' R K⁻¹ x of each pixel x, K' t), where (R, t) leads from this camera to the other, K' is the other's."""
-        mine, yours = (g.camera.world_to_camera.double().cpu() for g in (self, other))
-        R = yours[:3, :3] @ mine[:3, :3].T
-        t = yours[:3, 3] - R @ mine[:3, 3]
-        K, K_other = (_intrinsics(g.camera) for g in (self, other))
-        H, shift = K_other @ R @ torch.linalg.inv(K), K_other @ t
-        x = (torch.arange(self.camera.width, dtype=torch.float64) + 0.5)[None, :, None]
-        y = (torch.arange(self.camera.height, dtype=torch.float64) + 0.5)[:, None, None]
-        return (x * H[:, 0] + y * H[:, 1] + H[:, 2]).to(self.image), shift.to(self.image)
+        rotated, shift = towards(self.camera, other.camera)
+        return rotated.to(self.image), shift.to(self.image)
 
 
 def grey(photo: Photo, enlarge: int, max_pixels: int) -> Grey:
@@ -51,7 +45,3 @@ def grey(photo: Photo, enlarge: int, max_pixels: int) -> Grey:
         image, camera = images.upsample(image, enlarge), camera.scaled(enlarge)
     r, g, b = image.float().unbind(dim=-1)
     return Grey(camera, (r + g + b) / 3)
-
-
-def _intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:
-    return torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64)

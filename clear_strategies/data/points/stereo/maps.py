@@ -10,14 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.view import Photo
+from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.points.projection import inside_of, project
 from clear_strategies.data.points.stereo.consistency import confirm
 from clear_strategies.data.points.stereo.depth import Estimate, estimate
 from clear_strategies.data.points.stereo.image import Grey, grey
 from clear_strategies.data.points.stereo.settings import StereoSettings
 from clear_strategies.data.points.stereo.sources import Comparison, comparisons
-from clear_strategies.data.scene import DepthMap
 
 _log = logging.getLogger(__name__)
 

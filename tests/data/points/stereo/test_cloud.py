@@ -5,11 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from clear_strategies.core.view import Photo
+from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.points import CloudSettings, StereoSettings, initial_points
 from clear_strategies.data.points.stereo.cloud import points_of
 from clear_strategies.data.points.stereo.filling import fill, floats
-from clear_strategies.data.scene import DepthMap
 from clear_strategies.errors import DataError, SettingError
 from tests.helpers.planes import photo, plane_photos
 
