@@ -14,14 +14,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 import rasterizers
+from rasterizers.checks import require_depth
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer, Splats
 
 
 class Drawn(NamedTuple):
-    """An image in the autograd graph of its splats.
+    """An image, and its depth if it was asked for, in the autograd graph of their splats.
 
     Args:
+        depth: the expected depth, see `rasterizers.interface.Rendering.depth`.
         means2d: projected centres, pixels. After `backward()` its `.grad` is the screen gradient in 1/pixel; the gradient
             of the positions does not pass through it.
     """
@@ -30,39 +32,61 @@ class Drawn(NamedTuple):
     alpha: Float[Tensor, "H W"]
     means2d: Float[Tensor, "N 2"]
     visible: Bool[Tensor, " N"]
+    depth: Float[Tensor, "H W"] | None = None
 
 
-def draw(rasterizer: Rasterizer, splats: Splats, camera: Camera, means2d: Tensor | None = None) -> Drawn:
-    """Draw the splats. Gradients flow from the image to the splats' tensors; alpha is not differentiable.
+def draw(
+    rasterizer: Rasterizer, splats: Splats, camera: Camera, means2d: Tensor | None = None, *, depth: bool = False
+) -> Drawn:
+    """Draw the splats. Gradients flow from image and depth to the splats' tensors; alpha is not differentiable.
 
     Args:
         means2d: a tensor that receives the projected centres and whose `.grad` will be the screen gradient; None makes one.
+        depth: also draw the expected depth.
+
+    Raises:
+        ValueError: depth is asked of a rasterizer without the trait.
     """
+    if depth:
+        require_depth(rasterizer)
     if means2d is None:
         means2d = splats.means.new_zeros(len(splats), 2).requires_grad_()
     tensors = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN)
-    image, alpha, visible = _Draw.apply(rasterizer, camera, means2d, splats.rgb_offset, *tensors)  # type: ignore[no-untyped-call]
-    return Drawn(image, alpha, means2d, visible)
+    image, alpha, visible, expected = _Draw.apply(  # type: ignore[no-untyped-call]
+        rasterizer, camera, depth, means2d, splats.rgb_offset, *tensors
+    )
+    return Drawn(image, alpha, means2d, visible, expected)
 
 
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, rasterizer: Rasterizer, camera: Camera, means2d: Tensor, offset: Tensor | None, *tensors: Tensor
+        ctx: Any,
+        rasterizer: Rasterizer,
+        camera: Camera,
+        depth: bool,
+        means2d: Tensor,
+        offset: Tensor | None,
+        *tensors: Tensor,
     ) -> Any:
         means, quats, scales, opacities, sh0, shN = (x.detach() for x in tensors)
         ctx.offset = offset is not None
         offset = None if offset is None else offset.detach()
-        ctx.rendering = rasterizer(Splats(means, quats, scales, opacities, sh0, shN, offset), camera)
+        detached = Splats(means, quats, scales, opacities, sh0, shN, offset)
+        ctx.rendering = rasterizer(detached, camera, depth=True) if depth else rasterizer(detached, camera)
         means2d.data.copy_(ctx.rendering.means2d)
         ctx.mark_non_differentiable(ctx.rendering.alpha, ctx.rendering.visible)
-        return ctx.rendering.image, ctx.rendering.alpha, ctx.rendering.visible
+        ctx.set_materialize_grads(False)  # without a gradient of depth, three channels do
+        return ctx.rendering.image, ctx.rendering.alpha, ctx.rendering.visible, ctx.rendering.depth
 
     @staticmethod
-    def backward(ctx: Any, *cotangents: Tensor) -> Any:
-        g = ctx.rendering.vjp(cotangents[0][None])
+    def backward(ctx: Any, of_image: Tensor | None, _alpha: None, _visible: None, of_depth: Tensor | None) -> Any:
+        cotangent = torch.zeros_like(ctx.rendering.image) if of_image is None else of_image
+        if of_depth is not None:
+            cotangent = torch.cat((cotangent, of_depth[..., None]), dim=-1)
+        g = ctx.rendering.vjp(cotangent[None])
         gradients = (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN)
-        return None, None, g.screen[0], g.rgb[0] if ctx.offset else None, *(x[0] for x in gradients)
+        return None, None, None, g.screen[0], g.rgb[0] if ctx.offset else None, *(x[0] for x in gradients)
 
 
 def rasterization(
@@ -85,11 +109,12 @@ def rasterization(
     rasterize_mode: str = "classic",
     backend: str = "auto",
     **ignored: Any,
-) -> tuple[Float[Tensor, "C H W 3"], Float[Tensor, "C H W 1"], dict[str, Any]]:
-    """Stands in for gsplat's `rasterization` with a backend of this package: pinhole cameras, RGB.
+) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"], dict[str, Any]]:
+    """Stands in for gsplat's `rasterization` with a backend of this package: pinhole cameras, RGB and expected depth.
 
     Args:
         colors: [N, K, 3] spherical harmonics with `sh_degree` the active degree, or [N, 3] RGB if `sh_degree` is None.
+        render_mode: "RGB", or "RGB+ED" with the expected depth as a fourth channel of the images.
         packed: has no effect; `info` is always unpacked.
         ignored: gsplat's other arguments (sparse_grad, tile_size, far_plane …) have no effect.
         backend: a name of `rasterizers.load`.
@@ -101,10 +126,10 @@ def rasterization(
     Raises:
         ValueError: a mode that only gsplat supports.
     """
-    if render_mode != "RGB" or rasterize_mode not in ("classic", "antialiased") or absgrad:
+    if render_mode not in ("RGB", "RGB+ED") or rasterize_mode not in ("classic", "antialiased") or absgrad:
         raise ValueError(
-            "this stand-in for gsplat's rasterization draws render_mode='RGB', rasterize_mode='classic' or 'antialiased', "
-            f"absgrad=False; got {render_mode!r}, {rasterize_mode!r}, {absgrad}. gsplat's own needs CUDA."
+            "this stand-in for gsplat's rasterization draws render_mode='RGB' or 'RGB+ED', rasterize_mode='classic' or "
+            f"'antialiased', absgrad=False; got {render_mode!r}, {rasterize_mode!r}, {absgrad}. gsplat's own needs CUDA."
         )
     n = len(means)
     if sh_degree is None:
@@ -119,13 +144,15 @@ def rasterization(
         antialiased = rasterize_mode == "antialiased"
         rasterizer = _loaded(backend, means.device.type, near_plane, eps2d, antialiased, background)
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
-        shots.append(draw(rasterizer, splats, Camera(pose.detach(), fx, fy, cx, cy, width, height), means2d[i]))
+        camera = Camera(pose.detach(), fx, fy, cx, cy, width, height)
+        shots.append(draw(rasterizer, splats, camera, means2d[i], depth=render_mode == "RGB+ED"))
     visible = torch.stack([shot.visible for shot in shots])
     info = {
         "means2d": means2d, "radii": visible[..., None].expand(-1, -1, 2).int(), "gaussian_ids": None,
         "width": width, "height": height, "n_cameras": len(shots),
     }  # fmt: skip
-    return torch.stack([s.image for s in shots]), torch.stack([s.alpha for s in shots])[..., None], info
+    images = [s.image if s.depth is None else torch.cat((s.image, s.depth[..., None]), -1) for s in shots]
+    return torch.stack(images), torch.stack([s.alpha for s in shots])[..., None], info
 
 
 @lru_cache(maxsize=8)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.interface import Camera, Splats, Traits
+from rasterizers.interface import Camera, Rasterizer, Splats, Traits
 
 _SHAPES: Final = {
     "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (None, 3), "rgb_offset": (3,),
@@ -65,15 +65,33 @@ def require_finite(splats: Splats) -> None:
             raise ValueError(f"splats.{field.name} must be finite; Gaussian {index} is not ({int(bad.sum())} in all).")
 
 
-def require_cotangents(cotangents: Tensor, image: Tensor) -> None:
-    """Refuse cotangents that are not [K, H, W, 3] for an image [H, W, 3].
+def require_cotangents(cotangents: Tensor, image: Tensor, depth: Tensor | None = None) -> None:
+    """Refuse cotangents that are not [K, H, W, 3] for an image [H, W, 3], or [K, H, W, 4] if depth was drawn, too.
 
     Raises:
         ValueError: they have another shape.
     """
-    expected = tuple(image.shape)
-    if cotangents.dim() != 4 or tuple(cotangents.shape[1:]) != expected:
-        raise ValueError(f"cotangents must be [K, {', '.join(map(str, expected))}], got {tuple(cotangents.shape)}.")
+    height, width, _ = image.shape
+    channels = (3,) if depth is None else (3, 4)
+    if cotangents.dim() == 4 and tuple(cotangents.shape[1:3]) == (height, width) and cotangents.shape[3] in channels:
+        return
+    undrawn = cotangents.dim() == 4 and cotangents.shape[3] == 4 and depth is None
+    raise ValueError(
+        f"cotangents must be [K, {height}, {width}, {' or '.join(map(str, channels))}], got {tuple(cotangents.shape)}"
+        + (": the fourth channel is that of depth, which was not drawn; draw with depth=True." if undrawn else ".")
+    )
+
+
+def require_depth(rasterizer: Rasterizer) -> None:
+    """Refuse a rasterizer that draws no depth, before it is asked to.
+
+    Raises:
+        ValueError: it lacks the trait.
+    """
+    if not rasterizer.traits.depth:
+        raise ValueError(
+            f"{type(rasterizer).__name__} draws no depth (its traits.depth is False); cpp, torch, warp and gsplat do."
+        )
 
 
 def require_tiles(tiles: Tensor, width: int, height: int, tile: int) -> None:

@@ -73,10 +73,12 @@ class GsplatRasterizer(RasterSettings):
 
     @property
     def traits(self) -> Traits:
-        return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}))
+        return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}), depth=True)
 
-    def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> GsplatRendering:
-        """Draw.
+    def __call__(
+        self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None, *, depth: bool = False
+    ) -> GsplatRendering:
+        """Draw; depth by gsplat's render mode "RGB+ED".
 
         Raises:
             TypeError: the splats are on another device, or not float32.
@@ -102,28 +104,33 @@ class GsplatRasterizer(RasterSettings):
                 near_plane=self.near, eps2d=self.kernel, sh_degree=math.isqrt(splats.shN.shape[1] + 1) - 1, packed=False,
                 backgrounds=splats.means.new_tensor(self.background)[None],
                 rasterize_mode="antialiased" if self.antialiased else "classic",
+                **({"render_mode": "RGB+ED"} if depth else {}),
             )  # fmt: skip
         radii = info["radii"][0]
         visible = (radii > 0).all(-1) if radii.dim() == 2 else radii > 0
         requested = None if tiles is None else refine_mask(tiles, self.tile, camera.height, camera.width)[..., None]
-        image = (
-            images[0] if requested is None else torch.where(requested, images[0], images[0].new_tensor(self.background))
-        )
+        pixels = images[0].detach()
+        if requested is not None:
+            pixels = torch.where(requested, pixels, pixels.new_tensor((*self.background, 0.0)[: pixels.shape[-1]]))
         direction = torch.nn.functional.normalize(splats.means.detach() - camera.center.to(splats.means), dim=-1)
         basis = spherical_harmonics(direction, splats.shN.shape[1])
         alpha = alphas[0, ..., 0].detach()
         alpha = alpha if requested is None else alpha * requested[..., 0]
         return GsplatRendering(
-            image.detach(), alpha, info["means2d"].detach()[0], visible, images, {**leaves, "screen": info["means2d"]},
-            basis, requested,
+            pixels[..., :3].contiguous(), alpha, pixels[..., 3] if depth else None, info["means2d"].detach()[0], visible,
+            images, {**leaves, "screen": info["means2d"]}, basis, requested,
         )  # fmt: skip
 
     def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
+        self,
+        jobs: Sequence[tuple[Splats, Camera]],
+        tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None,
+        *,
+        depth: Sequence[bool] | None = None,
     ) -> list[Rendering]:
         """Draws the jobs one after the other; nothing is shared."""
-        masks = [None] * len(jobs) if tiles is None else tiles
-        return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
+        masks, depths = tiles or [None] * len(jobs), depth or [False] * len(jobs)
+        return [self(*job, mask, depth=z) for job, mask, z in zip(jobs, masks, depths, strict=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,25 +138,27 @@ class GsplatRendering:
     """An image, and its VJP through gsplat's autograd graph.
 
     Args:
-        drawn: [1, H, W, 3], in the graph of `leaves`.
+        drawn: image and depth, in the graph of `leaves`.
         requested: the pixels of the tile mask; None: all.
     """
 
     image: Float[Tensor, "H W 3"]
     alpha: Float[Tensor, "H W"]
+    depth: Float[Tensor, "H W"] | None
     means2d: Float[Tensor, "N 2"]
     visible: Bool[Tensor, " N"]
-    drawn: Float[Tensor, "1 H W 3"]
+    drawn: Float[Tensor, "1 H W C"]
     leaves: dict[str, Tensor]
     basis: Float[Tensor, "N B1"]
     requested: Bool[Tensor, "H W 1"] | None
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
-        require_cotangents(cotangents, self.image)
+    def vjp(self, cotangents: Float[Tensor, "K H W C"]) -> SplatGradients:
+        require_cotangents(cotangents, self.image, self.depth)
+        channels = self.drawn[..., : cotangents.shape[-1]]
         gradients = []
         for cotangent in cotangents if self.requested is None else cotangents * self.requested:
             found = torch.autograd.grad(
-                self.drawn, list(self.leaves.values()), cotangent[None], retain_graph=True, materialize_grads=True
+                channels, list(self.leaves.values()), cotangent[None], retain_graph=True, materialize_grads=True
             )
             gradients.append(dict(zip(self.leaves, found, strict=True)))
 

@@ -170,13 +170,23 @@ class SplatGradients:
 
 @runtime_checkable
 class Rendering(Protocol):
-    """An image, and the VJP that maps its gradients to those of the splats."""
+    """An image, its depth if it was asked for, and the VJP that maps their gradients to those of the splats."""
 
     @property
     def image(self) -> Float[Tensor, "H W 3"]: ...
 
     @property
     def alpha(self) -> Float[Tensor, "H W"]: ...
+
+    @property
+    def depth(self) -> Float[Tensor, "H W"] | None:
+        """The expected depth of each pixel, world units; None if it was not asked for.
+
+        E = Σ wᵢ zᵢ / Σ wᵢ with the blending weights wᵢ = Tᵢ αᵢ and the depths zᵢ of the centres along the camera's axis: "ED"
+        in gsplat's terms, the accumulated depth "D" divided by alpha. It is 0 where nothing is drawn. Where alpha is small it
+        is that of a few faint Gaussians, so a loss of depth should be weighted by alpha.
+        """
+        ...
 
     @property
     def means2d(self) -> Float[Tensor, "N 2"]:
@@ -188,8 +198,11 @@ class Rendering(Protocol):
         """Whether the Gaussian may contribute to a pixel of the image."""
         ...
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
+    def vjp(self, cotangents: Float[Tensor, "K H W C"]) -> SplatGradients:
         """The gradients of the splats for K gradients of the image (cotangents), in one pass where the backend can.
+
+        A fourth channel of the cotangents is the gradient of `depth`. It reaches the depths zᵢ and the weights wᵢ, and
+        through them every tensor of the geometry. Three channels cost no more than without depth.
 
         Backends may read the splats' tensors again: call this before they are changed in place.
         """
@@ -204,11 +217,13 @@ class Traits:
         devices: "cpu", "cuda" or both: where the splats' tensors may be.
         dtypes: the types that the splats' tensors may have.
         native_threads: it computes on the threads of `rasterizers.native`, not on torch's.
+        depth: it draws expected depth. Without this trait nobody passes the argument `depth`, so its methods may lack it.
     """
 
     devices: frozenset[str]
     dtypes: frozenset[torch.dtype]
     native_threads: bool = False
+    depth: bool = False
 
 
 @runtime_checkable
@@ -218,11 +233,14 @@ class Rasterizer(Protocol):
     @property
     def traits(self) -> Traits: ...
 
-    def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
+    def __call__(
+        self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None, *, depth: bool = False
+    ) -> Rendering:
         """Draw the splats.
 
         Args:
             tiles: the mask of requested tiles; the others show the background and send no gradient. None requests all.
+            depth: also draw `Rendering.depth`, for a rasterizer with the trait `depth`.
         """
         ...
 
@@ -232,9 +250,13 @@ class Rasterizer(Protocol):
         ...
 
     def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
+        self,
+        jobs: Sequence[tuple[Splats, Camera]],
+        tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None,
+        *,
+        depth: Sequence[bool] | None = None,
     ) -> list[Rendering]:
-        """Draw several resolutions from one pose, each with its tile mask.
+        """Draw several resolutions from one pose, each with its tile mask, and with depth or without; None: none with it.
 
         Backends may share work between jobs whose splats hold the same tensor objects.
         """

@@ -9,6 +9,8 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,10 +19,13 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from rasterizers.interface import Camera, Rasterizer, SplatGradients, Splats
+from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats
 from rasterizers.reference import ReferenceRasterizer
 
 Make = Callable[..., Rasterizer]
+Check = Callable[[Make], None]
+
+_log = logging.getLogger(__name__)
 
 _ATTRIBUTES: Final = ("means", "quats", "scales", "opacities", "sh0", "shN", "rgb_offset")
 # Finite differences need an image without cut-offs, which are discontinuous.
@@ -32,7 +37,7 @@ class ContractError(AssertionError):
 
 
 def check_rasterizer(make: Make) -> None:
-    """Run every check.
+    """Run every check; those of depth if the rasterizer draws it.
 
     Args:
         make: the class, or a function that builds the rasterizer from fields of `RasterSettings`.
@@ -44,14 +49,16 @@ def check_rasterizer(make: Make) -> None:
         check(make)
 
 
-def check_gradients_are_finite_differences(make: Make) -> None:
+def check_gradients_are_finite_differences(make: Make, *, depth: bool = False) -> None:
     """The VJP agrees with finite differences along random directions, for every attribute."""
     rasterizer = make(background=(0.2, 0.5, 0.9), **_SMOOTH)
     dtype = _widest(rasterizer)
     splats, camera = scene(24, dtype=dtype, seed=1), _camera(40, 30)
     g = torch.Generator().manual_seed(2)
-    v = torch.randn(1, 30, 40, 3, generator=g).to(dtype)
-    gradients = rasterizer(splats, camera).vjp(v)
+    draw = _drawing(rasterizer, depth)
+    rendering = draw(splats, camera)
+    v = _cotangents(rendering, 1, g)
+    gradients = rendering.vjp(v)
     step, tolerance = (1e-6, 1e-4) if dtype == torch.float64 else (1e-2, 2e-2)
     for name in _ATTRIBUTES:
         value, gradient = getattr(splats, name), gradient_of(gradients, name)[0]
@@ -60,7 +67,7 @@ def check_gradients_are_finite_differences(make: Make) -> None:
             if name in ("opacities", "scales"):
                 direction = direction * value * 0.3
             direction = direction / torch.linalg.vector_norm(direction)
-            ends = [rasterizer(replace(splats, **{name: value + s * step * direction}), camera).image for s in (1, -1)]
+            ends = [pixels_of(draw(replace(splats, **{name: value + s * step * direction}), camera)) for s in (1, -1)]
             numeric = float(((ends[0] - ends[1]) * v[0]).sum()) / (2 * step)
             analytic = float((gradient * direction).sum())
             scale = max(abs(numeric), float(gradient.abs().max()) * 1e-2, 1e-9)
@@ -69,13 +76,12 @@ def check_gradients_are_finite_differences(make: Make) -> None:
             )
 
 
-def check_cotangents_together_equal_one_by_one(make: Make) -> None:
+def check_cotangents_together_equal_one_by_one(make: Make, *, depth: bool = False) -> None:
     """One call with K cotangents equals K calls with one."""
     rasterizer = make()
-    dtype = _widest(rasterizer)
-    splats, camera = scene(60, dtype=dtype), _camera(48, 33)
-    rendering = rasterizer(splats, camera)
-    v = torch.randn(3, 33, 48, 3, generator=torch.Generator().manual_seed(3)).to(dtype)
+    splats, camera = scene(60, dtype=_widest(rasterizer)), _camera(48, 33)
+    rendering = _drawing(rasterizer, depth)(splats, camera)
+    v = _cotangents(rendering, 3, torch.Generator().manual_seed(3))
     together = rendering.vjp(v)
     for k in range(3):
         alone = rendering.vjp(v[k : k + 1])
@@ -83,17 +89,18 @@ def check_cotangents_together_equal_one_by_one(make: Make) -> None:
             _close(gradient_of(together, name)[k], gradient_of(alone, name)[0], 1e-5, f"cotangent {k} of {name}")
 
 
-def check_dropped_equals_absent(make: Make) -> None:
+def check_dropped_equals_absent(make: Make, *, depth: bool = False) -> None:
     """A Gaussian with opacity 0 is invisible and has no gradient, and the image is as without it."""
     rasterizer = make()
     dtype = _widest(rasterizer)
     splats, camera = scene(50, dtype=dtype), _camera(48, 33)
     kept = torch.arange(50) % 3 != 0
     gated = replace(splats, opacities=splats.opacities * kept)
-    rendering, without = rasterizer(gated, camera), rasterizer(select(splats, kept), camera)
-    _close(rendering.image, without.image, 1e-6, "the image")
+    draw = _drawing(rasterizer, depth)
+    rendering, without = draw(gated, camera), draw(select(splats, kept), camera)
+    _close(pixels_of(rendering), pixels_of(without), 1e-6, "the image")
     _require(not bool(rendering.visible[~kept].any()), "a dropped Gaussian counts as visible")
-    v = torch.ones(1, 33, 48, 3, dtype=dtype)
+    v = torch.ones_like(pixels_of(rendering))[None]
     gradients, expected = rendering.vjp(v), without.vjp(v)
     for name in _ATTRIBUTES:
         rows = gradient_of(gradients, name)[0]
@@ -101,46 +108,49 @@ def check_dropped_equals_absent(make: Make) -> None:
         _close(rows[kept], gradient_of(expected, name)[0], 1e-5, f"the others' {name}")
 
 
-def check_nothing_to_draw(make: Make) -> None:
-    """With no Gaussian, or none in view: the background, alpha 0, and zero gradients of the right shape."""
+def check_nothing_to_draw(make: Make, *, depth: bool = False) -> None:
+    """With no Gaussian, or none in view: the background, alpha and depth 0, and zero gradients of the right shape."""
     background = (0.1, 0.6, 0.3)
     rasterizer = make(background=background)
     dtype, camera = _widest(rasterizer), _camera(19, 11)
     behind = scene(5, dtype=dtype)
     behind = replace(behind, means=behind.means - torch.tensor([0, 0, 100.0], dtype=dtype))
     for splats in (select(behind, torch.zeros(5, dtype=torch.bool)), behind):
-        rendering = rasterizer(splats, camera)
+        rendering = _drawing(rasterizer, depth)(splats, camera)
         _close(rendering.image, torch.tensor(background, dtype=dtype).expand(11, 19, 3), 1e-7, "the background")
         _require(float(rendering.alpha.abs().max()) == 0, "alpha is not 0 where nothing is")
-        gradients = rendering.vjp(torch.ones(2, 11, 19, 3, dtype=dtype))
+        _require(rendering.depth is None or not bool(rendering.depth.any()), "depth is not 0 where nothing is")
+        gradients = rendering.vjp(torch.ones_like(pixels_of(rendering)).expand(2, -1, -1, -1))
         for name in _ATTRIBUTES:
             found = gradient_of(gradients, name)
             _require(found.shape[:2] == (2, len(splats)), f"the gradient of {name} has shape {tuple(found.shape)}")
             _require(found.numel() == 0 or float(found.abs().max()) == 0, f"the gradient of {name} is not 0")
 
 
-def check_tile_mask(make: Make) -> None:
-    """Requested tiles are as without a mask; the others show the background and send no gradient."""
+def check_tile_mask(make: Make, *, depth: bool = False) -> None:
+    """Requested tiles are as without a mask; the others show the background and depth 0, and send no gradient."""
     rasterizer = make(tile=8)
-    dtype = _widest(rasterizer)
-    splats, camera = scene(60, dtype=dtype), _camera(48, 33)
+    splats, camera = scene(60, dtype=_widest(rasterizer)), _camera(48, 33)
+    draw = _drawing(rasterizer, depth)
     mask = torch.rand(5, 6, generator=torch.Generator().manual_seed(4)) < 0.5
     pixels = mask.repeat_interleave(8, 0).repeat_interleave(8, 1)[:33, :48]
-    full, partial = rasterizer(splats, camera), rasterizer(splats, camera, tiles=mask)
-    _close(partial.image[pixels], full.image[pixels], 1e-6, "requested pixels")
-    _require(float(partial.image[~pixels].abs().max()) == 0, "pixels that were not requested are not background")
-    v = torch.randn(1, 33, 48, 3, generator=torch.Generator().manual_seed(5)).to(dtype)
+    full, partial = draw(splats, camera), draw(splats, camera, tiles=mask)
+    _close(pixels_of(partial)[pixels], pixels_of(full)[pixels], 1e-6, "requested pixels")
+    _require(float(pixels_of(partial)[~pixels].abs().max()) == 0, "pixels that were not requested are not background")
+    v = _cotangents(full, 1, torch.Generator().manual_seed(5))
     found, expected = partial.vjp(v), full.vjp(v * pixels[None, :, :, None])
     for name in _ATTRIBUTES:
         _close(gradient_of(found, name), gradient_of(expected, name), 1e-5, f"the gradient of {name} under a mask")
-    whole, masked = rasterizer.render_scales([(splats, camera.scaled(1 / 3)), (splats, camera)], [None, mask])
+    jobs = [(splats, camera.scaled(1 / 3)), (splats, camera)]
+    together = functools.partial(rasterizer.render_scales, jobs, [None, mask])
+    whole, masked = together(depth=[False, True]) if depth else together()
     _close(
-        whole.image,
-        rasterizer(splats, camera.scaled(1 / 3)).image,
+        pixels_of(whole),
+        rasterizer(*jobs[0]).image,
         1e-6,
         "an image without a mask, drawn together with a masked one",
     )
-    _close(masked.image, partial.image, 1e-6, "an image with a mask, drawn together with another")
+    _close(pixels_of(masked), pixels_of(partial), 1e-6, "an image with a mask, drawn together with another")
 
 
 def check_equal_depths_have_an_order(make: Make) -> None:
@@ -153,32 +163,50 @@ def check_equal_depths_have_an_order(make: Make) -> None:
     _require(bool((first == second).all()), "two renderings of one scene differ")
 
 
-def check_agrees_with_the_reference(make: Make) -> None:
+def check_agrees_with_the_reference(make: Make, *, depth: bool = False) -> None:
     """Image and gradients agree with the reference in float64, at the default cut-offs, for SH degrees 0 to 3."""
     rasterizer = make()
     for bands in (0, 3, 8, 15):
         splats, camera = scene(300, bands=bands), _camera(65, 47)
-        exact = ReferenceRasterizer()(to(splats, torch.float64), camera)
+        exact = ReferenceRasterizer()(to(splats, torch.float64), camera, depth=depth)
         dtype = torch.float32 if torch.float32 in rasterizer.traits.dtypes else torch.float64
-        found = rasterizer(to(splats, dtype), camera)
-        error = (found.image.double() - exact.image).abs()
+        found = _drawing(rasterizer, depth)(to(splats, dtype), camera)
+        error = (pixels_of(found).double() - pixels_of(exact)).abs() / magnitude(exact)
         _require(float((error <= 5e-6).double().mean()) >= 0.999, f"{bands} bands: more than 0.1 % of values are off")
         _require(float(error.max()) <= 8e-3, f"{bands} bands: a value is off by {float(error.max()):.2g}")
-        v = torch.randn(1, 47, 65, 3, generator=torch.Generator().manual_seed(6))
-        gradients, expected = found.vjp(v.to(dtype)), exact.vjp(v.double())
+        v = _cotangents(exact, 1, torch.Generator().manual_seed(6))
+        gradients, expected = found.vjp(v.to(dtype)), exact.vjp(v)
         for name in (*_ATTRIBUTES, "screen"):
             a, b = gradient_of(gradients, name).double(), gradient_of(expected, name)
             _close(a, b, 1e-3, f"{bands} bands: gradient of {name}")
 
 
-CHECKS: Final[Sequence[Callable[[Make], None]]] = (
+def _of_depth(check: Callable[..., None]) -> Check:
+    """The same check with depth as a fourth channel, for rasterizers that draw it."""
+
+    @functools.wraps(check)
+    def of_depth(make: Make) -> None:
+        if make().traits.depth:
+            check(make, depth=True)
+        else:
+            _log.info("%s: not checked, the rasterizer's traits.depth is False.", of_depth.__name__)
+
+    of_depth.__name__ = f"{check.__name__}_of_depth"
+    return of_depth
+
+
+_OF_EACH_CHANNEL: Final = (
     check_gradients_are_finite_differences,
     check_cotangents_together_equal_one_by_one,
     check_dropped_equals_absent,
     check_nothing_to_draw,
     check_tile_mask,
-    check_equal_depths_have_an_order,
     check_agrees_with_the_reference,
+)
+CHECKS: Final[Sequence[Check]] = (
+    *_OF_EACH_CHANNEL,
+    check_equal_depths_have_an_order,
+    *(_of_depth(check) for check in _OF_EACH_CHANNEL),
 )
 
 
@@ -213,6 +241,35 @@ def gradient_of(gradients: SplatGradients, name: str) -> Tensor:
     """The gradient of an attribute by name; that of `rgb_offset` is the colour's."""
     found: Tensor = getattr(gradients, "rgb" if name == "rgb_offset" else name)
     return found
+
+
+def pixels_of(rendering: Rendering) -> Tensor:
+    """The image [H, W, 3], or with depth as a fourth channel if it was drawn."""
+    return rendering.image if rendering.depth is None else torch.cat((rendering.image, rendering.depth[..., None]), -1)
+
+
+def magnitude(exact: Rendering) -> Tensor:
+    """The scale of errors of `pixels_of`: 1 for colours, and E / alpha for depth.
+
+    A wrong weight moves E by its share of alpha. Where little is drawn E may flip between two faint Gaussians.
+    """
+    if exact.depth is None:
+        return torch.ones_like(exact.image)
+    of_depth = (exact.depth / exact.alpha).where(exact.alpha > 0, math.inf)
+    return torch.cat((torch.ones_like(exact.image), of_depth[..., None]), -1)
+
+
+def _drawing(rasterizer: Rasterizer, depth: bool) -> Callable[..., Rendering]:
+    """The rasterizer; the argument is given only if depth is asked for, because without the trait it may be unknown."""
+    return functools.partial(rasterizer, depth=True) if depth else rasterizer
+
+
+def _cotangents(like: Rendering, k: int, generator: torch.Generator) -> Tensor:
+    """Random cotangents of `pixels_of`. Those of depth are weighted by alpha, because E is not smooth where little is drawn."""
+    image = like.image
+    v = torch.randn(k, *image.shape[:2], 3 if like.depth is None else 4, generator=generator).to(image)
+    v[..., 3:] *= like.alpha[..., None]
+    return v
 
 
 def _map(splats: Splats, f: Callable[[Tensor], Tensor]) -> Splats:

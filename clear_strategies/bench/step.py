@@ -59,20 +59,26 @@ class RecordedRasterizer:
         self.rasterizer, self.tile, self.traits = rasterizer, rasterizer.tile, rasterizer.traits
         self.renderings: list[Rendering] = []
 
-    def __call__(self, splats: Splats, camera: Camera, tiles: Tensor | None = None) -> Rendering:
-        return self.rasterizer(splats, camera, tiles)
+    def __call__(
+        self, splats: Splats, camera: Camera, tiles: Tensor | None = None, *, depth: bool = False
+    ) -> Rendering:
+        return self.rasterizer(splats, camera, tiles, depth=depth)
 
     def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Tensor | None] | None = None
+        self,
+        jobs: Sequence[tuple[Splats, Camera]],
+        tiles: Sequence[Tensor | None] | None = None,
+        *,
+        depth: Sequence[bool] | None = None,
     ) -> list[Rendering]:
         if not self.renderings:
-            self.renderings = [_Recorded(r) for r in self.rasterizer.render_scales(jobs, tiles)]
+            self.renderings = [_Recorded(r) for r in self.rasterizer.render_scales(jobs, tiles, depth=depth)]
         return self.renderings
 
 
 class _Recorded:
     def __init__(self, rendering: Rendering) -> None:
-        self.image, self.alpha = rendering.image, rendering.alpha
+        self.image, self.alpha, self.depth = rendering.image, rendering.alpha, rendering.depth
         self.means2d, self.visible = rendering.means2d, rendering.visible
         self._rendering, self._gradients = rendering, dict[int, SplatGradients]()
 

@@ -33,6 +33,7 @@ _TRAITS: Final = Traits(
     devices=frozenset({"cpu"}),
     dtypes=frozenset({torch.float32, torch.float64}),
     native_threads=True,
+    depth=True,
 )
 _LONGEST_SIDE: Final = 32 << 15  # px: bins of 32 px are numbered in 16 bits
 _BLOCK: Final = 4  # px, the block that the kernels blend at once; tiles are a multiple of it
@@ -78,18 +79,24 @@ class CppRasterizer(RasterSettings):
     def traits(self) -> Traits:
         return _TRAITS
 
-    def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
-        return CppRendering(_Frame(self, [(splats, camera)], [tiles]), 0)
+    def __call__(
+        self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None, *, depth: bool = False
+    ) -> Rendering:
+        return CppRendering(_Frame(self, [(splats, camera)], [tiles]), 0, depth=depth)
 
     def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
+        self,
+        jobs: Sequence[tuple[Splats, Camera]],
+        tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None,
+        *,
+        depth: Sequence[bool] | None = None,
     ) -> list[Rendering]:
         """Jobs with the same pose and tensor objects share projection, colour and depth order."""
-        masks = [None] * len(jobs) if tiles is None else tiles
+        masks, depths = tiles or [None] * len(jobs), depth or [False] * len(jobs)
         if len(jobs) > 1 and all(same_gaussians_and_pose(jobs[0], job) for job in jobs[1:]):
             frame = _Frame(self, jobs, masks)
-            return [CppRendering(frame, i) for i in range(len(jobs))]
-        return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
+            return [CppRendering(frame, i, depth=depths[i]) for i in range(len(jobs))]
+        return [self(*job, mask, depth=z) for job, mask, z in zip(jobs, masks, depths, strict=True)]
 
 
 def _require_side(camera: Camera) -> None:
@@ -177,18 +184,19 @@ class _Frame:
 class CppRendering:
     """An image on one pixel grid of a frame."""
 
-    def __init__(self, frame: _Frame, grid: int) -> None:
+    def __init__(self, frame: _Frame, grid: int, *, depth: bool) -> None:
         self._frame, self._grid = frame, grid
         camera = frame.cameras[grid]
         self.image: Float[Tensor, "H W 3"] = frame.empty(camera.height, camera.width, 3)
         self.alpha: Float[Tensor, "H W"] = frame.empty(camera.height, camera.width)
+        self.depth: Float[Tensor, "H W"] | None = frame.empty(camera.height, camera.width) if depth else None
         self.means2d: Float[Tensor, "N 2"] = frame.means2d[grid]
         self.visible: Bool[Tensor, " N"] = frame.visible[grid]
-        frame.native.draw(grid, self.image, self.alpha, frame.threads)
+        frame.native.draw(grid, self.image, self.alpha, self.depth, frame.threads)
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
+    def vjp(self, cotangents: Float[Tensor, "K H W C"]) -> SplatGradients:
         """One pass for up to three cotangents; see `Rendering.vjp`."""
-        require_cotangents(cotangents, self.image)
+        require_cotangents(cotangents, self.image, self.depth)
         k, n, frame = len(cotangents), len(self.visible), self._frame
         means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
         opacities = frame.empty(k, n)

@@ -26,6 +26,7 @@ from rasterizers.reference.tiles import TileGrid, TileLists, list_tiles
 _TRAITS: Final = Traits(
     devices=frozenset({"cpu", "cuda"}),
     dtypes=frozenset({torch.float32, torch.float64}),
+    depth=True,
 )
 
 
@@ -49,19 +50,25 @@ class ReferenceRasterizer(RasterSettings):
     def traits(self) -> Traits:
         return _TRAITS
 
-    def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
+    def __call__(
+        self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None, *, depth: bool = False
+    ) -> Rendering:
         require_splats(splats, _TRAITS)
         require_finite(splats)
         grid = TileGrid(camera.width, camera.height, self.tile)
-        projection = project(splats, camera, self)
+        projection = project(splats, camera, self, depth=depth)
         lists = list_tiles(projection, grid, tiles)
         return ReferenceRendering(self, grid, projection, lists)
 
     def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
+        self,
+        jobs: Sequence[tuple[Splats, Camera]],
+        tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None,
+        *,
+        depth: Sequence[bool] | None = None,
     ) -> list[Rendering]:
-        masks = [None] * len(jobs) if tiles is None else tiles
-        return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
+        masks, depths = tiles or [None] * len(jobs), depth or [False] * len(jobs)
+        return [self(*job, mask, depth=z) for job, mask, z in zip(jobs, masks, depths, strict=True)]
 
 
 class ReferenceRendering:
@@ -73,12 +80,14 @@ class ReferenceRendering:
         self.means2d: Float[Tensor, "N 2"] = projection.scatter(projection.means2d.detach(), n)
         self.visible: Bool[Tensor, " N"] = projection.scatter(lists.visible, n)
         tiles, transmittance, self._passes = blend(projection.table(), lists, grid, settings, settings.lanes)
-        self.image: Float[Tensor, "H W 3"] = grid.to_image(tiles)
+        pixels = grid.to_image(tiles)
+        self.image: Float[Tensor, "H W 3"] = pixels[..., :3].contiguous()
+        self.depth: Float[Tensor, "H W"] | None = pixels[..., 3] if projection.draws_depth else None
         self.alpha: Float[Tensor, "H W"] = 1 - grid.to_image(transmittance[..., None])[..., 0]
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
+    def vjp(self, cotangents: Float[Tensor, "K H W C"]) -> SplatGradients:
         """One pass for all K; see `Rendering.vjp`."""
-        require_cotangents(cotangents, self.image)
+        require_cotangents(cotangents, self.image, self.depth)
         v = torch.stack([self._grid.to_tiles(c.to(self.image)) for c in cotangents])
         table = self._projection.table()
         return self._projection.vjp(blend_vjp(table, self._passes, self._grid, self._settings, v))

@@ -2,6 +2,8 @@
 
     α_i = min(α_max, o_i exp(-½ dᵀ Σ'⁻¹ d)),   T_i = Π_{j<i} (1 - α_j),   I = Σ_i T_i α_i c_i + T_end·background
 
+Expected depth, if the table has depths, is E = Σ_i T_i α_i z_i / Σ_i T_i α_i.
+
 A pair with α_i < α_min is skipped; a pixel ends *before* the Gaussian that would take its transmittance below
 `transmittance_min`. The work is split into batches of tiles and slabs of their lists: [B tiles, L pairs, P pixels].
 """
@@ -17,17 +19,20 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rasterizers.interface import RasterSettings
-from rasterizers.reference.projection import CONIC, MEAN, OPACITY, RGB
+from rasterizers.reference.projection import CONIC, DEPTH, MEAN, OPACITY, RGB
 from rasterizers.reference.tiles import TileGrid, TileLists
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pass:
-    """What the VJP needs of a batch: its tiles, each slab's pairs with the T in front of it, and T_end."""
+    """What the VJP needs of a batch: its tiles, each slab's pairs with the T in front of it, T_end, and if depth is drawn
+    E with Σ T_i α_i.
+    """
 
     tiles: Int[Tensor, " B"]
     slabs: list[tuple[Int[Tensor, "B _"], Float[Tensor, "B P"]]]
     end: Float[Tensor, "B P"]
+    depth: tuple[Float[Tensor, "B P"], Float[Tensor, "B P"]] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +44,7 @@ class Slab:
         kept: 1 where the pixel has not ended, else 0; None if no pixel ends in this slab.
     """
 
-    rows: Float[Tensor, "B L 9"]
+    rows: Float[Tensor, "B L W"]
     splat: Float[Tensor, "B L P"]
     alpha: Float[Tensor, "B L P"]
     before: Float[Tensor, "B L P"]
@@ -60,16 +65,17 @@ class Slab:
 
 @torch.no_grad()
 def blend(
-    table: Float[Tensor, "M1 9"], lists: TileLists, grid: TileGrid, settings: RasterSettings, lanes: int
-) -> tuple[Float[Tensor, "T P 3"], Float[Tensor, "T P"], list[Pass]]:
-    """Colour and final transmittance of every pixel of every tile, and what `blend_vjp` needs."""
+    table: Float[Tensor, "M1 W"], lists: TileLists, grid: TileGrid, settings: RasterSettings, lanes: int
+) -> tuple[Float[Tensor, "T P C"], Float[Tensor, "T P"], list[Pass]]:
+    """Colour, expected depth and final transmittance of every pixel of every tile, and what `blend_vjp` needs."""
     n_tiles, pixels = grid.rows * grid.columns, grid.tile**2
-    background = table.new_tensor(settings.background)
-    colors = background.expand(n_tiles, pixels, 3).clone()
+    draws_depth = table.shape[1] == DEPTH.stop
+    background = table.new_tensor((*settings.background, 0.0) if draws_depth else settings.background)
+    colors = background.expand(n_tiles, pixels, -1).clone()
     transmittance = table.new_ones(n_tiles, pixels)
     passes = []
     for tiles in lists.batches(pixels, lanes):
-        color = table.new_zeros(len(tiles), pixels, 3)
+        color, cover = table.new_zeros(len(tiles), pixels, len(background)), table.new_zeros(len(tiles), pixels)
         through = end = table.new_ones(len(tiles), pixels)  # `through` keeps falling after a pixel has ended
         slabs = []
         for pairs in lists.slabs(tiles):
@@ -77,32 +83,44 @@ def blend(
                 break
             slabs.append((pairs, through))
             slab = _composite(table[pairs], tiles, grid, settings, through)
-            color += slab.weights.transpose(1, 2) @ slab.rows[..., RGB]
+            weights = slab.weights
+            color += weights.transpose(1, 2) @ slab.rows[..., RGB.start :]
+            if draws_depth:
+                cover += weights.sum(1)  # not 1 - T_end, which has no digits left where little is drawn
             through, end = slab.after[:, -1], slab.end(end)
+        depth = None
+        if draws_depth:
+            depth = color[..., 3].div_(cover.where(cover > 0, 1.0)), cover
         colors[tiles] = color + end[..., None] * background
         transmittance[tiles] = end
-        passes.append(Pass(tiles, slabs, end))
+        passes.append(Pass(tiles, slabs, end, depth))
     return colors, transmittance, passes
 
 
 @torch.no_grad()
 def blend_vjp(
-    table: Float[Tensor, "M1 9"],
+    table: Float[Tensor, "M1 W"],
     passes: list[Pass],
     grid: TileGrid,
     settings: RasterSettings,
-    cotangents: Float[Tensor, "K T P 3"],
-) -> Float[Tensor, "K M1 9"]:
+    cotangents: Float[Tensor, "K T P C"],
+) -> Float[Tensor, "K M1 W"]:
     """Gradient of Σ cotangent·image with respect to the table, back to front.
 
     With s_i = c_i·v and `behind` = Σ_{j>i} T_j α_j s_j + T_end background·v:  ∂/∂α_i = T_i s_i - behind / (1 - α_i).
+    A cotangent v_E of depth adds (z_i - E) v_E / Σ_j T_j α_j to s_i: at the E that was drawn, E has the gradient of
+    Σ_i T_i α_i (z_i - E) / Σ_j T_j α_j with E and the denominator held.
     """
+    has_depth = cotangents.shape[-1] == 4
     background = table.new_tensor(settings.background)
     monomials = _monomials(grid.tile, table)
     gradients = table.new_zeros(len(cotangents), *table.shape)
     for batch in passes:
         v = cotangents[:, batch.tiles]
-        behind = batch.end * (v @ background)
+        if has_depth and batch.depth is not None:
+            expected, cover = batch.depth
+            v[..., 3] /= cover.where(cover > 0, 1.0)
+        behind = batch.end * (v[..., :3] @ background)
         for pairs, through in reversed(batch.slabs):
             slab = _composite(table[pairs], batch.tiles, grid, settings, through)
             weights = slab.weights
@@ -112,18 +130,20 @@ def blend_vjp(
                 sensitivity *= slab.kept
             one_minus_alpha = 1 - slab.alpha
             for k, v_k in enumerate(v):
-                s = slab.rows[..., RGB] @ v_k.transpose(1, 2)
+                s = slab.rows[..., RGB] @ v_k[..., :3].transpose(1, 2)
+                if has_depth:
+                    s += (slab.rows[..., DEPTH] - expected[:, None]) * v_k[:, None, :, 3]
                 blended = weights * s
                 tail = blended.flip(1).cumsum(1).flip(1)  # includes i itself
                 d_alpha = slab.before * s - (tail - blended + behind[k][:, None]) / one_minus_alpha
                 d_rows = _table_gradient(slab.rows, d_alpha * sensitivity, weights @ v_k, batch.tiles, grid, monomials)
-                gradients[k].index_add_(0, pairs.flatten(), d_rows.flatten(0, 1))
+                gradients[k, :, : d_rows.shape[-1]].index_add_(0, pairs.flatten(), d_rows.flatten(0, 1))
                 behind[k] += tail[:, 0]
     return gradients
 
 
 def _composite(
-    rows: Float[Tensor, "B L 9"],
+    rows: Float[Tensor, "B L W"],
     tiles: Int[Tensor, " B"],
     grid: TileGrid,
     settings: RasterSettings,
@@ -147,13 +167,13 @@ def _composite(
 
 
 def _table_gradient(
-    rows: Float[Tensor, "B L 9"],
+    rows: Float[Tensor, "B L W"],
     q: Float[Tensor, "B L P"],
-    d_rgb: Float[Tensor, "B L 3"],
+    d_channels: Float[Tensor, "B L C"],
     tiles: Int[Tensor, " B"],
     grid: TileGrid,
     monomials: Float[Tensor, "P 6"],
-) -> Float[Tensor, "B L 9"]:
+) -> Float[Tensor, "B L _"]:
     """The gradient of the table's rows from q = ∂L/∂(log splat) per pixel, by q's moments about the Gaussian's centre."""
     # Moments about the tile's centre first, because one matrix product then serves all tiles.
     m, mx, my, mxx, mxy, myy = (q @ monomials).unbind(-1)
@@ -167,7 +187,7 @@ def _table_gradient(
     qyy = myy + 2 * oy * my + oy * oy * m
     d_opacity = m / rows[..., OPACITY][..., 0].clamp_min(torch.finfo(rows.dtype).tiny)
     d_mean_conic_opacity = (A * qx + B * qy, B * qx + C * qy, -0.5 * qxx, -qxy, -0.5 * qyy, d_opacity)
-    return torch.cat((torch.stack(d_mean_conic_opacity, dim=-1), d_rgb), dim=-1)
+    return torch.cat((torch.stack(d_mean_conic_opacity, dim=-1), d_channels), dim=-1)
 
 
 def _monomials(tile: int, like: Tensor) -> Float[Tensor, "P 6"]:

@@ -19,9 +19,8 @@ from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
 # The Jacobian is clamped beyond this share of the half field of view outside the image.
 _FRUSTUM_MARGIN = 0.3
 
-# Columns of the table that blending reads, one row per projected Gaussian.
-MEAN, CONIC, OPACITY, RGB = slice(0, 2), slice(2, 5), slice(5, 6), slice(6, 9)
-TABLE_WIDTH = 9
+# Columns of the table that blending reads, one row per projected Gaussian; the last one is there if depth is drawn.
+MEAN, CONIC, OPACITY, RGB, DEPTH = slice(0, 2), slice(2, 5), slice(5, 6), slice(6, 9), slice(9, 10)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,6 +35,7 @@ class Projection:
         power_max: the exponent at which alpha has fallen to alpha_min.
         leaves: copies of the splats' rows (means, quats, scales, opacities), the inputs of the graph.
         raw_rgb: colour before its clamp at 0. basis: Y of this view's directions.
+        draws_depth: the table has the column of depths.
     """
 
     n_splats: int
@@ -50,12 +50,17 @@ class Projection:
     leaves: tuple[Tensor, Tensor, Tensor, Tensor]
     raw_rgb: Float[Tensor, "M 3"]
     basis: Float[Tensor, "M B1"]
+    draws_depth: bool
 
-    def table(self) -> Float[Tensor, "M1 9"]:
+    def table(self) -> Float[Tensor, "M1 W"]:
         """The columns that blending reads, plus an empty row that pads the tile lists."""
-        columns = (self.means2d, self.conics, self.opacities[:, None], self.rgb)
-        table = torch.cat(columns, dim=1).detach()
-        return torch.cat((table, table.new_zeros(1, TABLE_WIDTH)))
+        table = torch.column_stack([x.detach() for x in self._columns()])
+        return torch.cat((table, table.new_zeros(1, table.shape[1])))
+
+    def _columns(self) -> tuple[Tensor, ...]:
+        """MEAN, CONIC, OPACITY, RGB and, if it is drawn, DEPTH."""
+        columns = (self.means2d, self.conics, self.opacities, self.rgb)
+        return (*columns, self.depths) if self.draws_depth else columns
 
     def scatter(self, values: Tensor, n: int) -> Tensor:
         """The values at their rows among all N splats; zeros (or False) elsewhere."""
@@ -63,13 +68,14 @@ class Projection:
         out[self.rows] = values
         return out
 
-    def vjp(self, table_gradients: Float[Tensor, "K M1 9"]) -> SplatGradients:
+    def vjp(self, table_gradients: Float[Tensor, "K M1 W"]) -> SplatGradients:
         """The splats' gradients from those of the table."""
-        outputs = (self.means2d, self.conics, self.opacities, self.rgb)
+        outputs = self._columns()
         inputs = (*self.leaves, self.raw_rgb)
         by_cotangent = []
         for g in table_gradients[:, : self.rows.shape[0]]:
-            cotangents = (g[:, MEAN], g[:, CONIC], g[:, OPACITY][:, 0], g[:, RGB])
+            parts = (g[:, MEAN], g[:, CONIC], g[:, OPACITY], g[:, RGB], g[:, DEPTH])
+            cotangents = [part.reshape(x.shape) for part, x in zip(parts, outputs, strict=False)]
             gradients = torch.autograd.grad(outputs, inputs, cotangents, retain_graph=True, materialize_grads=True)
             by_cotangent.append([*gradients, g[:, MEAN]])
         means, quats, scales, opacities, rgb, screen = (
@@ -81,7 +87,7 @@ class Projection:
         )
 
 
-def project(splats: Splats, camera: Camera, settings: RasterSettings) -> Projection:
+def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: bool) -> Projection:
     """Σ' = J W Σ Wᵀ Jᵀ + kernel·I and u = π(μ), for every Gaussian that can contribute."""
     pose = camera.world_to_camera.to(splats.means)
     rows = _candidates(splats, pose, settings)
@@ -133,12 +139,13 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings) -> Project
         conics,
         opacities,
         rgb,
-        z.detach(),
+        z,
         half,
         power_max,
         leaves,
         raw_rgb,
         basis.detach(),
+        depth,
     )
 
 

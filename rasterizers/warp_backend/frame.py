@@ -49,9 +49,11 @@ LANES: Final = {"cuda": 32, "cpu": 1}
 class _View:
     """One pixel grid of a frame: its inputs, and its results on the device."""
 
-    def __init__(self, settings: WarpRasterizer, splats: Splats, camera: Camera, mask: Tensor | None) -> None:
+    def __init__(
+        self, settings: WarpRasterizer, splats: Splats, camera: Camera, mask: Tensor | None, *, has_depth: bool
+    ) -> None:
         n, like = len(splats), splats.means
-        self.camera = camera
+        self.camera, self.has_depth = camera, has_depth
         self.columns, self.rows_of_tiles = -(-camera.width // TILE), -(-camera.height // TILE)
         self.opacities = splats.opacities.detach().contiguous()
         self.offsets = None if splats.rgb_offset is None else splats.rgb_offset.detach().contiguous()
@@ -85,6 +87,7 @@ class Frame:
         settings: WarpRasterizer,
         jobs: Sequence[tuple[Splats, Camera]],
         tiles: Sequence[Bool[Tensor, "_ _"] | None],
+        depth: Sequence[bool],
     ) -> None:
         splats, camera = jobs[0]
         for mask, (_, view) in zip(tiles, jobs, strict=True):
@@ -101,7 +104,8 @@ class Frame:
         self.bands = self.shN.shape[1]
         self.colours = self.empty(self.n, 3)
         self.slopes = self.empty(self.n if self.bands else 0, 3, 3)
-        self.views = [_View(settings, job, view, mask) for (job, view), mask in zip(jobs, tiles, strict=True)]
+        self.depths = self.empty(self.n if any(depth) else 0)
+        self.views = [_View(settings, *job, mask, has_depth=z) for job, mask, z in zip(jobs, tiles, depth, strict=True)]
         self._basis: Tensor | None = None
         self._resolved = False
 
@@ -169,7 +173,7 @@ class Frame:
                 view.offsets is not None, array(view.offsets, wp.vec3),
                 view.requested is not None, array(view.requested), nth == 0,
                 array(keys), array(self.colours, wp.vec3), array(self.slopes, wp.mat33),
-                array(view.ellipses, types.Row), array(view.means2d, wp.vec2), array(view.visible),
+                array(self.depths), array(view.ellipses, types.Row), array(view.means2d, wp.vec2), array(view.visible),
                 array(view.counts), array(not_finite),
             )  # fmt: skip
         self.totals = torch.cat([*(view.counts.sum(0, True) for view in self.views), not_finite])
@@ -220,6 +224,7 @@ class WarpRendering:
         self._image, self._alpha = frame.empty(height, width, 3), frame.empty(height, width)
         self._transmittance = frame.empty(height, width)
         self._ended = frame.empty(height, width, dtype=torch.int32)
+        self._depth, self._over_weight = (frame.empty(height, width) if view.has_depth else None for _ in range(2))
         self._blend()
 
     @property
@@ -232,6 +237,11 @@ class WarpRendering:
         self._resolve()
         return self._alpha
 
+    @property
+    def depth(self) -> Float[Tensor, "H W"] | None:
+        self._resolve()
+        return self._depth
+
     def _resolve(self) -> None:
         with on_stream(self._frame.like.device):
             self._frame.resolve_counts()
@@ -242,17 +252,20 @@ class WarpRendering:
         frame, view, lists = self._frame, self._view, self._view.lists
         self._drawn_from, self._reached = lists, torch.zeros_like(lists.starts)
         frame.launch(
-            blend, view.columns * view.rows_of_tiles * TILE**2, view.grid, frame.cuts,
-            array(view.ellipses, types.Row), array(lists.gaussians), array(lists.starts), array(lists.ends),
+            blend(view.has_depth), view.columns * view.rows_of_tiles * TILE**2, view.grid, frame.cuts,
+            array(view.ellipses, types.Row), array(frame.depths), array(lists.gaussians), array(lists.starts),
+            array(lists.ends),
             array(self._image, wp.vec3), array(self._alpha), array(self._transmittance), array(self._ended),
-            array(self._reached),
+            array(self._reached), array(self._depth), array(self._over_weight),
         )  # fmt: skip
 
-    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
+    def vjp(self, cotangents: Float[Tensor, "K H W C"]) -> SplatGradients:
         """One pass for up to three cotangents; see `Rendering.vjp`."""
-        require_cotangents(cotangents, self.image)
+        require_cotangents(cotangents, self.image, self.depth)
         k, n, frame = len(cotangents), len(self.visible), self._frame
         v = cotangents.detach().to(self._image).contiguous()
+        if self._over_weight is not None and v.shape[-1] == types.DEEP:
+            v = torch.cat((v[..., :3], v[..., 3:] * self._over_weight[..., None]), dim=-1)
         means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
         opacities = frame.empty(k, n)
         capacity = padded(self._view.pairs)
@@ -266,22 +279,25 @@ class WarpRendering:
 
     def _fill(self, v: Tensor, *out: Tensor) -> None:
         """Fill the gradients for one to three cotangents."""
-        frame, view, lists, k = self._frame, self._view, self._drawn_from, len(v)
-        pair_sums = frame.empty(padded(view.pairs), 9 * k)
-        row = wp.types.vector(length=9 * k, dtype=wp.float32)
+        frame, view, lists, k, channels = self._frame, self._view, self._drawn_from, len(v), v.shape[-1]
+        width = k * (types.SUMS + channels)
+        pair_sums = frame.empty(padded(view.pairs), width)
+        row = wp.types.vector(length=width, dtype=wp.float32)
         lanes = LANES[frame.settings.device]
         wp.launch_tiled(
-            blend_vjp(k, lanes), dim=[len(lists.starts)], block_dim=lanes,  # includes the tile of unused places, see list_pairs
+            blend_vjp(k, channels, lanes), block_dim=lanes,
+            dim=[len(lists.starts)],  # includes the tile of unused places, see list_pairs
             device=wp.device_from_torch(frame.like.device),
             inputs=[
-                view.grid, frame.cuts, array(view.ellipses, types.Row), array(lists.gaussians),
+                view.grid, frame.cuts, array(view.ellipses, types.Row), array(frame.depths), array(lists.gaussians),
                 array(lists.places), array(lists.starts), array(lists.ends), array(self._transmittance),
-                array(self._ended), array(self._reached), array(v, wp.vec3), wp.from_torch(pair_sums, row),
+                array(self._ended), array(self._reached), array(self._depth),
+                array(v, wp.types.vector(length=channels, dtype=wp.float32)), wp.from_torch(pair_sums, row),
             ],
         )  # fmt: skip
         widths = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec2, wp.vec3)
         frame.launch(
-            project_vjp(k), frame.n, frame.pose, view.grid, frame.cuts,
+            project_vjp(k, channels), frame.n, frame.pose, view.grid, frame.cuts,
             array(frame.means, wp.vec3), array(frame.quats, wp.vec4), array(frame.scales, wp.vec3),
             array(view.opacities), array(frame.slopes, wp.mat33), frame.bands > 0,
             array(view.ellipses, types.Row), array(view.counts), array(view.firsts), array(pair_sums, row),

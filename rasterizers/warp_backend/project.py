@@ -17,7 +17,7 @@ from rasterizers.warp_backend.geometry import (
     geometry_of,
     geometry_vjp,
 )
-from rasterizers.warp_backend.types import FAR, Cuts, Ellipse, Grid, Pose, Row, ellipse_of, row_of
+from rasterizers.warp_backend.types import DEEP, FAR, SUMS, Cuts, Ellipse, Grid, Pose, Row, ellipse_of, row_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -75,6 +75,7 @@ def project(
     keys: wp.array[wp.int32],
     colours: wp.array[wp.vec3],
     slopes: wp.array[wp.mat33],
+    depths: wp.array[wp.float32],
     rows: wp.array[Row],
     means2d: wp.array[wp.vec2],
     visible: wp.array[wp.bool],
@@ -82,7 +83,7 @@ def project(
     not_finite: wp.array[wp.int64],
 ) -> None:
     """One thread per Gaussian. Depth key, colour and slope, which the grids share, are computed for the first grid that
-    draws the Gaussian.
+    draws the Gaussian; and its depth, if `depths` is not empty.
 
     `not_finite` becomes 1 if a number that was read is not finite.
     """
@@ -117,6 +118,8 @@ def project(
                         colours[i] = rgb
                         if shN.shape[1] > 0:
                             slopes[i] = slope
+                        if depths.shape[0] > 0:
+                            depths[i] = wp.float32(centre.z)
                     ellipse.rgb = colours[i]
                     if has_offsets:
                         ellipse.rgb += offsets[i]
@@ -127,9 +130,10 @@ def project(
 
 
 @cache
-def project_vjp(K: int) -> Any:
-    """The VJP kernel for K cotangents."""
-    PairSums = wp.types.vector(length=9 * K, dtype=wp.float32)
+def project_vjp(K: int, C: int) -> Any:
+    """The VJP kernel for K cotangents of C channels, three or with depth four."""
+    W = SUMS + C
+    PairSums = wp.types.vector(length=W * K, dtype=wp.float32)
 
     @wp.kernel(module="unique", enable_backward=False)
     def project_vjp(
@@ -172,18 +176,20 @@ def project_vjp(K: int) -> Any:
         ellipse = ellipse_of(rows[i])
         for k in range(K):
             sums = Sums()
-            sums.q = total[9 * k]
-            sums.first = wp.vec2(total[9 * k + 1], total[9 * k + 2])
-            sums.xx = total[9 * k + 3]
-            sums.xy = total[9 * k + 4]
-            sums.yy = total[9 * k + 5]
+            sums.q = total[W * k]
+            sums.first = wp.vec2(total[W * k + 1], total[W * k + 2])
+            sums.xx = total[W * k + 3]
+            sums.xy = total[W * k + 4]
+            sums.yy = total[W * k + 5]
             out = geometry_vjp(pose, grid, cuts, g, f, scales[i], sums)
             rgb = wp.vec3(0.0, 0.0, 0.0)
             for c in range(3):
                 if ellipse.rgb[c] >= 0.0:  # where the colour is clamped, the image does not depend on it
-                    rgb[c] = total[9 * k + 6 + c]
+                    rgb[c] = total[W * k + SUMS + c]
             if has_slopes:
                 out.mean += wp.transpose(slopes[i]) * rgb
+            if C == DEEP:
+                out.mean += total[W * k + SUMS + 3] * pose.rotation[2]
             d_means[k, i] = out.mean
             d_quats[k, i] = out.quat
             d_scales[k, i] = out.scale

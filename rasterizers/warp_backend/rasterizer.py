@@ -17,7 +17,7 @@ from rasterizers.warp_runtime import require_warp
 TILE: Final = 8
 """Edge of the tiles that Gaussians are listed for, px."""
 PAIR_BYTES: Final = 24  # tile and place, twice for the sort, and the Gaussian, before and after it
-SUMS_BYTES: Final = 36  # a pair's sums for one cotangent
+SUMS_BYTES: Final = 40  # a pair's sums for one cotangent: ten with depth, nine without
 
 
 def _default_device() -> str:
@@ -55,7 +55,7 @@ class WarpRasterizer(RasterSettings):
 
     @property
     def traits(self) -> Traits:
-        return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}))
+        return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}), depth=True)
 
     def capacity(self, camera: Camera) -> int:
         """The number of pairs to allocate for an image of this size before they are counted; -1: it is the first one."""
@@ -70,21 +70,27 @@ class WarpRasterizer(RasterSettings):
         """Whether the lists of this many pairs, which are counted in 32 bits, fit the budget."""
         return mebibytes(pairs) <= self.memory and pairs < 2**31
 
-    def __call__(self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None) -> Rendering:
+    def __call__(
+        self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None, *, depth: bool = False
+    ) -> Rendering:
         from rasterizers.warp_backend.frame import Frame
 
-        return Frame(self, [(splats, camera)], [tiles]).draw()[0]
+        return Frame(self, [(splats, camera)], [tiles], [depth]).draw()[0]
 
     def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None
+        self,
+        jobs: Sequence[tuple[Splats, Camera]],
+        tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None,
+        *,
+        depth: Sequence[bool] | None = None,
     ) -> list[Rendering]:
         """Jobs with the same pose and tensor objects share colour and depth order."""
         from rasterizers.warp_backend.frame import Frame
 
-        masks = [None] * len(jobs) if tiles is None else tiles
+        masks, depths = tiles or [None] * len(jobs), depth or [False] * len(jobs)
         if len(jobs) > 1 and all(same_gaussians_and_pose(jobs[0], job) for job in jobs[1:]):
-            return [*Frame(self, jobs, masks).draw()]
-        return [self(splats, camera, mask) for (splats, camera), mask in zip(jobs, masks, strict=True)]
+            return [*Frame(self, jobs, masks, depths).draw()]
+        return [self(*job, mask, depth=z) for job, mask, z in zip(jobs, masks, depths, strict=True)]
 
 
 def padded(count: int) -> int:

@@ -13,6 +13,10 @@ wp.set_module_options({"enable_backward": False})
 TILE: Final = wp.constant(rasterizer.TILE)
 PIXELS: Final = wp.constant(rasterizer.TILE**2)
 """Pixels of a tile."""
+SUMS: Final = wp.constant(6)
+"""Sums of a pair for one cotangent before those of the channels: q = ∂L/∂(log alpha) and its moments."""
+DEEP: Final = wp.constant(4)
+"""Channels of a cotangent with depth."""
 FAR: Final = wp.constant(2**31 - 1)
 """The depth key of a Gaussian that is not drawn."""
 

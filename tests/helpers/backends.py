@@ -12,7 +12,7 @@ import torch
 import rasterizers
 from rasterizers import BackendUnavailable, Camera, Rasterizer, Rendering, SplatGradients, Splats
 from rasterizers.reference import ReferenceRasterizer
-from rasterizers.testing import gradient_of, scene, to
+from rasterizers.testing import gradient_of, pixels_of, scene, to
 
 ATTRIBUTES = ("means", "quats", "scales", "opacities", "sh0", "shN", "rgb_offset", "screen")
 CLEAN = {"alpha_min": 1e-7, "transmittance_min": 1e-9}  # cut-offs far below what float32 resolves: no flips
@@ -64,13 +64,15 @@ class OnDevice:
         self.rasterizer, self.device = rasterizer, device
         self.traits, self.tile = rasterizer.traits, rasterizer.tile
 
-    def __call__(self, splats: Splats, camera: Camera, tiles: torch.Tensor | None = None) -> Rendering:
-        return CopiedBack(self.rasterizer(moved(splats, self.device), camera, tiles))
+    def __call__(
+        self, splats: Splats, camera: Camera, tiles: torch.Tensor | None = None, *, depth: bool = False
+    ) -> Rendering:
+        return CopiedBack(self.rasterizer(moved(splats, self.device), camera, tiles, depth=depth))
 
-    def render_scales(self, jobs, tiles=None) -> list[Rendering]:
+    def render_scales(self, jobs, tiles=None, *, depth=None) -> list[Rendering]:
         there: dict[int, torch.Tensor] = {}  # the same tensor stays the same tensor
         jobs = [(moved(splats, self.device, there), camera) for splats, camera in jobs]
-        return [CopiedBack(rendering) for rendering in self.rasterizer.render_scales(jobs, tiles)]
+        return [CopiedBack(rendering) for rendering in self.rasterizer.render_scales(jobs, tiles, depth=depth)]
 
 
 class CopiedBack:
@@ -79,6 +81,7 @@ class CopiedBack:
     def __init__(self, rendering: Rendering) -> None:
         self.rendering = rendering
         self.image, self.alpha = rendering.image.cpu(), rendering.alpha.cpu()
+        self.depth = None if rendering.depth is None else rendering.depth.cpu()
         self.means2d, self.visible = rendering.means2d.cpu(), rendering.visible.cpu()
 
     def vjp(self, cotangents: torch.Tensor) -> SplatGradients:
@@ -121,23 +124,23 @@ def backends(*, dtype: torch.dtype | None = None) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("backend", params)
 
 
-def exact(splats: Splats, camera: Camera, **settings: Any) -> Rendering:
+def exact(splats: Splats, camera: Camera, *, depth: bool = False, **settings: Any) -> Rendering:
     """The rendering in float64, by "cpp" where it was compiled."""
     exact_rasterizer = ReferenceRasterizer(**settings) if why_not("cpp") else rasterizers.load("cpp", **settings)
-    return exact_rasterizer(to(splats, torch.float64), camera)
+    return exact_rasterizer(to(splats, torch.float64), camera, depth=depth)
 
 
 def camera(width=65, height=47) -> Camera:
     return Camera(torch.eye(4), 0.9 * width, 0.9 * width, 0.52 * width, 0.47 * height, width, height)
 
 
-def cotangents(k, height, width, seed=0) -> torch.Tensor:
-    return torch.randn(k, height, width, 3, generator=torch.Generator().manual_seed(seed))
+def cotangents(k, height, width, seed=0, *, channels=3) -> torch.Tensor:
+    return torch.randn(k, height, width, channels, generator=torch.Generator().manual_seed(seed))
 
 
 def everything(rendering, v):
     g = rendering.vjp(v)
-    pixels = (rendering.image, rendering.alpha, rendering.means2d, rendering.visible)
+    pixels = (pixels_of(rendering), rendering.alpha, rendering.means2d, rendering.visible)
     return (*pixels, *(gradient_of(g, name) for name in ATTRIBUTES), g.basis)
 
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
+import torch
 from hydra.utils import instantiate
 from torch import Tensor
 
 import rasterizers
-from rasterizers import Camera, Rasterizer, RasterSettings, Rendering, Splats, Traits
+from rasterizers import Camera, Rasterizer, RasterSettings, Rendering, Splats, Traits, autograd
 from rasterizers.reference import ReferenceRasterizer
-from rasterizers.testing import check_rasterizer
+from rasterizers.testing import check_rasterizer, scene
 from tests.helpers.backends import BACKENDS, why_not
 
 
@@ -34,12 +35,36 @@ class ThirdParty(RasterSettings):
     def traits(self) -> Traits:
         return self.inner.traits
 
-    def __call__(self, splats: Splats, camera: Camera, tiles: Tensor | None = None) -> Rendering:
-        return self.inner(splats, camera, tiles)
+    def __call__(
+        self, splats: Splats, camera: Camera, tiles: Tensor | None = None, *, depth: bool = False
+    ) -> Rendering:
+        return self.inner(splats, camera, tiles, depth=depth)
 
     def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], tiles: Sequence[Tensor | None] | None = None
+        self,
+        jobs: Sequence[tuple[Splats, Camera]],
+        tiles: Sequence[Tensor | None] | None = None,
+        *,
+        depth: Sequence[bool] | None = None,
     ) -> list[Rendering]:
+        return self.inner.render_scales(jobs, tiles, depth=depth)
+
+
+class Flat:
+    """Draws no depth, and has no argument for it."""
+
+    def __init__(self, **settings) -> None:
+        self.inner = rasterizers.load("torch", **settings)
+        self.tile = self.inner.tile
+
+    @property
+    def traits(self) -> Traits:
+        return replace(self.inner.traits, depth=False)
+
+    def __call__(self, splats, camera, tiles=None):
+        return self.inner(splats, camera, tiles)
+
+    def render_scales(self, jobs, tiles=None):
         return self.inner.render_scales(jobs, tiles)
 
 
@@ -49,6 +74,16 @@ def test_a_third_partys_rasterizer_passes_the_checks_and_is_built_by_its_path():
     found = instantiate({"_target_": target, "near": 0.01, "background": [1, 1, 1], "lanes_per_pass": 4096})
     assert isinstance(found, Rasterizer)
     assert found == ThirdParty(near=0.01, background=(1.0, 1.0, 1.0), lanes_per_pass=4096)
+
+
+def test_a_rasterizer_without_depth_passes_the_checks_and_is_refused_by_name_where_depth_is_asked(caplog):
+    with caplog.at_level("INFO", "rasterizers"):
+        check_rasterizer(Flat)
+    assert "check_tile_mask_of_depth: not checked, the rasterizer's traits.depth is False" in caplog.text
+    splats, camera = scene(5), Camera(torch.eye(4), 40.0, 40.0, 20.0, 15.0, 40, 30)
+    assert autograd.draw(Flat(), splats, camera).depth is None
+    with pytest.raises(ValueError, match=r"Flat draws no depth \(its traits\.depth is False\)"):
+        autograd.draw(Flat(), splats, camera, depth=True)
 
 
 @pytest.mark.parametrize(

@@ -143,7 +143,7 @@ def test_errors_are_raised_when_an_image_is_accessed(deferred):
     rasterizer(splats, view)
 
     def launched(splats):  # not by `rasterizer(…)`: the tests' type checks would access the image that it returns
-        return frame.Frame(rasterizer, [(splats, view)], [None]).draw()[0]
+        return frame.Frame(rasterizer, [(splats, view)], [None], [False]).draw()[0]
 
     huge = launched(dataclasses.replace(splats, scales=splats.scales * 100))
     with pytest.raises(MemoryError, match="Raise `memory`"):
@@ -205,9 +205,12 @@ def test_the_kernels_compile_for_cuda_on_a_machine_without(monkeypatch, tmp_path
 
     from rasterizers.warp_backend import bins, blend, colour, project
 
-    back = blend.blend_vjp(1, 32)
-    monkeypatch.setitem(back.module.options, "block_dim", 32)
-    for kernel in (bins.list_pairs, blend.blend, colour.basis, project.project, back, project.project_vjp(1)):
+    kernels = [bins.list_pairs, colour.basis, project.project]
+    for channels in (3, 4):
+        back = blend.blend_vjp(1, channels, 32)
+        monkeypatch.setitem(back.module.options, "block_dim", 32)
+        kernels += [blend.blend(channels == 4), back, project.project_vjp(1, channels)]
+    for kernel in kernels:
         wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path / kernel.key, use_ptx=True)
         (compiled,) = (tmp_path / kernel.key).glob("*.ptx")
         assert ".target sm_90" in compiled.read_text()

@@ -44,6 +44,7 @@ class Drawn:
     visible: Tensor
     like: Tensor
     bands: int
+    depth: None = None
 
     def vjp(self, cotangents: Tensor) -> SplatGradients:
         k, n = len(cotangents), len(self.like)

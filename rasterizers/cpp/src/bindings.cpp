@@ -116,24 +116,28 @@ void bind_frame(nb::module_& m) {
       .def_static("empty", &empty<T>, nb::rv_policy::reference)
       .def("pairs", &F::pairs)
       .def("draw",
-           [](F& self, int i, Write<T, -1, -1, 3> image, Write<T, -1, -1> alpha, int threads) {
-             T *pixels = image.data(), *cover = alpha.data();
+           [](F& self, int i, Write<T, -1, -1, 3> image, Write<T, -1, -1> alpha, std::optional<Write<T, -1, -1>> depth,
+              int threads) {
+             T *pixels = image.data(), *cover = alpha.data(), *expected = depth ? depth->data() : nullptr;
              nb::gil_scoped_release release;
-             self.draw(i, pixels, cover, threads);
+             self.draw(i, pixels, cover, expected, threads);
            },
-           nb::arg("grid"), tensor("image"), tensor("alpha"), nb::arg("threads"))
+           nb::arg("grid"), tensor("image"), tensor("alpha"), tensor("depth").none(), nb::arg("threads"))
       .def("vjp",
-           [](F& self, int i, Read<T, -1, -1, -1, 3> cotangents, Read<T, -1, 3> means, Read<T, -1, 4> quats,
+           [](F& self, int i, Read<T, -1, -1, -1, -1> cotangents, Read<T, -1, 3> means, Read<T, -1, 4> quats,
               Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1, 3> d_means,
               Write<T, -1, -1, 4> d_quats, Write<T, -1, -1, 3> d_scales, Write<T, -1, -1> d_opacities,
               Write<T, -1, -1, 2> d_screen, Write<T, -1, -1, 3> d_rgb, int threads) {
              Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
              Gradients<T> out{d_means.data(),     d_quats.data(),  d_scales.data(),
                               d_opacities.data(), d_screen.data(), d_rgb.data()};
-             const int K = int(cotangents.shape(0));
+             const int K = int(cotangents.shape(0)), C = int(cotangents.shape(3));
+             require(C == kColour || (C == kColourAndDepth && self.has_depth(i)),
+                     "cotangents must have three channels, or a fourth one for the depth that was drawn");
              const T* v = cotangents.data();
              nb::gil_scoped_release release;
-             self.vjp(i, K, v, splats, out, threads);
+             if (C == kColour) self.template vjp<kColour>(i, K, v, splats, out, threads);
+             else self.template vjp<kColourAndDepth>(i, K, v, splats, out, threads);
            },
            nb::arg("grid"), tensor("cotangents"), tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"),
            tensor("shN"), tensor("d_means"), tensor("d_quats"), tensor("d_scales"), tensor("d_opacities"),

@@ -3,6 +3,8 @@
 //   α_i = min(α_max, 2^(…)),   T_i = Π_{j<i} (1 - α_j),   I = Σ T_i α_i c_i + T_end · background
 //
 // A Gaussian with α_i < α_min is skipped; a pixel ends before the Gaussian that would take its T below transmittance_min.
+//
+// C is the number of channels: kColour, or kColourAndDepth with expected depth, E = Σ T_i α_i z_i / Σ T_i α_i.
 #pragma once
 
 #include <climits>
@@ -11,6 +13,8 @@
 #include "columns.hpp"
 
 namespace clear {
+
+inline constexpr int kColour = 3, kColourAndDepth = 4;
 
 // The centres of a block's sixteen pixels, row by row, relative to the bin's corner like a segment's Gaussians.
 template <class T>
@@ -37,9 +41,18 @@ struct BlockEnd {
   }
 };
 
+// What a block has blended: Σ w times each channel, and with depth Σ w, because 1 - T has no digits left where little is
+// drawn.
+template <class T, int C>
+struct BlockBlend {
+  static constexpr int kSums = C == kColourAndDepth ? C + 1 : C;
+  T sums[kSums][kLanes];
+};
+
+// What the backward pass of depth needs of each pixel: the expected depth E, and 1 / Σ w, which is 0 where nothing is drawn.
 template <class T>
-struct BlockColour {
-  T r[kLanes], g[kLanes], b[kLanes];
+struct BlockDepth {
+  T expected[kLanes], over_weight[kLanes];
 };
 
 // Loads a block's pixels from a [height, width, C] image; zeros beyond the image's edge.
@@ -76,18 +89,20 @@ CLEAR_INLINE Lanes<T> exponent(const Ellipse<T>& e, const Lanes<T>& dx, const La
   return L(e.peak) - dx * along - L(e.C) * dy * dy;
 }
 
-// Blends one segment into a block; segments after the first continue from `colour` and `end`.
-template <class T>
-void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, BlockColour<T>& colour, BlockEnd<T>& end) {
+// Blends one segment into a block; segments after the first continue from `out` and `end`.
+template <class T, int C>
+void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, BlockBlend<T, C>& out, BlockEnd<T>& end) {
   using L = Lanes<T>;
   const PixelCentres<T> pixel(block);
   const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, transmittance_min = s.transmittance_min;
-  L through = T(1), r = T(0), g = T(0), b = T(0);
+  L through = T(1), sums[out.kSums];
+  for (L& sum : sums) sum = T(0);
   Mask<T> alive = Mask<T>::from_bits(0xffff);
   if (segment.first == 0) {
     std::fill_n(end.ended, kLanes, INT_MAX);
   } else {
-    through = L::load(end.transmittance), r = L::load(colour.r), g = L::load(colour.g), b = L::load(colour.b);
+    through = L::load(end.transmittance);
+    for (int c = 0; c < out.kSums; ++c) sums[c] = L::load(out.sums[c]);
     std::uint32_t open = 0;
     for (int i = 0; i < kLanes; ++i) open |= std::uint32_t(end.ended[i] == INT_MAX) << i;
     alive = Mask<T>::from_bits(open);
@@ -111,16 +126,17 @@ void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, Blo
       alive = alive.and_not(counts.and_not(kept));
     }
     const L w = where(kept, weight);
-    r += w * L(e.r), g += w * L(e.g), b += w * L(e.b);
+    for (int c = 0; c < C; ++c) sums[c] += w * L((&e.r)[c]);
+    if constexpr (out.kSums > C) sums[C] += w;
     through = select(kept, after, through);
     if (__builtin_expect(stops != 0, 0) && !alive.any()) break;
   }
   through.store(end.transmittance);
-  r.store(colour.r), g.store(colour.g), b.store(colour.b);
+  for (int c = 0; c < out.kSums; ++c) sums[c].store(out.sums[c]);
 }
 
 // Sums over a block's pixels for the Gaussians of its bin: one row of `PairSums` per (Gaussian, cotangent).
-template <class T, int K>
+template <class T, int K, int C>
 struct BlockSums {
   static constexpr int kRows = kLanes;  // Gaussians are collected until every lane has one
   T q[K][kRows][kLanes], weight[kRows][kLanes];
@@ -129,7 +145,7 @@ struct BlockSums {
 
   // Transposes the rows so that a lane is a Gaussian; a sum over pixels is then fifteen additions for sixteen Gaussians.
   // Not inlined: two copies beside the loop over Gaussians would exceed the instruction cache.
-  __attribute__((noinline)) void flush(int count, const T (&cotangent)[K][3][kLanes], PairSums<T>* sums) {
+  __attribute__((noinline)) void flush(int count, const T (&cotangent)[K][C][kLanes], PairSums<T>* sums) {
     using L = Lanes<T>;
     if (!count) return;
     for (int i = count; i < kRows; ++i) {
@@ -146,14 +162,12 @@ struct BlockSums {
       for (int i = 0; i < kRows; ++i) v[i] = L::load(q[k][i]);
       transpose(v);
       moments(v, ox, oy, out);
-      L red = T(0), green = T(0), blue = T(0);
-      for (int p = 0; p < kLanes; ++p) {
-        red += w[p] * L(cotangent[k][0][p]);
-        green += w[p] * L(cotangent[k][1][p]);
-        blue += w[p] * L(cotangent[k][2][p]);
-      }
-      out[6] = red, out[7] = green, out[8] = blue;
-      for (int i = 9; i < kRows; ++i) out[i] = T(0);
+      L channels[C];
+      for (L& channel : channels) channel = T(0);
+      for (int p = 0; p < kLanes; ++p)
+        for (int c = 0; c < C; ++c) channels[c] += w[p] * L(cotangent[k][c][p]);
+      for (int c = 0; c < C; ++c) out[6 + c] = channels[c];
+      for (int i = 6 + C; i < kRows; ++i) out[i] = T(0);
       transpose(out);
       for (int i = 0; i < count; ++i) {
         T* row = &sums[std::int64_t(place[i]) * K + k].q;
@@ -192,10 +206,14 @@ struct BlockBack {
 };
 
 //   ∂I·v/∂α_i = T_i (c_i·v) - behind / (1 - α_i)
-// Where α is capped, the image does not depend on the ellipse.
-template <class T, int K>
+// Where α is capped, the image does not depend on the ellipse. Depth is a channel like the others with the value z_i - E and
+// a cotangent that was divided by Σ w: at the E that was drawn, E has the gradient of Σ w_i (z_i - E) / Σ w with E and Σ w held.
+// The difference is small and loses no digits. `depth` is null without depth.
+template <class T, int K, int C>
 void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s, const BlockEnd<T>& end,
-                     const T (&cotangent)[K][3][kLanes], BlockBack<T, K>& back, PairSums<T>* sums) {
+                     const BlockDepth<T>* depth, const T (&cotangent)[K][C][kLanes], BlockBack<T, K>& back,
+                     PairSums<T>* sums) {
+  constexpr bool has_depth = C == kColourAndDepth;
   using L = Lanes<T>;
   const PixelCentres<T> pixel(block);
   const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, one = T(1);
@@ -216,12 +234,13 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
   if (last < segment.count) n = int(std::lower_bound(list, list + n, last) - list);
   if (!n) return;
 
-  L through = L::load(back.transmittance), v[K][3], behind[K];
+  L through = L::load(back.transmittance), v[K][C], behind[K], expected = T(0);
+  if constexpr (has_depth) expected = L::load(depth->expected);
   for (int k = 0; k < K; ++k) {
     behind[k] = L::load(back.behind[k]);
-    for (int c = 0; c < 3; ++c) v[k][c] = L::load(cotangent[k][c]);
+    for (int c = 0; c < C; ++c) v[k][c] = L::load(cotangent[k][c]);
   }
-  BlockSums<T, K> collected;
+  BlockSums<T, K, C> collected;
   int count = 0;
   const Ellipse<T>* ellipses = segment.ellipses.data();
   for (int i = n - 1; i >= 0; --i) {
@@ -238,7 +257,8 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
     const Mask<T> moves = kept & (free <= alpha_max);
     weight.store(collected.weight[count]);
     for (int k = 0; k < K; ++k) {
-      const L light = v[k][0] * L(e.r) + v[k][1] * L(e.g) + v[k][2] * L(e.b);
+      L light = v[k][0] * L(e.r) + v[k][1] * L(e.g) + v[k][2] * L(e.b);
+      if constexpr (has_depth) light += v[k][3] * (L(e.z) - expected);
       const L d_alpha = through * light - behind[k] * over;
       where(moves, alpha * d_alpha).store(collected.q[k][count]);
       behind[k] += weight * light;

@@ -45,30 +45,40 @@ class Frame {
     return total;
   }
 
-  void draw(int i, T* image, T* alpha, int threads) {
+  // `depth` is null if it is not asked for.
+  void draw(int i, T* image, T* alpha, T* depth, int threads) {
     View& view = views_.at(i);
     const Grid<T>& grid = view.target.grid;
-    view.ends.reserve_lost(std::size_t(grid.columns()) * grid.rows() * kBlocks);
+    const std::size_t blocks = std::size_t(grid.columns()) * grid.rows() * kBlocks;
+    view.ends.reserve_lost(blocks);
+    if (depth) view.depths.reserve_lost(blocks);
+    view.has_depth = depth != nullptr;
     bands_of(view, kBytesPerPair + kMostCotangents * sizeof(PairSums<T>));  // throws now where the gradients would not fit
     for (const Band& band : bands_of(view, kBytesPerPair)) {
       list(view, band, threads);
-      Pool::instance().run(threads, band.bins(), [&](std::int64_t bin) { draw_bin(job(view, bin), image, alpha); });
+      Pool::instance().run(threads, band.bins(), [&](std::int64_t bin) {
+        if (depth) draw_bin<T, kColourAndDepth>(job(view, bin), image, alpha, depth);
+        else draw_bin<T, kColour>(job(view, bin), image, alpha, nullptr);
+      });
       view.bins.has_masks = true;
     }
   }
 
-  // The gradients [K, n, …] for K cotangents [K, height, width, 3].
+  bool has_depth(int i) const { return views_.at(i).has_depth; }
+
+  // The gradients [K, n, …] for K cotangents [K, height, width, C].
+  template <int C>
   void vjp(int i, int K, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
     View& view = views_.at(i);
-    const std::int64_t image = std::int64_t(view.target.grid.width) * view.target.grid.height * 3;
+    const std::int64_t image = std::int64_t(view.target.grid.width) * view.target.grid.height * C;
     for (int k = 0; k < K;) {
       const int now = std::min(kMostCotangents, K - k);
       const std::int64_t at = k * n_;
       Gradients<T> part{out.means + 3 * at,     out.quats + 4 * at,  out.scales + 3 * at,
                         out.opacities + at, out.screen + 2 * at, out.rgb + 3 * at};
-      if (now == 1) vjp_of<1>(view, cotangents + k * image, splats, part, threads);
-      if (now == 2) vjp_of<2>(view, cotangents + k * image, splats, part, threads);
-      if (now == 3) vjp_of<3>(view, cotangents + k * image, splats, part, threads);
+      if (now == 1) vjp_of<1, C>(view, cotangents + k * image, splats, part, threads);
+      if (now == 2) vjp_of<2, C>(view, cotangents + k * image, splats, part, threads);
+      if (now == 3) vjp_of<3, C>(view, cotangents + k * image, splats, part, threads);
       k += now;
     }
   }
@@ -110,6 +120,8 @@ class Frame {
     Target<T> target;
     std::vector<std::int64_t> pairs_in_row;
     Buffer<BlockEnd<T>> ends;           // [bins, 64]
+    Buffer<BlockDepth<T>> depths;       // [bins, 64] if depth was drawn
+    bool has_depth = false;
     Bins bins;                          // the last listed band
   };
 
@@ -177,10 +189,11 @@ class Frame {
             y,
             inside,
             inside & view.target.request.blocks(std::int64_t(place)),
-            view.ends.data() + place * kBlocks};
+            view.ends.data() + place * kBlocks,
+            view.has_depth ? view.depths.data() + place * kBlocks : nullptr};
   }
 
-  template <int K>
+  template <int K, int C>
   void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
     const std::vector<Band> bands = bands_of(view, kBytesPerPair + K * sizeof(PairSums<T>));
     const bool whole = bands.size() == 1;
@@ -192,7 +205,7 @@ class Frame {
       if (view.bins.band != band) list(view, band, threads);
       pair_sums_.reserve_lost(view.bins.pairs.size() * K);
       Pool::instance().run(threads, band.bins(),
-                           [&](std::int64_t bin) { blend_vjp_bin<T, K>(job(view, bin), cotangents, pair_sums_.data()); });
+                           [&](std::int64_t bin) { blend_vjp_bin<T, K, C>(job(view, bin), cotangents, pair_sums_.data()); });
       view.bins.has_masks = true;
       if (whole) break;
       Pool::instance().run(threads, chunks_of(n_), [&](std::int64_t chunk) { add_band<K>(view, chunk); });

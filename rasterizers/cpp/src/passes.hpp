@@ -15,6 +15,7 @@ struct BinJob {
   int bin, x, y;                 // its index in the band, and its place on the pixel grid
   std::uint64_t inside, requested;  // blocks in the image; the requested ones among them
   BlockEnd<T>* ends;             // [64]
+  BlockDepth<T>* depths;         // [64], or null if depth is not drawn
 
   std::int64_t pairs() const { return bins.starts[bin + 1] - bins.starts[bin]; }
   int block_x(int block) const { return x * kBin + block % kBlocksAcross * kBlock; }
@@ -32,9 +33,9 @@ Segment<T>& thread_segment() {
   return segment;
 }
 
-// A bin without a requested block shows the background.
+// A bin without a requested block shows the background, and depth 0 if it is not null.
 template <class T>
-void fill_bin(const BinJob<T>& job, T* image, T* alpha) {
+void fill_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
   const int x = job.x * kBin, columns = std::min(kBin, job.grid.width - x);
   T pixels[3 * kBin];
   for (int i = 0; i < 3 * kBin; ++i) pixels[i] = job.settings.background[i % 3];
@@ -42,20 +43,32 @@ void fill_bin(const BinJob<T>& job, T* image, T* alpha) {
     const std::int64_t at = std::int64_t(y) * job.grid.width + x;
     std::memcpy(image + 3 * at, pixels, sizeof(T) * 3 * columns);
     std::fill_n(alpha + at, columns, T(0));
+    if (depth) std::fill_n(depth + at, columns, T(0));
   }
 }
 
-// Draws the bin's pixels into [height, width, 3] and [height, width]; blocks not requested show the background.
+// The expected depth of a block's pixels.
 template <class T>
-void draw_bin(const BinJob<T>& job, T* image, T* alpha) {
-  if (!job.requested) return fill_bin(job, image, alpha);
+CLEAR_INLINE Lanes<T> expected_depth(const BlockBlend<T, kColourAndDepth>& blend, BlockDepth<T>& out) {
   using L = Lanes<T>;
-  static thread_local BlockColour<T> scratch[kBlocks];
-  BlockColour<T>* colours = scratch;
+  const L weight = L::load(blend.sums[kColourAndDepth]);
+  const L over = where(weight > L(T(0)), L(T(1)) / weight), expected = L::load(blend.sums[kColour]) * over;
+  expected.store(out.expected), over.store(out.over_weight);
+  return expected;
+}
+
+// Draws the bin's pixels into an image [height, width, 3] and alpha and depth [height, width]; depth is null for C = kColour.
+// Blocks not requested show the background.
+template <class T, int C>
+void draw_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
+  if (!job.requested) return fill_bin(job, image, alpha, depth);
+  using L = Lanes<T>;
+  static thread_local BlockBlend<T, C> scratch[kBlocks];
+  BlockBlend<T, C>* blends = scratch;
   each_block(job.inside, [&](int b) {
     std::fill_n(job.ends[b].transmittance, kLanes, T(1));
     std::fill_n(job.ends[b].ended, kLanes, INT_MAX);
-    colours[b] = {};
+    blends[b] = {};
   });
   const std::int64_t n = job.pairs();
   std::uint64_t open = job.requested;
@@ -64,64 +77,66 @@ void draw_bin(const BinJob<T>& job, T* image, T* alpha) {
     gather(job.ellipses, job.bins, job.bin, first, job.requested, part);
     each_block(open, [&](int b) {
       if (!part.lengths[b]) return;
-      blend_block(part, b, job.settings, colours[b], job.ends[b]);
+      blend_block(part, b, job.settings, blends[b], job.ends[b]);
       if (first + kSegment < n && job.ends[b].finished()) open &= ~(std::uint64_t(1) << b);
     });
   }
   each_block(job.inside, [&](int b) {
     const L through = L::load(job.ends[b].transmittance);
-    const L channels[3] = {L::load(colours[b].r), L::load(colours[b].g), L::load(colours[b].b)};
     L pixel[3], cover[1] = {L(T(1)) - through};
-    for (int c = 0; c < 3; ++c) pixel[c] = channels[c] + through * L(job.settings.background[c]);
+    for (int c = 0; c < 3; ++c) pixel[c] = L::load(blends[b].sums[c]) + through * L(job.settings.background[c]);
     store_block<3>(image, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), pixel);
     store_block<1>(alpha, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), cover);
+    if constexpr (C == kColourAndDepth) {
+      const L expected[1] = {expected_depth(blends[b], job.depths[b])};
+      store_block<1>(depth, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), expected);
+    }
   });
 }
 
 // The state of a bin's blocks in the backward pass.
-template <class T, int K>
+template <class T, int K, int C>
 struct BinVjp {
   BlockBack<T, K> back[kBlocks];
-  T cotangent[kBlocks][K][3][kLanes];
+  T cotangent[kBlocks][K][C][kLanes];
 };
 
-template <class T, int K>
-void start_vjp(const BinJob<T>& job, const T* cotangents, BinVjp<T, K>& out) {
+template <class T, int K, int C>
+void start_vjp(const BinJob<T>& job, const T* cotangents, BinVjp<T, K, C>& out) {
   using L = Lanes<T>;
-  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * 3;
+  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * C;
   each_block(job.requested, [&](int b) {
     const L through = L::load(job.ends[b].transmittance);
     through.store(out.back[b].transmittance);
     for (int k = 0; k < K; ++k) {
-      L v[3], light = T(0);
-      load_block<3>(cotangents + k * image, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), v);
-      for (int c = 0; c < 3; ++c) {
-        light += v[c] * L(job.settings.background[c]);
-        v[c].store(out.cotangent[b][k][c]);
-      }
+      L v[C], light = T(0);
+      load_block<C>(cotangents + k * image, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), v);
+      for (int c = 0; c < kColour; ++c) light += v[c] * L(job.settings.background[c]);
+      if constexpr (C == kColourAndDepth) v[kColour] *= L::load(job.depths[b].over_weight);
+      for (int c = 0; c < C; ++c) v[c].store(out.cotangent[b][k][c]);
       (through * light).store(out.back[b].behind[k]);
     }
   });
 }
 
 // Prefetches a bin's cotangents, whose rows lie far apart in memory, while its Gaussians are gathered.
-template <class T, int K>
+template <class T, int K, int C>
 CLEAR_INLINE void fetch_cotangents(const BinJob<T>& job, const T* cotangents) {
-  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * 3;
+  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * C;
   for (int k = 0; k < K; ++k)
     for (int y = job.y * kBin; y < std::min(job.grid.height, (job.y + 1) * kBin); ++y)
-      for (int x = 0; x < 3 * kBin; x += kLanes)
-        __builtin_prefetch(cotangents + k * image + (std::int64_t(y) * job.grid.width + job.x * kBin) * 3 + x);
+      for (int x = 0; x < C * kBin; x += kLanes)
+        __builtin_prefetch(cotangents + k * image + (std::int64_t(y) * job.grid.width + job.x * kBin) * C + x);
 }
 
 // The backward pass of a bin, back to front. Writes every row of `pair_sums` [pairs, K].
-template <class T, int K>
+template <class T, int K, int C>
 void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T>* pair_sums) {
   const std::int64_t n = job.pairs();
   if (!n) return;
-  static thread_local BinVjp<T, K> scratch;
-  BinVjp<T, K>& mine = scratch;
-  fetch_cotangents<T, K>(job, cotangents);
+  static thread_local BinVjp<T, K, C> scratch;
+  BinVjp<T, K, C>& mine = scratch;
+  fetch_cotangents<T, K, C>(job, cotangents);
   std::int64_t end = 0;  // no pixel blended a pair from here on, and their segments may not have been listed
   each_block(job.requested, [&](int b) {
     for (std::int32_t e : job.ends[b].ended) end = std::max<std::int64_t>(end, std::min<std::int64_t>(e, n));
@@ -137,7 +152,8 @@ void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T>* pair_
     if (!std::exchange(started, true)) start_vjp(job, cotangents, mine);
     each_block(job.requested, [&](int b) {
       if (part.lengths[b])
-        blend_block_vjp<T, K>(part, b, job.settings, job.ends[b], mine.cotangent[b], mine.back[b], sums);
+        blend_block_vjp<T, K, C>(part, b, job.settings, job.ends[b], job.depths ? job.depths + b : nullptr,
+                                 mine.cotangent[b], mine.back[b], sums);
     });
   }
 }

@@ -157,7 +157,8 @@ std::uint32_t project_group(const Pose& pose, const Settings<T>& s, const Splats
     const std::uint32_t drawn = keep_requested(target, visible, count, target.ranges.data() + first);
     any |= drawn;
     if (!drawn) continue;
-    e[kRed] = e[kGreen] = e[kBlue] = e[14] = e[15] = T(0);  // the colour is written by `colour_group`
+    e[kRed] = e[kGreen] = e[kBlue] = e[15] = T(0);  // the colour is written by `colour_group`
+    e[kDepth] = g.z;
     transpose(e);
     for (int i = 0; i < count; ++i)
       if ((drawn >> i) & 1) e[i].store(&target.ellipses[first + i].u);

@@ -87,6 +87,7 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
     auto keep = [&](auto& columns) {
       for (L& column : columns) column = where(real, column);
     };
+    for (int axis = 0; axis < 3; ++axis) gradient.mean[axis] += L(T(pose.R[6 + axis])) * sum[9];  // of the depth
     L alone[1] = {gradient.opacity};
     keep(gradient.mean), keep(gradient.quat), keep(gradient.scale), keep(gradient.screen), keep(rgb), keep(alone);
     const std::int64_t at = k * splats.n;

@@ -71,20 +71,20 @@ struct alignas(kLanes * sizeof(T)) Ellipse {
   T peak;            // log2 of the opacity after the Mip compensation
   T reach;           // alpha >= alpha_min within A dx² + B dx dy + C dy² <= reach (with a margin); <= 0: not drawn
   T half_x, half_y;  // half the box around that region, px
-  T r, g, b;         // colour, clamped at 0
+  T r, g, b, z;      // colour, clamped at 0, and the centre's depth: the channels that are blended
   T whole_u, whole_v;  // the whole pixel nearest to the centre: at 1,000 px a float resolves 6e-5 px
-  T padding[2];
+  T padding;
 };
 static_assert(sizeof(Ellipse<float>) == 64);
 
 // Indices of an Ellipse's fields among its sixteen numbers.
-enum Field { kU, kV, kA, kB, kC, kPeak, kReach, kHalfX, kHalfY, kRed, kGreen, kBlue, kWholeU, kWholeV };
+enum Field { kU, kV, kA, kB, kC, kPeak, kReach, kHalfX, kHalfY, kRed, kGreen, kBlue, kDepth, kWholeU, kWholeV };
 
-// Sums over the pixels of a (Gaussian, bin) pair: q = ∂L/∂(log alpha), q's moments about the centre, and ∂L/∂rgb.
+// Sums over the pixels of a (Gaussian, bin) pair: q = ∂L/∂(log alpha), q's moments about the centre, and ∂L/∂(r, g, b, z).
 template <class T>
 struct alignas(kLanes * sizeof(T)) PairSums {
-  T q, qx, qy, qxx, qxy, qyy, r, g, b;
-  T padding[7];
+  T q, qx, qy, qxx, qxy, qyy, r, g, b, z;
+  T padding[6];
 };
 
 }  // namespace clear
