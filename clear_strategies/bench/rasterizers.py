@@ -26,6 +26,7 @@ from rasterizers.interface import PRESETS, Rasterizer
 SCENES: Final = ("small", "s100k", "s100k-lr", "s500k")
 COTANGENTS: Final = 3
 FORWARD, QUARTER, TOGETHER, SEPARATE = "forward", "quarter_tiles", "lr_hr_together", "lr_hr_separate"
+DEPTH = "with_depth"
 BACKWARD: Final = tuple(f"backward_k{k}" for k in range(1, COTANGENTS + 1))
 SAME, NONE = "same cut-offs", "no cut-offs"
 
@@ -194,16 +195,19 @@ def _affordable(backend: str, workload: Workload, what: str, note: Callable[[str
 
 
 def backend_on(workload: Workload, backend: str, preset: str, isa: str | None = None) -> Contestant:
-    """One of our backends, with the stages that peers lack: demanded tiles, both scales together."""
+    """One of our backends, with the stages that peers lack: demanded tiles, depth, both scales together."""
     kernels = {"isa": isa} if isa else {}
     rasterizer = rasterizers.load(backend, preset=preset, **kernels, **SETTINGS)
     cotangents = random_cotangents(workload)
     splats, camera, tiles = workload.splats, workload.camera, quarter_of_tiles(rasterizer, workload)
+    with_depth = torch.cat((cotangents[:1], cotangents[1:2, ..., :1]), dim=-1)
     lr = camera.scaled(1 / workload.lr_factor) if workload.lr_factor else None
 
     def stages(work_log: WorkLog) -> None:
         with work_log.stage(QUARTER):
             rasterizer(splats, camera, tiles=tiles).vjp(cotangents[:1])
+        with work_log.stage(DEPTH):
+            rasterizer(splats, camera, depth=True).vjp(with_depth)
         if lr is not None:
             with work_log.stage(TOGETHER):
                 rasterizer.render_scales([(splats, lr), (splats, camera)])
@@ -239,6 +243,8 @@ def _time_rows(workload: Workload, contestants: Sequence[Contestant], median: pd
         row |= {f"k{k}_over_k1": ms[BACKWARD[k - 1]] / ms[BACKWARD[0]] for k in range(2, COTANGENTS + 1)}
         if QUARTER in ms:
             row["quarter_over_all_tiles"] = ms[QUARTER] / (ms[FORWARD] + ms[BACKWARD[0]])
+        if DEPTH in ms:
+            row["depth_over_colour"] = ms[DEPTH] / (ms[FORWARD] + ms[BACKWARD[0]])
         if SEPARATE in ms:
             row["together_over_separate"] = ms[TOGETHER] / ms[SEPARATE]
         if cotangents.is_cuda:
