@@ -36,6 +36,7 @@ from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
 from clear_strategies import Conductor, Strategy
+from clear_strategies.commands import train
 from clear_strategies.compose import CONF
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -114,10 +115,12 @@ class Parsed(Exception):
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_commands_are_understood(words, monkeypatch):
+def test_commands_are_understood(words, monkeypatch, tmp_path):
     line = " ".join(words)
     if words[0] == "clear-strategies" and words[1] in READ_BY_ARGPARSE:
         require_parsable("clear_strategies.run", words[1:], monkeypatch)
+    elif words[:2] == ["clear-strategies", "train"]:
+        require_composable(train.overrides([str(tmp_path), *words[3:]]))
     elif words[:3] == ["python", "-m", "clear_strategies.run"] or words[0] == "clear-strategies":
         require_composable(words[1:] if words[0] == "clear-strategies" else words[3:])
     elif words[:3] == ["python", "-m", "pytest"]:

@@ -71,7 +71,7 @@ def test_medians_leave_out_stages_that_a_contender_has_not():
 def test_the_tables_hold_every_stage_and_both_errors():
     tables = measured(drawing, scene=["tiny"], backend=["torch"], preset=["fast"], repeats=1).tables
     time, error = tables["rasterizers_time"], tables["rasterizers_error"]
-    stages = (drawing.FORWARD, *drawing.BACKWARD, drawing.QUARTER, drawing.TOGETHER, drawing.SEPARATE)
+    stages = (drawing.FORWARD, *drawing.BACKWARD, drawing.QUARTER, drawing.DEPTH, drawing.TOGETHER, drawing.SEPARATE)
     assert list(tables["rasterizers_turns"]["stage"]) == list(stages)
     assert time.loc[0, "k2_over_k1"] == pytest.approx(time.loc[0, "backward_k2_ms"] / time.loc[0, "backward_k1_ms"])
     same, none = error["means_relative"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ import torch
 import rasterizers
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs.saved import open_splat, overview
+from clear_strategies.training import checkpoint
 from tests.helpers import saved_run, toy
 
 CAMERA = toy.camera(0.2)
@@ -80,8 +82,9 @@ def test_the_inria_layout_of_a_model_is_found(run, tmp_path):
 def test_a_rasterizer_that_is_not_here_gives_way(run, tmp_path, caplog):
     folder, _ = run
     shutil.copytree(folder, tmp_path / "run")
-    for manifest in (tmp_path / "run" / "checkpoints").rglob("manifest.json"):
-        manifest.write_text(manifest.read_text().replace('"rasterizer.name": "torch"', '"rasterizer.name": "theirs"'))
+    for path in (tmp_path / "run" / "checkpoints").rglob("step_*"):
+        saved = checkpoint.load(path)
+        checkpoint.save(path.parent, replace(saved, config={**saved.config, "rasterizer.name": "theirs"}))
     assert open_splat(tmp_path / "run").painter.color(CAMERA).isfinite().all()
     assert "draws instead" in caplog.text
     with pytest.raises(SettingError, match="nothing"):

@@ -59,18 +59,20 @@ def main(arguments: list[str] | None = None) -> int:
             if options.only in (None, name):
                 _log.info("%s …", name)
                 rows += run()
-    options.out.write_text(page(rows))
+    options.out.write_text(page(rows, f"--every {options.every} --mutants {options.mutants}"))
     _log.info("%s", options.out)
     return int(not all(row.met for row in rows))
 
 
-def page(rows: list[Row]) -> str:
+def page(rows: list[Row], size: str) -> str:
     """docs/stability.md."""
     return (
         "# Numerical stability\n\n"
         "Extreme inputs, faults and damaged files, and the worst that each did. `python -m tests.stress` measures this page "
         "again; the test command runs a slice of it (`tests/stress/test_stress.py`).\n\n"
-        f"Measured on {datetime.datetime.now(datetime.UTC):%Y-%m-%d}, {platform.machine()}.\n\n" + table(rows) + "\n"
+        f"Measured on {datetime.datetime.now(datetime.UTC):%Y-%m-%d}, {platform.machine()}, with `{size}`.\n\n"
+        + table(rows)
+        + "\n"
         "- **Single Gaussians**: 17 scales (1e-8 to 1e8) × 13 depths (1e-6 to 1e6) × 7 logits (-100 to 100) × 9 norms of the "
         "quaternion (1e-20 to 1e20), an ellipsoid drawn by each backend in float32 and by the reference in float64. The "
         "image's error is absolute. The gradient's is relative to the largest attribute's, each gradient times its "
