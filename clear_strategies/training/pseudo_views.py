@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from clear_strategies.core.deferred import Number
+from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.data.pseudo_views import PseudoView, cut_out, pseudo_views
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import SettingError
@@ -37,7 +38,7 @@ class PseudoViewSettings:
         every: iterations from one step on a pseudo view to the next; 0: none.
         count: how many pseudo views are made before training.
         reach: largest distance of a pseudo camera from its photo's, as a multiple of the photo's median depth.
-        weight: of the LR loss on them, > 0; that of a photo is lambda_lr.
+        weight: of their LR loss, > 0, as a multiple of a photo's, which is lambda_lr.
         tolerance: largest relative difference between the depth of a point and that of a photo that vouches for it.
         max_pixels: larger LR photos are first reduced by a whole factor; bounds time and memory.
 
@@ -69,9 +70,16 @@ class PseudoViews:
     views: Sequence[PseudoView] = ()
 
     @classmethod
-    def of(cls, scene: Scene, settings: PseudoViewSettings, seed: int) -> PseudoViews:
-        """Make them, on the device of the scene's views; none, and a message, where the scene needs none or has no depth."""
+    def of(cls, scene: Scene, settings: PseudoViewSettings, seed: int, lambda_lr: float = 1.0) -> PseudoViews:
+        """Make them, on the device of the scene's views; none, and a message, where they are of no use.
+
+        Args:
+            lambda_lr: the weight of the LR loss.
+        """
         if settings.every == 0:
+            return cls(settings)
+        if lambda_lr == 0:
+            _log.warning("pseudo_views has no effect: it is the LR loss on them that trains, and lambda_lr is 0.")
             return cls(settings)
         photos = {view.name: view.lr.to("cpu") for view in scene.train}
         if cut_out(photos.values(), scene.background):
@@ -119,18 +127,26 @@ class PseudoViews:
 
 
 def step(s: TrainState, rasterizer: Rasterizer, view: PseudoView) -> Number:
-    """One step of the optimizer on the LR loss where the pseudo view is known; returns the loss."""
+    """One step of the optimizer on the LR loss where the pseudo view is known; returns the loss.
+
+    Raises:
+        DivergedError: the loss or its gradient is not finite; nothing has changed.
+    """
     θ, o = s.field, s.conductor.objective
     shot = θ.shot(rasterizer, view.photo.camera)
     known = view.known[..., None]
     losses = o.lr(torch.where(known, shot.image, 0.0), view.photo.image)  # Eq. 4, equal where unknown
-    cotangents: Tensor = losses.cotangents * known * (s.pseudo_views.settings.weight / max(o.lambda_lr, 1e-12))
+    where = f"t={s.t}, a pseudo view"
+    require_finite_losses(where, losses.values, {"it": view.photo.image, "the render": shot.image})
+    cotangents: Tensor = losses.cotangents * known * s.pseudo_views.settings.weight
     steps = s.optimizer.steps
     if s.compiled_step is not None:
         (g,) = s.compiled_step.vjp(shot, cotangents)
+        require_finite(f"{where}: the gradient", g.table())
         s.compiled_step.step(θ.raw(), g, None, s.t)
     else:
         (grads,) = shot.vjp(cotangents)
+        require_finite(f"{where}: the gradient", grads)
         s.optimizer.step(θ.raw(), s.conductor.merge(θ.raw(), grads, None, s.t).grads, shot.visible)
         θ.constrain()
     s.optimizer.steps = steps  # the learning rates follow the iteration

@@ -92,7 +92,9 @@ class TrainState:
             scene.train,
             compiled_step=step,
             skip_policy=SkipPolicy(skips),
-            pseudo_views=PseudoViews.of(scene, pseudo_views or PseudoViewSettings(), settings.seed),
+            pseudo_views=PseudoViews.of(
+                scene, pseudo_views or PseudoViewSettings(), settings.seed, conductor.objective.lambda_lr
+            ),
         )
         state.refilter()
         return state

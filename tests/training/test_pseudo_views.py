@@ -10,7 +10,7 @@ import torch
 
 from clear_strategies.core import deferred
 from clear_strategies.data.pseudo_views import PseudoView
-from clear_strategies.errors import SettingError
+from clear_strategies.errors import DivergedError, SettingError
 from clear_strategies.training import pseudo_views
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.pseudo_views import LOSS, PseudoViews, PseudoViewSettings
@@ -103,6 +103,22 @@ def test_the_warning_names_the_remedy(caplog):
     caplog.clear()
     PseudoViews.of(SCENE, PseudoViewSettings(), seed=5)
     assert not caplog.text
+
+
+def test_without_an_lr_loss_they_have_no_effect_and_the_warning_says_so(caplog):
+    assert PseudoViews.of(with_depth(SCENE), BESIDE, seed=5, lambda_lr=0).says() is None
+    assert "lambda_lr is 0" in caplog.text
+
+
+@pytest.mark.parametrize("fused", ["auto", "off"])
+def test_a_number_that_is_not_finite_is_found_before_the_step(fused):
+    state = start((), beside=BESIDE, fused=fused)
+    view = blank(state, known=True)
+    view.photo.image[3, 4] = torch.nan
+    before = parameters(state)
+    with pytest.raises(DivergedError, match="t=1, a pseudo view"):
+        pseudo_views.step(state, toy.RASTERIZER, view)
+    assert all(torch.equal(value, before[name]) for name, value in state.field.raw().items())
 
 
 def test_an_object_cut_out_of_its_surroundings_needs_none(caplog):
