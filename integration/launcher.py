@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from clear_strategies.compose import conductor
-from clear_strategies.data.priors import Images
 from clear_strategies.errors import DataError
-from integration.views import sr_source
+from integration.views import sr_images, sr_source
 
 
 def parser(module: str, description: str) -> argparse.ArgumentParser:
@@ -50,7 +49,7 @@ class Launch:
         self.script, self.arguments, self.save_lr = options.script, options.rest, options.save_lr
         if not self.script.is_file():
             raise DataError(self.script, "script", "is not there", "give the training script of your trainer")
-        sr = None if options.sr is None else Images(options.sr, options.suffix)
+        sr = sr_images(options.sr, options.suffix)
         self.settings: dict[str, Any] = {
             "strategies": options.strategies, "overrides": options.overrides, "sr": sr, "factor": options.factor,
         }  # fmt: skip

@@ -31,7 +31,7 @@ from integration.errors import HostError
 from integration.host_score import warn_if_score_is_unused
 from integration.log import show_log
 from integration.model_proxy import ModelRenderer, Role, enlarged_camera
-from integration.views import SuperResolve, sr_source, view
+from integration.views import sr_images, sr_source, view
 
 _log = logging.getLogger(__name__)
 
@@ -119,7 +119,7 @@ class Attached:
             )
         self._settings, self._density, self._module = settings, density, module
         self._conductor: Conductor = conductor(settings.strategies, *settings.overrides, iterations=trainer.max_steps)
-        self._sr, self._factor = sr_source(_sr_images(settings), self._conductor, settings.factor)
+        self._sr, self._factor = sr_source(sr_images(settings.sr, settings.suffix), self._conductor, settings.factor)
         end_with_strategies(self._conductor, density, "densify_until_iter")
         self._views: dict[str, View] = {}
         self._masks: dict[str, Tensor | None] = {}
@@ -273,12 +273,6 @@ class Attached:
             detail = self._resumed["detail"]["value"].to(sh0)
             checkpoint["state_dict"][_SH0] = sh0 - sh0_offset(detail, sh0)
         original(checkpoint)
-
-
-def _sr_images(settings: ClearDensityController) -> SuperResolve | None:
-    from clear_strategies.data.priors import Images
-
-    return None if settings.sr is None else Images(settings.sr, settings.suffix)
 
 
 def _to_pixels(result: Mapping[str, Any]) -> tuple[float, float] | None:

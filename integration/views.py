@@ -64,18 +64,27 @@ def enlarged_mask(mask: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "H W
     return mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
 
 
+def sr_images(sr: SuperResolve | str | Path | None, suffix: str = "") -> SuperResolve | None:
+    """The function that gives SR images: those of a folder where `sr` names one, else `sr` itself.
+
+    Args:
+        suffix: what the SR tool appended to the names in the folder.
+    """
+    if sr is None or not isinstance(sr, str | Path):
+        return sr
+    from clear_strategies.data.priors import Images
+
+    return Images(str(sr), suffix)
+
+
 def sr_source(sr: SuperResolve | str | Path | None, conductor: Conductor, factor: int) -> tuple[SuperResolve, int]:
     """The function that gives SR images, and their factor. Without SR images the "HR" view is the LR view.
 
     Raises:
         SettingError: there are no SR images, but the objective or a strategy needs them.
     """
-    if sr is not None:
-        if not isinstance(sr, str | Path):
-            return sr, factor
-        from clear_strategies.data.priors import Images
-
-        return Images(str(sr)), factor
+    if (images := sr_images(sr)) is not None:
+        return images, factor
     λ = conductor.objective.lambda_hr
     if λ.peak > 0 or λ.final > 0 or conductor.owner("observe") is not None:
         raise SettingError(

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from clear_strategies.compose import conductor
-from clear_strategies.data.priors import Images
 from clear_strategies.errors import SettingError
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
@@ -22,7 +21,7 @@ from integration.gsplat.attached import Attached
 from integration.gsplat.data import masks_from_dataset, views_from_dataset
 from integration.log import show_log
 from integration.replacing import Replaced
-from integration.views import SuperResolve, sr_source
+from integration.views import SuperResolve, sr_images, sr_source
 
 _log = logging.getLogger(__name__)
 
@@ -67,7 +66,7 @@ def install(
         installed: called with every attachment.
     """
     show_log()
-    images = Images(str(sr), suffix) if isinstance(sr, str | Path) else sr
+    images = sr_images(sr, suffix)
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
 
     @functools.wraps(train)

@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from clear_strategies.compose import conductor
-from clear_strategies.data.priors import Images
 from integration.densification import end_with_strategies
 from integration.errors import HostError
 from integration.inria.attached import Attached
 from integration.log import show_log
-from integration.views import SuperResolve
+from integration.views import SuperResolve, sr_images
 
 
 def install(
@@ -51,10 +50,8 @@ def install(
         raise HostError(f"{type(opt).__name__} has no iterations, which the options of training_setup have in 3DGS.")
     chosen = conductor(strategies, *overrides, iterations=int(iterations))
     end_with_strategies(chosen, opt, "densify_until_iter")
-    if isinstance(sr, str | Path):
-        sr = Images(str(sr), suffix)
     attached = Attached(
-        gaussians, scene.getTrainCameras(), chosen, sr=sr, factor=factor, seed=seed,
+        gaussians, scene.getTrainCameras(), chosen, sr=sr_images(sr, suffix), factor=factor, seed=seed,
         threshold=getattr(opt, "densify_grad_threshold", None), densify_until=getattr(opt, "densify_until_iter", None),
     )  # fmt: skip
     renderer = sys.modules.get("gaussian_renderer")
