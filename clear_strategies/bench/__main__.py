@@ -113,25 +113,15 @@ def parser() -> argparse.ArgumentParser:
     names = [variant.name for variant in pareto.VARIANTS]
     ask.add_argument("--variants", nargs="+", default=names, metavar="NAME", help=f"default: {', '.join(names)}")
 
-    ask = questions.add_parser(
-        "stereo", parents=[common, out], help="error, coverage and seconds of the depth of the training photos"
-    )
-    ask.add_argument(
-        "overrides",
-        nargs="*",
-        metavar="OVERRIDE",
-        help="the data set and its settings, as for a run (default: the demo)",
-    )
-
-    ask = questions.add_parser(
-        "evidence", parents=[common, out], help="how well reliability finds the known errors of a corrupted prior"
-    )
-    ask.add_argument(
-        "overrides",
-        nargs="*",
-        metavar="OVERRIDE",
-        help="the data set and its prior, as for a run (default: the demo)",
-    )
+    for name, what, chosen in (
+        ("stereo", "error, coverage and seconds of the depth of the training photos", "settings"),
+        ("evidence", "how well reliability finds the known errors of a corrupted prior", "prior"),
+    ):
+        ask = questions.add_parser(name, parents=[common, out], help=what)
+        ask.add_argument(
+            "overrides", nargs="*", metavar="OVERRIDE",
+            help=f"the data set and its {chosen}, as for a run (default: the demo)",
+        )  # fmt: skip
 
     ask = questions.add_parser("device", parents=[common, garden], help="all checks that need a GPU, into a folder")
     ask.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder for logs, tables and runs")

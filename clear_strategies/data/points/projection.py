@@ -6,13 +6,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from clear_strategies.core.projection import intrinsics
 from rasterizers.interface import Camera
 
 
 def projection_matrix(camera: Camera) -> Float[Tensor, "3 4"]:
     """K [R | t], float64 on the CPU."""
-    K = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]], dtype=torch.float64)
-    return K @ camera.world_to_camera.double().cpu()[:3]
+    return intrinsics(camera) @ camera.world_to_camera.double().cpu()[:3]
 
 
 def project(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
