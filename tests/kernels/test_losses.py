@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import subprocess
@@ -69,28 +70,39 @@ def sky(height=96, width=90):
     return x
 
 
-PAIRS = {
-    f"{level:.3g} against {difference:g} more": (
-        torch.full((20, 20, 3), level),
-        torch.full((20, 20, 3), level) + difference,
-    )
-    for level in (0.0, 1 / 255, 0.5, 0.6, 1.0)
-    for difference in (0.0, 1e-7, 1e-3)
-} | {
-    "noise of 1 x 1": (image(1, 1, 1).float(), image(1, 1, 2).float()),
-    "noise of 3 x 30": (image(3, 30, 1).float(), image(3, 30, 2).float()),
-    "noise of 11 x 11": (image(11, 11, 1).float(), image(11, 11, 2).float()),
-    "noise of 40 x 1": (image(40, 1, 1).float(), image(40, 1, 2).float()),
-    "noise over several tiles": (image(141, 353, 1).float(), image(141, 353, 2).float()),
-    "sky and rough copy": rough(sky(), 0.05),
-    "sky and close copy": rough(sky(), 1e-3),
-    "sky and other sky": (sky(), 1.1 * sky()),
-    "photo and rough copy": rough(photo(133, 350), 0.1),
-    "photo and close copy": rough(photo(77, 91), 1e-3),
-    "photo and itself": (photo(50, 60), photo(50, 60)),
-    "photo inverted": (photo(50, 60), 1 - photo(50, 60)),
-    "beyond [0, 1]": (3 * photo(50, 60) - 1, photo(50, 60, 6)),
-}
+PAIRS = (
+    {
+        f"{level:.3g} against {difference:g} more": (
+            torch.full((20, 20, 3), level),
+            torch.full((20, 20, 3), level) + difference,
+        )
+        for level in (0.0, 1 / 255, 0.5, 0.6, 1.0)
+        for difference in (0.0, 1e-7, 1e-3)
+    }
+    | {
+        f"{x:.3g} against a far {y:.3g}": (torch.full((20, 20, 3), x), torch.full((20, 20, 3), y))
+        for x, y in itertools.permutations((0.0, 3e-4, 1 / 255, 0.5, 1.0), 2)
+    }
+    | {
+        "noise against black": (image(30, 40, 1).float(), torch.zeros(30, 40, 3)),
+        "black against noise": (torch.zeros(30, 40, 3), image(30, 40, 1).float()),
+        "noise against grey": (image(30, 40, 1).float(), torch.full((30, 40, 3), 0.4)),
+        "noise against its hundredth": (image(30, 40, 1).float(), 0.01 * image(30, 40, 1).float()),
+        "noise of 1 x 1": (image(1, 1, 1).float(), image(1, 1, 2).float()),
+        "noise of 3 x 30": (image(3, 30, 1).float(), image(3, 30, 2).float()),
+        "noise of 11 x 11": (image(11, 11, 1).float(), image(11, 11, 2).float()),
+        "noise of 40 x 1": (image(40, 1, 1).float(), image(40, 1, 2).float()),
+        "noise over several tiles": (image(141, 353, 1).float(), image(141, 353, 2).float()),
+        "sky and rough copy": rough(sky(), 0.05),
+        "sky and close copy": rough(sky(), 1e-3),
+        "sky and other sky": (sky(), 1.1 * sky()),
+        "photo and rough copy": rough(photo(133, 350), 0.1),
+        "photo and close copy": rough(photo(77, 91), 1e-3),
+        "photo and itself": (photo(50, 60), photo(50, 60)),
+        "photo inverted": (photo(50, 60), 1 - photo(50, 60)),
+        "beyond [0, 1]": (3 * photo(50, 60) - 1, photo(50, 60, 6)),
+    }
+)
 COMPILED = [pytest.param("cpp", marks=needs_cpp), pytest.param("warp", marks=needs_warp)]
 every_compiled = pytest.mark.parametrize("name", COMPILED)
 every_implementation = pytest.mark.parametrize("name", [*COMPILED, "torch"])

@@ -1,15 +1,18 @@
 // L1 and mean SSIM (11 x 11 Gaussian window, σ = 1.5, zero padding) with their gradient, in one pass over the images.
 //
-// With the sum s = x + y and the difference e = y - x of the images, SSIM factorises:
+// With the difference e = y - x of the images, SSIM factorises:
 //
-//   SSIM = (1 - u)(1 - n),   u = μe² / B1,  B1 = (μs² + μe²)/2 + C1,   n = σe² / B2,  B2 = (σs² + σe²)/2 + C2,
+//   SSIM = (1 - u)(1 - n),   u = μe² / B1,  1 - u = A1 / B1,  A1 = 2 μx μy + C1,  B1 = A1 + μe²,
+//                            n = σe² / B2,  1 - n = A2 / B2,  A2 = 2 σxy + C2,    B2 = A2 + σe².
 //
-// This form needs two means and two variances, no covariance, and is accurate where the images are nearly equal (u and n
-// are then small numbers, not differences of nearly equal ones; equal images give exactly 1 and gradient 0).
 // With a window w around q, the gradient at a pixel p is
 //
-//   ∂Σ SSIM / ∂x_p = Σ_q w(p-q) [a(q) + b(q) (s_p - μs(q)) + c(q) (e_p - μe(q))],
-//   a = (1-n) (2μe + u (μs - μe)) / B1,   b = (1-u) n / B2,   c = (1-u) (2-n) / B2.
+//   ∂Σ SSIM / ∂x_p = Σ_q w(p-q) [a(q) + b(q) (y_p - μy(q)) + c(q) (e_p - μe(q))],
+//   a = 2 (1-n) ((1-u) μe + u μy) / B1,   b = 2 (1-u) n / B2,   c = 2 (1-u) (1-n) / B2.
+//
+// Every factor is accurate wherever it counts. Where the images are nearly equal, u and n are small numbers, not differences
+// of nearly equal ones; equal images give exactly 1 and gradient 0. Where y is dark or flat beside x, u or n is nearly 1, and
+// 1 - u and 1 - n are not subtracted. y is summed itself, because y found from x + y and e would be off by the rounding of x.
 //
 // Windows are separable: columns first, then rows. E[s²] - E[s]² would lose the variance of flat regions, so every sum is
 // taken about a value inside its window: a pixel of the column for the column sums, the column's mean for the row sums
@@ -99,38 +102,38 @@ inline double total(const Floats& v) {
 
 // The input of a group's column sums: the kSpan rows from 5 above the group's first row to 5 below its last.
 struct Columns {
-  const float *s[kSpan], *e[kSpan];
-  const float *s_origin, *e_origin;
+  const float *y[kSpan], *e[kSpan];
+  const float *y_origin, *e_origin;
 };
 
-// Column means and variances for rows [first, first + Rows) of the group.
+// Column means of y and e, covariances of x and y, and variances of e, for rows [first, first + Rows) of the group.
 template <int Rows>
-void down_columns(const Columns& in, int first, int width, float* const* mean_s, float* const* mean_e,
-                  float* const* var_s, float* const* var_e) {
+void down_columns(const Columns& in, int first, int width, float* const* mean_y, float* const* mean_e,
+                  float* const* cov_xy, float* const* var_e) {
   for (int i = 0; i < width; i += kWidth) {
-    Register s0 = load(in.s_origin + i), e0 = load(in.e_origin + i);
-    Register ms[Rows], me[Rows], vs[Rows], ve[Rows];
+    Register y0 = load(in.y_origin + i), e0 = load(in.e_origin + i);
+    Register my[Rows], me[Rows], vxy[Rows], ve[Rows];
 #pragma GCC unroll 4
-    for (int r = 0; r < Rows; ++r) ms[r] = me[r] = vs[r] = ve[r] = Register{};
+    for (int r = 0; r < Rows; ++r) my[r] = me[r] = vxy[r] = ve[r] = Register{};
 #pragma GCC unroll 16
     for (int k = 0; k < Rows + kTaps - 1; ++k) {
-      Register s = load(in.s[first + k] + i) - s0, e = load(in.e[first + k] + i) - e0;
-      Register ss = s * s, ee = e * e;
+      Register y = load(in.y[first + k] + i) - y0, e = load(in.e[first + k] + i) - e0;
+      Register xy = (y - e) * y, ee = e * e;
 #pragma GCC unroll 4
       for (int r = 0; r < Rows; ++r) {
         if (k < r || k - r >= kTaps) continue;
         const float w = kWindow[k - r];
-        ms[r] += w * s;
+        my[r] += w * y;
         me[r] += w * e;
-        vs[r] += w * ss;
+        vxy[r] += w * xy;
         ve[r] += w * ee;
       }
     }
 #pragma GCC unroll 4
     for (int r = 0; r < Rows; ++r) {
-      store(mean_s[first + r] + i, s0 + ms[r]);
+      store(mean_y[first + r] + i, y0 + my[r]);
       store(mean_e[first + r] + i, e0 + me[r]);
-      store(var_s[first + r] + i, vs[r] - ms[r] * ms[r]);
+      store(cov_xy[first + r] + i, vxy[r] - (my[r] - me[r]) * my[r]);
       store(var_e[first + r] + i, ve[r] - me[r] * me[r]);
     }
   }
@@ -138,64 +141,65 @@ void down_columns(const Columns& in, int first, int width, float* const* mean_s,
 
 // The maps of one row: local means, the gradient's coefficients, and 1 - SSIM.
 struct MapRow {
-  float *mean_s, *mean_e, *a, *b, *c, *dissimilarity;
+  float *mean_y, *mean_e, *a, *b, *c, *dissimilarity;
 };
 
-// Computes the windows' means and variances from those of the columns, and the maps from them. `mean_s`, … start kHalo
+// Computes the windows' means and (co)variances from those of the columns, and the maps from them. `mean_y`, … start kHalo
 // numbers before the maps.
-inline void along_row(const float* mean_s, const float* mean_e, const float* var_s, const float* var_e, int width,
+inline void along_row(const float* mean_y, const float* mean_e, const float* cov_xy, const float* var_e, int width,
                       const MapRow& out) {
   for (int i = 0; i < width; i += kWidth) {
     int at = i + kHalo;
-    Register s0 = load(mean_s + at), e0 = load(mean_e + at), w0 = kWindow[kReach] - Register{};
-    Register ms{}, me{}, vs = w0 * load(var_s + at), ve = w0 * load(var_e + at);
+    Register y0 = load(mean_y + at), e0 = load(mean_e + at), w0 = kWindow[kReach] - Register{};
+    Register my{}, me{}, vxy = w0 * load(cov_xy + at), ve = w0 * load(var_e + at);
 #pragma GCC unroll 16
     for (int k = 0; k < kTaps; ++k) {
       if (k == kReach) continue;
       int from = at + (k - kReach) * kChannels;
       const float w = kWindow[k];
-      Register s = load(mean_s + from) - s0, e = load(mean_e + from) - e0;
-      ms += w * s;
+      Register y = load(mean_y + from) - y0, e = load(mean_e + from) - e0;
+      my += w * y;
       me += w * e;
-      vs += w * (load(var_s + from) + s * s);
+      vxy += w * (load(cov_xy + from) + (y - e) * y);
       ve += w * (load(var_e + from) + e * e);
     }
-    vs -= ms * ms;
+    vxy -= (my - me) * my;
     ve -= me * me;
-    ms += s0;
+    my += y0;
     me += e0;
-    const float half = 0.5f, one = 1.0f, two = 2.0f;
+    const float two = 2.0f;
     const Register me2 = me * me;
-    const Register over_B1 = Native<float>::reciprocal((ms * ms + me2) * half + kC1);
-    const Register over_B2 = Native<float>::reciprocal((vs + ve) * half + kC2);
-    Register u = me2 * over_B1, n = ve * over_B2, scale = (one - u) * over_B2;
-    store(out.mean_s + i, ms);
+    const Register A1 = two * (my - me) * my + kC1, A2 = two * vxy + kC2;
+    const Register over_B1 = Native<float>::reciprocal(A1 + me2), over_B2 = Native<float>::reciprocal(A2 + ve);
+    const Register u = me2 * over_B1, n = ve * over_B2, not_u = A1 * over_B1, not_n = A2 * over_B2;
+    const Register scale = two * not_u * over_B2;
+    store(out.mean_y + i, my);
     store(out.mean_e + i, me);
-    store(out.a + i, (one - n) * (two * me + u * (ms - me)) * over_B1);
+    store(out.a + i, two * not_n * (not_u * me + u * my) * over_B1);
     store(out.b + i, scale * n);
-    store(out.c + i, scale * (two - n));
+    store(out.c + i, scale * not_n);
     store(out.dissimilarity + i, u + n - u * n);
   }
 }
 
 // The kSpan rows of maps around a group, and the row of local means that the sums are taken about.
 struct Maps {
-  const float *mean_s[kSpan], *mean_e[kSpan], *a[kSpan], *b[kSpan], *c[kSpan];
-  const float *s_origin, *e_origin;
+  const float *mean_y[kSpan], *mean_e[kSpan], *a[kSpan], *b[kSpan], *c[kSpan];
+  const float *y_origin, *e_origin;
 };
 
-// The gradient's column sums: Σ w [a + b (s0 - μs) + c (e0 - μe)], Σ w b and Σ w c.
+// The gradient's column sums: Σ w [a + b (y0 - μy) + c (e0 - μe)], Σ w b and Σ w c.
 template <int Rows>
 void down_maps(const Maps& in, int first, int width, float* const* sum_a, float* const* sum_b, float* const* sum_c) {
   for (int i = 0; i < width; i += kWidth) {
-    Register s0 = load(in.s_origin + i), e0 = load(in.e_origin + i);
+    Register y0 = load(in.y_origin + i), e0 = load(in.e_origin + i);
     Register A[Rows], B[Rows], C[Rows];
 #pragma GCC unroll 4
     for (int r = 0; r < Rows; ++r) A[r] = B[r] = C[r] = Register{};
 #pragma GCC unroll 16
     for (int k = 0; k < Rows + kTaps - 1; ++k) {
       Register b = load(in.b[first + k] + i), c = load(in.c[first + k] + i);
-      Register a = load(in.a[first + k] + i) + b * (s0 - load(in.mean_s[first + k] + i)) +
+      Register a = load(in.a[first + k] + i) + b * (y0 - load(in.mean_y[first + k] + i)) +
                  c * (e0 - load(in.mean_e[first + k] + i));
 #pragma GCC unroll 4
       for (int r = 0; r < Rows; ++r) {
@@ -231,18 +235,18 @@ struct GradientRow {
   float l1_scale, ssim_scale;
 };
 
-// Computes the gradient of one row from the column sums about s_origin and e_origin, all of which start kHalo numbers
+// Computes the gradient of one row from the column sums about y_origin and e_origin, all of which start kHalo numbers
 // before the row; returns Σ |e|.
-inline double along_sums(const float* sum_a, const float* sum_b, const float* sum_c, const float* s_origin,
-                         const float* e_origin, const float* s, const float* e, const GradientRow& out) {
+inline double along_sums(const float* sum_a, const float* sum_b, const float* sum_c, const float* y_origin,
+                         const float* e_origin, const float* y, const float* e, const GradientRow& out) {
   Floats zero(0.0f), step(out.l1_scale), absolute_sum(0.0f);
   for (int i = 0; i < out.length; i += kLanes) {
-    Floats s0 = Floats::load(s + i), e0 = Floats::load(e + i), g(0.0f);
+    Floats y0 = Floats::load(y + i), e0 = Floats::load(e + i), g(0.0f);
 #pragma GCC unroll 16
     for (int k = 0; k < kTaps; ++k) {
       int from = i + kHalo + (k - kReach) * kChannels;
       g += Floats(kWindow[k]) *
-           (Floats::load(sum_a + from) + Floats::load(sum_b + from) * (s0 - Floats::load(s_origin + from)) +
+           (Floats::load(sum_a + from) + Floats::load(sum_b + from) * (y0 - Floats::load(y_origin + from)) +
             Floats::load(sum_c + from) * (e0 - Floats::load(e_origin + from)));
     }
     g = where(e0 < zero, step) - where(e0 > zero, step) + Floats(out.ssim_scale) * g;
@@ -280,25 +284,25 @@ inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, Photometric
     return p;
   };
   auto ring = [&take](int w) { return Ring{take(std::ptrdiff_t(w) * kRing), w}; };
-  Ring s = ring(in_width), e = ring(in_width);
-  Ring mean_s = ring(map_width), mean_e = ring(map_width), a = ring(map_width), b = ring(map_width), c = ring(map_width);
+  Ring y = ring(in_width), e = ring(in_width);
+  Ring mean_y = ring(map_width), mean_e = ring(map_width), a = ring(map_width), b = ring(map_width), c = ring(map_width);
   float *column[4][kGroup], *sum[3][kGroup], *dissimilarity = take(map_width);
   for (auto& quantity : column)
     for (float*& row : quantity) row = take(in_width);
   for (auto& quantity : sum)
     for (float*& row : quantity) row = take(map_width);
 
-  // Rows of s and e, zero outside the image.
+  // Rows of y and e, zero outside the image.
   auto read = [&](int r) {
-    float *to_s = s.row(r), *to_e = e.row(r);
-    std::fill_n(to_s, in_width, 0.0f);
+    float *to_y = y.row(r), *to_e = e.row(r);
+    std::fill_n(to_y, in_width, 0.0f);
     std::fill_n(to_e, in_width, 0.0f);
     if (r < 0 || r >= im.height) return;
     int begin = std::max(0, in_left), end = std::min(im.row, in_left + in_width);
-    const float *x = im.x + std::ptrdiff_t(r) * im.row, *y = im.y + std::ptrdiff_t(r) * im.row;
+    const float *from_x = im.x + std::ptrdiff_t(r) * im.row, *from_y = im.y + std::ptrdiff_t(r) * im.row;
     for (int i = begin; i < end; ++i) {
-      to_s[i - in_left] = x[i] + y[i];
-      to_e[i - in_left] = y[i] - x[i];
+      to_y[i - in_left] = from_y[i];
+      to_e[i - in_left] = from_y[i] - from_x[i];
     }
   };
 
@@ -306,22 +310,22 @@ inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, Photometric
   // The maps of rows [q, q + 4); zero outside the image.
   auto forward = [&](int q) {
     Columns in;
-    for (int k = 0; k < kSpan; ++k) in.s[k] = s.row(q - kReach + k), in.e[k] = e.row(q - kReach + k);
+    for (int k = 0; k < kSpan; ++k) in.y[k] = y.row(q - kReach + k), in.e[k] = e.row(q - kReach + k);
     int origin = std::clamp(q + kGroup / 2, 0, im.height - 1);
-    in.s_origin = s.row(origin), in.e_origin = e.row(origin);
+    in.y_origin = y.row(origin), in.e_origin = e.row(origin);
     for (int r = 0; r < kGroup; r += kTogether)
       down_columns<kTogether>(in, r, in_width, column[0], column[1], column[2], column[3]);
     for (int r = 0; r < kGroup; ++r) {
-      int y = q + r;
-      MapRow out{mean_s.row(y), mean_e.row(y), a.row(y), b.row(y), c.row(y), dissimilarity};
+      int at = q + r;
+      MapRow out{mean_y.row(at), mean_e.row(at), a.row(at), b.row(at), c.row(at), dissimilarity};
       int begin = std::max(0, -map_left), end = std::min(map_width, im.row - map_left);
-      if (y < 0 || y >= im.height) begin = end = 0;
+      if (at < 0 || at >= im.height) begin = end = 0;
       else along_row(column[0][r], column[1][r], column[2][r], column[3][r], map_width, out);
-      for (float* row : {out.mean_s, out.mean_e, out.a, out.b, out.c}) {
+      for (float* row : {out.mean_y, out.mean_e, out.a, out.b, out.c}) {
         std::fill(row, row + begin, 0.0f);
         std::fill(row + end, row + map_width, 0.0f);
       }
-      if (y >= t.top && y < t.bottom) sums.dssim += total(dissimilarity + kHalo, t.right - t.left);
+      if (at >= t.top && at < t.bottom) sums.dssim += total(dissimilarity + kHalo, t.right - t.left);
     }
   };
   // The gradient of rows [p, p + 4).
@@ -329,15 +333,15 @@ inline PhotometricMeans run_tile(const ImagePair& im, const Tile& t, Photometric
     Maps in;
     for (int k = 0; k < kSpan; ++k) {
       int r = p - kReach + k;
-      in.mean_s[k] = mean_s.row(r), in.mean_e[k] = mean_e.row(r);
+      in.mean_y[k] = mean_y.row(r), in.mean_e[k] = mean_e.row(r);
       in.a[k] = a.row(r), in.b[k] = b.row(r), in.c[k] = c.row(r);
     }
     int origin = std::min(p + kGroup / 2, im.height - 1);
-    in.s_origin = mean_s.row(origin), in.e_origin = mean_e.row(origin);
+    in.y_origin = mean_y.row(origin), in.e_origin = mean_e.row(origin);
     for (int r = 0; r < kGroup; r += kTogether) down_maps<kTogether>(in, r, map_width, sum[0], sum[1], sum[2]);
     for (int r = 0; r < kGroup && p + r < t.bottom; ++r) {
       GradientRow out{im.gradient + std::ptrdiff_t(p + r) * im.row + t.left, t.right - t.left, l1_scale, ssim_scale};
-      sums.l1 += along_sums(sum[0][r], sum[1][r], sum[2][r], in.s_origin, in.e_origin, s.row(p + r) + 2 * kHalo,
+      sums.l1 += along_sums(sum[0][r], sum[1][r], sum[2][r], in.y_origin, in.e_origin, y.row(p + r) + 2 * kHalo,
                             e.row(p + r) + 2 * kHalo, out);
     }
   };

@@ -1,16 +1,17 @@
 """The kernels of SSIM (11 x 11 Gaussian window, σ = 1.5, zero padding): its maps, and the gradient.
 
-With the sum s = x + y and the difference d = y - x of the images, SSIM factorises:
+With the difference d = y - x of the images, SSIM factorises:
 
-    SSIM = (1 - u)(1 - n),   u = μd² / B1,  B1 = (μs² + μd²)/2 + C1,   n = σd² / B2,  B2 = (σs² + σd²)/2 + C2,
+    SSIM = (1 - u)(1 - n),   u = μd² / B1,  1 - u = A1 / B1,  A1 = 2 μx μy + C1,  B1 = A1 + μd²,
+                             n = σd² / B2,  1 - n = A2 / B2,  A2 = 2 σxy + C2,    B2 = A2 + σd².
 
 With a window w around q, the gradient at a pixel p is
 
-    ∂Σ SSIM / ∂x_p = Σ_q w(p-q) [a(q) + b(q) (s_p - μs(q)) + c(q) (d_p - μd(q))],
-    a = (1-n) (2μd + u (μs - μd)) / B1,   b = (1-u) n / B2,   c = (1-u) (2-n) / B2.
+    ∂Σ SSIM / ∂x_p = Σ_q w(p-q) [a(q) + b(q) (y_p - μy(q)) + c(q) (d_p - μd(q))],
+    a = 2 (1-n) ((1-u) μd + u μy) / B1,   b = 2 (1-u) n / B2,   c = 2 (1-u) (1-n) / B2.
 
 Windows are separable: columns first, then rows. Every sum is taken about a value inside its window, because flat regions
-would otherwise lose their variance. `kernels/src/ssim.hpp` does the same.
+would otherwise lose their variance. `kernels/src/ssim.hpp` does the same, and says why in this form.
 
 Channels are interleaved: a row is W · 3 numbers, and a neighbour is three numbers away. A block of threads has `ROWS` rows of
 `WIDTH` numbers, including those that its windows reach on either side, and a thread per column: the thread sums down the
@@ -39,7 +40,7 @@ HALO: Final = 3 * REACH
 STRIDE: Final = WIDTH - 2 * HALO
 """Numbers of a row that a block computes; the rest of `WIDTH` is what their windows reach."""
 MAPS: Final = 5
-"""The maps are μs, μd, a, b and c."""
+"""The maps are μy, μd, a, b and c."""
 
 Rows: Final[Any] = wp.types.vector(length=ROWS, dtype=wp.float32)
 WINDOW: Final = wp.constant(wp.types.vector(length=TAPS, dtype=wp.float32)(*gaussian_window()))
@@ -56,9 +57,9 @@ C2: Final = wp.constant(0.03**2)
 @wp.func
 @no_type_check
 def pair_at(x: wp.array2d[wp.float32], y: wp.array2d[wp.float32], row: wp.int32, column: wp.int32) -> wp.vec2:
-    """The sum s and the difference d, 0 beyond the image. Always loads, because unconditional loads overlap."""
+    """Image y and the difference d, 0 beyond the image. Always loads, because unconditional loads overlap."""
     i, j = wp.clamp(row, 0, x.shape[0] - 1), wp.clamp(column, 0, x.shape[1] - 1)
-    pair = wp.vec2(x[i, j] + y[i, j], y[i, j] - x[i, j])
+    pair = wp.vec2(y[i, j], y[i, j] - x[i, j])
     return wp.where(i == row and j == column, pair, wp.vec2(0.0, 0.0))
 
 
@@ -93,52 +94,52 @@ def similarity(lanes: int) -> Any:
         group, across, lane = wp.tid()
         height, width = x.shape[0], x.shape[1]
         top, left = group * ROWS, across * STRIDE - HALO
-        mean_s = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+        mean_y = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
         mean_d = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
-        var_s = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
+        cov_xy = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
         var_d = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
 
         for turn in range(turns):
             at = turn * lanes
             column = left + at + lane
             origin = pair_at(x, y, wp.min(top + ROWS / 2, height - 1), column)
-            MS, MD, VS, VD = Rows(), Rows(), Rows(), Rows()
+            MY, MD, CXY, VD = Rows(), Rows(), Rows(), Rows()
             for k in range(SPAN):
                 near, w = pair_at(x, y, top - REACH + k, column) - origin, SHARES[k]
-                MS += w * near[0]
+                MY += w * near[0]
                 MD += w * near[1]
-                VS += w * (near[0] * near[0])
+                CXY += w * ((near[0] - near[1]) * near[0])
                 VD += w * (near[1] * near[1])
-            wp.tile_assign(mean_s, wp.tile(MS + Rows(origin[0])), offset=(0, at))
+            wp.tile_assign(mean_y, wp.tile(MY + Rows(origin[0])), offset=(0, at))
             wp.tile_assign(mean_d, wp.tile(MD + Rows(origin[1])), offset=(0, at))
-            wp.tile_assign(var_s, wp.tile(VS - wp.cw_mul(MS, MS)), offset=(0, at))
+            wp.tile_assign(cov_xy, wp.tile(CXY - wp.cw_mul(MY - MD, MY)), offset=(0, at))
             wp.tile_assign(var_d, wp.tile(VD - wp.cw_mul(MD, MD)), offset=(0, at))
 
         total = wp.float64(0.0)
         for at in range(HALO + lane, wp.min(WIDTH - HALO, width - left), lanes):
             for r in range(wp.min(ROWS, height - top)):
-                s0, d0 = mean_s[r, at], mean_d[r, at]
-                ms, md, vs, vd = wp.float32(0.0), wp.float32(0.0), wp.float32(0.0), wp.float32(0.0)
+                y0, d0 = mean_y[r, at], mean_d[r, at]
+                my, md, cxy, vd = wp.float32(0.0), wp.float32(0.0), wp.float32(0.0), wp.float32(0.0)
                 for k in range(TAPS):
                     beside = at + (k - REACH) * 3
-                    s, d = mean_s[r, beside] - s0, mean_d[r, beside] - d0
-                    ms += WINDOW[k] * s
-                    md += WINDOW[k] * d
-                    vs += WINDOW[k] * (var_s[r, beside] + s * s)
-                    vd += WINDOW[k] * (var_d[r, beside] + d * d)
-                vs -= ms * ms
+                    dy, dd = mean_y[r, beside] - y0, mean_d[r, beside] - d0
+                    my += WINDOW[k] * dy
+                    md += WINDOW[k] * dd
+                    cxy += WINDOW[k] * (cov_xy[r, beside] + (dy - dd) * dy)
+                    vd += WINDOW[k] * (var_d[r, beside] + dd * dd)
+                cxy -= (my - md) * my
                 vd -= md * md
-                ms += s0
+                my += y0
                 md += d0
-                over_B1 = 1.0 / (0.5 * (ms * ms + md * md) + C1)
-                over_B2 = 1.0 / (0.5 * (vs + vd) + C2)
-                u, n = md * md * over_B1, vd * over_B2
+                A1, A2 = 2.0 * (my - md) * my + C1, 2.0 * cxy + C2
+                over_B1, over_B2 = 1.0 / (A1 + md * md), 1.0 / (A2 + vd)
+                u, n, not_u, not_n = md * md * over_B1, vd * over_B2, A1 * over_B1, A2 * over_B2
                 row, column = top + r, left + at
-                maps[0, row, column] = ms
+                maps[0, row, column] = my
                 maps[1, row, column] = md
-                maps[2, row, column] = (1.0 - n) * (2.0 * md + u * (ms - md)) * over_B1
-                maps[3, row, column] = (1.0 - u) * over_B2 * n
-                maps[4, row, column] = (1.0 - u) * over_B2 * (2.0 - n)
+                maps[2, row, column] = 2.0 * not_n * (not_u * md + u * my) * over_B1
+                maps[3, row, column] = 2.0 * not_u * over_B2 * n
+                maps[4, row, column] = 2.0 * not_u * over_B2 * not_n
                 total += wp.float64(u + n - u * n)
         wp.tile_store(parts, wp.tile_sum(wp.tile(weight * total)), offset=(group * blocks_across(width) + across,))
 
@@ -168,25 +169,25 @@ def gradient(lanes: int) -> Any:
         sum_a = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
         sum_b = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
         sum_c = wp.tile_empty(shape=(ROWS, WIDTH), dtype=wp.float32, storage="shared")
-        origin_s = wp.tile_empty(shape=(WIDTH,), dtype=wp.float32, storage="shared")
+        origin_y = wp.tile_empty(shape=(WIDTH,), dtype=wp.float32, storage="shared")
         origin_d = wp.tile_empty(shape=(WIDTH,), dtype=wp.float32, storage="shared")
 
         for turn in range(turns):
             at = turn * lanes
             column, middle = left + at + lane, wp.min(top + ROWS / 2, height - 1)
-            s0, d0 = map_at(maps, 0, middle, column), map_at(maps, 1, middle, column)
+            y0, d0 = map_at(maps, 0, middle, column), map_at(maps, 1, middle, column)
             A, B, C = Rows(), Rows(), Rows()
             for k in range(SPAN):
                 row, w = top - REACH + k, SHARES[k]
-                ms, md = map_at(maps, 0, row, column), map_at(maps, 1, row, column)
+                my, md = map_at(maps, 0, row, column), map_at(maps, 1, row, column)
                 b, c = map_at(maps, 3, row, column), map_at(maps, 4, row, column)
-                A += w * (map_at(maps, 2, row, column) + b * (s0 - ms) + c * (d0 - md))
+                A += w * (map_at(maps, 2, row, column) + b * (y0 - my) + c * (d0 - md))
                 B += w * b
                 C += w * c
             wp.tile_assign(sum_a, wp.tile(A), offset=(0, at))
             wp.tile_assign(sum_b, wp.tile(B), offset=(0, at))
             wp.tile_assign(sum_c, wp.tile(C), offset=(0, at))
-            wp.tile_assign(origin_s, wp.tile(s0), offset=(at,))
+            wp.tile_assign(origin_y, wp.tile(y0), offset=(at,))
             wp.tile_assign(origin_d, wp.tile(d0), offset=(at,))
 
         total = wp.float64(0.0)
@@ -196,7 +197,7 @@ def gradient(lanes: int) -> Any:
                 g = wp.float32(0.0)
                 for k in range(TAPS):
                     beside = at + (k - REACH) * 3
-                    about = pair - wp.vec2(origin_s[beside], origin_d[beside])
+                    about = pair - wp.vec2(origin_y[beside], origin_d[beside])
                     g += WINDOW[k] * (sum_a[r, beside] + sum_b[r, beside] * about[0] + sum_c[r, beside] * about[1])
                 out[top + r, left + at] = ssim_step * g - l1_step * sign(pair[1])
                 total += wp.float64(wp.abs(pair[1]))
