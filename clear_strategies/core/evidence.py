@@ -43,15 +43,15 @@ class Evidence:
 
 
 def lift(
-    patch_map: Float[Tensor, "ph pw"],
+    patch_maps: Float[Tensor, "C ph pw"],
     centers: Float[Tensor, "N 2"],
     visible: Bool[Tensor, " N"],
     patch: float,
     size: tuple[int, int],
     lookup: Lookup = "nearest",
     outside: Outside = "clamp",
-) -> Float[Tensor, " N"]:
-    """Look up the patch p(u_i) that contains each projected centre.  Eq. 10
+) -> Float[Tensor, "C N"]:
+    """Look up the patch p(u_i) that contains each projected centre, in several maps at once.  Eq. 10
 
     Args:
         centers: u_i in pixels of the image that the patches tile. patch: edge of a patch in those pixels.
@@ -62,21 +62,19 @@ def lift(
     """
     grid = centers / patch
     if lookup == "bilinear":
-        values = _bilinear(patch_map, grid)
+        values = _bilinear(patch_maps, grid)
     else:
-        column = grid[:, 0].floor().clamp(0, patch_map.shape[1] - 1).long()
-        row = grid[:, 1].floor().clamp(0, patch_map.shape[0] - 1).long()
-        values = patch_map[row, column]
+        height, width = patch_maps.shape[1:]
+        column, row = (grid[:, i].clamp(0, edge - 1).long() for i, edge in ((0, width), (1, height)))
+        values = patch_maps.flatten(1).index_select(1, row * width + column)
     counted = visible
     if outside == "neutral":
         (x, y), (width, height) = centers.unbind(-1), size
         counted = counted & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    return torch.where(counted, values, torch.zeros_like(values))
+    return values * counted
 
 
-def _bilinear(patch_map: Float[Tensor, "ph pw"], grid: Float[Tensor, "N 2"]) -> Float[Tensor, " N"]:
-    height, width = patch_map.shape
+def _bilinear(patch_maps: Float[Tensor, "C ph pw"], grid: Float[Tensor, "N 2"]) -> Float[Tensor, "C N"]:
+    height, width = patch_maps.shape[1:]
     points = torch.stack((2 * grid[:, 0] / width - 1, 2 * grid[:, 1] / height - 1), dim=-1)[None, None]
-    return F.grid_sample(patch_map[None, None], points, mode="bilinear", padding_mode="border", align_corners=False)[
-        0, 0, 0
-    ]
+    return F.grid_sample(patch_maps[None], points, mode="bilinear", padding_mode="border", align_corners=False)[0, :, 0]

@@ -103,11 +103,9 @@ class P2G(Strategy):
 
     def observe(self, view: View, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""
-        R, A = self._cached_patches(view)
-        size = (view.lr.camera.width, view.lr.camera.height)
-        u = hr.means2d / view.factor  # patches live on the LR grid
-        q = lift(R, u, hr.visible, self.patch, size, self.lookup, self.outside)
-        a = lift(A, u, hr.visible, self.patch, size, self.lookup, self.outside)
+        maps = torch.stack(self._cached_patches(view))  # R, A
+        size = (view.hr.camera.width, view.hr.camera.height)
+        q, a = lift(maps, hr.means2d, hr.visible, self.patch * view.factor, size, self.lookup, self.outside)
         self.log("mean_q", deferred.mean(q, hr.visible))
         self.log("mean_w", deferred.mean(q * a, hr.visible))
         return Evidence(q, a)

@@ -72,14 +72,15 @@ def test_images_in_eight_bit_units_are_refused():
 
 
 def test_lifting_takes_the_patch_of_the_centre_and_the_border_outside():
-    patches = torch.tensor([[0.1, 0.2], [0.3, 0.4]])
+    patches = torch.tensor([[[0.1, 0.2], [0.3, 0.4]], [[1.0, 2.0], [3.0, 4.0]]])
     u = torch.tensor([[0.0, 0.0], [15.9, 15.9], [16.0, 0.0], [3.0, 20.0], [-50.0, 40.0], [99.0, 99.0], [20.0, 20.0]])
     visible = torch.tensor([True] * 6 + [False])
-    found = lift(patches, u, visible, 16, (32, 32))
+    found, second = lift(patches, u, visible, 16, (32, 32))
+    assert second.tolist() == pytest.approx([10 * value for value in found.tolist()])
     assert found.tolist() == pytest.approx([0.1, 0.1, 0.2, 0.3, 0.3, 0.4, 0.0])
-    neutral = lift(patches, u, visible, 16, (32, 32), outside="neutral")
+    neutral, _ = lift(patches, u, visible, 16, (32, 32), outside="neutral")
     assert neutral.tolist() == pytest.approx([0.1, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0])
-    between = lift(patches, torch.tensor([[16.0, 16.0], [8.0, 8.0]]), visible[:2], 16, (32, 32), lookup="bilinear")
+    between, _ = lift(patches, torch.tensor([[16.0, 16.0], [8.0, 8.0]]), visible[:2], 16, (32, 32), lookup="bilinear")
     assert between.tolist() == pytest.approx([0.25, 0.1])
 
 
