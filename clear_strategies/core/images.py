@@ -79,15 +79,26 @@ def upsample(image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel = "bic
     Raises:
         ValueError: unknown kernel.
     """
-    _require_member("upsampling kernel", kernel, get_args(UpKernel))
-    if factor == 1:
-        return image.clone()
-    size = (image.shape[0] * factor, image.shape[1] * factor)
-    if kernel == "nearest":
-        return _hwc(F.interpolate(_nchw(image), size=size, mode="nearest"))
-    # With antialias torch uses PIL's cubic kernel (a = -0.5), without it a = -0.75.
-    large = F.interpolate(_nchw(image), size=size, mode=kernel, antialias=True, align_corners=False)
-    return _hwc(large).clamp(0, 1)
+    return _enlarged(image, factor, kernel).clamp(0, 1)
+
+
+def back_projected(
+    sr: Float[Tensor, "H W C"],
+    lr: Float[Tensor, "h w C"],
+    factor: int,
+    rounds: int,
+    down: DownKernel = "bicubic",
+    where: Float[Tensor, "H W 1"] | float = 1.0,
+) -> Float[Tensor, "H W C"]:
+    """`sr` moved until it shrinks to `lr`: I ← I + U(I_LR − D(I)), iterated back-projection (Irani and Peleg, 1991).
+
+    Args:
+        rounds: how often; each leaves about half of the difference. down: D; U is bicubic.
+        where: a weight of the change, e.g. 1 where it is allowed and else 0.
+    """
+    for _ in range(rounds):
+        sr = (sr + where * _enlarged(lr - downsample(sr, factor, down), factor, "bicubic")).clamp(0, 1)
+    return sr
 
 
 def crop_to_multiple(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:
@@ -108,6 +119,17 @@ def patch_means(values: Float[Tensor, "H W C"], patch: int) -> Float[Tensor, "ph
 def quantize(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
     """Round to 8 bits, as an image file would."""
     return (image.clamp(0, 1) * 255).round() / 255
+
+
+def _enlarged(image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel) -> Float[Tensor, "H W C"]:
+    _require_member("upsampling kernel", kernel, get_args(UpKernel))
+    if factor == 1:
+        return image.clone()
+    size = (image.shape[0] * factor, image.shape[1] * factor)
+    if kernel == "nearest":
+        return _hwc(F.interpolate(_nchw(image), size=size, mode="nearest"))
+    # With antialias torch uses PIL's cubic kernel (a = -0.5), without it a = -0.75.
+    return _hwc(F.interpolate(_nchw(image), size=size, mode=kernel, antialias=True, align_corners=False))
 
 
 def _nchw(image: Float[Tensor, "H W C"]) -> Float[Tensor, "1 C H W"]:

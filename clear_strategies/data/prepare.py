@@ -55,6 +55,8 @@ class ViewSettings:
             training never sees, and LR is made from them, as in the papers. "both": they are trained on at HR, in place of
             SR images, and LR is made from them.
         downsample: D, the operator that makes LR.
+        back_projection: rounds by which each SR image is moved until it shrinks to its LR photo (`images.back_projected`);
+            0: it stays as the prior made it.
         lr_folder: ready-made LR images by the photos' names, instead of making them.
 
     Raises:
@@ -72,6 +74,7 @@ class ViewSettings:
     sizes: Sizes = "crop"
     photos_are: PhotosAre = "lr"
     downsample: DownKernel = "bicubic"
+    back_projection: int = 0
     lr_folder: str | None = None
 
     def __post_init__(self) -> None:
@@ -94,6 +97,7 @@ class ViewSettings:
         require_choice("data.views.sizes", self.sizes, get_args(Sizes))
         require_choice("data.views.photos_are", self.photos_are, get_args(PhotosAre))
         require_choice("data.views.downsample", self.downsample, get_args(DownKernel))
+        require_whole("data.views.back_projection", self.back_projection, least=0)
         if self.photos_are == "lr" and self.lr_folder:
             rule = "must be null with photos_are=lr, the default, because the photos are the LR images"
             refuse("data.views.lr_folder", rule, self.lr_folder, "data.views.photos_are=hr")
@@ -114,6 +118,14 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     require_source(cloud, capture.points)
     train = tuple(_view(frame, capture, views, prior, lr_files, required=True) for frame in train_frames)
     test = tuple(_view(frame, capture, views, prior, lr_files, required=False) for frame in test_frames)
+    moved = {}
+    if views.back_projection:
+        before = _disagreement(train, views.downsample)
+        train, test = (tuple(_agreeing(view, views) for view in part) for part in (train, test))
+        after = _disagreement(train, views.downsample)
+        moved["back-projection"] = (
+            f"SR images differed from the LR photos by {before:.2f} grey levels, now by {after:.2f}"
+        )
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
     initial = initial_points(
         cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, sfm_is_train=not held_out,
@@ -141,6 +153,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         "sizes": f"photos of {_size(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
         "LR": f"{_size(sample.lr.camera)}, {made}",
         "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), SR images: {sample.sr_source}",
+        **moved,
         **({} if network is None else {"SR network": f"{fingerprint(network)} (SHA-256)"}),
         "the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic, on average",
         "initial points": f"{len(points):,}: {points.source}",
@@ -283,6 +296,18 @@ def _view(
         bicubic = Bicubic()
         sr, sr_source = bicubic(frame.name, lr.image, views.sr_scale), bicubic.label
     return View(frame.name, lr, Photo(hr_camera, sr), truth=truth, sr_source=sr_source)
+
+
+def _agreeing(view: View, views: ViewSettings) -> View:
+    """The view, its SR image back-projected to its LR photo."""
+    sr = images.back_projected(view.hr.image, view.lr.image, view.factor, views.back_projection, views.downsample)
+    return replace(view, hr=Photo(view.hr.camera, images.quantize(sr)))
+
+
+def _disagreement(views: Sequence[View], down: DownKernel) -> float:
+    """Mean |D(I_HR) - I_LR| in grey levels of 255."""
+    means = [float((images.downsample(v.hr.image, v.factor, down) - v.lr.image).abs().mean()) for v in views]
+    return 255 * sum(means) / len(means)
 
 
 def _reduced(frame: Frame, views: ViewSettings) -> Photo:

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from clear_strategies.core import images
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.points import CloudSettings
@@ -217,3 +218,19 @@ def test_the_detail_of_sr_images_is_measured(caplog):
     levels, log = added(lambda capture: DemoPrior({f.name: f.load for f in capture.frames}), caplog)
     assert levels > 1
     assert "no detail" not in log
+
+
+def test_back_projected_sr_images_shrink_to_the_photos():
+    capture = demo.read(width=64, height=48, views=5, train=2)
+    prior = DemoPrior({f.name: f.load for f in capture.frames}, share=1.0, patch=16)
+
+    def disagreement(rounds: int) -> tuple[float, str | None]:
+        scene = prepare(capture, papers(train=2, back_projection=rounds), prior, POINTS)
+        differences = [images.downsample(v.hr.image, v.factor) - v.lr.image for v in (*scene.train, *scene.test)]
+        return max(float(d.abs().mean()) for d in differences), scene.notes.get("back-projection")
+
+    assert disagreement(0)[1] is None
+    moved, said = disagreement(10)
+    assert moved < 0.2 * disagreement(0)[0]
+    assert said is not None
+    assert said.startswith("SR images differed from the LR photos by ")

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.view import DepthMap, Photo, View
-from clear_strategies.data.priors.corrupted import back_projected
 from tests.helpers.planes import camera
 
 FACTOR, PATCH, WIDTH, HEIGHT = 4, 8, 48, 32  # LR px; 6 x 4 patches
@@ -53,5 +52,5 @@ def with_invention(views: list[View], which: int, row: int, column: int) -> list
     hr[box] = (hr - detail + detail.flip(0, 1))[box]
     touched = torch.zeros_like(hr[..., :1])
     touched[box] = 1
-    hr = images.quantize(back_projected(hr, view.hr.image, touched, FACTOR))
+    hr = images.quantize(images.back_projected(hr, view.lr.image, FACTOR, 20, where=touched))
     return [*views[:which], replace(view, hr=Photo(view.hr.camera, hr)), *views[which + 1 :]]

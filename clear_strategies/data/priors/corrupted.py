@@ -14,7 +14,6 @@ from typing import Final
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -78,7 +77,9 @@ class SeededErrors:
             box = (slice(top, top + self.patch), slice(left, left + self.patch))
             result[box] += self.strength * (errors[kind][box] + (shade.to(image) if kind == len(errors) - 1 else 0))
             touched[box] = 1
-        return images.quantize(back_projected(result, image, touched, factor) if self.hidden else result)
+        if self.hidden:
+            result = images.back_projected(result, images.downsample(image, factor), factor, _ROUNDS, where=touched)
+        return images.quantize(result)
 
     def wrong(self, height: int, width: int, factor: int, name: str) -> Bool[Tensor, "ph pw"]:
         """Which patches of the image called `name` have errors; height and width are its HR pixels."""
@@ -100,22 +101,6 @@ class SeededErrors:
             for which in chosen
         ]
         return shift.tolist(), wrong
-
-
-def back_projected(
-    result: Float[Tensor, "H W 3"], image: Float[Tensor, "H W 3"], touched: Float[Tensor, "H W 1"], factor: int
-) -> Float[Tensor, "H W 3"]:
-    """`result` moved, where it was touched, until it shrinks to the LR pixels of `image` (iterated back-projection)."""
-
-    def resized(values: Tensor, scale: float) -> Tensor:
-        batch = values.permute(2, 0, 1)[None]
-        return F.interpolate(batch, scale_factor=scale, mode="bicubic", antialias=True, align_corners=False)[0].permute(
-            1, 2, 0
-        )
-
-    for _ in range(_ROUNDS):
-        result = result + touched * resized(resized(image - result, 1 / factor), factor)
-    return result
 
 
 @dataclass(frozen=True, slots=True)
