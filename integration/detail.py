@@ -11,7 +11,7 @@ from torch import Tensor
 
 from clear_strategies.training.optim import LearningRates
 from integration.errors import HostError
-from integration.lineage import COMPARED, Change, find_change
+from integration.lineage import Change, Lineage
 from rasterizers.geometry import SH_C0
 
 
@@ -42,14 +42,14 @@ class DetailFeature:
     Its rows follow the host's Gaussians.
 
     Args:
-        params: returns the host's current leaves, by gsplat's names.
+        means: returns the host's current positions.
+        lineage: finds the host's changes of structure.
     """
 
-    def __init__(self, params: Callable[[], Mapping[str, Tensor]]) -> None:
-        self._params = params
-        self._known = self._compared()
+    def __init__(self, means: Callable[[], Tensor], lineage: Lineage) -> None:
+        self._means, self._lineage = means, lineage
         self._parents: Int[Tensor, " M"] | None = None  # since the last `poll_parents`
-        self._value = torch.nn.Parameter(torch.zeros_like(self._known["means"], requires_grad=False))
+        self._value = torch.nn.Parameter(torch.zeros_like(means(), requires_grad=False))
         self._adam = detail_adam(self._value)
 
     @property
@@ -98,8 +98,9 @@ class DetailFeature:
         Raises:
             HostError: the state holds another number of Gaussians.
         """
-        self._known, self._parents = self._compared(), None
-        means = self._known["means"]
+        self._lineage.restart()
+        self._parents = None
+        means = self._means()
         if len(state["value"]) != len(means):
             raise HostError(
                 f"the checkpoint holds f_det of {len(state['value']):,} Gaussians, but {len(means):,} Gaussians were loaded. "
@@ -109,28 +110,20 @@ class DetailFeature:
         self._adam = detail_adam(self._value)
         self._adam.load_state_dict(state["adam"])
 
-    def _compared(self) -> dict[str, Tensor]:
-        params = self._params()
-        return {name: params[name] for name in COMPARED}
-
     @torch.no_grad()
     def _follow_host(self) -> None:
         """Apply a change of the host's structure to f_det, and add it to the parents to report."""
-        now = self._compared()
-        if now["means"] is self._known["means"]:
-            if len(now["means"]) != len(self._value):
-                raise HostError(
-                    f"the host changed the number of Gaussians from {len(self._value):,} to {len(now['means']):,} inside "
-                    "its parameters. A changed set must be a new parameter, as in 3DGS."
-                )
-            return
-        before, self._known = self._known, now
-        change = find_change(before, now)
+        change = self._lineage.poll()
         if change is not None:
             self._gather(change)
             earlier = self._parents
             parents = change.parents if earlier is None else earlier[change.parents.clamp_min(0)]
             self._parents = torch.where(change.parents < 0, -1, parents)
+        if len(now := self._means()) != len(self._value):
+            raise HostError(
+                f"the host changed the number of Gaussians from {len(self._value):,} to {len(now):,} inside its parameters. A "
+                "changed set must be a new parameter, as in 3DGS."
+            )
 
     def _gather(self, change: Change) -> None:
         """Give each row its parent's f_det, or 0 without a parent; only old rows keep their Adam moments."""

@@ -31,6 +31,7 @@ from integration.errors import HostError
 from integration.host_score import warn_if_score_is_unused
 from integration.log import show_log
 from integration.model_proxy import ModelRenderer, Role, enlarged_camera
+from integration.rows import ROWS, RowNumbers
 from integration.views import sr_images, sr_source, view
 
 _log = logging.getLogger(__name__)
@@ -123,7 +124,7 @@ class Attached:
         end_with_strategies(self._conductor, density, "densify_until_iter")
         self._views: dict[str, View] = {}
         self._masks: dict[str, Tensor | None] = {}
-        self._photo: str | None = None  # name of the photo, inside a training step
+        self._batch: Any = None  # the host's, inside a training step
         self._resumed: Mapping[str, Any] = {}
         self._sh0_holds_detail = False  # while the host writes its files
         self.attachment: Attachment | None = None
@@ -144,7 +145,7 @@ class Attached:
             raise HostError(
                 f"the Gaussians have no {missing[0]}, as those of a VanillaGaussian have. Use a model with spherical harmonics."
             )
-        self._detail = DetailFeature(self._host_params)
+        self._detail = DetailFeature(lambda: self._host_params()["means"], self._carry_rows())
         self._renderer = ModelRenderer(
             module.gaussian_model, _ROLES, self._host_params, self._detail if settings.detail else None, self._conductor
         )
@@ -161,6 +162,13 @@ class Attached:
             _log.warning("resumed at step %d from a checkpoint without CLEAR: f_det starts from zero.", steps_done)
             attachment.t = steps_done + 1
         return attachment
+
+    def _carry_rows(self) -> RowNumbers:
+        """Row numbers as one more property that is not trained, which the host's controllers gather with the others."""
+        model = self._module.gaussian_model
+        names = model.get_property_names
+        model.get_property_names = lambda: (*names(), ROWS)
+        return RowNumbers(model.gaussians, lambda: self._host_params()["means"])
 
     def _host_params(self) -> dict[str, Tensor]:
         gaussians = self._module.gaussian_model.gaussians
@@ -182,30 +190,34 @@ class Attached:
             self._masks[name] = shown
 
     def _training_step(self, original: Callable[..., Any], batch: Any, *args: Any, **kwargs: Any) -> Any:
-        _, (name, _, _), _ = batch
         if self.attachment is None:
             self.attachment = self._attach()
-        self._photo = name
+        self._batch = batch
         try:
             return original(batch, *args, **kwargs)
         finally:
-            self._photo = None
+            self._batch = None
 
     def _forward(self, original: Callable[..., Any], camera: Any, *args: Any, **kwargs: Any) -> Any:
         """Both scales in a training step; f_base + f_det in any other rendering."""
         if self.attachment is None:
             return original(camera, *args, **kwargs)
-        if self._photo is None or not self._module.training:
+        if self._batch is None or not self._module.training:
             with self._using(self._renderer.with_detail()):
                 return original(camera, *args, **kwargs)
-        current, mask = self._views[self._photo], self._masks[self._photo]
+        _, photo, extra = self._batch
+        current, mask = self._views[photo[0]], self._masks[photo[0]]
 
         def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
-            sized = enlarged_camera(camera, current.factor) if resolution == "hr" else camera
+            hr = resolution == "hr"
+            sized = enlarged_camera(camera, current.factor) if hr else camera
 
             def render(model: Any) -> Any:
                 with self._using(model):
-                    return original(sized, *args, **kwargs)
+                    result = original(sized, *args, **kwargs)
+                if hr:  # at LR the host itself applies its exposure, bilateral grid …
+                    self._module.output_processor.training_forward((sized, photo, extra), result)
+                return result
 
             return self._renderer.render(render, current, resolution, gate, _to_pixels, mask)
 

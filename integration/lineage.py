@@ -1,15 +1,16 @@
-"""Which Gaussian came from which, for hosts that do not say.
+"""Which Gaussian came from which.
 
-Such a host replaces its parameters when it clones, splits or prunes. The replaced parameters hold the values of the last
-step, and every new row is a copy of an old row except for position, scale and opacity. A comparison of both sets therefore
-finds the change, whatever functions of the host made it.
+Hosts that gather every entry of their parameters carry row numbers, see rows.py. Others do not say. Such a host replaces its
+parameters when it clones, splits or prunes. The replaced parameters hold the values of the last step, and every new row is a
+copy of an old row except for position, scale and opacity. A comparison of both sets therefore finds the change, whatever
+functions of the host made it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -32,6 +33,57 @@ class Change:
 
     parents: Int[Tensor, " M"]
     fresh: Bool[Tensor, " M"]
+
+
+class Lineage(Protocol):
+    """What follows a host's changes of structure."""
+
+    def poll(self) -> Change | None:
+        """The change since the last call; None: there was none."""
+        ...
+
+    def restart(self) -> None:
+        """The host has loaded other parameters, which come from no earlier ones."""
+        ...
+
+
+class MatchedRows:
+    """The lineage of a host that does not say, by its parameters' values.
+
+    Args:
+        params: returns the host's current leaves, by gsplat's names.
+    """
+
+    def __init__(self, params: Callable[[], Mapping[str, Tensor]]) -> None:
+        self._params = params
+        self.restart()
+
+    def restart(self) -> None:
+        self._known = self._compared()
+
+    def poll(self) -> Change | None:
+        now = self._compared()
+        if now["means"] is self._known["means"]:
+            return None
+        before, self._known = self._known, now
+        return find_change(before, now)
+
+    def _compared(self) -> dict[str, Tensor]:
+        params = self._params()
+        return {name: params[name] for name in COMPARED}
+
+
+def change_of(parents: Int[Tensor, " M"], n: int) -> Change | None:
+    """The change of N Gaussians that made row i from row parents[i]; None: the rows are the same.
+
+    Of the rows with one parent, that at its parent's place is the old Gaussian, else the first.
+    """
+    rows = torch.arange(len(parents), device=parents.device)
+    if len(parents) == n and bool((parents == rows).all()):
+        return None
+    place = torch.where(parents == rows, rows - len(parents), rows)  # < 0: it has kept its place
+    first = torch.full((n,), len(parents), device=parents.device).scatter_reduce(0, parents, place, "amin")
+    return Change(parents, first[parents] != place)
 
 
 def find_change(before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> Change | None:

@@ -57,7 +57,7 @@ def main(iterations: int, strategies: str | None) -> float:
         views = [
             view(n, p.image, p.camera.world_to_camera, intrinsics(p.camera)[0], sr) for n, p in photos.items()
         ]  # +
-        clear = attach(splats, optimizers, views, clear_conductor, strategy=strategy, state=state)  # +
+        clear = attach(splats, optimizers, views, clear_conductor, strategy=strategy)  # +
         rasterization = clear.wrap(rasterization)  # +
 
     def render(camera: Camera) -> tuple[Tensor, dict[str, Any]]:

@@ -4,7 +4,7 @@
 
 none (`python -m integration.gsplat --sr sr_x4 simple_trainer.py default --data_dir data`), or two in a loop of your own:
 
-    clear = attach(splats, optimizers, views, conductor, strategy=strategy, state=strategy_state)
+    clear = attach(splats, optimizers, views, conductor, strategy=strategy)
     rasterization = clear.wrap(rasterization)
 
 The names, shapes and order of calls that `attach` relies on are those of gsplat 1.4 (radii [C, N]) and later (radii [C, N, 2]).
@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from integration.gsplat.attached import ROWS, Attached, attach
+from integration.gsplat.attached import Attached, attach
 from integration.gsplat.data import save_lr, views_from_dataset
 
 if TYPE_CHECKING:
     from integration.gsplat.simple_trainer import install
 
-__all__ = ["ROWS", "Attached", "attach", "install", "save_lr", "views_from_dataset"]
+__all__ = ["Attached", "attach", "install", "save_lr", "views_from_dataset"]
 
 
 def __getattr__(name: str) -> Any:

@@ -21,12 +21,9 @@ from integration.detail import detail_adam, sh0_offset
 from integration.errors import HostError
 from integration.host_score import warn_if_score_is_unused
 from integration.replacing import Replaced
+from integration.rows import RowNumbers
 from integration.views import enlarged_mask
 from rasterizers.geometry import SH_C0
-
-ROWS: Final = "clear_rows"
-"""Key in a gsplat strategy's `state`: the row of each Gaussian before the structure last changed. gsplat gathers every tensor
-of the state together with the parameters, so this tensor becomes the map of the change."""
 
 _PARAMETERS: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _ATTACHED: Final = "clear_attached"  # attribute of a wrapped function: its Attached
@@ -41,8 +38,8 @@ class Attached:
     Args:
         params: gsplat's dict of leaves. optimizers: one for each of them.
         views: all training views. A rendering is that of the view named by `rendering`, else of the one with its pose.
-        strategy, state: gsplat's densification strategy and its state. The strategy's threshold scales P2G's score, and
-            the state records every change of structure. None: a loop without densification.
+        strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one.
+        state: of gsplat 1.4's strategy, in which every change of structure is recorded; later versions record it in `params`.
         detail: add the detail feature f_det as `params["detail"]`, with an Adam of its own. gsplat's strategies clone,
             split and prune it like any other parameter.
         names: gsplat's parameter name -> the host's, where they differ (nerfstudio: sh0 is features_dc).
@@ -82,9 +79,11 @@ class Attached:
         if detail and "detail" not in params:
             params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
             optimizers["detail"] = detail_adam(params["detail"])
-        self._state = state
-        self._unchanged_rows: Tensor | None = None
-        self._number_rows()
+        self._rows = RowNumbers(
+            params if state is None else state,
+            lambda: self._params[self._host_name("means")],
+            as_parameter=state is None,
+        )
         self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).to(means)
         self._masks = dict(masks or {})
         self._named: View | None = None  # by `rendering`
@@ -92,7 +91,7 @@ class Attached:
         require_end(conductor, _refine_stop(strategy), "refine_stop_iter", first=0)
         self.attachment = Attachment(
             conductor, self.params, n_views=len(self._views), seed=seed, loss_scale=loss_scale, accumulation=accumulation,
-            poll_parents=None if state is None else self._poll_parents, threshold=_threshold(strategy, conductor),
+            poll_parents=self._poll_parents, threshold=_threshold(strategy, conductor),
         )  # fmt: skip
         self._hook = optimizers[self._host_name("means")].register_step_pre_hook(
             lambda *_: self.attachment.before_step()
@@ -166,30 +165,14 @@ class Attached:
         for replaced in self._replaced:
             replaced.undo()
         self._replaced.clear()
-        if self._state is not None:
-            self._state.pop(ROWS, None)
+        self._rows.remove()
 
     def _host_name(self, name: str) -> str:
         return self._names.get(name) or name
 
     def _poll_parents(self) -> Int[Tensor, " M"] | None:
-        """parents[M] of the changes since the last call; None: there were none."""
-        if self._state is None or self._state[ROWS] is self._unchanged_rows:
-            return None
-        rows: Tensor = self._state[ROWS]
-        if bool((rows == 0).any()) and (state := self.attachment.conductor.state_dict()):
-            raise HostError(
-                "MCMC added Gaussians and gsplat does not say where they come from, but "
-                f"{', '.join(state)} is stored per Gaussian. End MCMC (refine_stop_iter) before SVS's anchor_start."
-            )
-        self._number_rows()
-        return (rows - 1).clamp_min(0)
-
-    def _number_rows(self) -> None:
-        """Store the row of each Gaussian, from 1: gsplat's operations write 0 where the origin is unknown."""
-        if self._state is not None:
-            means = self._params[self._host_name("means")]
-            self._unchanged_rows = self._state[ROWS] = torch.arange(1, len(means) + 1, device=means.device)
+        change = self._rows.poll()
+        return None if change is None else change.parents
 
     def _find_view(self, viewmats: Float[Tensor, "*C 4 4"]) -> View | None:
         poses = viewmats.detach().reshape(-1, 4, 4)

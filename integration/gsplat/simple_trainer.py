@@ -29,6 +29,7 @@ _NEEDED: Final = {
     "batch_size": (1, "gradients of one view are merged per step"),
     "patch_size": (None, "SR images have the size of whole photos"),
     "sparse_grad": (False, "the gradients of all Gaussians are merged"),
+    "visible_adam": (False, "at HR other Gaussians are visible than at LR"),
     "app_opt": (False, "its colours are no spherical harmonics"),
     "random_bkgd": (False, "the background is composed after rendering, at one scale only"),
     "use_bilateral_grid": (False, "it changes the colours of one scale only"),
@@ -117,8 +118,8 @@ class _Installed:
         rendering = sys.modules["gsplat.rendering"]
         self.views, self._splats = views, runner.splats
         self.attached = Attached(
-            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, state=runner.strategy_state,
-            seed=seed, masks=masks_from_dataset(runner.trainset),
+            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=seed,
+            masks=masks_from_dataset(runner.trainset),
         )  # fmt: skip
         self.attached.replace_everywhere(rendering.rasterization)
         export = getattr(sys.modules["gsplat"], "export_splats", None)

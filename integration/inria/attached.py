@@ -17,6 +17,7 @@ from integration.detail import DetailFeature
 from integration.errors import HostError
 from integration.host_score import warn_if_score_is_unused
 from integration.inria.cameras import HostView, HostViews
+from integration.lineage import MatchedRows
 from integration.model_proxy import ModelRenderer, Role, enlarged_camera
 from integration.replacing import Replaced
 from integration.views import SuperResolve, sr_source
@@ -88,7 +89,7 @@ class Attached:
         warn_if_score_is_unused(conductor, gaussians, threshold)
         self._model, self._conductor = gaussians, conductor
         self.views = HostViews(cameras, *sr_source(sr, conductor, factor), gaussians._xyz.device)
-        self._detail = DetailFeature(self._host_params)
+        self._detail = DetailFeature(lambda: gaussians._xyz, MatchedRows(self._host_params))
         self._renderer = ModelRenderer(
             gaussians, _ROLES, self._host_params, self._detail if detail else None, conductor
         )

@@ -8,107 +8,34 @@ skipped. Their CUDA modules are replaced by tests/hosts/cpu. plyfile, torchmetri
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
-from pathlib import Path
 
-import numpy as np
 import pytest
 
-from clear_strategies.core import images
-from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import read_gaussians
-from tests.helpers import toy
+from tests.helpers.real_hosts import FROM_START, checkout, run
 
-ROOT = Path(__file__).resolve().parents[2]
-CPU = Path(__file__).parent / "cpu"
 HOSTS = {
     "3dgs": ["--disable_viewer"],
     "mip-splatting": [],
-    "dropgaussian": ["-r", "1", "--n_views", "3"],
-    "fsgs": [
-        "-r",
-        "1",
-        "--n_views",
-        "3",
-        "--images",
-        "images",
-        "--start_sample_pseudo",
-        "10",
-        "--sample_pseudo_interval",
-        "5",
-    ],
+    "dropgaussian": ["-r=1", "--n_views=3"],
+    "fsgs": ["-r=1", "--n_views=3", "--images=images", "--start_sample_pseudo=10", "--sample_pseudo_interval=5"],
 }
 TRAINING = {
     "iterations": 30, "densify_from_iter": 5, "densification_interval": 5, "densify_until_iter": 25, "test_iterations": 30,
     "checkpoint_iterations": 20, "densify_grad_threshold": 1e-5,
 }  # fmt: skip
-FROM_START = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
 SETUP = "    gaussians.training_setup(opt)\n"
 
 
 @pytest.fixture(params=HOSTS)
 def host(request):
-    folder = Path(os.environ.get("CLEAR_HOSTS", "")) / request.param
-    if "CLEAR_HOSTS" not in os.environ or not (folder / "train.py").is_file():
-        pytest.skip(f"needs a checkout of {request.param} in CLEAR_HOSTS")
-    return folder.resolve()
-
-
-@pytest.fixture
-def scene(tmp_path):
-    """The toy scene as COLMAP text; the test view is the first, as the trainers' rule of every eighth photo wants it."""
-    made = toy.scene(60)
-    c = made.train[0].lr.camera
-    lines = []
-    for i, view in enumerate([made.test[0], *made.train]):
-        name, pose = f"{'ab'[i > 0]}{i}.png", view.lr.camera.world_to_camera
-        half = np.arctan2(float(pose[0, 2]), float(pose[0, 0])) / 2  # the toy's cameras turn about y
-        numbers = (np.cos(half), 0, np.sin(half), 0, *pose[:3, 3].tolist())
-        lines += [f"{i + 1} {' '.join(map(str, numbers))} 1 {name}", ""]
-        write_png(tmp_path / "images" / name, images.quantize(view.lr.image))
-        write_png(tmp_path / "sr" / name, images.quantize(view.hr.image))
-    points = list(zip(made.cloud.means.tolist(), (made.cloud.colors * 255).int().tolist(), strict=True))
-    sparse, dense = tmp_path / "sparse" / "0", tmp_path / "3_views" / "dense"
-    for folder in (sparse, dense):
-        folder.mkdir(parents=True)
-    (sparse / "cameras.txt").write_text(f"1 PINHOLE {c.width} {c.height} {c.fx} {c.fy} {c.cx} {c.cy}\n")
-    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
-    (sparse / "test.txt").write_text("a0.png\n")
-    rows = [f"{i} {words(x)} {words(rgb)} 0" for i, (x, rgb) in enumerate(points)]
-    (sparse / "points3D.txt").write_text("\n".join(rows) + "\n")
-    properties = [f"property float {n}" for n in ("x", "y", "z", "nx", "ny", "nz")]
-    properties += [f"property uchar {n}" for n in ("red", "green", "blue")]
-    header = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *properties, "end_header"]
-    body = [f"{words(x)} 0 0 0 {words(rgb)}" for x, rgb in points]
-    (dense / "fused.ply").write_text("\n".join([*header, *body]) + "\n")
-    np.save(tmp_path / "poses_bounds.npy", np.tile([*[0.0] * 15, 2.0, 6.0], (4, 1)))
-    return tmp_path
-
-
-def words(values):
-    return " ".join(map(str, values))
+    return checkout(request.param, "train.py")
 
 
 def training(host, **more):
     """The trainer's options."""
     return [*HOSTS[host.name], "--eval", *(f"--{name}={value}" for name, value in (TRAINING | more).items())]
-
-
-def run(host, *command):
-    """The output of a Python program in the host's folder; the exit status must be 0."""
-    environment = {
-        **os.environ, "HOST": host.name, "OMP_NUM_THREADS": "1",
-        "PYTHONPATH": os.pathsep.join([str(CPU), str(ROOT), os.environ.get("PYTHONPATH", "")]),
-    }  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, *map(str, command)], cwd=host, env=environment, capture_output=True, text=True, timeout=1_800,
-        check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-2_000:] + done.stderr[-4_000:]
-    return done.stdout + done.stderr
 
 
 def launched(host, scene, model, **more):

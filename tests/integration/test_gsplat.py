@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import pytest
 import torch
 
 import rasterizers
-from clear_strategies import GCO, P2G, SVS, Conductor, Objective, Strategy
+from clear_strategies import GCO, P2G, SVS, Conductor, Objective
 from clear_strategies.core.view import Photo, View
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.errors import SettingError
@@ -21,7 +21,8 @@ from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from integration import HostError
-from integration.gsplat import ROWS, attach
+from integration.gsplat import attach
+from integration.rows import ROWS
 from rasterizers import Splats, autograd
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
@@ -332,16 +333,6 @@ def leaves_of(splats):
     return {k: getattr(splats, k) for k in ("means", "quats", "scales", "opacities", "sh0", "shN")}
 
 
-@dataclass(frozen=True)
-class Recorder(Strategy):
-    """Records every change of structure."""
-
-    changes: list = field(default_factory=list)
-
-    def on_resize(self, parents):
-        self.changes.append(parents)
-
-
 class TestWithGsplat:
     """gsplat's own strategies."""
 
@@ -363,7 +354,7 @@ class TestWithGsplat:
         strategy = self.strategy(**settings)
         host = Host(scene, extent=4.0, strategy=strategy)
         objective = Objective(lambda_hr=HR_FROM_START)
-        clear = attached(host, scene, Conductor(*strategies, objective=objective), strategy=strategy, state=host.state)
+        clear = attached(host, scene, Conductor(*strategies, objective=objective), strategy=strategy)
         host.train([scene.train[i % 3].name for i in range(steps)])
         return host, clear
 
@@ -372,24 +363,11 @@ class TestWithGsplat:
         n = len(host.splats["means"])
         assert n > 40
         assert {len(p) for p in host.splats.values()} == {n}
-        assert len(host.state[ROWS]) == n
+        assert len(host.splats[ROWS]) == n
         assert clear.attachment.counts["structure changes"] >= 3
         assert clear.attachment.counts["scores written"] == 30
         assert clear.attachment.counts["merges"] == 30
         assert float(host.splats["detail"].abs().max()) > 0
-
-    def test_parents_are_where_each_gaussian_came_from(self, attached):
-        torch.manual_seed(0)
-        scene, strategy, recorder = toy.scene(40), self.strategy(), Recorder()
-        host = Host(scene, extent=4.0, strategy=strategy)
-        attached(host, scene, Conductor(recorder), strategy=strategy, state=host.state)
-        colors = host.splats["sh0"].detach().clone()
-        host.optimizers["sh0"].param_groups[0]["lr"] = 0.0  # colours stay, so that they identify Gaussians
-        host.train([scene.train[i % 3].name for i in range(30)])
-        assert len(recorder.changes) >= 3
-        for parents in recorder.changes:
-            colors = colors[parents]
-        assert torch.equal(colors, host.splats["sh0"].detach())
 
     def test_as_many_densify_by_the_score_as_by_the_ordinary_statistic(self, attached):
         counts = {}

@@ -123,6 +123,11 @@ def test_each_strategy_alone_changes_what_it_should(host, sr):
     assert 5 <= int((dropped & (plain["means"].abs().sum(1) > 0)).sum()) <= N - 5
 
 
+def test_the_hosts_exposure_is_applied_at_both_scales(host, sr):
+    module = fitted(host, host.controller(strategies="baseline", sr=sr, suffix="_x4", overrides=HR_FROM_START[:2]), 1)
+    assert module.output_processor.sizes == [96, 24]
+
+
 def test_without_hr_no_sr_images_are_needed(host):
     off = ["objective.lambda_hr.peak=0", "objective.lambda_hr.final=0"]
     module = fitted(host, host.controller(strategies="svs", overrides=off), 3)

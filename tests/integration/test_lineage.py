@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from integration.lineage import find_change
+from integration.lineage import change_of, find_change
 
 
 def gaussians(*x, colours=None, rotation=0.0):
@@ -39,3 +39,12 @@ def test_empty_sets_can_be_compared():
     empty = {name: tensor[:0] for name, tensor in gaussians(1.0).items()}
     assert find_change(empty, gaussians(1.0)).parents.tolist() == [-1]
     assert find_change(gaussians(1.0), empty).parents.tolist() == []
+
+
+def test_of_rows_with_one_parent_the_one_that_kept_its_place_is_the_old_gaussian():
+    relocated = change_of(torch.tensor([2, 1, 2, 3]), 4)  # row 0 was moved onto 2
+    assert relocated.fresh.tolist() == [True, False, False, False]
+    pruned_and_split = change_of(torch.tensor([1, 3, 3]), 4)
+    assert pruned_and_split.fresh.tolist() == [False, False, True]
+    assert change_of(torch.arange(4), 4) is None
+    assert change_of(torch.arange(3), 4).fresh.tolist() == [False, False, False]

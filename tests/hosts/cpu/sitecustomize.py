@@ -4,11 +4,11 @@ Only for the programs that tests/hosts starts.
 """
 
 import functools
-import importlib.machinery
-import importlib.util
+import os
 import sys
 import types
 
+import absent  # noqa: F401
 import torch
 from torch.overrides import TorchFunctionMode
 
@@ -71,20 +71,7 @@ class Transforms:
 torch.hub.load = lambda repository, name, *_, **__: Transforms() if name == "transforms" else Midas()
 
 
-class Absent(types.ModuleType):
-    """A module whose every name is a function that does nothing."""
-
-    def __getattr__(self, name):
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return lambda *_, **__: None
-
-
-if importlib.util.find_spec("torchvision") is None:  # the trainers write pictures by it
-    parts = {name: Absent(f"torchvision.{name}") for name in ("utils", "models", "transforms")}
-    sys.modules["torchvision"] = torchvision = Absent("torchvision")
-    for name, part in parts.items():
-        sys.modules[f"torchvision.{name}"] = part
-        setattr(torchvision, name, part)
-    for module in (torchvision, *parts.values()):
-        module.__spec__ = importlib.machinery.ModuleSpec(module.__name__, None)
+if os.environ["HOST"].startswith(("gsplat", "lightning")):
+    import no_lpips  # noqa: F401
+if os.environ["HOST"].startswith("gsplat"):
+    import gsplat_cpu  # noqa: F401

@@ -11,6 +11,7 @@ from clear_strategies.training.field import GaussianField
 from rasterizers import Camera as Pinhole
 from rasterizers import Splats, autograd, load
 
+NAMES = {"means": "means", "shs_dc": "sh0", "shs_rest": "shN", "scales": "scales", "rotations": "quats"}
 RASTERIZER = load("torch", near=0.01, kernel=0.3, antialiased=False)
 
 
@@ -31,10 +32,21 @@ class VanillaGaussianModel(torch.nn.Module):
     def __init__(self, cloud):
         super().__init__()
         raw = GaussianField.from_cloud(cloud).raw()
-        names = {"means": "means", "shs_dc": "sh0", "shs_rest": "shN", "scales": "scales", "rotations": "quats"}
-        self.gaussians = torch.nn.ParameterDict({k: torch.nn.Parameter(raw[v].clone()) for k, v in names.items()})
+        self.gaussians = torch.nn.ParameterDict({k: torch.nn.Parameter(raw[v].clone()) for k, v in NAMES.items()})
         self.gaussians["opacities"] = torch.nn.Parameter(raw["opacities"][:, None].clone())
         self.active_sh_degree = 3
+
+    def get_property_names(self):
+        return (*NAMES, "opacities")
+
+    @property
+    def properties(self):
+        return {name: self.gaussians[name] for name in self.get_property_names()}
+
+    @properties.setter
+    def properties(self, properties):
+        for name in self.get_property_names():
+            self.gaussians[name] = properties[name]
 
     @property
     def n_gaussians(self):
@@ -83,11 +95,22 @@ class Renderer(torch.nn.Module):
         return self(viewpoint_camera=viewpoint_camera, pc=pc, bg_color=bg_color, scaling_modifier=scaling_modifier)
 
 
+class Exposure:
+    """Multiplies the image of a training step by a brightness."""
+
+    def __init__(self):
+        self.brightness, self.sizes = torch.tensor(1.0), []
+
+    def training_forward(self, batch, outputs):
+        self.sizes.append(int(batch[0].width))
+        outputs["render"] = outputs["render"] * self.brightness
+
+
 class GaussianSplatting(torch.nn.Module):
     def __init__(self, cloud, density, renderer):
         super().__init__()
         self.gaussian_model, self.renderer = VanillaGaussianModel(cloud), renderer
-        self.density_controller = density.instantiate()
+        self.density_controller, self.output_processor = density.instantiate(), Exposure()
         self.hparams = {
             "renderer": renderer,
             "density": density,
@@ -108,6 +131,7 @@ class GaussianSplatting(torch.nn.Module):
         for optimizer in self.gaussian_optimizers:
             optimizer.zero_grad(set_to_none=True)
         outputs = self(camera)
+        self.output_processor.training_forward(batch, outputs)
         metrics, prog_bar = {}, {}
         for hook in self.extra_train_metrics:
             hook(outputs, batch, self.gaussian_model, global_step, self, metrics, prog_bar)
@@ -119,7 +143,7 @@ class GaussianSplatting(torch.nn.Module):
         image = outputs["render"].permute(1, 2, 0)
         loss = losses.photometric(image.detach(), gt_image.permute(1, 2, 0), 0.2, kernels="torch")
         (image * loss.gradient).sum().backward()
-        self.grads = {k: p.grad for k, p in self.gaussian_model.gaussians.items()}
+        self.grads = {k: p.grad for k, p in self.gaussian_model.gaussians.items() if p.requires_grad}
         self.points = outputs["viewspace_points"]
         self.density_controller.after_backward(*arguments)
         for optimizer in self.gaussian_optimizers:

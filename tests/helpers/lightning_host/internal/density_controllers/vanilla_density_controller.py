@@ -41,16 +41,20 @@ class VanillaDensityControllerImpl(DensityControllerImpl):
             mean = (self.xyz_gradient_accum / self.denom).nan_to_num(0)
             kept = gaussian_model.get_opacities()[:, 0] > 0.005
             rows = torch.cat((kept.nonzero()[:, 0], (mean >= self.config.densify_grad_threshold).nonzero()[:, 0]))
-            old = kept.sum()
-            for optimizer in optimizers:
-                for group in optimizer.param_groups:
-                    before = group["params"][0]
-                    state = optimizer.state.pop(before, {})
-                    after = group["params"][0] = torch.nn.Parameter(before.detach()[rows])
-                    for name, moment in state.items():
-                        if moment.dim():
-                            state[name] = moment[rows]
-                            state[name][old:] = 0
-                    optimizer.state[after] = state
-                    gaussian_model.gaussians[group["name"]] = after
+            self.gather(gaussian_model, optimizers, rows, kept.sum())
             self.reset_statistics(len(rows))
+
+    def gather(self, gaussian_model, optimizers, rows, old):
+        """Every property at these rows, of which the first `old` keep their moments."""
+        changed = {k: torch.nn.Parameter(v[rows], requires_grad=False) for k, v in gaussian_model.properties.items()}
+        for optimizer in optimizers:
+            for group in optimizer.param_groups:
+                before = group["params"][0]
+                state = optimizer.state.pop(before, {})
+                after = group["params"][0] = changed[group["name"]].requires_grad_(True)
+                for name, moment in state.items():
+                    if moment.dim():
+                        state[name] = moment[rows]
+                        state[name][old:] = 0
+                optimizer.state[after] = state
+        gaussian_model.properties = changed

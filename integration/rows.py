@@ -1,0 +1,78 @@
+"""Which Gaussian came from which, in hosts that gather every entry of their parameters: numbered rows among them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, MutableMapping
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from integration.errors import HostError
+from integration.lineage import Change, change_of
+
+ROWS: Final = "clear_rows"
+"""Key of the row numbers."""
+
+
+class RowNumbers:
+    """Row numbers that clone, split, prune, relocation and MCMC's sampling gather, since they gather every entry.
+
+    Args:
+        entries: the host's parameters, which may hold one that is not trained; or the `state` of gsplat 1.4's strategies, whose
+            parameters may not.
+        means: returns the current positions.
+        as_parameter: whether the numbers must be a parameter.
+    """
+
+    def __init__(
+        self, entries: MutableMapping[str, Any] | torch.nn.ParameterDict, means: Callable[[], Tensor], *,
+        as_parameter: bool = True,
+    ) -> None:  # fmt: skip
+        self._entries: Any = entries
+        self._means, self._as_parameter = means, as_parameter
+        self._hook = (
+            entries.register_state_dict_post_hook(_leave_out) if isinstance(entries, torch.nn.ParameterDict) else None
+        )
+        self.restart()
+
+    def restart(self) -> None:
+        """Number the rows from 1: operations of gsplat 1.4 write 0 where the origin is unknown."""
+        means = self._means()
+        rows = torch.arange(1, len(means) + 1, device=means.device)
+        self._numbered = len(means)
+        self._entries[ROWS] = torch.nn.Parameter(rows, requires_grad=False) if self._as_parameter else rows
+        self._unchanged = self._entries[ROWS]
+
+    def poll(self) -> Change | None:
+        """The change since the last call; None: there was none.
+
+        Raises:
+            HostError: a densifier changed the parameters but not this one, or the origin of a row is unknown.
+        """
+        rows: Tensor = self._entries[ROWS]
+        n = len(self._means())
+        if len(rows) != n and self._as_parameter:
+            raise HostError(
+                f"the densifier changed the number of Gaussians from {len(rows):,} to {n:,} without the parameter {ROWS}. It "
+                "must treat every entry of the parameters alike."
+            )
+        if rows is self._unchanged or len(rows) != n:
+            return None
+        if bool((rows == 0).any()):
+            raise HostError("gsplat 1.4 does not say where relocated Gaussians come from. Update it to 1.5 or later.")
+        change = change_of(rows.detach() - 1, self._numbered)
+        self.restart()
+        return change
+
+    def remove(self) -> None:
+        """Take the row numbers out of the host."""
+        if ROWS in self._entries:
+            del self._entries[ROWS]
+        if self._hook is not None:
+            self._hook.remove()
+
+
+def _leave_out(_: Any, stored: dict[str, Any], prefix: str, *__: Any) -> None:
+    """A host's checkpoints hold what it trains."""
+    stored.pop(f"{prefix}{ROWS}", None)

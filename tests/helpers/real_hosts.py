@@ -1,0 +1,75 @@
+"""Checkouts of real trainers, run as programs on a CPU, and the toy scene in COLMAP's text files for them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clear_strategies.core import images
+from clear_strategies.data.photo_files import write_png
+from tests.helpers import toy
+
+ROOT = Path(__file__).resolve().parents[2]
+CPU = ROOT / "tests" / "hosts" / "cpu"
+FROM_START = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
+"""Settings of a run that is too short for the warm-up, and photos that are too small for P2G's patches."""
+
+
+def checkout(name: str, script: str) -> Path:
+    """The folder of a trainer; the test is skipped without it."""
+    folder = Path(os.environ.get("CLEAR_HOSTS", "")) / name
+    if "CLEAR_HOSTS" not in os.environ or not (folder / script).is_file():
+        pytest.skip(f"needs a checkout of {name} in CLEAR_HOSTS")
+    return folder.resolve()
+
+
+def run(host: Path, *command: object, inside: str = "", more_paths: tuple[Path, ...] = ()) -> str:
+    """The output of a Python program in the host's folder; the exit status must be 0."""
+    paths = [CPU, *more_paths, ROOT, os.environ.get("PYTHONPATH", "")]
+    environment = {
+        **os.environ, "HOST": host.name, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(map(str, paths)),
+    }  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, *map(str, command)], cwd=host / inside, env=environment, capture_output=True, text=True,
+        timeout=1_800, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2_000:] + done.stderr[-4_000:]
+    return done.stdout + done.stderr
+
+
+def write_scene(folder: Path) -> None:
+    """The toy scene as COLMAP text; the test view is the first, as the trainers' rule of every eighth photo wants it."""
+    made = toy.scene(60)
+    c = made.train[0].lr.camera
+    lines = []
+    for i, view in enumerate([made.test[0], *made.train]):
+        name, pose = f"{'ab'[i > 0]}{i}.png", view.lr.camera.world_to_camera
+        half = np.arctan2(float(pose[0, 2]), float(pose[0, 0])) / 2  # the toy's cameras turn about y
+        numbers = (np.cos(half), 0, np.sin(half), 0, *pose[:3, 3].tolist())
+        lines += [f"{i + 1} {' '.join(map(str, numbers))} 1 {name}", ""]
+        write_png(folder / "images" / name, images.quantize(view.lr.image))
+        write_png(folder / "sr" / name, images.quantize(view.hr.image))
+    points = list(zip(made.cloud.means.tolist(), (made.cloud.colors * 255).int().tolist(), strict=True))
+    sparse, dense = folder / "sparse" / "0", folder / "3_views" / "dense"
+    for part in (sparse, dense):
+        part.mkdir(parents=True)
+    (sparse / "cameras.txt").write_text(f"1 PINHOLE {c.width} {c.height} {c.fx} {c.fy} {c.cx} {c.cy}\n")
+    (sparse / "images.txt").write_text("\n".join(lines) + "\n")
+    (sparse / "test.txt").write_text("a0.png\n")
+    rows = [f"{i} {_words(x)} {_words(rgb)} 0" for i, (x, rgb) in enumerate(points)]
+    (sparse / "points3D.txt").write_text("\n".join(rows) + "\n")
+    properties = [f"property float {n}" for n in ("x", "y", "z", "nx", "ny", "nz")]
+    properties += [f"property uchar {n}" for n in ("red", "green", "blue")]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *properties, "end_header"]
+    body = [f"{_words(x)} 0 0 0 {_words(rgb)}" for x, rgb in points]
+    (dense / "fused.ply").write_text("\n".join([*header, *body]) + "\n")
+    np.save(folder / "poses_bounds.npy", np.tile([*[0.0] * 15, 2.0, 6.0], (4, 1)))
+
+
+def _words(values) -> str:
+    return " ".join(map(str, values))

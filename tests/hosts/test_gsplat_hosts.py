@@ -1,0 +1,97 @@
+"""gsplat's own examples/simple_trainer.py, on a CPU: both of its densifiers, evaluation, and the files that it writes.
+
+    CLEAR_HOSTS=FOLDER python -m pytest tests/hosts
+
+FOLDER holds checkouts named gsplat-1.5.3 and gsplat-1.6.0; nothing is fetched, and those that are not there are skipped. Their
+CUDA modules are replaced by tests/hosts/cpu. tyro, torchmetrics, tensorboard, imageio, opencv, scikit-learn and matplotlib
+must be installed, and COLMAP's pycolmap for 1.6.0.
+"""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+
+from clear_strategies.data.ply import read_gaussians
+from tests.helpers.real_hosts import CPU, FROM_START, checkout, run
+
+STEPS = 30
+END = "    cli(main, cfg, verbose=True)\n"
+
+
+@pytest.fixture(params=["gsplat-1.5.3", "gsplat-1.6.0"])
+def host(request):
+    return checkout(request.param, "examples/simple_trainer.py")
+
+
+def start(host, *command):
+    paths = (host, host / "examples")
+    if host.name == "gsplat-1.5.3":
+        paths = (CPU / "pycolmap_of_gsplat_1_5", *paths)
+    return run(host, *command, inside="examples", more_paths=paths)
+
+
+def training(scene, results, **more):
+    """simple_trainer's options."""
+    settings = {
+        "data-dir": scene, "data-factor": 1, "result-dir": results, "max-steps": STEPS, "eval-steps": STEPS,
+        "save-steps": STEPS, "ply-steps": STEPS, "strategy.refine-start-iter": 4, "strategy.refine-every": 5,
+        "strategy.refine-stop-iter": 25, **more,
+    }  # fmt: skip
+    named = [word for name, value in settings.items() for word in (f"--{name}", str(value))]
+    return [*named, "--save-ply", "--disable-viewer", "--disable-video"]
+
+
+def launched(host, scene, results, densifier="default", *extra, **more):
+    overrides = [f"--overrides={override}" for override in FROM_START]
+    clear = ["-m", "integration.gsplat", "--sr", scene / "sr", *overrides]
+    return start(host, *clear, "simple_trainer.py", densifier, *training(scene, results, **more), *extra)
+
+
+def counts(said):
+    return {what: int(n) for n, what in re.findall(r"(\d+) (merges|HR renders|structure changes)", said)}
+
+
+def stored(results):
+    return torch.load(next((results / "ckpts").glob("*.pt")), weights_only=True)["splats"]
+
+
+@pytest.mark.parametrize("densifier", ["default", "mcmc"])
+def test_it_trains_densifies_evaluates_and_saves(host, scene, tmp_path, densifier):
+    threshold = {"strategy.grow-grad2d": 1e-5} if densifier == "default" else {}
+    said = launched(host, scene, tmp_path / "run", densifier, **threshold)
+    assert "refine_stop_iter=14 instead of 25" in said  # SVS ends densification at half of max_steps
+    assert counts(said)["merges"] == counts(said)["HR renders"] == STEPS
+    assert counts(said)["structure changes"] >= 1
+    assert "PSNR" in said
+    splats = stored(tmp_path / "run")
+    assert set(splats) == {"means", "scales", "quats", "opacities", "sh0", "shN"}
+    assert len(splats["means"]) > 60
+    written = read_gaussians(next((tmp_path / "run" / "ply").glob("*.ply")))
+    assert torch.allclose(written.sh0, splats["sh0"], atol=1e-6)  # f_base + f_det in both
+
+
+def test_its_own_evaluation_reads_the_checkpoint(host, scene, tmp_path):
+    launched(host, scene, tmp_path / "run")
+    file = next((tmp_path / "run" / "ckpts").glob("*.pt"))
+    again = training(scene, tmp_path / "again")
+    assert "PSNR" in start(host, "simple_trainer.py", "default", *again, "--ckpt", file)
+
+
+def test_one_line_does_the_same_as_none(host, scene, tmp_path):
+    text = (host / "examples" / "simple_trainer.py").read_text()
+    assert text.count(END) == 1
+    line = f"    install(Runner, sr={str(scene / 'sr')!r}, overrides={FROM_START!r})\n"
+    edited = tmp_path / "edited.py"
+    edited.write_text(text.replace(END, f"    from integration.gsplat import install\n{line}{END}"))
+    start(host, edited, "default", *training(scene, tmp_path / "one"))
+    launched(host, scene, tmp_path / "none")
+    one, none = stored(tmp_path / "one"), stored(tmp_path / "none")
+    assert all(torch.allclose(one[name], none[name], atol=1e-4) for name in none)
+
+
+def test_a_view_is_recognised_while_its_pose_moves(host, scene, tmp_path):
+    said = launched(host, scene, tmp_path / "run", "default", "--pose-opt", **{"pose-noise": 0.01})
+    assert counts(said)["merges"] == STEPS

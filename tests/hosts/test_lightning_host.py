@@ -1,0 +1,71 @@
+"""The real gaussian-splatting-lightning, on a CPU: from the start through densification, checkpoints, evaluation and resume.
+
+    CLEAR_HOSTS=FOLDER python -m pytest tests/hosts
+
+FOLDER holds a checkout named lightning; nothing is fetched, and without it these tests are skipped. Its CUDA modules are
+replaced by tests/hosts/cpu. lightning 2.5.0 to 2.5.2, jsonargparse[signatures], torchmetrics, plyfile, opencv and matplotlib
+must be installed: from 2.5.3 on, lightning reads a checkpoint's settings in a way that this host's cannot be read.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+import torch
+
+from clear_strategies.data.ply import read_gaussians
+from tests.helpers.real_hosts import FROM_START, checkout, run
+
+STEPS = 30
+
+
+@pytest.fixture
+def host():
+    return checkout("lightning", "main.py")
+
+
+def train(host, scene, output, *more, **settings):
+    base = {
+        "densify_from_iter": 4, "densification_interval": 5, "densify_until_iter": 25, "densify_grad_threshold": 1e-5,
+    }  # fmt: skip
+    density = {
+        "class_path": "integration.lightning.ClearDensityController",
+        "init_args": {
+            "base": {"class_path": "VanillaDensityController", "init_args": base}, "sr": str(scene / "sr"),
+            "overrides": FROM_START, **settings,
+        },
+    }  # fmt: skip
+    config = output.with_suffix(".yaml")
+    config.write_text(json.dumps({"model": {"density": density, "save_ply": True}}))  # YAML contains JSON
+    return run(
+        host, "main.py", "fit", "--config", config, "--data.path", scene, "--data.parser", "Colmap",
+        "--data.parser.split_mode", "experiment", "--trainer.accelerator", "cpu", "--max_steps", STEPS,
+        "--save_iterations", "[20]", "-n", "run", "--output", output, "--logger", "none", *more,
+    )  # fmt: skip
+
+
+def cloud(output):
+    return read_gaussians(output / "run" / "point_cloud" / f"iteration_{STEPS}" / "point_cloud.ply")
+
+
+def test_it_trains_densifies_saves_and_continues_as_if_it_had_not_stopped(host, scene, tmp_path):
+    said = train(host, scene, tmp_path / "whole")
+    assert re.search(r"densify_until_iter=1\d instead of 25", said)
+    whole = cloud(tmp_path / "whole")
+    assert len(whole) != 60
+    checkpoint = next((tmp_path / "whole" / "run" / "checkpoints").glob("*step=20.ckpt"))
+    continued = train(host, scene, tmp_path / "continued", "--ckpt_path", checkpoint)
+    assert "f_det starts from zero" not in continued
+    resumed = cloud(tmp_path / "continued")
+    assert len(resumed) == len(whole)
+    assert torch.allclose(resumed.means, whole.means, atol=0.05)
+
+
+def test_a_checkpoint_holds_f_base_and_f_det(host, scene, tmp_path):
+    train(host, scene, tmp_path / "whole")
+    last = max((tmp_path / "whole" / "run" / "checkpoints").glob("*.ckpt"), key=lambda file: file.stat().st_mtime)
+    stored = torch.load(last, weights_only=False, map_location="cpu")["state_dict"]
+    sh0 = stored["gaussian_model.gaussians.shs_dc"]
+    assert torch.allclose(cloud(tmp_path / "whole").sh0, sh0, atol=1e-6)
