@@ -52,8 +52,8 @@ class ConductorSettings:
     strategies: Mapping[str, Strategy] = field(default_factory=dict)
     statistics_from: int | None = signature(Conductor).parameters["statistics_from"].default
 
-    def conductor(self, stretch: float) -> Conductor:
-        """The conductor, its milestones times `stretch`.
+    def conductor(self, stretch: float, iterations: int | None = None) -> Conductor:
+        """The conductor of a run, its milestones times `stretch`.
 
         Raises:
             StrategyConflict: two strategies answer a question that only one may.
@@ -62,6 +62,7 @@ class ConductorSettings:
             *(scaled(strategy, stretch) for strategy in self.strategies.values()),
             objective=scaled(self.objective, stretch),
             statistics_from=None if self.statistics_from is None else round(self.statistics_from * stretch),
+            iterations=iterations,
         )
 
 
@@ -85,7 +86,7 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
     if "pseudo_views" in config:
         _log.warning("%s: a trainer other than this package's makes no pseudo views; the rest takes part.", strategy)
     settings: ConductorSettings = build(tree(config, _TRAINERS))
-    return settings.conductor(iterations / REFERENCE_ITERATIONS)
+    return settings.conductor(iterations / REFERENCE_ITERATIONS, iterations)
 
 
 # Options for both doors, readings=literal above all, set these as well; a host has its own.

@@ -15,9 +15,13 @@ from integration.lineage import Change, Lineage
 from rasterizers.geometry import SH_C0
 
 
-def detail_adam(detail: torch.nn.Parameter) -> torch.optim.Adam:
-    """An Adam for f_det, with our trainer's learning rate."""
-    rates = LearningRates()
+def detail_rates(iterations: int | None) -> LearningRates:
+    """Our trainer's learning rates in a run of this length; None: it is unknown, and taken to be long."""
+    return LearningRates() if iterations is None else LearningRates().of_run(iterations)
+
+
+def detail_adam(detail: torch.nn.Parameter, rates: LearningRates) -> torch.optim.Adam:
+    """An Adam for f_det."""
     return torch.optim.Adam([detail], lr=rates.detail, eps=rates.eps)
 
 
@@ -44,13 +48,14 @@ class DetailFeature:
     Args:
         means: returns the host's current positions.
         lineage: finds the host's changes of structure.
+        iterations: of the run; None: unknown.
     """
 
-    def __init__(self, means: Callable[[], Tensor], lineage: Lineage) -> None:
-        self._means, self._lineage = means, lineage
+    def __init__(self, means: Callable[[], Tensor], lineage: Lineage, iterations: int | None = None) -> None:
+        self._means, self._lineage, self._rates = means, lineage, detail_rates(iterations)
         self._parents: Int[Tensor, " M"] | None = None  # since the last `poll_parents`
         self._value = torch.nn.Parameter(torch.zeros_like(means(), requires_grad=False))
-        self._adam = detail_adam(self._value)
+        self._adam = detail_adam(self._value, self._rates)
 
     @property
     def value(self) -> Float[Tensor, "N 3"]:
@@ -107,7 +112,7 @@ class DetailFeature:
                 "Load both from one checkpoint."
             )
         self._value = torch.nn.Parameter(state["value"].to(means))
-        self._adam = detail_adam(self._value)
+        self._adam = detail_adam(self._value, self._rates)
         self._adam.load_state_dict(state["adam"])
 
     @torch.no_grad()

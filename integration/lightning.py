@@ -145,7 +145,9 @@ class Attached:
             raise HostError(
                 f"the Gaussians have no {missing[0]}, as those of a VanillaGaussian have. Use a model with spherical harmonics."
             )
-        self._detail = DetailFeature(lambda: self._host_params()["means"], self._carry_rows())
+        self._detail = DetailFeature(
+            lambda: self._host_params()["means"], self._carry_rows(), self._conductor.iterations
+        )
         self._renderer = ModelRenderer(
             module.gaussian_model, _ROLES, self._host_params, self._detail if settings.detail else None, self._conductor
         )

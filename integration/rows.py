@@ -32,7 +32,9 @@ class RowNumbers:
         self._entries: Any = entries
         self._means, self._as_parameter = means, as_parameter
         self._hook = (
-            entries.register_state_dict_post_hook(_leave_out) if isinstance(entries, torch.nn.ParameterDict) else None
+            entries.register_state_dict_post_hook(_leave_out)  # type: ignore[no-untyped-call]
+            if isinstance(entries, torch.nn.ParameterDict)
+            else None
         )
         self.restart()
 

@@ -151,7 +151,7 @@ class _Training:
             self.conductor,
             settings=scaled(settings.fit, stretch),
             density=scaled(settings.density, stretch),
-            rates=scaled(settings.optim, stretch),
+            rates=scaled(settings.optim, stretch).of_run(settings.fit.iterations),
             mip=scaled(settings.mip, stretch),
             skips=scaled(settings.skips, stretch),
             pseudo_views=settings.pseudo_views,

@@ -136,17 +136,19 @@ class Conductor:
         objective: the losses and their weights.
         statistics_from: iteration from which densification statistics need the HR render although λ_HR = 0; None:
             as soon as λ_HR > 0 (F11).
+        iterations: of the run, where they are known; adapters give f_det a lower rate in short runs.
 
     Raises:
         StrategyConflict: two strategies answer a question that only one may.
     """
 
     def __init__(
-        self, *strategies: Strategy, objective: Objective | None = None, statistics_from: int | None = 500
-    ) -> None:
+        self, *strategies: Strategy, objective: Objective | None = None, statistics_from: int | None = 500,
+        iterations: int | None = None,
+    ) -> None:  # fmt: skip
         self.strategies = strategies
         self.objective = objective if objective is not None else Objective()
-        self.statistics_from = statistics_from
+        self.statistics_from, self.iterations = statistics_from, iterations
         self.work_log = WorkLog()
         self._one: dict[str, Strategy] = {}
         for hook in _ONE_ANSWER:

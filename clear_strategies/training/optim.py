@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import torch
@@ -13,6 +14,8 @@ from torch import Tensor
 from clear_strategies.core.gradients import ATTRIBUTES
 from clear_strategies.errors import SettingError
 from clear_strategies.schedules import LARGEST_RATE, LogLinear
+
+_log = logging.getLogger(__name__)
 
 BETA1: Final = 0.9
 BETA2: Final = 0.999
@@ -25,7 +28,9 @@ class LearningRates:
     Args:
         means: log-linear decay, in units of the scene's extent.
         quats, scales, opacities, sh0, shN: of the raw parameters (any norm, log, logit, SH coefficients).
-        detail: of f_det (F34).
+        detail: of f_det, an offset of RGB (F34).
+        detail_steps: a run of fewer iterations gives f_det a share of its rate in proportion; 0: always the whole rate. In RGB,
+            f_base moves at 0.28 of the rate of its SH coefficients, and a short run ends before it has followed f_det.
         detail_decay: share of f_det, in [0, 1), that is lost at every step in which HR takes part. L_HF does not change
             with a constant colour, so nothing else keeps f_det near 0; the paper has none, 0 (F35).
         eps: Adam's. Gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
@@ -42,6 +47,7 @@ class LearningRates:
     sh0: float = 2.5e-3
     shN: float = 1.25e-4  # noqa: N815 - gsplat's name
     detail: float = 2.5e-3
+    detail_steps: int = 1_500
     detail_decay: float = 0.002
     eps: float = 1e-15
     rows: Literal["all", "visible"] = "all"
@@ -54,8 +60,21 @@ class LearningRates:
             raise SettingError(f"eps must lie in [0, 1), got {self.eps}.")
         if not 0 <= self.detail_decay < 1:
             raise SettingError(f"detail_decay must lie in [0, 1), got {self.detail_decay}.")
+        if self.detail_steps < 0:
+            raise SettingError(f"detail_steps must be at least 0 iterations, got {self.detail_steps}.")
         if self.rows not in ("all", "visible"):
             raise SettingError(f"rows must be all or visible, got {self.rows!r}.")
+
+    def of_run(self, iterations: int) -> LearningRates:
+        """The rates of a run of this length; see `detail_steps`."""
+        if iterations >= self.detail_steps:
+            return self
+        rate = self.detail * iterations / self.detail_steps
+        _log.info(
+            "f_det learns at a rate of %.2g instead of %.2g: the run has %d iterations (optim.detail_steps: %d).",
+            rate, self.detail, iterations, self.detail_steps,
+        )  # fmt: skip
+        return replace(self, detail=rate)
 
     def at(self, t: int, extent: float) -> dict[str, float]:
         """Every attribute's rate at iteration t, in its own unit."""

@@ -17,7 +17,7 @@ from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment, HostRendering, Resolution
 from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 from integration.densification import require_end
-from integration.detail import detail_adam, sh0_offset
+from integration.detail import detail_adam, detail_rates, sh0_offset
 from integration.errors import HostError
 from integration.host_score import warn_if_score_is_unused
 from integration.replacing import Replaced
@@ -78,7 +78,7 @@ class Attached:
         means = params[self._host_name("means")]
         if detail and "detail" not in params:
             params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
-            optimizers["detail"] = detail_adam(params["detail"])
+            optimizers["detail"] = detail_adam(params["detail"], detail_rates(conductor.iterations))
         self._rows = RowNumbers(
             params if state is None else state,
             lambda: self._params[self._host_name("means")],

@@ -89,7 +89,7 @@ class Attached:
         warn_if_score_is_unused(conductor, gaussians, threshold)
         self._model, self._conductor = gaussians, conductor
         self.views = HostViews(cameras, *sr_source(sr, conductor, factor), gaussians._xyz.device)
-        self._detail = DetailFeature(lambda: gaussians._xyz, MatchedRows(self._host_params))
+        self._detail = DetailFeature(lambda: gaussians._xyz, MatchedRows(self._host_params), conductor.iterations)
         self._renderer = ModelRenderer(
             gaussians, _ROLES, self._host_params, self._detail if detail else None, conductor
         )

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from clear_strategies.errors import SettingError
 from integration.densification import end_of_densification
-from integration.detail import sh0_offset
+from integration.detail import detail_rates, sh0_offset
 from integration.gsplat import Attached, attach
 from integration.nerfstudio.data import prior, save_lr, views_from_datamanager
 
@@ -148,6 +148,8 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         if end < stop:
             CONSOLE.log(f"CLEAR: densification ends at step {end} instead of {stop} (SVS: anchor_start).")
             self.strategy.refine_stop_iter = end
+        for group in host.optimizers.optimizers["detail"].param_groups:
+            group["lr"] = detail_rates(chosen.iterations).detail
         return attach(
             self.gauss_params, host.optimizers.optimizers, views_from_datamanager(datamanager, sr, config.factor, self.device),
             chosen,

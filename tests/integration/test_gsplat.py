@@ -213,6 +213,14 @@ def test_renderings_without_gradients_show_the_detail_feature_and_train_nothing(
     assert clear.attachment.counts["LR renders"] == 0
 
 
+@pytest.mark.parametrize(("iterations", "share"), [(None, 1), (300, 0.2), (30_000, 1)])
+def test_f_det_learns_at_a_lower_rate_in_a_short_run(iterations, share, attached):
+    scene = toy.scene(20)
+    host = Host(scene)
+    attached(host, scene, Conductor(iterations=iterations))
+    assert host.optimizers["detail"].param_groups[0]["lr"] == pytest.approx(LearningRates().detail * share)
+
+
 def test_remove_restores_the_loop(attached):
     scene = toy.scene(20)
     alone = Host(scene)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.data.scene import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.density.base import DensityError, cameras_extent
+from clear_strategies.errors import SettingError
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import filter_std
@@ -205,6 +207,18 @@ def test_adam_is_torchs_adam():
             optimizer.step()
     for name, value in params.items():
         assert torch.allclose(value, theirs[name].detach(), rtol=1e-5, atol=1e-7), name
+
+
+def test_a_short_run_gives_f_det_a_share_of_its_rate(caplog):
+    with caplog.at_level("INFO"):
+        short = LearningRates().of_run(300)
+    assert short.detail == pytest.approx(LearningRates().detail / 5)
+    assert replace(short, detail=LearningRates().detail) == LearningRates()
+    assert "rate of 0.0005 instead of 0.0025: the run has 300 iterations" in caplog.text
+    assert LearningRates().of_run(1_500) == LearningRates()
+    assert LearningRates(detail_steps=0).of_run(1) == LearningRates(detail_steps=0)
+    with pytest.raises(SettingError, match="detail_steps must be at least 0"):
+        LearningRates(detail_steps=-1)
 
 
 def test_visible_rows_only_leaves_the_others_where_they_are():
