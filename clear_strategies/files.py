@@ -80,7 +80,7 @@ def sweep(folder: Path) -> None:
                 shutil.rmtree(left, ignore_errors=True)
             else:
                 left.unlink(missing_ok=True)
-            _log.info("%s: removed, a process died while it wrote this.", left)
+            _log.debug("%s: removed, a process died while it wrote this.", left)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -16,7 +16,7 @@ import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -32,6 +32,8 @@ from clear_strategies.jobs.sweep import Sweep
 
 _log = logging.getLogger(__name__)
 
+_VERBOSE: Final = "fit.verbose=true"
+
 
 def main() -> None:
     """The command line: a subcommand, or Hydra's."""
@@ -45,14 +47,14 @@ def main() -> None:
 
 
 def hydra_main(overrides: Sequence[str] | None = None) -> None:
-    """Hydra's command line.
+    """Hydra's command line, and `-v`.
 
     Args:
         overrides: in place of the program's arguments.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra passes errors on instead of printing them its own way
-    if overrides is not None:
-        sys.argv[1:] = overrides  # Hydra reads them there
+    arguments = sys.argv[1:] if overrides is None else overrides
+    sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else a for a in arguments]  # Hydra reads them there
     exit_codes.require_train()
     hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import torch
 
+from clear_strategies import console
 from clear_strategies.bench import device, evidence, iteration, kernels, pareto, rasterizers, stereo
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
@@ -28,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     options = vars(parser().parse_args(arguments))
     question, threads, out = options.pop("question"), options.pop("threads"), options["out"]
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    console.show()
     if threads is not None:
         torch.set_num_threads(threads)
     shown: dict[str, Any] = {

@@ -16,7 +16,8 @@ from typing import Final
 import torch
 
 import rasterizers
-from clear_strategies.commands.options import log_to_terminal, parser_of
+from clear_strategies import console
+from clear_strategies.commands.options import parser_of
 from clear_strategies.data.priors.cache import cache_folder
 from clear_strategies.errors import SettingError
 from clear_strategies.outputs.provenance import provenance
@@ -32,6 +33,7 @@ EXTRAS: Final = {
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
     "heic": (("pillow_heif",), "photos as iPhones save them (HEIC)"),
     "view": (("viser", "nerfview"), "clear-strategies view, and the splat in a page"),
+    "log": (("tensorboard",), "fit.log=tensorboard: curves and pictures while a run trains"),
     "gsplat": (("gsplat",), "gsplat's densifiers, and its rasterizer on CUDA"),
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
     "open3d": (("open3d",), "a second way of removing outliers from point clouds"),
@@ -52,7 +54,7 @@ def main(arguments: Sequence[str]) -> None:
     parser = parser_of("doctor", "Say what this machine has, what works, and what is missing.", run=False)
     parser.add_argument("--all", action="store_true", help="test backends as well that compile for a minute first")
     options = parser.parse_args(arguments)
-    log_to_terminal(verbose=options.verbose)
+    console.show(verbose=options.verbose)
     sections: dict[str, Callable[[], Iterator[tuple[str, str]]]] = {
         "versions": _versions, "machine": _machine, "missing extras": _missing, "other programs": _programs, "cache": _cache,
     }  # fmt: skip

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from clear_strategies.commands.options import log_to_terminal, parser_of
+from clear_strategies import console
+from clear_strategies.commands.options import parser_of
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
 from clear_strategies.outputs.export import gaussians_of
@@ -39,7 +40,7 @@ def main(arguments: Sequence[str]) -> None:
         help="degree of view-dependent colour that is kept (3)",
     )
     options = parser.parse_args(arguments)
-    log_to_terminal(verbose=options.verbose)
+    console.show(verbose=options.verbose)
     splat = open_splat(options.run, options.rasterizer)
     g = gaussians_of(splat.painter.field)
     g = replace(g, shN=g.shN[:, : (options.sh + 1) ** 2 - 1])

@@ -1,11 +1,9 @@
-"""What the subcommands share: their arguments, and messages on the terminal."""
+"""What the subcommands share: their arguments."""
 
 from __future__ import annotations
 
 import argparse
-import logging
 import math
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
@@ -43,10 +41,3 @@ def positive(kind: Callable[[str], float]) -> Callable[[str], float]:
 
     parse.__name__ = getattr(kind, "__name__", "number")
     return parse
-
-
-def log_to_terminal(*, verbose: bool) -> None:
-    """Messages go to stderr, as they are."""
-    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, format="%(message)s", stream=sys.stderr)
-    for library in ("websockets", "PIL", "matplotlib", "asyncio"):
-        logging.getLogger(library).setLevel(logging.WARNING)

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from clear_strategies.commands.options import log_to_terminal, parser_of, positive
+from clear_strategies import console
+from clear_strategies.commands.options import parser_of, positive
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import SavedSplat, open_splat
 from clear_strategies.viewing import cameras, film, paths, video
@@ -32,7 +33,7 @@ def main(arguments: Sequence[str]) -> None:
         DataError, SettingError: the run or an argument cannot be used.
     """
     options = _parser().parse_args(arguments)
-    log_to_terminal(verbose=options.verbose)
+    console.show(verbose=options.verbose)
     began = time.perf_counter()
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)

@@ -7,7 +7,8 @@ import logging
 import webbrowser
 from collections.abc import Sequence
 
-from clear_strategies.commands.options import log_to_terminal, parser_of
+from clear_strategies import console
+from clear_strategies.commands.options import parser_of
 from clear_strategies.jobs.saved import open_splat
 from clear_strategies.viewing import live, points
 
@@ -29,7 +30,7 @@ def main(arguments: Sequence[str]) -> None:
     )
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     options = parser.parse_args(arguments)
-    log_to_terminal(verbose=options.verbose)
+    console.show(verbose=options.verbose)
     live.require_viewer()
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)

@@ -67,7 +67,7 @@ def within_limit(
 
 
 def _noted(capture: Capture, why: str) -> Capture:
-    _log.info("HR side: %s.", why)
+    _log.debug("HR side: %s.", why)
     return replace(capture, notes={**capture.notes, "HR side": why})
 
 

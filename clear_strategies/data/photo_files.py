@@ -95,7 +95,7 @@ def read_image(
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
     if alpha.size and alpha.min() < 1:
         if background is None:
-            _log.info("%s has transparent pixels: composited over black.", path.name)
+            _log.debug("%s has transparent pixels: composited over black.", path.name)
         rgb = rgb * alpha + np.asarray(background or (0, 0, 0), np.float32) * (1 - alpha)
     return torch.from_numpy(np.ascontiguousarray(rgb))
 
@@ -115,7 +115,7 @@ def orientation_of(image: Image.Image) -> int:
     try:
         orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
     except Exception as error:  # PIL raises many types of error on damaged blocks
-        _log.info("%s: its EXIF block cannot be read (%s) and is not used.", image.filename, error)  # type: ignore[attr-defined]
+        _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", image.filename, error)  # type: ignore[attr-defined]
         return 1
     return orientation if orientation in _TURNS else 1
 
@@ -131,7 +131,7 @@ def exif_of(path: Path) -> dict[int, Any]:
             block = image.getexif()
             return {**block, **block.get_ifd(_EXIF_PHOTO)}
         except Exception as error:  # as above
-            _log.info("%s: its EXIF block cannot be read (%s) and is not used.", path.name, error)
+            _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", path.name, error)
             return {}
 
 

@@ -22,6 +22,7 @@ from clear_strategies.data.checks import refuse, require_choice, require_number,
 from clear_strategies.data.photo_files import image_size, inside, list_images, read_image, write_png
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
 from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of
+from clear_strategies.data.progress import Progress
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
@@ -116,8 +117,12 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     lr_files = check_headers(train_frames + test_frames, views)
     held_out = len(train_frames) < len(capture.frames)  # so the capture's points may know what training must not
     require_source(cloud, capture.points)
-    train = tuple(_view(frame, capture, views, prior, lr_files, required=True) for frame in train_frames)
-    test = tuple(_view(frame, capture, views, prior, lr_files, required=False) for frame in test_frames)
+    progress = Progress("photos and their SR images", "photos", len(train_frames) + len(test_frames))
+    found: list[View] = []
+    for frame in (*train_frames, *test_frames):
+        found.append(_view(frame, capture, views, prior, lr_files, required=len(found) < len(train_frames)))
+        progress(len(found))
+    train, test = tuple(found[: len(train_frames)]), tuple(found[len(train_frames) :])
     moved = {}
     if views.back_projection:
         before = _disagreement(train, views.downsample)

@@ -175,7 +175,7 @@ class Density:
         optimizer.take(parents, fresh)
         self._place_children(field, slice(len(stay) + len(clones), len(parents)), t)
         self.score, self.ordinary, self.count = (self.score.new_zeros(len(parents)) for _ in range(3))
-        _log.info(
+        _log.debug(
             "t=%d: %d cloned, %d split, %d pruned: %d -> %d Gaussians.",
             t, len(clones), len(splits), n - int(keep.sum()), n, len(parents),
         )  # fmt: skip

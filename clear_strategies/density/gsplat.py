@@ -295,7 +295,7 @@ class GsplatDensifier:
     def _report(self, parents: Int[Tensor, " M"], n: int, t: int) -> None:
         children = torch.bincount(parents, minlength=n)
         grown, gone = int((children > 1).sum()), int((children == 0).sum())
-        _log.info("t=%d: %s: %d grown, %d removed: %d -> %d Gaussians.", t, self.kind, grown, gone, n, len(parents))
+        _log.debug("t=%d: %s: %d grown, %d removed: %d -> %d Gaussians.", t, self.kind, grown, gone, n, len(parents))
         if len(parents) < self.settings.min_gaussians:
             raise DensityError(
                 f"t={t}: {self.kind} left {len(parents)} of {n:,} Gaussians, fewer than "

@@ -20,6 +20,7 @@ from rasterizers.interface import BackendUnavailable, Rasterizer, RasterSettings
 _log = logging.getLogger(__name__)
 
 _SHARED: Final = RasterSettings()
+_SLOWEST: Final = "torch"
 Color = tuple[float, float, float]
 Device = Literal["cpu", "cuda"]
 
@@ -138,12 +139,13 @@ def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked:
     return Drawing(rasterizer, name if device == "cpu" else f"{name} on {device}", device, kernel, make)
 
 
-def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer]) -> None:
-    """For `auto`: log why the other backends were not chosen."""
+def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer], chosen: Drawing) -> None:
+    """For `auto`: log why the other backends were not chosen; on the console where that leaves the slowest."""
     if isinstance(settings, RasterizerSettings) and settings.name == "auto":
+        level = logging.INFO if chosen.name == _SLOWEST else logging.DEBUG
         for name, reason in rasterizers.available().items():
             if reason is not None:
-                _log.info("rasterizer %s is not available: %s", name, reason)
+                _log.log(level, "rasterizer %s is not available: %s", name, reason)
 
 
 def drawn_on(devices: frozenset[str], name: str, asked: Device | None) -> Device:
@@ -162,7 +164,11 @@ def threads(asked: int | None) -> tuple[int, str]:
     """How many threads a job has, and why."""
     if asked is not None:
         return asked, "fit.threads"
-    launcher = HydraConfig.get().launcher if HydraConfig.initialized() else None
-    jobs = int(launcher.n_jobs) if launcher is not None and "n_jobs" in launcher else 1
-    here = f"of {sweep.cores()} here"
+    jobs, here = jobs_at_once(), f"of {sweep.cores()} here"
     return sweep.threads(jobs), here if jobs == 1 else f"{here}, hydra.launcher.n_jobs={jobs}"
+
+
+def jobs_at_once() -> int:
+    """How many jobs share this machine and its terminal, as joblib counts them; 1 for other launchers."""
+    launcher = HydraConfig.get().launcher if HydraConfig.initialized() else None
+    return int(launcher.n_jobs) if launcher is not None and "n_jobs" in launcher else 1

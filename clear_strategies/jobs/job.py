@@ -6,10 +6,10 @@ import functools
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -26,7 +26,7 @@ from clear_strategies.jobs import device, resume, scene
 from clear_strategies.jobs.device import Device, RasterizerSettings
 from clear_strategies.jobs.lock import hold
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.outputs import plan, results, score_table
+from clear_strategies.outputs import plan, results, score_table, tensorboard
 from clear_strategies.outputs.baseline import FOLDER as BASELINE
 from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.metrics import Evaluation
@@ -55,6 +55,9 @@ class RunSettings(FitSettings):
     Args:
         map_views: number of training views with maps of reliability and correction in maps/; 0: none.
         video: frames of path.mp4 and path.gif, a loop through the training cameras, 24 a second; 0: none.
+        verbose: show on the console what run.log has of every step, too; `-v` on the command line.
+        page: the most Gaussians of a field that splat.html is written for, a page that shows it in any browser; 0: none.
+        log: tensorboard writes losses, PSNR, learning rates and a few pictures for TensorBoard; extra [log].
         viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
         baseline: train first, on the same scene with the same settings, without any strategy, into the folder baseline/ of
             the run; the contact sheet and the scores then show both. Without effect in a sweep, for a run that has no
@@ -69,6 +72,9 @@ class RunSettings(FitSettings):
 
     map_views: int = 3
     video: int = 72
+    page: int = 500_000
+    log: Literal["tensorboard"] | None = None
+    verbose: bool = False
     viewer: bool = False
     baseline: bool = False
     resume: str | None = None
@@ -81,6 +87,8 @@ class RunSettings(FitSettings):
             raise SettingError(f"map_views must be at least 0, got {self.map_views}. 0 writes no maps.")
         if self.video < 0:
             raise SettingError(f"video must be at least 0 frames, got {self.video}. 0 writes no video.")
+        if self.page < 0:
+            raise SettingError(f"page must be at least 0 Gaussians, got {self.page}. 0 writes no page.")
         if self.threads is not None and self.threads < 1:
             raise SettingError(f"threads must be at least 1, got {self.threads}. null takes all cores.")
 
@@ -194,6 +202,8 @@ def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = Non
     settings = settings_of(values)
     if settings.fit.viewer:
         live.require_viewer()
+    if settings.fit.log == "tensorboard":
+        tensorboard.require_tensorboard()
     ours, baseline = _Training.of(settings, values, folder), None
     if settings.fit.baseline and _why_without_baseline(settings) is None:
         values_without = {**values, "strategies": {}}
@@ -209,9 +219,13 @@ def _why_without_baseline(settings: JobSettings) -> str | None:
         return f"since +method={settings.method} is one itself"
     if not settings.strategies:
         return "since it has no strategy and is the baseline itself"
-    if HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN:
+    if _in_sweep():
         return "since it is a job of a sweep, whose report compares the jobs"
     return None
+
+
+def _in_sweep() -> bool:
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def _run(
@@ -226,7 +240,7 @@ def _run(
     if settings.data.save_lr is not None:
         save_lr(loaded, Path(settings.data.save_lr))
         return None
-    device.log_choice(settings.rasterizer)
+    device.log_choice(settings.rasterizer, drawing)
     drawing = drawing.over(loaded.background)
     place = _Place(loaded, loaded.to(drawing.device), drawing, watch)
     # Both are made ready before the first trains, so that nothing is refused after it has.
@@ -237,13 +251,18 @@ def _run(
             first = baseline.start(place.there, of_baseline)
     state = ours.start(place.there, source)
     drawn = f"{drawing.name}, kernel {drawing.kernel} px²"
-    _log.info("%s", plan.describe(loaded, state, ours.chosen, rasterizer=drawn, threads=f"{threads} ({why})"))
+    # Of many jobs the console shows a line each; the rest is in their run.log.
+    level = logging.DEBUG if _in_sweep() else logging.INFO
+    described = plan.describe(loaded, state, ours.chosen, rasterizer=drawn, threads=f"{threads} ({why})")
+    _log.log(level, "%s", described)
     if settings.fit.baseline and baseline is None:
-        _log.info("fit.baseline: no baseline trains beside this run, %s.", _why_without_baseline(settings))
+        _log.log(level, "fit.baseline: no baseline trains beside this run, %s.", _why_without_baseline(settings))
     ours.remove_earlier_metrics()
     beside = None if baseline is None else _trained_first(baseline, first, place)
     evaluation, seconds = _train(ours, state, place, beside)
-    _log.info("%s", score_table.describe(ours.folder, evaluation, seconds, beside))
+    _log.log(level, "%s", score_table.describe(ours.folder, evaluation, seconds, beside))
+    if _in_sweep():
+        _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, ours.folder, evaluation, seconds))
     mean = evaluation.mean("test") or evaluation.mean("train")
     return None if mean is None else mean.psnr
 
@@ -263,21 +282,27 @@ def _trained_first(training: _Training, state: TrainState | None, place: _Place)
 
 
 @contextmanager
-def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[Callable[[], None] | None]:
-    """What is called after each iteration: the job's watch and, with `fit.viewer`, the viewer's turn."""
-    if not training.settings.fit.viewer:
-        yield place.watch
-        return
-    painter = Painter(state.field, place.drawing.make)
-    saved, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"
-    with live.watched(painter, saved, title, lambda address: _log.info("look while it trains: %s", address)) as turn:
+def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[Callable[[], None]]:
+    """What is called after each iteration: the job's watch, the viewer's turn (`fit.viewer`) and the log (`fit.log`)."""
+    fit_settings, painter = training.settings.fit, Painter(state.field, place.drawing.make)
+    calls = [] if place.watch is None else [place.watch]
+    with ExitStack() as open_:
+        if fit_settings.viewer:
+            saved, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"
+            turn = open_.enter_context(live.watched(painter, saved, title, _tell_address))
+            calls.append(lambda: turn(state.t - 1))
+        if fit_settings.log == "tensorboard":
+            calls.append(open_.enter_context(tensorboard.logged(training.folder, state, place.scene, painter)))
 
         def after_step() -> None:
-            if place.watch is not None:
-                place.watch()
-            turn(state.t - 1)
+            for call in calls:
+                call()
 
         yield after_step
+
+
+def _tell_address(address: str) -> None:
+    _log.info("look while it trains: %s", address)
 
 
 def _train(
@@ -292,7 +317,8 @@ def _train(
     write_cameras(training.folder, place.scene)
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
     watched = _watched(training, state, place)
-    with watched as after_step, progress_bar(state, after_step, training.chosen.title) as progress:
+    alone = device.jobs_at_once() == 1
+    with watched as after_step, progress_bar(state, after_step, training.chosen.title, shown=alone) as progress:
         checkpoints = training.folder / resume.CHECKPOINTS
         fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)
     seconds = time.perf_counter() - began
@@ -307,6 +333,7 @@ def _train(
         map_views=settings.fit.map_views,
         painter=Painter(state.field, place.drawing.make),
         video_frames=settings.fit.video,
+        page_gaussians=settings.fit.page,
         seconds=seconds,
         config=training.compared,
         baseline=beside,

@@ -34,7 +34,10 @@ _NOT_COMPARED: Final = {
     "fit.probe_views",
     "fit.map_views",
     "fit.video",
+    "fit.page",
     "fit.viewer",
+    "fit.verbose",
+    "fit.log",
 }
 
 

@@ -107,7 +107,7 @@ def load(data: DataSettings, prior: PriorSettings, seed: int) -> Scene:
         if isinstance(chosen, Bicubic):
             _log.warning("prior: auto chose %s. %s.", chosen.label, _remedy(views.sr_scale))
         else:
-            _log.info("prior: auto chose %s.", chosen.label)
+            _log.debug("prior: auto chose %s.", chosen.label)
     return scene
 
 

@@ -32,7 +32,7 @@ def write_loop(folder: Path, train: Sequence[Camera], painter: Painter, frames: 
     began = time.perf_counter()
     where = [cameras.at_most(camera, _LONGEST) for camera in paths.through(train, frames)]
     video.write_videos([folder / "path.mp4", folder / "path.gif"], film.color_frames(painter, where), fps=film.FPS)
-    _log.info(
+    _log.debug(
         "path.mp4, path.gif: %d frames of %dx%d in %.1f s (fit.video=0 writes none).",
         frames, where[0].width, where[0].height, time.perf_counter() - began,
     )  # fmt: skip

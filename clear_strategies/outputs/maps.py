@@ -94,7 +94,7 @@ def write_maps(
             write_depth(own / "depth.png", view.lr, view.depth, f"{view.name}: depth by stereo")
     corrector = conductor.owner("correct")
     if corrector is None:
-        _log.info("maps: no strategy of this run corrects, so there is no corrected.png.")
+        _log.debug("maps: no strategy of this run corrects, so there is no corrected.png.")
     observer = next((s for s in conductor.strategies if s.patch_maps(views[0]) is not None), None)
     content = {
         "note": _NOTE,

@@ -109,7 +109,7 @@ def evaluate(
                 renders[view.name] = image
             tables[part][view.name] = _scores_of(view, image, down)
         if "LR" in against[part]:
-            _log.info("%s views: HR is unknown; images reduced by %s were compared with the LR photos.", part, down)
+            _log.debug("%s views: HR is unknown; images reduced by %s were compared with the LR photos.", part, down)
     return Evaluation(tables["test"], tables["train"], against, renders)
 
 

@@ -17,35 +17,34 @@ _READ_EVERY: Final = 0.25  # seconds; reading the history's numbers waits for th
 
 @contextmanager
 def progress_bar(
-    state: TrainState, after_step: Callable[[], None] | None = None, name: str | None = None
+    state: TrainState, after_step: Callable[[], None] | None = None, name: str | None = None, *, shown: bool = True
 ) -> Iterator[Progress]:
     """A bar with loss, PSNR, number of Gaussians, conflict ratio and remaining time.
 
     Args:
         after_step: called after each iteration.
         name: of what trains, before the bar.
+        shown: False where several jobs share the terminal.
     """
     from tqdm import tqdm
-    from tqdm.contrib.logging import logging_redirect_tqdm
 
-    shown: dict[str, str] = {}
+    beside: dict[str, str] = {}
     redraw_every = 0.5 if sys.stderr.isatty() else 15  # seconds; a log file needs no animation
     total, done = state.settings.iterations, state.t - 1
-    with (
-        logging_redirect_tqdm(),
-        tqdm(desc=name, total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=redraw_every) as bar,
-    ):
+    with tqdm(
+        desc=name, total=total, initial=done, unit="it", dynamic_ncols=True, mininterval=redraw_every, disable=not shown
+    ) as bar:
         last_read = -math.inf
 
         def show(row: Mapping[str, float]) -> None:
             λ_lr, λ_hr = state.conductor.objective.lambda_lr, row["lambda_hr"]
-            shown["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
-            shown["N"] = f"{int(row['n_gaussians']):,}"
+            beside["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
+            beside["N"] = f"{int(row['n_gaussians']):,}"
             if not math.isnan(row.get("conflict", math.nan)):
-                shown["conflict"] = f"{row['conflict']:.2f}"
+                beside["conflict"] = f"{row['conflict']:.2f}"
             if "psnr_test" in row:
-                shown["psnr"] = f"{row['psnr_test']:.2f} dB"
-            bar.set_postfix(shown, refresh=False)
+                beside["psnr"] = f"{row['psnr_test']:.2f} dB"
+            bar.set_postfix(beside, refresh=False)
 
         def update(state: TrainState) -> None:
             nonlocal last_read

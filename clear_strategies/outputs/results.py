@@ -25,6 +25,7 @@ from clear_strategies.outputs.maps import write_maps
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen, marks
 from clear_strategies.outputs.provenance import provenance
+from clear_strategies.outputs.splat_page import write_splat_page
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Rasterizer
@@ -32,7 +33,7 @@ from rasterizers.interface import Rasterizer
 # What a run writes into its folder, in this order.
 FILES: Final[Mapping[str, str]] = {
     ".hydra/": "the configuration and the overrides that the run was started with",
-    "run.log": "what the run printed",
+    "run.log": "what the run printed, and the details that the console shows with `-v` alone",
     "checkpoints/": "states to resume from (`fit.resume`), the newest `fit.keep` of them",
     "baseline/": "the baseline that trained beside the run (`fit.baseline`), with all these files of its own",
     "cameras.json": "the cameras, in the layout of Inria's 3DGS, which SuperSplat and SIBR open",
@@ -44,6 +45,8 @@ FILES: Final[Mapping[str, str]] = {
     "views/": "LR photo, prior and truth of the views on the contact sheet",
     "path.mp4": "a loop through the training cameras (`fit.video`)",
     "path.gif": "the same, smaller",
+    "splat.html": "the splat in a page that turns it, without a server or a network (`fit.page`)",
+    "tensorboard/": "the numbers of history.csv and a few pictures, for TensorBoard (`fit.log`)",
     "contact_sheet.png": "the same few views: LR photo, prior, baseline (if there is one), render, truth and error side by side",
     "curves.png": "losses, PSNR, number of Gaussians, conflict and correction over iterations",
     "history.csv": "one row per iteration: every number that was measured, empty where there was none",
@@ -67,6 +70,7 @@ def write_results(
     map_views: int,
     painter: Painter,
     video_frames: int,
+    page_gaussians: int,
     seconds: float,
     config: Mapping[str, Any],
     baseline: Baseline | None = None,
@@ -79,6 +83,7 @@ def write_results(
         map_views: how many training views get maps, at most.
         painter: of the state's field, for depth and video.
         video_frames: of the loop through the training cameras; 0: none.
+        page_gaussians: a field of more gets no page.
         seconds: training time.
         config: the run's configuration, kept in metrics.json.
         baseline: the one that trained beside it, for the contact sheet and metrics.json.
@@ -99,6 +104,10 @@ def write_results(
         write_depths(folder / "depth", _shown(scene), painter)
     with work_log.stage("video"):
         write_loop(folder, [view.hr.camera for view in scene.train], painter, video_frames)
+    with work_log.stage("page"):
+        write_splat_page(
+            folder, [view.hr.camera for view in scene.train], painter, page_gaussians, title, scene.background
+        )
     write_curves(folder / "curves.png", history, marks(state), title)
     _write_tables(folder, history, work_log)
     files.write_json(

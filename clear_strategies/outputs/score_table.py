@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Final
@@ -25,17 +26,40 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, baseline: Bas
     width = max((len(image) for _, image, _ in rows), default=0)
     lines = [f"  {part:<5}  {image:<{width}}  {numbers}" for part, image, numbers in rows]
     note = f"  {NOTE}." if any(image in ("bicubic", "prior") for _, image, _ in rows) else ""
-    next_ = f"  look next: {folder / 'contact_sheet.png'}, or clear-strategies view {folder}"
-    return "\n".join(
-        [f"done in {seconds:.0f} s{beside}: {folder}", *lines, *filter(None, [_LEGEND if lines else "", note]), next_]
+    unknown = [part for part in ("test", "train") if "LR" in evaluation.against.get(part, "")]
+    reduced = (
+        f"  {' and '.join(unknown)}: nobody knows the HR photos, so reduced images are compared with the LR photos."
     )
+    notes = filter(None, [_LEGEND if lines else "", note, reduced if unknown else ""])
+    return "\n".join([f"done in {seconds:.0f} s{beside}: {_near(folder)}", *lines, *notes, _look_next(_near(folder))])
 
 
 def describe_baseline(baseline: Baseline) -> str:
     """One line."""
-    part = next(iter(baseline.means), None)
-    scores = "" if part is None else f", {part} views {baseline.means[part].psnr:.2f} dB"
-    return f"the baseline: done in {baseline.seconds:.0f} s{scores}: {baseline.folder}"
+    return f"the baseline: {_in_short(baseline.seconds, baseline.means)}: {_near(baseline.folder)}"
+
+
+def describe_job(number: int, folder: Path, evaluation: Evaluation, seconds: float) -> str:
+    """One line, of a job among many."""
+    means = {part: mean for part in ("test", "train") if (mean := evaluation.mean(part)) is not None}
+    return f"job {number}: {_in_short(seconds, means)}: {_near(folder)}"
+
+
+def _in_short(seconds: float, means: Mapping[str, ImageScores]) -> str:
+    part = next(iter(means), None)
+    return f"done in {seconds:.0f} s" + ("" if part is None else f", {part} views {means[part].psnr:.2f} dB")
+
+
+def _near(folder: Path) -> Path:
+    """The folder as it is called from here."""
+    here = Path.cwd()
+    return folder.relative_to(here) if folder.is_relative_to(here) else folder
+
+
+def _look_next(folder: Path) -> str:
+    pages = [f"{page} in a browser" for page in (folder / "splat.html",) if page.exists()]
+    shown = ", ".join([*pages, str(folder / "contact_sheet.png")])
+    return f"  look next: {shown}, or clear-strategies view {shlex.quote(str(folder))}"
 
 
 def _rows(part: str, evaluation: Evaluation, baseline: Baseline | None) -> Iterator[tuple[str, str]]:

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from clear_strategies import files
+from clear_strategies import console, files
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.outputs.figures import save_png
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--page-mb", type=float, default=page.BUDGET_MB, metavar="MB", help="size limit of report.html (%(default)s)"
     )
     options = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    console.show()
     out = options.out or options.folders[0]
     try:
         text = write(collect(options.folders), out, paper=options.paper, page_mb=options.page_mb)

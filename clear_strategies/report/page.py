@@ -10,11 +10,13 @@ import base64
 import hashlib
 import html
 import logging
+import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote
 
 from clear_strategies import files
 from clear_strategies.data.photo_files import image_size, jpeg, read_image
@@ -24,6 +26,7 @@ from clear_strategies.outputs.figures import ERROR_MAX, spaced
 from clear_strategies.outputs.maps import MAPS
 from clear_strategies.report.runs import Run, skips
 from clear_strategies.report.table import Columns, Table
+from clear_strategies.viewing import page as splat_page
 
 _log = logging.getLogger(__name__)
 
@@ -95,7 +98,9 @@ def write_page(path: Path, sections: Sequence[Section], *, budget_mb: float = BU
         images = Images(lossy)
         scenes = [_scene(section, images, views) for section in sections]
         limits = _limits(scenes, lossy=lossy, views=views)
-        page = _render(sections, scenes, images, limits).encode()
+        page = _render(
+            sections, scenes, images, limits, [_splats(section, path.parent) for section in sections]
+        ).encode()
         if len(page) <= budget_mb * 1e6:
             break
     else:
@@ -188,7 +193,23 @@ def _maps(section: Section, images: Images, views: int) -> list[dict[str, Any]]:
     return list(found.values())
 
 
-def _render(sections: Sequence[Section], scenes: Sequence[Mapping[str, Any]], images: Images, limits: str) -> str:
+def _splats(section: Section, folder: Path) -> dict[str, str]:
+    """The splat.html of each run that has one, as an address from the report's folder."""
+    found = {method: run.folder / splat_page.FILE for method, run in section.runs.items()}
+    return {
+        method: quote(Path(os.path.relpath(file, folder)).as_posix())
+        for method, file in found.items()
+        if file.is_file()
+    }
+
+
+def _render(
+    sections: Sequence[Section],
+    scenes: Sequence[Mapping[str, Any]],
+    images: Images,
+    limits: str,
+    splats: Sequence[Mapping[str, str]],
+) -> str:
     from jinja2 import Environment, FileSystemLoader
 
     environment = Environment(loader=FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
@@ -200,6 +221,7 @@ def _render(sections: Sequence[Section], scenes: Sequence[Mapping[str, Any]], im
         sections=sections,
         data={"images": images.uris, "scenes": scenes, "magma": _magma(), "errorMax": ERROR_MAX},
         limits=limits,
+        splats=splats,
         style=style,
         script=script,
     )

@@ -95,7 +95,7 @@ class P2G(Strategy):
             if (agreement := found.get(view.name)) is None:
                 continue
             self.cache[_VIEWS, view.name, view.factor] = agreement
-            _log.info(
+            _log.debug(
                 "%s: other views show %.0f %% of its patches and confirm their detail by %.2f on average; R of the rest is "
                 "the photo's.", view.name, 100 * float(agreement.known.double().mean()),
                 float(agreement.reliability[agreement.known].mean()),
@@ -143,7 +143,7 @@ class P2G(Strategy):
         key = (view.name, view.factor)
         if key not in self.cache:
             R, A = self.cache[key] = self._patches(view)
-            _log.info(
+            _log.debug(
                 "%s: reliability R %.2f..%.2f (mean %.3f), detail demand A mean %.3f over %dx%d patches.",
                 view.name, float(R.min()), float(R.max()), float(R.mean()), float(A.mean()), R.shape[1], R.shape[0],
             )  # fmt: skip

@@ -73,7 +73,7 @@ class SVS(Strategy):
         self.cache["seed"] = seed
         self.cache["share"] = self._share_of_rate(n_views)
         if self.cache["share"] < 1 and self.dropout.maximum > 0:
-            _log.info(
+            _log.debug(
                 "dropout rises to %.3f instead of %.3f: each of the %d training views is seen %d times (svs.looks: %d).",
                 self.dropout.maximum * self.cache["share"], self.dropout.maximum, n_views, self.dropout.full // n_views,
                 self.looks,

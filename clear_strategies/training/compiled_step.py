@@ -53,7 +53,7 @@ def compiled_step_for(conductor: Conductor, optimizer: Adam, mode: FusedMode = "
     reason = next(_why_not(conductor, optimizer, mode), None)
     if reason is None:
         return CompiledStep(conductor, optimizer, skips=mode == "auto")
-    _log.info("The per-Gaussian step takes the readable path: %s.", reason)
+    _log.debug("The per-Gaussian step takes the readable path: %s.", reason)
     return None
 
 

@@ -147,7 +147,7 @@ class SkipPolicy:
         added = (view.hr.image - images.upsample(view.lr.image, view.factor)).abs()
         wanted = images.patch_means(added, tile) >= self.skips.flat
         flat = int((~wanted).sum())
-        _log.info(
+        _log.debug(
             "%s: %d of %d HR tiles (%d px) are flat and trained on LR alone.",
             view.name, flat, wanted.numel(), tile,
         )  # fmt: skip

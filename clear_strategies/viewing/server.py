@@ -27,6 +27,7 @@ from torch import Tensor
 
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.viewing import paths, video
+from clear_strategies.viewing.aim import aim
 from clear_strategies.viewing.cameras import SavedCamera
 from clear_strategies.viewing.film import DepthScale
 from clear_strategies.viewing.look import AS_MEASURED, Look, Painter
@@ -132,7 +133,7 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         self._failed: str | None = None
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its address; whoever opens it does
             server = viser.ViserServer(host=host, port=port, verbose=False, label=title)
-        self._aim(server)
+        aim(server, [saved.camera for saved in screen.cameras])
         super().__init__(server, self._render, output_dir=out, mode="rendering")
         server.gui.set_panel_label(title)
         self._training = self._add_training() if live else None
@@ -229,22 +230,6 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
                 self._failed = str(error)
                 _log.warning("the viewer could not draw: %s", error)
             return np.zeros((size[1], size[0], 3), np.uint8)
-
-    def _aim(self, server: viser.ViserServer) -> None:
-        """Begin at the first camera, upright as the cameras are."""
-        poses = [saved.camera for saved in self._screen.cameras]
-        if not poses:
-            return
-        axes = torch.stack([camera.world_to_camera[:3, :3].double() for camera in poses])
-        up = -axes[:, 1].mean(0)
-        server.scene.set_up_direction(tuple((up / up.norm().clamp_min(1e-9)).tolist()))
-        first = poses[0]
-        distance = float(np.linalg.norm(paths.look_at(poses) - first.center.double().numpy()))
-        start = server.initial_camera
-        start.position = tuple(first.center.tolist())
-        start.look_at = tuple((first.center.double() + distance * first.world_to_camera[2, :3].double()).tolist())
-        start.up = tuple((-first.world_to_camera[1, :3]).tolist())
-        start.fov = 2 * math.atan(first.height / 2 / first.fy)
 
     def _add_cameras(self) -> None:
         train = [saved for saved in self._screen.cameras if saved.split == "train"][:_MOST_FRUSTUMS]

@@ -61,7 +61,7 @@ def test_without_a_background_alpha_is_composited_over_black_and_logged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = save(tmp_path / "a.png", np.array([[[255, 0, 0, 51]]], np.uint8))
-    with caplog.at_level("INFO"):
+    with caplog.at_level("DEBUG"):
         torch.testing.assert_close(photo_files.read_image(path), torch.tensor([[[0.2, 0.0, 0.0]]]))
     assert "a.png has transparent pixels" in caplog.text
 

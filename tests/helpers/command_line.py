@@ -10,7 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 TINY = ["data.reader.width=64", "data.reader.height=48", "fit.iterations=12", "fit.max_degree=1", "data.cloud.init=random",
         "data.cloud.random_points=60", "data.reader.views=5", "data.reader.train=2", "data.views.train=2",
-        "skips=none", "fit.baseline=false"]  # fmt: skip
+        "skips=none", "fit.baseline=false", "fit.page=0"]  # fmt: skip
 
 
 def run(

@@ -9,6 +9,7 @@ FLOORS: dict[str, tuple[set[str], set[str]]] = {
     "errors": (set(), set()),
     "files": ({"errors"}, set()),
     "schedules": ({"errors"}, set()),
+    "console": (set(), set()),
     "core": (GROUND, {"PIL"}),
     "kernels": (GROUND | {"core"}, {"warp"}),
     "strategies": (GROUND | {"core"}, set()),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +26,7 @@ def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
     tiny = replace(capture.frames[unused], camera=capture.frames[unused].camera.scaled(1 / 16))
     frames = tuple(tiny if i == unused else frame for i, frame in enumerate(capture.frames))
     views = ViewSettings(train=2, test_limit=1, photos_are="hr")
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level("DEBUG"):
         scene = load(DataSettings(reader=lambda: replace(capture, frames=frames), views=views), AutoPrior(), 0)
     assert tiny.name not in {view.name for view in (*scene.train, *scene.test)}
     assert "prior: auto chose demo" in caplog.text
@@ -44,7 +43,7 @@ def of_photos(factor: int = 4) -> Scene:
 def test_auto_takes_waifu2x_where_it_is_installed_and_says_nothing_else_of_it(tmp_path, monkeypatch, caplog):
     fake_ncnn.install(tmp_path / "site", monkeypatch)
     monkeypatch.setenv("CLEAR_CACHE", str(tmp_path / "cache"))
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level("DEBUG"):
         scene = of_photos()
     assert caplog.text.count("prior: auto chose waifu2x (photo model).") == 1
     assert "pip install" not in caplog.text
@@ -52,7 +51,7 @@ def test_auto_takes_waifu2x_where_it_is_installed_and_says_nothing_else_of_it(tm
     assert scene.notes["SR network"].startswith("WAIFU2X_PHOTO_UP2X.param ")
     assert not scene.synthetic_prior
     caplog.clear()
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level("DEBUG"):
         again = of_photos()
     assert caplog.text.count("SR image from the cache (waifu2x (photo model))") == 4
     assert [(v.hr.image == w.hr.image).all() for v, w in zip(scene.train, again.train, strict=True)] == [True, True]
@@ -60,7 +59,7 @@ def test_auto_takes_waifu2x_where_it_is_installed_and_says_nothing_else_of_it(tm
 
 def test_auto_without_the_extra_says_in_one_line_what_to_install(monkeypatch, caplog):
     monkeypatch.setattr(ncnn, "find_spec", lambda name: None)
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level("DEBUG"):
         scene = of_photos()
     lines = [line for line in caplog.messages if "prior" in line or "pip install" in line]
     assert lines == [

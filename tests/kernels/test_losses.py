@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import logging
 import os
 import subprocess
 import sys
@@ -285,7 +284,7 @@ def test_without_compiled_kernels_torch_is_used(monkeypatch):
 def test_the_objective_is_the_same_with_cpp_and_torch(caplog):
     x, y = rough(photo(60, 70), 0.1)
     kernels._log_once.cache_clear()
-    with caplog.at_level(logging.INFO, "clear_strategies.kernels.losses"):
+    with caplog.at_level("DEBUG", "clear_strategies.kernels.losses"):
         fast = [Objective(kernels="auto", clamp_render=clamp).hr(x, y) for clamp in (False, True)]
     assert [record.message for record in caplog.records] == [f"image losses: cpp, for {cpp.native().isa}."]
     for clamp, losses in zip((False, True), fast, strict=True):

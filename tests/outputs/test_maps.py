@@ -188,7 +188,7 @@ def test_views_with_stereo_show_their_depth(tmp_path: Path) -> None:
 def test_without_a_strategy_that_corrects_there_is_no_corrected_map(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO")
+    caplog.set_level("DEBUG")
     state = trained()
     write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER)
     content = json.loads((tmp_path / "maps.json").read_text())

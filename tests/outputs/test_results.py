@@ -30,7 +30,7 @@ from clear_strategies.viewing.look import Painter
 from tests.helpers import toy
 from tests.helpers.image_files import holds, read
 
-WRITTEN_BY_OTHERS = {".hydra/", "run.log", "checkpoints/", "baseline/", "cameras.json", "cameras/"}
+WRITTEN_BY_OTHERS = {".hydra/", "run.log", "checkpoints/", "baseline/", "cameras.json", "cameras/", "tensorboard/"}
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
 SCENE = toy.scene()
 
@@ -54,11 +54,12 @@ def write(
     *,
     scene: Scene = SCENE,
     video: int = 2,
+    page: int = 1000,
 ) -> Evaluation:
     return write_results(
         folder, scene, state, toy.RASTERIZER, Chosen(None, ["gco", "p2g"]), backend="torch", down="bicubic",
-        map_views=map_views, painter=Painter(state.field, lambda **_: toy.RASTERIZER), video_frames=video, seconds=1.5,
-        config={"fit": {"seed": 0}}, baseline=baseline,
+        map_views=map_views, painter=Painter(state.field, lambda **_: toy.RASTERIZER), video_frames=video, page_gaussians=page,
+        seconds=1.5, config={"fit": {"seed": 0}}, baseline=baseline,
     )  # fmt: skip
 
 
@@ -128,7 +129,7 @@ def test_a_video_that_cannot_be_written_is_named(
     tmp_path: Path, state: TrainState, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr("clear_strategies.viewing.video.find_spec", lambda _: None)
-    with caplog.at_level("INFO"):
+    with caplog.at_level("DEBUG"):
         write(tmp_path, state, map_views=0)
     assert "pip install imageio-ffmpeg" in caplog.text
     assert not (tmp_path / "path.mp4").exists()

@@ -118,3 +118,12 @@ def test_runs_without_views_and_maps_still_make_a_page(tmp_path: Path, caplog: p
     assert [layer["label"] for layer in scene["views"][0]["layers"]] == ["gco"]
     assert scene["maps"] == []
     assert "no run has views/" in caplog.text
+
+
+def test_the_splats_of_runs_that_have_a_page_are_linked(tmp_path: Path) -> None:
+    make_run(tmp_path / "runs" / "a b#", "+strategy=gco")
+    make_run(tmp_path / "runs" / "1", "+strategy=baseline")
+    (tmp_path / "runs" / "a b#" / "splat.html").write_text("<html></html>")
+    report.write(report.collect([tmp_path / "runs"]), tmp_path / "report")
+    links = [to for to in Page(tmp_path / "report" / "report.html").references if to.endswith("splat.html")]
+    assert links == ["../runs/a%20b%23/splat.html"]

@@ -107,7 +107,7 @@ def test_observation_is_made_once_a_view_and_invisible_gaussians_have_none(caplo
     view = toy.scene().train[0]
     _, shot = GaussianField.from_cloud(toy.scene().cloud).render_scales(toy.RASTERIZER, view)
     p2g = P2G()
-    with caplog.at_level("INFO"):
+    with caplog.at_level("DEBUG"):
         first, second = p2g.observe(view, shot), p2g.observe(view, shot)
     assert caplog.text.count(view.name) == 1
     assert torch.equal(first.reliability, second.reliability)
@@ -157,7 +157,7 @@ def test_a_flat_image_asks_for_no_detail_on_and_off_the_8_bit_grid(grey, down):
 
 
 def test_the_agreement_of_views_sees_an_invention_that_the_photo_cannot_see(caplog):
-    caplog.set_level("INFO")
+    caplog.set_level("DEBUG")
     views = planes.with_invention(planes.plane_views(), 1, row=2, column=3)
     R = {}
     for agreement in ("photo", "views", "both"):

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from clear_strategies.data import ply
-from clear_strategies.data.readers import colmap, llff
+from clear_strategies.data.readers import colmap_model, llff
 from clear_strategies.errors import DataError
 from clear_strategies.training import checkpoint
 from tests.helpers.malformed import GOOD
@@ -46,9 +46,9 @@ def targets(folder: Path) -> dict[str, tuple[Path, Callable[[], None]]]:
     model = scene / "sparse" / "0"
 
     def read_colmap() -> None:
-        found = colmap.read_model(model)
+        found = colmap_model.read_model(model)
         for image in found.images:
-            pose = colmap.pose_of(image)
+            pose = colmap_model.pose_of(image)
             _require(bool(pose.isfinite().all()) and image.camera in found.lenses)
         _require(bool(np.isfinite(found.points.means).all()))
 

@@ -6,7 +6,6 @@ In C++ and in Warp, whose kernels for CUDA run on a CPU, too.
 from __future__ import annotations
 
 import itertools
-import logging
 import math
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -385,7 +384,7 @@ def test_the_readable_path_is_taken_where_it_must_be_and_that_is_said_once(caplo
     ]
     for arguments, reason in cases:
         caplog.clear()
-        with caplog.at_level(logging.INFO):
+        with caplog.at_level("DEBUG"):
             assert compiled_step_for(*arguments) is None
         assert [reason in message for message in caplog.messages] == [True]
 
@@ -394,7 +393,7 @@ def test_the_readable_path_is_taken_where_it_must_be_and_that_is_said_once(caplo
 
     monkeypatch.setattr("clear_strategies.training.compiled_step.load_kernels", missing)
     caplog.clear()
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level("DEBUG"):
         assert compiled_step_for(Conductor(), adam) is None
     assert caplog.messages == ["The per-Gaussian step takes the readable path: the compiled kernels are not installed."]
 

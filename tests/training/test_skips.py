@@ -128,7 +128,7 @@ def test_every_milestone_stretches_with_the_run():
 def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
     state = start(("gco",))
     state.skip_policy = SkipPolicy(Skips(plateau_gain=0.99, plateau_window=2, plateau_from=6, plateau_to=17))
-    with caplog.at_level("INFO"):
+    with caplog.at_level("DEBUG"):
         fit(state, toy.scene(), toy.RASTERIZER)
     assert [int(row["t"]) for row in state.history] == [*range(1, 9), 18, 19, 20]
     assert state.optimizer.steps == ITERATIONS  # so the learning rates are those of the end

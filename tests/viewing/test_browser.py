@@ -1,8 +1,9 @@
-"""The viewer in a real browser: the page shows the splat, and a drag turns it."""
+"""The viewer and the page of a run in a real browser: both show the splat, and a drag turns it."""
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import shutil
 import time
@@ -12,6 +13,7 @@ import pytest
 from PIL import Image
 
 from clear_strategies.jobs.saved import open_splat
+from clear_strategies.viewing.page import write_page
 from tests.helpers import saved_run
 
 sync_api = pytest.importorskip("playwright.sync_api")
@@ -40,23 +42,46 @@ def until(what, found):
     raise AssertionError("the page did not change in time")
 
 
-def test_the_page_shows_the_splat_and_a_drag_turns_it(tmp_path):
+def require_that_a_drag_turns_it(page) -> None:
+    """The page shows something, and something else after the drag."""
+    session = page.context.new_cdp_session(page)
+    before = until(lambda: picture(session), lambda shown: shown.std() > 8)  # an empty page has one colour
+    page.mouse.move(100, 300)
+    page.mouse.down()
+    page.mouse.move(180, 320, steps=4)
+    page.mouse.up()
+    until(lambda: picture(session), lambda shown: np.abs(shown - before).mean() > 4)
+
+
+@contextlib.contextmanager
+def opened(**context):
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        page = browser.new_page(viewport={"width": 640, "height": 420}, **context)
+        page.set_default_timeout(1000 * PATIENCE)
+        yield page
+        browser.close()
+
+
+def test_the_viewer_shows_the_splat_and_a_drag_turns_it(tmp_path):
     saved_run.write(tmp_path)
     splat = open_splat(tmp_path)
     viewer = server.SplatViewer(server.Screen(splat.painter, splat.cameras), title="toy", port=8421, out=tmp_path)
     try:
-        with sync_api.sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
-            page = browser.new_page(viewport={"width": 640, "height": 420})
-            page.set_default_timeout(1000 * PATIENCE)
+        with opened() as page:
             page.goto(viewer.address)
-            session = page.context.new_cdp_session(page)
-            before = until(lambda: picture(session), lambda shown: shown.std() > 8)  # an empty page has one colour
-            page.mouse.move(100, 300)
-            page.mouse.down()
-            page.mouse.move(180, 320, steps=4)
-            page.mouse.up()
-            until(lambda: picture(session), lambda shown: np.abs(shown - before).mean() > 4)
-            browser.close()
+            require_that_a_drag_turns_it(page)
     finally:
         viewer.close()
+
+
+def test_the_page_of_a_run_does_so_from_the_disk_without_a_network(tmp_path):
+    field = saved_run.write(tmp_path)
+    cameras = [view.hr.camera for view in saved_run.SCENE.train]
+    write_page(tmp_path / "splat.html", field.baked(), cameras, "toy", (0.0, 0.0, 0.0))
+    with opened(offline=True) as page:
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto((tmp_path / "splat.html").as_uri())
+        require_that_a_drag_turns_it(page)
+    assert not [url for url in asked if url.startswith(("http", "ws"))]

@@ -176,7 +176,7 @@ def initial_points(
         cloud = replace(cloud, means=means, colors=colors, source=f"{cloud.source}, in voxels of {settings.voxel:g}")
     if len(cloud) > settings.max_points:
         chosen = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(seed))[: settings.max_points]
-        _log.info("%d of %d points chosen at random (max_points).", settings.max_points, len(cloud))
+        _log.debug("%d of %d points chosen at random (max_points).", settings.max_points, len(cloud))
         cloud = cloud[chosen.sort().values]
     return InitialPoints(cloud, depths)
 
@@ -206,19 +206,19 @@ def _from_photos(
     """
     auto = settings.init == "auto"
     if auto and sfm is not None and known is None:
-        _log.info("init: auto does not use the scene's own points, because test views were used for them.")
+        _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
     features = triangulate(photos, settings.triangulation) if known is None else known
     if settings.init != "triangulated":
         maps = depth_maps(photos, features.means, settings.stereo, background)
         cloud = stereo_cloud(features, photos, maps, settings, background)
         if cloud is not None:
             if auto:
-                _log.info("init: auto chose %s.", cloud.source)
+                _log.debug("init: auto chose %s.", cloud.source)
             return cloud, tuple(maps)
         if not auto:
             problem = f"stereo confirms no depth in any of the {len(photos)} training LR images"
             raise DataError("scene", "points", problem, "use init=triangulated or random, or closer views")
-        _log.info("init: stereo confirms no depth in any of the %d training LR images.", len(photos))
+        _log.debug("init: stereo confirms no depth in any of the %d training LR images.", len(photos))
     elif len(features) == 0:
         problem = f"none could be triangulated from the {len(photos)} training LR images"
         raise DataError("scene", "points", problem, "use init=random, or more or closer views")
@@ -227,7 +227,7 @@ def _from_photos(
         _log.warning(message, len(features), settings.enough)
         return None, ()
     if auto:
-        _log.info("init: auto chose %s.", features.source)
+        _log.debug("init: auto chose %s.", features.source)
     return _cleaned(settings, features, photos, background), ()
 
 
@@ -276,13 +276,13 @@ def _without_outliers(settings: CloudSettings, cloud: PointCloud) -> PointCloud:
     if settings.outlier_neighbours == 0:
         return cloud
     if len(cloud) <= settings.outlier_neighbours:
-        _log.info("outliers are kept: %d points are too few to tell them.", len(cloud))
+        _log.debug("outliers are kept: %d points are too few to tell them.", len(cloud))
         return cloud
     kept = remove_outliers(cloud.means, settings.outlier_neighbours, settings.outlier_ratio)
     if len(kept) == 0:
         _log.warning("outliers are kept: the points coincide, so all of them would be removed.")
         return cloud
-    _log.info("%d of %d points removed as outliers.", len(cloud) - len(kept), len(cloud))
+    _log.debug("%d of %d points removed as outliers.", len(cloud) - len(kept), len(cloud))
     return cloud[kept]
 
 
@@ -294,6 +294,6 @@ def _densified(
 ) -> PointCloud:
     grid = sum(len(pixel_grid(photo, settings.stride)) for photo in photos)
     if settings.densify == "auto" and len(cloud) >= grid:
-        _log.info("densify: auto adds nothing: the cloud has %d points, the views' grids %d.", len(cloud), grid)
+        _log.debug("densify: auto adds nothing: the cloud has %d points, the views' grids %d.", len(cloud), grid)
         return cloud
     return densify(cloud, photos, settings.stride, background) if settings.densify else cloud

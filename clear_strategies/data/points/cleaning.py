@@ -96,7 +96,7 @@ def _open3d(task: str) -> Any:
     try:
         import open3d
     except (ImportError, OSError) as reason:
-        _log.info("%s by SciPy: open3d (extra [open3d]) cannot be imported (%s).", task, " ".join(str(reason).split()))
+        _log.debug("%s by SciPy: open3d (extra [open3d]) cannot be imported (%s).", task, " ".join(str(reason).split()))
         return None
-    _log.info("%s by open3d %s.", task, open3d.__version__)
+    _log.debug("%s by open3d %s.", task, open3d.__version__)
     return open3d

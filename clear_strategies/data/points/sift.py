@@ -37,6 +37,7 @@ class TriangulationSettings:
     Args:
         enlarge: factor by which images are enlarged before SIFT runs; small images give few features otherwise.
         contrast: SIFT's contrast threshold; a lower one gives more and weaker features.
+        max_features: of an image, the strongest; the time of matching grows with its square. None: all.
         ratio: largest distance of a match, relative to that of the second best (Lowe's ratio test).
         epipolar: largest distance from the epipolar lines, root mean square over both views, LR px.
         reprojection: largest reprojection error in either view, LR px.
@@ -48,6 +49,7 @@ class TriangulationSettings:
 
     enlarge: int = 2
     contrast: float = 0.01
+    max_features: int | None = 8192
     ratio: float = 0.85
     epipolar: float = 1.0
     reprojection: float = 1.0
@@ -55,6 +57,8 @@ class TriangulationSettings:
 
     def __post_init__(self) -> None:
         require_whole("data.cloud.triangulation.enlarge", self.enlarge, least=1)
+        if self.max_features is not None:
+            require_whole("data.cloud.triangulation.max_features", self.max_features, least=1)
         require_number("data.cloud.triangulation.ratio", self.ratio, above=0, most=1)
         for name in ("contrast", "epipolar", "reprojection", "angle"):
             require_number(f"data.cloud.triangulation.{name}", getattr(self, name), above=0)
@@ -95,7 +99,7 @@ def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None 
 
     sampled = [sample_colors(photo.image, f.pixels) for photo, f in zip(photos, features, strict=True)]
     colors = torch.cat(sampled)[pairs.features[chosen]].mean(dim=1) if len(chosen) else torch.zeros(0, 3)
-    _log.info("%d features, %d pairs of them, %d points.", len(view), len(pairs.means), len(chosen))
+    _log.debug("%d features, %d pairs of them, %d points.", len(view), len(pairs.means), len(chosen))
     source = f"{len(chosen):,} points triangulated from the {len(photos)} training LR images"
     return PointCloud(pairs.means[chosen].float(), colors, source)
 
@@ -109,7 +113,9 @@ def find_features(photo: Photo, settings: TriangulationSettings) -> Features:
     size = (grey.shape[1] * settings.enlarge, grey.shape[0] * settings.enlarge)
     large = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)
     # Without the precise upscale every keypoint is a quarter of a pixel too far right and down.
-    sift: Any = cv2.SIFT_create(contrastThreshold=settings.contrast, enable_precise_upscale=True)  # type: ignore[attr-defined]
+    sift: Any = cv2.SIFT_create(  # type: ignore[attr-defined]
+        nfeatures=settings.max_features or 0, contrastThreshold=settings.contrast, enable_precise_upscale=True
+    )
     keypoints, descriptors = sift.detectAndCompute(large, None)
     if descriptors is None:
         return Features(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128))

@@ -52,7 +52,7 @@ class Cached:
             except DataError as damaged:
                 _log.warning("a cached SR image is damaged and is computed again: %s", damaged)
             else:
-                _log.info("%s: SR image from the cache (%s).", name, self.label)
+                _log.debug("%s: SR image from the cache (%s).", name, self.label)
                 return result
         result = images.quantize(self.prior(name, lr, factor)).contiguous()  # as read_image's: sums have an order
         try:

@@ -94,4 +94,4 @@ def warn_if_far_from_lr(what: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor,
 def log_result(name: str, label: str, sr: Float[Tensor, "H W 3"], began: float) -> None:
     """Log the size of an SR image and the seconds since `began` (time.perf_counter)."""
     seconds = time.perf_counter() - began
-    _log.info("%s: %s made %dx%d in %.1f s.", name, label, sr.shape[1], sr.shape[0], seconds)
+    _log.debug("%s: %s made %dx%d in %.1f s.", name, label, sr.shape[1], sr.shape[0], seconds)

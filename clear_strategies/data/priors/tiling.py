@@ -3,22 +3,16 @@
 from __future__ import annotations
 
 import itertools
-import logging
 import math
-import time
 from collections.abc import Callable
-from typing import Final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.data.checks import require_whole
+from clear_strategies.data.progress import Progress
 from clear_strategies.errors import SettingError
-
-_log = logging.getLogger(__name__)
-
-_SECONDS_BETWEEN_REPORTS: Final = 10.0
 
 
 def tiled(
@@ -44,7 +38,7 @@ def tiled(
     rows, columns = (_shares(size, tile, overlap) for size in (height, width))
     out = lr.new_zeros(height * factor, width * factor, 3)
     weight = lr.new_zeros(height * factor, width * factor, 1)
-    total, began = len(rows) * len(columns), time.perf_counter()
+    progress = Progress("super-resolution of a photo", "tiles", len(rows) * len(columns))
     for done, (row, column) in enumerate((r, c) for r in rows for c in columns):
         part = tuple(
             slice(max(a - 2 * overlap, 0), min(b + 2 * overlap, size))
@@ -58,9 +52,7 @@ def tiled(
         enlarged = tuple(slice(along.start * factor, along.stop * factor) for along in part)
         out[enlarged] += fade * upscale(lr[part])
         weight[enlarged] += fade
-        if time.perf_counter() - began > _SECONDS_BETWEEN_REPORTS:
-            _log.info("super-resolution: %d of %d tiles.", done + 1, total)
-            began = time.perf_counter()
+        progress(done + 1)
     return out / weight
 
 

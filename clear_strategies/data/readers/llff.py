@@ -17,6 +17,7 @@ from clear_strategies.data.capture import Capture, Color, Frame, lens_notes, sor
 from clear_strategies.data.checks import as_color, require_choice
 from clear_strategies.data.photo_files import folder_note, image_folder, inside, list_images
 from clear_strategies.data.readers import colmap
+from clear_strategies.data.readers.colmap_model import Model, find_model, read_model
 from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 from clear_strategies.files import require_regular
@@ -78,7 +79,7 @@ def read(
 def _from_colmap(
     root: Path, folder: Path, background: Color | None, allow_outside: bool, missing: Fault, broken: Fault
 ) -> Capture:
-    model = colmap.read_model(colmap.find_model(root))
+    model = read_model(find_model(root))
     registered = sorted(image.name for image in model.images)
     files = {p.name: inside(folder, p.name, file=folder, allow_outside=allow_outside) for p in list_images(folder)}
     if any(name in files for name in registered):
@@ -109,7 +110,7 @@ def _from_bounds(
             f"there are {len(table)}, but {folder.name} holds {len(paths)} images",
             "give one row an image",
         )
-    model = colmap.read_model(colmap.find_model(root)) if has_model else None
+    model = read_model(find_model(root)) if has_model else None
     ids = _ids_by_order(model, len(paths))
     frames, lenses = [], []
     kept = usable(folder, range(len(paths)), lambda i: paths[i], missing="refuse", broken=broken)
@@ -141,13 +142,13 @@ def _from_bounds(
     return Capture(root.resolve().name, sorted_by_name(frames, folder), points, background or (0.0, 0.0, 0.0), notes)
 
 
-def _ids_by_order(model: colmap.Model | None, n: int) -> list[int | None]:
+def _ids_by_order(model: Model | None, n: int) -> list[int | None]:
     """The model's ids of the n photos, matched in order of names."""
     if model is None:
         return [None] * n
     registered = sorted(model.images, key=lambda image: image.name)
     if len(registered) != n:
-        _log.info("%s has %d of %d photos: its points are not used.", model.folder, len(registered), n)
+        _log.debug("%s has %d of %d photos: its points are not used.", model.folder, len(registered), n)
         return [None] * n
     return [image.id for image in registered]
 

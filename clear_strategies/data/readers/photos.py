@@ -16,6 +16,7 @@ from clear_strategies.data.exif import Exif, read_exif
 from clear_strategies.data.photo_files import image_size, inside, list_images
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
+from clear_strategies.data.readers.colmap_model import Model, read_model
 from clear_strategies.data.usable import Fault, some, usable
 from clear_strategies.errors import DataError
 
@@ -72,14 +73,14 @@ def read(
         image_size(path, turn=True)
     folder = base / _key(paths, max_side, max_features, seed)
     if (folder / "cameras.bin").is_file():
-        _log.info("%s: poses from the cache %s.", root, folder)
+        _log.debug("%s: poses from the cache %s.", root, folder)
     else:
         settings = sfm.SfmSettings(max_side, max_features, least_placed, threads, seed)
         sfm.reconstruct(root, photos, folder, settings)
-    return _capture(root, paths, photos, colmap.read_model(folder))
+    return _capture(root, paths, photos, read_model(folder))
 
 
-def _capture(root: Path, paths: Sequence[Path], photos: Mapping[Path, Exif], model: colmap.Model) -> Capture:
+def _capture(root: Path, paths: Sequence[Path], photos: Mapping[Path, Exif], model: Model) -> Capture:
     """The photos with their poses; the model knows them by their numbers."""
     by_copy = {sfm.copy_name(i): path for i, path in enumerate(paths)}
     found = colmap.capture(root, model, root, {image.name: by_copy[image.name] for image in model.images}, upright=True)

@@ -20,6 +20,7 @@ from PIL import Image as Picture
 
 from clear_strategies.data.exif import Exif
 from clear_strategies.data.photo_files import read_image, write_jpeg
+from clear_strategies.data.progress import EVERY, Progress
 from clear_strategies.data.usable import some
 from clear_strategies.errors import DataError
 
@@ -27,7 +28,6 @@ _log = logging.getLogger(__name__)
 
 FEWEST: Final = 3
 MORE: Final = "take more photos that overlap by two thirds, with the same camera and zoom, of a scene with texture"
-_EVERY: Final = 10.0  # seconds between lines of progress
 _MEGA: Final = 1 << 20
 _DISTANCES: Final = 4  # bytes of each pair of features that are compared
 
@@ -152,7 +152,7 @@ def _write_copies(
         focal = None if exif.focal35 is None else round(exif.focal_pixels(*size), 2)
         groups.setdefault((*size, focal), []).append(copy_name(i))
     known = sum(len(names) for (_, _, focal), names in groups.items() if focal is not None)
-    _log.info("%d cameras; the focal length of %d of %d photos is in EXIF.", len(groups), known, len(photos))
+    _log.debug("%d cameras; the focal length of %d of %d photos is in EXIF.", len(groups), known, len(photos))
     return groups
 
 
@@ -172,16 +172,16 @@ def _placing(count: int) -> Callable[[], None]:
 @contextlib.contextmanager
 def _progress(database: Path, table: str, what: str, unit: str, total: int) -> Iterator[None]:
     """Log every few seconds how many rows a table of COLMAP's database has: its calls return only at their end."""
-    done = threading.Event()
+    done, progress = threading.Event(), Progress(what, unit, total)
 
     def watch() -> None:
-        while not done.wait(_EVERY):
+        while not done.wait(EVERY):
             with (
                 contextlib.suppress(sqlite3.Error),
                 contextlib.closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as connection,
             ):
                 rows = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]  # noqa: S608
-                _log.info("%s: %d of %d %s.", what, rows, total, unit)
+                progress.tell(rows)
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()

@@ -126,4 +126,4 @@ def _fastest(x: Tensor, y: Tensor) -> Choice:
 
 @cache
 def _log_once(which: str) -> None:
-    _log.info("image losses: %s.", which)
+    _log.debug("image losses: %s.", which)

@@ -115,7 +115,7 @@ def test_tiny_clouds_are_left_alone() -> None:
 
 
 def test_the_log_says_which_library_ran(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
+    caplog.set_level("DEBUG")
     without_open3d(monkeypatch)
     remove_outliers(room(100), 16, 3.0)
     assert "outlier removal by SciPy: open3d (extra [open3d]) cannot be imported" in caplog.text

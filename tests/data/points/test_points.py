@@ -25,7 +25,7 @@ def flat_photos() -> list[Photo]:
 
 
 def test_auto_triangulates_where_it_can(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
+    caplog.set_level("DEBUG")
     cloud = initial_points(CloudSettings(densify=False), plane_photos(3), sfm=sfm(), train_ids=[1, 2, 3]).cloud
     assert len(cloud) > 50
     assert cloud.uses_test_views == "no"

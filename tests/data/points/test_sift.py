@@ -52,6 +52,18 @@ def test_the_same_photos_give_the_same_cloud() -> None:
     assert torch.equal(one.colors, two.colors)
 
 
+def test_of_too_many_features_the_strongest_are_taken() -> None:
+    photo = plane_photos(1)[0]
+    every = find_features(photo, TriangulationSettings(max_features=None))
+    some = find_features(photo, TriangulationSettings(max_features=50))
+    assert 50 <= len(some.pixels) < len(every.pixels)  # OpenCV keeps all that are as strong as the last
+    assert len(some.pixels) < 60
+    found = {tuple(pixel) for pixel in every.pixels.tolist()}
+    assert all(tuple(pixel) in found for pixel in some.pixels.tolist())
+    with pytest.raises(SettingError, match="max_features"):
+        TriangulationSettings(max_features=0)
+
+
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_flat_images_give_an_empty_cloud(count: int) -> None:
     cloud = triangulate([Photo(camera(0.1 * i), torch.full((100, 100, 3), 0.5)) for i in range(count)])

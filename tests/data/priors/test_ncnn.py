@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 
 import pytest
@@ -73,7 +72,7 @@ def test_a_network_that_fails_is_refused_in_one_line(
 
 
 def test_one_line_of_the_log_per_image(fake: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level("DEBUG"):
         Ncnn()("view", photo(8, 12), 4)
     (line,) = caplog.messages
     assert line.startswith("view: waifu2x (photo model) made 48x32 in ")

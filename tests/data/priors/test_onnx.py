@@ -97,7 +97,7 @@ def test_a_network_with_another_channel_order_gives_a_warning(tmp_path: Path, ca
 def test_a_good_network_logs_model_size_and_time_and_no_warning(
     network: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level("DEBUG"):
         Onnx(str(network))("view", photo(8, 12), 4)
     assert "view: onnx tiny_x4.onnx made 48x32 in" in caplog.text
     assert not [record for record in caplog.records if record.levelno > logging.INFO]

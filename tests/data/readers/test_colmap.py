@@ -69,7 +69,7 @@ def test_photos_may_differ_from_the_model_in_their_ending(tmp_path: Path) -> Non
 def test_photos_without_a_pose_and_further_models_are_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     shutil.copy(tiny.colmap_bin(tmp_path) / "images/a.png", tmp_path / "images/d.png")
     shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
-    with caplog.at_level("INFO"):
+    with caplog.at_level("DEBUG"):
         capture = colmap.read(tmp_path)
     assert capture.notes["without pose"] == "1 photos, not used: d.png"
     assert "other models (1) are not" in caplog.text

@@ -115,6 +115,6 @@ def _judged(photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"], setting
 
 
 def _unknown(photo: Photo, reason: str) -> DepthMap:
-    _log.info("stereo: a photo of %dx%d is left out: %s.", photo.camera.width, photo.camera.height, reason)
+    _log.debug("stereo: a photo of %dx%d is left out: %s.", photo.camera.width, photo.camera.height, reason)
     shape = (photo.camera.height, photo.camera.width)
     return DepthMap(photo.image.new_full(shape, torch.nan), photo.image.new_zeros(shape))

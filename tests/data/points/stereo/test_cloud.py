@@ -63,7 +63,7 @@ def test_only_unknown_pixels_are_filled_and_never_in_known_free_space() -> None:
 
 
 def test_auto_takes_stereo_keeps_its_depth_and_says_how_much_is_known(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
+    caplog.set_level("DEBUG")
     found = initial_points(CloudSettings(stereo=StereoSettings(max_planes=64)), plane_photos(3, 64, 48))
     assert len(found.depths) == 3
     assert "dense stereo between the 3 training LR images (depth known at" in found.cloud.source

@@ -82,14 +82,14 @@ def test_compared_images_may_be_larger_or_smaller_than_the_photos(changed: dict[
 
 
 def test_a_textureless_photo_has_no_depth_and_the_log_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
+    caplog.set_level("DEBUG")
     flat = [replace(p, image=torch.full_like(p.image, 0.5)) for p in photos_of(slanted)]
     assert all(found.coverage == 0 for found in depth_maps(flat, NONE, QUICK))
     assert "confirmed at only 0.0% of the pixels" in caplog.text
 
 
 def test_photos_from_one_place_have_no_depth(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
+    caplog.set_level("DEBUG")
     photos = [cast(slanted, camera(0.0, degrees))[0] for degrees in (-5, 0, 5)]
     assert all(found.coverage == 0 for found in depth_maps(photos, NONE, QUICK))
     assert "no other photo sees the same surfaces" in caplog.text
@@ -112,7 +112,7 @@ def test_a_photo_whose_stereo_fails_does_not_spoil_the_others() -> None:
 
 
 def test_depth_behind_most_triangulated_points_is_not_trusted(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("INFO")
+    caplog.set_level("DEBUG")
     photos = photos_of(slanted)
     near = torch.cat((torch.rand(40, 2) - 0.5, torch.full((40, 1), 2.5)), dim=1)
     far = torch.cat((torch.rand(40, 2) - 0.5, torch.full((40, 1), 6.0)), dim=1)

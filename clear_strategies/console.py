@@ -1,0 +1,48 @@
+"""What the programs say on the terminal, and how much of it. conf/config.yaml sets a run's logging up with this.
+
+INFO is for everybody: the plan, what takes long, the result and where to look next. DEBUG is for those who ask (`-v`): every
+round of the densifier, timings, which kernels were chosen. Warnings are always shown. A run's run.log has all three.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import sys
+from typing import Any, Final, TextIO
+
+_OURS: Final = ("clear_strategies", "rasterizers", "integration")
+
+_CHATTY: Final = ("websockets", "PIL", "matplotlib", "asyncio")  # libraries that tell every event at INFO
+_PREFIXES: Final = {logging.WARNING: "warning: ", logging.ERROR: "error: ", logging.CRITICAL: "error: "}
+
+
+class Console(logging.StreamHandler[Any]):
+    """Writes messages above a progress bar, warnings and errors with a prefix.
+
+    Args:
+        stream: None: stdout.
+        verbose: also what run.log alone has otherwise.
+    """
+
+    def __init__(self, stream: TextIO | io.TextIOBase | None = None, *, verbose: bool = False) -> None:
+        super().__init__(stream if stream is not None else sys.stdout)
+        self.setLevel(logging.DEBUG if verbose else logging.INFO)
+
+    def format(self, record: logging.LogRecord) -> str:
+        return _PREFIXES.get(record.levelno, "") + super().format(record)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        bars = sys.modules.get("tqdm")  # where nobody has imported it, there is no bar
+        with contextlib.nullcontext() if bars is None else bars.tqdm.external_write_mode(file=self.stream):
+            super().emit(record)
+
+
+def show(*, verbose: bool = False) -> None:
+    """Messages go to stderr, for programs that Hydra does not start; without effect where logging is set up already."""
+    logging.basicConfig(handlers=[Console(sys.stderr, verbose=verbose)], level=logging.INFO, format="%(message)s")
+    for name in _OURS if verbose else ():
+        logging.getLogger(name).setLevel(logging.DEBUG)
+    for name in _CHATTY:
+        logging.getLogger(name).setLevel(logging.WARNING)

@@ -1,0 +1,219 @@
+"""Folders of photos as phones and people leave them: each ends well, or with one line that names the file and the cure.
+
+Structure from motion is replaced by a model that is there already, of three photos a, b and c.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from clear_strategies.data.capture import Capture
+from clear_strategies.data.photo_files import read_image
+from clear_strategies.data.readers import photos
+from clear_strategies.errors import DataError
+from tests.helpers import captures
+from tests.helpers.captures import NAMES
+
+Read = Callable[..., Capture]
+
+
+@pytest.fixture
+def of_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Read]:
+    """A folder of three photos, and what reads it."""
+    model = captures.colmap_bin(tmp_path / "model") / "sparse" / "0"
+    monkeypatch.setattr(photos.sfm, "copy_name", lambda i: NAMES[i] if i < len(NAMES) else f"{i}.jpg")
+
+    def reconstruct(root: Path, found: Mapping[Path, object], folder: Path, settings: object) -> None:
+        for path in found:  # it makes copies of all of them
+            read_image(path, turn=True)
+        shutil.copytree(model, folder)
+
+    monkeypatch.setattr(photos.sfm, "reconstruct", reconstruct)
+    captures.write_photos(tmp_path / "photos")
+    return tmp_path / "photos", lambda **settings: photos.read(tmp_path / "photos", tmp_path / "cache", **settings)
+
+
+def image_of(path: Path) -> Image.Image:
+    with Image.open(path) as image:
+        return image.convert("RGB")
+
+
+def again(folder: Path, name: str = "b.png", **saving) -> None:
+    """Save b anew, under a name and in a form."""
+    image = image_of(folder / "b.png")
+    (folder / "b.png").unlink()
+    image.save(folder / name, **saving)
+
+
+def turn(path: Path, orientation: int) -> np.ndarray:
+    """Store a photo turned, as its EXIF block then says; its upright pixels."""
+    upright, exif = image_of(path), Image.Exif()
+    exif[0x0112] = orientation
+    stored = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}[orientation]
+    upright.transpose(stored).save(path, exif=exif)
+    return np.asarray(upright)
+
+
+def as_heic(folder: Path, name: str) -> None:
+    heif = pytest.importorskip("pillow_heif")
+    heif.register_heif_opener()
+    large = image_of(folder / "b.png").resize((64, 48))
+    (folder / "b.png").unlink()
+    large.save(folder / name, format="HEIF")
+
+
+def beside(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).write_bytes(b"never opened")
+
+
+def as_mode(folder: Path, mode: str, name: str = "b.png") -> None:
+    image = image_of(folder / "b.png").convert(mode)
+    (folder / "b.png").unlink()
+    image.save(folder / name)
+
+
+def as_portrait(folder: Path) -> None:
+    """Two pictures in one JPEG, the second of them depth: what phones save as a portrait."""
+    image = image_of(folder / "b.png")
+    (folder / "b.png").unlink()
+    image.save(folder / "b.jpg", format="MPO", save_all=True, append_images=[image.convert("L").convert("RGB")])
+
+
+def with_damaged_exif(folder: Path) -> None:
+    again(folder, "b.jpg", exif=b"Exif\0\0MM\0*\xff\xff\xff\xff" + bytes(20))
+
+
+def as_links(folder: Path) -> None:
+    shutil.move(folder, folder.parent / "elsewhere")
+    folder.mkdir()
+    for name in NAMES:
+        (folder / name).symlink_to(folder.parent / "elsewhere" / name)
+
+
+def sixteen_bits(folder: Path) -> None:
+    import cv2
+
+    pixels = np.asarray(image_of(folder / "b.png")).astype(np.uint16) * 257
+    cv2.imwrite(str(folder / "b.png"), pixels[..., ::-1])
+
+
+# What the folder holds, and the photos that are then used.
+READ: dict[str, tuple[Callable[[Path], object], list[str]]] = {
+    "a photo on its side, by EXIF": (lambda f: turn(f / "b.png", 6), ["a.png", "b.png", "c.png"]),
+    "a photo upside down, by EXIF": (lambda f: turn(f / "b.png", 3), ["a.png", "b.png", "c.png"]),
+    "HEIC among others": (lambda f: as_heic(f, "b.heic"), ["a.png", "b.heic", "c.png"]),
+    "HEIC that calls itself JPEG": (lambda f: as_heic(f, "b.jpg"), ["a.png", "b.jpg", "c.png"]),
+    "a photo saved as HEIC and as JPEG": (lambda f: beside(f, "b.HEIC"), ["a.png", "b.png", "c.png"]),
+    "what a Mac and a phone leave beside photos": (
+        lambda f: beside(f, "._a.png", ".DS_Store", "clip.mov", "Thumbs.db"),
+        ["a.png", "b.png", "c.png"],
+    ),
+    "a link to nowhere": (lambda f: (f / "d.png").symlink_to(f / "gone.png"), ["a.png", "b.png", "c.png"]),
+    "an ending in capitals, a name with spaces": (lambda f: again(f, "b é (1).JPG"), ["a.png", "b é (1).JPG", "c.png"]),
+    "16 bits among 8": (sixteen_bits, ["a.png", "b.png", "c.png"]),
+    "a grey photo": (lambda f: as_mode(f, "L"), ["a.png", "b.png", "c.png"]),
+    "a transparent photo": (lambda f: as_mode(f, "RGBA"), ["a.png", "b.png", "c.png"]),
+    "a portrait of two pictures": (as_portrait, ["a.png", "b.jpg", "c.png"]),
+    "a damaged EXIF block": (with_damaged_exif, ["a.png", "b.jpg", "c.png"]),
+}
+
+
+@pytest.mark.parametrize("name", READ)
+def test_untidy_photos_that_can_be_read_are_read(of_photos, name):
+    folder, read = of_photos
+    make, expected = READ[name]
+    make(folder)
+    capture = read()
+    assert [frame.name for frame in capture.frames] == expected
+    assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
+
+
+class Refusal(NamedTuple):
+    """What the folder holds, what the refusal says, and the setting that goes on without it, if there is one."""
+
+    make: Callable[[Path], object]
+    says: tuple[str, ...]
+    cure: dict[str, object] | None = None
+    read: int = 3  # photos that are used with the cure
+
+
+SKIP, BROKEN = {"broken": "skip"}, "data.broken=skip"
+REFUSED = {
+    "a truncated photo": Refusal(lambda f: (f / "d.png").write_bytes((f / "b.png").read_bytes()[:200]), ("d.png", BROKEN), SKIP),
+    "a web page instead of a photo": Refusal(lambda f: (f / "d.jpg").write_text("404 not found"), ("d.jpg", BROKEN), SKIP),
+    "an empty file": Refusal(lambda f: (f / "d.jpg").touch(), ("d.jpg", BROKEN), SKIP),
+    "colours for print": Refusal(
+        lambda f: image_of(f / "a.png").convert("CMYK").save(f / "d.jpg"), ("d.jpg", "CMYK", "convert the image"), SKIP
+    ),
+    "an animation": Refusal(
+        lambda f: image_of(f / "a.png").save(f / "d.webp", save_all=True, append_images=[image_of(f / "b.png")]),
+        ("d.webp", "several in one file"), SKIP,
+    ),
+    "links out of the folder": Refusal(
+        as_links, ("leads out of", "data.reader.allow_outside=true"), {"allow_outside": True}
+    ),
+    "two files of one name": Refusal(lambda f: image_of(f / "a.png").save(f / "a.jpg"), ("'a' has several files", "keep one")),
+    "two photos": Refusal(lambda f: (f / "b.png").unlink(), ("there are 2, poses need at least 3", "take more photos")),
+    "no photo": Refusal(lambda f: [(f / name).unlink() for name in NAMES], ("holds no image", "check the path")),
+    "no folder": Refusal(shutil.rmtree, ("is not there", "check the path")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_the_others_are_refused_in_one_line_with_the_file_and_the_cure(of_photos, name):
+    folder, read = of_photos
+    case = REFUSED[name]
+    case.make(folder)
+    with pytest.raises(DataError) as refusal:
+        [frame.load() for frame in read().frames]
+    assert "\n" not in str(refusal.value)
+    assert all(part in str(refusal.value) for part in case.says), str(refusal.value)
+    if case.cure is not None:
+        capture = read(**case.cure)
+        assert len(capture.frames) == case.read
+        assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
+
+
+def test_photos_turned_by_exif_are_upright(of_photos):
+    folder, read = of_photos
+    for orientation in (3, 6, 8):
+        captures.write_photos(folder)
+        upright = turn(folder / "b.png", orientation)
+        assert torch.equal((read().frames[1].load() * 255).round().to(torch.uint8), torch.from_numpy(upright.copy()))
+
+
+def test_heic_without_its_library_is_named_with_the_extra(of_photos, monkeypatch):
+    folder, read = of_photos
+    (folder / "b.png").unlink()
+    (folder / "b.heic").write_bytes(b"\0\0\0\x18ftypheic" + bytes(64))
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(DataError, match=r"b\.heic.*clear-strategies\[heic\]"):
+        read()
+
+
+def test_a_photo_that_is_there_twice_is_said(of_photos, caplog):
+    folder, read = of_photos
+    beside(folder, "b.HEIC")
+    with caplog.at_level("INFO"):
+        read()
+    assert "b.HEIC" in caplog.text
+
+
+def test_different_exposures_are_said(of_photos, caplog):
+    folder, read = of_photos
+    for name, time in (("a", 0.01), ("b", 0.04), ("c", 0.01)):
+        exif = Image.Exif()
+        exif[0x8769] = {0x829A: time, 0x829D: 2.0, 0x8827: 100}
+        image_of(folder / f"{name}.png").save(folder / f"{name}.png", exif=exif)
+    assert read().notes["exposure"].startswith("differs by 2.0 stops between a.png and b.png")
+    assert "exposure" in caplog.text

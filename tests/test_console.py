@@ -1,0 +1,96 @@
+"""The console shows the plan, the bar, the result and warnings; run.log has everything."""
+
+from __future__ import annotations
+
+import io
+import logging
+import sys
+
+import pytest
+from tqdm import tqdm
+
+from clear_strategies.console import Console
+from tests.helpers.command_line import TINY, run
+
+# Of every part of a run that tells details, one.
+DETAILS = ["image losses: ", "reliability R", "cloned, ", "prior: auto chose"]
+
+
+@pytest.fixture
+def logger():
+    logger = logging.getLogger("clear_strategies.tests.console")
+    logger.setLevel(logging.DEBUG)
+    logger.propagate = False
+    yield logger
+    logger.handlers.clear()
+
+
+@pytest.mark.parametrize(
+    ("verbose", "expected"), [(False, "plan\nwarning: odd\n"), (True, "detail\nplan\nwarning: odd\n")]
+)
+def test_details_are_for_those_who_ask_and_warnings_have_a_prefix(logger, verbose, expected):
+    stream = io.StringIO()
+    logger.addHandler(Console(stream, verbose=verbose))
+    logger.debug("detail")
+    logger.info("plan")
+    logger.warning("odd")
+    assert stream.getvalue() == expected
+
+
+def test_a_message_stands_on_a_line_of_its_own_above_the_bar(logger, monkeypatch):
+    screen = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", screen)
+    logger.addHandler(Console(screen))
+    with tqdm(total=10, file=screen, mininterval=0) as bar:
+        bar.update(3)
+        logger.info("said")
+        bar.update(3)
+    lines = screen.getvalue().replace("\r", "\n").splitlines()
+    assert "said" in lines
+    assert "3/10" in screen.getvalue().partition("said")[2]  # the bar is drawn again below
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("console")
+    return folder, {
+        name: run("+strategy=clear", *TINY, f"hydra.run.dir={name}", *more, cwd=folder)
+        for name, more in {"quiet": [], "loud": ["-v"]}.items()
+    }
+
+
+def test_by_default_the_console_has_the_plan_the_bar_the_result_and_where_to_look(demo):
+    folder, runs = demo
+    quiet = runs["quiet"]
+    assert quiet.returncode == 0, quiet.stderr
+    lines = quiet.stdout.splitlines()
+    assert lines[0].split()[0] == "scene"
+    done = next(i for i, line in enumerate(lines) if line.startswith("done in"))
+    assert lines[done].endswith(" s: quiet")
+    plan, result = lines[:done], lines[done + 1 :]
+    assert all(line.startswith(("  ", "warning: ", "GCO is inactive")) for line in plan), quiet.stdout
+    assert result[-1] == "  look next: quiet/contact_sheet.png, or clear-strategies view quiet"
+    assert sum("GMSD, the error of edges" in line for line in result) == 1
+    assert not any(detail in quiet.stdout for detail in DETAILS)
+    assert "it/s" in quiet.stderr
+    log = (folder / "quiet" / "run.log").read_text()
+    assert all(detail in log for detail in [*DETAILS, "done in", "scene"])
+
+
+def test_v_shows_what_run_log_has(demo):
+    folder, runs = demo
+    loud = runs["loud"]
+    assert loud.returncode == 0, loud.stderr
+    assert all(detail in loud.stdout for detail in DETAILS)
+    assert "verbose: true" in (folder / "loud" / ".hydra" / "config.yaml").read_text()
+    fields = [(folder / name / "point_cloud.ply").read_bytes() for name in runs]
+    assert fields[0] == fields[1]
+
+
+def test_of_many_jobs_the_console_has_a_line_each(tmp_path):
+    result = run("-m", "+strategy=gco,svs", *TINY, "fit.iterations=3", "hydra.sweep.dir=all", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    for job in (0, 1):
+        assert sum(line.startswith(f"job {job}: done in ") for line in result.stdout.splitlines()) == 1
+        assert "initial points" in (tmp_path / "all" / str(job) / "run.log").read_text()
+    assert "initial points" not in result.stdout
