@@ -59,7 +59,7 @@ class P2G(Strategy):
     """
 
     agreement: Agreement = "photo"
-    reliability_scale: float | str = 0.05
+    reliability_scale: float | str = 0.01
     floor: float = 0.25
     normalize: bool = True
     patch: int = 16
@@ -182,7 +182,7 @@ def patch_evidence(
     hr: Float[Tensor, "H W 3"],
     factor: int,
     patch: int = 16,
-    reliability_scale: float | str = 0.05,
+    reliability_scale: float | str = 0.01,
     detail_eps: float = 1e-4,
     down: DownKernel = "bicubic",
     up: UpKernel = "bicubic",

@@ -27,9 +27,9 @@ def test_reliability_is_one_where_the_reference_agrees_with_lr():
 
 
 def test_reliability_worked_out_by_hand():
-    # The reference is brighter by 0.05 in the left half: R = exp(-1) there, 1 in the right half.
+    # The reference is brighter by 0.01 in the left half: R = exp(-1) there, 1 in the right half.
     lr, hr = torch.full((16, 32, 3), 0.4), torch.full((64, 128, 3), 0.4)
-    hr[:, :64] += 0.05
+    hr[:, :64] += 0.01
     R, _ = patch_evidence(lr, hr, 4, down="area")
     assert R.shape == (1, 2)
     assert R[0].tolist() == pytest.approx([math.exp(-1), 1.0], rel=1e-5)
