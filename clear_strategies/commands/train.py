@@ -20,7 +20,7 @@ _ITERATIONS: Final = 1000
 _USAGE: Final = f"""clear-strategies train PHOTOS [setting=value …]
 
 PHOTOS is a folder of photos, or a capture: COLMAP's sparse/, a transforms.json, a poses_bounds.npy or a Blender scene in it.
-It trains the whole method (+strategy=clear) on all photos for fit.iterations={_ITERATIONS}; settings change that, e.g.
+It trains what we use ourselves (+strategy=best) on all photos for fit.iterations={_ITERATIONS}; settings change that, e.g.
 
   clear-strategies train photos/ fit.iterations=3000
   clear-strategies train photos/ data.views.test_every=8          every 8th photo is kept for testing
@@ -61,7 +61,7 @@ def overrides(arguments: Sequence[str]) -> list[str]:
         path = path.parent
     if not path.is_dir():
         raise SettingError(f"train: {path} is no folder. Name the folder of the photos, or of the capture.")
-    chosen = [] if any(override.startswith(_CHOOSE_STRATEGIES) for override in rest) else ["+strategy=clear"]
+    chosen = [] if any(override.startswith(_CHOOSE_STRATEGIES) for override in rest) else ["+strategy=best"]
     chosen += (
         [] if any(override.startswith(_CHOOSE_ITERATIONS) for override in rest) else [f"fit.iterations={_ITERATIONS}"]
     )

@@ -45,8 +45,8 @@ def test_a_folder_of_any_name_becomes_data_path(tmp_path, name):
 
 
 def test_strategies_that_are_named_replace_the_whole_method(tmp_path):
-    assert "+strategy=clear" not in train.overrides([str(tmp_path), "+strategy=gco"])
-    assert "+strategy=clear" in train.overrides([str(tmp_path)])
+    assert "+strategy=best" not in train.overrides([str(tmp_path), "+strategy=gco"])
+    assert "+strategy=best" in train.overrides([str(tmp_path)])
     assert not any(o.startswith("fit.iterations") for o in train.overrides([str(tmp_path), "+protocol=llff_x4"]))
 
 
