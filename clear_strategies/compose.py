@@ -84,13 +84,16 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
     chosen = f"+strategy=[{','.join(names)}]" if len(names) > 1 else f"+strategy={names[0]}"
     config = composed([chosen, *overrides])
     if "pseudo_views" in config:
-        _log.warning("%s: a trainer other than this package's makes no pseudo views; the rest takes part.", strategy)
+        _log.warning(
+            "%s: a trainer other than this package's makes no pseudo views and takes the SR images as they are; the rest "
+            "takes part.", strategy,
+        )  # fmt: skip
     settings: ConductorSettings = build(tree(config, _TRAINERS))
     return settings.conductor(iterations / REFERENCE_ITERATIONS, iterations)
 
 
 # Options for both doors, readings=literal above all, set these as well; a host has its own.
-_TRAINERS: Final = ("optim", "skips", "pseudo_views")
+_TRAINERS: Final = ("optim", "skips", "pseudo_views", "data")
 
 
 def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
