@@ -35,6 +35,7 @@ _FORMATS: Final = ("ascii", "binary_little_endian", "binary_big_endian")
 _LONGEST_HEADER: Final = 1 << 16  # bytes
 _LONGEST_COUNT: Final = 20  # digits
 _BANDS: Final = (0, 3, 8, 15)  # (degree + 1)² - 1
+_OPAQUE: Final = 16.0  # logit: sigmoid gives 1 as closely as float32 tells it from 1
 
 _XYZ: Final = ("x", "y", "z")
 _NORMAL: Final = ("nx", "ny", "nz")
@@ -106,6 +107,8 @@ def write_gaussians(path: Path, g: GaussianPly, *, comments: Sequence[str] = ("S
 def read_gaussians(path: Path) -> GaussianPly:
     """Read the standard layout. Other properties are ignored, with a warning that names them.
 
+    Opacities of exactly 0 and 1, whose logits are infinite, are read: formats of 8 bits have them.
+
     Raises:
         DataError: the file is damaged or truncated, or a property is missing or not finite.
     """
@@ -121,7 +124,7 @@ def read_gaussians(path: Path) -> GaussianPly:
         means=_columns(path, table, _XYZ),
         sh0=_columns(path, table, _DC)[:, None],
         shN=_columns(path, table, rest).view(len(table), 3, len(rest) // 3).transpose(1, 2).contiguous(),
-        opacities=_columns(path, table, ("opacity",))[:, 0],
+        opacities=_columns(path, table, ("opacity",), infinite=_OPAQUE)[:, 0],
         scales=_columns(path, table, _SCALE),
         quats=_columns(path, table, _ROTATION),
     )
@@ -307,14 +310,18 @@ def _rgb(path: Path, table: np.ndarray) -> Float[Tensor, "N 3"]:
     return colors
 
 
-def _columns(path: Path, table: np.ndarray, names: Sequence[str]) -> Float[Tensor, "N C"]:
-    """Properties as float32; each must exist and be finite."""
+def _columns(
+    path: Path, table: np.ndarray, names: Sequence[str], *, infinite: float | None = None
+) -> Float[Tensor, "N C"]:
+    """Properties as float32; each must exist and be finite, unless this number stands for infinity."""
     missing = [name for name in names if name not in _names(table)]
     if missing:
         problem = f"is missing from the vertices, which have {', '.join(_names(table))}"
         raise DataError(path, missing[0], problem, "export it again, with this property")
     with np.errstate(over="ignore"):  # overflow gives infinity
         columns = np.array(structured_to_unstructured(table[list(names)], np.float32))
+    if infinite is not None:
+        columns = np.where(np.isinf(columns), np.copysign(np.float32(infinite), columns), columns)
     finite = np.isfinite(columns)
     if not finite.all():
         i, k = np.argwhere(~finite)[0]

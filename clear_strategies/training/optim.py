@@ -70,7 +70,7 @@ class LearningRates:
         if iterations >= self.detail_steps:
             return self
         rate = self.detail * iterations / self.detail_steps
-        _log.info(
+        _log.debug(
             "f_det learns at a rate of %.2g instead of %.2g: the run has %d iterations (optim.detail_steps: %d).",
             rate, self.detail, iterations, self.detail_steps,
         )  # fmt: skip

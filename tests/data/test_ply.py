@@ -253,3 +253,17 @@ def test_no_damage_raises_anything_but_the_one_line(tmp_path: Path, data: st.Dat
     for read in (read_points, read_gaussians):
         with suppress(DataError):
             read(file)
+
+
+def test_opacities_of_exactly_0_and_1_are_read(tmp_path: Path) -> None:
+    """As a PLY has them that was converted from a format of 8 bits; any other infinity is damage."""
+    path, g = tmp_path / "a.ply", gaussians(3, 0)
+    write_gaussians(path, g)
+    content = path.read_bytes()
+    at = content.index(struct.pack("<f", float(g.opacities[1])))
+    for value in (float("inf"), float("-inf")):
+        path.write_bytes(content[:at] + struct.pack("<f", value) + content[at + 4 :])
+        assert read_gaussians(path).opacities.sigmoid()[1] == pytest.approx(float(value > 0), abs=1e-6)
+    path.write_bytes(content[:at] + struct.pack("<f", float("nan")) + content[at + 4 :])
+    with pytest.raises(DataError, match="opacity: is not finite in vertex 1"):
+        read_gaussians(path)
