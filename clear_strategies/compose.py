@@ -85,15 +85,16 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
     config = composed([chosen, *overrides])
     if "pseudo_views" in config:
         _log.warning(
-            "%s: a trainer other than this package's makes no pseudo views and takes the SR images as they are; the rest "
-            "takes part.", strategy,
-        )  # fmt: skip
+            "%s: a trainer other than this package's makes no pseudo views, has no depth loss and takes the SR images as "
+            "they are; the rest takes part.",
+            strategy,
+        )
     settings: ConductorSettings = build(tree(config, _TRAINERS))
     return settings.conductor(iterations / REFERENCE_ITERATIONS, iterations)
 
 
 # Options for both doors, readings=literal above all, set these as well; a host has its own.
-_TRAINERS: Final = ("optim", "skips", "pseudo_views", "data")
+_TRAINERS: Final = ("optim", "skips", "pseudo_views", "depth_loss", "data")
 
 
 def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:

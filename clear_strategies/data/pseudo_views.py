@@ -35,14 +35,16 @@ class PseudoView:
     Args:
         photo: the colours, 0 where unknown, and the camera.
         known: where photos tell the colour.
+        depth: of the surfaces whose colour is known, all of full confidence.
     """
 
     photo: Photo
     known: Bool[Tensor, "h w"]
+    depth: DepthMap
 
     def to(self, device: torch.device | str) -> PseudoView:
         """The same pseudo view on `device`."""
-        return PseudoView(self.photo.to(device), self.known.to(device))
+        return PseudoView(self.photo.to(device), self.known.to(device), self.depth.to(device))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,7 +164,8 @@ def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Pse
     known[known.clone()] = weight > 0
     around = 9 * torch.nn.functional.avg_pool2d(known[None, None].float(), 3, 1, 1)[0, 0]
     known &= around >= _NEIGHBOURS - 0.5
-    return PseudoView(Photo(camera, torch.where(known[..., None], image, 0.0).clamp(0, 1)), known)
+    there = DepthMap(torch.where(known, depth, torch.nan).float(), known.float())
+    return PseudoView(Photo(camera, torch.where(known[..., None], image, 0.0).clamp(0, 1)), known, there)
 
 
 def _front(camera: Camera, points: Float[Tensor, "N 3"]) -> Float[Tensor, "h w"]:

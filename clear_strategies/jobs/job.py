@@ -33,6 +33,7 @@ from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import build
+from clear_strategies.training.depth_loss import DepthLoss
 from clear_strategies.training.loop import fit
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
@@ -110,6 +111,7 @@ class JobSettings(ConductorSettings):
     fit: RunSettings = field(default_factory=RunSettings)
     mip: MipFilter = field(default_factory=MipFilter)
     pseudo_views: PseudoViewSettings = field(default_factory=PseudoViewSettings)
+    depth_loss: DepthLoss = field(default_factory=DepthLoss)
     method: str | None = None
 
     def __post_init__(self) -> None:
@@ -151,11 +153,11 @@ class _Training:
     def chosen(self) -> plan.Chosen:
         return plan.Chosen(self.settings.method, list(self.settings.strategies))
 
-    def start(self, there: Scene, source: str | None) -> TrainState:
+    def start(self, place: _Place, source: str | None) -> TrainState:
         """The state to train from: the first one, or what `source`, a value of `fit.resume`, leads to."""
         settings, stretch = self.settings, self.settings.fit.stretch
         state = TrainState.start(
-            there,
+            place.there,
             self.conductor,
             settings=scaled(settings.fit, stretch),
             density=scaled(settings.density, stretch),
@@ -163,6 +165,9 @@ class _Training:
             mip=scaled(settings.mip, stretch),
             skips=scaled(settings.skips, stretch),
             pseudo_views=settings.pseudo_views,
+            depth_loss=settings.depth_loss.of_run(
+                place.there, place.drawing.rasterizer, draws_lr=self.conductor.wants_lr
+            ),
         )
         resume.resume(state, source, self.folder, self.compared)
         return state
@@ -248,8 +253,8 @@ def _run(
     if baseline is not None:
         source, of_baseline = resume.of_both(source, ours.compared, baseline.compared)
         if of_baseline != resume.AUTO or resume.finished(baseline.folder, baseline.compared) is None:
-            first = baseline.start(place.there, of_baseline)
-    state = ours.start(place.there, source)
+            first = baseline.start(place, of_baseline)
+    state = ours.start(place, source)
     drawn = f"{drawing.name}, kernel {drawing.kernel} px²"
     # Of many jobs the console shows a line each; the rest is in their run.log.
     level = logging.DEBUG if _in_sweep() else logging.INFO

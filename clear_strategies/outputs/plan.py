@@ -57,6 +57,8 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, *, rasterizer: str
         lines[f"milestones of {state.density.name}"] = ", ".join(f"{name} {t}" for name, t in found.items())
     if (beside := state.pseudo_views.says()) is not None:
         lines["pseudo views"] = beside
+    if state.depth_loss.weight > 0:
+        lines["depth loss"] = f"of LR renders, weight {state.depth_loss.weight:g}"
     lines["skipped"] = "; ".join(_skipped(state)) or "nothing"
     _warn_of_idle_strategies(conductor)
     width = max(map(len, lines))

@@ -22,7 +22,7 @@ from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DivergedError
 from clear_strategies.merging.conductor import Update
-from clear_strategies.training import checkpoint, pseudo_views
+from clear_strategies.training import checkpoint, depth_loss, pseudo_views
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training.skips import PLATEAU_LOSS
@@ -40,7 +40,11 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     tiles = s.skip_policy.wanted(view, rasterizer.tile, ask.work_log) if scales["hr"] else None
     z = ask.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in scales.items() if wanted)}"):
-        lr, hr = θ.render_scales(rasterizer, view, gate=z, tiles=tiles, **scales)  # Î_LR, Î_HR     Eq. 2, 3
+        known = view.depth if s.depth_loss.weight > 0 else None
+        lr, hr = θ.render_scales(  # Î_LR, Î_HR     Eq. 2, 3
+            rasterizer, view, gate=z, tiles=tiles, depth=known is not None, **scales
+        )
+    loss_depth = None if lr is None or known is None else s.depth_loss.added(lr, known)
     drawn = [shot for shot in (lr, hr) if shot is not None]
     u = ask.update(θ.raw(), lr, hr, view, t, s.compiled_step)
     if u.grads is not None:  # else the compiled step has made the step
@@ -60,8 +64,9 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
             s.refilter()
     low = images.area_mean(drawn[-1].image, view.factor) if lr is None else lr.image
     s.history.append(_row(s, u, low, view))
-    if loss_beside is not None:
-        s.history[-1][pseudo_views.LOSS] = loss_beside
+    for name, loss in ((pseudo_views.LOSS, loss_beside), (depth_loss.LOSS, loss_depth)):
+        if loss is not None:
+            s.history[-1][name] = loss
     if s.skip_policy.measured(t):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)

@@ -133,7 +133,9 @@ def step(s: TrainState, rasterizer: Rasterizer, view: PseudoView) -> Number:
         DivergedError: the loss or its gradient is not finite; nothing has changed.
     """
     θ, o = s.field, s.conductor.objective
-    shot = θ.shot(rasterizer, view.photo.camera)
+    shot = θ.shot(rasterizer, view.photo.camera, depth=s.depth_loss.weight > 0)
+    if s.depth_loss.weight > 0:
+        s.depth_loss.added(shot, view.depth)
     known = view.known[..., None]
     losses = o.lr(torch.where(known, shot.image, 0.0), view.photo.image)  # Eq. 4, equal where unknown
     where = f"t={s.t}, a pseudo view"

@@ -22,6 +22,7 @@ from clear_strategies.errors import DataError, DivergedError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
+from clear_strategies.training.depth_loss import DepthLoss
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
@@ -53,6 +54,7 @@ class TrainState:
     compiled_step: CompiledStep | None = None
     skip_policy: SkipPolicy = field(default_factory=SkipPolicy)
     pseudo_views: PseudoViews = field(default_factory=PseudoViews)
+    depth_loss: DepthLoss = field(default_factory=DepthLoss)
 
     @classmethod
     def start(
@@ -66,11 +68,13 @@ class TrainState:
         mip: MipFilter,
         skips: Skips | None = None,
         pseudo_views: PseudoViewSettings | None = None,
+        depth_loss: DepthLoss | None = None,
     ) -> TrainState:
         """The state before the first iteration, on the device of the scene's views.
 
         Args:
             settings, density, rates, mip, skips: with milestones already scaled to this run.
+            depth_loss: as its `of_run` gives it.
         """
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
@@ -95,6 +99,7 @@ class TrainState:
             pseudo_views=PseudoViews.of(
                 scene, pseudo_views or PseudoViewSettings(), settings.seed, conductor.objective.lambda_lr
             ),
+            depth_loss=depth_loss or DepthLoss(),
         )
         state.refilter()
         return state

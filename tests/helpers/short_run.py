@@ -18,6 +18,7 @@ from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.base import cameras_extent
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.training.compiled_step import FusedMode
+from clear_strategies.training.depth_loss import DepthLoss
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
@@ -52,6 +53,7 @@ def start(
     iterations: int = ITERATIONS,
     *,
     beside: PseudoViewSettings | None = None,
+    depth_loss: DepthLoss | None = None,
     fused: FusedMode = "auto",
 ) -> TrainState:
     make = {
@@ -66,7 +68,7 @@ def start(
     }
     objective = Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
     return TrainState.start(
-        SCENE if beside is None else with_depth(SCENE),
+        SCENE if beside is None and depth_loss is None else with_depth(SCENE),
         Conductor(*(make[name]() for name in names), objective=objective, statistics_from=1),
         settings=FitSettings(
             iterations=iterations,
@@ -92,6 +94,7 @@ def start(
         rates=LearningRates(means=LogLinear(end=ITERATIONS), detail_decay=0.01),
         mip=MipFilter(every=7, last=1),
         pseudo_views=beside,
+        depth_loss=depth_loss,
     )
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from clear_strategies.core import deferred
+from clear_strategies.core.view import DepthMap
 from clear_strategies.data.pseudo_views import PseudoView
 from clear_strategies.errors import DivergedError, SettingError
 from clear_strategies.training import pseudo_views
@@ -29,7 +30,8 @@ def blank(state: TrainState, known: bool) -> PseudoView:
     """One view whose colours are black, known everywhere or nowhere."""
     photo = state.views[0].lr
     black = replace(photo, image=torch.zeros_like(photo.image))
-    return PseudoView(black, torch.full(photo.image.shape[:2], known))
+    everywhere = torch.full(photo.image.shape[:2], known)
+    return PseudoView(black, everywhere, DepthMap(torch.ones_like(everywhere, dtype=torch.float32), everywhere.float()))
 
 
 def test_steps_come_every_nth_iteration_and_their_loss_is_in_the_history():
