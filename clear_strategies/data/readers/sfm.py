@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import sqlite3
 import tempfile
 import threading
@@ -30,6 +31,7 @@ FEWEST: Final = 3
 MORE: Final = "take more photos that overlap by two thirds, with the same camera and zoom, of a scene with texture"
 _MEGA: Final = 1 << 20
 _DISTANCES: Final = 4  # bytes of each pair of features that are compared
+_MEMORY: Final = 4 << 30  # bytes that all threads together may take in matching
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +41,7 @@ class SfmSettings:
     Args:
         max_side: features are extracted from photos reduced to this many pixels.
         max_features: of a photo, the strongest; memory and time of matching grow with its square.
-        precise: features that follow a surface's tilt, which take three times as long to find.
+        precise: features that follow a surface's tilt, matched once more along the epipolar lines; about six times as long.
         least_placed: the least share of the photos that must be placed, in (0, 1].
         threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
         seed: of COLMAP's random samples.
@@ -52,6 +54,17 @@ class SfmSettings:
     threads: int
     seed: int
 
+    @property
+    def matchers(self) -> int:
+        """Threads that match at once: as many as `_MEMORY` lasts for."""
+        asked = self.threads if self.threads > 0 else os.cpu_count() or 1
+        return max(1, min(asked, _MEMORY // self.memory))
+
+    @property
+    def memory(self) -> int:
+        """Bytes that a thread takes to match two photos: each feature is compared with each, guided once more."""
+        return (3 if self.precise else 2) * _DISTANCES * self.max_features**2
+
 
 def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings: SfmSettings) -> None:
     """Estimate the poses of these photos and write the model with most of them to `folder`, under their numbers' names.
@@ -61,11 +74,10 @@ def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings:
     """
     pycolmap = _pycolmap()
     folder.parent.mkdir(parents=True, exist_ok=True)
-    count, features = len(photos), settings.max_features
-    pairs = count * (count - 1) // 2
+    count = len(photos)
     _log.info(
-        "%s: estimating the poses of %d photos: up to %d features each, %d pairs, about %d MB a thread in matching.",
-        root, count, features, pairs, 2 * _DISTANCES * features**2 // _MEGA,
+        "%s: estimating the poses of %d photos: up to %d features each, %d pairs, about %d MB in matching.",
+        root, count, settings.max_features, count * (count - 1) // 2, settings.matchers * settings.memory // _MEGA,
     )  # fmt: skip
     try:
         with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work:
@@ -123,7 +135,8 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
                     reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
                 )  # fmt: skip
         matching = pycolmap.FeatureMatchingOptions()
-        matching.num_threads, matching.use_gpu = settings.threads, False
+        matching.num_threads, matching.use_gpu = settings.matchers, False
+        matching.guided_matching = settings.precise
         with _progress(database, "two_view_geometries", "matching", "pairs", count * (count - 1) // 2):
             pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
         mapping = pycolmap.IncrementalPipelineOptions()
