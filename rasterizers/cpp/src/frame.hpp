@@ -267,7 +267,7 @@ class Frame {
       }
       std::uint32_t bits = 0;
       for (int i = 0; i < group.count; ++i) bits |= std::uint32_t(sparse || touched(group.rows[i])) << i;
-      project_vjp_group<T, K>(pose_, settings_, splats, view.target, slopes_, group, rows, bits, out);
+      project_vjp_group(pose_, settings_, splats, view.target, slopes_, group, K, rows, bits, out);
     }
   }
 

@@ -52,10 +52,10 @@ CLEAR_INLINE void fetch_rows(const Splats<T>& splats, const Target<T>& target, c
   }
 }
 
-// The gradients of a group; those of its lanes that are not `touched` are zeros.
-template <class T, int K>
+// The gradients of a group from the K rows of sums of each Gaussian; those of its lanes that are not `touched` are zeros.
+template <class T>
 void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, const Target<T>& target,
-                       const Buffer<Slope<T>>& slopes, const Group& group, Lanes<T> (&rows)[K][kLanes],
+                       const Buffer<Slope<T>>& slopes, const Group& group, int K, Lanes<T> (*rows)[kLanes],
                        std::uint32_t touched, const Gradients<T>& out) {
   using L = Lanes<T>;
   const Mask<T> real = Mask<T>::from_bits(touched);

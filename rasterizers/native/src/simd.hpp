@@ -178,6 +178,23 @@ struct Native {
 #endif
 };
 
+// Repeats a statement for each register i of sixteen numbers. Written out, because a compiler takes long to unroll the many
+// loops of one to eight steps, and cannot simplify what they compute before that.
+#if defined(CLEAR_DOUBLE)
+#define CLEAR_EACH_REGISTER(...) for (int i = 0; i < registers; ++i) __VA_ARGS__
+#else
+#define CLEAR_ONE_REGISTER(n, ...)  \
+  if constexpr (n < registers) {    \
+    constexpr int i = n;            \
+    __VA_ARGS__;                    \
+  }
+#define CLEAR_EACH_REGISTER(...)                                              \
+  CLEAR_ONE_REGISTER(0, __VA_ARGS__) CLEAR_ONE_REGISTER(1, __VA_ARGS__)       \
+  CLEAR_ONE_REGISTER(2, __VA_ARGS__) CLEAR_ONE_REGISTER(3, __VA_ARGS__)       \
+  CLEAR_ONE_REGISTER(4, __VA_ARGS__) CLEAR_ONE_REGISTER(5, __VA_ARGS__)       \
+  CLEAR_ONE_REGISTER(6, __VA_ARGS__) CLEAR_ONE_REGISTER(7, __VA_ARGS__)
+#endif
+
 template <class T>
 struct Mask {
   static constexpr int registers = kLanes / Native<T>::width;
@@ -185,23 +202,23 @@ struct Mask {
 
   CLEAR_INLINE Mask operator&(const Mask& o) const {
     Mask m;
-    for (int i = 0; i < registers; ++i) m.r[i] = Native<T>::mask_and(r[i], o.r[i]);
+    CLEAR_EACH_REGISTER(m.r[i] = Native<T>::mask_and(r[i], o.r[i]));
     return m;
   }
   CLEAR_INLINE Mask and_not(const Mask& o) const {
     Mask m;
-    for (int i = 0; i < registers; ++i) m.r[i] = Native<T>::mask_and_not(r[i], o.r[i]);
+    CLEAR_EACH_REGISTER(m.r[i] = Native<T>::mask_and_not(r[i], o.r[i]));
     return m;
   }
   CLEAR_INLINE std::uint32_t bits() const {
     std::uint32_t b = 0;
-    for (int i = 0; i < registers; ++i) b |= Native<T>::bits(r[i]) << (i * Native<T>::width);
+    CLEAR_EACH_REGISTER(b |= Native<T>::bits(r[i]) << (i * Native<T>::width));
     return b;
   }
   CLEAR_INLINE bool any() const { return bits() != 0; }
   static CLEAR_INLINE Mask from_bits(std::uint32_t b) {
     Mask m;
-    for (int i = 0; i < registers; ++i) m.r[i] = Native<T>::from_bits(b >> (i * Native<T>::width));
+    CLEAR_EACH_REGISTER(m.r[i] = Native<T>::from_bits(b >> (i * Native<T>::width)));
     return m;
   }
 };
@@ -214,26 +231,26 @@ struct Lanes {
 
   Lanes() = default;
   CLEAR_INLINE Lanes(T x) {
-    for (int i = 0; i < registers; ++i) r[i] = x - Register{};  // x - 0 is x, also for -0; compiles to a broadcast
+    CLEAR_EACH_REGISTER(r[i] = x - Register{});  // x - 0 is x, also for -0; compiles to a broadcast
   }
   static CLEAR_INLINE Lanes load(const T* p) {
     // Register by register: one memcpy of several registers would go through the stack.
     Lanes a;
-    for (int i = 0; i < registers; ++i) std::memcpy(&a.r[i], p + i * Native<T>::width, sizeof(Register));
+    CLEAR_EACH_REGISTER(std::memcpy(&a.r[i], p + i * Native<T>::width, sizeof(Register)));
     return a;
   }
   CLEAR_INLINE void store(T* p) const {
-    for (int i = 0; i < registers; ++i) std::memcpy(p + i * Native<T>::width, &r[i], sizeof(Register));
+    CLEAR_EACH_REGISTER(std::memcpy(p + i * Native<T>::width, &r[i], sizeof(Register)));
   }
 
 #define CLEAR_OPERATOR(op)                                                          \
   friend CLEAR_INLINE Lanes operator op(const Lanes& a, const Lanes& b) {           \
     Lanes c;                                                                        \
-    for (int i = 0; i < registers; ++i) c.r[i] = a.r[i] op b.r[i];                  \
+    CLEAR_EACH_REGISTER(c.r[i] = a.r[i] op b.r[i]);                                 \
     return c;                                                                       \
   }                                                                                 \
   CLEAR_INLINE Lanes& operator op##=(const Lanes & b) {                             \
-    for (int i = 0; i < registers; ++i) r[i] = r[i] op b.r[i];                      \
+    CLEAR_EACH_REGISTER(r[i] = r[i] op b.r[i]);                                     \
     return *this;                                                                   \
   }
   CLEAR_OPERATOR(+)
@@ -246,7 +263,7 @@ struct Lanes {
 #define CLEAR_COMPARISON(name, call)                                                \
   friend CLEAR_INLINE Mask<T> name(const Lanes& a, const Lanes& b) {                \
     Mask<T> m;                                                                      \
-    for (int i = 0; i < registers; ++i) m.r[i] = call;                              \
+    CLEAR_EACH_REGISTER(m.r[i] = call);                                             \
     return m;                                                                       \
   }
   CLEAR_COMPARISON(operator<, Native<T>::less(a.r[i], b.r[i]))
@@ -257,8 +274,9 @@ struct Lanes {
 };
 
 #define CLEAR_EACH(name, ...)                                                       \
+  constexpr int registers = Lanes<T>::registers;                                    \
   Lanes<T> c;                                                                       \
-  for (int i = 0; i < Lanes<T>::registers; ++i) c.r[i] = Native<T>::name(__VA_ARGS__); \
+  CLEAR_EACH_REGISTER(c.r[i] = Native<T>::name(__VA_ARGS__));                       \
   return c;
 
 template <class T>
