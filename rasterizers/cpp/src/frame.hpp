@@ -77,8 +77,10 @@ class Frame {
       Gradients<T> part{out.means + 3 * at,     out.quats + 4 * at,  out.scales + 3 * at,
                         out.opacities + at, out.screen + 2 * at, out.rgb + 3 * at};
       if (now == 1) vjp_of<1, C>(view, cotangents + k * image, splats, part, threads);
-      if (now == 2) vjp_of<2, C>(view, cotangents + k * image, splats, part, threads);
-      if (now == 3) vjp_of<3, C>(view, cotangents + k * image, splats, part, threads);
+      if constexpr (kMostCotangents > 1) {
+        if (now == 2) vjp_of<2, C>(view, cotangents + k * image, splats, part, threads);
+        if (now == 3) vjp_of<3, C>(view, cotangents + k * image, splats, part, threads);
+      }
       k += now;
     }
   }
@@ -114,7 +116,7 @@ class Frame {
  private:
   // `Bins::pairs`, `where` and `masks`.
   static constexpr std::int64_t kBytesPerPair = 2 * sizeof(std::uint32_t) + sizeof(std::uint64_t);
-  static constexpr int kMostCotangents = 3;  // of one backward pass
+  static constexpr int kMostCotangents = sizeof(T) == 4 ? 3 : 1;  // of one backward pass; in double, quick to compile instead
 
   struct View {
     Target<T> target;

@@ -30,7 +30,7 @@ class Recycler {
   }
 
   // A block of at least `bytes`, at most about twice that. The address sanitizer gets exact blocks, and none is kept.
-  Block take(std::size_t bytes) {
+  __attribute__((noinline)) Block take(std::size_t bytes) {
 #if defined(__SANITIZE_ADDRESS__)
     const std::size_t exact = (bytes + 63) / 64 * 64;
     Block block{std::aligned_alloc(64, exact), exact};
@@ -61,7 +61,7 @@ class Recycler {
     return fresh;
   }
 
-  void give(Block block) {
+  __attribute__((noinline)) void give(Block block) noexcept {
     if (!block.data) return;
 #if defined(__SANITIZE_ADDRESS__)
     std::free(block.data);

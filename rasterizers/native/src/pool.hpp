@@ -12,6 +12,7 @@
 #include <functional>
 #include <mutex>
 #include <thread>
+#include <type_traits>
 #include <vector>
 #if defined(__unix__) || defined(__APPLE__)
 #include <unistd.h>
@@ -37,15 +38,21 @@ class Pool {
   // thread uses it, or a task calls `run`), the caller runs all tasks itself. Rethrows the first exception.
   template <class Task>
   void run(int threads, std::int64_t n, Task&& task) {
+    run(threads, n, [](const void* one, std::int64_t i) { (*static_cast<const std::remove_reference_t<Task>*>(one))(i); }, &task);
+  }
+
+ private:
+  // Compiled once, not for every task.
+  __attribute__((noinline)) void run(int threads, std::int64_t n, void (*call)(const void*, std::int64_t), const void* task) {
     std::unique_lock<std::mutex> only(running_, std::try_to_lock);
     if (threads <= 1 || n <= 1 || !only.owns_lock()) {
-      for (std::int64_t i = 0; i < n; ++i) task(i);
+      for (std::int64_t i = 0; i < n; ++i) call(task, i);
       return;
     }
     std::function<void()> work = [&] {
       for (std::int64_t i; (i = next_.fetch_add(1, std::memory_order_relaxed)) < n;) {
         try {
-          task(i);
+          call(task, i);
         } catch (...) {
           std::lock_guard<std::mutex> lock(mutex_);
           if (!failure_) failure_ = std::current_exception();
@@ -76,7 +83,6 @@ class Pool {
     if (failure_) std::rethrow_exception(failure_);
   }
 
- private:
   static constexpr int kSpins = 400;  // about 20 µs: stages follow each other closely, and waking a sleeping thread takes longer
 
   static long process() {
