@@ -25,6 +25,8 @@ struct PixelCentres {
     T px[kLanes], py[kLanes];
     for (int i = 0; i < kLanes; ++i) px[i] = T(X + i % kBlock) + T(0.5), py[i] = T(Y + i / kBlock) + T(0.5);
     x = Lanes<T>::load(px), y = Lanes<T>::load(py);
+    if constexpr (Native<T>::width % kBlock == 0)
+      for (auto& same : x.r) same = x.r[0];  // whole rows of pixels: says that dx is one register, too
   }
 };
 
@@ -113,23 +115,24 @@ void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, Blo
   for (int i = 0; i < n; ++i) {
     const Ellipse<T>& e = ellipses[list[i]];
     const L dx = pixel.x - L(e.u), dy = pixel.y - L(e.v);
-    const L alpha = minimum(exp2(exponent(e, dx, dy)), alpha_max);
-    const Mask<T> counts = (alpha >= alpha_min) & alive;
+    const L drawn = minimum(exp2(exponent(e, dx, dy)), alpha_max);
+    const Mask<T> counts = (drawn >= alpha_min) & alive;
     if (!counts.any()) continue;
+    const L alpha = where(counts, drawn);  // at 0 a pixel stays as it is
     // T (1 - α) with one rounding: T - weight loses digits for an α near 1, and the backward pass divides by 1 - α.
-    const L weight = through * alpha, after = subtract_product(through, through, alpha);
-    const Mask<T> kept = counts & (after >= transmittance_min);
-    const std::uint32_t stops = counts.bits() ^ kept.bits();
-    if (__builtin_expect(stops != 0, 0)) {
-      for (std::uint32_t m = stops; m; m &= m - 1)
+    L weight = through * alpha, after = subtract_product(through, through, alpha);
+    const Mask<T> ends = after < transmittance_min;  // of a pixel that ended before, T is still above
+    const bool some_end = ends.any();
+    if (__builtin_expect(some_end, 0)) {
+      for (std::uint32_t m = ends.bits(); m; m &= m - 1)
         end.ended[__builtin_ctz(m)] = std::int32_t(segment.first) + list[i];
-      alive = alive.and_not(counts.and_not(kept));
+      alive = alive.and_not(ends);
+      weight = select(ends, L(T(0)), weight), after = select(ends, through, after);
     }
-    const L w = where(kept, weight);
-    for (int c = 0; c < C; ++c) sums[c] += w * L((&e.r)[c]);
-    if constexpr (out.kSums > C) sums[C] += w;
-    through = select(kept, after, through);
-    if (__builtin_expect(stops != 0, 0) && !alive.any()) break;
+    for (int c = 0; c < C; ++c) sums[c] += weight * L((&e.r)[c]);
+    if constexpr (out.kSums > C) sums[C] += weight;
+    through = after;
+    if (__builtin_expect(some_end, 0) && !alive.any()) break;
   }
   through.store(end.transmittance);
   for (int c = 0; c < out.kSums; ++c) sums[c].store(out.sums[c]);
@@ -143,11 +146,45 @@ struct BlockSums {
   T offset_x[kRows], offset_y[kRows];  // from the Gaussian's centre to the block's
   int place[kRows];
 
-  // Transposes the rows so that a lane is a Gaussian; a sum over pixels is then fifteen additions for sixteen Gaussians.
   // Not inlined: two copies beside the loop over Gaussians would exceed the instruction cache.
   __attribute__((noinline)) void flush(int count, const T (&cotangent)[K][C][kLanes], PairSums<T>* sums) {
+    if constexpr (kByQuads)
+      for (int i = 0; i < count; ++i) add_by_quads(i, cotangent, sums);
+    else if (count)
+      add_by_transposes(count, cotangent, sums);
+  }
+
+ private:
+  // Where sixteen rows do not fit the registers, transposing them would go through memory again and again.
+  static constexpr bool kByQuads = sizeof(T) == 4 && Lanes<T>::registers > 1;
+
+  // A sum over pixels is the sum of a register's quads, four sums at a time.
+  CLEAR_INLINE void add_by_quads(int row, const T (&cotangent)[K][C][kLanes], PairSums<T>* sums) const {
     using L = Lanes<T>;
-    if (!count) return;
+    using Register = typename L::Register;
+    constexpr int n = L::registers;
+    const PixelCentres<T> pixel(0);
+    const L dx = pixel.x + L(offset_x[row] - kBlock / 2), dy = pixel.y + L(offset_y[row] - kBlock / 2);
+    const L w = L::load(weight[row]);
+    for (int k = 0; k < K; ++k) {
+      const L v = L::load(q[k][row]), along = v * dy;
+      Register m = v.r[0], my = along.r[0], myy = along.r[0] * dy.r[0], channels[C];
+      for (int i = 1; i < n; ++i) m += v.r[i], my += along.r[i], myy += along.r[i] * dy.r[i];
+      for (int c = 0; c < C; ++c) {
+        const L parts = L::load(cotangent[k][c]);
+        channels[c] = w.r[0] * parts.r[0];
+        for (int i = 1; i < n; ++i) channels[c] += w.r[i] * parts.r[i];
+      }
+      const Register x = dx.r[0], mx = m * x, none = {};  // every register holds whole rows of pixels
+      T* out = &sums[std::int64_t(place[row]) * K + k].q;
+      add_quads(out, sum_quads(m, mx, my, mx * x), sum_quads(my * x, myy, channels[0], channels[1]));
+      add_quads(out + 8, sum_quads(channels[2], C > kColour ? channels[C - 1] : none, none, none), none);
+    }
+  }
+
+  // Transposed, a lane is a Gaussian; a sum over pixels is then fifteen additions for sixteen Gaussians.
+  CLEAR_INLINE void add_by_transposes(int count, const T (&cotangent)[K][C][kLanes], PairSums<T>* sums) {
+    using L = Lanes<T>;
     for (int i = count; i < kRows; ++i) {
       L(T(0)).store(weight[i]);
       for (int k = 0; k < K; ++k) L(T(0)).store(q[k][i]);
@@ -176,7 +213,6 @@ struct BlockSums {
     }
   }
 
- private:
   // Σ v, Σ v·dx, … about the Gaussian's centre, from the moments about the block's centre, whose offsets are constants.
   static CLEAR_INLINE void moments(const Lanes<T> (&v)[kLanes], const Lanes<T>& ox, const Lanes<T>& oy,
                                    Lanes<T> (&out)[kLanes]) {

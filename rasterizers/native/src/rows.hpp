@@ -51,6 +51,14 @@ CLEAR_INLINE void transpose_four(FloatRegister& a, FloatRegister& b, FloatRegist
   c = Matrix::template shuffle<0, 2, 0, 2>(ab2, cd2), d = Matrix::template shuffle<1, 3, 1, 3>(ab2, cd2);
 }
 
+// In every quad: the sum of a's four numbers, of b's, c's and d's.
+CLEAR_INLINE FloatRegister sum_quads(FloatRegister a, FloatRegister b, FloatRegister c, FloatRegister d) {
+  using Q = WithinQuads;
+  const FloatRegister ab = Q::shuffle<0, 2, 0, 2>(a, b) + Q::shuffle<1, 3, 1, 3>(a, b);
+  const FloatRegister cd = Q::shuffle<0, 2, 0, 2>(c, d) + Q::shuffle<1, 3, 1, 3>(c, d);
+  return Q::shuffle<0, 2, 0, 2>(ab, cd) + Q::shuffle<1, 3, 1, 3>(ab, cd);
+}
+
 // Transposes a square of kRegisterBytes / 4 rows, one register each.
 CLEAR_INLINE void transpose_square(FloatRegister (&rows)[Native<float>::width]) {
   for (int i = 0; i < kQuads; ++i)
@@ -66,6 +74,22 @@ CLEAR_INLINE void transpose_square(FloatRegister (&rows)[Native<float>::width]) 
   }
 #endif
 }
+
+#if !defined(__AVX512F__)
+// Adds to p[0 … 3] the sum of a's quads, and to p[4 … 7] that of b's.
+CLEAR_INLINE void add_quads(float* p, FloatRegister a, FloatRegister b) {
+#if defined(__AVX2__)
+  const __m256 crossed = _mm256_permute2f128_ps((__m256)a, (__m256)b, 0x21);  // a's upper quad, b's lower one
+  const __m256 both = _mm256_add_ps(_mm256_blend_ps((__m256)a, (__m256)b, 0xf0), crossed);
+  _mm256_storeu_ps(p, _mm256_add_ps(_mm256_loadu_ps(p), both));
+#else
+  FloatRegister row[2];
+  std::memcpy(row, p, sizeof row);
+  row[0] += a, row[1] += b;
+  std::memcpy(p, row, sizeof row);
+#endif
+}
+#endif
 
 // Transposes in place: rows[i] lane j  <->  rows[j] lane i.
 template <class T>

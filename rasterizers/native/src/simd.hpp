@@ -215,7 +215,11 @@ struct Mask {
     CLEAR_EACH_REGISTER(b |= Native<T>::bits(r[i]) << (i * Native<T>::width));
     return b;
   }
-  CLEAR_INLINE bool any() const { return bits() != 0; }
+  CLEAR_INLINE bool any() const {
+    typename Native<T>::Mask some{};
+    CLEAR_EACH_REGISTER(some |= r[i]);
+    return Native<T>::bits(some) != 0;
+  }
   static CLEAR_INLINE Mask from_bits(std::uint32_t b) {
     Mask m;
     CLEAR_EACH_REGISTER(m.r[i] = Native<T>::from_bits(b >> (i * Native<T>::width)));
@@ -352,14 +356,27 @@ CLEAR_INLINE Lanes<T> where(const Mask<T>& m, const Lanes<T>& a) {
 template <class T>
 CLEAR_INLINE Lanes<T> exp2(const Lanes<T>& x) {
   if constexpr (sizeof(T) == 4) {
-    Lanes<T> n = nearest(x), f = x - n;
-    Lanes<T> p = T(1.32647e-3);
-    p = p * f + T(9.67151e-3);
-    p = p * f + T(5.550734e-2);
-    p = p * f + T(2.4022242e-1);
-    p = p * f + T(6.9314698e-1);
-    p = p * f + T(1);
-    return scale_by_power(p, n);
+    auto power = [](const Lanes<T>& f) CLEAR_LAMBDA {
+      Lanes<T> p = T(1.32647e-3);
+      p = p * f + T(9.67151e-3);
+      p = p * f + T(5.550734e-2);
+      p = p * f + T(2.4022242e-1);
+      p = p * f + T(6.9314698e-1);
+      return p * f + T(1);
+    };
+#if defined(__AVX512F__)
+    const Lanes<T> n = nearest(x);
+    return scale_by_power(power(x - n), n);
+#else
+    // The last bits of x + 1.5 · 2^23 are the nearest integer; added to a float's exponent, they multiply by its power of two.
+    constexpr int registers = Lanes<T>::registers, mantissa = 23;
+    const Lanes<T> big = T(12582912.0), bounded = maximum(Lanes<T>(T(-125)), x), sum = bounded + big;  // NaN stays NaN
+    Lanes<T> p = power(bounded - (sum - big));
+    using Integer = typename Native<T>::Integer;
+    using Register = typename Native<T>::Register;
+    CLEAR_EACH_REGISTER(p.r[i] = (Register)((Integer)p.r[i] + ((Integer)sum.r[i] << mantissa)));
+    return p;
+#endif
   } else {
     T a[kLanes];
     x.store(a);
@@ -371,27 +388,27 @@ CLEAR_INLINE Lanes<T> exp2(const Lanes<T>& x) {
 // log2 x for x > 0.
 template <class T>
 CLEAR_INLINE Lanes<T> log2(const Lanes<T>& x) {
-  T a[kLanes];
-  x.store(a);
   if constexpr (sizeof(T) == 4) {
     // x = m 2^e with m in [√½, √2);  log2 m = 2/ln 2 · artanh s,  s = (m - 1)/(m + 1).
-    T mantissa[kLanes], exponent[kLanes];
-    for (int i = 0; i < kLanes; ++i) {
-      std::int32_t bits;
-      std::memcpy(&bits, &a[i], 4);
-      std::int32_t e = (bits - 0x3f3504f3) >> 23;
-      bits -= e << 23;
-      std::memcpy(&mantissa[i], &bits, 4);
-      exponent[i] = T(e);
-    }
-    Lanes<T> m = Lanes<T>::load(mantissa), s = (m - T(1)) / (m + T(1)), s2 = s * s;
+    constexpr int registers = Lanes<T>::registers, mantissa = 23, sqrt_half = 0x3f3504f3;
+    using Integer = typename Native<T>::Integer;
+    using Register = typename Native<T>::Register;
+    Lanes<T> m, exponent;
+    CLEAR_EACH_REGISTER({
+      const Integer e = ((Integer)x.r[i] - sqrt_half) >> mantissa;
+      m.r[i] = (Register)((Integer)x.r[i] - (e << mantissa));
+      exponent.r[i] = __builtin_convertvector(e, Register);
+    });
+    const Lanes<T> s = (m - T(1)) / (m + T(1)), s2 = s * s;
     Lanes<T> p = T(1.0 / 9);
     p = p * s2 + T(1.0 / 7);
     p = p * s2 + T(1.0 / 5);
     p = p * s2 + T(1.0 / 3);
     p = p * s2 + T(1);
-    return Lanes<T>::load(exponent) + s * p * T(2.8853900817779268);
+    return exponent + s * p * T(2.8853900817779268);
   } else {
+    T a[kLanes];
+    x.store(a);
     for (T& v : a) v = std::log2(v);
     return Lanes<T>::load(a);
   }
