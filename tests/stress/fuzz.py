@@ -1,47 +1,57 @@
-"""Random damage to the binary formats: what comes back is sound or a DataError, at once and in little memory."""
+"""Random damage to the files that are read: what comes back is sound or a DataError, at once and in little memory."""
 
 from __future__ import annotations
 
+import random
+import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from clear_strategies.data import ply
-from clear_strategies.data.readers import colmap_model, llff
+from clear_strategies.data.capture import Capture
+from clear_strategies.data.photo_files import read_image
+from clear_strategies.data.readers import colmap, colmap_model, llff, nerfstudio
 from clear_strategies.errors import DataError
 from clear_strategies.training import checkpoint
 from tests.helpers.malformed import GOOD
-from tests.stress.checkpoints import small
+from tests.stress.faults import small
 from tests.stress.rows import Row, Worst
 
 _SECONDS = 0.1  # that one input may take
+_MEMORY = 2**30  # bytes beyond those of before
+_EXTREMES = (b"\0", b"\x7f", b"\x80", b"\xff")
 
 
-def mutant(good: bytes, rng: np.random.Generator) -> bytes:
+def mutant(good: bytes, rng: random.Random) -> bytes:
     """One to three edits: a bit flipped, bytes overwritten, repeated, removed, or the rest cut off."""
     data = bytearray(good)
-    for _ in range(rng.integers(1, 4)):
-        at, length = int(rng.integers(max(1, len(data)))), int(rng.integers(1, 9))
-        match rng.integers(8):
+    for _ in range(rng.randint(1, 3)):
+        at, length = rng.randrange(max(1, len(data))), rng.randint(1, 8)
+        match rng.randrange(8):
             case 0 | 1 | 2 if data:
-                data[at] ^= 1 << int(rng.integers(8))
+                data[at] ^= 1 << rng.randrange(8)
             case 3 | 4:
-                data[at : at + length] = bytes([int(rng.choice([0, 0x7F, 0x80, 0xFF]))]) * length
+                data[at : at + length] = rng.choice(_EXTREMES) * length
             case 5:
                 data[at:at] = data[at : at + length]
             case 6:
                 del data[at : at + length]
             case _:
-                if rng.integers(4) == 0:
+                if rng.randrange(4) == 0:
                     del data[at:]
     return bytes(data)
 
 
-def targets(folder: Path) -> dict[str, tuple[Path, Callable[[], None]]]:
-    """Format -> the file to damage, and what reads it and checks what comes back."""
+Target = tuple[Path, Callable[[], None]]
+
+
+def binary(folder: Path) -> dict[str, Target]:
+    """Binary format -> the file to damage, and what reads it and checks what comes back."""
     scene, table = GOOD["colmap"](folder / "colmap"), GOOD["llff"](folder / "llff")
     model = scene / "sparse" / "0"
 
@@ -84,17 +94,54 @@ def targets(folder: Path) -> dict[str, tuple[Path, Callable[[], None]]]:
     }
 
 
-def measure(folder: Path, mutants: int, seed: int = 0) -> list[Row]:
-    """How many mutants of each format gave an unsound result, another error, or took too long."""
-    rows = []
-    for name, (file, read) in targets(folder).items():
-        good, rng, bad = file.read_bytes(), np.random.default_rng(seed), Worst()
-        for i in range(mutants):
-            file.write_bytes(mutant(good, rng))
-            bad.add(_fails(read), f"mutant {i} of seed {seed}")
-        file.write_bytes(good)
-        rows.append(bad.row(f"damaged {name}: unsound, untyped or slow", "all", 0))
-    return rows
+def scenes(folder: Path) -> dict[str, Target]:
+    """Text and images, read as parts of a whole scene, which takes a millisecond and more."""
+    text, shared = GOOD["colmap_txt"](folder / "txt"), GOOD["nerfstudio"](folder / "nerfstudio")
+    photo = GOOD["colmap"](folder / "photo") / "images" / "b.png"
+
+    def read_photo() -> None:
+        image = read_image(photo)
+        _require(image.dim() == 3 and bool(image.isfinite().all()))
+
+    return {
+        **{f"COLMAP {name}.txt": (text / "sparse" / "0" / f"{name}.txt", lambda: _require_sound(colmap.read(text)))
+           for name in ("cameras", "images", "points3D")},
+        "transforms.json": (shared / "transforms.json", lambda: _require_sound(nerfstudio.read(shared))),
+        "PNG": (photo, read_photo),
+    }  # fmt: skip
+
+
+def _require_sound(capture: Capture) -> None:
+    for frame in capture.frames:
+        rotation = frame.camera.world_to_camera[:3, :3]
+        _require(float((rotation @ rotation.T - torch.eye(3).to(rotation)).abs().max()) < 1e-6)
+    if capture.points is not None:
+        _require(bool(capture.points.means.isfinite().all()))
+        _require(set(capture.points.track_image.tolist()) <= {frame.sfm_id for frame in capture.frames})
+
+
+def measure(targets: dict[str, Target], mutants: int, *, seed: int = 0, goal: int = 0) -> Iterator[Row]:
+    """How many mutants of each format gave an unsound result, another error, took too long or too much memory."""
+    with _bounded_memory():
+        for name, (file, read) in targets.items():
+            good, rng, bad = file.read_bytes(), random.Random(seed), Worst()  # noqa: S311 - no secret
+            for i in range(mutants):
+                file.write_bytes(mutant(good, rng))
+                bad.add(_fails(read), f"mutant {i} of seed {seed}")
+            file.write_bytes(good)
+            yield bad.row(f"damaged {name}: unsound, untyped or slow", "all", 0, goal)
+
+
+@contextmanager
+def _bounded_memory() -> Iterator[None]:
+    """A reader that allocates by a damaged count then fails here, and not the machine."""
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + _MEMORY, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def _fails(read: Callable[[], None]) -> float:

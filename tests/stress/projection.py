@@ -63,8 +63,8 @@ def measure(name: str, draw: Rasterizer, *, every: int = 1) -> list[Row]:
         ours, theirs = found.vjp(v), right.vjp(v.double())
         gradient.add(_gradient_error(ours, theirs, splats), where)
     return [
-        image.row("single Gaussians: image", name, _IMAGE),
-        gradient.row("single Gaussians: gradient", name, _GRADIENT),
+        image.row("single Gaussians: image", name, _IMAGE, 13_923),
+        gradient.row("single Gaussians: gradient", name, _GRADIENT, 0),
     ]
 
 

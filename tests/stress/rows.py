@@ -1,10 +1,14 @@
-"""What a stress measurement found, and the page of all of them."""
+"""What a stress measurement found, and the table of all of them."""
 
 from __future__ import annotations
 
+import csv
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from clear_strategies import files
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,6 +20,9 @@ class Row:
         cases: how many inputs. worst: the largest error, or the number of failures, over all of them.
         bound: what `worst` may be at most.
         where: the input of the worst error.
+        goal: how many inputs a release is measured with; 0: as many as there are.
+        part: the measurement that the row belongs to, for `python -m tests.stress --only`.
+        measured: the day.
     """
 
     what: str
@@ -24,6 +31,9 @@ class Row:
     worst: float
     bound: float
     where: str
+    goal: int = 0
+    part: str = ""
+    measured: str = ""
 
     @property
     def met(self) -> bool:
@@ -35,12 +45,41 @@ class Row:
 
 def table(rows: Iterable[Row]) -> str:
     """Markdown."""
-    lines = ["| check | backend | cases | worst | bound | met | worst case |", "|---|---|---:|---:|---:|---|---|"]
-    lines += [
-        f"| {r.what} | {r.backend} | {r.cases:,} | {r.worst:.2g} | {r.bound:g} | {'yes' if r.met else '**no**'} | {r.where} |"
-        for r in rows
+    lines = [
+        "| check | backend | cases | goal | worst | bound | met | worst case | measured |",
+        "|---|---|---:|---:|---:|---:|---|---|---|",
     ]
+    for r in rows:
+        met = "**no**" if not r.met else "yes" if r.cases >= r.goal else "so far"
+        goal = f"{max(r.goal, r.cases):,}" if r.goal else "all"
+        lines.append(
+            f"| {r.what} | {r.backend} | {r.cases:,} | {goal} | {r.worst:.2g} | {r.bound:g} | {met} | {r.where} "
+            f"| {r.measured} |"
+        )
     return "\n".join(lines) + "\n"
+
+
+def read(path: Path) -> list[Row]:
+    """The rows of earlier measurements; none where there is no file."""
+    if not path.exists():
+        return []
+    kinds = {"cases": int, "goal": int, "worst": float, "bound": float}
+    with path.open(newline="", encoding="utf-8") as file:
+        return [
+            Row(**{name: kinds.get(name, str)(value) for name, value in row.items()}) for row in csv.DictReader(file)
+        ]
+
+
+def write(path: Path, rows: Iterable[Row]) -> None:
+    names = [field.name for field in fields(Row)]
+    files.write_csv(path, ({name: getattr(row, name) for name in names} for row in rows), names)
+
+
+def merged(earlier: Sequence[Row], found: Sequence[Row], order: Sequence[str]) -> list[Row]:
+    """The rows of the parts that were measured now in place of their earlier ones."""
+    now = {row.part for row in found}
+    kept = [row for row in earlier if row.part not in now and row.part in order]
+    return sorted([*kept, *found], key=lambda row: order.index(row.part))
 
 
 @dataclass(slots=True)
@@ -56,5 +95,14 @@ class Worst:
         if not error <= self.error:  # NaN counts as the largest
             self.error, self.where = (math.inf if math.isnan(error) else error), where
 
-    def row(self, what: str, backend: str, bound: float) -> Row:
-        return Row(what, backend, self.cases, self.error, bound, self.where)
+    def add_to_last(self, error: float, where: str) -> None:
+        """Another finding about the case that was added last."""
+        self.cases -= 1
+        self.add(error, where)
+
+    def row(self, what: str, backend: str, bound: float, goal: int = 0) -> Row:
+        return Row(what, backend, self.cases, self.error, bound, self.where, goal)
+
+
+def of_part(rows: Iterable[Row], part: str, day: str) -> list[Row]:
+    return [replace(row, part=part, measured=day) for row in rows]

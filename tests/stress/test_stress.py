@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
+from clear_strategies import files
+from clear_strategies.errors import SettingError
 from clear_strategies.training import checkpoint
+from clear_strategies.training.optim import Adam
+from clear_strategies.training.state import TrainState
 from rasterizers.reference import ReferenceRasterizer
 from tests.helpers.backends import BACKENDS, why_not
-from tests.stress import checkpoints, fuzz, gco, projection
+from tests.stress import attacks, bad_inputs, checkpoints, faults, fuzz, gco, kills, lifecycle, projection, soak
 from tests.stress.__main__ import _CLEAN, main
-from tests.stress.rows import Row, Worst, table
+from tests.stress.bad_inputs import BadInput
+from tests.stress.rows import Row, Worst, read, table, write
 
 EVERY = {"torch": 97, "warp": 499}
+MUTANTS = 2_000
 
 
 @pytest.mark.parametrize("name", ["torch", *BACKENDS])
@@ -43,9 +52,28 @@ def test_gco_agrees_with_sixty_digits_and_sees_conflicts_beside_an_outlier() -> 
         row.require()
 
 
-def test_no_fault_of_a_save_loses_a_checkpoint(tmp_path: Path) -> None:
-    row = checkpoints.faults(tmp_path)
-    assert row.cases > 100
+def test_the_lifecycle_holds_in_any_order() -> None:
+    row = lifecycle.measure(6, steps=12)
+    assert row.cases > 50
+    row.require()
+
+
+def test_moments_that_stay_behind_and_a_save_of_nan_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    def careless(self, parents, fresh):
+        self.first = {name: rows[parents] for name, rows in self.first.items()}
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Adam, "take", careless)
+        assert not lifecycle.measure(30, steps=12).met
+    monkeypatch.setattr(TrainState, "require_finite", lambda self: None)
+    row = lifecycle.measure(30, steps=12)
+    assert not row.met
+    assert "DivergedError was not raised" in row.where
+
+
+def test_a_file_cut_by_any_fault_would_be_found_and_is_not_left(tmp_path: Path) -> None:
+    row = faults.measure(tmp_path, most=250)
+    assert row.cases > 200
     row.require()
 
 
@@ -58,15 +86,83 @@ def test_a_save_that_removes_before_it_writes_would_be_found(tmp_path: Path, mon
         return save(folder, saved, keep=keep)
 
     monkeypatch.setattr(checkpoint, "save", careless)
-    assert not checkpoints.faults(tmp_path).met
+    assert not faults.measure(tmp_path, most=250).met
+
+
+def test_an_export_that_writes_in_place_would_be_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def careless(path: Path, data: bytes) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("wb") as file:
+            file.write(data)
+
+    monkeypatch.setattr(files, "write_bytes", careless)
+    assert not faults.measure(tmp_path, most=250).met
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the run that is killed is a forked process")
+def test_killed_runs_end_as_one_that_was_not(tmp_path: Path) -> None:
+    kills.measure(tmp_path, 5).require()
 
 
 def test_altered_bits_and_cut_files_are_refused(tmp_path: Path) -> None:
     checkpoints.integrity(tmp_path, 150).require()
 
 
+@pytest.mark.parametrize("given", bad_inputs.inputs(), ids=lambda given: given.id)
+def test_a_bad_input_is_refused_in_one_line(given: BadInput, tmp_path: Path) -> None:
+    assert bad_inputs.problem(given, tmp_path) is None
+
+
+@pytest.mark.parametrize("given", attacks.attacks(), ids=lambda given: given.name)
+def test_an_attack_is_refused_and_leaves_no_trace(given: BadInput, tmp_path: Path) -> None:
+    assert attacks.trace(given, tmp_path) is None
+
+
+def test_there_are_as_many_bad_inputs_and_attacks_as_a_release_asks_for() -> None:
+    named = [given.id for given in bad_inputs.inputs()]
+    assert len(named) == len(set(named)) >= 300
+    attacked = [given.name for given in attacks.attacks()]
+    assert len(attacked) == len(set(attacked)) >= 40
+
+
+def test_an_input_that_is_accepted_or_refused_otherwise_would_be_found(tmp_path: Path) -> None:
+    def fails(folder: Path) -> None:
+        raise ZeroDivisionError
+
+    def lines(folder: Path) -> None:
+        raise SettingError("a\nb")
+
+    for give, says in ((lambda folder: None, "it is accepted"), (fails, "ZeroDivisionError"), (lines, "several lines")):
+        assert says in (bad_inputs.problem(BadInput("x", "y", give, ""), tmp_path) or "")
+
+
+def test_a_program_a_secret_and_a_file_outside_would_be_found(tmp_path: Path) -> None:
+    folder = tmp_path / "here"
+    folder.mkdir()
+    (tmp_path / "secret.txt").write_text("s")
+
+    def refused_after(act: Callable[[Path], object]) -> BadInput:
+        def give(there: Path) -> None:
+            act(there)
+            raise SettingError("no")
+
+        return BadInput("x", "y", give, "no")
+
+    assert attacks.trace(refused_after(lambda there: None), folder) is None
+    assert "subprocess" in (
+        attacks.trace(refused_after(lambda there: subprocess.run(["true"], check=True)), folder) or ""
+    )
+    assert "outside" in (
+        attacks.trace(refused_after(lambda there: (tmp_path / "outside").write_text("x")), folder) or ""
+    )
+    assert "secret" in (attacks.trace(refused_after(lambda there: (tmp_path / "secret.txt").read_text()), folder) or "")
+    assert "canary" in (attacks.trace(refused_after(lambda there: (there / "canary").mkdir()), folder) or "")
+
+
 def test_damaged_files_are_refused_or_sound(tmp_path: Path) -> None:
-    for row in fuzz.measure(tmp_path, 250):
+    for row in fuzz.measure(fuzz.binary(tmp_path / "binary"), MUTANTS):
+        row.require()
+    for row in fuzz.measure(fuzz.scenes(tmp_path / "scenes"), MUTANTS // 20):
         row.require()
 
 
@@ -74,8 +170,14 @@ def test_a_reader_with_an_untyped_error_would_be_found(tmp_path: Path, monkeypat
     monkeypatch.setattr(
         fuzz.ply, "read_gaussians", lambda path: torch.frombuffer(path.read_bytes()[:7], dtype=torch.float32)
     )
-    rows = {row.what: row for row in fuzz.measure(tmp_path, 3)}
+    rows = {row.what: row for row in fuzz.measure(fuzz.binary(tmp_path), 3)}
     assert not rows["damaged PLY: unsound, untyped or slow"].met
+
+
+def test_a_short_soak_stays_finite() -> None:
+    _, open_files, finite = soak.run(200)
+    open_files.require()
+    finite.require()
 
 
 def test_a_row_that_is_not_a_number_or_has_no_case_is_not_met() -> None:
@@ -89,6 +191,27 @@ def test_a_row_that_is_not_a_number_or_has_no_case_is_not_met() -> None:
     assert "**no**" in table([row, Row("fine", "none", 1, 0.0, 0.0, "none")])
 
 
-def test_the_command_writes_the_page(tmp_path: Path) -> None:
-    assert main(["--only", "gco", "--out", str(tmp_path / "stability.md")]) == 0
-    assert "| GCO: conflicts that an outlier hides | readable |" in (tmp_path / "stability.md").read_text()
+def test_the_command_writes_the_page_and_keeps_what_it_did_not_measure(tmp_path: Path) -> None:
+    page = tmp_path / "stability.md"
+    kept, replaced = (
+        Row(what, "all", 1, 0.0, 0.0, "none", part=part) for what, part in (("old soak", "soak"), ("old", "gco"))
+    )
+    write(tmp_path / "stability.csv", [kept, replaced])
+    assert main(["--only", "gco", "--out", str(page)]) == 0
+    written = page.read_text()
+    assert "| GCO: conflicts that an outlier hides | readable |" in written
+    assert [row.what for row in read(tmp_path / "stability.csv")][-1] == "old soak"
+    assert "| old |" not in written
+
+
+def test_fewer_cases_than_a_release_asks_for_are_met_so_far() -> None:
+    few = Row("few", "all", 10, 0.0, 0.0, "none", goal=100)
+    assert "| so far |" in table([few])
+    assert "| yes |" in table([Row("enough", "all", 100, 0.0, 0.0, "none", goal=100)])
+
+
+def test_inputs_and_attacks_are_listed_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--list"]) == 0
+    listed = capsys.readouterr().out
+    assert "PLY: count of 2^63\n" in listed
+    assert "attack: llff: npy of objects\n" in listed

@@ -1,0 +1,123 @@
+"""Image files: damaged, of a kind that is not read, too large, turned, or not of the size that is expected."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from clear_strategies.data.photo_files import image_size, read_image
+from tests.helpers.malformed import bomb
+from tests.stress.bad_inputs import BadInput
+
+
+def _encoded(form: str, mode: str = "RGB", size: tuple[int, int] = (40, 30), **options: Any) -> bytes:
+    noise = np.random.default_rng(0).integers(0, 256, (*size[::-1], 3), np.uint8)
+    stream = io.BytesIO()
+    Image.fromarray(noise).convert(mode).save(stream, form, **options)
+    return stream.getvalue()
+
+
+def _turned(form: str, orientation: int) -> bytes:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    return _encoded(form, exif=exif)
+
+
+def _pages(form: str) -> bytes:
+    pages = [Image.new("RGB", (8, 8), color) for color in ("red", "blue")]
+    stream = io.BytesIO()
+    pages[0].save(stream, form, save_all=True, append_images=pages[1:])
+    return stream.getvalue()
+
+
+def _read(content: bytes, **options: Any) -> Callable[[Path], object]:
+    def give(folder: Path) -> object:
+        (folder / "a.png").write_bytes(content)
+        return read_image(folder / "a.png", **options)
+
+    return give
+
+
+def _flipped(content: bytes, at: int) -> bytes:
+    data = bytearray(content)
+    data[at] ^= 0xFF
+    return bytes(data)
+
+
+_PNG, _JPEG, _WEBP, _TIFF = (_encoded(form) for form in ("PNG", "JPEG", "WEBP", "TIFF"))
+_UNREADABLE, _BROKEN = "a.png: file: is no readable image", "a.png: pixels: cannot be decoded"
+
+
+def _absent(folder: Path) -> object:
+    return read_image(folder / "none.png")
+
+
+def _folder(folder: Path) -> object:
+    (folder / "a.png").mkdir()
+    return read_image(folder / "a.png")
+
+
+def _pipe(folder: Path) -> object:
+    os.mkfifo(folder / "a.png")
+    return image_size(folder / "a.png")
+
+
+def _device(folder: Path) -> object:
+    (folder / "a.png").symlink_to("/dev/zero")
+    return read_image(folder / "a.png")
+
+
+def _huge_png_of_one_colour(folder: Path) -> object:
+    Image.new("L", (9_990, 9_990)).save(folder / "a.png")
+    return image_size(folder / "a.png")
+
+
+_CASES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "absent": (_absent, "none.png: file: is not there"),
+    "a folder": (_folder, r"a.png: file: "),
+    "a pipe": (_pipe, "a.png: file: is a pipe, a device or a socket"),
+    "a device": (_device, "a.png: file: is a pipe, a device or a socket"),
+    "empty": (_read(b""), _UNREADABLE),
+    "one byte": (_read(b"\x89"), _UNREADABLE),
+    "text": (_read(b"not a picture\n" * 9), _UNREADABLE),
+    "SVG": (_read(b"<svg xmlns='http://www.w3.org/2000/svg'/>"), _UNREADABLE),
+    "PDF": (_read(b"%PDF-1.7\n%%EOF"), _UNREADABLE),
+    "zip": (_read(b"PK\x03\x04" + bytes(60)), _UNREADABLE),
+    "GIF": (_read(_encoded("GIF", "P")), _UNREADABLE),
+    "BMP": (_read(_encoded("BMP")), _UNREADABLE),
+    "PPM": (_read(_encoded("PPM")), _UNREADABLE),
+    "PNG cut in its header": (_read(_PNG[:20]), _UNREADABLE),
+    "PNG cut in its pixels": (_read(_PNG[:-60]), _BROKEN),
+    "PNG cut after a tenth": (_read(_PNG[: len(_PNG) // 10]), _BROKEN),
+    "PNG with a flipped byte of pixels": (_read(_flipped(_PNG, len(_PNG) // 2)), _BROKEN),
+    "PNG with a flipped byte of its size": (_read(_flipped(_PNG, 19)), f"{_UNREADABLE}|{_BROKEN}|size"),
+    "PNG without its signature": (_read(_PNG[8:]), _UNREADABLE),
+    "JPEG cut in its header": (_read(_JPEG[:12]), _UNREADABLE),
+    "JPEG cut in its pixels": (_read(_JPEG[:-200]), _BROKEN),
+    "JPEG of two bytes": (_read(b"\xff\xd8"), _UNREADABLE),
+    "WebP cut": (_read(_WEBP[:-40]), f"{_UNREADABLE}|{_BROKEN}"),
+    "TIFF cut": (_read(_TIFF[: len(_TIFF) // 2]), f"{_UNREADABLE}|{_BROKEN}"),
+    "TIFF of two pages": (_read(_pages("TIFF")), "a.png: pages: are several in one file"),
+    "moving PNG": (_read(_pages("PNG")), "a.png: pages: are several in one file"),
+    "moving WebP": (_read(_pages("WEBP")), "a.png: pages: are several in one file"),
+    "CMYK TIFF": (_read(_encoded("TIFF", "CMYK")), "a.png: colour mode: is CMYK"),
+    "CMYK JPEG": (_read(_encoded("JPEG", "CMYK")), "a.png: colour mode: is CMYK"),
+    "TIFF of floats": (_read(_encoded("TIFF", "F")), "a.png: colour mode: is F"),
+    "TIFF of 32-bit numbers": (_read(_encoded("TIFF", "I")), "a.png: colour mode: is I"),
+    "LAB TIFF": (_read(_encoded("TIFF", "LAB")), "a.png: colour mode: is LAB"),
+    **{f"JPEG turned by EXIF {i}": (_read(_turned("JPEG", i)), f"EXIF orientation: is {i}") for i in range(2, 9)},
+    "PNG turned by EXIF": (_read(_turned("PNG", 6)), "EXIF orientation: is 6"),
+    "WebP turned by EXIF": (_read(_turned("WEBP", 8)), "EXIF orientation: is 8"),
+    "another size": (_read(_PNG, expect=(30, 40)), "a.png: size: is 40x30 where 30x40 is expected"),
+    "larger than allowed": (_read(_PNG, max_pixels=1199), "a.png: size: 40x30 is more than 1,199 pixels"),
+    "header of 3.6 gigapixels": (_read(bomb(60_000, 60_000)), "a.png: (size|file)"),
+    "header of 2^31 pixels a side": (_read(bomb(2**31 - 1, 2**31 - 1)), "a.png: (size|file)"),
+    "100 megapixels of one colour": (_huge_png_of_one_colour, "more than 200 times the file, as in no photo"),
+}
+INPUTS = [BadInput("image", name, give, pattern) for name, (give, pattern) in _CASES.items()]

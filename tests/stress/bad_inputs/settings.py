@@ -1,0 +1,143 @@
+"""Settings on the command line: outside their range, of another type, or of a name that nothing has."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from clear_strategies.compose import CONF, tree
+from clear_strategies.jobs import device
+from clear_strategies.jobs.job import settings_of
+from tests.stress.bad_inputs import BadInput
+
+# An override, and what the message says beside the setting's name.
+_REFUSED: dict[str, str] = {
+    "fit.iterations=0": "must be at least 1, got 0",
+    "fit.iterations=-5": "must be at least 1, got -5",
+    "fit.iterations=1.5": "whole number",
+    "fit.iterations=many": "whole number",
+    "fit.iterations=null": "whole number",
+    "fit.max_degree=4": "must be 0, 1, 2 or 3, got 4",
+    "fit.max_degree=-1": "must be 0, 1, 2 or 3, got -1",
+    "fit.keep=0": "must be at least 1 checkpoint, got 0",
+    "fit.fused=sometimes": "auto",
+    "fit.map_views=-1": "must be at least 0",
+    "fit.video=-1": "must be at least 0",
+    "fit.threads=0": "must be at least 1",
+    "fit.device=tpu": "cpu",
+    "fit.seed=x": "whole number",
+    "fit.scale_schedule=7": "true or false",
+    "fit.resume=[]": "text",
+    "density.threshold=0": "must be > 0",
+    "density.threshold=-1e-4": "must be > 0",
+    "density.threshold=.inf": "finite",
+    "density.threshold=.nan": "finite",
+    "density.mode=best": "quantile",
+    "density.reduce=median": "mean",
+    "density.every=0": "at least 1",
+    "density.max_gaussians=0": "at least 1",
+    "density.min_gaussians=0": "at least 1",
+    "density.reset_every=-1": "at least 0",
+    "density.prune_opacity=1": r"\[0, 1\)",
+    "density.prune_opacity=-0.1": r"\[0, 1\)",
+    "optim.quats=-1": "must lie in",
+    "optim.scales=1e30": "must lie in",
+    "optim.opacities=.nan": "finite",
+    "optim.sh0=x": "number",
+    "optim.eps=1": r"\[0, 1\)",
+    "optim.eps=-1e-15": r"\[0, 1\)",
+    "optim.detail_decay=1": r"\[0, 1\)",
+    "optim.rows=some": "all",
+    "optim.means.initial=0": r"\(0, 100\]",
+    "skips.hr_every=0": "at least 1",
+    "skips.flat=1": r"\[0, 1\)",
+    "skips.plateau_gain=-1": r"\[0, 1\)",
+    "skips.coarse_until=-1": "at least 0",
+    "rasterizer.alpha_max=1": "alpha_max",
+    "rasterizer.alpha_min=0": "alpha_min",
+    "rasterizer.alpha_min=0.999": "alpha_min",
+    "rasterizer.transmittance_min=1": "transmittance_min",
+    "rasterizer.near=0": "near",
+    "rasterizer.kernel=-1": "kernel",
+    "rasterizer.memory=0": "memory",
+    "rasterizer.preset=best": "preset",
+    "rasterizer.name=opengl": "opengl",
+    "rasterizer.background=[0,0]": "background",
+    "rasterizer.background=[0,0,2]": "background",
+    "strategies.gco.tolerance=1": r"\[0, 1\)",
+    "strategies.gco.tolerance=-0.1": r"\[0, 1\)",
+    "strategies.gco.weight_min=0.9": "weight_min",
+    "strategies.gco.weight_max=2": "weight_max",
+    "strategies.gco.bound=tight": "omega",
+    "strategies.gco.eps=tiny": "relative",
+    "strategies.gco.eps=relative:-1": "relative",
+    "strategies.gco.groups=[colour]": "groups",
+    "strategies.gco.tolerances=0.1": "",
+    "strategies.p2g.reliability_scale=0": "reliability_scale",
+    "strategies.p2g.reliability_scale=relative:x": "reliability_scale",
+    "strategies.p2g.floor=1.1": r"\[0, 1\]",
+    "strategies.p2g.patch=0": "at least 1",
+    "strategies.p2g.detail_eps=0": "> 0",
+    "strategies.p2g.down=sharp": "bicubic",
+    "strategies.p2g.lookup=cubic": "nearest",
+    "strategies.p2g.outside=mirror": "clamp",
+    "strategies.p2g.score_by=luck": "evidence",
+    "strategies.p2g.agreement=some": "photo",
+    "strategies.svs.looks=-1": "at least 0",
+    "strategies.svs.anchor_strength=-1": ">= 0",
+    "strategies.svs.reduction=max": "sum",
+    "strategies.svs.anchor_weights.means=-1": ">= 0",
+    "strategies.svs.dropout.maximum=1": "",
+    "objective.lambda_ssim=1.5": r"\[0, 1\]",
+    "objective.lambda_hf=-1": ">= 0",
+    "objective.lambda_lr=-1": ">= 0",
+    "objective.haar_levels=0": "at least 1",
+    "objective.kernels=fortran": "kernels",
+    "objective.lambda_hr.start=9999": "<=",
+    "objective.lr_from=sr": "lr",
+    "prior._target_=os.system": "must name a class",
+    "+strategies.mine={}": "",
+    "+strategies.mine._target_=nowhere.Mine": "cannot be imported|must name a class",
+    "data.views.sr_scale=0": "sr_scale",
+    "data.views.sr_scale=2.5": "sr_scale",
+    "data.views.shrink=0": "shrink",
+    "data.views.train=0": "train",
+    "data.cloud.init=magic": "init",
+    "data.views.photos_are=low": "photos_are",
+}  # fmt: skip
+
+
+@cache
+def _sound() -> DictConfig:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", ["+strategy=clear"])
+
+
+def _given(override: str) -> Callable[[Path], object]:
+    def give(folder: Path) -> object:
+        config = copy.deepcopy(_sound())
+        key, _, value = override.partition("=")
+        added = key.startswith("+")
+        OmegaConf.update(
+            config, key.lstrip("+"), OmegaConf.create(f"v: {value}")["v"], merge=not added, force_add=added
+        )
+        settings = settings_of(tree(config))
+        return device.drawing(settings.rasterizer, settings.fit.device)
+
+    return give
+
+
+def _pattern(override: str, says: str) -> str:
+    """The message names the setting, or what holds it."""
+    words = "|".join(override.lstrip("+").partition("=")[0].split(".")[-2:])
+    return says if "|" in says else rf"(?=.*({words})).*{says}"
+
+
+INPUTS = [
+    BadInput("setting", override, _given(override), _pattern(override, says)) for override, says in _REFUSED.items()
+]

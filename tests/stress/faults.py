@@ -1,0 +1,284 @@
+"""Every operation on files of a save, of an export and of a resumed run fails once in each way that a disk or a kill has.
+
+Afterwards a checkpoint is whole, every other file is as before or as it was to become, and the next start leaves no rest.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from clear_strategies import files
+from clear_strategies.data.photo_files import write_png
+from clear_strategies.errors import DataError
+from clear_strategies.outputs.export import export_ply
+from clear_strategies.training import checkpoint
+from clear_strategies.training.checkpoint import Checkpoint
+from clear_strategies.training.field import GaussianField
+from clear_strategies.viewing.cameras import write_cameras
+from tests.helpers import toy
+from tests.stress.rows import Row, Worst
+
+
+class Killed(BaseException):
+    """The process is gone: no operation after it happens either."""
+
+
+FAULTS: dict[str, Callable[[], BaseException]] = {
+    "kill": Killed,
+    "ENOSPC": lambda: OSError(errno.ENOSPC, "No space left on device"),
+    "EIO": lambda: OSError(errno.EIO, "Input/output error"),
+    "EACCES": lambda: PermissionError(errno.EACCES, "Permission denied"),
+    "short write": lambda: OSError(errno.EFBIG, "File too large"),
+}
+
+
+class _Disk:
+    """Counts operations, and fails the `at`-th; after a kill all later ones fail."""
+
+    def __init__(self, at: int, make: Callable[[], BaseException]) -> None:
+        self.at, self.make, self.seen, self.dead = at, make, list[str](), False
+
+    def count(self, name: str) -> None:
+        if self.dead:
+            raise Killed
+        self.seen.append(name)
+        if len(self.seen) == self.at:
+            error = self.make()
+            self.dead = isinstance(error, Killed)
+            raise error
+
+    def wrapped(self, name: str, real: Callable) -> Callable:
+        def call(*arguments, **options):
+            self.count(name)
+            return real(*arguments, **options)
+
+        return call
+
+    def opened(self, real: Callable) -> Callable:
+        def call(path, mode="r", *arguments, **options):
+            if set(mode) & set("wxa+"):
+                self.count("open")
+                return _File(self, real(path, mode, *arguments, **options))
+            return real(path, mode, *arguments, **options)
+
+        return call
+
+    def remove_tree(self, path, ignore_errors=False, **_) -> None:
+        """As shutil.rmtree, in operations that each may fail."""
+        try:
+            for entry in sorted(Path(path).iterdir()):
+                entry.unlink()
+            Path(path).rmdir()
+        except OSError:
+            if not ignore_errors:
+                raise
+
+
+class _File:
+    """An open file whose writes may fail, and then leave half of the bytes."""
+
+    def __init__(self, disk: _Disk, file: io.IOBase) -> None:
+        self._disk, self._file = disk, file
+
+    def write(self, data):
+        try:
+            self._disk.count("write")
+        except BaseException:
+            self._file.write(data[: len(data) // 2])
+            self._file.flush()
+            raise
+        return self._file.write(data)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._file.close()
+
+    def __getattr__(self, name: str):
+        return getattr(self._file, name)
+
+
+@contextmanager
+def fault(at: int, make: Callable[[], BaseException]) -> Iterator[list[str]]:
+    """Let the `at`-th operation on files fail. Yields the operations by name."""
+    disk = _Disk(at, make)
+    patched = [(Path, name) for name in ("mkdir", "rename", "replace", "unlink", "rmdir")] + [(os, "fsync")]
+    before = [(owner, name, getattr(owner, name)) for owner, name in (*patched, (io, "open"), (shutil, "rmtree"))]
+    for owner, name, real in before[:-2]:
+        setattr(owner, name, disk.wrapped(name, real))
+    io.open = disk.opened(io.open)  # what Path.open calls
+    shutil.rmtree = disk.remove_tree
+    try:
+        yield disk.seen
+    finally:
+        for owner, name, real in before:
+            setattr(owner, name, real)
+
+
+def small(t: int, value: float) -> Checkpoint:
+    facts = {"optimizer_steps": float(t), "degree": 1.0}
+    tensors = {"field/means": torch.full((5, 3), value)}
+    work = {"render LR": {"runs": t, "seconds": 1.5, "skipped": {"why": 2}}}
+    return Checkpoint(t, tensors, {"fit.seed": 1}, facts, [{"t": 1.0, "loss": 0.25}], work)
+
+
+_SCENE = toy.scene(6, train=2, test=1)
+
+
+def _write_all(folder: Path, value: float) -> None:
+    """The files of a finished run that are no checkpoint, small."""
+    write_cameras(folder, _SCENE)
+    field = GaussianField.from_cloud(_SCENE.cloud, max_degree=1)
+    field.detail.data.fill_(value)
+    export_ply(folder / "point_cloud.ply", field)
+    write_png(folder / "renders" / "view1.png", _SCENE.test[0].lr.image * value)
+    files.write_csv(folder / "history.csv", [{"t": 1.0, "loss": value}], ["t", "loss"])
+    files.write_json(folder / "metrics.json", {"psnr": value})
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Work on the files of a run.
+
+    Args:
+        prepare: makes the run's folder as it was. act: the work.
+    """
+
+    name: str
+    prepare: Callable[[Path], object]
+    act: Callable[[Path], object]
+
+
+def _saves(keep: int, *iterations: int) -> Callable[[Path], None]:
+    def act(folder: Path) -> None:
+        for i, t in enumerate(iterations, 2):
+            checkpoint.save(folder / "checkpoints", small(t, float(i)), keep=keep)
+
+    return act
+
+
+def _first(keep: int, *, exported: bool = False) -> Callable[[Path], None]:
+    def prepare(folder: Path) -> None:
+        checkpoint.save(folder / "checkpoints", small(100, 1.0), keep=keep)
+        if exported:
+            _write_all(folder, 0.25)
+
+    return prepare
+
+
+def _resumed(keep: int) -> Callable[[Path], None]:
+    def act(folder: Path) -> None:
+        files.sweep(folder)
+        found = checkpoint.load(folder)
+        _saves(keep, found.t + 100, found.t + 200)(folder)
+        _write_all(folder, 0.75)
+
+    return act
+
+
+def _died(keep: int) -> Callable[[Path], None]:
+    """A process died while it saved and while it exported."""
+
+    def prepare(folder: Path) -> None:
+        _first(keep, exported=True)(folder)
+        (folder / "checkpoints" / ".step_0000200.7.partial").mkdir()
+        (folder / "checkpoints" / ".step_0000200.7.partial" / "history.json").write_text("[")
+        (folder / ".metrics.json.7.partial").write_text("{")
+
+    return prepare
+
+
+SCENARIOS = [
+    *(Scenario(f"save, keep={k}", _first(k), _saves(k, 200)) for k in (1, 3)),
+    *(Scenario(f"save the same step again, keep={k}", _first(k), _saves(k, 100)) for k in (1, 3)),
+    *(Scenario(f"three saves, keep={k}", _first(k), _saves(k, 200, 300, 400)) for k in (1, 2)),
+    Scenario("first export", _first(1), lambda folder: _write_all(folder, 0.75)),
+    Scenario("export over another", _first(1, exported=True), lambda folder: _write_all(folder, 0.75)),
+    *(Scenario(f"resumed run, keep={k}", _first(k, exported=True), _resumed(k)) for k in (1, 2, 3)),
+    Scenario("resumed after a death", _died(1), _resumed(1)),
+]
+
+
+def measure(folder: Path, *, most: int | None = None) -> Row:
+    """Every operation of every scenario fails in every way.
+
+    Args:
+        most: of the fault points, evenly chosen; None: all.
+    """
+    flush, lost = os.fsync, Worst()
+    os.fsync = lambda descriptor: None  # a disk's own cache is not part of this, and waiting for it is most of the time
+    try:
+        for what, failed, whole in _outcomes(folder, most):
+            lost.add(float(not whole), f"{what}: {failed}")
+    finally:
+        os.fsync = flush
+    return lost.row(
+        "fault points of save, export and resume: a checkpoint lost, a torn file or a rest", "all", 0, 1_500
+    )
+
+
+def _outcomes(folder: Path, most: int | None) -> Iterator[tuple[str, str, bool]]:
+    """The scenario, the operation that failed and how, and whether all was whole afterwards."""
+    points = list(_points(folder))
+    step = 1 if most is None else max(1, len(points) // most)
+    for scenario, kind, at, states in points[::step]:
+        here = folder / "run"
+        scenario.prepare(here)
+        with fault(at, FAULTS[kind]) as seen, suppress(OSError, Killed):
+            scenario.act(here)
+        yield scenario.name, f"{kind} at {seen[-1]} {at}", _whole(here, states)
+        shutil.rmtree(here)
+
+
+States = dict[str, set[bytes]]
+
+
+def _points(folder: Path) -> Iterator[tuple[Scenario, str, int, States]]:
+    """Every fault point, and what each file that is no checkpoint may hold afterwards."""
+    for scenario in SCENARIOS:
+        here = folder / "whole"
+        scenario.prepare(here)
+        states: States = {}
+        _add_contents(here, states)
+        with fault(0, Killed) as seen:
+            scenario.act(here)
+        _add_contents(here, states)
+        shutil.rmtree(here)
+        for kind in FAULTS:
+            for at, name in enumerate(seen, 1):
+                if kind != "short write" or name == "write":
+                    yield scenario, kind, at, states
+
+
+def _add_contents(folder: Path, states: States) -> None:
+    for name, content in _contents(folder).items():
+        states.setdefault(name, set()).add(content)
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
+    return {name: path.read_bytes() for name, path in found.items() if not name.startswith("checkpoints")}
+
+
+def _whole(folder: Path, states: States) -> bool:
+    """Whether the next start finds a checkpoint, no torn file, and no rest of a write."""
+    files.sweep(folder)
+    try:
+        found = [checkpoint.load(path) for path in checkpoint.saved(folder / "checkpoints")]
+    except DataError:
+        return False
+    values = [saved.tensors["field/means"] for saved in found]
+    rests = [path for path in folder.rglob("*") if ".partial" in path.name]
+    known = all(content in states.get(name, ()) for name, content in _contents(folder).items())
+    sound = all(bool((x == x[0, 0]).all()) and float(x[0, 0]) in (1.0, 2.0, 3.0, 4.0) for x in values)
+    return bool(found) and sound and known and not rests

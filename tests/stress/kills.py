@@ -1,0 +1,118 @@
+"""A real run is killed at random moments, started again, and killed again; at its end it has the bits of one that never was.
+
+The job runs in a forked child of a process that has already imported everything, so that a kill costs a fraction of a second.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import signal
+import time
+import traceback
+from contextlib import ExitStack
+from pathlib import Path
+from unittest import mock
+
+import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from clear_strategies.compose import CONF
+from clear_strategies.errors import DataError
+from clear_strategies.jobs import job
+from clear_strategies.jobs.resume import CHECKPOINTS
+from clear_strategies.outputs import results
+from clear_strategies.training import checkpoint
+from tests.helpers.command_line import TINY
+from tests.stress.rows import Row, Worst
+
+# Every event of a run and a checkpoint every third iteration.
+_RUN = [
+    *(override for override in TINY if not override.startswith("fit.iterations")),
+    "+strategy=clear", "fit.iterations=60", "fit.checkpoint_every=500", "fit.keep=2", "fit.video=0", "fit.map_views=0",
+    "fit.resume=auto", "fit.threads=1", "density.max_gaussians=300",
+]  # fmt: skip
+# Drawn by matplotlib in nine tenths of so short a run, and written by the same function as the other files.
+_PICTURES = ("write_curves", "write_contact_sheet")
+_MOST_KILLS = 6  # of one run, before it may end
+
+
+def measure(folder: Path, kills: int, *, seed: int = 0) -> Row:
+    """Kill runs `kills` times in all; a failure is a checkpoint lost, a rest after the end, or another result."""
+    with ExitStack() as stack:
+        for name in _PICTURES:
+            stack.enter_context(mock.patch.object(results, name))
+        return _measure(folder, kills, seed)
+
+
+def _measure(folder: Path, kills: int, seed: int) -> Row:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", _RUN)
+    job.run(config, folder / "warm")  # in this process, so that its children need not import anything
+    began = time.monotonic()
+    _require_done(_started(config, folder / "whole"))
+    seconds = time.monotonic() - began
+    expected, rng, bad, run = _results(folder / "whole"), random.Random(seed), Worst(), 0  # noqa: S311 - no secret
+    while bad.cases < kills:
+        here, newest, run = folder / f"run{run}", 0, run + 1
+        for _ in range(min(rng.randint(1, _MOST_KILLS), kills - bad.cases)):
+            delay = rng.uniform(0, seconds)
+            pid = _started(config, here)
+            time.sleep(delay)
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+            found = _newest(here)
+            bad.add(
+                float(found is None or found < newest), f"run {run}, killed after {delay:.2f} s: a checkpoint is lost"
+            )
+            newest = found or newest
+        _require_done(_started(config, here))
+        same, rests = _results(here) == expected, _rests(here)
+        bad.add_to_last(
+            float(not same or bool(rests)), f"run {run}: {'another result' if not same else f'left {rests}'}"
+        )
+    return bad.row(
+        "SIGKILLs of a run: a checkpoint lost, a rest after the next start, or another result", "cpu", 0, 200
+    )
+
+
+def _started(config: DictConfig, folder: Path) -> int:
+    """The process that runs the job."""
+    if pid := os.fork():
+        return pid
+    code = 1
+    try:
+        logging.disable(logging.CRITICAL)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the progress bar writes to stderr, where errors go as well
+        torch.set_num_threads(1)
+        job.run(config, folder)
+        code = 0
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(code)
+
+
+def _require_done(pid: int) -> None:
+    if code := os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]):
+        raise RuntimeError(f"the run that nobody killed ended with {code}")
+
+
+def _newest(folder: Path) -> int | None:
+    """The iteration of the newest checkpoint, 0 where none was saved yet; None where one is not whole."""
+    try:
+        return max((checkpoint.load(path).t for path in checkpoint.saved(folder / CHECKPOINTS)), default=0)
+    except DataError:
+        return None
+
+
+def _results(folder: Path) -> tuple[bytes, dict[str, bytes]]:
+    """The bytes of the exported field, and of every tensor of the last checkpoint."""
+    tensors = checkpoint.load(folder).tensors
+    return (folder / "point_cloud.ply").read_bytes(), {name: x.numpy().tobytes() for name, x in tensors.items()}
+
+
+def _rests(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.rglob("*") if ".partial" in path.name or path.name == "run.lock")
