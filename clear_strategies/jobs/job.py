@@ -33,6 +33,7 @@ from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import build
+from clear_strategies.training import memory
 from clear_strategies.training.depth_loss import DepthLoss
 from clear_strategies.training.loop import fit
 from clear_strategies.training.mip import MipFilter
@@ -255,11 +256,16 @@ def _run(
         if of_baseline != resume.AUTO or resume.finished(baseline.folder, baseline.compared) is None:
             first = baseline.start(place, of_baseline)
     state = ours.start(place, source)
-    drawn = f"{drawing.name}, kernel {drawing.kernel} px²"
     # Of many jobs the console shows a line each; the rest is in their run.log.
     level = logging.DEBUG if _in_sweep() else logging.INFO
-    described = plan.describe(loaded, state, ours.chosen, rasterizer=drawn, threads=f"{threads} ({why})")
-    _log.log(level, "%s", described)
+    found, most = memory.needs(state, drawing.rasterizer), getattr(state.density.settings, "max_gaussians", None)
+    machine = {
+        "rasterizer": f"{drawing.name}, kernel {drawing.kernel} px²",
+        "threads": f"{threads} ({why})",
+        "memory": memory.says(found, most),
+    }
+    _log.log(level, "%s", plan.describe(loaded, state, ours.chosen, machine))
+    memory.require(found, None if settings.fit.memory is None else settings.fit.memory << 20, most)
     if settings.fit.baseline and baseline is None:
         _log.log(level, "fit.baseline: no baseline trains beside this run, %s.", _why_without_baseline(settings))
     ours.remove_earlier_metrics()

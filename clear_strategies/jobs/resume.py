@@ -33,6 +33,7 @@ _NOT_COMPARED: Final = {
     "fit.probe_every",
     "fit.probe_views",
     "fit.map_views",
+    "fit.memory",
     "fit.video",
     "fit.page",
     "fit.viewer",

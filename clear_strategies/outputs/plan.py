@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -33,8 +33,12 @@ class Chosen:
         return self.method or " + ".join(self.strategies) or "baseline"
 
 
-def describe(scene: Scene, state: TrainState, chosen: Chosen, *, rasterizer: str, threads: str) -> str:
-    """The plan: the data, the strategies, the milestones and what is skipped. Strategies without effect give a warning."""
+def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[str, str]) -> str:
+    """The plan: the data, the strategies, the milestones and what is skipped. Strategies without effect give a warning.
+
+    Args:
+        machine: what computes, label -> fact: the rasterizer, the threads, the memory.
+    """
     settings, conductor = state.settings, state.conductor
     strategies = ", ".join(
         f"{name} ({type(s).__name__})" for name, s in zip(chosen.strategies, conductor.strategies, strict=True)
@@ -44,8 +48,7 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, *, rasterizer: str
         **({} if chosen.method is None else {"method": f"{chosen.method}; strategies named before it take no part"}),
         "strategies": strategies or ("none (the paper's baseline)" if chosen.method is None else "none"),
         "device": _named(state.device),
-        "rasterizer": rasterizer,
-        "threads": threads,
+        **machine,
         "per-Gaussian pass": "readable" if state.compiled_step is None else "compiled",
         "iterations": f"{settings.iterations}, seed {settings.seed}",
         "milestones": ", ".join(f"{name} {t}" for name, t in marks(state).items()),

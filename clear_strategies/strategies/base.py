@@ -125,6 +125,10 @@ class Strategy:
         """The parts of the strategy that its settings switch off, a phrase each."""
         return ()
 
+    def keeps(self) -> Sequence[str]:
+        """The attributes of which the strategy keeps a copy in its `state`, for the prediction of memory."""
+        return ()
+
     def marks(self) -> Mapping[str, int]:
         """Iterations worth a mark on a training curve, by name."""
         return {}

@@ -115,6 +115,9 @@ class SVS(Strategy):
     def skipped(self) -> Sequence[str]:
         return () if self.anchor_strength > 0 else ("anchor (anchor_strength = 0)",)
 
+    def keeps(self) -> Sequence[str]:
+        return [name for name, w in self.anchor_weights.items() if w > 0] if self.anchor_strength > 0 else ()
+
     def marks(self) -> Mapping[str, int]:
         return {"anchor": self.anchor_start} if self.anchor_strength > 0 else {}
 
@@ -124,8 +127,7 @@ class SVS(Strategy):
     def after_step(self, params: Mapping[str, Tensor], t: int) -> None:
         """θ^a = sg(θ(t_a)); the last structural change was at t < t_a."""
         if t == self.anchor_start and self.anchor_strength > 0:
-            held = [name for name, w in self.anchor_weights.items() if w > 0 and name in params]
-            self.state.update({name: params[name].detach().clone() for name in held})
+            self.state.update({name: params[name].detach().clone() for name in self.keeps() if name in params})
             self.cache.pop("extent", None)
 
     def on_resize(self, parents: Tensor) -> None:

@@ -24,6 +24,8 @@ class FitSettings:
         probe_views: how many test views these evaluate.
         checkpoint_every: iterations between checkpoints; 0: only when interrupted.
         keep: how many checkpoints stay, at least 1.
+        memory: MiB that training may take, loading included; None: what is free on this machine. More is refused before the
+            first iteration.
         fused: "auto" merges, corrects, anchors and steps in one compiled pass where it can, and skips rows that would
             not move; "every_row" skips none (the same bits); "off" takes the readable path.
 
@@ -40,6 +42,7 @@ class FitSettings:
     probe_views: int = 3
     checkpoint_every: int = milestone(2_500)
     keep: int = 3
+    memory: int | None = None
     fused: FusedMode = "auto"
 
     def __post_init__(self) -> None:
@@ -49,6 +52,8 @@ class FitSettings:
             raise SettingError(f"max_degree must be 0, 1, 2 or 3, got {self.max_degree}.")
         if self.keep < 1:
             raise SettingError(f"keep must be at least 1 checkpoint, got {self.keep}.")
+        if self.memory is not None and self.memory < 1:
+            raise SettingError(f"memory must be at least 1 MiB, got {self.memory}. null takes what is free.")
         if self.fused not in get_args(FusedMode):
             raise SettingError(
                 f"fused must be one of {', '.join(get_args(FusedMode))}, got {self.fused!r}. In a YAML file, off is quoted."

@@ -84,6 +84,11 @@ class CppRasterizer(RasterSettings):
     ) -> Rendering:
         return CppRendering(_Frame(self, [(splats, camera)], [tiles]), 0, depth=depth)
 
+    def list_bytes(self, splats: Splats, camera: Camera) -> int:
+        """See `interface.CountsLists`; projects the Gaussians and draws nothing."""
+        pairs: int = _Frame(self, [(splats, camera)], [None]).native.pairs(0)
+        return pairs * (_PAIR_BYTES + 2 * _SUMS_BYTES)
+
     def render_scales(
         self,
         jobs: Sequence[tuple[Splats, Camera]],
@@ -97,6 +102,10 @@ class CppRasterizer(RasterSettings):
             frame = _Frame(self, jobs, masks)
             return [CppRendering(frame, i, depth=depths[i]) for i in range(len(jobs))]
         return [self(*job, mask, depth=z) for job, mask, z in zip(jobs, masks, depths, strict=True)]
+
+
+_PAIR_BYTES: Final = 16  # its Gaussian, its place, and the blocks of its bin that the ellipse reaches
+_SUMS_BYTES: Final = 64  # a pair's sums for one cotangent
 
 
 def _require_side(camera: Camera) -> None:

@@ -33,7 +33,7 @@ def started(*strategies: Strategy, **objective: Any) -> TrainState:
 
 
 def lines(state: TrainState, *names: str, method: str | None = None) -> dict[str, str]:
-    text = plan.describe(SCENE, state, plan.Chosen(method, names), rasterizer="torch", threads="1")
+    text = plan.describe(SCENE, state, plan.Chosen(method, names), {"rasterizer": "torch", "threads": "1"})
     split = (line.strip().partition("  ") for line in text.splitlines())
     return {label: words for label, _, words in split}
 

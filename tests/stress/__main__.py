@@ -26,6 +26,7 @@ from tests.stress import (
     gco,
     kills,
     lifecycle,
+    memory,
     projection,
     rows,
     sanitizers,
@@ -59,11 +60,11 @@ def _fuzz(options: argparse.Namespace, folder: Path) -> Iterator[Row]:
     yield from fuzz.measure(fuzz.scenes(folder / "scenes"), options.mutants // 20)
 
 
-def _sanitizers(_: argparse.Namespace, folder: Path) -> Iterable[Row]:
+def _sanitizers(options: argparse.Namespace, folder: Path) -> Iterable[Row]:
     if reason := sanitizers.why_not():
         _log.info("sanitizers: left out, %s", reason)
         return []
-    return sanitizers.measure(folder)
+    return sanitizers.measure(folder, options.isa)
 
 
 MEASUREMENTS: dict[str, Callable[[argparse.Namespace, Path], Iterable[Row]]] = {
@@ -76,6 +77,7 @@ MEASUREMENTS: dict[str, Callable[[argparse.Namespace, Path], Iterable[Row]]] = {
     "inputs": lambda options, folder: bad_inputs.measure(folder),
     "attacks": lambda options, folder: [attacks.measure(folder)],
     "fuzz": _fuzz,
+    "memory": lambda options, folder: memory.measure(),
     "soak": lambda options, folder: soak.measure(options.iterations),
     "sanitizers": _sanitizers,
 }
@@ -91,6 +93,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--examples", type=int, default=500, help="runs in random order (%(default)s)")
     parser.add_argument("--kills", type=int, default=200, help="SIGKILLs of a run (%(default)s)")
     parser.add_argument("--iterations", type=int, default=10_000, help="of the soak (%(default)s)")
+    parser.add_argument("--isa", nargs="+", help="instruction sets for the sanitizers (all that run here)")
     parser.add_argument("--list", action="store_true", help="name every bad input and attack, and measure nothing")
     parser.add_argument(
         "--out", type=Path, default=PAGE, help="the page to write, with its .csv beside it (%(default)s)"

@@ -11,6 +11,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from rasterizers.native import load_kernels
@@ -36,13 +37,14 @@ def why_not() -> str | None:
     return f"{', '.join(missing)} not installed" if missing else None
 
 
-def measure(folder: Path) -> list[Row]:
-    """One row per instruction set that this processor runs, and one of the checks without Python."""
-    rows = [_native_checks(folder)]
-    for isa in [*load_kernels("rasterizers.cpp").instruction_sets(), "baseline"]:
-        if isa not in {row.backend for row in rows}:
-            rows.append(_tests(folder, isa))
-    return rows
+def measure(folder: Path, isas: Sequence[str] | None = None) -> list[Row]:
+    """One row per instruction set, and one of the checks without Python.
+
+    Args:
+        isas: None: all that this processor runs.
+    """
+    chosen = dict.fromkeys(isas or [*load_kernels("rasterizers.cpp").instruction_sets(), "baseline"])
+    return [_native_checks(folder), *(_tests(folder, isa) for isa in chosen)]
 
 
 def _native_checks(folder: Path) -> Row:

@@ -1,0 +1,187 @@
+"""The peak of memory that training needs, predicted before the first iteration, and the budget it is compared with.
+
+What is there already, the photos and what loading them took, is measured. What training adds is counted per Gaussian and per
+pixel, in `Needs`, which is the only place that knows these numbers:
+
+    peak(n) = max(peak so far, memory now + what n Gaussians add)
+
+A rasterizer bounds its own lists (`rasterizer.memory`, MiB) and draws in parts beyond that.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import torch
+
+from clear_strategies.core.view import View
+from clear_strategies.errors import SettingError
+from clear_strategies.training.state import TrainState
+from rasterizers.interface import CountsLists, Rasterizer
+
+_log = logging.getLogger(__name__)
+
+_FLOAT: Final = 4  # bytes
+_MIB: Final = 1 << 20
+# Floats per Gaussian, beside the parameters: what one iteration holds at once.
+_ACTIVATION: Final = (
+    3 + 3 + 3 + 3 + 1 + 1 + 1 + 2
+)  # scales twice, their squares, sigmoid, coefficient, factor, opacities
+_PROJECTION: Final = (
+    16 + 2 + 2 + 1 + 4
+)  # slopes of the colour, depth in float64, two orders, the drawn ones, their ranges
+_GRID: Final = 16 + 2 + 2 + 1 + 1  # ellipse, range of bins, centre, flags, first pair; once per scale
+_GRADIENT: Final = 3 + 4 + 3 + 1 + 2 + 3  # of one cotangent
+_COTANGENTS: Final = 3  # L_LR, L_base, L_HF
+_EVIDENCE: Final = 8  # q, a, w, m, the scores and their sums
+# Floats per pixel: a render with its alpha, its cotangents, its blocks' ends and the maps of its losses.
+_PER_PIXEL: Final = 3 + 1 + 2 * 3 + 2 + 6
+_SAVED_TWICE: Final = 2  # the tensors as bytes, and the file made of them
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What training takes, in bytes.
+
+    Args:
+        now: of the process, or of the device, before the first iteration. reached: the most so far.
+        gaussians: how many there are at the start.
+        held: per Gaussian, for the whole run: parameters, moments, statistics, and what strategies keep.
+        worked: per Gaussian, while an iteration runs. saved: per Gaussian, while a checkpoint is written.
+        lists: per Gaussian, of the rasterizer; at most `most_lists` in all.
+        pixels: of the images of one iteration.
+    """
+
+    now: int
+    reached: int
+    gaussians: int
+    held: int
+    worked: int
+    saved: int
+    lists: int
+    most_lists: int
+    pixels: int
+
+    def peak(self, gaussians: int) -> int:
+        """With this many Gaussians, from the start or by growing to them.
+
+        The allocator keeps what an iteration has freed, so a checkpoint is written beside it.
+        """
+        grown = max(0, gaussians - self.gaussians) * self.held
+        drawn = min(gaussians * self.lists, self.most_lists)
+        return max(self.reached, self.now + grown + gaussians * (self.worked + self.saved) + drawn + self.pixels)
+
+    def fits(self, budget: int) -> int:
+        """The most Gaussians whose peak is within the budget, 0 where not even the first are."""
+        if self.peak(self.gaussians) > budget:
+            return 0
+        low, high = self.gaussians, 1 << 40
+        while low < high:
+            middle = (low + high + 1) // 2
+            low, high = (middle, high) if self.peak(middle) <= budget else (low, middle - 1)
+        return low
+
+
+def needs(state: TrainState, rasterizer: Rasterizer) -> Needs:
+    """Count for this run; draws nothing."""
+    n, raw, cuda = len(state.field), state.field.raw(), state.device.type == "cuda"
+    parameters = sum(x.nbytes for x in raw.values()) // n
+    statistics = sum(x.nbytes for x in state.density.state_dict().values()) // n
+    anchored = sum(raw[name].nbytes for s in state.conductor.strategies for name in s.keeps() if name in raw) // n
+    held = 3 * parameters + _FLOAT + statistics + anchored
+    largest = max(x.nbytes for x in raw.values()) // n  # a change of structure copies one tensor at a time
+    basis = 1 + state.field.shN.shape[1]
+    scales = 1 + state.conductor.wants_lr
+    floats = _ACTIVATION + _PROJECTION + scales * _GRID + _COTANGENTS * _GRADIENT + scales * basis + _EVIDENCE
+    view = max(state.views, key=lambda view: view.hr.image.numel())
+    lists, most = _lists(state, rasterizer, view)
+    return Needs(
+        now=torch.cuda.memory_allocated(state.device) if cuda else resident(),
+        reached=torch.cuda.max_memory_allocated(state.device) if cuda else peak(),
+        gaussians=n,
+        held=held,
+        worked=_FLOAT * floats + largest,
+        saved=0 if cuda else _SAVED_TWICE * held,  # on the CPU, whose memory is not what a device runs out of
+        lists=lists,
+        most_lists=most,
+        pixels=_FLOAT * _PER_PIXEL * (view.hr.image.shape[0] * view.hr.image.shape[1]),
+    )
+
+
+def _lists(state: TrainState, rasterizer: Rasterizer, view: View) -> tuple[int, int]:
+    """Bytes per Gaussian of the lists of the largest image, and the most that the rasterizer takes in all."""
+    if not isinstance(rasterizer, CountsLists):
+        return 0, 0
+    splats = state.field.baked()
+    return rasterizer.list_bytes(splats, view.hr.camera) // len(splats), rasterizer.memory * _MIB
+
+
+def require(found: Needs, budget: int | None, most: int | None) -> None:
+    """Refuse a run whose start does not fit; warn where it cannot grow as far as it may.
+
+    Args:
+        budget: bytes; None: what is free on this machine, if that is known. most: Gaussians that the density allows.
+
+    Raises:
+        SettingError: the first Gaussians need more than the budget.
+    """
+    allowed = budget if budget is not None else available(found)
+    if allowed is None:
+        return
+    start, whose = found.peak(found.gaussians), "fit.memory allows" if budget is not None else "is free on this machine"
+    if start > allowed:
+        raise SettingError(
+            f"fit.memory: {found.gaussians:,} Gaussians need {mebibytes(start)} MiB, and {mebibytes(allowed)} MiB {whose}. "
+            "Raise data.views.shrink, lower fit.max_degree or data.cloud.max_points, or raise fit.memory."
+        )
+    fits = found.fits(allowed)
+    if most is not None and fits < most:
+        _log.warning(
+            "density.max_gaussians=%d need %d MiB, and %d MiB %s: %d Gaussians fit.",
+            most, mebibytes(found.peak(most)), mebibytes(allowed), whose, fits,
+        )  # fmt: skip
+
+
+def says(found: Needs, most: int | None) -> str:
+    """A line of the plan."""
+    more = (found.peak(10 * found.gaussians + 10**6) - found.peak(9 * found.gaussians + 10**6)) / found.gaussians
+    line = f"{mebibytes(found.peak(found.gaussians))} MiB at the start ({mebibytes(found.reached)} MiB were taken until now)"
+    line += f", {more / 1024:.1f} KiB for each further Gaussian"
+    return line if most is None else f"{line}, {mebibytes(found.peak(most))} MiB with density.max_gaussians={most:,}"
+
+
+def mebibytes(size: int) -> int:
+    return -(-size // _MIB)
+
+
+def resident() -> int:
+    """Bytes that the process holds now; 0 where the system does not say."""
+    return _of_status("VmRSS")
+
+
+def peak() -> int:
+    """The most bytes that the process has held; 0 where the system does not say."""
+    return _of_status("VmHWM")
+
+
+def available(found: Needs) -> int | None:
+    """Bytes that training may take on this machine, with what it holds already; None where the system does not say."""
+    if torch.cuda.is_available() and found.saved == 0:
+        return int(torch.cuda.mem_get_info()[0]) + found.now
+    try:
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        return int(lines["MemAvailable"].split()[0]) * 1024 + found.now
+    except (OSError, KeyError, ValueError):
+        return None
+
+
+def _of_status(name: str) -> int:
+    try:
+        lines = dict(line.split(":", 1) for line in Path(f"/proc/{os.getpid()}/status").read_text().splitlines())
+        return int(lines[name].split()[0]) * 1024
+    except (OSError, KeyError, ValueError):
+        return 0

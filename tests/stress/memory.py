@@ -1,0 +1,82 @@
+"""The peak of memory that the plan predicts, against the one that the process reaches."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import multiprocessing
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from unittest import mock
+
+import torch
+from hydra import compose, initialize_config_dir
+
+from clear_strategies.compose import CONF
+from clear_strategies.jobs import job
+from clear_strategies.training import memory
+from clear_strategies.training.state import TrainState
+from tests.helpers.command_line import TINY
+from tests.stress.rows import Row
+
+_BOUND = 0.15
+_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+_ALL = ["+strategy=clear", "fit.baseline=false", "fit.video=0", "fit.map_views=0", "fit.iterations=100", "fit.threads=1",
+        "fit.probe_every=0"]  # fmt: skip
+SCENES = {
+    "demo": [*_ALL],
+    "fern": [*_ALL, "+scene=fern", f"data.root={_DATA}"],
+    "kitchen360": [*_ALL, "+scene=kitchen360", f"data.root={_DATA}"],
+}
+
+
+def measure() -> Iterator[Row]:
+    """One row per scene that is here, each in a process of its own."""
+    for name, overrides in SCENES.items():
+        if name != "demo" and not (_DATA / name).is_dir():
+            continue
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+            predicted, reached, loading, gaussians = pool.submit(run, overrides).result()
+        where = f"predicted {predicted:.0f} MiB for {gaussians:,} Gaussians, taken {reached:.0f}, {loading:.0f} until the plan"
+        yield Row("predicted peak of memory: relative error", name, 1, abs(predicted / reached - 1), _BOUND, where)
+
+
+def run(overrides: Sequence[str]) -> tuple[float, float, float, int]:
+    """MiB beyond the imports: predicted and reached at the largest number of Gaussians, and reached before the first
+    iteration; and that number.
+    """
+    torch.set_num_threads(1)
+    folder = Path(tempfile.mkdtemp())
+    job.run(_config([*TINY, "+strategy=clear", "fit.video=0"]), folder / "imports")
+    gc.collect()
+    ctypes.CDLL("libc.so.6").malloc_trim(0)
+    Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
+    base, found, most, reached = memory.resident(), list[memory.Needs](), [0], [0]
+    count, fit = memory.needs, job.fit
+
+    def noted(state: TrainState, rasterizer) -> memory.Needs:
+        found.append(count(state, rasterizer))
+        return found[-1]
+
+    def watched(state: TrainState, *arguments, **options) -> TrainState:
+        inner = options.pop("progress")
+
+        def progress(state: TrainState) -> None:
+            most[0] = max(most[0], len(state.field))
+            inner(state)
+
+        ended = fit(state, *arguments, progress=progress, **options)
+        reached[0] = memory.peak()
+        return ended
+
+    with mock.patch.object(memory, "needs", noted), mock.patch.object(job, "fit", watched):
+        job.run(_config(overrides), folder / "run")
+    one = found[0]
+    return (one.peak(most[0]) - base) / 2**20, (reached[0] - base) / 2**20, (one.reached - base) / 2**20, most[0]
+
+
+def _config(overrides: Sequence[str]):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", list(overrides))
