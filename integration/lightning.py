@@ -145,6 +145,11 @@ class Attached:
             raise HostError(
                 f"the Gaussians have no {missing[0]}, as those of a VanillaGaussian have. Use a model with spherical harmonics."
             )
+        if any(p.requires_grad for p in module.renderer.parameters()):
+            raise HostError(
+                f"{type(module.renderer).__name__} trains an appearance model of its own, which two scales do not share. Use a "
+                "renderer without one."
+            )
         self._detail = DetailFeature(
             lambda: self._host_params()["means"], self._carry_rows(), self._conductor.iterations
         )

@@ -26,7 +26,7 @@ if importlib.util.find_spec("nerfstudio") is None:
 
 os.environ["TORCHDYNAMO_DISABLE"] = "1"
 import yaml
-from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from nerfstudio.engine.callbacks import TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.models import splatfacto
 from nerfstudio.plugins.registry import discover_methods
 
@@ -251,3 +251,13 @@ def test_accumulated_gradients_are_refused(capture, tmp_path):
     config.gradient_accumulation_steps = {"means": 2}
     with pytest.raises(SettingError, match="gradient_accumulation_steps"):
         trainer(config)
+
+
+def test_several_processes_are_refused(capture, tmp_path):
+    host = trainer(configured(capture, tmp_path))
+    host.world_size = 2
+    attributes = TrainingCallbackAttributes(
+        optimizers=host.optimizers, grad_scaler=host.grad_scaler, pipeline=host.pipeline, trainer=host
+    )
+    with pytest.raises(SettingError, match="trains in one process, got 2"):
+        host.pipeline.model.get_training_callbacks(attributes)

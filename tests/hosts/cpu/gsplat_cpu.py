@@ -4,7 +4,6 @@ import functools
 import inspect
 
 import gsplat.distributed
-import gsplat.relocation
 import gsplat.rendering
 import gsplat.strategy.ops
 import torch
@@ -22,24 +21,12 @@ def rasterization(*args, **kwargs):
     return autograd.rasterization(**{k: v for k, v in call.items() if k in KNOWN}, backend="torch")
 
 
-def relocation(opacities, scales, ratios, binoms, n_max, min_opacity=0.0):
-    """Eq. 9 of the MCMC paper: n copies that together look like the old Gaussian."""
-    new = (1 - (1 - opacities) ** (1 / ratios)).clamp_min(min_opacity)
-    total = torch.zeros_like(opacities)
-    for i in range(int(ratios.max())):
-        k = torch.arange(i + 1)
-        terms = binoms[i, k] * (-1.0) ** k / (k + 1).sqrt() * new[:, None] ** (k + 1)
-        total += terms.sum(1) * (i < ratios)
-    return new, scales * (opacities / total)[:, None]
-
-
 class InThisProcess(torch.utils.data.DataLoader):
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **{k: v for k, v in kwargs.items() if k in ("batch_size", "shuffle")})
 
 
 gsplat.rendering.rasterization = gsplat.rasterization = rasterization
-gsplat.relocation._make_lazy_cuda_func = {"relocation": relocation}.__getitem__
 gsplat.strategy.ops.quat_scale_to_covar_preci = _quat_scale_to_covar_preci
 gsplat.distributed.cli = lambda train, config, verbose=False: train(0, 0, 1, config)
 torch.cuda.device_count = lambda: 1
