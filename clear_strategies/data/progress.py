@@ -20,14 +20,10 @@ class Progress:
 
     def __init__(self, what: str, unit: str, total: int) -> None:
         self.what, self.unit, self.total = what, unit, total
-        self._said = time.monotonic()
+        self._said, self._done = time.monotonic(), 0
 
     def __call__(self, done: int) -> None:
-        """So many are done."""
-        if time.monotonic() - self._said >= EVERY and done < self.total:
-            self.tell(done)
-
-    def tell(self, done: int) -> None:
-        """Say it now."""
-        _log.info("%s: %d of %d %s", self.what, done, self.total, self.unit)
-        self._said = time.monotonic()
+        """So many are done: say so, if the last line is old enough and something has happened since."""
+        if time.monotonic() - self._said >= EVERY and self._done < done < self.total:
+            _log.info("%s: %d of %d %s", self.what, done, self.total, self.unit)
+            self._said, self._done = time.monotonic(), done

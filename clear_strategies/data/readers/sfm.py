@@ -146,7 +146,7 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
         mapping.mapper.abs_pose_min_num_inliers = 15
         # Of few photos most points are seen by two alone. With them those six stand four times more exactly.
         mapping.triangulation.ignore_two_view_tracks = False
-        _log.info("placing the photos.")
+        _log.debug("placing the photos.")
         models = pycolmap.incremental_mapping(
             database, copies, work, options=mapping, next_image_callback=_placing(count)
         )
@@ -176,13 +176,12 @@ def _write_copies(
 
 def _placing(count: int) -> Callable[[], None]:
     """Counts the photos that COLMAP places. It may begin anew with other photos, so the count is of attempts."""
-    attempts = 0
+    attempts, progress = 0, Progress("placing the photos", "photos", count)
 
     def note() -> None:
         nonlocal attempts
         attempts += 1
-        if attempts % max(1, count // 10) == 0:
-            _log.info("placing the photos: %d, of %d.", attempts + 2, count)  # it starts from a pair
+        progress(attempts + 2)  # it starts from a pair
 
     return note
 
@@ -193,13 +192,13 @@ def _progress(database: Path, table: str, what: str, unit: str, total: int) -> I
     done, progress = threading.Event(), Progress(what, unit, total)
 
     def watch() -> None:
-        while not done.wait(EVERY):
+        while not done.wait(EVERY / 4):
             with (
                 contextlib.suppress(sqlite3.Error),
                 contextlib.closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as connection,
             ):
                 rows = connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]  # noqa: S608
-                progress.tell(rows)
+                progress(rows)
 
     thread = threading.Thread(target=watch, daemon=True)
     thread.start()
