@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 import sys
 
 import pytest
@@ -63,7 +64,7 @@ def test_by_default_the_console_has_the_plan_the_bar_the_result_and_where_to_loo
     folder, runs = demo
     quiet = runs["quiet"]
     assert quiet.returncode == 0, quiet.stderr
-    lines = quiet.stdout.splitlines()
+    lines = [line for line in quiet.stdout.splitlines() if not re.search(r": \d+ of \d+ ", line)]  # on a slow machine
     assert lines[0].split()[0] == "scene"
     done = next(i for i, line in enumerate(lines) if line.startswith("done in"))
     assert lines[done].endswith(" s: quiet")
