@@ -105,7 +105,7 @@ PYTHON = [
     pytest.param(block, id=f"{name(page)}-{i}") for page in PAGES for i, block in enumerate(blocks(page, "python"))
 ]
 # Commands of other programs: nothing of them is checked, but that extras exist.
-FOREIGN = r"(python3? -m (venv|pip)|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|tensorboard|cd) ?"
+FOREIGN = r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|tensorboard|cd) ?"
 
 READ_BY_ARGPARSE = ("render", "export", "view", "doctor")  # subcommands; the others read Hydra's words
 
