@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import torch
 from PIL import Image
 
 from clear_strategies.data.readers import colmap, photos
+from clear_strategies.data.readers.sfm import SfmSettings
 from clear_strategies.errors import DataError
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -87,3 +89,14 @@ def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_take
     with pytest.raises(DataError, match=r"only 4 of 10 photos .*overlap.* data\.reader\.least_placed=0\.4"):
         photos.sfm._require_placed(Path("mine"), [4, 2], 10, 0.5)
     photos.sfm._require_placed(Path("mine"), [6, 3], 10, 0.5)
+
+
+@pytest.mark.parametrize("precise", [True, False])
+def test_the_memory_of_matching_is_bounded_on_machines_of_many_cores(
+    monkeypatch: pytest.MonkeyPatch, precise: bool
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    settings = SfmSettings(1600, 8192, precise, 0.5, threads=-1, seed=0)
+    assert 3 << 30 < settings.matchers * settings.memory <= 4 << 30
+    assert SfmSettings(1600, 8192, precise, 0.5, threads=2, seed=0).matchers == 2
+    assert SfmSettings(1600, 100_000, precise, 0.5, threads=-1, seed=0).matchers == 1
