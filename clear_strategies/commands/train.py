@@ -5,6 +5,7 @@ The reader is the one of what lies in the folder. Everything behind the folder g
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -26,11 +27,14 @@ It trains what we use ourselves (+strategy=best) on all photos for fit.iteration
   clear-strategies train photos/ data.views.test_every=8          every 8th photo is kept for testing
   clear-strategies train photos/ data.views.max_hr_megapixels=8   sharper, slower, more memory
   clear-strategies train photos/ data.missing=skip data.broken=skip
+  clear-strategies train photos/ fit.log=tensorboard -v           curves while it trains; every detail on the console
 
 `clear-strategies --cfg job data=photos` lists all settings.
 """
 # What decides which strategies train, and for how long, so that the defaults must not.
 _CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
+_PLAIN: Final = re.compile(r"(/|\./|(\.\./)+)?[A-Za-z_][\w./-]*", re.ASCII)  # needs no quotes, for Hydra or a shell
+_NO_TEXT: Final = ("null", "true", "false", "nan", "inf")
 _CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "+protocol=", "+scene=")
 
 
@@ -85,6 +89,8 @@ def detect(folder: Path) -> tuple[str, Path]:
 
 
 def _quoted(value: str) -> str:
-    """A string of Hydra's grammar: paths may contain spaces, commas, brackets and equals signs."""
+    """A string of Hydra's grammar: paths may contain spaces, commas, brackets and equals signs, or look like numbers."""
+    if _PLAIN.fullmatch(value) and value.lower() not in _NO_TEXT:
+        return value
     escaped = value.replace("\\", "\\\\").replace("'", "\\'") if "'" in value else value
     return f"'{escaped}'"

@@ -44,6 +44,17 @@ def test_a_folder_of_any_name_becomes_data_path(tmp_path, name):
     assert set(config.strategies) == {"gco", "p2g", "svs"}
 
 
+@pytest.mark.parametrize(
+    ("name", "plain"), [("photos", True), ("a/b-c.d", True), ("1e5", False), ("null", False), ("my photos", False)]
+)
+def test_a_plain_path_needs_no_quotes_and_a_path_that_looks_like_a_number_is_text(tmp_path, monkeypatch, name, plain):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).mkdir(parents=True)
+    overrides = train.overrides([name])
+    assert (f"data.path={name}" in overrides) == plain
+    assert composed(overrides, "config").data.path == name
+
+
 def test_strategies_that_are_named_replace_the_whole_method(tmp_path):
     assert "+strategy=best" not in train.overrides([str(tmp_path), "+strategy=gco"])
     assert "+strategy=best" in train.overrides([str(tmp_path)])
