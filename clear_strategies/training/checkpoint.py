@@ -13,7 +13,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -61,7 +61,7 @@ class Checkpoint:
     tensors: Mapping[str, Tensor]
     config: Mapping[str, Any]
     facts: Mapping[str, float]
-    history: list[dict[str, float]]
+    history: Sequence[dict[str, float]]
     work_log: Mapping[str, Any] = field(default_factory=dict)
     device: str = "cpu"
 
@@ -77,24 +77,21 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     target = _free_name(folder / f"{_PREFIX}{checkpoint.t:07d}")
     tensors = {name: value.detach().cpu().contiguous() for name, value in checkpoint.tensors.items()}
-    files = {_TENSORS: to_bytes(tensors), _HISTORY: json.dumps(checkpoint.history).encode()}
-    manifest = {
+    contents = {_TENSORS: [to_bytes(tensors)], _HISTORY: _rows(checkpoint.history)}
+    manifest: dict[str, Any] = {
         "format": FORMAT,
         "t": checkpoint.t,
         "config": checkpoint.config,
         "facts": checkpoint.facts,
         "work_log": checkpoint.work_log,
         "device": checkpoint.device,
-        "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in files.items()},
     }
-    files[_MANIFEST] = _sealed(manifest).encode()
-
     partial = partial_of(target)
     shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir()
-        for name, data in files.items():
-            _write_durably(partial / name, data)
+        manifest["sha256"] = {name: _write_durably(partial / name, parts) for name, parts in contents.items()}
+        _write_durably(partial / _MANIFEST, [_sealed(manifest).encode()])
         _flush_folder(partial)
         partial.rename(target)
         _flush_folder(folder)
@@ -218,11 +215,24 @@ def _newest(path: Path) -> Path:
     raise DataError(path, "checkpoint", "no checkpoint is here", "give a run's folder or one of its checkpoints/step_*")
 
 
-def _write_durably(path: Path, data: bytes) -> None:
+def _rows(history: Sequence[Mapping[str, float]]) -> Iterator[bytes]:
+    """The JSON of a list, row by row: as a whole it is larger than the history itself."""
+    yield b"["
+    for i, row in enumerate(history):
+        yield (", " * (i > 0) + json.dumps(row)).encode()
+    yield b"]"
+
+
+def _write_durably(path: Path, parts: Iterable[bytes]) -> str:
+    """Write the parts one after the other; returns the SHA-256 of the whole."""
+    digest = hashlib.sha256()
     with path.open("wb") as file:
-        file.write(data)
+        for part in parts:
+            digest.update(part)
+            file.write(part)
         file.flush()
         os.fsync(file.fileno())
+    return digest.hexdigest()
 
 
 def _flush_folder(folder: Path) -> None:

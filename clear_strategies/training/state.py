@@ -13,7 +13,6 @@ from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import is_finite, rows_not_finite
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
@@ -24,6 +23,7 @@ from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
 from clear_strategies.training.depth_loss import DepthLoss
 from clear_strategies.training.field import GaussianField
+from clear_strategies.training.history import History
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.pseudo_views import PseudoViews, PseudoViewSettings
@@ -50,7 +50,7 @@ class TrainState:
     mip: MipFilter
     views: tuple[View, ...]
     t: int = 1
-    history: list[dict[str, Number]] = field(default_factory=list)
+    history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
     skip_policy: SkipPolicy = field(default_factory=SkipPolicy)
     pseudo_views: PseudoViews = field(default_factory=PseudoViews)
@@ -181,7 +181,7 @@ class TrainState:
             tensors,
             config,
             facts,
-            list(self.history_as_floats()),
+            self.history_as_floats(),
             self.conductor.work_log.state_dict(),
             self.device.type,
         )
@@ -210,7 +210,7 @@ class TrainState:
                 source, "tensors", f"do not fit this run ({error})", "resume with the run's own config"
             ) from error
         self.t = saved.t
-        self.history = [dict(row) for row in saved.history]
+        self.history = History(dict(row) for row in saved.history)
 
     def _require_rows(self, tables: Mapping[str, Mapping[str, Tensor]], saved: Checkpoint) -> None:
         """Check what is restored: as many rows everywhere as there are means, each as wide as here, of the same type.
