@@ -35,7 +35,7 @@ CASES = [(names, None) for names in SUBSETS] + [(("gco", "p2g", "svs"), PseudoVi
 def test_resuming_is_bitwise(names, beside, tmp_path, caplog):
     whole = start(names, beside=beside)
     saved = {}
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.DEBUG):
         for t in range(1, ITERATIONS + 1):
             if t in CUTS:
                 saved[t] = checkpoint.save(tmp_path / str(t), whole.checkpoint({"names": list(names)}))
