@@ -53,7 +53,7 @@ def _in_short(seconds: float, means: Mapping[str, ImageScores]) -> str:
 def _near(folder: Path) -> Path:
     """The folder as it is called from here."""
     here = Path.cwd()
-    return folder.relative_to(here) if folder.is_relative_to(here) else folder
+    return folder.relative_to(here) if here in folder.parents else folder
 
 
 def _look_next(folder: Path) -> str:
