@@ -3,7 +3,6 @@
 Only for the programs that tests/hosts starts.
 """
 
-import functools
 import os
 import sys
 import types
@@ -49,7 +48,9 @@ torch.nn.Module.cuda = lambda self, *_, **__: self
 torch.cuda.Event = Event
 for name in ("empty_cache", "synchronize", "manual_seed_all", "manual_seed", "set_device"):
     setattr(torch.cuda, name, lambda *_, **__: None)
-torch.load = functools.partial(torch.load, weights_only=False)  # the trainers' checkpoints are from before torch 2.6
+load = torch.load
+# The trainers' checkpoints are from before torch 2.6, and name a device that is not there.
+torch.load = lambda *args, **kwargs: load(*args, **{"weights_only": False, **kwargs, "map_location": "cpu"})
 
 lpips = types.ModuleType("lpipsPyTorch")  # its network would be downloaded
 lpips.lpips = lambda *_, **__: torch.zeros(1)
