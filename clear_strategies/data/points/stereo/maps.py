@@ -17,6 +17,7 @@ from clear_strategies.data.points.stereo.depth import Estimate, estimate
 from clear_strategies.data.points.stereo.image import Grey, grey
 from clear_strategies.data.points.stereo.settings import StereoSettings
 from clear_strategies.data.points.stereo.sources import Comparison, comparisons
+from clear_strategies.data.progress import Progress
 
 _log = logging.getLogger(__name__)
 
@@ -69,6 +70,7 @@ def _estimates(
     """Each photo's own depth on the grid of its LR pixels; None without photos to compare it with."""
     greys = [grey(photo, settings.enlarge, settings.max_pixels) for photo in photos]
     found: list[Estimate | None] = []
+    progress = Progress("depth by stereo", "photos", len(photos))
     for i, (photo, comparison) in enumerate(zip(photos, compared, strict=True)):
         others = [greys[j] for j in comparison.others[: settings.sources]]
         if not others:
@@ -76,6 +78,7 @@ def _estimates(
             continue
         found.append(_on_photo(estimate(greys[i], others, comparison, settings), photo))
         _log.debug("stereo: photo %d against %s.", i, comparison.others[: settings.sources])
+        progress(i + 1)
     return found
 
 
