@@ -28,18 +28,17 @@ _log = logging.getLogger(__name__)
 _FLOAT: Final = 4  # bytes
 _MIB: Final = 1 << 20
 # Floats per Gaussian, beside the parameters: what one iteration holds at once.
-_ACTIVATION: Final = (
-    3 + 3 + 3 + 3 + 1 + 1 + 1 + 2
-)  # scales twice, their squares, sigmoid, coefficient, factor, opacities
-_PROJECTION: Final = (
-    16 + 2 + 2 + 1 + 4
-)  # slopes of the colour, depth in float64, two orders, the drawn ones, their ranges
+# Activation: scales twice, their squares, sigmoid, coefficient, factor, opacities.
+_ACTIVATION: Final = 3 + 3 + 3 + 3 + 1 + 1 + 1 + 2
+# Projection: slopes of the colour, depth in float64, two orders, the drawn ones, their ranges.
+_PROJECTION: Final = 16 + 2 + 2 + 1 + 4
 _GRID: Final = 16 + 2 + 2 + 1 + 1  # ellipse, range of bins, centre, flags, first pair; once per scale
 _GRADIENT: Final = 3 + 4 + 3 + 1 + 2 + 3  # of one cotangent
 _COTANGENTS: Final = 3  # L_LR, L_base, L_HF
 _EVIDENCE: Final = 8  # q, a, w, m, the scores and their sums
-# Floats per pixel: a render with its alpha, its cotangents, its blocks' ends and the maps of its losses.
-_PER_PIXEL: Final = 3 + 1 + 2 * 3 + 2 + 6
+# Floats per pixel of the largest HR image: the render with alpha and the ends of its blocks, two cotangents and their copy,
+# and what the losses hold, or P2G when it compares the SR image with the photo.
+_PER_PIXEL: Final = (3 + 1 + 2) + 2 * (2 * 3) + max(4 * 3, 8 * 3)
 _SAVED_TWICE: Final = 2  # the tensors as bytes, and the file made of them
 
 

@@ -57,7 +57,7 @@ def _projection(options: argparse.Namespace, _: Path) -> Iterator[Row]:
 
 def _fuzz(options: argparse.Namespace, folder: Path) -> Iterator[Row]:
     yield from fuzz.measure(fuzz.binary(folder / "binary"), options.mutants, goal=10**7)
-    yield from fuzz.measure(fuzz.scenes(folder / "scenes"), options.mutants // 20)
+    yield from fuzz.measure(fuzz.scenes(folder / "scenes"), options.mutants // 20, goal=10**7 // 20)
 
 
 def _sanitizers(options: argparse.Namespace, folder: Path) -> Iterable[Row]:
@@ -146,7 +146,7 @@ def page(found: list[Row]) -> str:
         "- **Damaged files**: a mutant counts if it is read as a sound file with other content than it may have, if its error "
         "is no `DataError`, or if it takes more than 0.1 s or 1 GiB.\n"
         "- **Memory**: the peak that the plan predicts, at the number of Gaussians that the run reached, against what the "
-        "process took beyond its imports.\n"
+        "process took beyond its imports. What an iteration holds per pixel was counted with these scenes at hand.\n"
         "- **Soak**: one process, with evaluations and checkpoints on the way.\n"
         "- **C++ under ASan and UBSan**: the modules compiled anew with both sanitizers, and their tests.\n"
     )

@@ -23,7 +23,7 @@ from tests.stress.rows import Row
 
 _BOUND = 0.15
 _DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-_ALL = ["+strategy=clear", "fit.baseline=false", "fit.video=0", "fit.map_views=0", "fit.iterations=100", "fit.threads=1",
+_ALL = ["+strategy=clear", "fit.baseline=false", "fit.video=0", "fit.map_views=0", "fit.iterations=60", "fit.threads=1",
         "fit.probe_every=0"]  # fmt: skip
 SCENES = {
     "demo": [*_ALL],

@@ -64,7 +64,7 @@ def measure(name: str, draw: Rasterizer, *, every: int = 1) -> list[Row]:
         gradient.add(_gradient_error(ours, theirs, splats), where)
     return [
         image.row("single Gaussians: image", name, _IMAGE, 13_923),
-        gradient.row("single Gaussians: gradient", name, _GRADIENT, 0),
+        gradient.row("single Gaussians: gradient", name, _GRADIENT, gradient.cases * every),
     ]
 
 

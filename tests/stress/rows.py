@@ -51,7 +51,7 @@ def table(rows: Iterable[Row]) -> str:
     ]
     for r in rows:
         met = "**no**" if not r.met else "yes" if r.cases >= r.goal else "so far"
-        goal = f"{max(r.goal, r.cases):,}" if r.goal else "all"
+        goal = f"{r.goal:,}" if r.goal else "all"
         lines.append(
             f"| {r.what} | {r.backend} | {r.cases:,} | {goal} | {r.worst:.2g} | {r.bound:g} | {met} | {r.where} "
             f"| {r.measured} |"
