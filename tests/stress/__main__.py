@@ -148,7 +148,8 @@ def page(found: list[Row]) -> str:
         "- **Memory**: the peak that the plan predicts, at the number of Gaussians that the run reached, against what the "
         "process took beyond its imports. What an iteration holds per pixel was counted with these scenes at hand.\n"
         "- **Soak**: one process, with evaluations and checkpoints on the way.\n"
-        "- **C++ under ASan and UBSan**: the modules compiled anew with both sanitizers, and their tests.\n"
+        "- **C++ under ASan and UBSan** (`--only sanitizers`): the modules compiled anew with both sanitizers, and their tests. "
+        "Without rows above it has not been run since the page began.\n"
     )
 
 
