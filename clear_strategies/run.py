@@ -103,7 +103,7 @@ def _end(
         _log.warning("left to the other process: %s", message)
         ours.note_left(number, message)
         return
-    _log.error("%s", message)
+    _log.log(logging.INFO if code > exit_codes.SIGNALS else logging.ERROR, "%s", message)  # a stop is no error
     if code > exit_codes.SIGNALS:
         signum = code - exit_codes.SIGNALS
         if ours is not None and launcher == "joblib":
@@ -139,7 +139,7 @@ class SweepCallback(Callback):
         if failed:
             _log.error("%d job(s) failed: %s", len(failed), " | ".join(failed))
         if stopped is not None:
-            _log.error("stopped by %s. With fit.resume=auto the same command goes on.", signal.Signals(stopped).name)
+            _log.info("stopped by %s. With fit.resume=auto the same command goes on.", signal.Signals(stopped).name)
             sys.exit(exit_codes.SIGNALS + stopped)
         if failed:
             sys.exit(exit_codes.UNUSABLE)

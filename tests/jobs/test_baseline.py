@@ -191,10 +191,11 @@ def test_what_is_a_baseline_itself_trains_none(tmp_path, overrides, why, caplog)
 
 def test_the_jobs_of_a_sweep_train_none(tmp_path, monkeypatch, caplog):
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", ["hydra.mode=MULTIRUN"], return_hydra_config=True)
+        config = compose("config", ["hydra.mode=MULTIRUN", "hydra.job.num=0"], return_hydra_config=True)
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
     HydraConfig.instance().set_config(config)
-    train(tmp_path)
+    with caplog.at_level("DEBUG"):
+        train(tmp_path)
     assert "since it is a job of a sweep" in caplog.text
     assert not (tmp_path / "baseline").exists()
 

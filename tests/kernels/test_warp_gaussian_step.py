@@ -113,7 +113,7 @@ def test_cuda_fields_without_warp_use_the_readable_path_and_log_why(adam_on_cuda
         raise BackendUnavailable(f"{what} needs NVIDIA Warp, which is not installed.")
 
     monkeypatch.setattr("clear_strategies.training.compiled_step.require_warp", missing)
-    with caplog.at_level("INFO"):
+    with caplog.at_level("DEBUG"):
         assert compiled_step_for(Conductor(), adam_on_cuda) is None
     assert caplog.messages == [
         "The per-Gaussian step takes the readable path: the compiled pass needs NVIDIA Warp, which is not installed."

@@ -210,7 +210,7 @@ def test_adam_is_torchs_adam():
 
 
 def test_a_short_run_gives_f_det_a_share_of_its_rate(caplog):
-    with caplog.at_level("INFO"):
+    with caplog.at_level("DEBUG"):
         short = LearningRates().of_run(300)
     assert short.detail == pytest.approx(LearningRates().detail / 5)
     assert replace(short, detail=LearningRates().detail) == LearningRates()
