@@ -7,6 +7,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,28 +52,21 @@ def _sealed(**changes: Any) -> Callable[[Path], object]:
     return _load(spoil)
 
 
-def _history(content: bytes) -> Callable[[Path], object]:
-    """A history in place of the one that was saved, with its hash in the manifest."""
+def _content(name: str, content: bytes) -> Callable[[Path], object]:
+    """A file's content in place of the one that was saved, with its hash in the manifest."""
 
     def spoil(path: Path) -> None:
-        (path / "history.json").write_bytes(content)
+        (path / name).write_bytes(content)
         manifest = json.loads((path / "manifest.json").read_text())
         manifest.pop("sha256_of_manifest")
-        manifest["sha256"]["history.json"] = hashlib.sha256(content).hexdigest()
+        manifest["sha256"][name] = hashlib.sha256(content).hexdigest()
         (path / "manifest.json").write_text(checkpoint._sealed(manifest))
 
     return _load(spoil)
 
 
-def _tensors(content: bytes) -> Callable[[Path], object]:
-    def spoil(path: Path) -> None:
-        (path / "tensors.safetensors").write_bytes(content)
-        manifest = json.loads((path / "manifest.json").read_text())
-        manifest.pop("sha256_of_manifest")
-        manifest["sha256"]["tensors.safetensors"] = hashlib.sha256(content).hexdigest()
-        (path / "manifest.json").write_text(checkpoint._sealed(manifest))
-
-    return _load(spoil)
+_history = partial(_content, "history.json")
+_tensors = partial(_content, "tensors.safetensors")
 
 
 def _swapped(name: str) -> Callable[[Path], object]:
