@@ -31,7 +31,7 @@ def blank(state: TrainState, known: bool) -> PseudoView:
     photo = state.views[0].lr
     black = replace(photo, image=torch.zeros_like(photo.image))
     everywhere = torch.full(photo.image.shape[:2], known)
-    return PseudoView(black, everywhere, DepthMap(torch.ones_like(everywhere, dtype=torch.float32), everywhere.float()))
+    return PseudoView(black, DepthMap(torch.ones_like(everywhere, dtype=torch.float32), everywhere.float()))
 
 
 def test_steps_come_every_nth_iteration_and_their_loss_is_in_the_history():
