@@ -1,9 +1,9 @@
 """Which Gaussian came from which.
 
-Hosts that gather every entry of their parameters carry row numbers, see rows.py. Others do not say. Such a host replaces its
-parameters when it clones, splits or prunes. The replaced parameters hold the values of the last step, and every new row is a
-copy of an old row except for position, scale and opacity. A comparison of both sets therefore finds the change, whatever
-functions of the host made it.
+Hosts that gather every entry of their parameters carry row numbers, see rows.py; 3DGS's GaussianModel names the rows that it
+keeps, see inria/rows.py. Others do not say. Such a host replaces its parameters when it clones, splits or prunes. The replaced
+parameters hold the values of the last step, and every new row is a copy of an old row except for position, scale and opacity.
+A comparison of both sets therefore finds the change, whatever functions of the host made it.
 """
 
 from __future__ import annotations
@@ -73,14 +73,19 @@ class MatchedRows:
         return {name: params[name] for name in COMPARED}
 
 
+def is_same(parents: Int[Tensor, " M"], n: int) -> bool:
+    """Whether the M rows are the N rows that they come from, in the same order."""
+    return len(parents) == n and bool((parents == torch.arange(n, device=parents.device)).all())
+
+
 def change_of(parents: Int[Tensor, " M"], n: int) -> Change | None:
     """The change of N Gaussians that made row i from row parents[i]; None: the rows are the same.
 
     Of the rows with one parent, that at its parent's place is the old Gaussian, else the first.
     """
-    rows = torch.arange(len(parents), device=parents.device)
-    if len(parents) == n and bool((parents == rows).all()):
+    if is_same(parents, n):
         return None
+    rows = torch.arange(len(parents), device=parents.device)
     place = torch.where(parents == rows, rows - len(parents), rows)  # < 0: it has kept its place
     first = torch.full((n,), len(parents), device=parents.device).scatter_reduce(0, parents, place, "amin")
     return Change(parents, first[parents] != place)
@@ -96,16 +101,27 @@ def find_change(before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> Ch
     parents, _ = _first_equal(old, new)
     moved = (parents < 0).nonzero()[:, 0]
     if len(moved):
-        copied = slice(_bits(before["means"]).shape[1], None)
-        parents[moved] = _nearest_equal(old[:, copied], new[moved, copied], before["means"], after["means"][moved])
-    rows = torch.arange(len(new), device=parents.device)
-    if len(old) == len(new) and bool((parents == rows).all()):
+        parents[moved] = nearest_copied(before, {name: after[name][moved] for name in COMPARED})
+    if is_same(parents, len(old)):
         return None
+    rows = torch.arange(len(new), device=parents.device)
     # Hosts append a clone behind its parent, so the first of equal rows is the old Gaussian.
     first = torch.full((len(old) + 1,), len(new), device=parents.device).scatter_reduce(0, parents + 1, rows, "amin")
     fresh = first[parents + 1] != rows
     fresh[moved] = True
     return Change(parents, fresh)
+
+
+def are_copies(rows: Mapping[str, Tensor], of: Mapping[str, Tensor], parents: Int[Tensor, " M"]) -> bool:
+    """Whether each of M rows has the rotation and colour of its parent; a row without a parent (-1) may have any."""
+    known = (parents >= 0).nonzero()[:, 0]
+    return all(bool((_bits(rows[name][known]) == _bits(of[name][parents[known]])).all()) for name in _COPIED)
+
+
+def nearest_copied(before: Mapping[str, Tensor], rows: Mapping[str, Tensor]) -> Int[Tensor, " M"]:
+    """The Gaussian of the same rotation and colour as each of M rows, the nearest of several; -1: there is none."""
+    old, new = (torch.cat([_bits(given[name]) for name in _COPIED], 1) for given in (before, rows))
+    return _nearest_equal(old, new, before["means"], rows["means"])
 
 
 def _bits(rows: Float[Tensor, "N ..."]) -> Int[Tensor, "N K"]:

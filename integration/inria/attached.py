@@ -17,7 +17,7 @@ from integration.detail import DetailFeature
 from integration.errors import HostError
 from integration.host_score import warn_if_score_is_unused
 from integration.inria.cameras import HostView, HostViews
-from integration.lineage import MatchedRows
+from integration.inria.rows import CarriedRows
 from integration.model_proxy import ModelRenderer, Role, enlarged_camera
 from integration.replacing import Replaced
 from integration.views import SuperResolve, sr_source
@@ -89,7 +89,8 @@ class Attached:
         warn_if_score_is_unused(conductor, gaussians, threshold)
         self._model, self._conductor = gaussians, conductor
         self.views = HostViews(cameras, *sr_source(sr, conductor, factor), gaussians._xyz.device)
-        self._detail = DetailFeature(lambda: gaussians._xyz, MatchedRows(self._host_params), conductor.iterations)
+        self._rows = CarriedRows(gaussians, self._host_params)
+        self._detail = DetailFeature(lambda: gaussians._xyz, self._rows, conductor.iterations)
         self._renderer = ModelRenderer(
             gaussians, _ROLES, self._host_params, self._detail if detail else None, conductor
         )
@@ -145,6 +146,7 @@ class Attached:
     def remove(self) -> None:
         """Restore the loop; f_det is no longer shown, see `fold_detail`."""
         self.attachment.remove()
+        self._rows.remove()
         for hook in self._hooks:
             hook.remove()
         for name in self._originals:  # the instance's replacements of its class's methods

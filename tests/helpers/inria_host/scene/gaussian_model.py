@@ -93,31 +93,36 @@ class GaussianModel:
         self.prune_points((self.get_opacity < min_opacity)[:, 0])
 
     def densification_postfix(self, xyz, features_dc, features_rest, opacities, scaling, rotation):
-        self.cat_tensors_to_optimizer(
-            dict(zip(GROUPS, (xyz, features_dc, features_rest, opacities, scaling, rotation), strict=True))
-        )
+        new = dict(zip(GROUPS, (xyz, features_dc, features_rest, opacities, scaling, rotation), strict=True))
+        self._take(self.cat_tensors_to_optimizer(new))
         self._reset_statistics()
 
     def cat_tensors_to_optimizer(self, new):
-        self._replace(lambda name, rows, fresh: torch.cat((rows, torch.zeros_like(new[name]) if fresh else new[name])))
+        return self._replaced(
+            lambda name, rows, fresh: torch.cat((rows, torch.zeros_like(new[name]) if fresh else new[name]))
+        )
 
     def prune_points(self, mask):
-        self._prune_optimizer(~mask)
+        self._take(self._prune_optimizer(~mask))
         self.xyz_gradient_accum, self.denom = self.xyz_gradient_accum[~mask], self.denom[~mask]
 
     def _prune_optimizer(self, keep):
-        self._replace(lambda name, rows, fresh: rows[keep])
+        return self._replaced(lambda name, rows, fresh: rows[keep])
 
-    def _replace(self, made):
+    def _take(self, optimizable_tensors):
+        for name, parameter in optimizable_tensors.items():
+            setattr(self, GROUPS[name], parameter)
+
+    def _replaced(self, made):
+        """New parameters in the optimizer; as in 3DGS, those of the model are replaced by the caller."""
         for group in self.optimizer.param_groups:
             old, name = group["params"][0], group["name"]
             state = self.optimizer.state.pop(old, {})
-            parameter = torch.nn.Parameter(made(name, old.detach(), False))
-            group["params"][0] = parameter
+            parameter = group["params"][0] = torch.nn.Parameter(made(name, old.detach(), False))
             if state:
                 moments = {k: made(name, m, True) if m.dim() else m for k, m in state.items()}
                 self.optimizer.state[parameter] = moments
-            setattr(self, GROUPS[name], parameter)
+        return {group["name"]: group["params"][0] for group in self.optimizer.param_groups}
 
     def reset_opacity(self):
         (group,) = (g for g in self.optimizer.param_groups if g["name"] == "opacity")

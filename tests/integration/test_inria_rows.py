@@ -1,0 +1,128 @@
+"""Which Gaussian came from which in a GaussianModel, where values alone do not tell, and where its functions are not used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pytest
+import torch
+
+from clear_strategies import Conductor, Strategy
+from integration.inria import attach
+from integration.inria.rows import CarriedRows
+from integration.lineage import MatchedRows
+from tests.helpers.inria import HR_FROM_START, N, loop, options
+
+ROWS = torch.arange(N)
+
+
+@dataclass(frozen=True)
+class Recorder(Strategy):
+    """Records every change of structure."""
+
+    changes: list = field(default_factory=list)
+
+    def on_resize(self, parents):
+        self.changes.append(parents)
+
+
+@pytest.fixture
+def model(inria_host, inria_capture):
+    return inria_host.setup(options(inria_host, inria_capture))[0]
+
+
+def host_params(model):
+    return {"means": model._xyz, "quats": model._rotation, "sh0": model._features_dc}
+
+
+def rows_of(model):
+    return CarriedRows(model, lambda: host_params(model))
+
+
+def append(model, rows):
+    names = ("_xyz", "_features_dc", "_features_rest", "_opacity", "_scaling", "_rotation")
+    model.densification_postfix(*(getattr(model, name)[rows].detach() for name in names))
+
+
+def pruned(*rows):
+    return torch.isin(ROWS, torch.tensor(rows))
+
+
+@torch.no_grad()
+def test_of_two_equal_gaussians_the_one_that_the_host_keeps_is_the_parent(model):
+    for p in host_params(model).values():
+        p[7] = p[3]
+    carried, matched = rows_of(model), MatchedRows(lambda: host_params(model))
+    model.prune_points(pruned(3))
+    assert carried.poll().parents[6] == 7
+    assert matched.poll().parents[6] == 3  # what values alone tell
+
+
+@torch.no_grad()
+def test_rows_that_moved_after_the_change_are_still_the_old_gaussians(model):
+    """As with MCMC's noise: by value every row would be new, and f_det would lose its moments."""
+    carried, matched = rows_of(model), MatchedRows(lambda: host_params(model))
+    append(model, [5])
+    model._xyz += 0.01
+    change = carried.poll()
+    assert change.parents.tolist() == [*range(N), 5]
+    assert change.fresh.nonzero()[:, 0].tolist() == [N]
+    assert int(matched.poll().fresh.sum()) == N + 1
+
+
+@torch.no_grad()
+def test_changes_between_two_polls_are_one_change(model):
+    carried = rows_of(model)
+    append(model, [2, 4])
+    model.prune_points(torch.isin(torch.arange(N + 2), torch.tensor([0, 2, N])))
+    append(model, [N - 2])  # the copy of 4
+    change = carried.poll()
+    assert change.parents.tolist() == [1, *range(3, N), 4, 4]
+    assert change.fresh.nonzero()[:, 0].tolist() == [N - 2, N - 1]
+    assert carried.poll() is None
+
+
+@torch.no_grad()
+def test_a_new_gaussian_that_is_no_copy_has_no_parent(model):
+    """FSGS puts new ones between neighbours, with colours of 0."""
+    carried = rows_of(model)
+    model.densification_postfix(
+        model._xyz[:1] + 1, torch.zeros(1, 1, 3), model._features_rest[:1], model._opacity[:1], model._scaling[:1],
+        model._rotation[:1],
+    )  # fmt: skip
+    assert carried.poll().parents.tolist() == [*range(N), -1]
+
+
+@torch.no_grad()
+def test_keeping_every_row_is_no_change(model):
+    carried = rows_of(model)
+    model.prune_points(pruned())
+    assert carried.poll() is None
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("also_pruned", [False, True], ids=["elsewhere alone", "elsewhere too"])
+def test_a_change_by_another_function_is_found_by_its_values(also_pruned, model, caplog):
+    carried = rows_of(model)
+    if also_pruned:
+        model.prune_points(pruned(0))
+    for name in ("_xyz", "_features_dc", "_rotation"):
+        setattr(model, name, torch.nn.Parameter(getattr(model, name).detach().flip(0)))
+    assert carried.poll().parents.tolist() == [*range(N)][also_pruned:][::-1]
+    assert ("found by the values" in caplog.text) == also_pruned
+
+
+def test_the_loop_reports_the_rows_and_gets_its_methods_back(inria_host, inria_capture):
+    opt = options(inria_host, inria_capture)
+    gaussians, scene = inria_host.setup(opt)
+    recorder = Recorder()
+    clear = attach(gaussians, scene.cameras, Conductor(recorder, objective=HR_FROM_START), sr=inria_capture / "sr")
+    gaussians.optimizer.param_groups[1]["lr"] = 0.0  # colours stay, so that they identify Gaussians
+    colors = gaussians._features_dc.detach().clone()
+    loop(inria_host, clear, opt, gaussians, scene)
+    assert len(recorder.changes) >= 3
+    for parents in recorder.changes:
+        colors = colors[parents]
+    assert torch.equal(colors, gaussians._features_dc.detach())
+    clear.remove()
+    assert not {"_prune_optimizer", "cat_tensors_to_optimizer"} & vars(gaussians).keys()
