@@ -18,6 +18,8 @@ ATTRIBUTES: Final = ("means", "quats", "scales", "opacities", "sh0", "shN", "det
 CONFLICT_GROUPS: Final = ("means", "sh0", "shN", "opacities", "scales", "quats")
 """The paper's six: position, base appearance, higher-order appearance, opacity, scale, rotation."""
 
+_ROWS: Final = 4096  # of the highest bands in float64: 1.5 MB
+
 
 class Grads(dict[str, Tensor]):
     """attribute -> gradient [N, …], with + and * by a number or by one number per Gaussian [N].
@@ -77,7 +79,13 @@ def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"
 
 def row_dot(a: Float[Tensor, "N ..."], b: Float[Tensor, "N ..."]) -> Float[Tensor, " N"]:
     """⟨a_i, b_i⟩ in float64: no product of two finite float32 numbers over- or underflows there."""
-    return (a.double() * b.double()).flatten(1).sum(1) if a.dim() > 1 else a.double() * b.double()
+    if a.dim() == 1:
+        return a.double() * b.double()
+    if not deferred.is_immediate(a):
+        return (a.double() * b.double()).flatten(1).sum(1)
+    # In blocks that stay in the processor's cache: copies of all rows in float64 take twice the memory of the gradients.
+    blocks = zip(torch.split(a, _ROWS), torch.split(b, _ROWS), strict=True)
+    return torch.cat([(x.double() * y.double()).flatten(1).sum(1) for x, y in blocks])
 
 
 def row_norm(a: Float[Tensor, "N ..."]) -> Float[Tensor, " N"]:

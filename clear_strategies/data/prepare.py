@@ -122,15 +122,16 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     for frame in (*train_frames, *test_frames):
         found.append(_view(frame, capture, views, prior, lr_files, required=len(found) < len(train_frames)))
         progress(len(found))
-    train, test = tuple(found[: len(train_frames)]), tuple(found[len(train_frames) :])
     moved = {}
     if views.back_projection:
-        before = _disagreement(train, views.downsample)
-        train, test = (tuple(_agreeing(view, views) for view in part) for part in (train, test))
-        after = _disagreement(train, views.downsample)
+        before = _disagreement(found[: len(train_frames)], views.downsample)
+        for i, view in enumerate(found):  # one by one: all SR images twice are hundreds of megabytes
+            found[i] = _agreeing(view, views)
+        after = _disagreement(found[: len(train_frames)], views.downsample)
         moved["back-projection"] = (
             f"SR images differed from the LR photos by {before:.2f} grey levels, now by {after:.2f}"
         )
+    train, test = tuple(found[: len(train_frames)]), tuple(found[len(train_frames) :])
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
     initial = initial_points(
         cloud, [v.lr for v in train], sfm=capture.points, train_ids=ids, sfm_is_train=not held_out,

@@ -31,6 +31,7 @@ from clear_strategies.outputs.baseline import FOLDER as BASELINE
 from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
+from clear_strategies.outputs.remarks import remarks
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import build
 from clear_strategies.training import memory
@@ -38,7 +39,7 @@ from clear_strategies.training.depth_loss import DepthLoss
 from clear_strategies.training.loop import fit
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.pseudo_views import PseudoViewSettings
+from clear_strategies.training.pseudo_views import PseudoViews, PseudoViewSettings
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import Skips
 from clear_strategies.training.state import TrainState
@@ -256,6 +257,7 @@ def _run(
         if of_baseline != resume.AUTO or resume.finished(baseline.folder, baseline.compared) is None:
             first = baseline.start(place, of_baseline)
     state = ours.start(place, source)
+    memory.release()
     # Of many jobs the console shows a line each; the rest is in their run.log.
     level = logging.DEBUG if _in_sweep() else logging.INFO
     found, most = memory.needs(state, drawing.rasterizer), getattr(state.density.settings, "max_gaussians", None)
@@ -264,13 +266,18 @@ def _run(
         "threads": f"{threads} ({why})",
         "memory": memory.says(found, most),
     }
-    _log.log(level, "%s", plan.describe(loaded, state, ours.chosen, machine))
+    said = plan.describe(loaded, state, ours.chosen, machine)
+    _log.log(level, "%s", said.short)
+    _log.debug("%s", said.details)
     memory.require(found, None if settings.fit.memory is None else settings.fit.memory << 20, most)
     if settings.fit.baseline and baseline is None:
         _log.log(level, "fit.baseline: no baseline trains beside this run, %s.", _why_without_baseline(settings))
     ours.remove_earlier_metrics()
     beside = None if baseline is None else _trained_first(baseline, first, place)
+    first = None  # its memory is for what trains now
     evaluation, seconds = _train(ours, state, place, beside)
+    for remark in remarks(state):
+        _log.log(level, "%s", remark)
     _log.log(level, "%s", score_table.describe(ours.folder, evaluation, seconds, beside))
     if _in_sweep():
         _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, ours.folder, evaluation, seconds))
@@ -333,6 +340,8 @@ def _train(
         checkpoints = training.folder / resume.CHECKPOINTS
         fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)
     seconds = time.perf_counter() - began
+    state.pseudo_views = PseudoViews()  # their memory is for the results
+    memory.release()
     evaluation = results.write_results(
         training.folder,
         place.scene,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import torch
 
@@ -14,6 +15,12 @@ from clear_strategies.schedules import milestones
 from clear_strategies.training.state import TrainState
 
 _log = logging.getLogger(__name__)
+
+# What a user decides on, or wants to know before waiting for the result. The rest is for `-v` and run.log.
+_SHORT: Final[Sequence[str]] = (
+    "scene", "poses", "HR side", "train views", "test views", "not used", "LR", "HR", "the SR images add", "initial points",
+    "method", "strategies", "rasterizer", "memory", "iterations", "skipped",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +40,20 @@ class Chosen:
         return self.method or " + ".join(self.strategies) or "baseline"
 
 
-def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[str, str]) -> str:
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A line for each fact.
+
+    Args:
+        short: for the console, at most fifteen lines.
+        details: the facts that are not in it.
+    """
+
+    short: str
+    details: str
+
+
+def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[str, str]) -> Plan:
     """The plan: the data, the strategies, the milestones and what is skipped. Strategies without effect give a warning.
 
     Args:
@@ -64,6 +84,13 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[s
         lines["depth loss"] = f"of LR renders, weight {state.depth_loss.weight:g}"
     lines["skipped"] = "; ".join(_skipped(state)) or "nothing"
     _warn_of_idle_strategies(conductor)
+    short = {label: lines[label] for label in _SHORT if label in lines}
+    details = {label: text for label, text in lines.items() if label not in short}
+    short["more"] = f"{len(details)} lines in run.log, or here with -v"
+    return Plan(_table(short), _table(details))
+
+
+def _table(lines: Mapping[str, str]) -> str:
     width = max(map(len, lines))
     return "\n".join(f"  {label:<{width}}  {text}" for label, text in lines.items())
 

@@ -125,6 +125,14 @@ class Strategy:
         """The parts of the strategy that its settings switch off, a phrase each."""
         return ()
 
+    def in_hindsight(self, means: Mapping[str, float]) -> str | None:
+        """What a run has shown of the strategy, said at its end; None: nothing worth a line.
+
+        Args:
+            means: of the run's history, by column.
+        """
+        return None
+
     def keeps(self) -> Sequence[str]:
         """The attributes of which the strategy keeps a copy in its `state`, for the prediction of memory."""
         return ()

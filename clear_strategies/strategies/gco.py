@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, Literal, overload
@@ -29,6 +29,7 @@ _log = logging.getLogger(__name__)
 
 # ω at its lower bound in this share of the corrections means that the prior agrees with LR and GCO does nothing.
 _INACTIVE_SHARE: Final = 0.9
+_AT_LOWER_BOUND: Final = "omega_at_lower_bound"  # the column of that share
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,15 @@ class GCO(Strategy):
         if lambda_lr == 0:
             return "lambda_LR is 0, so nothing can conflict"
         return "lambda_HR is 0 throughout" if lambda_hr == 0 else None
+
+    def in_hindsight(self, means: Mapping[str, float]) -> str | None:
+        share = means.get(_AT_LOWER_BOUND, 0.0)
+        if share <= _INACTIVE_SHARE:
+            return None
+        return (
+            f"GCO was inactive: omega sat at its lower bound {self.weight_min:g} in {share:.0%} of the corrections, because the "
+            "prior agrees with the LR images (reliability near 1)."
+        )
 
     def correction_rule(self) -> CorrectionRule:
         return CorrectionRule(
@@ -149,7 +159,7 @@ class GCO(Strategy):
         return value * mean_lr * mean_hr, value * mean_lr**2
 
     def report(self, done: Sequence[GroupReport], evidence: Evidence | None) -> None:
-        """Log what was corrected, and warn where ε or the prior makes GCO inactive."""
+        """Log what was corrected, and warn where ε makes GCO inactive."""
         compared, corrected, omega, at_bound = (
             deferred.defer(deferred.added, *(getattr(c, name) for c in done))
             for name in ("compared", "corrected", "omega", "at_lower_bound")
@@ -161,7 +171,7 @@ class GCO(Strategy):
             share = partial(self._share_of_group, c.group)
             self.log(f"corrected_{c.group}", deferred.defer(share, c.corrected, c.compared, margin))
         if corrected != 0 and evidence is not None and self.weight_min > 0:
-            self.log("omega_at_lower_bound", deferred.defer(self._share_at_bound, at_bound, corrected))
+            self.log(_AT_LOWER_BOUND, deferred.defer(deferred.ratio, at_bound, corrected))
 
     @property
     def _absolute_eps(self) -> float | None:
@@ -181,15 +191,6 @@ class GCO(Strategy):
                 group, margin, self.eps,
             )  # fmt: skip
         return deferred.ratio(corrected, compared)
-
-    def _share_at_bound(self, at_bound: float, corrected: float) -> float:
-        share = deferred.ratio(at_bound, corrected)
-        if share > _INACTIVE_SHARE and self._first("inactive"):
-            _log.info(
-                "GCO is inactive: omega sits at its lower bound %g in %.0f %% of the corrections, because the "
-                "prior agrees with the LR images (reliability near 1).", self.weight_min, 100 * share,
-            )  # fmt: skip
-        return share
 
     def _first(self, what: str) -> bool:
         known = what in self.cache

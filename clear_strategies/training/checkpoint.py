@@ -23,6 +23,7 @@ from torch import Tensor
 from clear_strategies.data import json_shapes as shapes
 from clear_strategies.errors import DataError
 from clear_strategies.files import partial_of
+from clear_strategies.training import tensor_file
 
 _log = logging.getLogger(__name__)
 
@@ -72,12 +73,9 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
     Raises:
         OSError: the disk is full or read-only; earlier checkpoints are untouched.
     """
-    from safetensors.torch import save as to_bytes
-
     folder.mkdir(parents=True, exist_ok=True)
     target = _free_name(folder / f"{_PREFIX}{checkpoint.t:07d}")
-    tensors = {name: value.detach().cpu().contiguous() for name, value in checkpoint.tensors.items()}
-    contents = {_TENSORS: [to_bytes(tensors)], _HISTORY: _rows(checkpoint.history)}
+    contents = {_TENSORS: tensor_file.parts(checkpoint.tensors), _HISTORY: _rows(checkpoint.history)}
     manifest: dict[str, Any] = {
         "format": FORMAT,
         "t": checkpoint.t,
@@ -223,7 +221,7 @@ def _rows(history: Sequence[Mapping[str, float]]) -> Iterator[bytes]:
     yield b"]"
 
 
-def _write_durably(path: Path, parts: Iterable[bytes]) -> str:
+def _write_durably(path: Path, parts: Iterable[bytes | memoryview]) -> str:
     """Write the parts one after the other; returns the SHA-256 of the whole."""
     digest = hashlib.sha256()
     with path.open("wb") as file:

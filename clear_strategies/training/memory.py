@@ -10,8 +10,11 @@ A rasterizer bounds its own lists (`rasterizer.memory`, MiB) and draws in parts 
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import logging
 import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -39,7 +42,6 @@ _EVIDENCE: Final = 8  # q, a, w, m, the scores and their sums
 # Floats per pixel of the largest HR image: the render with alpha and the ends of its blocks, two cotangents and their copy,
 # and what the losses hold, or P2G when it compares the SR image with the photo.
 _PER_PIXEL: Final = (3 + 1 + 2) + 2 * (2 * 3) + max(4 * 3, 8 * 3)
-_SAVED_TWICE: Final = 2  # the tensors as bytes, and the file made of them
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +52,10 @@ class Needs:
         now: of the process, or of the device, before the first iteration. reached: the most so far.
         gaussians: how many there are at the start.
         held: per Gaussian, for the whole run: parameters, moments, statistics, and what strategies keep.
-        worked: per Gaussian, while an iteration runs. saved: per Gaussian, while a checkpoint is written.
+        worked: per Gaussian, while an iteration runs.
         lists: per Gaussian, of the rasterizer; at most `most_lists` in all.
         pixels: of the images of one iteration.
+        cuda: this is the device's memory, not the process's.
     """
 
     now: int
@@ -60,19 +63,16 @@ class Needs:
     gaussians: int
     held: int
     worked: int
-    saved: int
     lists: int
     most_lists: int
     pixels: int
+    cuda: bool = False
 
     def peak(self, gaussians: int) -> int:
-        """With this many Gaussians, from the start or by growing to them.
-
-        The allocator keeps what an iteration has freed, so a checkpoint is written beside it.
-        """
+        """With this many Gaussians, from the start or by growing to them. Checkpoints are written without copies."""
         grown = max(0, gaussians - self.gaussians) * self.held
         drawn = min(gaussians * self.lists, self.most_lists)
-        return max(self.reached, self.now + grown + gaussians * (self.worked + self.saved) + drawn + self.pixels)
+        return max(self.reached, self.now + grown + gaussians * self.worked + drawn + self.pixels)
 
     def fits(self, budget: int) -> int:
         """The most Gaussians whose peak is within the budget, 0 where not even the first are."""
@@ -104,10 +104,10 @@ def needs(state: TrainState, rasterizer: Rasterizer) -> Needs:
         gaussians=n,
         held=held,
         worked=_FLOAT * floats + largest,
-        saved=0 if cuda else _SAVED_TWICE * held,  # on the CPU, whose memory is not what a device runs out of
         lists=lists,
         most_lists=most,
         pixels=_FLOAT * _PER_PIXEL * (view.hr.image.shape[0] * view.hr.image.shape[1]),
+        cuda=cuda,
     )
 
 
@@ -153,6 +153,14 @@ def says(found: Needs, most: int | None) -> str:
     return line if most is None else f"{line}, {mebibytes(found.peak(most))} MiB with density.max_gaussians={most:,}"
 
 
+def release() -> None:
+    """Give the system what has been freed, which the C library keeps: loading and training leave hundreds of MiB."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:  # glibc
+        trim(0)
+
+
 def mebibytes(size: int) -> int:
     return -(-size // _MIB)
 
@@ -169,7 +177,7 @@ def peak() -> int:
 
 def available(found: Needs) -> int | None:
     """Bytes that training may take on this machine, with what it holds already; None where the system does not say."""
-    if torch.cuda.is_available() and found.saved == 0:
+    if found.cuda:
         return int(torch.cuda.mem_get_info()[0]) + found.now
     try:
         lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())

@@ -13,6 +13,7 @@ from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs import plan
 from clear_strategies.outputs.progress import progress_bar
+from clear_strategies.outputs.remarks import remarks
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
@@ -33,8 +34,8 @@ def started(*strategies: Strategy, **objective: Any) -> TrainState:
 
 
 def lines(state: TrainState, *names: str, method: str | None = None) -> dict[str, str]:
-    text = plan.describe(SCENE, state, plan.Chosen(method, names), {"rasterizer": "torch", "threads": "1"})
-    split = (line.strip().partition("  ") for line in text.splitlines())
+    found = plan.describe(SCENE, state, plan.Chosen(method, names), {"rasterizer": "torch", "threads": "1"})
+    split = (line.strip().partition("  ") for text in (found.short, found.details) for line in text.splitlines())
     return {label: words for label, _, words in split}
 
 
@@ -58,6 +59,9 @@ class Quiet(Strategy):
     def skipped(self) -> Sequence[str]:
         return ("the loud part",)
 
+    def in_hindsight(self, means: Mapping[str, float]) -> str | None:
+        return f"{means['n_gaussians']:g} Gaussians, and not one loud"
+
     def marks(self) -> Mapping[str, int]:
         return {"silence": 5}
 
@@ -70,6 +74,21 @@ def test_any_strategy_states_what_it_skips_marks_and_warns_of(caplog: pytest.Log
     caplog.clear()
     lines(started(Quiet(), lambda_hr=WarmupDecay(peak=2, final=0)), "quiet")
     assert "no effect" not in caplog.text
+
+
+def test_a_run_ends_with_what_its_history_shows_of_a_strategy() -> None:
+    state = started(Quiet())
+    iterate(state, toy.RASTERIZER)
+    assert remarks(state) == ["40 Gaussians, and not one loud"]
+
+
+def test_the_console_gets_what_a_user_decides_on_and_run_log_the_rest() -> None:
+    found = plan.describe(SCENE, started(GCO()), plan.Chosen(None, ["gco"]), {"rasterizer": "torch", "threads": "1"})
+    short, details = found.short.splitlines(), found.details.splitlines()
+    assert len(short) <= 15
+    assert not set(short) & set(details)
+    assert any("milestones" in line for line in details)
+    assert short[-1].split(maxsplit=1) == ["more", f"{len(details)} lines in run.log, or here with -v"]
 
 
 def test_strategies_without_hr_are_idle(caplog: pytest.LogCaptureFixture) -> None:

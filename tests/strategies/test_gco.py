@@ -167,15 +167,15 @@ def test_an_absolute_epsilon_that_disables_correction_is_warned_of(caplog):
     assert "cannot fire for means" in caplog.text
 
 
-def test_a_prior_that_agrees_with_lr_makes_it_inactive_and_says_so(caplog):
+def test_a_prior_that_agrees_with_lr_makes_it_inactive_and_the_end_of_the_run_says_so():
     lr, hr = random_pair(8)
-    evidence = Evidence(torch.full((200,), 0.99), torch.ones(200))
-    with caplog.at_level(logging.INFO):
-        gco = GCO()
-        gco.correct(lr, hr, evidence)
-        gco.correct(lr, hr, evidence)
-    assert caplog.text.count("GCO is inactive") == 1
+    gco = GCO()
+    gco.correct(lr, hr, Evidence(torch.full((200,), 0.99), torch.ones(200)))
     assert gco.logs["mean_omega"] == pytest.approx(0.05, abs=1e-3)
+    assert "GCO was inactive: omega sat at its lower bound 0.05 in 100%" in gco.in_hindsight(gco.logs)
+    gco.correct(lr, hr, Evidence(torch.zeros(200), torch.ones(200)))
+    assert gco.in_hindsight(gco.logs) is None
+    assert gco.in_hindsight({}) is None
 
 
 def test_the_rival_reading_bounds_the_coefficient():
