@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
@@ -28,8 +29,8 @@ def checkout(name: str, script: str) -> Path:
     return folder.resolve()
 
 
-def run(host: Path, *command: object, inside: str = "", more_paths: tuple[Path, ...] = ()) -> str:
-    """The output of a Python program in the host's folder; the exit status must be 0."""
+def run(host: Path, *command: object, inside: str = "", more_paths: tuple[Path, ...] = (), status: int = 0) -> str:
+    """The output of a Python program in the host's folder, which must end with this exit status."""
     paths = [CPU, *more_paths, ROOT, os.environ.get("PYTHONPATH", "")]
     environment = {
         **os.environ, "HOST": host.name, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(map(str, paths)),
@@ -38,7 +39,7 @@ def run(host: Path, *command: object, inside: str = "", more_paths: tuple[Path, 
         [sys.executable, *map(str, command)], cwd=host / inside, env=environment, capture_output=True, text=True,
         timeout=1_800, check=False,
     )  # fmt: skip
-    assert done.returncode == 0, done.stdout[-2_000:] + done.stderr[-4_000:]
+    assert done.returncode == status, done.stdout[-2_000:] + done.stderr[-4_000:]
     return done.stdout + done.stderr
 
 
@@ -69,6 +70,23 @@ def write_scene(folder: Path) -> None:
     body = [f"{_words(x)} 0 0 0 {_words(rgb)}" for x, rgb in points]
     (dense / "fused.ply").write_text("\n".join([*header, *body]) + "\n")
     np.save(folder / "poses_bounds.npy", np.tile([*[0.0] * 15, 2.0, 6.0], (4, 1)))
+
+
+def spoil_half(folder: Path, *names: str) -> None:
+    """Fill the right half of these images with other pixels."""
+    for file in (folder / name for name in names):
+        image = np.array(Image.open(file))
+        half = image[:, image.shape[1] // 2 :]
+        half[...] = np.random.default_rng(0).integers(0, 256, half.shape)
+        Image.fromarray(image).save(file)
+
+
+def hide_half(folder: Path) -> None:
+    """Make the right half of all photos transparent."""
+    for file in sorted(folder.iterdir()):
+        image = np.array(Image.open(file).convert("RGBA"))
+        image[:, image.shape[1] // 2 :, 3] = 0
+        Image.fromarray(image).save(file)
 
 
 def _words(values) -> str:

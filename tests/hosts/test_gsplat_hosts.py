@@ -26,11 +26,11 @@ def host(request):
     return checkout(request.param, "examples/simple_trainer.py")
 
 
-def start(host, *command):
+def start(host, *command, status=0):
     paths = (host, host / "examples")
     if host.name == "gsplat-1.5.3":
         paths = (CPU / "pycolmap_of_gsplat_1_5", *paths)
-    return run(host, *command, inside="examples", more_paths=paths)
+    return run(host, *command, inside="examples", more_paths=paths, status=status)
 
 
 def training(scene, results, **more):
@@ -44,10 +44,12 @@ def training(scene, results, **more):
     return [*named, "--save-ply", "--disable-viewer", "--disable-video"]
 
 
-def launched(host, scene, results, densifier="default", *extra, **more):
+def launched(host, scene, results, densifier="default", *extra, status=0, **more):
     overrides = [f"--overrides={override}" for override in FROM_START]
     clear = ["-m", "integration.gsplat", "--sr", scene / "sr", *overrides]
-    return start(host, *clear, "simple_trainer.py", densifier, *training(scene, results, **more), *extra)
+    return start(
+        host, *clear, "simple_trainer.py", densifier, *training(scene, results, **more), *extra, status=status
+    )  # fmt: skip
 
 
 def counts(said):
@@ -95,3 +97,33 @@ def test_one_line_does_the_same_as_none(host, scene, tmp_path):
 def test_a_view_is_recognised_while_its_pose_moves(host, scene, tmp_path):
     said = launched(host, scene, tmp_path / "run", "default", "--pose-opt", **{"pose-noise": 0.01})
     assert counts(said)["merges"] == STEPS
+
+
+def test_3dgut_trains_without_a_score(host, scene, tmp_path):
+    said = launched(host, scene, tmp_path / "run", "mcmc", "--with-ut", "--with-eval3d")
+    assert counts(said)["merges"] == STEPS
+    assert "scores written" not in said
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (["--app-opt"], "app_opt"),
+        (["--random-bkgd"], "random_bkgd"),
+        (["--sparse-grad", "--packed"], "sparse_grad"),
+        (["--visible-adam"], "visible_adam"),
+        (["--batch-size", "2"], "batch_size"),
+        (["--patch-size", "8"], "patch_size"),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_options_that_change_one_scale_are_refused_before_the_first_step(host, scene, tmp_path, options, named):
+    said = launched(host, scene, tmp_path / "run", "default", *options, status=2)
+    assert f"{named}: CLEAR needs" in said
+    assert not list((tmp_path / "run").rglob("*.pt"))
+
+
+def test_photos_are_written_as_they_are_trained_on(host, scene, tmp_path):
+    clear = ["-m", "integration.gsplat", "--save-lr", tmp_path / "lr"]
+    start(host, *clear, "simple_trainer.py", "default", *training(scene, tmp_path / "run"))
+    assert sorted(file.name for file in (tmp_path / "lr").iterdir()) == ["b1.png", "b2.png", "b3.png"]

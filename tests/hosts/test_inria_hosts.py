@@ -1,4 +1,5 @@
-"""The real train.py of 3DGS and of its forks, on a CPU: from the start through densification, evaluation, save and reload.
+"""The real train.py of 3DGS and of its forks, on a CPU: from the start through densification, evaluation, save and reload,
+and the options that touch what CLEAR draws.
 
     CLEAR_HOSTS=FOLDER python -m pytest tests/hosts
 
@@ -10,10 +11,13 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
+import torch
+from PIL import Image
 
 from clear_strategies.data.ply import read_gaussians
-from tests.helpers.real_hosts import FROM_START, checkout, run
+from tests.helpers.real_hosts import FROM_START, checkout, hide_half, run, spoil_half
 
 HOSTS = {
     "3dgs": ["--disable_viewer"],
@@ -35,13 +39,20 @@ def host(request):
 
 def training(host, **more):
     """The trainer's options."""
-    return [*HOSTS[host.name], "--eval", *(f"--{name}={value}" for name, value in (TRAINING | more).items())]
+    return [
+        *HOSTS[host.name],
+        "--eval",
+        "--port=0",
+        *(f"--{name}={value}" for name, value in (TRAINING | more).items()),
+    ]
 
 
-def launched(host, scene, model, **more):
+def launched(host, scene, model, *extra, status=0, **more):
     overrides = [f"--overrides={override}" for override in FROM_START]
     clear = ["-m", "integration.inria", "--sr", scene / "sr", *overrides]
-    return run(host, *clear, "train.py", "-s", scene, "-m", model, *training(host, **more))
+    return run(
+        host, *clear, "train.py", "-s", scene, "-m", model, *training(host, **more), *extra, status=status
+    )  # fmt: skip
 
 
 def cloud(model):
@@ -74,3 +85,57 @@ def test_one_line_in_train_py_does_the_same(host, scene, tmp_path):
     one, none = cloud(tmp_path / "edited"), cloud(tmp_path / "launched")
     assert len(one) == len(none)
     assert float((one.sh0 - none.sh0).abs().max()) < 1e-4
+    checkpoint = tmp_path / "edited" / "chkpnt20.pth"
+    resumed = training(host, start_checkpoint=checkpoint)
+    run(host, edited, "-s", scene, "-m", tmp_path / "resumed", *resumed)
+    assert len(cloud(tmp_path / "resumed")) == len(one)
+
+
+def test_its_own_render_py_shows_what_training_evaluated(host, scene, tmp_path):
+    """The file holds f_base + f_det, as evaluation during training shows it."""
+    said = launched(host, scene, tmp_path / "model")
+    (evaluated,) = (float(psnr) for psnr in re.findall(r"Evaluating test: .*PSNR (?:tensor\()?([\d.]+)", said))
+    run(host, "render.py", "-m", tmp_path / "model", "--skip_train")
+    files = sorted((tmp_path / "model" / "test").rglob("*.png"))
+    assert len(files) == 2  # the rendering and the photo
+    rendered, photo = (np.asarray(Image.open(file), dtype=float) / 255 for file in files)
+    squared = ((rendered - photo) ** 2).mean((0, 1))
+    assert float((-10 * np.log10(squared)).mean()) == pytest.approx(evaluated, abs=0.05)
+
+
+def test_photos_are_written_as_they_are_trained_on(host, scene, tmp_path):
+    run(host, "-m", "integration.inria", "--save-lr", tmp_path / "lr", "train.py", "-s", scene, "-m", tmp_path / "model",
+        *training(host), "-r", 2)  # fmt: skip
+    written = sorted((tmp_path / "lr").iterdir())
+    assert [file.name for file in written] == ["b1.png", "b2.png", "b3.png"]
+    assert {Image.open(file).size for file in written} == {(12, 8)}
+    assert not (tmp_path / "model" / "point_cloud").exists()
+
+
+@pytest.mark.parametrize("hidden_by", ["alpha of the photos", "--train_test_exp"])
+def test_what_3dgs_hides_is_learned_from_no_sr_image(hidden_by, scene, tmp_path):
+    host, extra = checkout("3dgs", "train.py"), []
+    if hidden_by == "--train_test_exp":
+        extra, names = [hidden_by], ["a0.png"]  # the right half of the test photo
+    else:
+        hide_half(scene / "images")
+        names = ["b1.png", "b2.png", "b3.png"]
+    launched(host, scene, tmp_path / "whole", *extra)
+    spoil_half(scene / "sr", *names)
+    launched(host, scene, tmp_path / "spoilt", *extra)
+    whole, spoilt = cloud(tmp_path / "whole"), cloud(tmp_path / "spoilt")
+    assert all(torch.equal(getattr(whole, name), getattr(spoilt, name)) for name in ("means", "opacities", "sh0"))
+
+
+@pytest.mark.parametrize("name", ["3dgs", "dropgaussian"])
+def test_a_random_background_is_the_same_at_both_scales(name, scene, tmp_path):
+    """It is an argument of `render`."""
+    said = launched(checkout(name, "train.py"), scene, tmp_path / "model", "--random_background")
+    assert "30 merges" in said
+
+
+def test_mip_splattings_ray_jitter_is_refused_before_the_first_step(scene, tmp_path):
+    host = checkout("mip-splatting", "train.py")
+    said = launched(host, scene, tmp_path / "model", "--ray_jitter", status=2)
+    assert "rays are jittered, and two scales of a view cannot share that" in said
+    assert not (tmp_path / "model" / "point_cloud").exists()

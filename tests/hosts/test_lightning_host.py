@@ -12,11 +12,13 @@ from __future__ import annotations
 import json
 import re
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from clear_strategies.data.ply import read_gaussians
-from tests.helpers.real_hosts import FROM_START, checkout, run
+from tests.helpers.real_hosts import FROM_START, checkout, run, spoil_half
 
 STEPS = 30
 
@@ -34,7 +36,7 @@ MCMC = {
 }
 
 
-def train(host, scene, output, *more, base=VANILLA, model=None, **settings):
+def train(host, scene, output, *more, base=VANILLA, model=None, status=0, **settings):
     density = {
         "class_path": "integration.lightning.ClearDensityController",
         "init_args": {
@@ -49,7 +51,7 @@ def train(host, scene, output, *more, base=VANILLA, model=None, **settings):
         host, "main.py", "fit", "--config", config, "--data.path", scene, "--data.parser", "Colmap",
         "--data.parser.split_mode", "experiment", "--trainer.accelerator", "cpu", "--max_steps", STEPS,
         "--save_iterations", "[20]", "-n", "run", "--output", output, "--logger",
-        "lightning.pytorch.loggers.CSVLogger", *more,
+        "lightning.pytorch.loggers.CSVLogger", *more, status=status,
     )  # fmt: skip
 
 
@@ -97,3 +99,40 @@ def test_it_trains_with_the_hosts_mcmc(host, scene, tmp_path):
 def test_output_processors_work_at_both_scales(host, scene, tmp_path, processor):
     train(host, scene, tmp_path / "run", model={"output_processor": processor})
     assert len(cloud(tmp_path / "run")) > 0
+
+
+def test_what_a_mask_hides_is_learned_from_no_sr_image(host, scene, tmp_path):
+    mask = np.full((16, 24), 255, dtype=np.uint8)
+    mask[:, 12:] = 0
+    names = ["b1.png", "b2.png", "b3.png"]
+    (tmp_path / "masks").mkdir()
+    for name in names:
+        Image.fromarray(mask).save(tmp_path / "masks" / f"{name}.png")
+    masked = ["--data.parser.mask_dir", tmp_path / "masks"]
+    train(host, scene, tmp_path / "whole", *masked)
+    spoil_half(scene / "sr", *names)
+    train(host, scene, tmp_path / "spoilt", *masked)
+    whole, spoilt = cloud(tmp_path / "whole"), cloud(tmp_path / "spoilt")
+    assert all(torch.equal(getattr(whole, name), getattr(spoilt, name)) for name in ("means", "opacities", "sh0"))
+
+
+def test_a_random_background_is_the_same_at_both_scales(host, scene, tmp_path):
+    train(host, scene, tmp_path / "run", model={"random_background": True})
+    assert len(cloud(tmp_path / "run")) > 0
+
+
+@pytest.mark.parametrize(
+    ("options", "model", "message"),
+    [
+        (["--trainer.precision", "bf16-mixed"], {}, "gradients are merged in 32 bits, got precision=bf16-mixed"),
+        (["--trainer.devices", "2"], {}, "one process trains, got 2"),
+        ([], {"renderer": "AppearanceMLPRenderer"}, "trains an appearance model of its own"),
+    ],
+    ids=["precision", "processes", "appearance"],
+)
+def test_settings_that_do_not_work_with_two_scales_are_refused_at_the_start(
+    host, scene, tmp_path, options, model, message
+):
+    said = train(host, scene, tmp_path / "run", *options, model=model, status=1)
+    assert message in said
+    assert not (tmp_path / "run" / "run" / "point_cloud").exists()

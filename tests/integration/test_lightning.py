@@ -194,10 +194,40 @@ def test_densification_ends_when_a_strategy_ends_it(host, sr):
     assert module.density_controller.config.densify_until_iter == 8
 
 
-def test_two_photos_of_one_name_and_several_processes_are_refused(host, sr):
+def test_two_photos_of_one_name_are_refused(host, sr):
     host.photos.append(host.photos[0])
     with pytest.raises(HostError, match="two training photos are called"):
         fitted(host, host.controller(sr=sr, suffix="_x4"), 1)
+
+
+@pytest.mark.parametrize(
+    ("trainer", "message"),
+    [
+        ({"world_size": 2}, r"one process trains, got 2. Set trainer.devices=1"),
+        ({"precision": "16-mixed"}, r"got precision=16-mixed. Set trainer.precision=32"),
+    ],
+    ids=["processes", "precision"],
+)
+def test_several_processes_and_half_precision_are_refused_before_the_first_step(trainer, message, host, sr):
+    module = host.splatting.GaussianSplatting(
+        host.scene.cloud, host.controller(sr=sr, suffix="_x4"), host.splatting.Renderer()
+    )
+    module.trainer = SimpleNamespace(global_step=0, max_steps=5, **trainer)
+    with pytest.raises(HostError, match=message):
+        module.density_controller.setup("fit", module)
+
+
+def test_models_whose_colours_are_not_those_of_the_gaussians_are_refused(host, sr):
+    density = host.controller(sr=sr, suffix="_x4")
+    module = host.splatting.GaussianSplatting(host.scene.cloud, density, host.splatting.Renderer())
+    module.renderer.appearance = torch.nn.Linear(2, 2)
+    with pytest.raises(HostError, match="Renderer trains an appearance model of its own"):
+        host.splatting.fit(module, host.photos, 1)
+    module = host.splatting.GaussianSplatting(host.scene.cloud, density, host.splatting.Renderer())
+    del module.gaussian_model.gaussians["shs_rest"]
+    module.gaussian_model.training_setup = lambda: [torch.optim.Adam([module.gaussian_model.gaussians["means"]])]
+    with pytest.raises(HostError, match="no shs_rest, as those of a VanillaGaussian have"):
+        host.splatting.fit(module, host.photos, 1)
 
 
 def test_a_resumed_run_without_our_state_continues_at_its_step_and_warns(host, sr, caplog):

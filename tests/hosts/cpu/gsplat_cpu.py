@@ -18,7 +18,10 @@ theirs = inspect.signature(gsplat.rendering.rasterization)
 @functools.wraps(gsplat.rendering.rasterization)
 def rasterization(*args, **kwargs):
     call = theirs.bind(*args, **kwargs).arguments
-    return autograd.rasterization(**{k: v for k, v in call.items() if k in KNOWN}, backend="torch")
+    renders, alphas, info = autograd.rasterization(**{k: v for k, v in call.items() if k in KNOWN}, backend="torch")
+    if call.get("with_ut"):  # the unscented transform has no gradient of the projected centres
+        info["means2d"] = info["means2d"].detach()
+    return renders, alphas, info
 
 
 class InThisProcess(torch.utils.data.DataLoader):

@@ -55,7 +55,7 @@ class GaussianRasterizer(torch.nn.Module):
             return autograd.draw(rasterizer, splats, camera, offset)
 
         drawn = draw(shs[:, :1], shs[:, 1:bands], background, _InNdc.apply(means2D, w, h))
-        image, radii = drawn.image.permute(2, 0, 1), 3 * drawn.visible.int()
+        image, radii = drawn.image.permute(2, 0, 1).contiguous(), 3 * drawn.visible.int()
         if HOST in ("mip-splatting", "dropgaussian", "lightning"):
             return image, radii
         z = (means3D @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3])[:, 2:].clamp_min(0.2)
