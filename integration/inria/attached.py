@@ -35,6 +35,7 @@ _ROLES: Final[tuple[tuple[str, Role], ...]] = (
     ("_features_dc", "detail"),
 )
 _SAVERS: Final = ("save_ply", "save_fused_ply")
+_FILTER: Final = "compute_3D_filter"
 _STATE: Final = "clear"
 """Key of our state in the optimizer's state, which the host's checkpoints hold."""
 
@@ -99,11 +100,13 @@ class Attached:
             poll_parents=lambda: self._detail.poll_parents(conductor.state_dict),
         )  # fmt: skip
         self._originals = {
-            name: getattr(gaussians, name) for name in (*_SAVERS, "training_setup") if hasattr(gaussians, name)
+            name: getattr(gaussians, name) for name in (*_SAVERS, _FILTER, "training_setup") if hasattr(gaussians, name)
         }
         for name in _SAVERS:
             if name in self._originals:
                 setattr(gaussians, name, functools.partial(self._save_with_detail, self._originals[name]))
+        if _FILTER in self._originals:
+            setattr(gaussians, _FILTER, self._compute_filter_at_hr)
         gaussians.training_setup = self._training_setup
         self._replaced: Replaced | None = None
         self._hooks: list[Any] = []
@@ -175,6 +178,10 @@ class Attached:
         result = self._originals["training_setup"](*args, **kwargs)
         self._hook_optimizer()
         return result
+
+    def _compute_filter_at_hr(self, cameras: Sequence[Any]) -> Any:
+        """Mip-Splatting's 3D filter limits Gaussians to what the finest training camera samples, and that is one at HR."""
+        return self._originals[_FILTER]([enlarged_camera(camera, self.views.factor) for camera in cameras])
 
     def _hook_optimizer(self) -> None:
         for hook in self._hooks:

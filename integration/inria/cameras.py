@@ -43,6 +43,9 @@ class HostViews:
         sr: gives the SR images. factor: HR pixels per LR pixel.
         device: of the Gaussians.
 
+    Attributes:
+        factor: of all views.
+
     Raises:
         SettingError: there is no camera.
         DataError: two cameras have one name; an SR image is missing, or is not `factor` times as large as its photo.
@@ -61,6 +64,7 @@ class HostViews:
                 twice, "training cameras", "two have this name, so their SR images cannot be told apart",
                 "give every photo its own name; this trainer ignores folders",
             )  # fmt: skip
+        self.factor = factor
         self.all = tuple(_host_view(camera, sr, factor, device) for camera in cameras)
         self._by_camera = {id(host_view.camera): host_view for host_view in self.all}
         self._by_name: dict[str | None, HostView] = dict(zip(names, self.all, strict=True))

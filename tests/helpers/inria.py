@@ -10,6 +10,7 @@ from clear_strategies.schedules import WarmupDecay
 FOLDER = Path(__file__).parent / "inria_host"
 N = 24  # Gaussians
 HR_FROM_START = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
+WITHOUT_HR = Objective(lambda_hr=WarmupDecay(peak=0, final=0))
 
 
 def options(host, folder, **settings):

@@ -19,7 +19,7 @@ from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors import Images
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.errors import SettingError
-from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, scaled
+from clear_strategies.schedules import LogLinear, Ramp, scaled
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
@@ -30,9 +30,8 @@ from integration.inria import attach
 from integration.inria.cameras import HostViews, intrinsics
 from integration.model_proxy import enlarged_camera
 from tests.helpers import toy
-from tests.helpers.inria import HR_FROM_START, N, loop, options
+from tests.helpers.inria import HR_FROM_START, WITHOUT_HR, N, loop, options
 
-WITHOUT_HR = Objective(lambda_hr=WarmupDecay(peak=0, final=0))
 STEPS = 25
 
 
@@ -214,63 +213,6 @@ def test_without_a_strategy_the_gradient_is_that_of_the_summed_losses(inria_host
     clear.wrap(inria_host.render)(camera, gaussians, None, None)["render"].sum().backward()
     assert gaussians._features_rest.grad is None
     assert clear.attachment.counts["merges"] == 1
-
-
-@pytest.mark.parametrize("strategies", [(), (GCO(),)], ids=["baseline", "gco"])
-def test_without_a_score_the_densifier_reads_its_own_statistic(strategies, inria_host, inria_capture):
-    """Its threshold is meant for the gradient of the photo; with HR's gradient added, every host would grow more."""
-    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
-    clear = attach(gaussians, scene.cameras, Conductor(*strategies, objective=HR_FROM_START), sr=inria_capture / "sr")
-    read = []
-    for render in (inria_host.render, clear.wrap(inria_host.render)):
-        package = render(scene.cameras[0], gaussians, None, None)
-        inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
-        read.append(package["viewspace_points"].grad)
-    assert clear.attachment.counts["HR renders"] == 1
-    assert torch.equal(*read)
-
-
-def test_with_a_score_as_many_gaussians_pass_the_threshold_as_by_the_hosts_statistic(inria_host, inria_capture):
-    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
-    package = inria_host.render(scene.cameras[0], gaussians, None, None)
-    inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
-    own = package["viewspace_points"].grad[:, :2].norm(dim=1)
-    threshold = float(own.sort(descending=True).values[6:8].mean())  # 7 of 24 pass
-    clear = attach(
-        gaussians, scene.cameras, Conductor(P2G(patch=4), objective=HR_FROM_START), sr=inria_capture / "sr",
-        threshold=threshold,
-    )  # fmt: skip
-    package = clear.wrap(inria_host.render)(scene.cameras[0], gaussians, None, None)
-    inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
-    written = package["viewspace_points"].grad[:, :2].norm(dim=1)
-    assert int((written >= threshold).sum()) == int((own >= threshold).sum()) == 7
-    assert not torch.allclose(written, own)
-
-
-def test_mip_splattings_third_column_holds_the_score_too(inria_host, inria_capture, monkeypatch):
-    """It splits as many Gaussians by the largest absolute gradients as by the gradient, so it must rank by the score."""
-    monkeypatch.setattr(importlib.import_module("gaussian_renderer"), "ABSOLUTE", True)
-    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
-    gaussians.xyz_gradient_accum_abs = torch.zeros(N, 1)
-    clear = attach(gaussians, scene.cameras, Conductor(P2G(patch=4), objective=HR_FROM_START), sr=inria_capture / "sr")
-    package = clear.wrap(inria_host.render)(scene.cameras[0], gaussians, None, None)
-    inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
-    gradient = package["viewspace_points"].grad
-    assert torch.equal(gradient[:, 2], gradient[:, 0])
-    assert float(gradient[:, 2].max()) > 0
-
-
-def test_absolute_gradients_stay_the_hosts_own(inria_host, inria_capture, caplog):
-    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
-    clear = attach(gaussians, scene.cameras, Conductor(P2G(patch=4), objective=HR_FROM_START), sr=inria_capture / "sr")
-    grads = []
-    for render in (inria_host.render, clear.wrap(inria_host.render)):
-        package = render(scene.cameras[0], gaussians, None, None, columns=4)
-        inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
-        grads.append(package["viewspace_points"].grad)
-    assert torch.equal(grads[0][:, 2:], grads[1][:, 2:])
-    assert not torch.equal(grads[0][:, :2], grads[1][:, :2])
-    assert "4 columns" in caplog.text
 
 
 @pytest.mark.parametrize("indices", [False, True])
