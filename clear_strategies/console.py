@@ -19,7 +19,7 @@ _PREFIXES: Final = {logging.WARNING: "warning: ", logging.ERROR: "error: ", logg
 
 
 class Console(logging.StreamHandler[Any]):
-    """Writes messages above a progress bar, warnings and errors with a prefix.
+    """Writes messages above a progress bar, warnings and errors with a prefix; of chatty libraries nothing else.
 
     Args:
         stream: None: stdout.
@@ -29,6 +29,7 @@ class Console(logging.StreamHandler[Any]):
     def __init__(self, stream: TextIO | io.TextIOBase | None = None, *, verbose: bool = False) -> None:
         super().__init__(stream if stream is not None else sys.stdout)
         self.setLevel(logging.DEBUG if verbose else logging.INFO)
+        self.addFilter(lambda record: record.levelno >= logging.WARNING or record.name.split(".")[0] not in _CHATTY)
 
     def format(self, record: logging.LogRecord) -> str:
         return _PREFIXES.get(record.levelno, "") + super().format(record)
@@ -44,5 +45,3 @@ def show(*, verbose: bool = False) -> None:
     logging.basicConfig(handlers=[Console(sys.stderr, verbose=verbose)], level=logging.INFO, format="%(message)s")
     for name in _OURS if verbose else ():
         logging.getLogger(name).setLevel(logging.DEBUG)
-    for name in _CHATTY:
-        logging.getLogger(name).setLevel(logging.WARNING)

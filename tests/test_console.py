@@ -38,6 +38,15 @@ def test_details_are_for_those_who_ask_and_warnings_have_a_prefix(logger, verbos
     assert stream.getvalue() == expected
 
 
+def test_what_chatty_libraries_do_is_not_shown_and_their_warnings_are():
+    stream, server = io.StringIO(), logging.LogRecord("websockets.server", logging.INFO, "", 0, "server listening", None, None)
+    console = Console(stream)
+    console.handle(server)
+    server.levelno = logging.WARNING
+    console.handle(server)
+    assert stream.getvalue() == "warning: server listening\n"
+
+
 def test_a_message_stands_on_a_line_of_its_own_above_the_bar(logger, monkeypatch):
     screen = io.StringIO()
     monkeypatch.setattr(sys, "stderr", screen)
