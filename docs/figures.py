@@ -1,15 +1,14 @@
 """The pictures of the documentation.
 
 `python docs/figures.py` draws those of docs/explanation/evidence-sparse.md from its CSV files. `python docs/figures.py demo`
-trains the demo, as the README's first command does, and makes its contact sheet the README's picture, docs/images/demo.png;
-further words are overrides of the run.
+trains the demo, as the README's first command does, and draws the README's picture of it, docs/images/demo.png; further
+words are overrides of the run.
 """
 
 from __future__ import annotations
 
 import csv
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -140,11 +139,44 @@ def main(folder: Path) -> None:
     changes(folder, "skips_chosen", "left out")
 
 
+# The test view of the README's picture, and the part of it that is magnified: left, top, right, bottom, px.
+VIEW: Final = "demo_08"
+PART: Final = (10, 24, 122, 108)
+
+
 def demo(folder: Path, *overrides: str) -> None:
     with tempfile.TemporaryDirectory() as run:
         command = [sys.executable, "-m", "clear_strategies.run", "+strategy=clear", *overrides, f"hydra.run.dir={run}"]
         subprocess.run(command, cwd=DOCS.parent, check=True)  # noqa: S603 - this interpreter
-        shutil.copyfile(Path(run) / "contact_sheet.png", folder / "demo.png")
+        readme_picture(Path(run), folder / "demo.png")
+
+
+def readme_picture(run: Path, out: Path) -> None:
+    """One test view of a run and of its baseline, whole and a part, beside its LR photo, its SR image and the truth."""
+    panels = {
+        "LR photo": run / "views" / f"{VIEW}_lr.png",
+        "SR image": run / "views" / f"{VIEW}_prior.png",
+        "baseline": run / "baseline" / "renders" / f"{VIEW}.png",
+        "CLEAR": run / "renders" / f"{VIEW}.png",
+        "truth": run / "views" / f"{VIEW}_truth.png",
+    }
+    height, width, _ = plt.imread(panels["truth"]).shape
+    figure, axes = plt.subplots(2, len(panels), figsize=(12, 3.8))
+    for column, (title, file) in enumerate(panels.items()):
+        whole, part = axes[:, column]
+        for axis in (whole, part):
+            axis.imshow(plt.imread(file), extent=(0, width, height, 0), interpolation="nearest")
+            axis.set_axis_off()
+        whole.set_title(title)
+        left, top, right, bottom = PART
+        whole.add_patch(
+            mpl.patches.Rectangle((left, top), right - left, bottom - top, fill=False, color="white", lw=0.8)
+        )
+        part.set_xlim(left, right)
+        part.set_ylim(bottom, top)
+    figure.subplots_adjust(0, 0, 1, 0.93, wspace=0.02, hspace=0.03)
+    figure.savefig(out, dpi=100)
+    plt.close(figure)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,10 @@ def test_details_are_for_those_who_ask_and_warnings_have_a_prefix(logger, verbos
 
 
 def test_what_chatty_libraries_do_is_not_shown_and_their_warnings_are():
-    stream, server = io.StringIO(), logging.LogRecord("websockets.server", logging.INFO, "", 0, "server listening", None, None)
+    stream, server = (
+        io.StringIO(),
+        logging.LogRecord("websockets.server", logging.INFO, "", 0, "server listening", None, None),
+    )
     console = Console(stream)
     console.handle(server)
     server.levelno = logging.WARNING

@@ -321,7 +321,7 @@ def without_numbers(line: str) -> str:
 
 
 @pytest.mark.slow
-def test_the_readmes_picture_is_the_contact_sheet_of_the_demo(tmp_path):
+def test_the_readmes_picture_is_drawn_from_a_run_of_the_demo(tmp_path):
     loaded(DOCS / "figures.py").demo(tmp_path, *(f"{key}={value}" for key, value in TINY.items()))
     with Image.open(tmp_path / "demo.png") as picture, Image.open(DOCS / "images" / "demo.png") as shown:
         assert picture.width > picture.height
