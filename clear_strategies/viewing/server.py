@@ -10,6 +10,7 @@ import io
 import logging
 import math
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -131,6 +132,8 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         self._screen, self._names = screen, tuple(names)
         self._around = around if around is not None else lambda draw: draw()
         self._failed: str | None = None
+        # A browser that goes away while its picture is drawn.
+        warnings.filterwarnings("ignore", message=".*it will never be delivered")
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its address; whoever opens it does
             server = viser.ViserServer(host=host, port=port, verbose=False, label=title)
         aim(server, [saved.camera for saved in screen.cameras])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 import sqlite3
 import tempfile
 import threading
@@ -210,12 +211,15 @@ def _progress(database: Path, table: str, what: str, unit: str, total: int) -> I
 
 
 def _pycolmap() -> Any:
+    terminated = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError as error:
         raise DataError(
             "data=photos", "pycolmap", f"cannot be imported ({error})", "pip install 'clear-strategies[colmap]'"
         ) from error
+    if terminated is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, terminated)  # the import sets one that prints a stack trace
     return pycolmap
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -83,6 +85,13 @@ def test_without_pycolmap_the_extra_is_named(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(DataError, match=r"clear-strategies\[colmap\]"):
         photos.read(flat_photos(tmp_path / "photos", 3), tmp_path / "cache")
+
+
+def test_a_run_that_is_terminated_while_it_reads_photos_ends_without_a_stack_trace() -> None:
+    program = "import os, signal; from clear_strategies.data.readers import sfm; sfm._pycolmap(); "
+    command = [sys.executable, "-c", f"{program}os.kill(os.getpid(), signal.SIGTERM)"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (-signal.SIGTERM, "")
 
 
 def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_takes_them() -> None:
