@@ -157,6 +157,7 @@ class Attached:
             module.gaussian_model, _ROLES, self._host_params, self._detail if settings.detail else None, self._conductor
         )
         self._views_from_dataset(module.trainer.train_dataloader.dataset)
+        self._filter_at_hr()
         attachment = Attachment(
             self._conductor, self._renderer.params, n_views=len(self._views), seed=settings.seed, threshold=threshold,
             poll_parents=lambda: self._detail.poll_parents(self._conductor.state_dict),
@@ -176,6 +177,13 @@ class Attached:
         names = model.get_property_names
         model.get_property_names = lambda: (*names(), ROWS)
         return RowNumbers(model.gaussians, lambda: self._host_params()["means"])
+
+    def _filter_at_hr(self) -> None:
+        """Mip-Splatting's 3D filter limits Gaussians to what the finest training camera samples, and that is one at HR."""
+        model = self._module.gaussian_model
+        if hasattr(model, "_train_camera_set") and hasattr(model, "compute_3d_filter"):
+            model._train_camera_set = [enlarged_camera(camera, self._factor) for camera in model._train_camera_set]
+            model.compute_3d_filter()
 
     def _host_params(self) -> dict[str, Tensor]:
         gaussians = self._module.gaussian_model.gaussians

@@ -92,6 +92,8 @@ def test_one_line_does_the_same_as_none(host, scene, tmp_path):
     launched(host, scene, tmp_path / "none")
     one, none = stored(tmp_path / "one"), stored(tmp_path / "none")
     assert all(torch.allclose(one[name], none[name], atol=1e-4) for name in none)
+    file = next((tmp_path / "one" / "ckpts").glob("*.pt"))
+    assert "PSNR" in start(host, edited, "default", *training(scene, tmp_path / "again"), "--ckpt", file)
 
 
 def test_a_view_is_recognised_while_its_pose_moves(host, scene, tmp_path):

@@ -184,6 +184,18 @@ def test_a_masked_pixel_is_hidden_at_both_scales(host, sr):
     assert attachment_of(module).log["base"] == 0
 
 
+def test_mip_splattings_filter_is_that_of_the_hr_cameras(host, sr):
+    module = host.splatting.GaussianSplatting(
+        host.scene.cloud, host.controller(sr=sr, suffix="_x4"), host.splatting.Renderer()
+    )
+    model, widths = module.gaussian_model, []
+    model._train_camera_set = [camera for _, camera, _ in host.photos]
+    model.compute_3d_filter = lambda: widths.extend(int(camera.width) for camera in model._train_camera_set)
+    host.splatting.fit(module, host.photos, 1)
+    assert widths == [96, 96, 96]
+    assert int(host.photos[0][1].width) == 24
+
+
 def test_losses_of_hr_are_in_the_hosts_log(host, sr):
     module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=HR_FROM_START), 3)
     assert float(module.logged["clear_base"]) > 0
