@@ -447,7 +447,9 @@ def test_pictures_are_drawn_from_the_tables(tmp_path):
 
 def test_numbers_of_a_summary_are_those_of_its_table():
     """Every row of a small table on the evidence pages stands in the CSV file that is linked below it."""
-    page = "".join((DOCS / "explanation" / name).read_text() for name in ("evidence.md", "evidence-sparse.md"))
+    page = "".join(
+        (DOCS / "explanation" / name).read_text() for name in ("evidence.md", "evidence-sparse.md", "evidence-hosts.md")
+    )
     checked = 0
     for section in page.split("\n## ")[1:]:
         table = re.search(r"^\|.*\n\|[-|]+\|\n((?:\|.*\n)+)", section, re.MULTILINE)

@@ -122,17 +122,14 @@ def test_a_random_background_is_the_same_at_both_scales(host, scene, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "model", "message"),
+    ("options", "message"),
     [
-        (["--trainer.precision", "bf16-mixed"], {}, "gradients are merged in 32 bits, got precision=bf16-mixed"),
-        (["--trainer.devices", "2"], {}, "one process trains, got 2"),
-        ([], {"renderer": "AppearanceMLPRenderer"}, "trains an appearance model of its own"),
+        (["--trainer.precision", "bf16-mixed"], "gradients are merged in 32 bits, got precision=bf16-mixed"),
+        (["--trainer.devices", "2"], "one process trains, got 2"),
     ],
-    ids=["precision", "processes", "appearance"],
+    ids=["precision", "processes"],
 )
-def test_settings_that_do_not_work_with_two_scales_are_refused_at_the_start(
-    host, scene, tmp_path, options, model, message
-):
-    said = train(host, scene, tmp_path / "run", *options, model=model, status=1)
+def test_settings_that_do_not_work_with_two_scales_are_refused_at_the_start(host, scene, tmp_path, options, message):
+    said = train(host, scene, tmp_path / "run", *options, status=1)
     assert message in said
     assert not (tmp_path / "run" / "run" / "point_cloud").exists()
