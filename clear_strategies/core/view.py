@@ -68,6 +68,8 @@ class View:
         truth: the real photo at HR, for evaluation only; training never uses it.
         sr_source: the prior's label, e.g. "onnx span_x4.onnx".
         depth: of the LR photo's surfaces, from stereo; None where nobody asked for it, e.g. in test views.
+        disagreement: |D(I) - I_LR| of the SR image I as the prior made it, where `hr` is I moved until it agrees with the
+            photo (data.views.back_projection): what I got wrong still tells how far to believe it. None where `hr` is I.
     """
 
     name: str
@@ -76,6 +78,7 @@ class View:
     truth: Float[Tensor, "H W 3"] | None = None
     sr_source: str = "unknown"
     depth: DepthMap | None = None
+    disagreement: Float[Tensor, "h w 3"] | None = None
 
     @property
     def factor(self) -> int:
@@ -86,4 +89,7 @@ class View:
         """The same view with its images on `device`."""
         truth = None if self.truth is None else self.truth.to(device)
         depth = None if self.depth is None else self.depth.to(device)
-        return replace(self, lr=self.lr.to(device), hr=self.hr.to(device), truth=truth, depth=depth)
+        disagreement = None if self.disagreement is None else self.disagreement.to(device)
+        return replace(
+            self, lr=self.lr.to(device), hr=self.hr.to(device), truth=truth, depth=depth, disagreement=disagreement
+        )

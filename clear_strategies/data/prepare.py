@@ -306,8 +306,9 @@ def _view(
 
 def _agreeing(view: View, views: ViewSettings) -> View:
     """The view, its SR image back-projected to its LR photo."""
+    disagreement = (images.downsample(view.hr.image, view.factor, views.downsample) - view.lr.image).abs()
     sr = images.back_projected(view.hr.image, view.lr.image, view.factor, views.back_projection, views.downsample)
-    return replace(view, hr=Photo(view.hr.camera, images.quantize(sr)))
+    return replace(view, hr=Photo(view.hr.camera, images.quantize(sr)), disagreement=disagreement)
 
 
 def _disagreement(views: Sequence[View], down: DownKernel) -> float:

@@ -37,10 +37,10 @@ class P2G(Strategy):
     """Weigh SR detail by evidence.
 
     Args:
-        agreement: what R measures. "photo": the SR image agrees with its own LR photo (the paper); "views": its detail agrees
-            with that of other training views' SR images, at the place that the depth says; "both": the product. The
-            last two need depth (data.cloud.init=stereo); patches that no other view shows keep the photo's R times the
-            mean agreement of the view's other patches.
+        agreement: what R measures. "photo": the SR image, as the prior made it, agrees with its own LR photo (the paper);
+            "views": its detail agrees with that of other training views' SR images, at the place that the depth says;
+            "both": the product. The last two need depth (data.cloud.init=stereo); patches that no other view shows keep the
+            photo's R times the mean agreement of the view's other patches.
         reliability_scale: τ_r > 0, the mean |D(I_HR) - I_LR| (images in [0, 1]) at which R falls to 1/e; "relative:k" is k
             times the view's own mean, so that R covers its range whatever the prior is.
         floor: q_min in [0, 1], the share of its high-frequency gradient that every Gaussian keeps.
@@ -153,7 +153,7 @@ class P2G(Strategy):
     def _patches(self, view: View) -> tuple[Tensor, Tensor]:
         R, A = patch_evidence(
             view.lr.image, view.hr.image, view.factor, self.patch, self.reliability_scale, self.detail_eps, self.down,
-            self.up,
+            self.up, view.disagreement,
         )  # fmt: skip
         of_views = self._of_views(view)
         if of_views is None:
@@ -186,9 +186,11 @@ def patch_evidence(
     detail_eps: float = 1e-4,
     down: DownKernel = "bicubic",
     up: UpKernel = "bicubic",
+    disagreement: Float[Tensor, "h w 3"] | None = None,
 ) -> tuple[Float[Tensor, "ph pw"], Float[Tensor, "ph pw"]]:
     """R_p, agreement with the LR photo, and A_p, share of detail relative to twice the image's mean.  Eq. 9
 
+    R is that of `disagreement`, where it is given, in place of |D(I_HR) - I_LR|: see `View.disagreement`.
     A is 0 in a flat image, and 1/2 in a patch with the image's mean detail.
 
     Raises:
@@ -199,7 +201,8 @@ def patch_evidence(
         if not (low >= -1e-3 and high <= 1 + 1e-3):
             raise ValueError(f"{name} must lie in [0, 1], got {low:.3g}..{high:.3g}. Divide 8-bit values by 255.")
     reduced = downsample(hr, factor, down)
-    disagreement = (reduced - lr).abs()
+    if disagreement is None:
+        disagreement = (reduced - lr).abs()
     R = torch.exp(-patch_means(disagreement, patch) / _tau_r(reliability_scale, float(disagreement.mean())))
     # All kernels of D but "area" round to 8 bits. What that loses of an SR image with more of them is no detail.
     shown = hr if down == "area" else quantize(hr)

@@ -17,6 +17,7 @@ from clear_strategies.data.prepare import ViewSettings, check_headers, lr_size, 
 from clear_strategies.data.priors import Bicubic, DemoPrior
 from clear_strategies.data.readers import demo
 from clear_strategies.errors import DataError, SettingError
+from clear_strategies.strategies.p2g import P2G
 from rasterizers import Camera
 
 # Training indices among the n photos of each LLFF scene, and the number of test views: the 3-view protocol of RegNeRF,
@@ -234,3 +235,17 @@ def test_back_projected_sr_images_shrink_to_the_photos():
     assert moved < 0.2 * disagreement(0)[0]
     assert said is not None
     assert said.startswith("SR images differed from the LR photos by ")
+
+
+def test_how_far_a_back_projected_sr_image_was_from_its_photo_is_kept():
+    capture = demo.read(width=64, height=48, views=5, train=2)
+    prior = DemoPrior({f.name: f.load for f in capture.frames}, share=0.5, patch=16)
+    made, moved = (prepare(capture, papers(train=2, back_projection=rounds), prior, POINTS).train for rounds in (0, 10))
+    assert all(view.disagreement is None for view in made)
+    for before, after in zip(made, moved, strict=True):
+        wrong = (images.downsample(before.hr.image, before.factor) - before.lr.image).abs()
+        assert torch.equal(after.disagreement, wrong)
+        R = [P2G(patch=4).patch_maps(v).reliability for v in (before, after, replace(after, disagreement=None))]
+        assert torch.equal(R[0], R[1])
+        assert float(R[0].min()) < 0.1  # what was wrong is still known, and would not be without
+        assert float(R[2].min()) > 0.9
