@@ -70,6 +70,8 @@ def _rows(part: str, evaluation: Evaluation, baseline: Baseline | None) -> Itera
         yield "ours", _numbers(ours)
     if ours is not None and theirs is not None:
         yield OURS_MINUS_BASELINE, _numbers(_difference(ours, theirs), "+")
+    if "LR" in evaluation.against.get(part, ""):
+        return  # they are made from the very photos that they would be compared with
     for image in ("bicubic", "prior"):
         if (mean := evaluation.mean(part, image)) is not None:
             yield image, _numbers(mean)

@@ -52,6 +52,14 @@ def test_the_note_is_for_the_images_that_it_is_about() -> None:
     assert NOTE not in describe(Path("run"), Evaluation({"view": {"ours": OURS}}, {}, {}, {}), 1.0)
 
 
+def test_an_sr_image_is_not_compared_with_the_photo_that_it_is_made_of() -> None:
+    text = describe(Path("run"), Evaluation({}, TABLE, {"train": "LR photos"}, {}), 1.0)
+    words = [line.split() for line in text.splitlines()]
+    assert [image for part, image, *_ in words if part == "train"] == ["ours"]
+    assert NOTE not in text
+    assert "nobody knows the HR photos" in text
+
+
 @pytest.mark.parametrize(("means", "said"), [({"test": THEIRS}, ", test views 23.09 dB"), ({}, "")])
 def test_the_baseline_is_told_in_one_line(means: dict[str, ImageScores], said: str) -> None:
     told = describe_baseline(Baseline(Path("run/baseline"), means, {}, 11.2))
