@@ -138,9 +138,6 @@ def load(path: Path) -> Checkpoint:
     Raises:
         DataError: nothing is there, a file is missing or altered, or the format is newer than this version.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load as from_bytes
-
     path = _newest(path)
     manifest = _manifest(path)
     files = {}
@@ -148,10 +145,7 @@ def load(path: Path) -> Checkpoint:
         files[name] = _read(path / name)
         if hashlib.sha256(files[name]).hexdigest() != manifest["sha256"][name]:
             raise DataError(path / name, "sha256", "is not what the manifest says: the file was altered", _USE_ANOTHER)
-    try:
-        tensors = from_bytes(files[_TENSORS])
-    except (SafetensorError, ValueError, KeyError, AttributeError, RuntimeError) as error:
-        raise DataError(path / _TENSORS, "tensors", f"are no safetensors ({error})", _USE_ANOTHER) from error
+    tensors = tensors_of(path / _TENSORS, files[_TENSORS])
     history = _json(path / _HISTORY, files[_HISTORY])
     shapes.require(path / _HISTORY, history, _HISTORY_SHAPE, _USE_ANOTHER)
     return Checkpoint(
@@ -163,6 +157,21 @@ def load(path: Path) -> Checkpoint:
         work_log=manifest["work_log"],
         device=manifest["device"],
     )
+
+
+def tensors_of(file: Path, data: bytes) -> dict[str, Tensor]:
+    """The content of a tensors.safetensors.
+
+    Raises:
+        DataError: it is damaged.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load as from_bytes
+
+    try:
+        return from_bytes(data)
+    except (SafetensorError, ValueError, KeyError, AttributeError, RuntimeError) as error:
+        raise DataError(file, "tensors", f"are no safetensors ({error})", _USE_ANOTHER) from error
 
 
 _USE_ANOTHER: Final = "resume from another checkpoint of the run, or start a new run"

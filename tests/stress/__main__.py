@@ -55,9 +55,10 @@ def _projection(options: argparse.Namespace, _: Path) -> Iterator[Row]:
         yield from projection.measure(name, make(**_CLEAN), every=options.every)
 
 
-def _fuzz(options: argparse.Namespace, folder: Path) -> Iterator[Row]:
-    yield from fuzz.measure(fuzz.binary(folder / "binary"), options.mutants, goal=10**7)
-    yield from fuzz.measure(fuzz.scenes(folder / "scenes"), options.mutants // 20, goal=10**7 // 20)
+def _fuzz(options: argparse.Namespace, _: Path) -> Iterator[Row]:
+    for targets, fewer in ((fuzz.binary, 1), (fuzz.text, 20), (fuzz.scenes, 200)):
+        count, goal = max(1, options.mutants // fewer), 10**7 // fewer
+        yield from fuzz.measure(targets, count, goal=goal, processes=options.processes)
 
 
 def _sanitizers(options: argparse.Namespace, folder: Path) -> Iterable[Row]:
@@ -90,6 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=list(MEASUREMENTS), help="some of them")
     parser.add_argument("--every", type=int, default=1, help="every n-th of the 13,923 single Gaussians (%(default)s)")
     parser.add_argument("--mutants", type=int, default=10**7, help="mutants per binary format (%(default)s)")
+    parser.add_argument("--processes", type=int, default=1, help="that read mutants at the same time (%(default)s)")
     parser.add_argument("--examples", type=int, default=500, help="runs in random order (%(default)s)")
     parser.add_argument("--kills", type=int, default=200, help="SIGKILLs of a run (%(default)s)")
     parser.add_argument("--iterations", type=int, default=10_000, help="of the soak (%(default)s)")

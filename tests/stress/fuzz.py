@@ -1,18 +1,32 @@
-"""Random damage to the files that are read: what comes back is sound or a DataError, at once and in little memory."""
+"""Random damage to the files that are read: what comes back is sound or a DataError, at once and in little memory.
+
+Mutants come in blocks, each with a seed of its own, so that any number of processes makes the same ones: `mutants("PLY", 3,
+good)` gives those of the format's fourth block again.
+"""
 
 from __future__ import annotations
 
+import io
+import logging
+import math
+import multiprocessing
+import os
 import random
 import resource
+import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from functools import cache
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from clear_strategies.data import ply
+from clear_strategies.data.cameras import Lens
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.readers import colmap, colmap_model, llff, nerfstudio
@@ -20,83 +34,84 @@ from clear_strategies.errors import DataError
 from clear_strategies.training import checkpoint
 from tests.helpers.malformed import GOOD
 from tests.stress.faults import small
-from tests.stress.rows import Row, Worst
+from tests.stress.rows import Row
 
 _SECONDS = 0.1  # that one input may take
 _MEMORY = 2**30  # bytes beyond those of before
+_BLOCK = 10_000  # mutants
 _EXTREMES = (b"\0", b"\x7f", b"\x80", b"\xff")
+_LONGEST = 8  # bytes of one edit
+
+_log = logging.getLogger("tests.stress")
+
+Target = tuple[Sequence[Path], Callable[[], None]]
+"""The files of which one is damaged, and what reads them and checks what comes back."""
+Targets = Callable[[Path], dict[str, Target]]
+"""Writes good files to a folder: format -> target."""
 
 
-def mutant(good: bytes, rng: random.Random) -> bytes:
+def mutants(name: str, block: int, good: Sequence[bytes]) -> Iterator[tuple[int, bytes]]:
+    """(which of the `good` files, its damaged content), without end."""
+    rng = random.Random(f"{name} {block}")  # noqa: S311 - no secret
+    while True:
+        which = int(rng.random() * len(good))
+        yield which, _mutant(good[which], rng.random)
+
+
+def _mutant(good: bytes, uniform: Callable[[], float]) -> bytes:
     """One to three edits: a bit flipped, bytes overwritten, repeated, removed, or the rest cut off."""
     data = bytearray(good)
-    for _ in range(rng.randint(1, 3)):
-        at, length = rng.randrange(max(1, len(data))), rng.randint(1, 8)
-        match rng.randrange(8):
-            case 0 | 1 | 2 if data:
-                data[at] ^= 1 << rng.randrange(8)
-            case 3 | 4:
-                data[at : at + length] = rng.choice(_EXTREMES) * length
-            case 5:
-                data[at:at] = data[at : at + length]
-            case 6:
-                del data[at : at + length]
-            case _:
-                if rng.randrange(4) == 0:
-                    del data[at:]
+    for _ in range(1 + int(3 * uniform())):
+        if not data:
+            break
+        at, length, edit = int(uniform() * len(data)), 1 + int(uniform() * _LONGEST), 8 * uniform()
+        if edit < 3:
+            data[at] ^= 1 << int(uniform() * 8)
+        elif edit < 5:
+            data[at : at + length] = _EXTREMES[int(uniform() * len(_EXTREMES))] * length
+        elif edit < 6:
+            data[at:at] = data[at : at + length]
+        elif edit < 7:
+            del data[at : at + length]
+        elif uniform() < 0.25:
+            del data[at:]
     return bytes(data)
 
 
-Target = tuple[Path, Callable[[], None]]
-
-
 def binary(folder: Path) -> dict[str, Target]:
-    """Binary format -> the file to damage, and what reads it and checks what comes back."""
-    scene, table = GOOD["colmap"](folder / "colmap"), GOOD["llff"](folder / "llff")
-    model = scene / "sparse" / "0"
+    """Each binary format by its own reader."""
+    model, table = GOOD["colmap"](folder / "colmap") / "sparse" / "0", GOOD["llff"](folder / "llff")
+    cameras, images, points = (model / f"{name}.bin" for name in ("cameras", "images", "points3D"))
+    bounds, cloud = table / "poses_bounds.npy", folder / "cloud.ply"
+    ply.write_gaussians(cloud, _gaussians(20))
+    saved = checkpoint.save(folder / "checkpoints", small(100, 1.0))
+    manifest, tensors = saved / "manifest.json", saved / "tensors.safetensors"
 
-    def read_colmap() -> None:
-        found = colmap_model.read_model(model)
-        for image in found.images:
-            pose = colmap_model.pose_of(image)
-            _require(bool(pose.isfinite().all()) and image.camera in found.lenses)
-        _require(bool(np.isfinite(found.points.means).all()))
-
-    cloud = folder / "cloud.ply"
-    n = 20
-    numbers = torch.linspace(-1, 1, n * 3).view(n, 3)
-    ply.write_gaussians(
-        cloud,
-        ply.GaussianPly(
-            numbers, numbers[:, None], numbers[:, None].repeat(1, 3, 1), numbers[:, 0], numbers, torch.ones(n, 4)
-        ),
-    )
-
-    def read_ply() -> None:
+    def read_gaussians() -> None:
         found = ply.read_gaussians(cloud)
         _require(bool(found.means.isfinite().all()) and len(found.opacities) == len(found.means))
-
-    saved = checkpoint.save(folder / "checkpoints", small(100, 1.0))
 
     def read_checkpoint() -> None:
         found = checkpoint.load(saved)
         _require(bool((found.tensors["field/means"] == 1.0).all()) and found.t == 100)
 
     return {
-        **{f"COLMAP {name}.bin": (model / f"{name}.bin", read_colmap) for name in ("cameras", "images", "points3D")},
-        "poses_bounds.npy": (
-            table / "poses_bounds.npy",
-            lambda: _require(llff.read(table, poses="poses_bounds") is not None),
-        ),
-        "PLY": (cloud, read_ply),
-        "checkpoint manifest": (saved / "manifest.json", read_checkpoint),
-        "checkpoint tensors": (saved / "tensors.safetensors", read_checkpoint),
+        "COLMAP cameras.bin": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras).values())),
+        "COLMAP images.bin": ([images], lambda: _require_images(colmap_model.read_images(images))),
+        "COLMAP points3D.bin": ([points], lambda: _require_points(colmap_model.read_points(points))),
+        "poses_bounds.npy": ([bounds], lambda: _require(bool(np.isfinite(llff.read_bounds(bounds)).all()))),
+        "PLY": ([cloud], read_gaussians),
+        "checkpoint manifest": ([manifest], read_checkpoint),
+        "checkpoint tensors": ([tensors], read_checkpoint),
+        # What a program with the manifest's hash at hand could have written.
+        "checkpoint tensors with their hash": ([tensors], lambda: checkpoint.tensors_of(tensors, tensors.read_bytes())),
     }
 
 
-def scenes(folder: Path) -> dict[str, Target]:
-    """Text and images, read as parts of a whole scene, which takes a millisecond and more."""
-    text, shared = GOOD["colmap_txt"](folder / "txt"), GOOD["nerfstudio"](folder / "nerfstudio")
+def text(folder: Path) -> dict[str, Target]:
+    """COLMAP's text files by their own readers; and PNG, whose decoder is a library."""
+    model = GOOD["colmap_txt"](folder / "txt") / "sparse" / "0"
+    cameras, images, points = (model / f"{name}.txt" for name in ("cameras", "images", "points3D"))
     photo = GOOD["colmap"](folder / "photo") / "images" / "b.png"
 
     def read_photo() -> None:
@@ -104,14 +119,56 @@ def scenes(folder: Path) -> dict[str, Target]:
         _require(image.dim() == 3 and bool(image.isfinite().all()))
 
     return {
-        **{f"COLMAP {name}.txt": (text / "sparse" / "0" / f"{name}.txt", lambda: _require_sound(colmap.read(text)))
-           for name in ("cameras", "images", "points3D")},
-        "transforms.json": (shared / "transforms.json", lambda: _require_sound(nerfstudio.read(shared))),
-        "PNG": (photo, read_photo),
-    }  # fmt: skip
+        "COLMAP cameras.txt": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras).values())),
+        "COLMAP images.txt": ([images], lambda: _require_images(colmap_model.read_images(images))),
+        "COLMAP points3D.txt": ([points], lambda: _require_points(colmap_model.read_points(points))),
+        "PNG": ([photo], read_photo),
+    }
 
 
-def _require_sound(capture: Capture) -> None:
+def scenes(folder: Path) -> dict[str, Target]:
+    """Whole scenes, one file of which is damaged: the parts must fit together. Reading one takes a millisecond and more."""
+    roots = {name: GOOD[name](folder / name) for name in ("colmap", "colmap_txt", "llff", "nerfstudio")}
+    reads = {"colmap": colmap.read, "colmap_txt": colmap.read, "llff": llff.read, "nerfstudio": nerfstudio.read}
+    labels = {
+        "colmap": "scene of COLMAP's binary files",
+        "colmap_txt": "scene of COLMAP's text files",
+        "llff": "scene of LLFF",
+        "nerfstudio": "scene of transforms.json",
+    }
+
+    def target(name: str) -> Target:
+        files = [path for path in sorted(roots[name].rglob("*")) if path.is_file() and "images" not in path.parent.name]
+        return files, lambda: _require_capture(reads[name](roots[name]))
+
+    return {labels[name]: target(name) for name in roots}
+
+
+def _gaussians(n: int) -> ply.GaussianPly:
+    numbers = torch.linspace(-1, 1, n * 3).view(n, 3)
+    rest = numbers[:, None].repeat(1, 3, 1)
+    return ply.GaussianPly(numbers, numbers[:, None], rest, numbers[:, 0], numbers, torch.ones(n, 4))
+
+
+def _require_lenses(lenses: Iterable[Lens]) -> None:
+    for lens in lenses:
+        _require(0 < lens.width < 2**20 and 0 < lens.height < 2**20 and lens.fx > 0 and lens.fy > 0)
+        _require(all(map(math.isfinite, (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion))))
+
+
+def _require_images(images: Sequence[colmap_model.Image]) -> None:
+    for image in images:
+        _require(all(map(math.isfinite, image.translation)) and 0.5 < math.hypot(*image.quat) < 2)
+    _require(len({image.id for image in images}) == len(images))
+
+
+def _require_points(points: colmap_model.Points) -> None:
+    n = len(points.means)
+    _require(bool(np.isfinite(points.means).all()) and len(points.colors) == n)
+    _require(not len(points.track) or 0 <= points.track[:, 0].min() <= points.track[:, 0].max() < n)
+
+
+def _require_capture(capture: Capture) -> None:
     for frame in capture.frames:
         rotation = frame.camera.world_to_camera[:3, :3]
         _require(float((rotation @ rotation.T - torch.eye(3).to(rotation)).abs().max()) < 1e-6)
@@ -120,16 +177,65 @@ def _require_sound(capture: Capture) -> None:
         _require(set(capture.points.track_image.tolist()) <= {frame.sfm_id for frame in capture.frames})
 
 
-def measure(targets: dict[str, Target], mutants: int, *, seed: int = 0, goal: int = 0) -> Iterator[Row]:
-    """How many mutants of each format gave an unsound result, another error, took too long or too much memory."""
-    with _bounded_memory():
-        for name, (file, read) in targets.items():
-            good, rng, bad = file.read_bytes(), random.Random(seed), Worst()  # noqa: S311 - no secret
-            for i in range(mutants):
-                file.write_bytes(mutant(good, rng))
-                bad.add(_fails(read), f"mutant {i} of seed {seed}")
-            file.write_bytes(good)
-            yield bad.row(f"damaged {name}: unsound, untyped or slow", "all", 0, goal)
+def measure(
+    targets: Targets, count: int, *, only: Sequence[str] = (), goal: int = 0, processes: int = 1
+) -> Iterator[Row]:
+    """How many of the first `count` mutants of each format gave an unsound result, another error, or took too much.
+
+    Args:
+        only: some of the formats; empty: all. processes: beyond 1, each reads blocks of its own.
+    """
+    for name in only or _written(targets)[1]:
+        began = time.monotonic()
+        blocks = [(targets, name, i, min(_BLOCK, count - i * _BLOCK)) for i in range(-(-count // _BLOCK))]
+        if processes == 1:
+            found = [_block(*block) for block in blocks]
+        else:
+            with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+                found = list(pool.map(_block, *zip(*blocks, strict=True)))
+        _log.info("%s: %.0f us each", name, (time.monotonic() - began) / count * 1e6)
+        failed, where = sum(n for n, _ in found), next((where for n, where in found if n), "none")
+        yield Row(f"damaged {name}: unsound, untyped or slow", "all", count, float(failed), 0, where, goal)
+
+
+def _block(targets: Targets, name: str, block: int, count: int) -> tuple[int, str]:
+    """How many of a block's first `count` mutants failed, and which was the first."""
+    paths, read = _written(targets)[1][name]
+    read()  # the first call imports and allocates what later ones do not
+    good, failed, first = [path.read_bytes() for path in paths], 0, "none"
+    with _bounded_memory(), _without_messages(), ExitStack() as stack:
+        files = [stack.enter_context(path.open("r+b", buffering=0)) for path in paths]
+        for i, (which, data) in enumerate(islice(mutants(name, block, good), count)):
+            _replace(files[which], data)
+            if _fails(read):
+                failed, first = failed + 1, f"mutant {i} of block {block}" if failed == 0 else first
+            _replace(files[which], good[which])
+    return failed, first
+
+
+@cache
+def _written(targets: Targets) -> tuple[tempfile.TemporaryDirectory[str], dict[str, Target]]:
+    """The targets, in a folder that is removed when the process ends; in memory where the system has such folders."""
+    memory = "/dev/shm"  # noqa: S108 - a name of its own is made in it
+    folder = tempfile.TemporaryDirectory(dir=memory if os.access(memory, os.W_OK) else None)
+    return folder, targets(Path(folder.name))
+
+
+def _replace(file: io.FileIO, data: bytes) -> None:
+    file.seek(0)
+    file.write(data)
+    file.truncate()
+
+
+@contextmanager
+def _without_messages() -> Iterator[None]:
+    """A warning for each mutant takes longer than the mutant."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 @contextmanager
@@ -144,15 +250,15 @@ def _bounded_memory() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-def _fails(read: Callable[[], None]) -> float:
+def _fails(read: Callable[[], None]) -> bool:
     began = time.process_time()
     try:
         read()
     except DataError:
         pass
     except Exception:
-        return 1.0
-    return float(time.process_time() - began > _SECONDS)
+        return True
+    return time.process_time() - began > _SECONDS
 
 
 def _require(holds: bool) -> None:

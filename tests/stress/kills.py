@@ -35,7 +35,7 @@ _RUN = [
     "fit.resume=auto", "fit.threads=1", "density.max_gaussians=300",
 ]  # fmt: skip
 # Drawn by matplotlib in nine tenths of so short a run, and written by the same function as the other files.
-_PICTURES = ("write_curves", "write_contact_sheet")
+_PICTURES = ("write_curves", "write_contact_sheet", "write_depths")
 _MOST_KILLS = 6  # of one run, before it may end
 
 

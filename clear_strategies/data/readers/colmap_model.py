@@ -10,7 +10,7 @@ import logging
 import math
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -98,9 +98,8 @@ def read_model(folder: Path) -> Model:
     """
     binary = any((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D"))
     ending = ".bin" if binary else ".txt"
-    cameras, images = (_cameras_bin, _images_bin) if binary else (_cameras_txt, _images_txt)
-    lenses = cameras(folder / f"cameras{ending}")
-    registered = images(folder / f"images{ending}")
+    lenses = read_cameras(folder / f"cameras{ending}")
+    registered = read_images(folder / f"images{ending}")
     if not registered:
         raise DataError(folder / f"images{ending}", "images", "there is none", "run COLMAP's mapper to its end")
     for image in registered:
@@ -109,15 +108,42 @@ def read_model(folder: Path) -> Model:
                 folder / f"images{ending}", image.name, f"has the unknown camera {image.camera}", _WRITE_AGAIN
             )
     file = folder / f"points3D{ending}"
-    points = Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.int64))
     if not file.exists():
         _log.debug("%s has no %s: the capture has no points.", folder, file.name)
+        points = _checked_points(file, set(), [], [], [])
     else:
-        points = _points_bin(file) if binary else _points_txt(file)
+        points = read_points(file)
         unknown = np.setdiff1d(points.track[:, 1], [image.id for image in registered])
         if len(unknown):
             raise DataError(file, "track", f"names the unknown image {unknown[0]}", _WRITE_AGAIN)
     return Model(folder, ending, lenses, registered, points)
+
+
+def read_cameras(file: Path) -> dict[int, Lens]:
+    """cameras.bin or cameras.txt: the lens of each camera by its id.
+
+    Raises:
+        DataError: the file is not what it should be.
+    """
+    return _cameras_bin(file) if file.suffix == ".bin" else _cameras_txt(file)
+
+
+def read_images(file: Path) -> list[Image]:
+    """images.bin or images.txt.
+
+    Raises:
+        DataError: the file is not what it should be.
+    """
+    return _images_bin(file) if file.suffix == ".bin" else _images_txt(file)
+
+
+def read_points(file: Path) -> Points:
+    """points3D.bin or points3D.txt.
+
+    Raises:
+        DataError: the file is not what it should be.
+    """
+    return _points_bin(file) if file.suffix == ".bin" else _points_txt(file)
 
 
 def pose_of(image: Image) -> Float[Tensor, "4 4"]:
@@ -214,19 +240,17 @@ def _images_bin(path: Path) -> list[Image]:
 def _points_bin(path: Path) -> Points:
     file = _Bytes(path)
     n = file.count("number of points", 8 + 24 + 3 + 8 + 8)
-    means, colors, track, ids = np.zeros((n, 3)), np.zeros((n, 3), np.uint8), [], set()
+    means, colors, track, ids = [], [], [], set()
     for i in range(n):
         number, x, y, z, r, g, b, _ = file.take("<Q3d3Bd", f"point {i}")
-        means[i], colors[i] = (x, y, z), (r, g, b)
+        means.append((x, y, z))
+        colors.append((r, g, b))
         ids.add(number)
         length = file.count(f"track of point {i}", 8)
-        entries = np.frombuffer(file.data, "<i4", 2 * length, file.at).reshape(-1, 2)[:, 0]
+        track.append(np.frombuffer(file.data, "<i4", 2 * length, file.at)[::2])
         file.skip(8 * length)
-        track.append(np.stack((np.full(length, i), entries), axis=1).astype(np.int64))
     file.finish()
-    if len(ids) != n:
-        raise DataError(path, "point id", "occurs twice", _WRITE_AGAIN)
-    return _checked_points(path, means, colors, track)
+    return _checked_points(path, ids, means, colors, track)
 
 
 def _cameras_txt(path: Path) -> dict[int, Lens]:
@@ -269,7 +293,7 @@ def _images_txt(path: Path) -> list[Image]:
 
 
 def _points_txt(path: Path) -> Points:
-    means, colors, track, ids = [], [], [], set()
+    means, colors, track, ids = list[list[float]](), list[list[int]](), [], set()
     for line, cells in _lines(path):
         if len(cells) < 8 or len(cells) % 2:
             raise DataError(path, f"line {line}", f"has {len(cells)} columns where 8 and pairs belong", _WRITE_AGAIN)
@@ -279,19 +303,30 @@ def _points_txt(path: Path) -> Points:
             raise DataError(path, f"line {line}", f"has the colour {rgb}", "colours lie in 0..255")
         colors.append(rgb)
         ids.add(_integer(path, line, cells[0]))
-        images = [_integer(path, line, c) for c in cells[8::2]]
-        track.append(np.array([(len(means) - 1, image) for image in images], np.int64).reshape(-1, 2))
+        track.append(np.array([_integer(path, line, c) for c in cells[8::2]], np.int64))
+    return _checked_points(path, ids, means, colors, track)
+
+
+def _checked_points(
+    path: Path,
+    ids: Set[int],
+    means: Sequence[Sequence[float]],
+    colors: Sequence[Sequence[int]],
+    track: Sequence[np.ndarray],
+) -> Points:
+    """`track`: of each point, the ids of the images that observe it."""
     if len(ids) != len(means):
         raise DataError(path, "point id", "occurs twice", _WRITE_AGAIN)
-    return _checked_points(path, np.array(means).reshape(-1, 3), np.array(colors, np.uint8).reshape(-1, 3), track)
-
-
-def _checked_points(path: Path, means: np.ndarray, colors: np.ndarray, track: list[np.ndarray]) -> Points:
-    near = (np.abs(means) < FARTHEST).all(1)
+    if not means:
+        return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.int64))
+    where = np.array(means)
+    near = np.abs(where) < FARTHEST
     if not near.all():
-        bad = int(np.flatnonzero(~near)[0])
+        bad = int(np.argwhere(~near)[0, 0])
         raise DataError(path, f"point {bad}", "is not finite", "remove the point")
-    return Points(means, colors, np.concatenate(track) if track else np.zeros((0, 2), np.int64))
+    point = np.repeat(np.arange(len(means)), [len(images) for images in track])
+    observed = np.stack((point, np.concatenate(track).astype(np.int64)), axis=1)
+    return Points(where, np.array(colors, np.uint8), observed)
 
 
 def _parameters(path: Path, model: str) -> int:

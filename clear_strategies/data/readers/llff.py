@@ -10,6 +10,7 @@ from tokenize import TokenError
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 from numpy.lib import format as npy_format
 
 from clear_strategies.data.cameras import Lens, rigid_inverse
@@ -24,7 +25,7 @@ from clear_strategies.files import require_regular
 
 _log = logging.getLogger(__name__)
 
-_COLUMNS: Final = 17  # a 3 x 5 matrix [R | t | height width focal], then the near and far bounds
+_COLUMNS: Final = 17
 # What numpy's parser of the header's Python literal raises on damaged ones.
 _HEADER_ERRORS: Final = (
     ValueError,
@@ -101,7 +102,7 @@ def _from_bounds(
     root: Path, folder: Path, has_model: bool, background: Color | None, allow_outside: bool, broken: Fault
 ) -> Capture:
     file = root / "poses_bounds.npy"
-    table = _read_table(file)
+    table = read_bounds(file)
     paths = list_images(folder)
     if len(paths) != len(table):
         raise DataError(
@@ -153,8 +154,14 @@ def _ids_by_order(model: Model | None, n: int) -> list[int | None]:
     return [image.id for image in registered]
 
 
-def _read_table(file: Path) -> np.ndarray:
-    """[n, 17] float64; the header is held against the file's size before anything is allocated."""
+def read_bounds(file: Path) -> Float[np.ndarray, "N 17"]:
+    """poses_bounds.npy: per image a 3 x 5 matrix [R | t | height width focal], then the near and far bounds.
+
+    The header is held against the file's size before anything is allocated.
+
+    Raises:
+        DataError: the file is no such table of finite numbers.
+    """
     require_regular(file)
     try:
         data = file.read_bytes()
