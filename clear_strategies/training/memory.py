@@ -92,7 +92,8 @@ def needs(state: TrainState, rasterizer: Rasterizer) -> Needs:
     statistics = sum(x.nbytes for x in state.density.state_dict().values()) // n
     anchored = sum(raw[name].nbytes for s in state.conductor.strategies for name in s.keeps() if name in raw) // n
     held = 3 * parameters + _FLOAT + statistics + anchored
-    largest = max(x.nbytes for x in raw.values()) // n  # a change of structure copies one tensor at a time
+    # A change of structure copies tensor by tensor, and the images drawn before it still hold the former parameters.
+    copied = parameters + max(x.nbytes for x in raw.values()) // n
     basis = 1 + state.field.shN.shape[1]
     scales = 1 + state.conductor.wants_lr
     floats = _ACTIVATION + _PROJECTION + scales * _GRID + _COTANGENTS * _GRADIENT + scales * basis + _EVIDENCE
@@ -103,7 +104,7 @@ def needs(state: TrainState, rasterizer: Rasterizer) -> Needs:
         reached=torch.cuda.max_memory_allocated(state.device) if cuda else peak(),
         gaussians=n,
         held=held,
-        worked=_FLOAT * floats + largest,
+        worked=_FLOAT * floats + copied,
         lists=lists,
         most_lists=most,
         pixels=_FLOAT * _PER_PIXEL * (view.hr.image.shape[0] * view.hr.image.shape[1]),

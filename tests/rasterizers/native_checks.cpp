@@ -124,9 +124,23 @@ std::vector<double> drawn(int threads) {
   return all;
 }
 
+// A field that grows asks for more each time: what it has outgrown is not kept beside the blocks that took its place.
+void check_recycler() {
+  Recycler& recycler = Recycler::instance();
+  const std::size_t before = recycler.held();
+  std::size_t bytes = 100'000;
+  for (int i = 0; i < 12; ++i, bytes += bytes / 4) {
+    const Recycler::Block a = recycler.take(bytes), b = recycler.take(bytes);
+    check(a.bytes >= bytes && a.data != b.data, "block", double(a.bytes));
+    recycler.give(a), recycler.give(b);
+  }
+  check(recycler.held() - before <= 4 * bytes, "blocks that were outgrown are kept", double(recycler.held() - before));
+}
+
 }  // namespace
 
 int main() {
+  check_recycler();
   check_lanes<float>(), check_lanes<double>();
   check_transpose<float>(), check_transpose<double>();
   check_rows<1, float>(), check_rows<2, float>(), check_rows<3, float>(), check_rows<4, float>();

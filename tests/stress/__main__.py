@@ -91,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=list(MEASUREMENTS), help="some of them")
     parser.add_argument("--every", type=int, default=1, help="every n-th of the 13,923 single Gaussians (%(default)s)")
     parser.add_argument("--mutants", type=int, default=10**7, help="mutants per binary format (%(default)s)")
-    parser.add_argument("--processes", type=int, default=1, help="that read mutants at the same time (%(default)s)")
+    parser.add_argument("--processes", type=int, default=1, help="that share the mutants (%(default)s)")
     parser.add_argument("--examples", type=int, default=500, help="runs in random order (%(default)s)")
     parser.add_argument("--kills", type=int, default=200, help="SIGKILLs of a run (%(default)s)")
     parser.add_argument("--iterations", type=int, default=10_000, help="of the soak (%(default)s)")
@@ -145,10 +145,13 @@ def page(found: list[Row]) -> str:
         "with one that nobody killed.\n"
         "- **Bad inputs and attacks** are tables with a name for each (`python -m tests.stress --list`). An attack must also "
         "start no program, open no connection, and open no file outside its folder.\n"
-        "- **Damaged files**: a mutant counts if it is read as a sound file with other content than it may have, if its error "
-        "is no `DataError`, or if it takes more than 0.1 s or 1 GiB.\n"
+        "- **Damaged files**: one to three edits each. A mutant counts if it is read as a sound file with other content than it "
+        "may have, if its error is no `DataError`, or if it takes more than 0.1 s or 1 GiB. Each file is read by its own "
+        "reader; a *scene* is read as a whole, with one of its files damaged. Tensors *with their hash* are what a program that "
+        "also writes the manifest could leave. `--processes` spreads the mutants, which are the same in any number of them.\n"
         "- **Memory**: the peak that the plan predicts, at the number of Gaussians that the run reached, against what the "
-        "process took beyond its imports. What an iteration holds per pixel was counted with these scenes at hand.\n"
+        "process took beyond its imports. The rest is what the C library has freed and keeps. What an iteration holds per pixel "
+        "was counted with these scenes at hand.\n"
         "- **Soak**: one process, with evaluations and checkpoints on the way.\n"
         "- **C++ under ASan and UBSan** (`--only sanitizers`): the modules compiled anew with both sanitizers, and their tests. "
         "Without rows above it has not been run since the page began.\n"

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 
 import pytest
-import torch
 
 from clear_strategies import files
 from clear_strategies.errors import SettingError
@@ -23,7 +23,7 @@ from tests.stress.bad_inputs import BadInput
 from tests.stress.rows import Row, Worst, read, table, write
 
 EVERY = {"torch": 97, "warp": 499}
-MUTANTS = 2_000
+MUTANTS = {fuzz.binary: 100_000, fuzz.text: 5_000, fuzz.scenes: 500}
 
 
 @pytest.mark.parametrize("name", ["torch", *BACKENDS])
@@ -159,19 +159,31 @@ def test_a_program_a_secret_and_a_file_outside_would_be_found(tmp_path: Path) ->
     assert "canary" in (attacks.trace(refused_after(lambda there: (there / "canary").mkdir()), folder) or "")
 
 
-def test_damaged_files_are_refused_or_sound(tmp_path: Path) -> None:
-    for row in fuzz.measure(fuzz.binary(tmp_path / "binary"), MUTANTS):
-        row.require()
-    for row in fuzz.measure(fuzz.scenes(tmp_path / "scenes"), MUTANTS // 20):
+@pytest.mark.parametrize("targets", MUTANTS, ids=lambda targets: targets.__name__)
+def test_damaged_files_are_refused_or_sound(targets: fuzz.Targets) -> None:
+    """In a process of its own, without the checks of types that tests run with."""
+    for row in fuzz.measure(targets, MUTANTS[targets], processes=1):
+        assert row.cases == MUTANTS[targets]
         row.require()
 
 
-def test_a_reader_with_an_untyped_error_would_be_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        fuzz.ply, "read_gaussians", lambda path: torch.frombuffer(path.read_bytes()[:7], dtype=torch.float32)
-    )
-    rows = {row.what: row for row in fuzz.measure(fuzz.binary(tmp_path), 3)}
-    assert not rows["damaged PLY: unsound, untyped or slow"].met
+def test_a_reader_with_an_untyped_error_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    read, sizes = fuzz.ply.read_gaussians, list[int]()
+
+    def careless(path: Path):
+        sizes.append(path.stat().st_size)
+        return read(path) if sizes[-1] == sizes[0] else {}[path]
+
+    monkeypatch.setattr(fuzz.ply, "read_gaussians", careless)
+    [row] = fuzz.measure(fuzz.binary, 50, only=["PLY"])
+    assert not row.met
+    assert row.worst == sum(size != sizes[0] for size in sizes) < 50
+    assert row.where.startswith("mutant ")
+
+
+def test_mutants_are_the_same_in_any_number_of_processes() -> None:
+    first = [list(islice(fuzz.mutants("PLY", block, [bytes(100)]), 50)) for block in (0, 0, 1)]
+    assert first[0] == first[1] != first[2]
 
 
 def test_a_short_soak_stays_finite() -> None:

@@ -1,7 +1,8 @@
 // Large uninitialised arrays whose memory is reused.
 //
 // A frame's arrays live for one iteration, and the next one needs nearly the same sizes. Fresh pages from the system cost
-// more than what is computed in them, so freed blocks are kept for the next request.
+// more than what is computed in them, so freed blocks are kept for the next request. A request that none of them fits takes the
+// place of one that has become too small: as the Gaussians grow in number, the blocks grow in size and not in number.
 #pragma once
 
 #include <cstddef>
@@ -39,17 +40,14 @@ class Recycler {
 #endif
     {
       std::lock_guard<std::mutex> lock(mutex_);
-      std::size_t best = kept_.size();
-      for (std::size_t i = 0; i < kept_.size(); ++i)
-        if (kept_[i].bytes >= bytes && kept_[i].bytes <= 2 * bytes + kPage &&
-            (best == kept_.size() || kept_[i].bytes < kept_[best].bytes))
-          best = i;
-      if (best < kept_.size()) {
-        Block found = kept_[best];
-        kept_.erase(kept_.begin() + std::ptrdiff_t(best));
-        held_ -= found.bytes;
-        return found;
+      std::size_t best = kept_.size(), outgrown = kept_.size();
+      for (std::size_t i = 0; i < kept_.size(); ++i) {
+        const std::size_t here = kept_[i].bytes;
+        if (here >= bytes && here <= 2 * bytes + kPage && (best == kept_.size() || here < kept_[best].bytes)) best = i;
+        if (here < bytes && 2 * here >= bytes && (outgrown == kept_.size() || here > kept_[outgrown].bytes)) outgrown = i;
       }
+      if (best < kept_.size()) return removed(best);
+      if (outgrown < kept_.size()) std::free(removed(outgrown).data);
     }
     const std::size_t align = bytes >= kHuge ? kHuge : kPage;
     Block fresh{nullptr, (bytes + bytes / 8 + align) / align * align};  // some more than asked: the next request may be a little larger
@@ -76,7 +74,20 @@ class Recycler {
     }
   }
 
+  // Bytes kept for later requests.
+  std::size_t held() {
+    std::lock_guard<std::mutex> lock(mutex_);
+    return held_;
+  }
+
  private:
+  Block removed(std::size_t i) {
+    const Block block = kept_[i];
+    kept_.erase(kept_.begin() + std::ptrdiff_t(i));
+    held_ -= block.bytes;
+    return block;
+  }
+
   static constexpr std::size_t kPage = 4096, kHuge = std::size_t(2) << 20, kMost = std::size_t(1) << 30;
   std::mutex mutex_;
   std::vector<Block> kept_;
