@@ -109,10 +109,10 @@ def binary(folder: Path) -> dict[str, Target]:
 
 
 def text(folder: Path) -> dict[str, Target]:
-    """COLMAP's text files by their own readers; and PNG, whose decoder is a library."""
+    """Text files by their own readers; and PNG, whose decoder is a library."""
     model = GOOD["colmap_txt"](folder / "txt") / "sparse" / "0"
     cameras, images, points = (model / f"{name}.txt" for name in ("cameras", "images", "points3D"))
-    photo = GOOD["colmap"](folder / "photo") / "images" / "b.png"
+    photo, shared = GOOD["colmap"](folder / "photo") / "images" / "b.png", GOOD["nerfstudio"](folder / "nerfstudio")
 
     def read_photo() -> None:
         image = read_image(photo)
@@ -122,6 +122,7 @@ def text(folder: Path) -> dict[str, Target]:
         "COLMAP cameras.txt": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras).values())),
         "COLMAP images.txt": ([images], lambda: _require_images(colmap_model.read_images(images))),
         "COLMAP points3D.txt": ([points], lambda: _require_points(colmap_model.read_points(points))),
+        "transforms.json": ([shared / "transforms.json"], lambda: _require_capture(nerfstudio.read(shared))),
         "PNG": ([photo], read_photo),
     }
 
@@ -138,7 +139,6 @@ def scenes(folder: Path) -> dict[str, Target]:
         "COLMAP binary scene": target("colmap", colmap.read),
         "COLMAP text scene": target("colmap_txt", colmap.read),
         "LLFF scene": target("llff", llff.read),
-        "transforms.json": target("nerfstudio", nerfstudio.read),
     }
 
 
