@@ -112,7 +112,6 @@ def test_3dgut_trains_without_a_score(host, scene, tmp_path):
     [
         (["--app-opt"], "app_opt"),
         (["--random-bkgd"], "random_bkgd"),
-        (["--sparse-grad", "--packed"], "sparse_grad"),
         (["--visible-adam"], "visible_adam"),
         (["--batch-size", "2"], "batch_size"),
         (["--patch-size", "8"], "patch_size"),
