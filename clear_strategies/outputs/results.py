@@ -26,6 +26,7 @@ from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen, marks
 from clear_strategies.outputs.provenance import provenance
 from clear_strategies.outputs.splat_page import write_splat_page
+from clear_strategies.training import memory
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Rasterizer
@@ -94,6 +95,7 @@ def write_results(
     with work_log.stage("maps"):
         if mapped := spaced(state.views, map_views):
             write_maps(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
+    memory.release()  # the gradients that the maps are made of: several times the field
     export_ply(folder / "point_cloud.ply", field)
 
     title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}"
