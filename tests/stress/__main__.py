@@ -51,8 +51,7 @@ def drawing() -> Iterator[tuple[str, Callable]]:
 
 
 def _projection(options: argparse.Namespace, _: Path) -> Iterator[Row]:
-    for name, make in drawing():
-        yield from projection.measure(name, make(**_CLEAN), every=options.every)
+    return projection.measure({name: make(**_CLEAN) for name, make in drawing()}, every=options.every)
 
 
 def _fuzz(options: argparse.Namespace, _: Path) -> Iterator[Row]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import torch
 
@@ -46,26 +46,25 @@ def cases(every: int = 1) -> Iterator[tuple[str, Splats]]:
         )
 
 
-def measure(name: str, draw: Rasterizer, *, every: int = 1) -> list[Row]:
-    """The image and the gradients of every case.
+def measure(backends: Mapping[str, Rasterizer], *, every: int = 1) -> Iterator[Row]:
+    """The image and the gradients of every case, by each backend.
 
     The rotation's gradient is measured against the quaternion's own scale: ‖g_quat‖ · ‖q‖, which does not depend on ‖q‖.
     """
     exact = ReferenceRasterizer(**_CLEAN)
     v = torch.randn(1, 9, 9, 3, generator=torch.Generator().manual_seed(0))
-    image, gradient = Worst(), Worst()
+    images, gradients = ({name: Worst() for name in backends} for _ in range(2))
     for where, splats in cases(every):
-        found, right = draw(splats, _CAMERA), exact(to(splats, torch.float64), _CAMERA)
-        error = (found.image.double() - right.image).abs()
-        image.add(float(error.max()), where)
-        if not bool(right.visible.any()):
-            continue
-        ours, theirs = found.vjp(v), right.vjp(v.double())
-        gradient.add(_gradient_error(ours, theirs, splats), where)
-    return [
-        image.row("single Gaussians: image", name, _IMAGE, 13_923),
-        gradient.row("single Gaussians: gradient", name, _GRADIENT, gradient.cases * every),
-    ]
+        right = exact(to(splats, torch.float64), _CAMERA)
+        theirs = right.vjp(v.double()) if bool(right.visible.any()) else None
+        for name, draw in backends.items():
+            found = draw(splats, _CAMERA)
+            images[name].add(float((found.image.double() - right.image).abs().max()), where)
+            if theirs is not None:
+                gradients[name].add(_gradient_error(found.vjp(v), theirs, splats), where)
+    for name in backends:
+        yield images[name].row("single Gaussians: image", name, _IMAGE, 13_923)
+        yield gradients[name].row("single Gaussians: gradient", name, _GRADIENT, gradients[name].cases * every)
 
 
 def _gradient_error(ours, theirs, splats: Splats) -> float:

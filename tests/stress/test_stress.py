@@ -31,7 +31,7 @@ def test_single_gaussians_agree_with_float64(name: str) -> None:
     if name != "torch" and (reason := why_not(name)):
         pytest.skip(str(reason))
     make = ReferenceRasterizer if name == "torch" else BACKENDS[name]
-    for row in projection.measure(name, make(**_CLEAN), every=EVERY.get(name, 61)):
+    for row in projection.measure({name: make(**_CLEAN)}, every=EVERY.get(name, 61)):
         row.require()
 
 
@@ -42,7 +42,7 @@ def test_an_image_that_is_off_is_found() -> None:
             rendering.image = rendering.image * 0.99
             return rendering
 
-    image, gradient = projection.measure("darker", Darker(**_CLEAN), every=997)
+    image, gradient = projection.measure({"darker": Darker(**_CLEAN)}, every=997)
     assert not image.met
     assert gradient.met
 
