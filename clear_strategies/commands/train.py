@@ -89,8 +89,11 @@ def detect(folder: Path) -> tuple[str, Path]:
 
 
 def _quoted(value: str) -> str:
-    """A string of Hydra's grammar: paths may contain spaces, commas, brackets and equals signs, or look like numbers."""
+    """A string of Hydra's grammar: paths may contain spaces, commas, brackets, equals signs and `${`, or look like
+    numbers. A backslash is itself, except before a quote or `${`, where both libraries want two.
+    """
     if _PLAIN.fullmatch(value) and value.lower() not in _NO_TEXT:
         return value
-    escaped = value.replace("\\", "\\\\").replace("'", "\\'") if "'" in value else value
-    return f"'{escaped}'"
+    for_omegaconf = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)
+    for_hydra = re.sub(r"(\\*)('|\Z)", lambda end: end[1] * 2 + ("\\'" if end[2] else ""), for_omegaconf)
+    return f"'{for_hydra}'"

@@ -8,14 +8,16 @@ from collections.abc import Collection
 from clear_strategies.errors import SettingError
 
 
-def require_whole(name: str, value: object, *, least: int) -> None:
-    """A whole number of at least `least`; a float such as 2.5 or 4.0 and a bool are none.
+def require_whole(name: str, value: object, *, least: int, most: int | None = None) -> None:
+    """A whole number of at least `least` and at most `most`; a float such as 2.5 or 4.0 and a bool are none.
 
     Raises:
         SettingError: it is not.
     """
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         refuse(name, f"must be a whole number of at least {least}", value, f"{name}={max(least, 1)}")
+    elif most is not None and value > most:
+        refuse(name, f"must be a whole number of at most {most}", value, f"{name}={most}")
 
 
 def require_number(

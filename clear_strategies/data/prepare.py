@@ -29,6 +29,7 @@ from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
+_MOST_ROUNDS: Final = 100  # each leaves about half of the difference: after 30, float32 has nothing left to move
 _ROUNDING: Final = 0.5  # grey levels: the largest difference that rounding to 8 bits makes
 
 Sizes = Literal["crop", "round"]
@@ -57,7 +58,7 @@ class ViewSettings:
             SR images, and LR is made from them.
         downsample: D, the operator that makes LR.
         back_projection: rounds by which each SR image is moved until it shrinks to its LR photo (`images.back_projected`);
-            0: it stays as the prior made it.
+            0: it stays as the prior made it; at most 100.
         lr_folder: ready-made LR images by the photos' names, instead of making them.
 
     Raises:
@@ -98,7 +99,7 @@ class ViewSettings:
         require_choice("data.views.sizes", self.sizes, get_args(Sizes))
         require_choice("data.views.photos_are", self.photos_are, get_args(PhotosAre))
         require_choice("data.views.downsample", self.downsample, get_args(DownKernel))
-        require_whole("data.views.back_projection", self.back_projection, least=0)
+        require_whole("data.views.back_projection", self.back_projection, least=0, most=_MOST_ROUNDS)
         if self.photos_are == "lr" and self.lr_folder:
             rule = "must be null with photos_are=lr, the default, because the photos are the LR images"
             refuse("data.views.lr_folder", rule, self.lr_folder, "data.views.photos_are=hr")

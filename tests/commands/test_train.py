@@ -6,7 +6,7 @@ import pytest
 
 from clear_strategies import commands
 from clear_strategies.commands import train
-from clear_strategies.compose import composed
+from clear_strategies.compose import composed, tree
 from clear_strategies.errors import SettingError
 
 
@@ -32,14 +32,18 @@ def test_photos_in_a_folder_called_images_are_found(tmp_path):
     assert train.detect(tmp_path) == ("photos", tmp_path / "images")
 
 
-@pytest.mark.parametrize("name", ["plain", "with space", "a=b,c", "it's [here] (1)"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "plain", "with space", "a=b,c", "it's [here] (1)", "ünï-日本", "ends\\", "b\\s", "quoted\\'", "q\\s'", "${oc.env:HOME}",
+        "\\${x}", "${",
+    ],
+)  # fmt: skip
 def test_a_folder_of_any_name_becomes_data_path(tmp_path, name):
     folder = tmp_path / name
     folder.mkdir()
-    from omegaconf import OmegaConf
-
     config = composed(train.overrides([str(folder), "fit.iterations=7"]), "config")
-    assert OmegaConf.to_container(config)["data"]["path"] == str(folder)
+    assert tree(config)["data"]["path"] == str(folder)
     assert config.fit.iterations == 7
     assert set(config.strategies) == {"gco", "p2g", "svs"}
 

@@ -16,6 +16,9 @@ from clear_strategies.errors import SettingError
 @pytest.mark.parametrize("value", [2.5, 4.0, True, None, "4", math.nan, 0])
 def test_only_whole_numbers_in_range_are_whole_numbers(value: object) -> None:
     require_whole("a.b", 1, least=1)
+    require_whole("a.b", 7, least=1, most=7)
+    with pytest.raises(SettingError, match=r"a\.b.*at most 7.*8"):
+        require_whole("a.b", 8, least=1, most=7)
     with pytest.raises(SettingError) as refusal:
         require_whole("a.b", value, least=1)
     assert str(refusal.value) == f"a.b: must be a whole number of at least 1, got {value!r}: a.b=1"
