@@ -463,6 +463,7 @@ def test_from_the_command_line(tmp_path):
     result = run("+strategy=clear", *own, *TINY, "hydra.run.dir=here", cwd=tmp_path)
     said = result.stdout + result.stderr
     assert result.returncode == 0, said
-    assert "start 1, stop 6, every 1, reset_every 4" in said
-    assert " grown, " in (tmp_path / "here" / "run.log").read_text()
+    log = (tmp_path / "here" / "run.log").read_text()
+    assert "start 1, stop 6, every 1, reset_every 4" in log
+    assert " grown, " in log
     assert (tmp_path / "here" / "metrics.json").is_file()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,3 +23,16 @@ def run(
     return subprocess.run(
         command, cwd=cwd, env=env, capture_output=True, text=True, timeout=240, check=False, **options
     )
+
+
+def trains(folder: Path) -> bool:
+    """Whether a run has come to its first density round, so that it answers signals by saving, until it has trained."""
+    log = folder / "run.log"
+    return log.exists() and " cloned, " in log.read_text()
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 120) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,23 +16,17 @@ import torch
 from clear_strategies.jobs import sweep
 from clear_strategies.jobs.sweep import Sweep, Watch
 from clear_strategies.training import checkpoint
-from tests.helpers.command_line import ROOT, TINY, run
+from tests.helpers.command_line import ROOT, TINY, run, trains, wait_for
 
 AUTO = ["fit.resume=auto", *TINY]
 SWEEP = ["-m", "hydra.sweep.dir=all", *AUTO]
+LONG = ["fit.iterations=400"]  # two seconds: time enough for a signal
 
 
 def start(*overrides: str, cwd: Path) -> subprocess.Popen[str]:
     env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "clear_strategies.run", *overrides]
     return subprocess.Popen(command, cwd=cwd, env=env, stderr=subprocess.STDOUT, stdout=subprocess.PIPE, text=True)
-
-
-def wait_for(condition, seconds: float = 120) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
 
 
 @pytest.fixture(scope="module")
@@ -96,19 +89,21 @@ def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same
     assert json.loads((tmp_path / "here" / "metrics.json").read_text())["seconds"] >= seconds[-1]
 
 
-def test_a_stopped_run_goes_on_by_itself_and_ends_the_same(whole, tmp_path):
-    every = [*AUTO, "fit.iterations=40", "+strategy=clear", "hydra.run.dir=here"]
+def test_a_stopped_run_goes_on_by_itself_and_ends_the_same(tmp_path):
+    every = [*AUTO, *LONG, "+strategy=clear", "hydra.run.dir=here"]
     process = start(*every, cwd=tmp_path)
-    while "it/s" not in process.stdout.readline():
-        pass
+    wait_for(lambda: trains(tmp_path / "here"))
     process.send_signal(signal.SIGTERM)
-    process.communicate(timeout=120)
-    assert process.returncode == 143
+    said, _ = process.communicate(timeout=120)
+    assert process.returncode == 143, said
     assert not (tmp_path / "here" / "metrics.json").exists()
     result = run(*every, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "resumed from" in result.stdout + result.stderr
-    assert (tmp_path / "here" / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
+    whole = run(*AUTO, *LONG, "+strategy=clear", "hydra.run.dir=whole", cwd=tmp_path)
+    assert whole.returncode == 0, whole.stderr
+    plys = [(tmp_path / name / "point_cloud.ply").read_bytes() for name in ("here", "whole")]
+    assert plys[0] == plys[1]
 
 
 def test_torch_and_kernels_divide_the_cores_among_the_jobs(monkeypatch):
@@ -165,15 +160,14 @@ def test_in_other_processes_a_failed_job_stops_no_other_and_is_told(tmp_path):
 @pytest.mark.parametrize("whom", ["parent", "group"])
 def test_a_stopped_joblib_sweep_saves_its_jobs_and_goes_on(tmp_path, whom):
     """Ctrl-C reaches the workers too, SIGTERM only the process that was started; both save and begin no other job."""
-    sweep_of_three = [*SWEEP, *JOBLIB, "+strategy=baseline,gco,svs", "fit.iterations=400"]
+    sweep_of_three = [*SWEEP, *JOBLIB, "+strategy=baseline,gco,svs", *LONG]
     env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
     with (tmp_path / "said").open("w") as said:
         process = subprocess.Popen(
             [sys.executable, "-m", "clear_strategies.run", *sweep_of_three], cwd=tmp_path, env=env, stdout=said,
             stderr=said, start_new_session=True,
         )  # fmt: skip
-        logs = [tmp_path / "all" / str(job) / "run.log" for job in (0, 1)]
-        wait_for(lambda: all(log.exists() and "cloned" in log.read_text() for log in logs))
+        wait_for(lambda: all(trains(tmp_path / "all" / job) for job in ("0", "1")))
         if whom == "group":
             os.killpg(process.pid, signal.SIGINT)
         else:
@@ -207,13 +201,12 @@ def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
         "main()\n"
     )
     env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", code, "+strategy=clear", "hydra.run.dir=here", *AUTO, "fit.iterations=400"]
+    command = [sys.executable, "-c", code, "+strategy=clear", "hydra.run.dir=here", *AUTO, *LONG]
     command.append("fit.checkpoint_every=0")
     with subprocess.Popen(
         command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as process:
-        while "it/s" not in process.stdout.readline():
-            pass
+        wait_for(lambda: trains(tmp_path / "here"))
         process.send_signal(signal.SIGTERM)  # some clusters send it first
         process.send_signal(signal.SIGUSR2)
         said, _ = process.communicate(timeout=120)
