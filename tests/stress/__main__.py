@@ -1,7 +1,8 @@
 """`python -m tests.stress`: every stress measurement whole, and docs/stability.md with what it found.
 
 `--only NAME …` measures some of them and keeps the other rows of docs/stability.csv. Options make the longest smaller; the
-page says how many cases ran, and with how many a release is measured.
+page says how many cases ran, and with how many a release is measured. Each row is written when it is there, so that what is
+interrupted keeps what it has measured.
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ import logging
 import platform
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
+from clear_strategies import files
 from rasterizers.reference import ReferenceRasterizer
 from tests.helpers.backends import BACKENDS, why_not
 from tests.stress import (
@@ -57,7 +60,8 @@ def _projection(options: argparse.Namespace, _: Path) -> Iterator[Row]:
 def _fuzz(options: argparse.Namespace, _: Path) -> Iterator[Row]:
     for targets, fewer in ((fuzz.binary, 1), (fuzz.text, 20), (fuzz.scenes, 200)):
         count, goal = max(1, options.mutants // fewer), 10**7 // fewer
-        yield from fuzz.measure(targets, count, goal=goal, processes=options.processes)
+        only = [name for name in fuzz.names(targets) if options.formats is None or name in options.formats]
+        yield from fuzz.measure(targets, count, only=only, goal=goal, processes=options.processes)
 
 
 def _sanitizers(options: argparse.Namespace, folder: Path) -> Iterable[Row]:
@@ -90,6 +94,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=list(MEASUREMENTS), help="some of them")
     parser.add_argument("--every", type=int, default=1, help="every n-th of the 13,923 single Gaussians (%(default)s)")
     parser.add_argument("--mutants", type=int, default=10**7, help="mutants per binary format (%(default)s)")
+    formats = [name for targets in (fuzz.binary, fuzz.text, fuzz.scenes) for name in fuzz.names(targets)]
+    parser.add_argument("--formats", nargs="+", choices=formats, help="of damaged files (all)")
     parser.add_argument("--processes", type=int, default=1, help="that share the mutants (%(default)s)")
     parser.add_argument("--examples", type=int, default=500, help="runs in random order (%(default)s)")
     parser.add_argument("--kills", type=int, default=200, help="SIGKILLs of a run (%(default)s)")
@@ -105,18 +111,26 @@ def main(arguments: list[str] | None = None) -> int:
         given = [*bad_inputs.inputs(), *attacks.attacks()]
         sys.stdout.write("".join(f"{one.id}\n" for one in given))
         return 0
-    day, found, csv = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}", list[Row](), options.out.with_suffix(".csv")
+    found = list[Row]()
     with tempfile.TemporaryDirectory() as folder:
-        for name, measure in MEASUREMENTS.items():
-            if name in options.only:
-                _log.info("%s …", name)
-                there = Path(folder) / name
-                there.mkdir()
-                found += rows.of_part(measure(options, there), name, day)
-    rows.write(csv, rows.merged(rows.read(csv), found, list(MEASUREMENTS)))
-    options.out.write_text(page(rows.read(csv)))
+        for name in (name for name in MEASUREMENTS if name in options.only):
+            _log.info("%s …", name)
+            there = Path(folder) / name
+            there.mkdir()
+            for row in MEASUREMENTS[name](options, there):
+                day = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"
+                found.append(replace(row, part=name, measured=day))
+                _write(options.out, found)
+            if name != "fuzz" or options.formats is None:
+                _write(options.out, found, whole={name})
     _log.info("%s", options.out)
     return int(not all(row.met for row in found))
+
+
+def _write(out: Path, found: list[Row], whole: Container[str] = ()) -> None:
+    csv = out.with_suffix(".csv")
+    rows.write(csv, rows.merged(rows.read(csv), found, list(MEASUREMENTS), whole))
+    files.write_text(out, page(rows.read(csv)))
 
 
 def page(found: list[Row]) -> str:

@@ -175,20 +175,25 @@ def _require_capture(capture: Capture) -> None:
         _require(set(capture.points.track_image.tolist()) <= {frame.sfm_id for frame in capture.frames})
 
 
+def names(targets: Targets) -> list[str]:
+    """The formats."""
+    return list(_written(targets)[1])
+
+
 def measure(
-    targets: Targets, count: int, *, only: Sequence[str] = (), goal: int = 0, processes: int = 0
+    targets: Targets, count: int, *, only: Sequence[str] | None = None, goal: int = 0, processes: int = 0
 ) -> Iterator[Row]:
     """How many of the first `count` mutants of each format gave an unsound result, another error, or took too much.
 
     Args:
-        only: some of the formats; empty: all. processes: that share the mutants; 0: this one reads them.
+        only: some of the formats; None: all. processes: that share the mutants; 0: this one reads them.
     """
     with ExitStack() as stack:
         spread: Callable[..., Iterable[tuple[int, str]]] = map
         if processes:
             spawn = multiprocessing.get_context("spawn")
             spread = stack.enter_context(ProcessPoolExecutor(processes, mp_context=spawn)).map
-        for name in only or _written(targets)[1]:
+        for name in names(targets) if only is None else only:
             began, starts = time.monotonic(), range(0, count, _BLOCK)
             counts = [min(_BLOCK, count - start) for start in starts]
             found = list(spread(_block, repeat(targets), repeat(name), range(len(starts)), counts))

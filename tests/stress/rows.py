@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Container, Iterable, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from clear_strategies import files
@@ -75,10 +75,17 @@ def write(path: Path, rows: Iterable[Row]) -> None:
     files.write_csv(path, ({name: getattr(row, name) for name in names} for row in rows), names)
 
 
-def merged(earlier: Sequence[Row], found: Sequence[Row], order: Sequence[str]) -> list[Row]:
-    """The rows of the parts that were measured now in place of their earlier ones."""
-    now = {row.part for row in found}
-    kept = [row for row in earlier if row.part not in now and row.part in order]
+def merged(earlier: Sequence[Row], found: Sequence[Row], order: Sequence[str], whole: Container[str] = ()) -> list[Row]:
+    """The rows that were measured now in place of their earlier ones, by part.
+
+    Args:
+        whole: the parts that were measured to the end: an earlier row of theirs that was not measured again goes.
+    """
+    now = {(row.part, row.what, row.backend) for row in found}
+    kept = [
+        row for row in earlier
+        if row.part in order and row.part not in whole and (row.part, row.what, row.backend) not in now
+    ]  # fmt: skip
     return sorted([*kept, *found], key=lambda row: order.index(row.part))
 
 
@@ -102,7 +109,3 @@ class Worst:
 
     def row(self, what: str, backend: str, bound: float, goal: int = 0) -> Row:
         return Row(what, backend, self.cases, self.error, bound, self.where, goal)
-
-
-def of_part(rows: Iterable[Row], part: str, day: str) -> list[Row]:
-    return [replace(row, part=part, measured=day) for row in rows]

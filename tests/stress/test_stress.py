@@ -216,6 +216,17 @@ def test_the_command_writes_the_page_and_keeps_what_it_did_not_measure(tmp_path:
     assert "| old |" not in written
 
 
+def test_a_row_is_written_when_it_is_there(tmp_path: Path) -> None:
+    """Some formats of the damaged files, measured one after the other, are one table."""
+    page, few = tmp_path / "stability.md", ["--only", "fuzz", "--processes", "0", "--out"]
+    write(tmp_path / "stability.csv", [Row("an old format", "all", 1, 0.0, 0.0, "none", part="fuzz")])
+    formats = ["PLY", "COLMAP cameras.bin"]
+    for name in formats:
+        main([*few, str(page), "--formats", name, "--mutants", "20"])
+    found = [row.what for row in read(tmp_path / "stability.csv")]
+    assert found == ["an old format", *(f"damaged {name}: unsound, untyped or slow" for name in formats)]
+
+
 def test_fewer_cases_than_a_release_asks_for_are_met_so_far() -> None:
     few = Row("few", "all", 10, 0.0, 0.0, "none", goal=100)
     assert "| so far |" in table([few])
