@@ -45,7 +45,7 @@ def read(
     Args:
         cache: folder of the poses; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Not in the photos' folder.
         max_side: features are extracted from photos reduced to this many pixels.
-        max_features: of a photo, the strongest; memory and time of matching grow with its square.
+        max_features: of a photo, those of the coarsest scales; memory and time of matching grow with its square.
         precise: features that follow a surface's tilt (affine shape, domain-size pooling), matched once more along the
             epipolar lines: more photos are placed, in about six times the time; "auto": for up to 30 photos.
         least_placed: the least share of the photos whose poses must be found.

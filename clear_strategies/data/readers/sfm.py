@@ -41,7 +41,7 @@ class SfmSettings:
 
     Args:
         max_side: features are extracted from photos reduced to this many pixels.
-        max_features: of a photo, the strongest; memory and time of matching grow with its square.
+        max_features: of a photo, those of the coarsest scales; memory and time of matching grow with its square.
         precise: features that follow a surface's tilt, matched once more along the epipolar lines; about six times as long.
         least_placed: the least share of the photos that must be placed, in (0, 1].
         threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
@@ -135,6 +135,7 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
                     database, copies, image_names=names, camera_mode=pycolmap.CameraMode.SINGLE,
                     reader_options=reader, extraction_options=extraction, device=pycolmap.Device.cpu,
                 )  # fmt: skip
+        _keep_coarsest(database, settings.max_features)
         matching = pycolmap.FeatureMatchingOptions()
         matching.num_threads, matching.use_gpu = settings.matchers, False
         matching.guided_matching = settings.precise
@@ -154,6 +155,20 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
     finally:
         pycolmap.logging.minloglevel = level
     return list(models.values())
+
+
+def _keep_coarsest(database: Path, most: int) -> None:
+    """Leave each photo that many features. COLMAP counts points, and a point with several orientations is several features.
+
+    COLMAP writes the features of coarse scales first.
+    """
+    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
+        for table in ("keypoints", "descriptors"):
+            connection.execute(
+                f"UPDATE {table} SET data = substr(data, 1, :most * (length(data) / rows)), rows = :most "  # noqa: S608
+                "WHERE rows > :most",
+                {"most": most},
+            )
 
 
 def _write_copies(
