@@ -124,7 +124,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         found.append(_view(frame, capture, views, prior, lr_files, required=len(found) < len(train_frames)))
         progress(len(found))
     moved = {}
-    if views.back_projection:
+    if views.back_projection and views.photos_are != "both":  # photos agree with what is made from them
         before = _disagreement(found[: len(train_frames)], views.downsample)
         for i, view in enumerate(found):  # one by one: all SR images twice are hundreds of megabytes
             found[i] = _agreeing(view, views)

@@ -237,6 +237,14 @@ def test_back_projected_sr_images_shrink_to_the_photos():
     assert said.startswith("SR images differed from the LR photos by ")
 
 
+def test_photos_that_are_the_hr_side_are_not_moved():
+    capture = demo.read(width=64, height=48, views=5, train=2)
+    prior = DemoPrior({f.name: f.load for f in capture.frames})
+    scene = prepare(capture, ViewSettings(photos_are="both", train=2, back_projection=10), prior, POINTS)
+    assert all(view.hr.image is view.truth for view in scene.train)
+    assert "back-projection" not in scene.notes
+
+
 def test_how_far_a_back_projected_sr_image_was_from_its_photo_is_kept():
     capture = demo.read(width=64, height=48, views=5, train=2)
     prior = DemoPrior({f.name: f.load for f in capture.frames}, share=0.5, patch=16)
