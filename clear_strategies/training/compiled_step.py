@@ -3,8 +3,8 @@
 The pass computes what `Conductor.merge`, `Activation.vjp`, `Adam.step` and `GaussianField.constrain` compute; these remain
 the specification, and tests/training/test_compiled_step.py compares the two. The products of the higher bands are rounded
 less here, so a Gaussian whose cosine lies within 2e-7 of -τ_c may be corrected in one path and not in the other; two trainings
-then drift apart as two seeds do. Strategies state their `correct` and
-`regularize` as data (`CorrectionRule`, `Anchor`); all their other hooks are called as in the readable path.
+then drift apart as two seeds do. Strategies state their `correct` and `regularize` as data (`CorrectionRule`, `Anchor`); all
+their other hooks are called as in the readable path.
 
 C++ runs for Gaussians in the CPU's memory, Warp for Gaussians on CUDA. On CUDA the host never waits: counts stay on the
 device, and so do the numbers made of them (`core.deferred`).

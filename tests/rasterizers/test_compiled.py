@@ -188,10 +188,11 @@ def test_lists_beyond_the_memory_budget_are_refused(backend):
         backend(memory=1)(huge, camera(2000, 64))
 
 
+@pytest.mark.parametrize("factor", [2, 3, 4, 5, 6, 7, 8])  # 1/3, 1/5, 1/6 and 1/7 are rounded
 @backends()
-def test_scales_drawn_together_equal_scales_drawn_alone(backend):
-    splats, hr = scene(500, bands=15), camera(128, 96)
-    lr = hr.scaled(1 / 4)
+def test_scales_drawn_together_equal_scales_drawn_alone(backend, factor):
+    splats, hr = scene(500, bands=15), camera(32 * factor, 24 * factor)
+    lr = hr.scaled(1 / factor)
     plain = replace(splats, rgb_offset=None, opacities=splats.opacities * 0.9)
     shared = backend().render_scales([(plain, lr), (splats, hr)])
     for rendering, (job, view) in zip(shared, [(plain, lr), (splats, hr)], strict=True):

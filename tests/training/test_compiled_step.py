@@ -150,6 +150,24 @@ def test_the_merged_gradient_is_the_readable_one(passes, setting, kind, caplog):
         assert caplog.messages == said
 
 
+@pytest.mark.parametrize("beyond", [-1e-5, -4e-7, 4e-7, 1e-5])
+def test_beyond_2e_7_of_the_margin_both_paths_decide_the_same(passes, beyond):
+    """The cosine of the SH gradients is that of ∇_rgb; its float32 rows round it by 1e-7."""
+    c, margin = case(1000, evidence=False), GCO().tolerance
+    g_lr, g_hr = c.lr.rgb[0].double(), c.hr.rgb[0].double()
+    along = g_lr / g_lr.norm(dim=1, keepdim=True)
+    across = torch.linalg.cross(along, g_hr)
+    cosine = -margin + beyond
+    c.hr.rgb[0] = 1e-5 * (cosine * along + math.sqrt(1 - cosine**2) * across / across.norm(dim=1, keepdim=True))
+    readable, compiled = conductors(GCO)
+    readable_merge(readable, c.fields[0].raw(), *c.grads(0, "base"), T)
+    step = CompiledStep(compiled, Adam(c.fields[1].raw(), LearningRates(), 1.0), passes=passes)
+    step.gradient(c.fields[1].raw(), *c.factors(1, "base"), T)
+    for conductor in (readable, compiled):
+        logs = as_floats(conductor.strategies[0].logs)
+        assert [logs[f"corrected_{group}"] for group in ("sh0", "shN")] == [float(beyond < 0)] * 2
+
+
 @pytest.mark.parametrize("names", [s for k in range(4) for s in itertools.combinations((GCO, P2G, SVS), k)], ids=str)
 def test_every_subset_of_strategies_with_and_without_hr(passes, names):
     for hr, anchored, hf in itertools.product(HR_COTANGENTS, (False, True), (0.2, 1.0)):
