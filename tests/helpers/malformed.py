@@ -218,6 +218,9 @@ CASES = [
     Case("2D count beyond file", "colmap", patch(IMAGES, NAME_AT + 6, "<Q", 2**60), r"images\.bin: 2D points of 'a"),
     Case("track beyond file", "colmap", patch(POINTS, 8 + 8 + 24 + 3 + 8, "<Q", 2**59), r"points3D\.bin: track of"),
     Case("zero quaternion", "colmap", patch(IMAGES, QUATERNION_AT, "<4d", 0, 0, 0, 0), r"images\.bin: a\.png: .*leng"),
+    # Its length is 2 by hypot, and less by the root of the sum of squares.
+    Case("quaternion of length 2", "colmap",
+         patch(IMAGES, QUATERNION_AT, "<4d", 1.969615506024416, 0, 0.34729635533386066, 0), r"of length 2:"),
     Case("NaN pose", "colmap", patch(IMAGES, QUATERNION_AT, "<d", float("nan")), r"images\.bin: a\.png: .*finite"),
     Case("infinite translation", "colmap", patch(IMAGES, QUATERNION_AT + 32, "<d", float("inf")), r"a\.png: .*finite"),
     Case("NaN point", "colmap", patch(POINTS, 16, "<d", float("nan")), r"points3D\.bin: point 0: .*finite"),

@@ -350,7 +350,7 @@ def _lens(path: Path, where: str, model: str, width: int, height: int, p: tuple[
 def _image(path: Path, number: int, pose: tuple[float, ...], camera: int, name: str) -> Image:
     if not all(abs(x) < FARTHEST for x in pose):
         raise DataError(path, name or f"image {number}", "has a pose that is not finite", _WRITE_AGAIN)
-    norm = math.sqrt(sum(x * x for x in pose[:4]))
+    norm = math.hypot(*pose[:4])
     if not 0.5 < norm < 2:
         raise DataError(
             path, name or f"image {number}", f"has a rotation quaternion of length {norm:.3g}", _WRITE_AGAIN
