@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Final, Literal, get_args
 
 import numpy as np
+from jaxtyping import Float
+from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
@@ -125,12 +127,14 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         progress(len(found))
     moved = {}
     if views.back_projection and views.photos_are != "both":  # photos agree with what is made from them
-        before = _disagreement(found[: len(train_frames)], views.downsample)
+        before = [_disagreement(view, views.downsample) for view in found]
         for i, view in enumerate(found):  # one by one: all SR images twice are hundreds of megabytes
-            found[i] = _agreeing(view, views)
-        after = _disagreement(found[: len(train_frames)], views.downsample)
+            found[i] = _agreeing(view, before[i], views)
+        trained = len(train_frames)
+        after = [_disagreement(view, views.downsample) for view in found[:trained]]
         moved["back-projection"] = (
-            f"SR images differed from the LR photos by {before:.2f} grey levels, now by {after:.2f}"
+            f"SR images differed from the LR photos by {_grey_levels(before[:trained]):.2f} grey levels, "
+            f"now by {_grey_levels(after):.2f}"
         )
     train, test = tuple(found[: len(train_frames)]), tuple(found[len(train_frames) :])
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
@@ -305,17 +309,20 @@ def _view(
     return View(frame.name, lr, Photo(hr_camera, sr), truth=truth, sr_source=sr_source)
 
 
-def _agreeing(view: View, views: ViewSettings) -> View:
-    """The view, its SR image back-projected to its LR photo."""
-    disagreement = (images.downsample(view.hr.image, view.factor, views.downsample) - view.lr.image).abs()
+def _agreeing(view: View, disagreement: Float[Tensor, "h w 3"], views: ViewSettings) -> View:
+    """The view, its SR image back-projected to its LR photo, with the disagreement of before."""
     sr = images.back_projected(view.hr.image, view.lr.image, view.factor, views.back_projection, views.downsample)
     return replace(view, hr=Photo(view.hr.camera, images.quantize(sr)), disagreement=disagreement)
 
 
-def _disagreement(views: Sequence[View], down: DownKernel) -> float:
-    """Mean |D(I_HR) - I_LR| in grey levels of 255."""
-    means = [float((images.downsample(v.hr.image, v.factor, down) - v.lr.image).abs().mean()) for v in views]
-    return 255 * sum(means) / len(means)
+def _disagreement(view: View, down: DownKernel) -> Float[Tensor, "h w 3"]:
+    """|D(I_HR) - I_LR|."""
+    return (images.downsample(view.hr.image, view.factor, down) - view.lr.image).abs()
+
+
+def _grey_levels(differences: Sequence[Tensor]) -> float:
+    """The mean over images of their mean difference, in grey levels of 255."""
+    return 255 * sum(float(difference.mean()) for difference in differences) / len(differences)
 
 
 def _reduced(frame: Frame, views: ViewSettings) -> Photo:
