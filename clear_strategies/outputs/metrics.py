@@ -91,6 +91,10 @@ class Evaluation:
         """Mean over the views of a part ("test", "train") that have this image."""
         return mean_scores([row[image] for row in getattr(self, part).values() if image in row])
 
+    def against_lr(self, part: str) -> bool:
+        """Whether views of a part are compared with their LR photos, since their HR photos are unknown."""
+        return "LR" in self.against.get(part, "")
+
 
 def evaluate(
     scene: Scene, render: Callable[[Camera], Float[Tensor, "H W 3"]], *, down: DownKernel = "bicubic"

@@ -26,7 +26,7 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, baseline: Bas
     width = max((len(image) for _, image, _ in rows), default=0)
     lines = [f"  {part:<5}  {image:<{width}}  {numbers}" for part, image, numbers in rows]
     note = f"  {NOTE}." if any(image in ("bicubic", "prior") for _, image, _ in rows) else ""
-    unknown = [part for part in ("test", "train") if "LR" in evaluation.against.get(part, "")]
+    unknown = [part for part in ("test", "train") if evaluation.against_lr(part)]
     reduced = (
         f"  {' and '.join(unknown)}: nobody knows the HR photos, so reduced images are compared with the LR photos."
     )
@@ -70,7 +70,7 @@ def _rows(part: str, evaluation: Evaluation, baseline: Baseline | None) -> Itera
         yield "ours", _numbers(ours)
     if ours is not None and theirs is not None:
         yield OURS_MINUS_BASELINE, _numbers(_difference(ours, theirs), "+")
-    if "LR" in evaluation.against.get(part, ""):
+    if evaluation.against_lr(part):
         return  # they are made from the very photos that they would be compared with
     for image in ("bicubic", "prior"):
         if (mean := evaluation.mean(part, image)) is not None:
