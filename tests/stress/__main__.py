@@ -41,6 +41,7 @@ _log = logging.getLogger("tests.stress")
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "stability.md"
 _CLEAN = {"alpha_min": 1e-7, "transmittance_min": 1e-9}
+_DAMAGED = {fuzz.binary: 1, fuzz.text: 20, fuzz.scenes: 200}  # of a text file or a scene, that many times fewer mutants
 
 
 def drawing() -> Iterator[tuple[str, Callable]]:
@@ -58,7 +59,7 @@ def _projection(options: argparse.Namespace, _: Path) -> Iterator[Row]:
 
 
 def _fuzz(options: argparse.Namespace, _: Path) -> Iterator[Row]:
-    for targets, fewer in ((fuzz.binary, 1), (fuzz.text, 20), (fuzz.scenes, 200)):
+    for targets, fewer in _DAMAGED.items():
         count, goal = max(1, options.mutants // fewer), 10**7 // fewer
         only = [name for name in fuzz.names(targets) if options.formats is None or name in options.formats]
         yield from fuzz.measure(targets, count, only=only, goal=goal, processes=options.processes)
@@ -94,7 +95,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=list(MEASUREMENTS), help="some of them")
     parser.add_argument("--every", type=int, default=1, help="every n-th of the 13,923 single Gaussians (%(default)s)")
     parser.add_argument("--mutants", type=int, default=10**7, help="mutants per binary format (%(default)s)")
-    formats = [name for targets in (fuzz.binary, fuzz.text, fuzz.scenes) for name in fuzz.names(targets)]
+    formats = [name for targets in _DAMAGED for name in fuzz.names(targets)]
     parser.add_argument("--formats", nargs="+", choices=formats, help="of damaged files (all)")
     parser.add_argument("--processes", type=int, default=1, help="that share the mutants (%(default)s)")
     parser.add_argument("--examples", type=int, default=500, help="runs in random order (%(default)s)")
