@@ -91,7 +91,7 @@ PAIRS = (
         "noise of 3 x 30": (image(3, 30, 1).float(), image(3, 30, 2).float()),
         "noise of 11 x 11": (image(11, 11, 1).float(), image(11, 11, 2).float()),
         "noise of 40 x 1": (image(40, 1, 1).float(), image(40, 1, 2).float()),
-        "noise over several tiles": (image(141, 353, 1).float(), image(141, 353, 2).float()),
+        "noise over several tiles": (image(141, 1101, 1).float(), image(141, 1101, 2).float()),
         "sky and rough copy": rough(sky(), 0.05),
         "sky and close copy": rough(sky(), 1e-3),
         "sky and other sky": (sky(), 1.1 * sky()),

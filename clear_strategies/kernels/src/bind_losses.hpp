@@ -9,7 +9,7 @@
 #include <utility>
 
 #include "haar.hpp"
-#include "ssim.hpp"
+#include "photometric.hpp"
 
 namespace clear {
 

@@ -1,0 +1,61 @@
+// L1 and mean SSIM of an image with their gradient, in one pass over the images.
+#pragma once
+
+#include <cmath>
+#include <vector>
+
+#include "pool.hpp"
+#include "ssim_tile.hpp"
+
+namespace clear {
+
+// L1 alone; no windows.
+inline double l1_with_gradient(const ImagePair& im, float weight, int threads) {
+  using Floats = Lanes<float>;
+  constexpr std::int64_t chunk = 1 << 14;
+  std::int64_t n = std::int64_t(im.height) * im.row, chunks = (n + chunk - 1) / chunk;
+  std::vector<double> sums(chunks);
+  float scale = weight / float(n);
+  Pool::instance().run(threads, chunks, [&](std::int64_t index) {
+    std::int64_t begin = index * chunk, end = std::min(n, begin + chunk), i = begin;
+    Floats zero(0.0f), sum(0.0f), step(scale);
+    for (; i + kLanes <= end; i += kLanes) {
+      Floats d = Floats::load(im.x + i) - Floats::load(im.y + i);
+      sum += absolute(d);
+      (where(d > zero, step) - where(d < zero, step)).store(im.gradient + i);
+    }
+    double all = 0;
+    for (const auto& part : sum.r) all += ssim::total(part);
+    for (; i < end; ++i) {
+      float d = im.x[i] - im.y[i];
+      all += std::fabs(d);
+      im.gradient[i] = d > 0 ? scale : d < 0 ? -scale : 0.0f;
+    }
+    sums[index] = all;
+  });
+  double all = 0;
+  for (double v : sums) all += v;
+  return all / double(n);
+}
+
+// Writes the gradient of l1 · mean |x - y| + dssim · (1 - SSIM) with respect to x; returns both means. With dssim = 0 no
+// SSIM is computed, and its mean is 0.
+inline PhotometricMeans photometric(const ImagePair& im, PhotometricWeights weights, int threads) {
+  if (weights.dssim == 0) return {l1_with_gradient(im, weights.l1, threads), 0};
+  // Tiles depend only on the image's size, and so the sums do not depend on the threads.
+  const int down = (im.height + ssim::kTileHeight - 1) / ssim::kTileHeight, across = ssim::tiles_across(im.row);
+  auto border = [](int size, int tiles, int i) { return int(std::int64_t(size) * i / tiles); };
+  std::vector<PhotometricMeans> sums(std::size_t(across) * down);
+  Pool::instance().run(threads, std::int64_t(sums.size()), [&](std::int64_t i) {
+    const int x = int(i) % across, y = int(i) / across;
+    const ssim::Tile tile{border(im.height, down, y), border(im.height, down, y + 1), border(im.row, across, x),
+                          border(im.row, across, x + 1)};
+    sums[i] = ssim::TileRun(im, tile, weights).run();
+  });
+  PhotometricMeans means{0, 0};
+  for (const PhotometricMeans& part : sums) means.l1 += part.l1, means.dssim += part.dssim;
+  double n = double(im.height) * im.row;
+  return {means.l1 / n, means.dssim / n};
+}
+
+}  // namespace clear
