@@ -13,21 +13,18 @@ struct DepthKey {
   std::uint32_t depth, index;
 };
 
-// Radix sort, least significant digit first; each digit is a stable counting sort, parallel over chunks.
-inline void sort_by_depth(Buffer<DepthKey>& keys, Buffer<DepthKey>& spare, int threads) {
+// Radix sort of keys up to `high`, least significant digit first; each digit is a stable counting sort, parallel over chunks.
+inline void sort_by_depth(Buffer<DepthKey>& keys, Buffer<DepthKey>& spare, std::uint32_t high, int threads) {
   const std::int64_t n = std::int64_t(keys.size());
-  if (n < 2) return;
-  std::uint32_t low = UINT32_MAX, high = 0;
-  for (std::int64_t i = 0; i < n; ++i) low = std::min(low, keys[i].depth), high = std::max(high, keys[i].depth);
-  const int bits = std::bit_width(high - low);
-  if (!bits) return;
+  const int bits = std::bit_width(high);
+  if (n < 2 || !bits) return;
   const int passes = (bits + 10) / 11, digit = (bits + passes - 1) / passes, buckets = 1 << digit;
   const int chunks = n < 16384 ? 1 : std::max(1, threads);
   std::vector<std::uint32_t> places(std::size_t(chunks) * buckets);
   spare.reserve_lost(n);
   for (int pass = 0; pass < passes; ++pass) {
     const int shift = pass * digit;
-    auto bucket = [&](const DepthKey& k) { return ((k.depth - low) >> shift) & (buckets - 1); };
+    auto bucket = [&](const DepthKey& k) { return (k.depth >> shift) & (buckets - 1); };
     auto range = [&](std::int64_t chunk) { return std::pair(n * chunk / chunks, n * (chunk + 1) / chunks); };
     Pool::instance().run(threads, chunks, [&](std::int64_t chunk) {
       std::uint32_t* counts = places.data() + chunk * buckets;
@@ -81,7 +78,7 @@ void order_by_depth(const Drawn& drawn, const Buffer<double>& depths, Buffer<std
       for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i)
         keys[at++] = {std::uint32_t((bits(*i) - all.low) >> shift), *i};
     });
-    sort_by_depth(keys, spare, threads);
+    sort_by_depth(keys, spare, std::uint32_t((all.high - all.low) >> shift), threads);
     for (std::int64_t i = 0; i < count; ++i) order[i] = keys[i].index;
   } else {
     for (std::int64_t c = 0; c < chunks; ++c) std::copy(drawn.begin(c), drawn.end(c), order.data() + starts[c]);
