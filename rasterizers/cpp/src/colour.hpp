@@ -8,12 +8,23 @@
 
 namespace clear {
 
+// A derivative that is 0 for every direction.
+struct Zero {};
+
+template <class T>
+CLEAR_INLINE void add_product(Lanes<T>& sum, const Lanes<T>& a, const Lanes<T>& b) {
+  sum += a * b;
+}
+template <class T>
+CLEAR_INLINE void add_product(Lanes<T>&, Zero, const Lanes<T>&) {}
+
 // Y and its derivatives with respect to the unit direction, band by band, with the signs of 3DGS.
 // Calls band(k, Y, dx, dy, dz) for k = 0 … bands.
 template <class T, class Band>
 CLEAR_INLINE void each_band(int bands, const Vec3<T>& direction, Band&& band) {
   using L = Lanes<T>;
-  const L x = direction[0], y = direction[1], z = direction[2], none = T(0);
+  const L x = direction[0], y = direction[1], z = direction[2];
+  const Zero none;
   band(0, L(T(0.28209479177387814)), none, none, none);
   if (bands < 3) return;
   const L c1 = T(0.4886025119029199);
@@ -64,13 +75,13 @@ CLEAR_INLINE void colour_of(const Pose& pose, const Vec3<T>& mean, int bands, co
   direction_of(pose, mean, direction, inverse_length);
   for (L& c : out.rgb) c = T(0.5);
   for (L& d : out.slope) d = T(0);
-  each_band<T>(bands, direction, [&](int k, const L& Y, const L& dx, const L& dy, const L& dz) CLEAR_LAMBDA {
+  each_band<T>(bands, direction, [&](int k, const L& Y, const auto& dx, const auto& dy, const auto& dz) CLEAR_LAMBDA {
     for (int c = 0; c < 3; ++c) {
       const L& w = coefficients[3 * k + c];
       out.rgb[c] += Y * w;
-      out.slope[3 * c] += dx * w;
-      out.slope[3 * c + 1] += dy * w;
-      out.slope[3 * c + 2] += dz * w;
+      add_product(out.slope[3 * c], dx, w);
+      add_product(out.slope[3 * c + 1], dy, w);
+      add_product(out.slope[3 * c + 2], dz, w);
     }
   });
   for (int c = 0; c < 3; ++c) {  // derivative of the unit direction: (I - d dᵀ) / length

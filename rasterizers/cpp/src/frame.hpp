@@ -99,7 +99,7 @@ class Frame {
         direction_of(pose_, mean, direction, length);
         for (L& y : Y) y = T(0);
         each_band<T>(splats.bands, direction,
-                     [&](int k, const L& y, const L&, const L&, const L&) CLEAR_LAMBDA { Y[k] = y; });
+                     [&](int k, const L& y, const auto&, const auto&, const auto&) CLEAR_LAMBDA { Y[k] = y; });
         transpose(Y);
         T row[kLanes];
         for (int i = 0; i < group.count; ++i) {
