@@ -231,6 +231,8 @@ template <class T>
 struct Lanes {
   static constexpr int registers = kLanes / Native<T>::width;
   using Register = typename Native<T>::Register;
+  // A register at any address. A compiler may copy memory in narrower moves, and a load must wait for several of them.
+  typedef Register Unaligned __attribute__((aligned(alignof(T)), may_alias));
   Register r[registers];
 
   Lanes() = default;
@@ -238,13 +240,12 @@ struct Lanes {
     CLEAR_EACH_REGISTER(r[i] = x - Register{});  // x - 0 is x, also for -0; compiles to a broadcast
   }
   static CLEAR_INLINE Lanes load(const T* p) {
-    // Register by register: one memcpy of several registers would go through the stack.
     Lanes a;
-    CLEAR_EACH_REGISTER(std::memcpy(&a.r[i], p + i * Native<T>::width, sizeof(Register)));
+    CLEAR_EACH_REGISTER(a.r[i] = reinterpret_cast<const Unaligned*>(p)[i]);
     return a;
   }
   CLEAR_INLINE void store(T* p) const {
-    CLEAR_EACH_REGISTER(std::memcpy(p + i * Native<T>::width, &r[i], sizeof(Register)));
+    CLEAR_EACH_REGISTER(reinterpret_cast<Unaligned*>(p)[i] = r[i]);
   }
 
 #define CLEAR_OPERATOR(op)                                                          \
