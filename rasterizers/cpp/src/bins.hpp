@@ -86,27 +86,25 @@ inline void list_pairs(const Band& band, const Drawn& drawn, const Buffer<std::u
     request.each_bin(r, [&](int x, int y) { visit((y - band.y0) * band.columns() + x - band.x0); });
   };
 
-  // Count each Gaussian's pairs.
+  // Count each Gaussian's pairs, and add the counts up.
   std::vector<std::int64_t> base(drawn.chunks() + 1, 0);
   out.first.reserve_lost(n + 1);
+  std::uint32_t* counts = out.first.data() + 1;
+  auto end_of = [&](std::int64_t c) { return counts + std::min(n, (c + 1) * kChunk); };
   Pool::instance().run(threads, drawn.chunks(), [&](std::int64_t c) {
-    std::int64_t count = 0;
-    for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i) count += request.bins_in(clipped(*i));
-    base[c + 1] = count;
+    std::fill(counts + c * kChunk, end_of(c), 0);
+    for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i) {
+      const std::int64_t count = request.bins_in(clipped(*i));
+      counts[*i] = std::uint32_t(count), base[c + 1] += count;
+    }
   });
   for (std::int64_t c = 0; c < drawn.chunks(); ++c) base[c + 1] += base[c];
   if (base.back() > std::int64_t(UINT32_MAX)) throw std::length_error("more than 2^32 pairs in one band");
+  out.first[0] = 0;
   Pool::instance().run(threads, drawn.chunks(), [&](std::int64_t c) {
     std::uint32_t place = std::uint32_t(base[c]);
-    std::uint32_t* next = out.first.data() + c * kChunk;
-    for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i) {
-      std::uint32_t* here = out.first.data() + *i + 1;
-      std::fill(next, here, place);
-      next = here, place += std::uint32_t(request.bins_in(clipped(*i)));
-    }
-    std::fill(next, out.first.data() + std::min(n, (c + 1) * kChunk), place);
+    for (std::uint32_t* count = counts + c * kChunk; count < end_of(c); ++count) place += *count, *count = place;
   });
-  out.first[n] = std::uint32_t(base.back());
 
   // List the pairs front to back within each bin: count in parts of the depth order, then scatter part by part. The first
   // pass reads in random order and stores what the second then reads sequentially.

@@ -49,12 +49,14 @@ CLEAR_INLINE void bins_of(const Grid<T>& grid, const Lanes<T> (&e)[kLanes], std:
 }
 
 // The visible Gaussians with a requested bin; the ranges of the others become empty.
+// Not inlined: `project_group` has no registers left for its loop.
 template <class T>
-std::uint32_t keep_requested(const Target<T>& target, std::uint32_t visible, int count, BinRange* ranges) {
+__attribute__((noinline)) std::uint32_t keep_requested(const Target<T>& target, std::uint32_t visible, int count,
+                                                       BinRange* ranges) {
   if (target.request.all()) return visible;
   std::uint32_t kept = 0;
   for (int i = 0; i < count; ++i) {
-    const bool any = target.request.bins_in(ranges[i]) > 0;
+    const bool any = target.request.any_in(ranges[i]);
     const std::uint64_t keep = -std::uint64_t(any);
     const auto range = std::bit_cast<std::uint64_t>(ranges[i]), none = std::bit_cast<std::uint64_t>(BinRange{});
     ranges[i] = std::bit_cast<BinRange>((range & keep) | (none & ~keep));

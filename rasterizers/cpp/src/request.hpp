@@ -1,6 +1,8 @@
 // The tile mask: which blocks of which bins are drawn, and how many requested bins lie in a rectangle.
 #pragma once
 
+#include <algorithm>
+#include <bit>
 #include <cstdint>
 #include <vector>
 
@@ -27,54 +29,73 @@ class Request {
         if (tiles[y * kBlock / edge * across + x * kBlock / edge])
           blocks_[y / kBlocksAcross * columns_ + x / kBlocksAcross] |=
               std::uint64_t(1) << (y % kBlocksAcross * kBlocksAcross + x % kBlocksAcross);
-    requested_.assign(std::size_t(rows_) * words() + 1, 0);
-    before_.assign(std::size_t(columns_ + 1) * (rows_ + 1), 0);
-    for (int y = 0; y < rows_; ++y)
-      for (int x = 0, row = 0; x < columns_; ++x) {
-        const bool any = blocks_[y * columns_ + x] != 0;
-        requested_[y * words() + x / 64] |= std::uint64_t(any) << x % 64;
-        row += any;
-        before_[corner(x + 1, y + 1)] = before_[corner(x + 1, y)] + row;
+    near_.assign(blocks_.size(), 0);
+    for (int y = rows_; y-- > 0;) {
+      std::uint64_t row = 0;
+      for (int x = columns_; x-- > 0;) {
+        row = (row << 1 | (blocks_[y * columns_ + x] != 0)) & 0xff;
+        near_[y * columns_ + x] = row | (y + 1 < rows_ ? near_[(y + 1) * columns_ + x] << kPatch : 0);
       }
+    }
   }
 
   bool all() const { return blocks_.empty(); }
   // One bit per block of a bin, counted row by row.
   std::uint64_t blocks(std::int64_t bin) const { return all() ? ~std::uint64_t(0) : blocks_[bin]; }
-  // The bins of the rectangle with a requested block. No branches: which Gaussians have any is not predictable.
+  // Whether the rectangle has a bin with a requested block. No branch on the answer, which is not predictable.
+  bool any_in(const BinRange& r) const {
+    if (all()) return r.count() > 0;
+    const int width = r.x1 + 1 - r.x0, height = r.y1 + 1 - r.y0;
+    if (std::max(width, height) <= kPatch) return near_[r.y0 * columns_ + r.x0] & rectangle(width, height);
+    return bins_in(r) > 0;
+  }
+  // How many such bins it has.
   std::int64_t bins_in(const BinRange& r) const {
     if (all()) return r.count();
-    return before_[corner(r.x1 + 1, r.y1 + 1)] - before_[corner(r.x0, r.y1 + 1)] - before_[corner(r.x1 + 1, r.y0)] +
-           before_[corner(r.x0, r.y0)];
+    std::int64_t count = 0;
+    each_patch(r, [&](int, int, std::uint64_t bits) { count += std::popcount(bits); });
+    return count;
   }
 
-  // Calls visit(x, y) for each bin of the rectangle with a requested block, row by row.
+  // Calls visit(x, y) for each such bin, row by row.
   template <class Visit>
   void each_bin(const BinRange& r, Visit&& visit) const {
-    for (int y = r.y0; y <= r.y1; ++y) {
-      if (all())
+    if (all()) {
+      for (int y = r.y0; y <= r.y1; ++y)
         for (int x = r.x0; x <= r.x1; ++x) visit(x, y);
-      else
-        for (int x = r.x0; x <= r.x1; x += 64)
-          for (std::uint64_t bits = bins_from(x, y, r.x1 - x + 1); bits; bits &= bits - 1) visit(x + __builtin_ctzll(bits), y);
+      return;
     }
+    each_patch(r, [&](int x, int y, std::uint64_t bits) {
+      for (; bits; bits &= bits - 1) visit(x + __builtin_ctzll(bits) % kPatch, y + __builtin_ctzll(bits) / kPatch);
+    });
   }
 
  private:
-  std::size_t corner(int x, int y) const { return std::size_t(y) * (columns_ + 1) + x; }
+  static constexpr int kPatch = 8;  // edge of a patch, bins: a 64-bit word has a bit per bin of a patch
 
-  int words() const { return (columns_ + 63) / 64; }
-  // Up to 64 bins of a row from x on, as bits.
-  std::uint64_t bins_from(int x, int y, int count) const {
-    const std::uint64_t* row = requested_.data() + y * words() + x / 64;
-    const std::uint64_t bits = x % 64 ? row[0] >> x % 64 | row[1] << (64 - x % 64) : row[0];
-    return count < 64 ? bits & ((std::uint64_t(1) << count) - 1) : bits;
+  // Calls visit(x, y, bits) for the patches that make up the rectangle, nearly always one: squares, or rows if it is too wide.
+  template <class Visit>
+  void each_patch(const BinRange& r, Visit&& visit) const {
+    const int rows = r.x1 - r.x0 < kPatch ? kPatch : 1;
+    for (int y = r.y0; y <= r.y1; y += rows)
+      for (int x = r.x0; x <= r.x1; x += kPatch) visit(x, y, patch(r, x, y, rows));
+  }
+
+  // The requested bins of the rectangle in the patch from (x, y) on, at most `rows` high.
+  std::uint64_t patch(const BinRange& r, int x, int y, int rows) const {
+    return near_[y * columns_ + x] & rectangle(std::min(r.x1 + 1 - x, kPatch), std::min(r.y1 + 1 - y, rows));
+  }
+
+  // The bits of the upper left width x height bins of a patch.
+  static std::uint64_t rectangle(int width, int height) {
+    static constexpr std::uint64_t kRows[] = {0x0,          0x1,            0x101,            0x10101,           0x1010101,
+                                              0x101010101, 0x10101010101, 0x1010101010101, 0x101010101010101};
+    return ((1u << width) - 1) * kRows[height];
   }
 
   int columns_ = 0, rows_ = 0;
   std::vector<std::uint64_t> blocks_;  // by bin; empty: all
-  std::vector<std::uint64_t> requested_;  // one bit per bin, each row from a word of its own on, and a word more
-  std::vector<std::int32_t> before_;   // requested bins above and to the left of each corner
+  std::vector<std::uint64_t> near_;    // by bin: which bins of the patch from it on have a requested block
 };
 
 }  // namespace clear
