@@ -62,24 +62,31 @@ CLEAR_INLINE Lanes<T> load_row(const T* tensor, const Group& group) {
   return columns[0];
 }
 
-// Columns of sixteen rows of `width` numbers at arbitrary addresses. Does not read beyond a row.
+// Columns of a group's rows of `width` numbers, `stride` apart, in place: there is room for at least sixteen. Does
+// not read beyond a row.
 template <class T>
-CLEAR_INLINE void gather_rows(const T* const (&rows)[kLanes], int width, Lanes<T>* columns) {
+CLEAR_INLINE void load_rows(const T* tensor, std::int64_t stride, const Group& group, int width, Lanes<T>* columns) {
   for (int start = 0; start < width; start += kLanes) {
-    int first = std::max(0, std::min(start, width - kLanes));  // the last sixteen overlap the previous ones
-    Lanes<T> block[kLanes];
+    const int first = std::max(0, std::min(start, width - kLanes));  // the last sixteen overlap the previous ones
+    auto& block = reinterpret_cast<Lanes<T>(&)[kLanes]>(columns[first]);
     for (int i = 0; i < kLanes; ++i) {
+      const T* row = tensor + stride * group.rows[i] + first;
       if (width >= kLanes) {
-        block[i] = Lanes<T>::load(rows[i] + first);
+        block[i] = Lanes<T>::load(row);
       } else {
         T padded[kLanes] = {};
-        std::copy(rows[i], rows[i] + width, padded);
+        std::copy(row, row + width, padded);
         block[i] = Lanes<T>::load(padded);
       }
     }
     transpose(block);
-    for (int c = start - first; c < kLanes && first + c < width; ++c) columns[first + c] = block[c];
   }
+}
+
+// Calls visit(i) for each lane whose bit is set.
+template <class Visit>
+CLEAR_INLINE void each_lane(std::uint32_t bits, Visit&& visit) {
+  for (; bits; bits &= bits - 1) visit(__builtin_ctz(bits));
 }
 
 // Writes the bits as bools.

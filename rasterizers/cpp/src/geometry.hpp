@@ -120,7 +120,7 @@ struct Footprint {
   L compensation;        // Mip-Splatting: √(det T Tᵀ / det Σ'), opacity factor that makes up for the kernel's blur
 
   CLEAR_INLINE Footprint(const Geometry<T>& g, const Grid<T>& grid, const Settings<T>& s) {
-    L largest = root(L(s.kernel));
+    L largest = s.root_kernel;
     for (int k = 0; k < 3; ++k) {
       X[k] = L(grid.fx) * g.row_x[k];
       Y[k] = L(grid.fy) * g.row_y[k];

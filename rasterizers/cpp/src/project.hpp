@@ -91,7 +91,7 @@ CLEAR_INLINE Mask<T> ellipse_of(const Centre& centre, const Geometry<T>& g, cons
   const L u = convert<T>(exact_u), v = convert<T>(exact_v);
   L A = L(log2e / 2) * f.xx, B = L(log2e) * f.xy, C = L(log2e / 2) * f.yy;
   L peak = log2(maximum(opacity * f.compensation, L(T(1e-30))));
-  L reach = (peak - L(std::log2(s.alpha_min))) * L(T(1.001)) + L(T(1e-3) * log2e);
+  L reach = (peak - L(s.log2_alpha_min)) * L(T(1.001)) + L(T(1e-3) * log2e);
   L extent = root(maximum(reach, L(T(0))) * L(2 / log2e)) * f.size;
   L half_x = extent * root(f.a + f.kernel), half_y = extent * root(f.c + f.kernel);
   constexpr T huge = T(1e30);  // such an ellipse, of 1e-15 px, covers no pixel centre, and the square would overflow
@@ -162,8 +162,7 @@ std::uint32_t project_group(const Pose& pose, const Settings<T>& s, const Splats
     e[kRed] = e[kGreen] = e[kBlue] = e[15] = T(0);  // the colour is written by `colour_group`
     e[kDepth] = g.z;
     transpose(e);
-    for (int i = 0; i < count; ++i)
-      if ((drawn >> i) & 1) e[i].store(&target.ellipses[first + i].u);
+    each_lane(drawn, [&](int i) CLEAR_LAMBDA { e[i].store(&target.ellipses[first + i].u); });
   }
   finite &= (poison >= L(T(0))).bits() == 0xffff;
   return any;
@@ -172,6 +171,7 @@ std::uint32_t project_group(const Pose& pose, const Settings<T>& s, const Splats
 // Prefetches a Gaussian's coefficients, which `colour_group` reads after the rest of the chunk has been projected.
 template <class T>
 CLEAR_INLINE void fetch_coefficients(const Splats<T>& splats, std::uint32_t number) {
+  __builtin_prefetch(splats.sh0 + 3 * std::size_t(number), 0, 2);
   if (!splats.bands) return;
   const T* row = splats.shN + splats.shN_stride * number;
   constexpr int line = 64 / sizeof(T);
@@ -189,11 +189,7 @@ void colour_group(const Pose& pose, const Splats<T>& splats, std::vector<Target<
   L base[3];
   load_rows<3>(splats.sh0, group, base);
   std::copy(base, base + 3, coefficients);
-  if (splats.bands) {
-    const T* rows[kLanes];
-    for (int i = 0; i < kLanes; ++i) rows[i] = splats.shN + splats.shN_stride * group.rows[i];
-    gather_rows(rows, 3 * splats.bands, coefficients + 3);
-  }
+  load_rows(splats.shN, splats.shN_stride, group, 3 * splats.bands, coefficients + 3);
   add_times_zero(coefficients, 3 + 3 * splats.bands, poison);
   Colour<T> colour;
   colour_of(pose, mean, splats.bands, coefficients, colour);
@@ -242,10 +238,10 @@ bool project(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, st
     std::uint32_t* numbers = drawn.open(chunk);
     std::int64_t count = 0;
     for (std::int64_t first = chunk * kChunk; first < std::min(n, (chunk + 1) * kChunk); first += kLanes)
-      for (std::uint32_t bits = project_group(pose, s, splats, targets, depths, first, finite); bits; bits &= bits - 1) {
-        numbers[count] = std::uint32_t(first + __builtin_ctz(bits));
+      each_lane(project_group(pose, s, splats, targets, depths, first, finite), [&](int i) CLEAR_LAMBDA {
+        numbers[count] = std::uint32_t(first + i);
         fetch_coefficients(splats, numbers[count++]);
-      }
+      });
     drawn.close(chunk, count);
     for (std::int64_t k = 0; k < count; k += kLanes)
       colour_group(pose, splats, targets, slopes, Group(numbers + k, count - k), finite);

@@ -23,6 +23,8 @@ struct Settings {
   T kernel, near, alpha_min, alpha_max, transmittance_min;
   T background[3];
   bool antialiased;
+  // Computed here, not for every sixteen Gaussians.
+  T log2_alpha_min = std::log2(alpha_min), root_kernel = std::sqrt(kernel);
 };
 
 // In double, because centres are always computed in double; see `Centre`.
