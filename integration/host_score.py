@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from clear_strategies.core.gradients import to_ndc
+from clear_strategies.core.gradients import screen_norm, to_ndc
 from clear_strategies.density.threshold import count_passing, topk_threshold
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
@@ -84,7 +84,7 @@ def score_for_host(
         # The host's threshold applies to Σ|∂L/∂u|, so that statistic decides how many Gaussians the score lets pass.
         if score is ordinary:
             return None
-        ordinary = torch.linalg.vector_norm(to_ndc(absgrad / loss_scale, slot.size), dim=-1)
+        ordinary = screen_norm(to_ndc(absgrad / loss_scale, slot.size))
     return score if score is ordinary or scaler is None else scaler(score, ordinary, visible)
 
 

@@ -128,5 +128,13 @@ def _share_below_zero(dot: Tensor, l2: Tensor, h2: Tensor) -> Number:
 
 def to_ndc(screen: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor, "N 2"]:
     """∇_u in NDC from ∇_u in pixels of an image of `size` (width, height)."""
-    width, height = size
-    return torch.stack((screen[:, 0] * (width / 2), screen[:, 1] * (height / 2)), dim=1)
+    ndc = screen.clone()
+    for axis, pixels in enumerate(size):
+        ndc[:, axis] *= pixels / 2
+    return ndc
+
+
+def screen_norm(screen: Float[Tensor, "N 2"]) -> Float[Tensor, " N"]:
+    """‖∇_u‖₂. torch's own norm over rows of two numbers takes five times as long on a CPU."""
+    squares = screen.square()
+    return (squares[:, 0] + squares[:, 1]).sqrt_()

@@ -17,7 +17,7 @@ from clear_strategies.core import images
 from clear_strategies.core.deferred import Number, Scalar
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.finite import require_finite, require_finite_losses
-from clear_strategies.core.gradients import Grads, Shot, conflict_ratio, to_ndc
+from clear_strategies.core.gradients import Grads, Shot, conflict_ratio, screen_norm, to_ndc
 from clear_strategies.core.view import View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import StrategyConflict
@@ -305,7 +305,7 @@ class Conductor:
             if hr.hf is not None:
                 hf = to_ndc(_screen(hr.hf), hr.size)
                 total = total + λ * self.objective.lambda_hf * hf
-        screen = ScreenGradients(screen_lr, base, hf, torch.linalg.vector_norm(total, dim=-1))
+        screen = ScreenGradients(screen_lr, base, hf, screen_norm(total))
         score = None if hr is None else self._ask("score", None, hr.evidence, screen)
         return screen.ordinary if score is None else score, screen.ordinary
 

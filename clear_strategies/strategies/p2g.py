@@ -20,7 +20,7 @@ from torch import Tensor
 from clear_strategies.core import deferred
 from clear_strategies.core.agreement import ViewAgreement, compare_views
 from clear_strategies.core.evidence import Evidence, Lookup, Outside, PatchMaps, lift
-from clear_strategies.core.gradients import Shot
+from clear_strategies.core.gradients import Shot, screen_norm
 from clear_strategies.core.images import DownKernel, UpKernel, downsample, patch_means, quantize, upsample
 from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
@@ -106,8 +106,9 @@ class P2G(Strategy):
         maps = torch.stack(self._cached_patches(view))  # R, A
         size = (view.hr.camera.width, view.hr.camera.height)
         q, a = lift(maps, hr.means2d, hr.visible, self.patch * view.factor, size, self.lookup, self.outside)
-        self.log("mean_q", deferred.mean(q, hr.visible))
-        self.log("mean_w", deferred.mean(q * a, hr.visible))
+        visible = hr.visible.sum()
+        self.log("mean_q", deferred.scalar(q.sum() / visible))  # both are 0 where a Gaussian is invisible
+        self.log("mean_w", deferred.scalar((q * a).sum() / visible))
         return Evidence(q, a)
 
     def route(self, evidence: Evidence | None) -> Float[Tensor, " N"]:
@@ -125,7 +126,7 @@ class P2G(Strategy):
         """S_i = w_i ‖∇_u L_HF‖, alone or joined with the ordinary statistic; None (ordinary) where λ_HF = 0."""
         if self.score_by == "gradient" or evidence is None or screen.hf is None:
             return None
-        S: Tensor = evidence.weight * torch.linalg.vector_norm(screen.hf, dim=-1)  # Eq. 14
+        S: Tensor = evidence.weight * screen_norm(screen.hf)  # Eq. 14
         if self.score_by == "evidence":
             return S
         S = S * (screen.ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny))

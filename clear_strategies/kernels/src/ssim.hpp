@@ -60,7 +60,6 @@ CLEAR_INLINE void windows(Value&& value, Register (&sums)[N]) {
   for (int i = 0; i < N; ++i) sums[i] = kWindow[kReach] * v[i + kReach];
 #pragma GCC unroll 16
   for (int k = 0; k < kReach; ++k)  // the windows in turn, because a sum waits for its previous term
-#pragma GCC unroll 16
     for (int i = 0; i < N; ++i) sums[i] += kWindow[k] * (v[i + k] + v[i + kTaps - 1 - k]);
 }
 
