@@ -30,11 +30,15 @@ CLEAR_INLINE Floats load_some(const float* values, int count) {
   return Floats::load(a);
 }
 
-// Prefetches sixteen rows. There are more tensors here than a processor follows by itself.
-CLEAR_INLINE void fetch_rows(const float* tensor, std::int64_t row, int width) {
+// Prefetches the rows [row, end). There are more tensors here than a processor follows by itself.
+CLEAR_INLINE void fetch_rows(const float* tensor, std::int64_t row, std::int64_t end, int width) {
   if (!tensor) return;
-  const char* begin = reinterpret_cast<const char*>(tensor + row * width);
-  for (int at = 0; at < int(sizeof(float)) * kLanes * width; at += 64) __builtin_prefetch(begin + at, 0, 2);
+  for (const float *p = tensor + row * width, *last = tensor + end * width; p < last; p += kLanes) __builtin_prefetch(p, 0, 2);
+}
+
+// The same of sixteen rows.
+CLEAR_INLINE void fetch_rows(const float* tensor, std::int64_t row, int width) {
+  fetch_rows(tensor, row, row + kLanes, width);
 }
 
 CLEAR_INLINE Doubles widen(const Floats& a) { return convert<double>(a); }

@@ -111,8 +111,6 @@ class ChunkStep {
 
   void sixteen(std::int64_t i, int count, Stepped& done, Tally& tally) const {
     fetch(g, i + kLanes);
-    for (const Attribute* a : {&s.means, &s.quats, &s.scales, &s.opacities, &s.sh0, &s.detail, &s.shN})
-      for (const float* tensor : {a->p, a->m, a->v}) fetch_rows(tensor, i + kLanes, a->width);
     Block b;
     load(g, i, count, b);
     std::uint32_t rows = first_bits(count);
@@ -136,10 +134,14 @@ class ChunkStep {
       step_detail(b, i, count, visible);
       step_rows(b, i, count, moving, shN_multiple);
     }
-    for (std::uint32_t resting = moving ? 0 : rows; resting; resting &= resting - 1) {
-      std::int64_t row = i + __builtin_ctz(resting);
-      rest_row(s.scales, row), rest_row(s.opacities, row), rest_row(s.detail, row);
-    }
+    if (moving) return;
+    for (int k = 0; k < count; ++k) rest_row(s.scales, i + k), rest_row(s.opacities, i + k), rest_row(s.detail, i + k);
+    for (const Attribute* a : {&s.means, &s.quats, &s.scales, &s.opacities, &s.sh0, &s.detail, &s.shN}) fetch_next(*a, i, i + kLanes);
+  }
+
+  // Prefetches the rows that follow sixteen later. Spread over the step, because a processor has few loads under way at once.
+  static CLEAR_INLINE void fetch_next(const Attribute& a, std::int64_t row, std::int64_t end) {
+    for (const float* tensor : {a.p, a.m, a.v}) fetch_rows(tensor, row + kLanes, end + kLanes, a.width);
   }
 
   // Corrects the HR gradients (Eq. 6, 7, 11). Lanes beyond the last Gaussian are zeros, which do not conflict.
@@ -180,6 +182,7 @@ class ChunkStep {
     if (!all)
       for (int k = 0; k < D * kLanes; ++k) moves[k] = float(moving >> (k / D) & 1);
     step_numbers(s.adam, a, D * i, D * count, numbers, all ? nullptr : moves);
+    fetch_next(a, i, i + kLanes);
   }
 
   // f_det gets only the routed gradient of L_HF, uncorrected.
@@ -196,8 +199,9 @@ class ChunkStep {
     std::copy_n(g.lr.rgb + 3 * i, 3 * count, lr);
     if (g.base) std::copy_n(g.base.rgb + 3 * i, 3 * count, base);
     if (g.hf) std::copy_n(g.hf.rgb + 3 * i, 3 * count, hf), b.m.store(m);
-    for (std::uint32_t rest = moving; rest; rest &= rest - 1) {
-      int k = __builtin_ctz(rest);
+    for (int k = 0; k < count; ++k) {
+      fetch_next(s.shN, i + k, i + k + 1);
+      if (!(moving >> k & 1)) continue;
       RowTables t{basis_row(g.lr, g.bases, i + k), {}, Floats::load(lr + 3 * k), Floats::load(base + 3 * k), Floats::load(hf + 3 * k)};
       if (g.base && g.base.basis != g.lr.basis) t.Y_hr = basis_row(g.base, g.bases, i + k);
       Floats gradient[3] = {0.0f, 0.0f, 0.0f};
