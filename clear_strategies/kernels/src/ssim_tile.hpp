@@ -44,7 +44,7 @@ using ColumnSums = Row<3>;     // `Sums` of the windows down a column
 using Single = Row<1>;
 
 // The last rows of a tile's images or maps.
-template <class Row>
+template <class Kind>
 struct Ring {
   static constexpr int kRows = span(kDown);
   float* rows[kRows];
@@ -52,10 +52,10 @@ struct Ring {
 };
 
 // What the windows of kDown neighbouring rows cover of a quantity; `first` is the first row.
-template <class Row>
+template <class Kind>
 struct Down {
   const float* rows[span(kDown)];
-  Down(const Ring<Row>& ring, int first) {
+  Down(const Ring<Kind>& ring, int first) {
     for (int k = 0; k < span(kDown); ++k) rows[k] = ring[first + k];
   }
   CLEAR_INLINE auto operator()(int quantity, std::ptrdiff_t place) const {
@@ -64,9 +64,9 @@ struct Down {
 };
 
 // What the windows of kAlong neighbouring pixels cover of a quantity of a row; `place` is the first pixel's.
-template <class Row>
+template <class Kind>
 struct Along {
-  static constexpr std::ptrdiff_t kPixel = std::ptrdiff_t(kChannels) * Row::kStep;
+  static constexpr std::ptrdiff_t kPixel = std::ptrdiff_t(kChannels) * Kind::kStep;
   const float* row;
   CLEAR_INLINE auto operator()(int quantity, std::ptrdiff_t place) const {
     return [p = row + place + quantity * kLanes - kReach * kPixel](int k) CLEAR_LAMBDA { return load(p + k * kPixel); };
@@ -101,7 +101,7 @@ class TileRun {
     const std::size_t ring = Images::floats(length_) + Maps::floats(length_);
     const std::size_t group = ColumnMoments::floats(length_) + ColumnSums::floats(length_);
     float* free = scratch(span(kDown) * ring + kDown * group + 3 * Single::floats(length_) + numbers());
-    auto take = [&]<class Row>(Row) { return std::exchange(free, free + Row::floats(length_)) + Row::kFirst; };
+    auto take = [&]<class Kind>(Kind) { return std::exchange(free, free + Kind::floats(length_)) + Kind::kFirst; };
     for (float*& row : images_.rows) row = take(Images());
     for (float*& row : maps_.rows) row = take(Maps());
     for (float*& row : moments_) row = take(ColumnMoments());
@@ -146,9 +146,9 @@ class TileRun {
     for (int v = 0; v < length_; v += kAlong * kChannels) each_register(v, v + kChannels, visit);
   }
 
-  template <class Row>
+  template <class Kind>
   static CLEAR_INLINE std::ptrdiff_t place(int v, int lane) {
-    return std::ptrdiff_t(v) * Row::kStep + lane;
+    return std::ptrdiff_t(v) * Kind::kStep + lane;
   }
 
   // 1 for the numbers [from, to) of the image's rows, 0 for the others.

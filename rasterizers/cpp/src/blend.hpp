@@ -95,16 +95,17 @@ CLEAR_INLINE Lanes<T> exponent(const Ellipse<T>& e, const Lanes<T>& dx, const La
 template <class T, int C>
 void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, BlockBlend<T, C>& out, BlockEnd<T>& end) {
   using L = Lanes<T>;
+  constexpr int kSums = BlockBlend<T, C>::kSums;
   const PixelCentres<T> pixel(block);
   const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, transmittance_min = s.transmittance_min;
-  L through = T(1), sums[out.kSums];
+  L through = T(1), sums[kSums];
   for (L& sum : sums) sum = T(0);
   Mask<T> alive = Mask<T>::from_bits(0xffff);
   if (segment.first == 0) {
     std::fill_n(end.ended, kLanes, INT_MAX);
   } else {
     through = L::load(end.transmittance);
-    for (int c = 0; c < out.kSums; ++c) sums[c] = L::load(out.sums[c]);
+    for (int c = 0; c < kSums; ++c) sums[c] = L::load(out.sums[c]);
     std::uint32_t open = 0;
     for (int i = 0; i < kLanes; ++i) open |= std::uint32_t(end.ended[i] == INT_MAX) << i;
     alive = Mask<T>::from_bits(open);
@@ -130,12 +131,12 @@ void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, Blo
       weight = select(ends, L(T(0)), weight), after = select(ends, through, after);
     }
     for (int c = 0; c < C; ++c) sums[c] += weight * L((&e.r)[c]);
-    if constexpr (out.kSums > C) sums[C] += weight;
+    if constexpr (kSums > C) sums[C] += weight;
     through = after;
     if (__builtin_expect(some_end, 0) && !alive.any()) break;
   }
   through.store(end.transmittance);
-  for (int c = 0; c < out.kSums; ++c) sums[c].store(out.sums[c]);
+  for (int c = 0; c < kSums; ++c) sums[c].store(out.sums[c]);
 }
 
 // Sums over a block's pixels for the Gaussians of its bin: one row of `PairSums` per (Gaussian, cotangent).
