@@ -175,7 +175,7 @@ class TileRun {
   void read(int r) {
     float* to = images_[r];
     if (r < 0 || r >= im_.height) {
-      std::fill_n(to, numbers() * 2, 0.0f);
+      std::fill_n(to, length_ * Images::kStep, 0.0f);
       return;
     }
     Images::cut(padded(row_of(im_.y, r), numbers_), length_, 0, to);
@@ -203,7 +203,7 @@ class TileRun {
     for (int r = 0; r < kDown; ++r) {
       const int at = q + r;
       if (at < 0 || at >= im_.height) {
-        std::fill_n(maps_[at], numbers() * 5, 0.0f);
+        std::fill_n(maps_[at], length_ * Maps::kStep, 0.0f);
       } else {
         ColumnMoments::continue_ends(moments_[r], length_);
         const double dissimilarity = maps_of_row(moments_[r], at);

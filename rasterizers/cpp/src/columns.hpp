@@ -83,12 +83,6 @@ CLEAR_INLINE void load_rows(const T* tensor, std::int64_t stride, const Group& g
   }
 }
 
-// Calls visit(i) for each lane whose bit is set.
-template <class Visit>
-CLEAR_INLINE void each_lane(std::uint32_t bits, Visit&& visit) {
-  for (; bits; bits &= bits - 1) visit(__builtin_ctz(bits));
-}
-
 // Writes the bits as bools.
 inline void store_bits(bool* out, int count, std::uint32_t bits) {
   for (int i = 0; i < count; ++i) out[i] = (bits >> i) & 1;

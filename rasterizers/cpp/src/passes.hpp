@@ -22,11 +22,6 @@ struct BinJob {
   int block_y(int block) const { return y * kBin + block / kBlocksAcross * kBlock; }
 };
 
-template <class Visit>
-CLEAR_INLINE void each_block(std::uint64_t blocks, Visit&& visit) {
-  for (; blocks; blocks &= blocks - 1) visit(__builtin_ctzll(blocks));
-}
-
 template <class T>
 Segment<T>& thread_segment() {
   static thread_local Segment<T> segment;
@@ -65,7 +60,7 @@ void draw_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
   using L = Lanes<T>;
   static thread_local BlockBlend<T, C> scratch[kBlocks];
   BlockBlend<T, C>* blends = scratch;
-  each_block(job.inside, [&](int b) {
+  each_bit(job.inside, [&](int b) {
     std::fill_n(job.ends[b].transmittance, kLanes, T(1));
     std::fill_n(job.ends[b].ended, kLanes, INT_MAX);
     blends[b] = {};
@@ -75,13 +70,13 @@ void draw_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
   for (std::int64_t first = 0; first < n && open; first += kSegment) {
     Segment<T>& part = thread_segment<T>();
     gather(job.ellipses, job.bins, job.bin, first, job.requested, part);
-    each_block(open, [&](int b) {
+    each_bit(open, [&](int b) {
       if (!part.lengths[b]) return;
       blend_block(part, b, job.settings, blends[b], job.ends[b]);
       if (first + kSegment < n && job.ends[b].finished()) open &= ~(std::uint64_t(1) << b);
     });
   }
-  each_block(job.inside, [&](int b) {
+  each_bit(job.inside, [&](int b) {
     const L through = L::load(job.ends[b].transmittance);
     L pixel[3], cover[1] = {L(T(1)) - through};
     for (int c = 0; c < 3; ++c) pixel[c] = L::load(blends[b].sums[c]) + through * L(job.settings.background[c]);
@@ -105,7 +100,7 @@ template <class T, int K, int C>
 void start_vjp(const BinJob<T>& job, const T* cotangents, BinVjp<T, K, C>& out) {
   using L = Lanes<T>;
   const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * C;
-  each_block(job.requested, [&](int b) {
+  each_bit(job.requested, [&](int b) {
     const L through = L::load(job.ends[b].transmittance);
     through.store(out.back[b].transmittance);
     for (int k = 0; k < K; ++k) {
@@ -138,7 +133,7 @@ void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T>* pair_
   BinVjp<T, K, C>& mine = scratch;
   fetch_cotangents<T, K, C>(job, cotangents);
   std::int64_t end = 0;  // no pixel blended a pair from here on, and their segments may not have been listed
-  each_block(job.requested, [&](int b) {
+  each_bit(job.requested, [&](int b) {
     for (std::int32_t e : job.ends[b].ended) end = std::max<std::int64_t>(end, std::min<std::int64_t>(e, n));
   });
   bool started = false;
@@ -150,7 +145,7 @@ void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T>* pair_
     Segment<T>& part = thread_segment<T>();
     gather(job.ellipses, job.bins, job.bin, first, job.requested, part);
     if (!std::exchange(started, true)) start_vjp(job, cotangents, mine);
-    each_block(job.requested, [&](int b) {
+    each_bit(job.requested, [&](int b) {
       if (part.lengths[b])
         blend_block_vjp<T, K, C>(part, b, job.settings, job.ends[b], job.depths ? job.depths + b : nullptr,
                                  mine.cotangent[b], mine.back[b], sums);

@@ -162,7 +162,7 @@ std::uint32_t project_group(const Pose& pose, const Settings<T>& s, const Splats
     e[kRed] = e[kGreen] = e[kBlue] = e[15] = T(0);  // the colour is written by `colour_group`
     e[kDepth] = g.z;
     transpose(e);
-    each_lane(drawn, [&](int i) CLEAR_LAMBDA { e[i].store(&target.ellipses[first + i].u); });
+    each_bit(drawn, [&](int i) CLEAR_LAMBDA { e[i].store(&target.ellipses[first + i].u); });
   }
   finite &= (poison >= L(T(0))).bits() == 0xffff;
   return any;
@@ -238,7 +238,7 @@ bool project(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, st
     std::uint32_t* numbers = drawn.open(chunk);
     std::int64_t count = 0;
     for (std::int64_t first = chunk * kChunk; first < std::min(n, (chunk + 1) * kChunk); first += kLanes)
-      each_lane(project_group(pose, s, splats, targets, depths, first, finite), [&](int i) CLEAR_LAMBDA {
+      each_bit(project_group(pose, s, splats, targets, depths, first, finite), [&](int i) CLEAR_LAMBDA {
         numbers[count] = std::uint32_t(first + i);
         fetch_coefficients(splats, numbers[count++]);
       });

@@ -66,7 +66,7 @@ class Request {
       return;
     }
     each_patch(r, [&](int x, int y, std::uint64_t bits) {
-      for (; bits; bits &= bits - 1) visit(x + __builtin_ctzll(bits) % kPatch, y + __builtin_ctzll(bits) / kPatch);
+      each_bit(bits, [&](int i) CLEAR_LAMBDA { visit(x + i % kPatch, y + i / kPatch); });
     });
   }
 

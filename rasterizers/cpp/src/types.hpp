@@ -9,6 +9,12 @@
 
 namespace clear {
 
+// Calls visit(i) for each bit i that is set, ascending.
+template <class Visit>
+CLEAR_INLINE void each_bit(std::uint64_t bits, Visit&& visit) {
+  for (; bits; bits &= bits - 1) visit(__builtin_ctzll(bits));
+}
+
 inline constexpr int kBin = 32;                             // edge of a bin, px: Gaussians are listed by bin
 inline constexpr int kBlock = 4;                            // edge of a block, px: sixteen lanes blend one
 inline constexpr int kBlocksAcross = kBin / kBlock;         // 8
