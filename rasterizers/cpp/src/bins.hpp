@@ -35,7 +35,7 @@ struct Bins {
   bool has_masks = false;
 };
 
-// The number of pairs in each row of bins. 64-bit: a million Gaussians that cover the image make 10^9 pairs.
+// The number of pairs in each row of bins.
 inline std::vector<std::int64_t> count_pairs(int rows, const Buffer<BinRange>& ranges, const Drawn& drawn, int threads) {
   const std::int64_t per_part = 16, parts = (drawn.chunks() + per_part - 1) / per_part;
   std::vector<std::int64_t> steps(std::size_t(parts) * (rows + 1), 0);  // differences from row to row
@@ -71,39 +71,85 @@ inline std::vector<std::int64_t> count_pairs_in_row(int row, int columns, const 
   return pairs;
 }
 
-// Lists the pairs of a band on the requested bins.
-inline void list_pairs(const Band& band, const Drawn& drawn, const Buffer<std::uint32_t>& order,
-                       const Buffer<BinRange>& ranges, std::int64_t n, const Request& request, Bins& out, int threads) {
+// How many rectangles cover each bin of a band. Sums of differences along both axes: adding a rectangle is no loop over its
+// bins, whose length a processor cannot foresee.
+class Coverage {
+ public:
+  explicit Coverage(const Band& band) : band_(band), width_(band.columns() + 1), steps_(width_ * (band.y1 - band.y0 + 1), 0) {}
+
+  void add(const BinRange& r) {
+    std::uint32_t *top = at(r.x0, r.y0), *bottom = at(r.x0, r.y1 + 1);
+    const int across = r.x1 + 1 - r.x0;
+    ++top[0], --top[across], --bottom[0], ++bottom[across];
+  }
+
+  // Calls visit(bin of the band, its place on the pixel grid, count) for each bin. `columns` are those of the grid.
+  template <class Visit>
+  void each(int columns, Visit&& visit) {
+    for (int y = band_.y0, bin = 0; y < band_.y1; ++y) {
+      std::uint32_t running = 0;
+      for (int x = band_.x0; x < band_.x1; ++x, ++bin) {
+        running += *at(x, y);
+        visit(bin, std::int64_t(y) * columns + x, *at(x, y) = running + (y > band_.y0 ? *at(x, y - 1) : 0));
+      }
+    }
+  }
+
+ private:
+  std::uint32_t* at(int x, int y) { return &steps_[(y - band_.y0) * width_ + x - band_.x0]; }
+
+  Band band_;
+  std::size_t width_;
+  std::vector<std::uint32_t> steps_;
+};
+
+// Lists the pairs of a band of the image on the requested bins.
+inline void list_pairs(const Band& band, const Band& image, const Drawn& drawn, const Buffer<std::uint32_t>& order,
+                       const Buffer<BinRange>& ranges, const Request& request, Bins& out, int threads) {
   out.band = band, out.has_masks = false;
   const int bins = band.bins();
   auto clipped = [&](std::uint32_t i) {
     BinRange r = ranges[i];
-    r.x0 = std::max<int>(r.x0, band.x0), r.x1 = std::max(std::min<int>(r.x1, band.x1 - 1), r.x0 - 1);
-    r.y0 = std::max<int>(r.y0, band.y0), r.y1 = std::max(std::min<int>(r.y1, band.y1 - 1), r.y0 - 1);
+    r.x0 = std::min(std::max<int>(r.x0, band.x0), band.x1), r.x1 = std::max(std::min<int>(r.x1, band.x1 - 1), r.x0 - 1);
+    r.y0 = std::min(std::max<int>(r.y0, band.y0), band.y1), r.y1 = std::max(std::min<int>(r.y1, band.y1 - 1), r.y0 - 1);
     return r;
   };
   auto each_bin = [&](const BinRange& r, auto&& visit) {
-    request.each_bin(r, [&](int x, int y) { visit((y - band.y0) * band.columns() + x - band.x0); });
+    const int corner = (r.y0 - band.y0) * band.columns() + r.x0 - band.x0;
+    if (request.all()) {  // one loop, because the ends of two are harder to foresee
+      const int width = r.x1 + 1 - r.x0, down = band.columns() + 1 - width;
+      for (int left = int(r.count()), bin = corner, in_row = width; left; --left) {
+        visit(bin);
+        const bool last = --in_row == 0;
+        bin += last ? down : 1, in_row = last ? width : in_row;
+      }
+    } else {
+      request.each_bin(r, [&](int x, int y) { visit((y - band.y0) * band.columns() + x - band.x0); });
+    }
   };
 
   // Count each Gaussian's pairs, and add the counts up.
-  std::vector<std::int64_t> base(drawn.chunks() + 1, 0);
+  const std::int64_t n = std::int64_t(ranges.size()), chunks = drawn.chunks();
+  std::vector<std::uint32_t> base(chunks + 1, 0);
   out.first.reserve_lost(n + 1);
   std::uint32_t* counts = out.first.data() + 1;
-  auto end_of = [&](std::int64_t c) { return counts + std::min(n, (c + 1) * kChunk); };
-  Pool::instance().run(threads, drawn.chunks(), [&](std::int64_t c) {
-    std::fill(counts + c * kChunk, end_of(c), 0);
-    for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i) {
-      const std::int64_t count = request.bins_in(clipped(*i));
-      counts[*i] = std::uint32_t(count), base[c + 1] += count;
+  Pool::instance().run(threads, chunks, [&](std::int64_t c) {
+    const std::int64_t begin = c * kChunk, end = std::min(n, begin + kChunk);
+    std::uint32_t pairs = 0;
+    if (request.all() && band == image) {  // a loop that the compiler turns into one over registers
+      for (std::int64_t i = begin; i < end; ++i) pairs += counts[i] = std::uint32_t(ranges[i].count());
+    } else {
+      std::fill(counts + begin, counts + end, 0);
+      for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i)
+        pairs += counts[*i] = std::uint32_t(request.bins_in(clipped(*i)));
     }
+    base[c + 1] = pairs;
   });
-  for (std::int64_t c = 0; c < drawn.chunks(); ++c) base[c + 1] += base[c];
-  if (base.back() > std::int64_t(UINT32_MAX)) throw std::length_error("more than 2^32 pairs in one band");
+  for (std::int64_t c = 0; c < chunks; ++c) base[c + 1] += base[c];
   out.first[0] = 0;
-  Pool::instance().run(threads, drawn.chunks(), [&](std::int64_t c) {
-    std::uint32_t place = std::uint32_t(base[c]);
-    for (std::uint32_t* count = counts + c * kChunk; count < end_of(c); ++count) place += *count, *count = place;
+  Pool::instance().run(threads, chunks, [&](std::int64_t c) {
+    std::uint32_t place = base[c];
+    for (std::int64_t i = c * kChunk; i < std::min(n, (c + 1) * kChunk); ++i) counts[i] = place += counts[i];
   });
 
   // List the pairs front to back within each bin: count in parts of the depth order, then scatter part by part. The first
@@ -114,13 +160,14 @@ inline void list_pairs(const Band& band, const Drawn& drawn, const Buffer<std::u
   };
   const std::int64_t m = std::int64_t(order.size());
   const int parts = m < 4096 ? 1 : std::max(1, threads);
-  std::vector<std::uint32_t> places(std::size_t(parts) * bins, 0);
+  const std::size_t stride = (bins + 31) / 16 * 16;  // two parts never write to one cache line
+  std::vector<std::uint32_t> places(parts * stride, 0);
   Buffer<Ranked> ranked;
   ranked.reserve_lost(m);
   auto part_of = [&](std::int64_t part) { return std::pair(m * part / parts, m * (part + 1) / parts); };
   Pool::instance().run(threads, parts, [&](std::int64_t part) {
     constexpr int ahead = 16;
-    std::uint32_t* count = places.data() + part * bins;
+    Coverage coverage(band);
     auto [begin, end] = part_of(part);
     for (std::int64_t k = begin; k < end; ++k) {
       if (k + ahead < end) {
@@ -128,21 +175,24 @@ inline void list_pairs(const Band& band, const Drawn& drawn, const Buffer<std::u
         __builtin_prefetch(&out.first[order[k + ahead]]);
       }
       ranked[k] = {clipped(order[k]), order[k], out.first[order[k]]};
-      each_bin(ranked[k].range, [&](int bin) { ++count[bin]; });
+      coverage.add(ranked[k].range);
     }
+    coverage.each(image.columns(), [&](int bin, std::int64_t place, std::uint32_t count) {
+      places[part * stride + bin] = request.blocks(place) ? count : 0;
+    });
   });
   out.starts.assign(bins + 1, 0);
   std::uint32_t place = 0;
   for (int bin = 0; bin < bins; ++bin) {
     out.starts[bin] = place;
-    for (int part = 0; part < parts; ++part) place += std::exchange(places[std::size_t(part) * bins + bin], place);
+    for (int part = 0; part < parts; ++part) place += std::exchange(places[part * stride + bin], place);
   }
   out.starts[bins] = place;
   out.pairs.reserve_lost(place);
   out.masks.reserve_lost(place);
   out.where.reserve_lost(place);
   Pool::instance().run(threads, parts, [&](std::int64_t part) {
-    std::uint32_t* next = places.data() + part * bins;
+    std::uint32_t* next = places.data() + part * stride;
     auto [begin, end] = part_of(part);
     for (std::int64_t k = begin; k < end; ++k) {
       std::uint32_t nth = ranked[k].first;

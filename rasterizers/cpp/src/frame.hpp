@@ -33,17 +33,12 @@ class Frame {
     for (Target<T>& target : targets) {
       View view;
       view.target = std::move(target);
-      view.pairs_in_row = count_pairs(view.target.grid.rows(), view.target.ranges, drawn_, threads);
       views_.push_back(std::move(view));
     }
     return true;
   }
 
-  std::int64_t pairs(int i) const {
-    std::int64_t total = 0;
-    for (std::int64_t p : views_.at(i).pairs_in_row) total += p;
-    return total;
-  }
+  std::int64_t pairs(int i) const { return views_.at(i).target.pairs; }
 
   // `depth` is null if it is not asked for.
   void draw(int i, T* image, T* alpha, T* depth, int threads) {
@@ -53,8 +48,8 @@ class Frame {
     view.ends.reserve_lost(blocks);
     if (depth) view.depths.reserve_lost(blocks);
     view.has_depth = depth != nullptr;
-    bands_of(view, kBytesPerPair + kMostCotangents * sizeof(PairSums<T>));  // throws now where the gradients would not fit
-    for (const Band& band : bands_of(view, kBytesPerPair)) {
+    bands_of(view, kBytesPerPair + kMostCotangents * sizeof(PairSums<T>), threads);  // throws now where the gradients would not fit
+    for (const Band& band : bands_of(view, kBytesPerPair, threads)) {
       list(view, band, threads);
       Pool::instance().run(threads, band.bins(), [&](std::int64_t bin) {
         if (depth) draw_bin<T, kColourAndDepth>(job(view, bin), image, alpha, depth);
@@ -120,7 +115,6 @@ class Frame {
 
   struct View {
     Target<T> target;
-    std::vector<std::int64_t> pairs_in_row;
     Buffer<BlockEnd<T>> ends;           // [bins, 64]
     Buffer<BlockDepth<T>> depths;       // [bins, 64] if depth was drawn
     bool has_depth = false;
@@ -128,14 +122,16 @@ class Frame {
   };
 
   // Splits the image into bands whose pairs fit the budget: rows of bins, and a row that does not fit into parts of it.
-  std::vector<Band> bands_of(const View& view, std::int64_t bytes_per_pair) const {
+  std::vector<Band> bands_of(const View& view, std::int64_t bytes_per_pair, int threads) const {
     const std::int64_t most = std::min(budget_ / bytes_per_pair, std::int64_t(UINT32_MAX));
-    const int columns = view.target.grid.columns(), rows = int(view.pairs_in_row.size());
+    const int columns = view.target.grid.columns(), rows = view.target.grid.rows();
+    if (view.target.pairs <= most) return {whole(view.target.grid)};
+    const std::vector<std::int64_t> pairs_in_row = count_pairs(rows, view.target.ranges, drawn_, threads);
     std::vector<Band> bands;
     int first = 0;
     std::int64_t held = 0;
     for (int row = 0; row < rows; ++row) {
-      const std::int64_t here = view.pairs_in_row[row];
+      const std::int64_t here = pairs_in_row[row];
       if (held + here > most && row > first) bands.push_back({0, columns, first, row}), first = row, held = 0;
       held += here;
       if (here <= most) continue;
@@ -171,8 +167,10 @@ class Frame {
                      " px wide. Raise `memory`, or remove Gaussians that large.");
   }
 
+  static Band whole(const Grid<T>& grid) { return {0, grid.columns(), 0, grid.rows()}; }
+
   void list(View& view, const Band& band, int threads) {
-    list_pairs(band, drawn_, order_, view.target.ranges, n_, view.target.request, view.bins, threads);
+    list_pairs(band, whole(view.target.grid), drawn_, order_, view.target.ranges, view.target.request, view.bins, threads);
   }
 
   // The job of a bin of the band, with its requested blocks.
@@ -197,7 +195,7 @@ class Frame {
 
   template <int K, int C>
   void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
-    const std::vector<Band> bands = bands_of(view, kBytesPerPair + K * sizeof(PairSums<T>));
+    const std::vector<Band> bands = bands_of(view, kBytesPerPair + K * sizeof(PairSums<T>), threads);
     const bool whole = bands.size() == 1;
     if (!whole) {
       splat_sums_.reserve_lost(std::size_t(n_) * K);

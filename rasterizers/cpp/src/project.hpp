@@ -28,6 +28,7 @@ struct Target {
   Buffer<BinRange> ranges;       // [n]; empty if the Gaussian is not drawn
   Buffer<Ellipse<T>> ellipses;   // [n]; of the drawn Gaussians
   Buffer<std::uint8_t> lit;      // [n]; bit c: channel c was not clamped at 0, and so has a gradient
+  std::int64_t pairs = 0;        // of a Gaussian and a bin; 64-bit: a million Gaussians that cover the image make 10^9
 };
 
 // The bins whose pixel centres the ellipses' boxes cover.
@@ -243,6 +244,11 @@ bool project(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, st
         fetch_coefficients(splats, numbers[count++]);
       });
     drawn.close(chunk, count);
+    for (Target<T>& target : targets) {
+      std::int64_t pairs = 0;
+      for (std::int64_t k = 0; k < count; ++k) pairs += target.ranges[numbers[k]].count();
+      std::atomic_ref(target.pairs).fetch_add(pairs, std::memory_order_relaxed);
+    }
     for (std::int64_t k = 0; k < count; k += kLanes)
       colour_group(pose, splats, targets, slopes, Group(numbers + k, count - k), finite);
     if (!finite) all_finite = false;

@@ -13,7 +13,7 @@ namespace clear {
 // A rectangle of bins, both ends included; empty if x1 = x0 - 1 or y1 = y0 - 1.
 struct BinRange {
   std::int16_t x0 = 0, x1 = -1, y0 = 0, y1 = -1;
-  std::int64_t count() const { return x1 < x0 || y1 < y0 ? 0 : std::int64_t(x1 - x0 + 1) * (y1 - y0 + 1); }
+  std::int64_t count() const { return std::int64_t(x1 + 1 - x0) * std::int64_t(y1 + 1 - y0); }
 };
 
 class Request {
