@@ -146,6 +146,7 @@ void bind_frame(nb::module_& m) {
                        Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1> out, int threads) {
         Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
         T* y = out.data();
+        require(reinterpret_cast<std::uintptr_t>(y) % (kLanes * sizeof(T)) == 0, "`out` must come from `empty`");
         nb::gil_scoped_release release;
         self.basis(splats, y, threads);
       },

@@ -27,7 +27,8 @@ struct Segment {
 };
 
 // The blocks of the bin that each of sixteen Gaussians reaches, with centres (u, v) relative to the bin's corner. For each
-// row of blocks: the leftmost and rightmost point of the ellipse within the row, exact up to a margin of 1e-3 px.
+// row of blocks: the leftmost and rightmost point of the ellipse within the row, exact up to a margin of 1e-3 px. Rows are
+// counted from the first one that the Gaussian may reach, because few of them are higher than three.
 template <class T>
 CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], const Lanes<T>& u, const Lanes<T>& v, std::uint64_t* masks) {
   using L = Lanes<T>;
@@ -37,11 +38,15 @@ CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], const Lanes<T>& u, co
   const L shear = -B / (L(T(2)) * A);                  // dx of the chord's middle per dy
   const L width = root(reach / A);                     // half the chord through the centre
   const L widest = -B / (L(T(2)) * C) * half_x;        // dy of the rightmost point; the leftmost lies opposite
+  const L reach_y = half_y + L(T(0.01));  // so that no rounding leaves a row out
+  const L top = maximum(floor((v - reach_y - L(T(kBlock - 0.5))) * L(T(1) / kBlock)), zero);
+  const L bottom = minimum(floor((v + reach_y - L(T(0.5))) * L(T(1) / kBlock)), L(T(kBlocksAcross - 1)));
   std::uint32_t low[kLanes] = {}, high[kLanes] = {};
-  for (int row = 0; row < kBlocksAcross; ++row) {
-    L first = L(T(row * kBlock) + T(0.5)) - v, last = first + L(T(kBlock - 1));
-    Mask<T> touches = (first <= half_y + slack) & (last >= -half_y - slack);
-    if (!touches.any()) continue;
+  for (int nth = 0; nth < kBlocksAcross; ++nth) {
+    const L row = top + L(T(nth));
+    if (!(row <= bottom).any()) break;
+    L first = (row * L(T(kBlock)) + L(T(0.5))) - v, last = first + L(T(kBlock - 1));
+    Mask<T> touches = (first <= half_y + slack) & (last >= -half_y - slack) & (row <= bottom);
     L from = maximum(first, -half_y), to = minimum(last, half_y);
     L dy_right = clamp(widest, from, to), dy_left = clamp(-widest, from, to);
     L t_right = dy_right * inverse, t_left = dy_left * inverse;
@@ -54,10 +59,13 @@ CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], const Lanes<T>& u, co
     L bits = where(some, scale_by_power(one, end) - scale_by_power(one, begin));  // 2^end - 2^begin
     T values[kLanes];
     bits.store(values);
-    std::uint32_t* half = row < 4 ? low : high;
-    for (int i = 0; i < kLanes; ++i) half[i] |= std::uint32_t(std::int32_t(values[i])) << (8 * (row & 3));
+    std::uint32_t* half = nth < 4 ? low : high;
+    for (int i = 0; i < kLanes; ++i) half[i] |= std::uint32_t(std::int32_t(values[i])) << (8 * (nth & 3));
   }
-  for (int i = 0; i < kLanes; ++i) masks[i] = std::uint64_t(high[i]) << 32 | low[i];
+  T tops[kLanes];
+  minimum(top, L(T(kBlocksAcross - 1))).store(tops);
+  for (int i = 0; i < kLanes; ++i)
+    masks[i] = (std::uint64_t(high[i]) << 32 | low[i]) << (kBlocksAcross * std::int32_t(tops[i]));
 }
 
 // The blocks of a bin that lie in the image, as bits.

@@ -84,9 +84,18 @@ class Frame {
   void basis(const Splats<T>& splats, T* out, int threads) {
     using L = Lanes<T>;
     const int width = splats.bands + 1;
+    auto write = [&](std::int64_t row, const L& Y) CLEAR_LAMBDA {
+      T* to = out + row * width;
+      if (width == kLanes) return Y.stream(to);
+      T numbers[kLanes];
+      Y.store(numbers);
+      std::copy(numbers, numbers + width, to);
+    };
     Pool::instance().run(threads, drawn_.chunks(), [&](std::int64_t chunk) {
-      std::int64_t written = chunk * kChunk;
-      auto zeros_until = [&](std::int64_t row) { std::fill(out + written * width, out + row * width, T(0)); };
+      std::int64_t next = chunk * kChunk;
+      auto zeros_until = [&](std::int64_t row) CLEAR_LAMBDA {
+        for (; next < row; ++next) write(next, L(T(0)));
+      };
       for (const std::uint32_t* number = drawn_.begin(chunk); number < drawn_.end(chunk); number += kLanes) {
         const Group group(number, drawn_.end(chunk) - number);
         L mean[3], direction[3], length, Y[kLanes];
@@ -96,15 +105,13 @@ class Frame {
         each_band<T>(splats.bands, direction,
                      [&](int k, const L& y, const auto&, const auto&, const auto&) CLEAR_LAMBDA { Y[k] = y; });
         transpose(Y);
-        T row[kLanes];
         for (int i = 0; i < group.count; ++i) {
           zeros_until(group.rows[i]);
-          Y[i].store(row);
-          std::copy(row, row + width, out + std::int64_t(group.rows[i]) * width);
-          written = group.rows[i] + 1;
+          write(next++, Y[i]);
         }
       }
       zeros_until(std::min(n_, (chunk + 1) * kChunk));
+      end_of_stream();
     });
   }
 

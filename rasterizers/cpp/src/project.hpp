@@ -215,7 +215,7 @@ void colour_group(const Pose& pose, const Splats<T>& splats, std::vector<Target<
     L rows[kLanes];
     for (int c = 0; c < kLanes; ++c) rows[c] = c < 9 ? colour.slope[c] : L(T(0));
     transpose(rows);
-    for (int i = 0; i < group.count; ++i) rows[i].store(slopes[group.rows[i]].numbers);
+    for (int i = 0; i < group.count; ++i) rows[i].stream(slopes[group.rows[i]].numbers);
   }
   finite &= (poison >= L(T(0))).bits() == 0xffff;
 }
@@ -251,6 +251,7 @@ bool project(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, st
     }
     for (std::int64_t k = 0; k < count; k += kLanes)
       colour_group(pose, splats, targets, slopes, Group(numbers + k, count - k), finite);
+    end_of_stream();
     if (!finite) all_finite = false;
   });
   return all_finite;

@@ -83,7 +83,7 @@ class Pool {
     if (failure_) std::rethrow_exception(failure_);
   }
 
-  static constexpr int kSpins = 400;  // about 20 µs: stages follow each other closely, and waking a sleeping thread takes longer
+  static constexpr int kSpins = 2000;  // about 50 µs: stages follow each other closely, and waking a sleeping thread takes longer
 
   static long process() {
 #if defined(__unix__) || defined(__APPLE__)

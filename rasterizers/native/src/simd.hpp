@@ -247,6 +247,19 @@ struct Lanes {
   CLEAR_INLINE void store(T* p) const {
     CLEAR_EACH_REGISTER(reinterpret_cast<Unaligned*>(p)[i] = r[i]);
   }
+  // Stores to memory past the caches, for what is not read again soon. `p` is aligned to sixteen numbers. `end_of_stream`
+  // comes before another thread reads.
+  CLEAR_INLINE void stream(T* p) const {
+#if defined(__AVX512F__)
+    if constexpr (sizeof(T) == 4) return _mm512_stream_ps(p, (__m512)r[0]);
+#elif defined(__AVX2__)
+    if constexpr (sizeof(T) == 4) {
+      CLEAR_EACH_REGISTER(_mm256_stream_ps(p + i * Native<T>::width, (__m256)r[i]));
+      return;
+    }
+#endif
+    store(p);
+  }
 
 #define CLEAR_OPERATOR(op)                                                          \
   friend CLEAR_INLINE Lanes operator op(const Lanes& a, const Lanes& b) {           \
@@ -277,6 +290,12 @@ struct Lanes {
   CLEAR_COMPARISON(operator>=, Native<T>::less_equal(b.r[i], a.r[i]))
 #undef CLEAR_COMPARISON
 };
+
+inline void end_of_stream() {
+#if defined(__AVX2__)
+  _mm_sfence();
+#endif
+}
 
 #define CLEAR_EACH(name, ...)                                                       \
   constexpr int registers = Lanes<T>::registers;                                    \
