@@ -14,8 +14,6 @@
 
 namespace clear {
 
-inline constexpr int kColour = 3, kColourAndDepth = 4;
-
 // The centres of a block's sixteen pixels, row by row, relative to the bin's corner like a segment's Gaussians.
 template <class T>
 struct PixelCentres {
@@ -139,16 +137,17 @@ void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, Blo
   for (int c = 0; c < kSums; ++c) sums[c].store(out.sums[c]);
 }
 
-// Sums over a block's pixels for the Gaussians of its bin: one row of `PairSums` per (Gaussian, cotangent).
+// Sums over a block's pixels for the Gaussians of its bin.
 template <class T, int K, int C>
 struct BlockSums {
+  using Sums = PairSums<T, K, C>;
   static constexpr int kRows = kLanes;  // Gaussians are collected until every lane has one
   T q[K][kRows][kLanes], weight[kRows][kLanes];
   T offset_x[kRows], offset_y[kRows];  // from the Gaussian's centre to the block's
   int place[kRows];
 
   // Not inlined: two copies beside the loop over Gaussians would exceed the instruction cache.
-  __attribute__((noinline)) void flush(int count, const T (&cotangent)[K][C][kLanes], PairSums<T>* sums) {
+  __attribute__((noinline)) void flush(int count, const T (&cotangent)[K][C][kLanes], Sums* sums) {
     if constexpr (kByQuads)
       for (int i = 0; i < count; ++i) add_by_quads(i, cotangent, sums);
     else if (count)
@@ -160,31 +159,36 @@ struct BlockSums {
   static constexpr bool kByQuads = sizeof(T) == 4 && Lanes<T>::registers > 1;
 
   // A sum over pixels is the sum of a register's quads, four sums at a time.
-  CLEAR_INLINE void add_by_quads(int row, const T (&cotangent)[K][C][kLanes], PairSums<T>* sums) const {
+  CLEAR_INLINE void add_by_quads(int row, const T (&cotangent)[K][C][kLanes], Sums* sums) const {
     using L = Lanes<T>;
     using Register = typename L::Register;
     constexpr int n = L::registers;
     const PixelCentres<T> pixel(0);
     const L dx = pixel.x + L(offset_x[row] - kBlock / 2), dy = pixel.y + L(offset_y[row] - kBlock / 2);
     const L w = L::load(weight[row]);
+    Register all[Sums::kRows * kLanes] = {};
     for (int k = 0; k < K; ++k) {
       const L v = L::load(q[k][row]), along = v * dy;
-      Register m = v.r[0], my = along.r[0], myy = along.r[0] * dy.r[0], channels[C];
+      Register* out = all + k * Sums::kWidth;
+      Register m = v.r[0], my = along.r[0], myy = along.r[0] * dy.r[0];
       for (int i = 1; i < n; ++i) m += v.r[i], my += along.r[i], myy += along.r[i] * dy.r[i];
+      const Register x = dx.r[0], mx = m * x;  // every register holds whole rows of pixels
+      out[0] = m, out[1] = mx, out[2] = my, out[3] = mx * x, out[4] = my * x, out[5] = myy;
       for (int c = 0; c < C; ++c) {
         const L parts = L::load(cotangent[k][c]);
-        channels[c] = w.r[0] * parts.r[0];
-        for (int i = 1; i < n; ++i) channels[c] += w.r[i] * parts.r[i];
+        out[6 + c] = w.r[0] * parts.r[0];
+        for (int i = 1; i < n; ++i) out[6 + c] += w.r[i] * parts.r[i];
       }
-      const Register x = dx.r[0], mx = m * x, none = {};  // every register holds whole rows of pixels
-      T* out = &sums[std::int64_t(place[row]) * K + k].q;
-      add_quads(out, sum_quads(m, mx, my, mx * x), sum_quads(my * x, myy, channels[0], channels[1]));
-      add_quads(out + 8, sum_quads(channels[2], C > kColour ? channels[C - 1] : none, none, none), none);
     }
+    T* out = sums[place[row]].numbers;
+    auto quad = [&](int i) CLEAR_LAMBDA { return sum_quads(all[i], all[i + 1], all[i + 2], all[i + 3]); };
+#pragma GCC unroll 4
+    for (int i = 0; i < K * Sums::kWidth; i += 2 * kQuad)
+      add_quads(out + i, quad(i), i + kQuad < K * Sums::kWidth ? quad(i + kQuad) : Register{});
   }
 
   // Transposed, a lane is a Gaussian; a sum over pixels is then fifteen additions for sixteen Gaussians.
-  CLEAR_INLINE void add_by_transposes(int count, const T (&cotangent)[K][C][kLanes], PairSums<T>* sums) {
+  CLEAR_INLINE void add_by_transposes(int count, const T (&cotangent)[K][C][kLanes], Sums* sums) {
     using L = Lanes<T>;
     for (int i = count; i < kRows; ++i) {
       L(T(0)).store(weight[i]);
@@ -195,8 +199,10 @@ struct BlockSums {
     for (int i = 0; i < kRows; ++i) w[i] = L::load(weight[i]);
     transpose(w);
     const L ox = L::load(offset_x), oy = L::load(offset_y);
+    L all[Sums::kRows][kLanes];
+#pragma GCC unroll 3
     for (int k = 0; k < K; ++k) {
-      L v[kRows], out[kRows];
+      L v[kRows], *out = all[0] + k * Sums::kWidth;
       for (int i = 0; i < kRows; ++i) v[i] = L::load(q[k][i]);
       transpose(v);
       moments(v, ox, oy, out);
@@ -205,18 +211,29 @@ struct BlockSums {
       for (int p = 0; p < kLanes; ++p)
         for (int c = 0; c < C; ++c) channels[c] += w[p] * L(cotangent[k][c][p]);
       for (int c = 0; c < C; ++c) out[6 + c] = channels[c];
-      for (int i = 6 + C; i < kRows; ++i) out[i] = T(0);
-      transpose(out);
+    }
+    constexpr int last = Sums::kRows - 1, rest = K * Sums::kWidth - last * kLanes;
+    for (int r = 0; r < (rest > kQuad ? last + 1 : last); ++r) {
+      if (r == last)
+        for (int i = rest; i < kLanes; ++i) all[r][i] = T(0);
+      transpose(all[r]);
       for (int i = 0; i < count; ++i) {
-        T* row = &sums[std::int64_t(place[i]) * K + k].q;
-        (L::load(row) + out[i]).store(row);
+        T* row = sums[place[i]].numbers + r * kLanes;
+        (L::load(row) + all[r][i]).store(row);
       }
+    }
+    if constexpr (rest <= kQuad) {
+      L columns[rest];
+      std::copy(all[last], all[last] + rest, columns);
+      T rows[kLanes][rest];
+      join_rows(rows[0], columns);
+      for (int i = 0; i < count; ++i)
+        for (int j = 0; j < rest; ++j) sums[place[i]].numbers[last * kLanes + j] += rows[i][j];
     }
   }
 
   // Σ v, Σ v·dx, … about the Gaussian's centre, from the moments about the block's centre, whose offsets are constants.
-  static CLEAR_INLINE void moments(const Lanes<T> (&v)[kLanes], const Lanes<T>& ox, const Lanes<T>& oy,
-                                   Lanes<T> (&out)[kLanes]) {
+  static CLEAR_INLINE void moments(const Lanes<T> (&v)[kLanes], const Lanes<T>& ox, const Lanes<T>& oy, Lanes<T>* out) {
     using L = Lanes<T>;
     L m = T(0), mx = T(0), my = T(0), mxx = T(0), mxy = T(0), myy = T(0);
     for (int row = 0; row < kBlock; ++row) {
@@ -249,7 +266,7 @@ struct BlockBack {
 template <class T, int K, int C>
 void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s, const BlockEnd<T>& end,
                      const BlockDepth<T>* depth, const T (&cotangent)[K][C][kLanes], BlockBack<T, K>& back,
-                     PairSums<T>* sums) {
+                     PairSums<T, K, C>* sums) {
   constexpr bool has_depth = C == kColourAndDepth;
   using L = Lanes<T>;
   const PixelCentres<T> pixel(block);

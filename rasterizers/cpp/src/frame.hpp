@@ -48,7 +48,7 @@ class Frame {
     view.ends.reserve_lost(blocks);
     if (depth) view.depths.reserve_lost(blocks);
     view.has_depth = depth != nullptr;
-    bands_of(view, kBytesPerPair + kMostCotangents * sizeof(PairSums<T>), threads);  // throws now where the gradients would not fit
+    bands_of(view, kBytesPerPair + sizeof(PairSums<T, kMostCotangents, kColourAndDepth>), threads);  // throws now where the gradients would not fit
     for (const Band& band : bands_of(view, kBytesPerPair, threads)) {
       list(view, band, threads);
       Pool::instance().run(threads, band.bins(), [&](std::int64_t bin) {
@@ -202,50 +202,58 @@ class Frame {
 
   template <int K, int C>
   void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
-    const std::vector<Band> bands = bands_of(view, kBytesPerPair + K * sizeof(PairSums<T>), threads);
+    using Sums = PairSums<T, K, C>;
+    const std::vector<Band> bands = bands_of(view, kBytesPerPair + sizeof(Sums), threads);
     const bool whole = bands.size() == 1;
+    Buffer<Sums> pair_sums, splat_sums;  // by pair; by Gaussian, when there are several bands
     if (!whole) {
-      splat_sums_.reserve_lost(std::size_t(n_) * K);
-      std::memset(static_cast<void*>(splat_sums_.data()), 0, sizeof(PairSums<T>) * n_ * K);
+      splat_sums.reserve_lost(n_);
+      std::memset(static_cast<void*>(splat_sums.data()), 0, sizeof(Sums) * n_);
     }
     for (const Band& band : bands) {
       if (view.bins.band != band) list(view, band, threads);
-      pair_sums_.reserve_lost(view.bins.pairs.size() * K);
+      pair_sums.reserve_lost(view.bins.pairs.size());
       Pool::instance().run(threads, band.bins(),
-                           [&](std::int64_t bin) { blend_vjp_bin<T, K, C>(job(view, bin), cotangents, pair_sums_.data()); });
+                           [&](std::int64_t bin) { blend_vjp_bin<T, K, C>(job(view, bin), cotangents, pair_sums.data()); });
       view.bins.has_masks = true;
       if (whole) break;
-      Pool::instance().run(threads, chunks_of(n_), [&](std::int64_t chunk) { add_band<K>(view, chunk); });
+      Pool::instance().run(threads, chunks_of(n_),
+                           [&](std::int64_t chunk) { add_band<K, C>(view, chunk, pair_sums.data(), splat_sums.data()); });
     }
-    Pool::instance().run(threads, chunks_of(n_), [&](std::int64_t chunk) { vjp_of_chunk<K>(view, whole, splats, chunk, out); });
+    Pool::instance().run(threads, chunks_of(n_), [&](std::int64_t chunk) {
+      vjp_of_chunk<K, C>(view, splats, chunk, whole ? pair_sums.data() : nullptr, splat_sums.data(), out);
+    });
   }
 
   // Adds the pair sums of the listed band to the sums of a chunk's Gaussians.
-  template <int K>
-  void add_band(const View& view, std::int64_t chunk) {
-    Lanes<T> rows[K][kLanes];
+  template <int K, int C>
+  void add_band(const View& view, std::int64_t chunk, const PairSums<T, K, C>* pair_sums, PairSums<T, K, C>* splat_sums) {
+    constexpr int R = PairSums<T, K, C>::kRows;
+    Lanes<T> rows[R][kLanes];
     for (const std::uint32_t* number = drawn_.begin(chunk); number < drawn_.end(chunk); number += kLanes) {
       const Group group(number, drawn_.end(chunk) - number);
-      load_sums<K>(group, rows);
-      add_pair_sums<T, K>(view.bins, group, pair_sums_, rows);
-      for (int k = 0; k < K; ++k)
-        for (int i = 0; i < group.count; ++i) rows[k][i].store(&splat_sums_[std::size_t(group.rows[i]) * K + k].q);
+      load_sums(group, splat_sums, rows);
+      add_pair_sums(view.bins, group, pair_sums, rows);
+      for (int r = 0; r < R; ++r)
+        for (int i = 0; i < group.count; ++i) rows[r][i].store(splat_sums[group.rows[i]].numbers + r * kLanes);
     }
   }
 
-  template <int K>
-  void load_sums(const Group& group, Lanes<T> (&rows)[K][kLanes]) const {
-    for (int k = 0; k < K; ++k)
-      for (int i = 0; i < kLanes; ++i) rows[k][i] = Lanes<T>::load(&splat_sums_[std::size_t(group.rows[i]) * K + k].q);
+  template <class Sums, int R>
+  void load_sums(const Group& group, const Sums* splat_sums, Lanes<T> (&rows)[R][kLanes]) const {
+    for (int r = 0; r < R; ++r)
+      for (int i = 0; i < kLanes; ++i) rows[r][i] = Lanes<T>::load(splat_sums[group.rows[i]].numbers + r * kLanes);
   }
 
-  // The gradients of a chunk's Gaussians, once the sums of all bands are there.
-  template <int K>
-  void vjp_of_chunk(const View& view, bool whole, const Splats<T>& splats, std::int64_t chunk, const Gradients<T>& out) {
+  // The gradients of a chunk's Gaussians, from the sums of their pairs, or their own where `pair_sums` is null.
+  template <int K, int C>
+  void vjp_of_chunk(const View& view, const Splats<T>& splats, std::int64_t chunk, const PairSums<T, K, C>* pair_sums,
+                    const PairSums<T, K, C>* splat_sums, const Gradients<T>& out) {
+    constexpr int R = PairSums<T, K, C>::kRows;
     constexpr std::int64_t ahead = 6 * kLanes;
     const std::int64_t first = chunk * kChunk, end = std::min(n_, first + kChunk);
     auto touched = [&](std::int64_t i) {
-      return whole ? view.bins.first[i + 1] > view.bins.first[i] : view.target.ranges[i].count() > 0;
+      return pair_sums ? view.bins.first[i + 1] > view.bins.first[i] : view.target.ranges[i].count() > 0;
     };
     std::uint32_t numbers[kChunk + ahead];
     std::int64_t count = 0;
@@ -260,21 +268,22 @@ class Frame {
     const std::int64_t known = sparse ? count : count + ahead;
     for (std::int64_t at = 0; at < count; at += kLanes) {
       const Group group(numbers + at, count - at);
-      Lanes<T> rows[K][kLanes];
+      Lanes<T> rows[R][kLanes];
       fetch_rows(splats, view.target, slopes_, numbers + std::min(known, at + 2 * kLanes),
                  numbers + std::min(known, at + 3 * kLanes));
-      if (whole) {
-        fetch_pair_sums<T, K>(view.bins, numbers + std::min(known, at + ahead),
-                              numbers + std::min(known, at + ahead + kLanes), pair_sums_);
-        for (int k = 0; k < K; ++k)
-          for (Lanes<T>& row : rows[k]) row = T(0);
-        add_pair_sums<T, K>(view.bins, group, pair_sums_, rows);
+      if (pair_sums) {
+        fetch_pair_sums(view.bins, numbers + std::min(known, at + ahead), numbers + std::min(known, at + ahead + kLanes),
+                        pair_sums);
+        for (auto& row : rows)
+          for (Lanes<T>& lanes : row) lanes = T(0);
+        add_pair_sums(view.bins, group, pair_sums, rows);
       } else {
-        load_sums<K>(group, rows);
+        load_sums(group, splat_sums, rows);
       }
+      for (auto& row : rows) transpose(row);
       std::uint32_t bits = 0;
       for (int i = 0; i < group.count; ++i) bits |= std::uint32_t(sparse || touched(group.rows[i])) << i;
-      project_vjp_group(pose_, settings_, splats, view.target, slopes_, group, K, rows, bits, out);
+      project_vjp_group(pose_, settings_, splats, view.target, slopes_, group, K, C, rows[0], bits, out);
     }
   }
 
@@ -286,7 +295,6 @@ class Frame {
   Buffer<double> depths_;
   Buffer<std::uint32_t> order_;
   std::vector<View> views_;
-  Buffer<PairSums<T>> pair_sums_, splat_sums_;  // by pair; by Gaussian, when there are several bands
 };
 
 }  // namespace clear

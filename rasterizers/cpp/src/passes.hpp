@@ -124,9 +124,9 @@ CLEAR_INLINE void fetch_cotangents(const BinJob<T>& job, const T* cotangents) {
         __builtin_prefetch(cotangents + k * image + (std::int64_t(y) * job.grid.width + job.x * kBin) * C + x);
 }
 
-// The backward pass of a bin, back to front. Writes every row of `pair_sums` [pairs, K].
+// The backward pass of a bin, back to front. Writes the sums of all its pairs.
 template <class T, int K, int C>
-void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T>* pair_sums) {
+void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T, K, C>* pair_sums) {
   const std::int64_t n = job.pairs();
   if (!n) return;
   static thread_local BinVjp<T, K, C> scratch;
@@ -139,8 +139,8 @@ void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T>* pair_
   bool started = false;
   for (std::int64_t first = (n - 1) / kSegment * kSegment; first >= 0; first -= kSegment) {
     const std::int64_t count = std::min<std::int64_t>(kSegment, n - first);
-    PairSums<T>* sums = pair_sums + (job.bins.starts[job.bin] + first) * K;
-    std::memset(static_cast<void*>(sums), 0, sizeof(PairSums<T>) * count * K);
+    PairSums<T, K, C>* sums = pair_sums + job.bins.starts[job.bin] + first;
+    std::memset(static_cast<void*>(sums), 0, sizeof *sums * count);
     if (first >= end) continue;
     Segment<T>& part = thread_segment<T>();
     gather(job.ellipses, job.bins, job.bin, first, job.requested, part);

@@ -21,22 +21,21 @@ void clear_gradients(std::int64_t n, std::int64_t first, std::int64_t count, con
   zero(out.means, 3), zero(out.quats, 4), zero(out.scales, 3), zero(out.opacities, 1), zero(out.screen, 2), zero(out.rgb, 3);
 }
 
-// Adds the pair sums of this band to the K rows of each Gaussian of the group.
-template <class T, int K>
-CLEAR_INLINE void add_pair_sums(const Bins& bins, const Group& group, const Buffer<PairSums<T>>& pair_sums,
-                                Lanes<T> (&rows)[K][kLanes]) {
+// Adds the pair sums of this band to the rows of each Gaussian of the group.
+template <class Sums, class T, int R>
+CLEAR_INLINE void add_pair_sums(const Bins& bins, const Group& group, const Sums* pair_sums, Lanes<T> (&rows)[R][kLanes]) {
   for (int i = 0; i < group.count; ++i)
     for (std::uint32_t p = bins.first[group.rows[i]]; p < bins.first[group.rows[i] + 1]; ++p)
-      for (int k = 0; k < K; ++k) rows[k][i] += Lanes<T>::load(&pair_sums[std::size_t(bins.where[p]) * K + k].q);
+      for (int r = 0; r < R; ++r) rows[r][i] += Lanes<T>::load(pair_sums[bins.where[p]].numbers + r * kLanes);
 }
 
 // Prefetches them for Gaussians that follow later: their addresses are scattered.
-template <class T, int K>
+template <class Sums>
 CLEAR_INLINE void fetch_pair_sums(const Bins& bins, const std::uint32_t* number, const std::uint32_t* end,
-                                  const Buffer<PairSums<T>>& pair_sums) {
+                                  const Sums* pair_sums) {
   for (; number < end; ++number)
     for (std::uint32_t p = bins.first[*number]; p < bins.first[*number + 1]; ++p)
-      for (int k = 0; k < K; ++k) __builtin_prefetch(&pair_sums[std::size_t(bins.where[p]) * K + k], 0, 1);
+      for (int r = 0; r < Sums::kRows; ++r) __builtin_prefetch(pair_sums[bins.where[p]].numbers + r * kLanes, 0, 1);
 }
 
 // Prefetches the rows that `project_vjp_group` reads of Gaussians that follow later, where these are not consecutive.
@@ -52,10 +51,10 @@ CLEAR_INLINE void fetch_rows(const Splats<T>& splats, const Target<T>& target, c
   }
 }
 
-// The gradients of a group from the K rows of sums of each Gaussian; those of its lanes that are not `touched` are zeros.
+// The gradients of a group from its Gaussians' sums, `PairSums` in columns; those of its lanes that are not `touched` are zeros.
 template <class T>
 void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, const Target<T>& target,
-                       const Buffer<Slope<T>>& slopes, const Group& group, int K, Lanes<T> (*rows)[kLanes],
+                       const Buffer<Slope<T>>& slopes, const Group& group, int K, int C, const Lanes<T>* sums,
                        std::uint32_t touched, const Gradients<T>& out) {
   using L = Lanes<T>;
   const Mask<T> real = Mask<T>::from_bits(touched);
@@ -74,8 +73,7 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
     transpose(slope);
   }
   for (int k = 0; k < K; ++k) {
-    L(&sum)[kLanes] = rows[k];
-    transpose(sum);
+    const L* sum = sums + k * (6 + C);
     LaneGradients<T> gradient;
     project_vjp(pose, target.grid, s, g, f, scale, opacity, sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], gradient);
     L rgb[3];
@@ -87,7 +85,8 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
     auto keep = [&](auto& columns) {
       for (L& column : columns) column = where(real, column);
     };
-    for (int axis = 0; axis < 3; ++axis) gradient.mean[axis] += L(T(pose.R[6 + axis])) * sum[9];  // of the depth
+    if (C == kColourAndDepth)
+      for (int axis = 0; axis < 3; ++axis) gradient.mean[axis] += L(T(pose.R[6 + axis])) * sum[9];
     L alone[1] = {gradient.opacity};
     keep(gradient.mean), keep(gradient.quat), keep(gradient.scale), keep(gradient.screen), keep(rgb), keep(alone);
     const std::int64_t at = k * splats.n;
