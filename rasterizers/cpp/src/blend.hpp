@@ -184,7 +184,8 @@ struct BlockSums {
     auto quad = [&](int i) CLEAR_LAMBDA { return sum_quads(all[i], all[i + 1], all[i + 2], all[i + 3]); };
 #pragma GCC unroll 4
     for (int i = 0; i < K * Sums::kWidth; i += 2 * kQuad)
-      add_quads(out + i, quad(i), i + kQuad < K * Sums::kWidth ? quad(i + kQuad) : Register{});
+      if (i + kQuad < K * Sums::kWidth) add_quads(out + i, quad(i), quad(i + kQuad));
+      else add_quad(out + i, quad(i));
   }
 
   // Transposed, a lane is a Gaussian; a sum over pixels is then fifteen additions for sixteen Gaussians.

@@ -28,18 +28,29 @@ Segment<T>& thread_segment() {
   return segment;
 }
 
+// Copies numbers to memory past the caches, where their places are aligned.
+template <class T>
+CLEAR_INLINE void stream_copy(const T* from, int count, T* to) {
+  if (count % kLanes || reinterpret_cast<std::uintptr_t>(to) % (kLanes * sizeof(T))) {
+    std::memcpy(to, from, sizeof(T) * count);
+  } else {
+    for (int i = 0; i < count; i += kLanes) Lanes<T>::load(from + i).stream(to + i);
+  }
+}
+
 // A bin without a requested block shows the background, and depth 0 if it is not null.
 template <class T>
 void fill_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
   const int x = job.x * kBin, columns = std::min(kBin, job.grid.width - x);
-  T pixels[3 * kBin];
+  T pixels[3 * kBin], zeros[kBin] = {};
   for (int i = 0; i < 3 * kBin; ++i) pixels[i] = job.settings.background[i % 3];
   for (int y = job.y * kBin; y < std::min(job.grid.height, (job.y + 1) * kBin); ++y) {
     const std::int64_t at = std::int64_t(y) * job.grid.width + x;
-    std::memcpy(image + 3 * at, pixels, sizeof(T) * 3 * columns);
-    std::fill_n(alpha + at, columns, T(0));
-    if (depth) std::fill_n(depth + at, columns, T(0));
+    stream_copy(pixels, 3 * columns, image + 3 * at);
+    stream_copy(zeros, columns, alpha + at);
+    if (depth) stream_copy(zeros, columns, depth + at);
   }
+  end_of_stream();
 }
 
 // The expected depth of a block's pixels.

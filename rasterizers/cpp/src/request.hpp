@@ -43,15 +43,11 @@ class Request {
   // One bit per block of a bin, counted row by row.
   std::uint64_t blocks(std::int64_t bin) const { return all() ? ~std::uint64_t(0) : blocks_[bin]; }
   // Whether the rectangle has a bin with a requested block. No branch on the answer, which is not predictable.
-  bool any_in(const BinRange& r) const {
-    if (all()) return r.count() > 0;
-    const int width = r.x1 + 1 - r.x0, height = r.y1 + 1 - r.y0;
-    if (std::max(width, height) <= kPatch) return near_[r.y0 * columns_ + r.x0] & rectangle(width, height);
-    return bins_in(r) > 0;
-  }
+  bool any_in(const BinRange& r) const { return all() ? r.count() > 0 : in_one_patch(r) ? patch(r) != 0 : bins_in(r) > 0; }
   // How many such bins it has.
   std::int64_t bins_in(const BinRange& r) const {
     if (all()) return r.count();
+    if (in_one_patch(r)) return std::popcount(patch(r));
     std::int64_t count = 0;
     each_patch(r, [&](int, int, std::uint64_t bits) { count += std::popcount(bits); });
     return count;
@@ -65,15 +61,23 @@ class Request {
         for (int x = r.x0; x <= r.x1; ++x) visit(x, y);
       return;
     }
-    each_patch(r, [&](int x, int y, std::uint64_t bits) {
+    auto visit_patch = [&](int x, int y, std::uint64_t bits) {
       each_bit(bits, [&](int i) CLEAR_LAMBDA { visit(x + i % kPatch, y + i / kPatch); });
-    });
+    };
+    if (in_one_patch(r)) visit_patch(r.x0, r.y0, patch(r));
+    else each_patch(r, visit_patch);
   }
 
  private:
   static constexpr int kPatch = 8;  // edge of a patch, bins: a 64-bit word has a bit per bin of a patch
 
-  // Calls visit(x, y, bits) for the patches that make up the rectangle, nearly always one: squares, or rows if it is too wide.
+  // Nearly always.
+  static bool in_one_patch(const BinRange& r) { return std::max(r.x1 - r.x0, r.y1 - r.y0) < kPatch; }
+  std::uint64_t patch(const BinRange& r) const {
+    return near_[r.y0 * columns_ + r.x0] & rectangle(r.x1 + 1 - r.x0, r.y1 + 1 - r.y0);
+  }
+
+  // Calls visit(x, y, bits) for the patches that make up the rectangle: squares, or rows if it is too wide.
   template <class Visit>
   void each_patch(const BinRange& r, Visit&& visit) const {
     const int rows = r.x1 - r.x0 < kPatch ? kPatch : 1;
