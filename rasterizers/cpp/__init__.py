@@ -87,7 +87,7 @@ class CppRasterizer(RasterSettings):
     def list_bytes(self, splats: Splats, camera: Camera) -> int:
         """See `interface.CountsLists`; projects the Gaussians and draws nothing."""
         pairs: int = _Frame(self, [(splats, camera)], [None]).native.pairs(0)
-        return pairs * (_PAIR_BYTES + 2 * _SUMS_BYTES)
+        return pairs * (_PAIR_BYTES + _SUMS_BYTES)
 
     def render_scales(
         self,
@@ -105,7 +105,7 @@ class CppRasterizer(RasterSettings):
 
 
 _PAIR_BYTES: Final = 16  # its Gaussian, its place, and the blocks of its bin that the ellipse reaches
-_SUMS_BYTES: Final = 64  # a pair's sums for one cotangent
+_SUMS_BYTES: Final = 128  # a pair's sums for two or three cotangents
 
 
 def _require_side(camera: Camera) -> None:
@@ -155,7 +155,6 @@ class _Frame:
             background=list(settings.background),
             antialiased=settings.antialiased,
             world_to_camera=camera.world_to_camera.double().flatten().tolist(),
-            center=camera.center.double().tolist(),
             budget=settings.memory << 20,
         )
         self.means2d = [self.empty(n, 2) for _ in jobs]

@@ -63,9 +63,8 @@ void bind_frame(nb::module_& m) {
       .def(
           "__init__",
           [](F* self, double kernel, double near, double alpha_min, double alpha_max, double transmittance_min,
-             std::vector<double> background, bool antialiased, std::vector<double> world_to_camera,
-             std::vector<double> center, std::int64_t budget) {
-            require(background.size() == 3 && world_to_camera.size() == 16 && center.size() == 3, "background, world_to_camera and center must have 3, 16 and 3 numbers");
+             std::vector<double> background, bool antialiased, std::vector<double> world_to_camera, std::int64_t budget) {
+            require(background.size() == 3 && world_to_camera.size() == 16, "background and world_to_camera must have 3 and 16 numbers");
             // A pixel always ends before T becomes subnormal, because the backward pass could not rebuild it.
             const T through_min = std::max(T(transmittance_min), T(sizeof(T) == 4 ? 1e-30 : 1e-250));
             Settings<T> s{T(kernel), T(near), T(alpha_min), T(alpha_max), through_min,
@@ -74,13 +73,14 @@ void bind_frame(nb::module_& m) {
             for (int i = 0; i < 3; ++i) {
               for (int k = 0; k < 3; ++k) pose.R[3 * i + k] = world_to_camera[4 * i + k];
               pose.t[i] = world_to_camera[4 * i + 3];
-              pose.center[i] = center[i];
             }
+            for (int i = 0; i < 3; ++i)
+              pose.center[i] = -(pose.R[i] * pose.t[0] + pose.R[3 + i] * pose.t[1] + pose.R[6 + i] * pose.t[2]);
             new (self) F(s, pose, budget);
           },
           nb::kw_only(), nb::arg("kernel"), nb::arg("near"), nb::arg("alpha_min"), nb::arg("alpha_max"),
           nb::arg("transmittance_min"), nb::arg("background"), nb::arg("antialiased"), nb::arg("world_to_camera"),
-          nb::arg("center"), nb::arg("budget"))
+          nb::arg("budget"))
       .def("project",
            [](F& self, Read<T, -1, 3> means, Read<T, -1, 4> quats, Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0,
               Rows<T> shN, std::vector<std::vector<double>> grids, std::vector<Read<T, -1>> opacities,

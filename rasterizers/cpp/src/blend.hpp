@@ -166,7 +166,10 @@ struct BlockSums {
     const PixelCentres<T> pixel(0);
     const L dx = pixel.x + L(offset_x[row] - kBlock / 2), dy = pixel.y + L(offset_y[row] - kBlock / 2);
     const L w = L::load(weight[row]);
-    Register all[Sums::kRows * kLanes] = {};
+    constexpr int total = K * Sums::kWidth;
+    Register all[(total + kQuad - 1) / kQuad * kQuad];
+    for (int i = total; i < int(std::size(all)); ++i) all[i] = Register{};
+#pragma GCC unroll 3
     for (int k = 0; k < K; ++k) {
       const L v = L::load(q[k][row]), along = v * dy;
       Register* out = all + k * Sums::kWidth;
@@ -183,8 +186,8 @@ struct BlockSums {
     T* out = sums[place[row]].numbers;
     auto quad = [&](int i) CLEAR_LAMBDA { return sum_quads(all[i], all[i + 1], all[i + 2], all[i + 3]); };
 #pragma GCC unroll 4
-    for (int i = 0; i < K * Sums::kWidth; i += 2 * kQuad)
-      if (i + kQuad < K * Sums::kWidth) add_quads(out + i, quad(i), quad(i + kQuad));
+    for (int i = 0; i < total; i += 2 * kQuad)
+      if (i + kQuad < total) add_quads(out + i, quad(i), quad(i + kQuad));
       else add_quad(out + i, quad(i));
   }
 

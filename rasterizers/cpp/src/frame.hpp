@@ -218,23 +218,22 @@ class Frame {
       view.bins.has_masks = true;
       if (whole) break;
       Pool::instance().run(threads, chunks_of(n_),
-                           [&](std::int64_t chunk) { add_band<K, C>(view, chunk, pair_sums.data(), splat_sums.data()); });
+                           [&](std::int64_t chunk) { add_band(view, chunk, pair_sums.data(), splat_sums.data()); });
     }
     Pool::instance().run(threads, chunks_of(n_), [&](std::int64_t chunk) {
-      vjp_of_chunk<K, C>(view, splats, chunk, whole ? pair_sums.data() : nullptr, splat_sums.data(), out);
+      vjp_of_chunk<K>(view, splats, chunk, whole, (whole ? pair_sums : splat_sums).data(), out);
     });
   }
 
   // Adds the pair sums of the listed band to the sums of a chunk's Gaussians.
-  template <int K, int C>
-  void add_band(const View& view, std::int64_t chunk, const PairSums<T, K, C>* pair_sums, PairSums<T, K, C>* splat_sums) {
-    constexpr int R = PairSums<T, K, C>::kRows;
-    Lanes<T> rows[R][kLanes];
+  template <class Sums>
+  void add_band(const View& view, std::int64_t chunk, const Sums* pair_sums, Sums* splat_sums) {
+    Lanes<T> rows[Sums::kRows][kLanes];
     for (const std::uint32_t* number = drawn_.begin(chunk); number < drawn_.end(chunk); number += kLanes) {
       const Group group(number, drawn_.end(chunk) - number);
       load_sums(group, splat_sums, rows);
       add_pair_sums(view.bins, group, pair_sums, rows);
-      for (int r = 0; r < R; ++r)
+      for (int r = 0; r < Sums::kRows; ++r)
         for (int i = 0; i < group.count; ++i) rows[r][i].store(splat_sums[group.rows[i]].numbers + r * kLanes);
     }
   }
@@ -245,15 +244,14 @@ class Frame {
       for (int i = 0; i < kLanes; ++i) rows[r][i] = Lanes<T>::load(splat_sums[group.rows[i]].numbers + r * kLanes);
   }
 
-  // The gradients of a chunk's Gaussians, from the sums of their pairs, or their own where `pair_sums` is null.
+  // The gradients of a chunk's Gaussians from `sums`, by pair where one band is the whole image, else by Gaussian.
   template <int K, int C>
-  void vjp_of_chunk(const View& view, const Splats<T>& splats, std::int64_t chunk, const PairSums<T, K, C>* pair_sums,
-                    const PairSums<T, K, C>* splat_sums, const Gradients<T>& out) {
-    constexpr int R = PairSums<T, K, C>::kRows;
+  void vjp_of_chunk(const View& view, const Splats<T>& splats, std::int64_t chunk, bool whole, const PairSums<T, K, C>* sums,
+                    const Gradients<T>& out) {
     constexpr std::int64_t ahead = 6 * kLanes;
     const std::int64_t first = chunk * kChunk, end = std::min(n_, first + kChunk);
     auto touched = [&](std::int64_t i) {
-      return pair_sums ? view.bins.first[i + 1] > view.bins.first[i] : view.target.ranges[i].count() > 0;
+      return whole ? view.bins.first[i + 1] > view.bins.first[i] : view.target.ranges[i].count() > 0;
     };
     std::uint32_t numbers[kChunk + ahead];
     std::int64_t count = 0;
@@ -268,17 +266,16 @@ class Frame {
     const std::int64_t known = sparse ? count : count + ahead;
     for (std::int64_t at = 0; at < count; at += kLanes) {
       const Group group(numbers + at, count - at);
-      Lanes<T> rows[R][kLanes];
+      Lanes<T> rows[PairSums<T, K, C>::kRows][kLanes];
       fetch_rows(splats, view.target, slopes_, numbers + std::min(known, at + 2 * kLanes),
                  numbers + std::min(known, at + 3 * kLanes));
-      if (pair_sums) {
-        fetch_pair_sums(view.bins, numbers + std::min(known, at + ahead), numbers + std::min(known, at + ahead + kLanes),
-                        pair_sums);
+      if (whole) {
+        fetch_pair_sums(view.bins, numbers + std::min(known, at + ahead), numbers + std::min(known, at + ahead + kLanes), sums);
         for (auto& row : rows)
           for (Lanes<T>& lanes : row) lanes = T(0);
-        add_pair_sums(view.bins, group, pair_sums, rows);
+        add_pair_sums(view.bins, group, sums, rows);
       } else {
-        load_sums(group, splat_sums, rows);
+        load_sums(group, sums, rows);
       }
       for (auto& row : rows) transpose(row);
       std::uint32_t bits = 0;
