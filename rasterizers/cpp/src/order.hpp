@@ -13,15 +13,16 @@ struct DepthKey {
   std::uint32_t depth, index;
 };
 
-// Radix sort of keys up to `high`, least significant digit first; each digit is a stable counting sort, parallel over chunks.
-inline void sort_by_depth(Buffer<DepthKey>& keys, Buffer<DepthKey>& spare, std::uint32_t high, int threads) {
+// Writes the Gaussians of keys up to `high` by depth. Radix sort, least significant digit first; each digit is a stable
+// counting sort, parallel over chunks.
+inline void sort_by_depth(Buffer<DepthKey>& keys, std::uint32_t high, Buffer<std::uint32_t>& order, int threads) {
   const std::int64_t n = std::int64_t(keys.size());
-  const int bits = std::bit_width(high);
-  if (n < 2 || !bits) return;
+  const int bits = std::max(1, int(std::bit_width(high)));
   const int passes = (bits + 10) / 11, digit = (bits + passes - 1) / passes, buckets = 1 << digit;
   const int chunks = n < 16384 ? 1 : std::max(1, threads);
   std::vector<std::uint32_t> places(std::size_t(chunks) * buckets);
-  spare.reserve_lost(n);
+  Buffer<DepthKey> spare;
+  spare.reserve_lost(passes > 1 ? n : 0);
   for (int pass = 0; pass < passes; ++pass) {
     const int shift = pass * digit;
     auto bucket = [&](const DepthKey& k) { return (k.depth >> shift) & (buckets - 1); };
@@ -39,7 +40,10 @@ inline void sort_by_depth(Buffer<DepthKey>& keys, Buffer<DepthKey>& spare, std::
     Pool::instance().run(threads, chunks, [&](std::int64_t chunk) {
       std::uint32_t* next = places.data() + chunk * buckets;
       auto [begin, end] = range(chunk);
-      for (std::int64_t i = begin; i < end; ++i) spare[next[bucket(keys[i])]++] = keys[i];
+      if (pass + 1 < passes)
+        for (std::int64_t i = begin; i < end; ++i) spare[next[bucket(keys[i])]++] = keys[i];
+      else
+        for (std::int64_t i = begin; i < end; ++i) order[next[bucket(keys[i])]++] = keys[i].index;
     });
     std::swap(keys, spare);
   }
@@ -71,15 +75,14 @@ void order_by_depth(const Drawn& drawn, const Buffer<double>& depths, Buffer<std
   if constexpr (sizeof(T) == 4) {
     // Keys are the 32 bits below the highest bit in which two depths differ: about 30 significant bits, a float has 24.
     const int shift = count ? std::max(0, int(std::bit_width(all.high - all.low)) - 32) : 0;
-    Buffer<DepthKey> keys, spare;
+    Buffer<DepthKey> keys;
     keys.reserve_lost(count);
     Pool::instance().run(threads, chunks, [&](std::int64_t c) {
       std::int64_t at = starts[c];
       for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i)
         keys[at++] = {std::uint32_t((bits(*i) - all.low) >> shift), *i};
     });
-    sort_by_depth(keys, spare, std::uint32_t((all.high - all.low) >> shift), threads);
-    for (std::int64_t i = 0; i < count; ++i) order[i] = keys[i].index;
+    sort_by_depth(keys, std::uint32_t((all.high - all.low) >> shift), order, threads);
   } else {
     for (std::int64_t c = 0; c < chunks; ++c) std::copy(drawn.begin(c), drawn.end(c), order.data() + starts[c]);
     std::stable_sort(order.data(), order.data() + count, [&](auto a, auto b) { return depths[a] < depths[b]; });
