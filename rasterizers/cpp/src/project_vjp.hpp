@@ -29,13 +29,14 @@ CLEAR_INLINE void add_pair_sums(const Bins& bins, const Group& group, const Sums
       for (int r = 0; r < R; ++r) rows[r][i] += Lanes<T>::load(pair_sums[bins.where[p]].numbers + r * kLanes);
 }
 
-// Prefetches them for Gaussians that follow later: their addresses are scattered.
+// Prefetches them for Gaussians that follow later: their addresses are scattered. One loop over the pairs of all, because the
+// Gaussians between them have none, and a processor foresees one loop's end better than sixteen.
 template <class Sums>
 CLEAR_INLINE void fetch_pair_sums(const Bins& bins, const std::uint32_t* number, const std::uint32_t* end,
                                   const Sums* pair_sums) {
-  for (; number < end; ++number)
-    for (std::uint32_t p = bins.first[*number]; p < bins.first[*number + 1]; ++p)
-      for (int r = 0; r < Sums::kRows; ++r) __builtin_prefetch(pair_sums[bins.where[p]].numbers + r * kLanes, 0, 1);
+  if (number == end) return;
+  for (std::uint32_t p = bins.first[*number]; p < bins.first[end[-1] + 1]; ++p)
+    for (int r = 0; r < Sums::kRows; ++r) __builtin_prefetch(pair_sums[bins.where[p]].numbers + r * kLanes, 0, 1);
 }
 
 // Prefetches the rows that `project_vjp_group` reads of Gaussians that follow later, where these are not consecutive.
