@@ -28,7 +28,7 @@ struct Segment {
 
 // The blocks of the bin that each of sixteen Gaussians reaches, with centres (u, v) relative to the bin's corner. For each
 // row of blocks: the leftmost and rightmost point of the ellipse within the row, exact up to a margin of 1e-3 px. Rows are
-// counted from the first one that the Gaussian may reach, because few of them are higher than three.
+// counted from the first one that a Gaussian may reach: most reach three of eight at most.
 template <class T>
 CLEAR_INLINE void block_masks(const Lanes<T> (&e)[kLanes], const Lanes<T>& u, const Lanes<T>& v, std::uint64_t* masks) {
   using L = Lanes<T>;

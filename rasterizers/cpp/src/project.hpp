@@ -234,6 +234,7 @@ bool project(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, st
     target.lit.reserve_lost(n);
   }
   std::atomic<bool> all_finite{true};
+  std::vector<std::atomic<std::int64_t>> pairs(targets.size());
   Pool::instance().run(threads, chunks_of(n), [&](std::int64_t chunk) {
     bool finite = true;
     std::uint32_t* numbers = drawn.open(chunk);
@@ -244,16 +245,17 @@ bool project(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, st
         fetch_coefficients(splats, numbers[count++]);
       });
     drawn.close(chunk, count);
-    for (Target<T>& target : targets) {
-      std::int64_t pairs = 0;
-      for (std::int64_t k = 0; k < count; ++k) pairs += target.ranges[numbers[k]].count();
-      std::atomic_ref(target.pairs).fetch_add(pairs, std::memory_order_relaxed);
+    for (std::size_t i = 0; i < targets.size(); ++i) {
+      std::int64_t here = 0;
+      for (std::int64_t k = 0; k < count; ++k) here += targets[i].ranges[numbers[k]].count();
+      pairs[i] += here;
     }
     for (std::int64_t k = 0; k < count; k += kLanes)
       colour_group(pose, splats, targets, slopes, Group(numbers + k, count - k), finite);
     end_of_stream();
     if (!finite) all_finite = false;
   });
+  for (std::size_t i = 0; i < targets.size(); ++i) targets[i].pairs = pairs[i];
   return all_finite;
 }
 

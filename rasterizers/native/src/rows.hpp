@@ -89,19 +89,18 @@ CLEAR_INLINE void add_quads(float* p, FloatRegister a, FloatRegister b) {
   std::memcpy(p, row, sizeof row);
 #endif
 }
-#endif
 
-#if defined(__AVX2__) && !defined(__AVX512F__)
+// Adds the sum of a's quads to p[0 … 3].
 CLEAR_INLINE void add_quad(float* p, FloatRegister a) {
+#if defined(__AVX2__)
   const __m128 sum = _mm_add_ps(_mm256_castps256_ps128((__m256)a), _mm256_extractf128_ps((__m256)a, 1));
   _mm_storeu_ps(p, _mm_add_ps(_mm_loadu_ps(p), sum));
-}
-#elif !defined(__AVX512F__)
-CLEAR_INLINE void add_quad(float* p, FloatRegister a) {
+#else
   FloatRegister row;
   std::memcpy(&row, p, sizeof row);
   row += a;
   std::memcpy(p, &row, sizeof row);
+#endif
 }
 #endif
 

@@ -247,8 +247,8 @@ struct Lanes {
   CLEAR_INLINE void store(T* p) const {
     CLEAR_EACH_REGISTER(reinterpret_cast<Unaligned*>(p)[i] = r[i]);
   }
-  // Stores to memory past the caches, for what is not read again soon. `p` is aligned to sixteen numbers. `end_of_stream`
-  // comes before another thread reads.
+  // Stores past the caches, for what is not read again soon; `p` is aligned to sixteen numbers. Other threads see it only
+  // after `end_of_stream`.
   CLEAR_INLINE void stream(T* p) const {
 #if defined(__AVX512F__)
     if constexpr (sizeof(T) == 4) return _mm512_stream_ps(p, (__m512)r[0]);
@@ -291,6 +291,7 @@ struct Lanes {
 #undef CLEAR_COMPARISON
 };
 
+// Comes after the last `stream` of a task.
 inline void end_of_stream() {
 #if defined(__AVX2__)
   _mm_sfence();
