@@ -55,11 +55,15 @@ struct BlockDepth {
   T expected[kLanes], over_weight[kLanes];
 };
 
-// Loads a block's pixels from a [height, width, C] image; zeros beyond the image's edge.
+// Loads a block's pixels from a [height, width, C] image; zeros beyond the image's edge. Whole blocks go from memory to
+// registers at once: a load must wait where it reads what several narrower stores, or one wider store, have just written.
 template <int C, class T>
 CLEAR_INLINE void load_block(const T* image, int width, int height, int X, int Y, Lanes<T> (&channels)[C]) {
   T pixels[kLanes * C];
   const int columns = std::min(kBlock, width - X), rows = std::min(kBlock, height - Y);
+  if constexpr (sizeof(T) == 4)
+    if (columns == kBlock && rows == kBlock)
+      return split_rows<C>(image + (std::int64_t(Y) * width + X) * C, std::ptrdiff_t(width) * C, channels);
   if (columns < kBlock || rows < kBlock) std::memset(pixels, 0, sizeof pixels);
   for (int y = 0; y < rows; ++y) {
     const T* from = image + (std::int64_t(Y + y) * width + X) * C;
@@ -72,8 +76,11 @@ CLEAR_INLINE void load_block(const T* image, int width, int height, int X, int Y
 template <int C, class T>
 CLEAR_INLINE void store_block(T* image, int width, int height, int X, int Y, const Lanes<T> (&channels)[C]) {
   T pixels[kLanes * C];
-  store_rows<C>(pixels, 0, kLanes, channels);
   const int columns = std::min(kBlock, width - X), rows = std::min(kBlock, height - Y);
+  if constexpr (sizeof(T) == 4)
+    if (columns == kBlock && rows == kBlock)
+      return join_rows<C>(image + (std::int64_t(Y) * width + X) * C, std::ptrdiff_t(width) * C, channels);
+  store_rows<C>(pixels, 0, kLanes, channels);
   for (int y = 0; y < rows; ++y) {
     T* to = image + (std::int64_t(Y + y) * width + X) * C;
     if (columns == kBlock) std::memcpy(to, pixels + y * kBlock * C, sizeof(T) * kBlock * C);

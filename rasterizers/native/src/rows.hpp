@@ -178,9 +178,37 @@ CLEAR_INLINE void join_registers(float* rows, const FloatRegister (&columns)[D])
   rearrange<D>(kInterleaving<D>.together, columns, out);
   for (int d = 0; d < D; ++d) _mm512_storeu_ps(rows + kLanes * d, (__m512)out[d]);
 }
+
+// The same with four rows each at p, p + stride, …
+template <int D>
+CLEAR_INLINE void split_registers(const float* p, std::ptrdiff_t stride, FloatRegister (&columns)[D]) {
+  auto quad = [&](int q) CLEAR_LAMBDA { return _mm_loadu_ps(p + q / D * stride + q % D * kQuad); };
+  FloatRegister in[D];
+  for (int d = 0; d < D; ++d) {
+    const int q = kQuads * d;
+    const __m512 two = _mm512_insertf32x4(_mm512_castps128_ps512(quad(q)), quad(q + 1), 1);
+    in[d] = (FloatRegister)_mm512_insertf32x4(_mm512_insertf32x4(two, quad(q + 2), 2), quad(q + 3), 3);
+  }
+  if constexpr (D == 1) columns[0] = in[0];
+  else rearrange<D>(kInterleaving<D>.apart, in, columns);
+}
+
+template <int D>
+CLEAR_INLINE void join_registers(float* p, std::ptrdiff_t stride, const FloatRegister (&columns)[D]) {
+  FloatRegister out[D];
+  if constexpr (D == 1) out[0] = columns[0];
+  else rearrange<D>(kInterleaving<D>.together, columns, out);
+  auto store = [&](int q, __m128 quad) CLEAR_LAMBDA { _mm_storeu_ps(p + q / D * stride + q % D * kQuad, quad); };
+  for (int d = 0; d < D; ++d) {
+    const __m512 a = (__m512)out[d];
+    const int q = kQuads * d;
+    store(q, _mm512_castps512_ps128(a)), store(q + 1, _mm512_extractf32x4_ps(a, 1));
+    store(q + 2, _mm512_extractf32x4_ps(a, 2)), store(q + 3, _mm512_extractf32x4_ps(a, 3));
+  }
+}
 #else
 // The register whose quad q is the four numbers at p + q · stride.
-CLEAR_INLINE FloatRegister load_quads(const float* p, [[maybe_unused]] int stride) {
+CLEAR_INLINE FloatRegister load_quads(const float* p, [[maybe_unused]] std::ptrdiff_t stride) {
 #if defined(__AVX2__)
   return (FloatRegister)_mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(p)), _mm_loadu_ps(p + stride), 1);
 #else
@@ -190,7 +218,7 @@ CLEAR_INLINE FloatRegister load_quads(const float* p, [[maybe_unused]] int strid
 #endif
 }
 
-CLEAR_INLINE void store_quads(float* p, [[maybe_unused]] int stride, FloatRegister a) {
+CLEAR_INLINE void store_quads(float* p, [[maybe_unused]] std::ptrdiff_t stride, FloatRegister a) {
 #if defined(__AVX2__)
   _mm_storeu_ps(p, _mm256_castps256_ps128((__m256)a));
   _mm_storeu_ps(p + stride, _mm256_extractf128_ps((__m256)a, 1));
@@ -199,13 +227,15 @@ CLEAR_INLINE void store_quads(float* p, [[maybe_unused]] int stride, FloatRegist
 #endif
 }
 
-// D columns, one register each, from D registers of rows of D numbers.
+// D columns, one register each, from D registers of rows of D numbers: four rows each at p, p + stride, …
 template <int D>
-CLEAR_INLINE void split_registers(const float* rows, FloatRegister (&out)[D]) {
+CLEAR_INLINE void split_registers(const float* p, std::ptrdiff_t stride, FloatRegister (&out)[D]) {
   using Q = WithinQuads;
   FloatRegister in[D];
-  for (int d = 0; d < D; ++d) in[d] = load_quads(rows + kQuad * d, kQuad * D);
-  if constexpr (D == 2) {
+  for (int d = 0; d < D; ++d) in[d] = load_quads(p + kQuad * d, stride);
+  if constexpr (D == 1) {
+    out[0] = in[0];
+  } else if constexpr (D == 2) {
     out[0] = Q::shuffle<0, 2, 0, 2>(in[0], in[1]), out[1] = Q::shuffle<1, 3, 1, 3>(in[0], in[1]);
   } else if constexpr (D == 3) {  // x0 y0 z0 x1 | y1 z1 x2 y2 | z2 x3 y3 z3
     const FloatRegister xy = Q::shuffle<2, 3, 1, 2>(in[1], in[2]), yz = Q::shuffle<1, 2, 0, 1>(in[0], in[1]);
@@ -218,10 +248,12 @@ CLEAR_INLINE void split_registers(const float* rows, FloatRegister (&out)[D]) {
 }
 
 template <int D>
-CLEAR_INLINE void join_registers(float* rows, const FloatRegister (&in)[D]) {
+CLEAR_INLINE void join_registers(float* p, std::ptrdiff_t stride, const FloatRegister (&in)[D]) {
   using Q = WithinQuads;
   FloatRegister out[D];
-  if constexpr (D == 2) {
+  if constexpr (D == 1) {
+    out[0] = in[0];
+  } else if constexpr (D == 2) {
     const FloatRegister even = Q::shuffle<0, 2, 0, 2>(in[0], in[1]), odd = Q::shuffle<1, 3, 1, 3>(in[0], in[1]);
     out[0] = Q::shuffle<0, 2, 0, 2>(even, odd), out[1] = Q::shuffle<1, 3, 1, 3>(even, odd);
   } else if constexpr (D == 3) {
@@ -232,7 +264,16 @@ CLEAR_INLINE void join_registers(float* rows, const FloatRegister (&in)[D]) {
     for (int d = 0; d < D; ++d) out[d] = in[d];
     transpose_four<Q>(out[0], out[1], out[2], out[3]);
   }
-  for (int d = 0; d < D; ++d) store_quads(rows + kQuad * d, kQuad * D, out[d]);
+  for (int d = 0; d < D; ++d) store_quads(p + kQuad * d, stride, out[d]);
+}
+
+template <int D>
+CLEAR_INLINE void split_registers(const float* rows, FloatRegister (&columns)[D]) {
+  split_registers<D>(rows, kQuad * D, columns);
+}
+template <int D>
+CLEAR_INLINE void join_registers(float* rows, const FloatRegister (&columns)[D]) {
+  join_registers<D>(rows, kQuad * D, columns);
 }
 #endif
 
@@ -274,6 +315,26 @@ CLEAR_INLINE void join_rows(T* rows, const Lanes<T> (&columns)[D]) {
     for (int d = 0; d < D; ++d) columns[d].store(split[d]);
     for (int i = 0; i < kLanes; ++i)
       for (int d = 0; d < D; ++d) rows[D * i + d] = split[d][i];
+  }
+}
+
+// Converts sixteen rows of D numbers, four each at p, p + stride, p + 2 stride and p + 3 stride, to D columns of sixteen.
+template <int D>
+CLEAR_INLINE void split_rows(const float* p, std::ptrdiff_t stride, Lanes<float> (&columns)[D]) {
+  for (int k = 0; k < Lanes<float>::registers; ++k) {
+    FloatRegister out[D];
+    split_registers<D>(p + kQuads * k * stride, stride, out);
+    for (int d = 0; d < D; ++d) columns[d].r[k] = out[d];
+  }
+}
+
+// … and back.
+template <int D>
+CLEAR_INLINE void join_rows(float* p, std::ptrdiff_t stride, const Lanes<float> (&columns)[D]) {
+  for (int k = 0; k < Lanes<float>::registers; ++k) {
+    FloatRegister in[D];
+    for (int d = 0; d < D; ++d) in[d] = columns[d].r[k];
+    join_registers<D>(p + kQuads * k * stride, stride, in);
   }
 }
 
