@@ -115,17 +115,7 @@ inline void list_pairs(const Band& band, const Band& image, const Drawn& drawn, 
     return r;
   };
   auto each_bin = [&](const BinRange& r, auto&& visit) {
-    const int corner = (r.y0 - band.y0) * band.columns() + r.x0 - band.x0;
-    if (request.all()) {  // one loop, because the ends of two are harder to foresee
-      const int width = r.x1 + 1 - r.x0, down = band.columns() + 1 - width;
-      for (int left = int(r.count()), bin = corner, in_row = width; left; --left) {
-        visit(bin);
-        const bool last = --in_row == 0;
-        bin += last ? down : 1, in_row = last ? width : in_row;
-      }
-    } else {
-      request.each_bin(r, [&](int x, int y) { visit((y - band.y0) * band.columns() + x - band.x0); });
-    }
+    request.each_bin(r, [&](int x, int y) { visit((y - band.y0) * band.columns() + x - band.x0); });
   };
 
   // Count each Gaussian's pairs, and add the counts up.

@@ -56,9 +56,13 @@ class Request {
   // Calls visit(x, y) for each such bin, row by row.
   template <class Visit>
   void each_bin(const BinRange& r, Visit&& visit) const {
-    if (all()) {
-      for (int y = r.y0; y <= r.y1; ++y)
-        for (int x = r.x0; x <= r.x1; ++x) visit(x, y);
+    if (all()) {  // one loop, because the ends of two are harder for a processor to foresee
+      std::int64_t left = r.count();
+      for (int x = r.x0, y = r.y0; left; --left) {
+        visit(x, y);
+        const bool last = x == r.x1;
+        x = last ? r.x0 : x + 1, y += last;
+      }
       return;
     }
     auto visit_patch = [&](int x, int y, std::uint64_t bits) {
