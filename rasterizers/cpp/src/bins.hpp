@@ -5,8 +5,6 @@
 #pragma once
 
 #include <algorithm>
-#include <stdexcept>
-#include <string>
 
 #include "groups.hpp"
 #include "pool.hpp"
@@ -34,42 +32,6 @@ struct Bins {
   Buffer<std::uint32_t> where;        // indices into `pairs` by Gaussian, from its top left bin on
   bool has_masks = false;
 };
-
-// The number of pairs in each row of bins.
-inline std::vector<std::int64_t> count_pairs(int rows, const Buffer<BinRange>& ranges, const Drawn& drawn, int threads) {
-  const std::int64_t per_part = 16, parts = (drawn.chunks() + per_part - 1) / per_part;
-  std::vector<std::int64_t> steps(std::size_t(parts) * (rows + 1), 0);  // differences from row to row
-  Pool::instance().run(threads, parts, [&](std::int64_t part) {
-    std::int64_t* step = steps.data() + part * (rows + 1);
-    for (std::int64_t c = part * per_part; c < std::min(drawn.chunks(), (part + 1) * per_part); ++c)
-      for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i) {
-        const BinRange r = ranges[*i];
-        if (!r.count()) continue;
-        step[r.y0] += r.x1 - r.x0 + 1;
-        step[r.y1 + 1] -= r.x1 - r.x0 + 1;
-      }
-  });
-  std::vector<std::int64_t> pairs(rows);
-  std::int64_t running = 0;
-  for (int row = 0; row < rows; ++row) {
-    for (std::int64_t part = 0; part < parts; ++part) running += steps[part * (rows + 1) + row];
-    pairs[row] = running;
-  }
-  return pairs;
-}
-
-// The number of pairs in each bin of a row.
-inline std::vector<std::int64_t> count_pairs_in_row(int row, int columns, const Buffer<BinRange>& ranges, const Drawn& drawn) {
-  std::vector<std::int64_t> pairs(columns + 1, 0);  // differences from bin to bin
-  for (std::int64_t c = 0; c < drawn.chunks(); ++c)
-    for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i) {
-      const BinRange r = ranges[*i];
-      if (r.count() && r.y0 <= row && row <= r.y1) ++pairs[r.x0], --pairs[r.x1 + 1];
-    }
-  for (int x = 1; x < columns; ++x) pairs[x] += pairs[x - 1];
-  pairs.pop_back();
-  return pairs;
-}
 
 // How many rectangles cover each bin of a band. Sums of differences along both axes: adding a rectangle is no loop over its
 // bins, whose length a processor cannot foresee.

@@ -59,33 +59,26 @@ struct BlockDepth {
 // registers at once: a load must wait where it reads what several narrower stores, or one wider store, have just written.
 template <int C, class T>
 CLEAR_INLINE void load_block(const T* image, int width, int height, int X, int Y, Lanes<T> (&channels)[C]) {
-  T pixels[kLanes * C];
   const int columns = std::min(kBlock, width - X), rows = std::min(kBlock, height - Y);
   if constexpr (sizeof(T) == 4)
     if (columns == kBlock && rows == kBlock)
       return split_rows<C>(image + (std::int64_t(Y) * width + X) * C, std::ptrdiff_t(width) * C, channels);
-  if (columns < kBlock || rows < kBlock) std::memset(pixels, 0, sizeof pixels);
-  for (int y = 0; y < rows; ++y) {
-    const T* from = image + (std::int64_t(Y + y) * width + X) * C;
-    if (columns == kBlock) std::memcpy(pixels + y * kBlock * C, from, sizeof(T) * kBlock * C);
-    else std::copy(from, from + columns * C, pixels + y * kBlock * C);
-  }
+  T pixels[kLanes * C] = {};
+  for (int y = 0; y < rows; ++y)
+    std::copy_n(image + (std::int64_t(Y + y) * width + X) * C, columns * C, pixels + y * kBlock * C);
   load_rows<C>(pixels, 0, kLanes, channels);
 }
 
 template <int C, class T>
 CLEAR_INLINE void store_block(T* image, int width, int height, int X, int Y, const Lanes<T> (&channels)[C]) {
-  T pixels[kLanes * C];
   const int columns = std::min(kBlock, width - X), rows = std::min(kBlock, height - Y);
   if constexpr (sizeof(T) == 4)
     if (columns == kBlock && rows == kBlock)
       return join_rows<C>(image + (std::int64_t(Y) * width + X) * C, std::ptrdiff_t(width) * C, channels);
+  T pixels[kLanes * C];
   store_rows<C>(pixels, 0, kLanes, channels);
-  for (int y = 0; y < rows; ++y) {
-    T* to = image + (std::int64_t(Y + y) * width + X) * C;
-    if (columns == kBlock) std::memcpy(to, pixels + y * kBlock * C, sizeof(T) * kBlock * C);
-    else std::copy(pixels + y * kBlock * C, pixels + (y * kBlock + columns) * C, to);
-  }
+  for (int y = 0; y < rows; ++y)
+    std::copy_n(pixels + y * kBlock * C, columns * C, image + (std::int64_t(Y + y) * width + X) * C);
 }
 
 // log2 of a Gaussian's α before the cap, at the pixels.

@@ -7,6 +7,10 @@
 // is then drawn band by band, with the same bits. What the backward pass needs is checked before the forward pass begins.
 #pragma once
 
+#include <numeric>
+#include <stdexcept>
+#include <string>
+
 #include "order.hpp"
 #include "passes.hpp"
 #include "project_vjp.hpp"
@@ -48,8 +52,8 @@ class Frame {
     view.ends.reserve_lost(blocks);
     if (depth) view.depths.reserve_lost(blocks);
     view.has_depth = depth != nullptr;
-    bands_of(view, kBytesPerPair + sizeof(PairSums<T, kMostCotangents, kColourAndDepth>), threads);  // throws now where the gradients would not fit
-    for (const Band& band : bands_of(view, kBytesPerPair, threads)) {
+    bands_of(view, kBytesPerPair + sizeof(PairSums<T, kMostCotangents, kColourAndDepth>));  // throws now where the gradients would not fit
+    for (const Band& band : bands_of(view, kBytesPerPair)) {
       list(view, band, threads);
       Pool::instance().run(threads, band.bins(), [&](std::int64_t bin) {
         if (depth) draw_bin<T, kColourAndDepth>(job(view, bin), image, alpha, depth);
@@ -129,29 +133,40 @@ class Frame {
   };
 
   // Splits the image into bands whose pairs fit the budget: rows of bins, and a row that does not fit into parts of it.
-  std::vector<Band> bands_of(const View& view, std::int64_t bytes_per_pair, int threads) const {
+  std::vector<Band> bands_of(const View& view, std::int64_t bytes_per_pair) const {
     const std::int64_t most = std::min(budget_ / bytes_per_pair, std::int64_t(UINT32_MAX));
     const int columns = view.target.grid.columns(), rows = view.target.grid.rows();
     if (view.target.pairs <= most) return {whole(view.target.grid)};
-    const std::vector<std::int64_t> pairs_in_row = count_pairs(rows, view.target.ranges, drawn_, threads);
+    const std::vector<std::uint32_t> pairs = pairs_in_bins(view);
     std::vector<Band> bands;
     int first = 0;
     std::int64_t held = 0;
     for (int row = 0; row < rows; ++row) {
-      const std::int64_t here = pairs_in_row[row];
+      const std::uint32_t* in_row = pairs.data() + std::size_t(row) * columns;
+      const std::int64_t here = std::accumulate(in_row, in_row + columns, std::int64_t(0));
       if (held + here > most && row > first) bands.push_back({0, columns, first, row}), first = row, held = 0;
       held += here;
       if (here <= most) continue;
-      split_row(view, row, most, bytes_per_pair, bands);
+      split_row(view, row, in_row, most, bytes_per_pair, bands);
       first = row + 1, held = 0;
     }
     if (first < rows) bands.push_back({0, columns, first, rows});
     return bands;
   }
 
-  void split_row(const View& view, int row, std::int64_t most, std::int64_t bytes_per_pair, std::vector<Band>& bands) const {
-    const std::vector<std::int64_t> pairs = count_pairs_in_row(row, view.target.grid.columns(), view.target.ranges, drawn_);
-    const int columns = int(pairs.size());
+  // The pairs of each bin of the image, requested or not.
+  std::vector<std::uint32_t> pairs_in_bins(const View& view) const {
+    Coverage coverage(whole(view.target.grid));
+    for (std::int64_t c = 0; c < drawn_.chunks(); ++c)
+      for (const std::uint32_t* i = drawn_.begin(c); i < drawn_.end(c); ++i) coverage.add(view.target.ranges[*i]);
+    std::vector<std::uint32_t> pairs(whole(view.target.grid).bins());
+    coverage.each(view.target.grid.columns(), [&](int bin, std::int64_t, std::uint32_t count) { pairs[bin] = count; });
+    return pairs;
+  }
+
+  void split_row(const View& view, int row, const std::uint32_t* pairs, std::int64_t most, std::int64_t bytes_per_pair,
+                 std::vector<Band>& bands) const {
+    const int columns = view.target.grid.columns();
     int first = 0;
     std::int64_t held = 0;
     for (int x = 0; x < columns; ++x) {
@@ -203,7 +218,7 @@ class Frame {
   template <int K, int C>
   void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
     using Sums = PairSums<T, K, C>;
-    const std::vector<Band> bands = bands_of(view, kBytesPerPair + sizeof(Sums), threads);
+    const std::vector<Band> bands = bands_of(view, kBytesPerPair + sizeof(Sums));
     const bool whole = bands.size() == 1;
     Buffer<Sums> pair_sums, splat_sums;  // by pair; by Gaussian, when there are several bands
     if (!whole) {

@@ -57,7 +57,7 @@ __attribute__((noinline)) std::uint32_t keep_requested(const Target<T>& target, 
   if (target.request.all()) return visible;
   std::uint32_t kept = 0;
   for (int i = 0; i < count; ++i) {
-    const bool any = target.request.any_in(ranges[i]);
+    const bool any = target.request.bins_in(ranges[i]) > 0;
     const std::uint64_t keep = -std::uint64_t(any);
     const auto range = std::bit_cast<std::uint64_t>(ranges[i]), none = std::bit_cast<std::uint64_t>(BinRange{});
     ranges[i] = std::bit_cast<BinRange>((range & keep) | (none & ~keep));

@@ -42,12 +42,9 @@ class Request {
   bool all() const { return blocks_.empty(); }
   // One bit per block of a bin, counted row by row.
   std::uint64_t blocks(std::int64_t bin) const { return all() ? ~std::uint64_t(0) : blocks_[bin]; }
-  // Whether the rectangle has a bin with a requested block. No branch on the answer, which is not predictable.
-  bool any_in(const BinRange& r) const { return all() ? r.count() > 0 : in_one_patch(r) ? patch(r) != 0 : bins_in(r) > 0; }
-  // How many such bins it has.
+  // How many bins of the rectangle have a requested block.
   std::int64_t bins_in(const BinRange& r) const {
     if (all()) return r.count();
-    if (in_one_patch(r)) return std::popcount(patch(r));
     std::int64_t count = 0;
     each_patch(r, [&](int, int, std::uint64_t bits) { count += std::popcount(bits); });
     return count;
@@ -65,25 +62,18 @@ class Request {
       }
       return;
     }
-    auto visit_patch = [&](int x, int y, std::uint64_t bits) {
+    each_patch(r, [&](int x, int y, std::uint64_t bits) {
       each_bit(bits, [&](int i) CLEAR_LAMBDA { visit(x + i % kPatch, y + i / kPatch); });
-    };
-    if (in_one_patch(r)) visit_patch(r.x0, r.y0, patch(r));
-    else each_patch(r, visit_patch);
+    });
   }
 
  private:
   static constexpr int kPatch = 8;  // edge of a patch, bins: a 64-bit word has a bit per bin of a patch
 
-  // Nearly always.
-  static bool in_one_patch(const BinRange& r) { return std::max(r.x1 - r.x0, r.y1 - r.y0) < kPatch; }
-  std::uint64_t patch(const BinRange& r) const {
-    return near_[r.y0 * columns_ + r.x0] & rectangle(r.x1 + 1 - r.x0, r.y1 + 1 - r.y0);
-  }
-
   // Calls visit(x, y, bits) for the patches that make up the rectangle: squares, or rows if it is too wide.
   template <class Visit>
   void each_patch(const BinRange& r, Visit&& visit) const {
+    if (std::max(r.x1 - r.x0, r.y1 - r.y0) < kPatch) return visit(r.x0, r.y0, patch(r, r.x0, r.y0, kPatch));  // nearly always
     const int rows = r.x1 - r.x0 < kPatch ? kPatch : 1;
     for (int y = r.y0; y <= r.y1; y += rows)
       for (int x = r.x0; x <= r.x1; x += kPatch) visit(x, y, patch(r, x, y, rows));
