@@ -1,17 +1,20 @@
-"""What to do with the gradients of Gaussians: CLEAR's strategies, and what carries them.
+"""Training strategies for 3D Gaussian Splatting from a few photos: GCO, P2G, SVS, pseudo views, and what carries them.
 
-A strategy is a small object that answers questions about a 3D Gaussian Splatting step; a `Conductor` asks them in the
-paper's order and merges the gradients. GCO, P2G and SVS work alone and together, in our trainer and in others'.
+A strategy is a small object that answers questions about a training step. A `Conductor` asks the strategies in a fixed order
+and merges the gradients. Each strategy works alone and with others, in the trainer of this package and in other trainers.
 """
 
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import ATTRIBUTES, CONFLICT_GROUPS, Grads, Shot
+from clear_strategies.core.step import Step
+from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
 from clear_strategies.errors import AnchorError, ClearError, DataError, StrategyConflict
 from clear_strategies.merging.conductor import Conductor, Update
 from clear_strategies.merging.objective import Objective
 from clear_strategies.strategies.base import ScreenGradients, Strategy
 from clear_strategies.strategies.gco import GCO
 from clear_strategies.strategies.p2g import P2G
+from clear_strategies.strategies.pseudo_views import PseudoViews
 from clear_strategies.strategies.splatsure import SplatSuRe
 from clear_strategies.strategies.svs import SVS
 
@@ -25,13 +28,19 @@ __all__ = [
     "ClearError",
     "Conductor",
     "DataError",
+    "DepthMap",
     "Evidence",
+    "ExtraView",
     "Grads",
     "Objective",
+    "Photo",
+    "PseudoViews",
     "ScreenGradients",
     "Shot",
     "SplatSuRe",
+    "Step",
     "Strategy",
     "StrategyConflict",
     "Update",
+    "View",
 ]

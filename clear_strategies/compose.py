@@ -6,8 +6,7 @@ conductor("clear", "strategies.gco.tolerance=0.1", iterations=30_000)
 from __future__ import annotations
 
 import difflib
-import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from inspect import signature
 from pathlib import Path
@@ -27,12 +26,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
 from clear_strategies.settings import build, one_line, with_defaults
 from clear_strategies.strategies.base import Strategy
-
-_log = logging.getLogger(__name__)
 
 _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
@@ -45,15 +43,20 @@ class ConductorSettings:
 
     Args:
         strategies: by the names that the configuration gives them.
+        decorators: of the prior, by name; each takes a prior and returns one.
         statistics_from: see `Conductor`; written for 10,000 iterations, as every milestone.
     """
 
     objective: Objective
     strategies: Mapping[str, Strategy] = field(default_factory=dict)
+    decorators: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     statistics_from: int | None = signature(Conductor).parameters["statistics_from"].default
 
-    def conductor(self, stretch: float, iterations: int | None = None) -> Conductor:
+    def conductor(self, stretch: float, detail: DetailRates | None = None) -> Conductor:
         """The conductor of a run, its milestones times `stretch`.
+
+        Args:
+            detail: for hosts; this package's trainer has the rates of f_det among its own (`optim`).
 
         Raises:
             StrategyConflict: two strategies answer a question that only one may.
@@ -62,7 +65,8 @@ class ConductorSettings:
             *(scaled(strategy, stretch) for strategy in self.strategies.values()),
             objective=scaled(self.objective, stretch),
             statistics_from=None if self.statistics_from is None else round(self.statistics_from * stretch),
-            iterations=iterations,
+            decorators=tuple(self.decorators.values()),
+            detail=detail,
         )
 
 
@@ -83,18 +87,19 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
     names = [name.strip() for name in strategy.split(",")]
     chosen = f"+strategy=[{','.join(names)}]" if len(names) > 1 else f"+strategy={names[0]}"
     config = composed([chosen, *overrides])
-    if "pseudo_views" in config:
-        _log.warning(
-            "%s: a trainer other than this package's makes no pseudo views, has no depth loss and takes the SR images as "
-            "they are; the rest takes part.",
-            strategy,
-        )
     settings: ConductorSettings = build(tree(config, _TRAINERS))
-    return settings.conductor(iterations / REFERENCE_ITERATIONS, iterations)
+    return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
 
 
-# Options for both doors, readings=literal above all, set these as well; a host has its own.
-_TRAINERS: Final = ("optim", "skips", "pseudo_views", "depth_loss", "data")
+# Options for both doors, readings=literal above all, set these as well; a host has its own. Of `optim` it has no f_det.
+_TRAINERS: Final = ("optim", "skips", "data")
+
+
+def _detail(config: DictConfig) -> DetailRates:
+    """The rates of f_det where an option for both doors sets them, else the defaults."""
+    optim = OmegaConf.to_container(config.get("optim", OmegaConf.create()))
+    keys = {"detail": "rate", "detail_steps": "steps", "detail_decay": "decay"}
+    return DetailRates(**{keys[key]: value for key, value in optim.items() if key in keys})  # type: ignore[union-attr]
 
 
 def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:

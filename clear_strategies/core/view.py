@@ -68,8 +68,9 @@ class View:
         truth: the real photo at HR, for evaluation only; training never uses it.
         sr_source: the prior's label, e.g. "onnx span_x4.onnx".
         depth: of the LR photo's surfaces, from stereo; None where nobody asked for it, e.g. in test views.
-        disagreement: |D(I) - I_LR| of the SR image I as the prior made it, where `hr` is I moved until it agrees with the
-            photo (data.views.back_projection): what I got wrong still tells how far to believe it. None where `hr` is I.
+        disagreement: |D(I) - I_LR|, where I is the SR image as the network made it and `hr` is I after back-projection, which
+            removes that difference. P2G judges the network by it. None where `hr` is I itself.
+        background: RGB in [0, 1] behind the scene; pixels of this colour belong to no surface.
     """
 
     name: str
@@ -79,6 +80,7 @@ class View:
     sr_source: str = "unknown"
     depth: DepthMap | None = None
     disagreement: Float[Tensor, "h w 3"] | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def factor(self) -> int:
@@ -93,3 +95,20 @@ class View:
         return replace(
             self, lr=self.lr.to(device), hr=self.hr.to(device), truth=truth, depth=depth, disagreement=disagreement
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExtraView:
+    """A picture that the field should match in addition to the view of an iteration, see `Strategy.extra_views`.
+
+    Args:
+        photo: the target, and its camera. Any size; the smaller, the cheaper.
+        weight: >= 0 for each pixel, a multiple of λ_LR; 0 where the target is unknown.
+    """
+
+    photo: Photo
+    weight: Float[Tensor, "h w"]
+
+    def to(self, device: torch.device | str) -> ExtraView:
+        """The same view with its tensors on `device`."""
+        return ExtraView(self.photo.to(device), self.weight.to(device))

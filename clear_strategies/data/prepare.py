@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Final, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
@@ -23,7 +22,7 @@ from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.data.photo_files import image_size, inside, list_images, read_image, write_png
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
-from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of
+from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of, super_resolved
 from clear_strategies.data.progress import Progress
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
@@ -31,7 +30,6 @@ from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_MOST_ROUNDS: Final = 100  # each leaves about half of the difference: after 30, float32 has nothing left to move
 _ROUNDING: Final = 0.5  # grey levels: the largest difference that rounding to 8 bits makes
 
 Sizes = Literal["crop", "round"]
@@ -59,8 +57,6 @@ class ViewSettings:
             training never sees, and LR is made from them, as in the papers. "both": they are trained on at HR, in place of
             SR images, and LR is made from them.
         downsample: D, the operator that makes LR.
-        back_projection: rounds by which each SR image is moved until it shrinks to its LR photo (`images.back_projected`);
-            0: it stays as the prior made it; at most 100.
         lr_folder: ready-made LR images by the photos' names, instead of making them.
 
     Raises:
@@ -78,7 +74,6 @@ class ViewSettings:
     sizes: Sizes = "crop"
     photos_are: PhotosAre = "lr"
     downsample: DownKernel = "bicubic"
-    back_projection: int = 0
     lr_folder: str | None = None
 
     def __post_init__(self) -> None:
@@ -101,7 +96,6 @@ class ViewSettings:
         require_choice("data.views.sizes", self.sizes, get_args(Sizes))
         require_choice("data.views.photos_are", self.photos_are, get_args(PhotosAre))
         require_choice("data.views.downsample", self.downsample, get_args(DownKernel))
-        require_whole("data.views.back_projection", self.back_projection, least=0, most=_MOST_ROUNDS)
         if self.photos_are == "lr" and self.lr_folder:
             rule = "must be null with photos_are=lr, the default, because the photos are the LR images"
             refuse("data.views.lr_folder", rule, self.lr_folder, "data.views.photos_are=hr")
@@ -125,17 +119,6 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     for frame in (*train_frames, *test_frames):
         found.append(_view(frame, capture, views, prior, lr_files, required=len(found) < len(train_frames)))
         progress(len(found))
-    moved = {}
-    if views.back_projection and views.photos_are != "both":  # photos agree with what is made from them
-        before = [_disagreement(view, views.downsample) for view in found]
-        for i, view in enumerate(found):  # one by one: all SR images twice are hundreds of megabytes
-            found[i] = _agreeing(view, before[i], views)
-        trained = len(train_frames)
-        after = [_disagreement(view, views.downsample) for view in found[:trained]]
-        moved["back-projection"] = (
-            f"SR images differed from the LR photos by {_grey_levels(before[:trained]):.2f} grey levels, "
-            f"now by {_grey_levels(after):.2f}"
-        )
     train, test = tuple(found[: len(train_frames)]), tuple(found[len(train_frames) :])
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
     initial = initial_points(
@@ -164,7 +147,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         "sizes": f"photos of {_size(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
         "LR": f"{_size(sample.lr.camera)}, {made}",
         "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), SR images: {sample.sr_source}",
-        **moved,
+        **_moved(train, views.downsample),
         **({} if network is None else {"SR network": f"{fingerprint(network)} (SHA-256)"}),
         "the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic, on average",
         "initial points": f"{len(points):,}: {points.source}",
@@ -297,27 +280,36 @@ def _view(
         else:
             lr = Photo(lr_camera, images.downsample(truth, views.sr_scale, views.downsample))
     if views.photos_are == "both" and truth is not None:
-        return View(frame.name, lr, Photo(hr_camera, truth), truth=truth, sr_source="none, the photos themselves")
+        return View(
+            frame.name,
+            lr,
+            Photo(hr_camera, truth),
+            truth=truth,
+            sr_source="none, the photos themselves",
+            background=capture.background,
+        )
     try:
-        sr, sr_source = prior(frame.name, lr.image, views.sr_scale), prior.label
+        made, sr_source = super_resolved(prior, frame.name, lr.image, views.sr_scale), prior.label
     except DataError as missing:
         if required:
             raise
         _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", frame.name, missing.problem)
         bicubic = Bicubic()
-        sr, sr_source = bicubic(frame.name, lr.image, views.sr_scale), bicubic.label
-    return View(frame.name, lr, Photo(hr_camera, sr), truth=truth, sr_source=sr_source)
+        made, sr_source = super_resolved(bicubic, frame.name, lr.image, views.sr_scale), bicubic.label
+    return View(
+        frame.name, lr, Photo(hr_camera, made.image), truth=truth, sr_source=sr_source, disagreement=made.disagreement,
+        background=capture.background,
+    )  # fmt: skip
 
 
-def _agreeing(view: View, disagreement: Float[Tensor, "h w 3"], views: ViewSettings) -> View:
-    """The view, its SR image back-projected to its LR photo, with the disagreement of before."""
-    sr = images.back_projected(view.hr.image, view.lr.image, view.factor, views.back_projection, views.downsample)
-    return replace(view, hr=Photo(view.hr.camera, images.quantize(sr)), disagreement=disagreement)
-
-
-def _disagreement(view: View, down: DownKernel) -> Float[Tensor, "h w 3"]:
-    """|D(I_HR) - I_LR|."""
-    return (images.downsample(view.hr.image, view.factor, down) - view.lr.image).abs()
+def _moved(views: Sequence[View], down: DownKernel) -> dict[str, str]:
+    """What back-projection has changed, a line for the plan; empty without it."""
+    before = [view.disagreement for view in views if view.disagreement is not None]
+    if not before:
+        return {}
+    after = [(images.downsample(view.hr.image, view.factor, down) - view.lr.image).abs() for view in views]
+    text = f"SR images differed from the LR photos by {_grey_levels(before):.2f} grey levels, now by {_grey_levels(after):.2f}"
+    return {"back-projection": text}
 
 
 def _grey_levels(differences: Sequence[Tensor]) -> float:

@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from clear_strategies import files
 from clear_strategies.compose import ConductorSettings, tree
 from clear_strategies.data.prepare import save_lr
+from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.base import DensifierSettings
 from clear_strategies.errors import SettingError
@@ -35,11 +36,9 @@ from clear_strategies.outputs.remarks import remarks
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import build
 from clear_strategies.training import memory
-from clear_strategies.training.depth_loss import DepthLoss
 from clear_strategies.training.loop import fit
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.pseudo_views import PseudoViews, PseudoViewSettings
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import Skips
 from clear_strategies.training.state import TrainState
@@ -112,13 +111,13 @@ class JobSettings(ConductorSettings):
     skips: Skips
     fit: RunSettings = field(default_factory=RunSettings)
     mip: MipFilter = field(default_factory=MipFilter)
-    pseudo_views: PseudoViewSettings = field(default_factory=PseudoViewSettings)
-    depth_loss: DepthLoss = field(default_factory=DepthLoss)
     method: str | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.prior, functools.partial):
             self.prior(truth={})  # it waits for the photos; its own settings are refused now
+        for decorate in self.decorators.values():
+            decorate(Bicubic())  # likewise
         scene.require_factor(self.prior, self.data.views.sr_scale)
 
 
@@ -166,10 +165,6 @@ class _Training:
             rates=scaled(settings.optim, stretch).of_run(settings.fit.iterations),
             mip=scaled(settings.mip, stretch),
             skips=scaled(settings.skips, stretch),
-            pseudo_views=settings.pseudo_views,
-            depth_loss=settings.depth_loss.of_run(
-                place.there, place.drawing.rasterizer, draws_lr=self.conductor.wants_lr
-            ),
         )
         resume.resume(state, source, self.folder, self.compared)
         return state
@@ -243,7 +238,7 @@ def _run(
         return finished[0]
     threads, why = device.threads(settings.fit.threads)
     torch.set_num_threads(threads)
-    loaded = scene.load(settings.data, settings.prior, settings.fit.seed)
+    loaded = scene.load(settings.data, settings.prior, settings.fit.seed, ours.conductor.prior)
     if settings.data.save_lr is not None:
         save_lr(loaded, Path(settings.data.save_lr))
         return None
@@ -340,7 +335,7 @@ def _train(
         checkpoints = training.folder / resume.CHECKPOINTS
         fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)
     seconds = time.perf_counter() - began
-    state.pseudo_views = PseudoViews()  # their memory is for the results
+    training.conductor.on_fit_end()  # its memory is for the results
     memory.release()
     evaluation = results.write_results(
         training.folder,

@@ -90,8 +90,14 @@ def _photos(capture: Capture) -> dict[str, Callable[[], Any]]:
     return {frame.name: frame.load for frame in capture.frames}
 
 
-def load(data: DataSettings, prior: PriorSettings, seed: int) -> Scene:
-    """Read the data set and prepare its views and its initial points."""
+def load(
+    data: DataSettings, prior: PriorSettings, seed: int, decorated: Callable[[Prior], Prior] = lambda prior: prior
+) -> Scene:
+    """Read the data set and prepare its views and its initial points.
+
+    Args:
+        decorated: what becomes of the chosen prior, see `Conductor.prior`.
+    """
     auto = isinstance(prior, AutoPrior) and data.save_lr is None
     capture, views = within_limit(data.reader(), data.views, reaches=_reach(prior, auto), super_resolve=not auto)
     if data.save_lr is not None:
@@ -102,7 +108,7 @@ def load(data: DataSettings, prior: PriorSettings, seed: int) -> Scene:
         chosen = prior(truth=_photos(capture))
     else:
         chosen = cast("Prior", prior)
-    scene = prepare(capture, views, cached(chosen), data.cloud, seed=seed)
+    scene = prepare(capture, views, decorated(cached(chosen)), data.cloud, seed=seed)
     if auto and views.photos_are != "both":  # logged once the photos are known to be usable
         if isinstance(chosen, Bicubic):
             _log.warning("prior: auto chose %s. %s.", chosen.label, _remedy(views.sr_scale))

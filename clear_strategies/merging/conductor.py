@@ -18,10 +18,12 @@ from clear_strategies.core.deferred import Number, Scalar
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, Shot, conflict_ratio, screen_norm, to_ndc
-from clear_strategies.core.view import View
+from clear_strategies.core.step import Step
+from clear_strategies.core.view import ExtraView, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import StrategyConflict
-from clear_strategies.merging.objective import Objective
+from clear_strategies.merging.detail import DetailRates
+from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.strategies.base import ScreenGradients, Strategy, overrides
 
 _log = logging.getLogger(__name__)
@@ -51,16 +53,21 @@ class HrGradients(Generic[G]):
     Args:
         base, hf: ∇L_base and ∇L_HF, each with `.screen` in 1/pixel of an image of `size` (width, height); hf is None
             where λ_HF = 0.
-        evidence: the answer of `observe`. m: the answer of `route`, [N] or 1.
+        step: the iteration, with the answer of `observe`. m: the answer of `route`, [N] or 1.
         losses: L_base and L_HF by name.
     """
 
     base: G
     hf: G | None
     size: tuple[int, int]
-    evidence: Evidence | None = None
+    step: Step
     m: float | Float[Tensor, " N"] = 1.0
     losses: Mapping[str, Scalar] = field(default_factory=dict)
+
+    @property
+    def evidence(self) -> Evidence | None:
+        """The answer of `observe`."""
+        return self.step.evidence
 
 
 def only(hr: HrGradients[Grads], names: Collection[str]) -> HrGradients[Grads]:
@@ -93,6 +100,7 @@ class Update:
     """What one iteration decided.
 
     Args:
+        step: the iteration, for `Conductor.after_step`.
         grads: the merged gradient by attribute, for the optimizer; None where a `Stepper` has made the step.
         score: S_i, the statistic that densification uses; `ordinary` is that of 3DGS, without strategies.
         conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
@@ -101,13 +109,21 @@ class Update:
     On a device, losses, conflict and logs are not floats yet: `deferred.read`.
     """
 
+    step: Step
     grads: Grads | None
     score: Float[Tensor, " N"]
     ordinary: Float[Tensor, " N"]
-    evidence: Evidence | None
     conflict: Mapping[str, Number] = field(default_factory=dict)
     losses: Mapping[str, Scalar] = field(default_factory=dict)
     logs: Mapping[str, Number] = field(default_factory=dict)
+
+    @property
+    def evidence(self) -> Evidence | None:
+        """The answer of `observe`; None without HR."""
+        return self.step.evidence
+
+
+P = TypeVar("P")
 
 
 @runtime_checkable
@@ -127,6 +143,10 @@ class Stepper(Protocol[G]):
         """Merge, and step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
         ...
 
+    def step_extra(self, params: Mapping[str, Tensor], g_lr: G, t: int) -> None:
+        """Step on the gradient of an extra view alone; nothing is regularized."""
+        ...
+
 
 class Conductor:
     """Asks strategies and merges gradients.
@@ -136,7 +156,8 @@ class Conductor:
         objective: the losses and their weights.
         statistics_from: iteration from which densification statistics need the HR render although λ_HR = 0; None:
             as soon as λ_HR > 0 (F11).
-        iterations: of the run, where they are known; adapters give f_det a lower rate in short runs.
+        decorators: each takes a prior and returns one, e.g. `BackProjected`; `prior` applies them in this order.
+        detail: the rates of f_det, for hosts.
 
     Raises:
         StrategyConflict: two strategies answer a question that only one may.
@@ -144,11 +165,12 @@ class Conductor:
 
     def __init__(
         self, *strategies: Strategy, objective: Objective | None = None, statistics_from: int | None = 500,
-        iterations: int | None = None,
+        decorators: Sequence[Callable[[Any], Any]] = (), detail: DetailRates | None = None,
     ) -> None:  # fmt: skip
         self.strategies = strategies
         self.objective = objective if objective is not None else Objective()
-        self.statistics_from, self.iterations = statistics_from, iterations
+        self.statistics_from = statistics_from
+        self.decorators, self.detail = tuple(decorators), detail if detail is not None else DetailRates()
         self.work_log = WorkLog()
         self._one: dict[str, Strategy] = {}
         for hook in _ONE_ANSWER:
@@ -162,8 +184,10 @@ class Conductor:
             if owners:
                 self._one[hook] = owners[0]
         self._regularizers = [s for s in strategies if overrides(s, "regularize")]
+        self._showing = [s for s in strategies if overrides(s, "extra_views")]
+        others = ("regularize", "extra_views", "may_densify", "after_step")
         for s in strategies:
-            if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, "regularize", "may_densify", "after_step")):
+            if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, *others)):
                 _log.warning("%s implements no hook; it has no effect.", type(s).__name__)
 
     def on_fit_start(
@@ -179,8 +203,19 @@ class Conductor:
             s.on_fit_start(n_views, seed)
             s.to(device)
             if s.wants_views():
-                with self.work_log.stage("views compared"):
+                with self.work_log.stage("views prepared"):
                     s.on_views(views)
+
+    def on_fit_end(self) -> None:
+        """Once, after the last iteration."""
+        for s in self.strategies:
+            s.on_fit_end()
+
+    def prior(self, prior: P) -> P:
+        """The prior with every decorator around it: what makes the SR images of a run with this conductor."""
+        for decorate in self.decorators:
+            prior = decorate(prior)
+        return prior
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""
@@ -235,6 +270,7 @@ class Conductor:
                 f"this objective needs the {'HR' if reduced else 'LR'} scale at t={t}, got None. Render what wants_lr "
                 "and wants_hr(t) ask for."
             )
+        self.forget_logs()
         with stage("losses LR"):
             low = rendered.image.detach()
             l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, view.lr.image)  # Eq. 4
@@ -250,8 +286,9 @@ class Conductor:
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            g_mean, from_hr = self._backward_hr(hr, view, vjp, where, through_mean)
+            g_mean, from_hr = self._backward_hr(hr, Step(t, view, hr.visible), vjp, where, through_mean)
             g_lr = g_mean if reduced else g_lr
+        step = Step(t, view) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else stepper.stage):
             score, ordinary = self.scores(to_ndc(_screen(g_lr), _size(rendered.image)), from_hr, t)  # S^dens   Eq. 14
             if stepper is None:
@@ -261,12 +298,32 @@ class Conductor:
             else:
                 _require_finite_parts(where, g_lr, from_hr)
                 grads, conflict = None, stepper.step(params, g_lr, from_hr, t)
-        e, losses = (None, {}) if from_hr is None else (from_hr.evidence, from_hr.losses)
-        return Update(grads, score, ordinary, e, conflict, {**l_lr.values, **losses}, self.logs())
+        losses = {} if from_hr is None else from_hr.losses
+        return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, self.logs())
 
-    def hr_gradients(self, hr: Shot, view: View) -> HrGradients[Grads]:
+    def hr_gradients(self, hr: Shot, view: View, t: int) -> HrGradients[Grads]:
         """Compare Î_HR with the SR image, backpropagate both losses in one pass, and ask for the evidence."""
-        return self._backward_hr(hr, view, _vjp, f"view {view.name}")[1]
+        return self._backward_hr(hr, Step(t, view, hr.visible), _vjp, f"t={t}, view {view.name}")[1]
+
+    def extra_views(self, t: int) -> list[ExtraView]:
+        """What the strategies want the field to match at t besides the view; each gets a step on `extra_loss`."""
+        if not self._showing or self.objective.lambda_lr == 0:
+            return []
+        return [extra for s in self._showing for extra in s.extra_views(t)]
+
+    def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:
+        """The LR loss of a render of `extra`, weighted by pixel: its value and its cotangent [1, h, w, 3].  Eq. 4
+
+        Where the weight is 0, both images count as black.
+
+        Raises:
+            DivergedError: the loss is not finite.
+        """
+        weight = extra.weight[..., None]
+        target = torch.where(weight > 0, extra.photo.image, 0.0)
+        found = self.objective.lr(torch.where(weight > 0, image.detach(), 0.0), target)
+        require_finite_losses(f"t={t}, an extra view", found.values, {"it": target, "the render": image})
+        return found._replace(cotangents=found.cotangents * weight)
 
     def merge(self, params: Mapping[str, Tensor], g_lr: Grads, hr: HrGradients[Grads] | None, t: int) -> Merged:
         """The merge: g_LR + λ_HR ĝ_HR + λ∇L_stab.
@@ -276,7 +333,7 @@ class Conductor:
         """
         if hr is None:
             return Merged(g_lr + self._regularize(params, t))
-        λ, λ_hf, e = self.objective.lambda_hr(t), self.objective.lambda_hf, hr.evidence
+        λ, λ_hf = self.objective.lambda_hr(t), self.objective.lambda_hf
         g_hf = None if hr.hf is None else hr.hf * hr.m * λ_hf  # m ∇L_HF        Eq. 12
         g_hr = _without_detail(hr.base if g_hf is None else hr.base + g_hf)  # g^HR           Eq. 13
         g_lr = _without_detail(g_lr)
@@ -284,7 +341,7 @@ class Conductor:
         corrected = g_hr
         if λ > 0:
             conflict = conflict_ratio(g_lr, g_hr)  # before correction
-            corrected = self._ask("correct", g_hr, g_lr, g_hr, e)  # ĝ^HR           Eq. 6, 7, 11
+            corrected = self._ask("correct", g_hr, g_lr, g_hr, hr.step)  # ĝ^HR           Eq. 6, 7, 11
         g = g_lr + corrected * λ  # Eq. 8
         if g_hf is not None and "detail" in g_hf:
             g["detail"] = g_hf["detail"] * λ  # f_det: never corrected, never from L_base
@@ -306,12 +363,13 @@ class Conductor:
                 hf = to_ndc(_screen(hr.hf), hr.size)
                 total = total + λ * self.objective.lambda_hf * hf
         screen = ScreenGradients(screen_lr, base, hf, screen_norm(total))
-        score = None if hr is None else self._ask("score", None, hr.evidence, screen)
+        score = None if hr is None else self._ask("score", None, hr.step, screen)
         return screen.ordinary if score is None else score, screen.ordinary
 
-    def after_step(self, params: Mapping[str, Tensor], t: int) -> None:
+    def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
+        """After the optimizer steps of an iteration."""
         for s in self.strategies:
-            s.after_step(params, t)
+            s.after_step(params, step)
 
     def may_densify(self, t: int) -> bool:
         return all(s.may_densify(t) for s in self.strategies)
@@ -347,10 +405,15 @@ class Conductor:
         """The scalars that the strategies logged in the last iteration."""
         return {name: value for s in self.strategies for name, value in s.logs.items()}
 
+    def forget_logs(self) -> None:
+        """Before an iteration: what the strategies log from now on belongs to it."""
+        for s in self.strategies:
+            s.logs.clear()
+
     def _backward_hr(
         self,
         hr: Shot,
-        view: View,
+        step: Step,
         vjp: Callable[..., Sequence[Any]],
         where: str,
         lr_cotangents: Tensor | None = None,
@@ -360,7 +423,7 @@ class Conductor:
         Args:
             where: for messages.
         """
-        stage = self.work_log.stage
+        stage, view = self.work_log.stage, step.view
         with stage("losses HR"):
             losses = self.objective.hr(hr.image.detach(), view.hr.image)  # Eq. 5
         require_finite_losses(where, losses.values, {"the SR image": view.hr.image, "the HR render": hr.image})
@@ -370,9 +433,9 @@ class Conductor:
         g_lr = None if lr_cotangents is None else gradients.pop(0)
         base, hf = gradients if len(gradients) > 1 else (gradients[0], None)
         with stage("evidence"):
-            e = self._ask("observe", None, view, hr)  # q, a, w        Eq. 9, 10
-            m = 1.0 if hf is None else self._ask("route", 1.0, e)  # m              Eq. 12
-        return g_lr, HrGradients(base, hf, _size(hr.image), e, m, losses.values)
+            step = replace(step, evidence=self._ask("observe", None, step, hr))  # q, a, w        Eq. 9, 10
+            m = 1.0 if hf is None else self._ask("route", 1.0, step)  # m              Eq. 12
+        return g_lr, HrGradients(base, hf, _size(hr.image), step, m, losses.values)
 
     def _by_name(self) -> dict[str, Strategy]:
         named: dict[str, Strategy] = {}

@@ -78,10 +78,9 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[s
             lines[f"milestones of {type(s).__name__}"] = ", ".join(f"{name} {t}" for name, t in found.items())
     if found := milestones(state.density.settings):
         lines[f"milestones of {state.density.name}"] = ", ".join(f"{name} {t}" for name, t in found.items())
-    if (beside := state.pseudo_views.says()) is not None:
-        lines["pseudo views"] = beside
-    if state.depth_loss.weight > 0:
-        lines["depth loss"] = f"of LR renders, weight {state.depth_loss.weight:g}"
+    for name, s in zip(chosen.strategies, conductor.strategies, strict=True):
+        if (prepared := s.summary()) is not None:
+            lines[name.replace("_", " ")] = prepared
     lines["skipped"] = "; ".join(_skipped(state)) or "nothing"
     _warn_of_idle_strategies(conductor)
     short = {label: lines[label] for label in _SHORT if label in lines}

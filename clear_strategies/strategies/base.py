@@ -1,8 +1,7 @@
-"""The contract of a strategy. A strategy answers questions about the gradients of Gaussians; it knows no rasterizer.
+"""The contract of a strategy. A strategy answers questions about one training iteration; it knows no rasterizer.
 
-The hooks are phases of the paper, so their order needs no configuration. A hook that no strategy
-overrides is never called. Exactly one strategy may override each of the hooks that give *the*
-answer: gate, observe, route, correct, score.
+The hooks are phases of an iteration, so their order needs no configuration. A hook that no strategy overrides is never
+called. At most one strategy may override each of the hooks with a single answer: gate, observe, route, correct, score.
 """
 
 from __future__ import annotations
@@ -20,6 +19,8 @@ from clear_strategies.core.compiled_rules import Anchor, CorrectionRule
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import Grads, Shot
+from clear_strategies.core.step import Step
+from clear_strategies.core.view import ExtraView, View
 
 _DEVICE = "device"
 
@@ -63,11 +64,11 @@ class Strategy:
         self.cache.clear()
         self.logs.clear()
 
-    def on_views(self, views: Sequence[Any]) -> None:
-        """Compare the training views with each other, once, after `on_fit_start`; only asked where `wants_views` says so.
+    def on_views(self, views: Sequence[View]) -> None:
+        """Look at all training views once, after `on_fit_start`; only called where `wants_views` is true.
 
         Args:
-            views: of a run; a host that does not have them all at the start gives none.
+            views: on the device of the field; empty where the training loop does not have them all at the start.
         """
         raise NotImplementedError
 
@@ -75,39 +76,58 @@ class Strategy:
         """Before render: which Gaussians take part? z >= 0 multiplies the opacity; None: all of them.  Eq. 15"""
         raise NotImplementedError
 
-    def observe(self, view: Any, hr: Shot) -> Evidence | None:
-        """After render: what does I_HR tell about each Gaussian?  Eq. 9, 10"""
+    def observe(self, step: Step, hr: Shot) -> Evidence | None:
+        """After render: what does I_HR tell about each Gaussian?  Eq. 9, 10
+
+        Args:
+            hr: the HR render of `step.view`.
+        """
         raise NotImplementedError
 
-    def route(self, evidence: Evidence | None) -> Float[Tensor, " N"]:
+    def route(self, step: Step) -> Float[Tensor, " N"]:
         """How much of its high-frequency gradient does each Gaussian get? m >= 0.  Eq. 12"""
         raise NotImplementedError
 
-    def correct(self, lr: Grads, hr: Grads, evidence: Evidence | None) -> Grads:
-        """How to reconcile the two? Returns the corrected g_HR; g_LR is never changed.  Eq. 6, 7, 11"""
+    def correct(self, lr: Grads, hr: Grads, step: Step) -> Grads:
+        """How to reconcile the two gradients? Returns the corrected g_HR; g_LR is never changed.  Eq. 6, 7, 11"""
         raise NotImplementedError
 
     def regularize(self, params: Mapping[str, Tensor], t: int) -> Grads | None:
         """Before the optimizer step: a gradient to add. Several strategies may answer.  Eq. 16"""
         raise NotImplementedError
 
-    def score(self, evidence: Evidence | None, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
+    def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
         """For densification: where is more structure needed? None: the ordinary statistic.  Eq. 14"""
+        raise NotImplementedError
+
+    def extra_views(self, t: int) -> Sequence[ExtraView]:
+        """Which other pictures should the field match at t? Several strategies may answer.
+
+        Each of them is rendered once, without dropout and f_det, and gets an optimizer step of its own on the LR loss, after
+        the step of the iteration's view. It takes no part in evidence, conflicts, densification or regularization.
+        """
         raise NotImplementedError
 
     def may_densify(self, t: int) -> bool:
         """May the structure change at t? All strategies must agree."""
         return True
 
-    def after_step(self, params: Mapping[str, Tensor], t: int) -> None:
-        """After the optimizer step: update `state`, e.g. take the anchor.  Eq. 16"""
+    def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
+        """After the optimizer steps of an iteration: update `state`, e.g. take the anchor, or change `params` in place."""
 
     def on_resize(self, parents: Int[Tensor, " M"]) -> None:
         """After the structure changed: row i of every per-Gaussian tensor now comes from row parents[i]."""
         for name, rows in self.state.items():
             self.state[name] = rows[parents]
 
+    def on_fit_end(self) -> None:
+        """After the last iteration: release the memory that only training needs."""
+
     # ---- facts about the strategy: the plan, the pictures and the compiled step read them -----------------------------
+
+    def summary(self) -> str | None:
+        """What the strategy has prepared for this run, a phrase for the plan; None: nothing."""
+        return None
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
         """Why the strategy changes nothing under these loss weights; None where it has an effect.
@@ -118,7 +138,7 @@ class Strategy:
         return None
 
     def wants_views(self) -> bool:
-        """Whether these settings compare the training views with each other, see `on_views`."""
+        """Whether these settings need all training views at the start, see `on_views`."""
         return False
 
     def skipped(self) -> Sequence[str]:
@@ -126,7 +146,7 @@ class Strategy:
         return ()
 
     def in_hindsight(self, means: Mapping[str, float]) -> str | None:
-        """What a run has shown of the strategy, said at its end; None: nothing worth a line.
+        """What a finished run shows of the strategy, one sentence; None: nothing worth a line.
 
         Args:
             means: of the run's history, by column.
@@ -141,7 +161,7 @@ class Strategy:
         """Iterations worth a mark on a training curve, by name."""
         return {}
 
-    def patch_maps(self, view: Any) -> PatchMaps | None:
+    def patch_maps(self, view: View) -> PatchMaps | None:
         """The patch evidence that the strategy works with for this view; None: it uses none.  Eq. 9"""
         return None
 

@@ -22,6 +22,7 @@ from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule,
 from clear_strategies.core.deferred import Scalar
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot, row_norm, scale_rows
+from clear_strategies.core.step import Step
 from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import Strategy
 
@@ -96,8 +97,14 @@ class GCO(Strategy):
             self._absolute_eps, self.report,
         )  # fmt: skip
 
-    def correct(self, lr: Grads, hr: Grads, evidence: Evidence | None) -> Grads:
-        """g̃_HR for every group; logs what was corrected."""
+    def correct(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], step: Step | None = None) -> Grads:
+        """g̃_HR for every group; logs what was corrected.
+
+        Args:
+            lr, hr: attribute -> gradient [N, …], any of `CONFLICT_GROUPS`; what only one of them has is not compared.
+            step: gives the reliability of Eq. 11; None: nothing is known of it, and conflicts are corrected in full.
+        """
+        evidence = None if step is None else step.evidence
         corrected, done = Grads(hr), []
         for group in self.groups:
             if group in lr and group in hr:
@@ -106,7 +113,9 @@ class GCO(Strategy):
         self.report(done, evidence)
         return corrected
 
-    def _correct_group(self, group: str, lr: Grads, hr: Grads, evidence: Evidence | None) -> tuple[Tensor, GroupReport]:
+    def _correct_group(
+        self, group: str, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], evidence: Evidence | None
+    ) -> tuple[Tensor, GroupReport]:
         g_lr, g_hr = lr[group], hr[group]
         dot, n_lr, n_hr = row_dot(g_lr, g_hr), row_norm(g_lr), row_norm(g_hr)
         both = (n_lr > 0) & (n_hr > 0)
@@ -201,7 +210,7 @@ class GCO(Strategy):
 _TINY: Final = torch.finfo(torch.float64).tiny
 
 
-def _turns_nothing(g: Grads) -> Bool[Tensor, " N"]:
+def _turns_nothing(g: Mapping[str, Tensor]) -> Bool[Tensor, " N"]:
     if "scales" not in g:
         return torch.zeros_like(g["quats"][:, 0], dtype=torch.bool)
     return row_norm(g["quats"]) <= ROTATION_NOISE * row_norm(g["scales"])

@@ -22,6 +22,7 @@ from clear_strategies.core.agreement import ViewAgreement, compare_views
 from clear_strategies.core.evidence import Evidence, Lookup, Outside, PatchMaps, lift
 from clear_strategies.core.gradients import Shot, screen_norm
 from clear_strategies.core.images import DownKernel, UpKernel, downsample, patch_means, quantize, upsample
+from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import ScreenGradients, Strategy
@@ -101,8 +102,9 @@ class P2G(Strategy):
                 float(agreement.reliability[agreement.known].mean()),
             )  # fmt: skip
 
-    def observe(self, view: View, hr: Shot) -> Evidence:
+    def observe(self, step: Step, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""
+        view = step.view
         maps = torch.stack(self._cached_patches(view))  # R, A
         size = (view.hr.camera.width, view.hr.camera.height)
         q, a = lift(maps, hr.means2d, hr.visible, self.patch * view.factor, size, self.lookup, self.outside)
@@ -111,22 +113,21 @@ class P2G(Strategy):
         self.log("mean_w", deferred.scalar((q * a).sum() / visible))
         return Evidence(q, a)
 
-    def route(self, evidence: Evidence | None) -> Float[Tensor, " N"]:
+    def route(self, step: Step) -> Float[Tensor, " N"]:
         """m_i = q_min + (1 - q_min) w_i, over its mean where `normalize`; undefined for invisible Gaussians."""
-        if evidence is None:
+        if step.evidence is None or step.visible is None:
             raise ValueError("P2G routes by evidence, but there is none for this view; call P2G.observe first.")
-        m = self.floor + (1 - self.floor) * evidence.weight  # Eq. 12
+        m = self.floor + (1 - self.floor) * step.evidence.weight  # Eq. 12
         if not self.normalize:
             return m
-        visible = evidence.reliability > 0
-        mean = (m * visible).sum() / visible.sum().clamp_min(1)
+        mean = (m * step.visible).sum() / step.visible.sum().clamp_min(1)
         return m / mean.clamp_min(torch.finfo(m.dtype).tiny)
 
-    def score(self, evidence: Evidence | None, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
+    def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
         """S_i = w_i ‖∇_u L_HF‖, alone or joined with the ordinary statistic; None (ordinary) where λ_HF = 0."""
-        if self.score_by == "gradient" or evidence is None or screen.hf is None:
+        if self.score_by == "gradient" or step.evidence is None or screen.hf is None:
             return None
-        S: Tensor = evidence.weight * screen_norm(screen.hf)  # Eq. 14
+        S: Tensor = step.evidence.weight * screen_norm(screen.hf)  # Eq. 14
         if self.score_by == "evidence":
             return S
         S = S * (screen.ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny))

@@ -1,14 +1,12 @@
 """SplatSuRe's weighting, per Gaussian: SR detail is used where no other view samples the Gaussian better.
 
-A Gaussian that one view samples from near and another from far is covered well by the near view's LR
-photo, while the far view's SR image can only guess what that photo shows. Its HR gradient is therefore
-withheld in every view except the one that samples it best.
+If one view sees a Gaussian from near and another from far, the LR photo of the near view shows what the SR image of
+the far view can only guess. The HR gradient of the Gaussian is therefore withheld in all views but the one that samples it best.
 
-From SplatSuRe: the ratio, the sigmoid, the exemptions, and the constants. Ours: SplatSuRe weighs the pixels
-of each SR image by a map, 1 - render(score) + render(best here), drawn once from a field that was first
-trained on LR; here each Gaussian's gradient is weighed while the one field trains. SplatSuRe's ratio is of
-screen radii; ours is of f / z, which equals it for round Gaussians and does not depend on scales that are
-still being learnt. Densification uses the unweighted gradient.
+The ratio, the sigmoid, the exemptions and the constants are SplatSuRe's. Two things differ. SplatSuRe weighs the pixels of
+each SR image by a map, rendered once from a field that was first trained on LR; this strategy weighs each Gaussian's gradient
+while the field trains. SplatSuRe's ratio is of screen radii; this one is of f / z, which is the same for round Gaussians and does
+not depend on scales that still change. Densification uses the unweighted gradient.
 """
 
 from __future__ import annotations
@@ -16,30 +14,27 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.evidence import Evidence
-from clear_strategies.core.gradients import Grads, Shot
+from clear_strategies.core.gradients import Grads
+from clear_strategies.core.step import Step
 from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import Strategy
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-_NOW: Final = "the view of this iteration"
-
 
 @dataclass(frozen=True)
 class SplatSuRe(Strategy):
     """Withhold HR gradients where another view samples the Gaussian better.
 
-    `state` holds, by view, the sampling rate f / z of every Gaussian (HR pixels per world unit) when it was last visible
-    in the view, 0 where it never was. Weights are 1 until every view has been rendered.
+    `state` holds, by view, the sampling rate f / z of each Gaussian (HR pixels per world unit) when it was last visible in
+    that view, and 0 before. So a Gaussian keeps its whole HR gradient until `min_views` views have shown it.
 
     Args:
         ratio: τ, the ratio of the finest to the coarsest sampling rate at which half of the HR gradient is withheld.
@@ -70,17 +65,12 @@ class SplatSuRe(Strategy):
                 n_views, self.min_views,
             )  # fmt: skip
 
-    def observe(self, view: Any, hr: Shot) -> Evidence | None:
-        """Stores the view and its visible Gaussians for `correct`; gives no evidence."""
-        self.cache[_NOW] = view.name, view.hr.camera, hr.visible
-        return None
-
-    def correct(self, lr: Grads, hr: Grads, evidence: Evidence | None) -> Grads:
+    def correct(self, lr: Grads, hr: Grads, step: Step) -> Grads:
         """W g_HR, attribute by attribute."""
-        name, _, visible = self.cache[_NOW]
         rows = next(iter(hr.values()))
-        w = self.weight(name).to(rows) if self.state else rows.new_ones(len(rows))
-        self.log("mean_hr_weight", deferred.mean(w, visible))
+        w = self.weight(step.view.name).to(rows) if self.state else rows.new_ones(len(rows))
+        if step.visible is not None:
+            self.log("mean_hr_weight", deferred.mean(w, step.visible))
         return hr * w
 
     def weight(self, name: str) -> Float[Tensor, " N"]:
@@ -101,15 +91,15 @@ class SplatSuRe(Strategy):
             exempt |= self.state[name] == finest
         return torch.where(exempt, 1.0, 1 - score)
 
-    def after_step(self, params: Mapping[str, Tensor], t: int) -> None:
-        """Store this view's sampling rates of its visible Gaussians."""
-        if _NOW not in self.cache:
+    def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
+        """Store the sampling rates of the Gaussians that the view of this step shows."""
+        if step.visible is None:
             return
-        name, camera, visible = self.cache.pop(_NOW)
+        name, camera = step.view.name, step.view.hr.camera
         pose = self._pose(name, camera).to(params["means"])
         z = params["means"] @ pose[2, :3] + pose[2, 3]
         before = self.state.get(name, torch.zeros_like(z))
-        self.state[name] = torch.where(visible & (z > 0), camera.fx / z, before)
+        self.state[name] = torch.where(step.visible & (z > 0), camera.fx / z, before)
 
     def _pose(self, name: str, camera: Camera) -> Float[Tensor, "4 4"]:
         """World to camera on the device of the field, cached until the view has another camera."""

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from clear_strategies.core.compiled_rules import Anchor
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
+from clear_strategies.core.step import Step
 from clear_strategies.errors import AnchorError, SettingError
 from clear_strategies.schedules import Ramp, milestone
 from clear_strategies.strategies.base import Strategy
@@ -124,9 +125,9 @@ class SVS(Strategy):
     def may_densify(self, t: int) -> bool:
         return t < self.anchor_start
 
-    def after_step(self, params: Mapping[str, Tensor], t: int) -> None:
+    def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
         """θ^a = sg(θ(t_a)); the last structural change was at t < t_a."""
-        if t == self.anchor_start and self.anchor_strength > 0:
+        if step.t == self.anchor_start and self.anchor_strength > 0:
             self.state.update({name: params[name].detach().clone() for name in self.keeps() if name in params})
             self.cache.pop("extent", None)
 

@@ -1,6 +1,6 @@
 """The contract of a strategy, as checks that anyone can run over their own.
 
-    from clear_strategies.testing import check_strategy
+    from clear_strategies.strategies.testing import check_strategy
     check_strategy(lambda: Mine(strength=2))
 
 Each check raises `ContractError` with what was expected and what was found.
@@ -96,7 +96,7 @@ def check_answers_have_their_shapes(make: Make) -> None:
         if update.evidence is not None:
             for q in (update.evidence.reliability, update.evidence.demand):
                 _require(bool(((q >= 0) & (q <= 1)).all()), "evidence must lie in [0, 1]")
-        conductor.after_step(params, t)
+        conductor.after_step(params, update.step)
 
 
 def check_works_without_hr(make: Make) -> None:
@@ -210,7 +210,7 @@ def _conductor(make: Make, *, lambda_hf: float = 0.2) -> Conductor:
     """Milestones are compressed, so that every phase falls inside the few steps of a check."""
     objective = Objective(WarmupDecay(start=0, full=1, decay_from=_STEPS, end=_STEPS), lambda_hf)
     conductor = Conductor(scaled(make(), _STEPS / 2 / 5_000), objective=objective)
-    conductor.on_fit_start(3, seed=11)
+    conductor.on_fit_start(3, seed=11, views=[_situation(0)[2]])
     return conductor
 
 
@@ -224,7 +224,9 @@ def _trace(conductor: Conductor, start: int, stop: int) -> Any:
         yield update.score
         grads = _grads(update)
         yield from (grads[name] for name in sorted(grads))
-        conductor.after_step(params, t)
+        for extra in conductor.extra_views(t):
+            yield from (extra.photo.image, extra.weight)
+        conductor.after_step(params, update.step)
 
 
 def _grads(update: Update) -> Grads:

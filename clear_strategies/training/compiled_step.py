@@ -153,6 +153,12 @@ class CompiledStep:
             visible = g_lr.visible if hr is None else g_lr.visible | hr.base.visible
         return self._run(params, g_lr, hr, t, rates, bias2, visible, None)
 
+    def step_extra(self, params: Mapping[str, Tensor], g_lr: Factors, t: int) -> None:
+        """Step on this gradient alone: no anchor pulls."""
+        rates, bias2 = self.optimizer.advance()
+        visible = g_lr.visible if self.optimizer.rates.rows == "visible" else None
+        self._run(params, g_lr, None, t, rates, bias2, visible, None, Anchor({}, {}))
+
     def gradient(
         self, params: Mapping[str, Tensor], g_lr: Factors, hr: HrGradients[Factors] | None, t: int
     ) -> tuple[Grads, Mapping[str, Number]]:
@@ -172,7 +178,12 @@ class CompiledStep:
         bias2: float,
         visible: Tensor | None,
         merged: Grads | None,
+        anchor: Anchor | None = None,
     ) -> Mapping[str, Number]:
+        """
+        Args:
+            anchor: in place of the strategies' own.
+        """
         o, a = self.conductor.objective, g_lr.activation
         m, e = (1.0, None) if hr is None else (hr.m, hr.evidence)
         activation = {
@@ -196,7 +207,7 @@ class CompiledStep:
             conflict = {group: deferred.defer(deferred.ratio, opposed, n) for group, opposed, n in shares}
             if self._rule is not None:
                 correction, margins = self._correction(self._rule, compared, products, e)
-        anchor = self._anchor(len(a.sigmoid))
+        anchor = self._anchor(len(a.sigmoid)) if anchor is None else anchor
         decays = (hr is not None and hr.hf is not None) or "detail" in anchor.targets
         keep = 1 - self.optimizer.rates.detail_decay if decays else 1.0
         attributes = {

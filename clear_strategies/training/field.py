@@ -102,13 +102,11 @@ class GaussianField(nn.Module):
         lr: bool = True,
         hr: bool = True,
         tiles: Bool[Tensor, "th tw"] | None = None,
-        depth: bool = False,
     ) -> tuple[FieldShot | None, FieldShot | None]:
         """Î_LR without f_det and Î_HR with it, of the same gated geometry; None for a scale that is not wanted.  Eq. 2, 3
 
         Args:
             tiles: the tiles of Î_HR that are rendered, see `Rasterizer.tile`; the others show I_HR and have no loss.
-            depth: also draw the expected depth of Î_LR, for a rasterizer with the trait `depth`.
         """
         active = self._activate(gate)
         wanted = [
@@ -117,19 +115,16 @@ class GaussianField(nn.Module):
             if on
         ]
         splats = [(active.splats(detail=detail), camera) for detail, camera, _ in wanted]
-        with_depth = {"depth": [not detail for detail, *_ in wanted]} if depth else {}
-        renderings = rasterizer.render_scales(splats, [mask for *_, mask in wanted], **with_depth)
+        renderings = rasterizer.render_scales(splats, [mask for *_, mask in wanted])
         shots = {d: FieldShot(r, active, detail=d) for (d, *_), r in zip(wanted, renderings, strict=True)}
         if hr and tiles is not None:
             shots[True].image = filled(shots[True].image, tiles, view.hr.image, rasterizer.tile)
         return shots.get(False), shots.get(True)
 
-    def shot(self, rasterizer: Rasterizer, camera: Camera, *, depth: bool = False) -> FieldShot:
+    def shot(self, rasterizer: Rasterizer, camera: Camera) -> FieldShot:
         """A rendering to learn from, of all Gaussians, without f_det."""
         active = self._activate(None)
-        splats = active.splats(detail=False)
-        rendering = rasterizer(splats, camera, depth=True) if depth else rasterizer(splats, camera)
-        return FieldShot(rendering, active, detail=False)
+        return FieldShot(rasterizer(active.splats(detail=False), camera), active, detail=False)
 
     def render(self, rasterizer: Rasterizer, camera: Camera, *, detail: bool = True) -> Float[Tensor, "H W 3"]:
         """An image for evaluation: no dropout, f = base + det, not clamped."""
@@ -235,14 +230,11 @@ class FieldShot:
     """A rendering of the field; see `gradients.Shot`.
 
     Attributes:
-        alpha, depth: see `Rendering`; depth is None where it was not asked for.
         gradients: maps K cotangents to gradients of the rendered splats, before the chain rule of `activation`.
     """
 
     def __init__(self, rendering: Rendering, activation: Activation, *, detail: bool) -> None:
         self.image, self.means2d, self.visible = rendering.image, rendering.means2d, rendering.visible
-        self.alpha = rendering.alpha
-        self.depth: Tensor | None = getattr(rendering, "depth", None)  # a backend without the trait may lack it
         self.gradients: Callable[[Tensor], SplatGradients] = rendering.vjp
         self.activation = activation
         self._detail = detail

@@ -22,8 +22,9 @@ from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DivergedError
 from clear_strategies.merging.conductor import Update
-from clear_strategies.training import checkpoint, depth_loss, pseudo_views
+from clear_strategies.training import checkpoint
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
+from clear_strategies.training.extra_steps import extra_steps
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training.skips import PLATEAU_LOSS
 from clear_strategies.training.state import TrainState
@@ -40,22 +41,15 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     tiles = s.skip_policy.wanted(view, rasterizer.tile, ask.work_log) if scales["hr"] else None
     z = ask.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in scales.items() if wanted)}"):
-        known = view.depth if s.depth_loss.weight > 0 else None
-        lr, hr = θ.render_scales(  # Î_LR, Î_HR     Eq. 2, 3
-            rasterizer, view, gate=z, tiles=tiles, depth=known is not None, **scales
-        )
-    loss_depth = None if lr is None or known is None else s.depth_loss.added(lr, known)
+        lr, hr = θ.render_scales(rasterizer, view, gate=z, tiles=tiles, **scales)  # Î_LR, Î_HR     Eq. 2, 3
     drawn = [shot for shot in (lr, hr) if shot is not None]
     u = ask.update(θ.raw(), lr, hr, view, t, s.compiled_step)
     if u.grads is not None:  # else the compiled step has made the step
         with stage("optimizer"):
             s.optimizer.step(θ.raw(), u.grads, torch.stack([shot.visible for shot in drawn]).any(0))
             θ.constrain()
-    beside, loss_beside = s.pseudo_views.due(t, s.settings.seed), None
-    if beside is not None:
-        with stage("pseudo view"):
-            loss_beside = pseudo_views.step(s, rasterizer, beside)
-    ask.after_step(θ.raw(), t)  # θᵃ at t = t_a  Eq. 16       SVS
+    extra = extra_steps(s, rasterizer, ask.extra_views(t))
+    ask.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
     s.density.accumulate(u, drawn[-1], t)  # S^dens         Eq. 14
     with stage("density and filter"):
         # clone · split · prune = parents[M]
@@ -63,10 +57,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
         if s.filter_due() and not restructured:  # the means have not moved since
             s.refilter()
     low = images.area_mean(drawn[-1].image, view.factor) if lr is None else lr.image
-    s.history.append(_row(s, u, low, view))
-    for name, loss in ((pseudo_views.LOSS, loss_beside), (depth_loss.LOSS, loss_depth)):
-        if loss is not None:
-            s.history[-1][name] = loss
+    s.history.append(_row(s, u, low, view) | extra)
     if s.skip_policy.measured(t):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
@@ -13,9 +12,8 @@ from torch import Tensor
 
 from clear_strategies.core.gradients import ATTRIBUTES
 from clear_strategies.errors import SettingError
+from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import LARGEST_RATE, LogLinear
-
-_log = logging.getLogger(__name__)
 
 BETA1: Final = 0.9
 BETA2: Final = 0.999
@@ -28,11 +26,7 @@ class LearningRates:
     Args:
         means: log-linear decay, in units of the scene's extent.
         quats, scales, opacities, sh0, shN: of the raw parameters (any norm, log, logit, SH coefficients).
-        detail: of f_det, an offset of RGB (F34).
-        detail_steps: a run of fewer iterations gives f_det a share of its rate in proportion; 0: always the whole rate. In RGB,
-            f_base moves at 0.28 of the rate of its SH coefficients, and a short run ends before it has followed f_det.
-        detail_decay: share of f_det, in [0, 1), that is lost at every step in which HR takes part. L_HF does not change
-            with a constant colour, so nothing else keeps f_det near 0; the paper has none, 0 (F35).
+        detail, detail_steps, detail_decay: rate, steps and decay of `DetailRates`.
         eps: Adam's. Gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
         rows: "all", or only the rows "visible" in this step (faster but not exact: the others' momentum waits).
 
@@ -46,35 +40,30 @@ class LearningRates:
     opacities: float = 5e-2
     sh0: float = 2.5e-3
     shN: float = 1.25e-4  # noqa: N815 - gsplat's name
-    detail: float = 2.5e-3
-    detail_steps: int = 1_500
-    detail_decay: float = 0.002
+    detail: float = DetailRates().rate
+    detail_steps: int = DetailRates().steps
+    detail_decay: float = DetailRates().decay
     eps: float = 1e-15
     rows: Literal["all", "visible"] = "all"
 
     def __post_init__(self) -> None:
-        for name in ("quats", "scales", "opacities", "sh0", "shN", "detail"):
+        for name in ("quats", "scales", "opacities", "sh0", "shN"):
             if not 0 <= getattr(self, name) <= LARGEST_RATE:
                 raise SettingError(f"{name} must lie in [0, {LARGEST_RATE:g}], got {getattr(self, name)}.")
         if not 0 <= self.eps < 1:
             raise SettingError(f"eps must lie in [0, 1), got {self.eps}.")
-        if not 0 <= self.detail_decay < 1:
-            raise SettingError(f"detail_decay must lie in [0, 1), got {self.detail_decay}.")
-        if self.detail_steps < 0:
-            raise SettingError(f"detail_steps must be at least 0 iterations, got {self.detail_steps}.")
+        self.of_detail  # noqa: B018 - its ranges are checked here
         if self.rows not in ("all", "visible"):
             raise SettingError(f"rows must be all or visible, got {self.rows!r}.")
 
+    @property
+    def of_detail(self) -> DetailRates:
+        """Those of f_det."""
+        return DetailRates(self.detail, self.detail_steps, self.detail_decay)
+
     def of_run(self, iterations: int) -> LearningRates:
-        """The rates of a run of this length; see `detail_steps`."""
-        if iterations >= self.detail_steps:
-            return self
-        rate = self.detail * iterations / self.detail_steps
-        _log.debug(
-            "f_det learns at a rate of %.2g instead of %.2g: the run has %d iterations (optim.detail_steps: %d).",
-            rate, self.detail, iterations, self.detail_steps,
-        )  # fmt: skip
-        return replace(self, detail=rate)
+        """The rates of a run of this length; see `DetailRates.of_run`."""
+        return replace(self, detail=self.of_detail.of_run(iterations).rate)
 
     def at(self, t: int, extent: float) -> dict[str, float]:
         """Every attribute's rate at iteration t, in its own unit."""

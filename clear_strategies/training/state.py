@@ -21,12 +21,10 @@ from clear_strategies.errors import DataError, DivergedError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
-from clear_strategies.training.depth_loss import DepthLoss
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.history import History
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
-from clear_strategies.training.pseudo_views import PseudoViews, PseudoViewSettings
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import SkipPolicy, Skips
 
@@ -53,8 +51,6 @@ class TrainState:
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
     skip_policy: SkipPolicy = field(default_factory=SkipPolicy)
-    pseudo_views: PseudoViews = field(default_factory=PseudoViews)
-    depth_loss: DepthLoss = field(default_factory=DepthLoss)
 
     @classmethod
     def start(
@@ -67,14 +63,11 @@ class TrainState:
         rates: LearningRates,
         mip: MipFilter,
         skips: Skips | None = None,
-        pseudo_views: PseudoViewSettings | None = None,
-        depth_loss: DepthLoss | None = None,
     ) -> TrainState:
         """The state before the first iteration, on the device of the scene's views.
 
         Args:
             settings, density, rates, mip, skips: with milestones already scaled to this run.
-            depth_loss: as its `of_run` gives it.
         """
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
@@ -96,10 +89,6 @@ class TrainState:
             scene.train,
             compiled_step=step,
             skip_policy=SkipPolicy(skips),
-            pseudo_views=PseudoViews.of(
-                scene, pseudo_views or PseudoViewSettings(), settings.seed, conductor.objective.lambda_lr
-            ),
-            depth_loss=depth_loss or DepthLoss(),
         )
         state.refilter()
         return state

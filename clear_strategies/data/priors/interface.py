@@ -7,7 +7,7 @@ import logging
 import os
 import time
 from pathlib import Path
-from typing import Final, Protocol, runtime_checkable
+from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Float
 from torch import Tensor
@@ -32,6 +32,26 @@ class Prior(Protocol):
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         """The SR image of the view called `name`: `factor` times as large as `lr`, in [0, 1], on 8-bit steps."""
         ...
+
+
+class SuperResolved(NamedTuple):
+    """The SR image of a view.
+
+    Args:
+        image: `factor` times as large as the LR photo, in [0, 1].
+        disagreement: see `View.disagreement`; None where the image is the network's own.
+    """
+
+    image: Float[Tensor, "H W 3"]
+    disagreement: Float[Tensor, "h w 3"] | None = None
+
+
+def super_resolved(prior: Any, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> SuperResolved:
+    """What a prior, or any function with its arguments, makes of an LR photo."""
+    if (own := getattr(prior, "super_resolved", None)) is not None:
+        made: SuperResolved = own(name, lr, factor)
+        return made
+    return SuperResolved(prior(name, lr, factor))
 
 
 @runtime_checkable

@@ -1,0 +1,36 @@
+"""One training iteration, as strategies see it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.view import View
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """One training iteration.
+
+    Args:
+        t: the iteration, from 1.
+        view: what this iteration trains on: photo and SR image, each with a camera that knows its size in pixels.
+        visible: the Gaussians that the HR render shows, [N]; None in an iteration without HR.
+        evidence: the answer of `Strategy.observe`; None before it, and where no strategy gives one.
+    """
+
+    t: int
+    view: View
+    visible: Bool[Tensor, " N"] | None = None
+    evidence: Evidence | None = None
+
+    def resized(self, parents: Int[Tensor, " M"]) -> Step:
+        """The same step after the structure changed: row i of everything per Gaussian comes from row parents[i]."""
+        visible = None if self.visible is None else self.visible[parents]
+        e = self.evidence
+        return replace(
+            self, visible=visible, evidence=None if e is None else Evidence(e.reliability[parents], e.demand[parents])
+        )

@@ -1,0 +1,50 @@
+"""The rates of the detail feature f_det, which every trainer needs and no host has."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+from clear_strategies.errors import SettingError
+from clear_strategies.schedules import LARGEST_RATE
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class DetailRates:
+    """How fast f_det learns and fades.
+
+    Args:
+        rate: Adam's, of f_det as an offset of RGB (F34).
+        steps: a run of fewer iterations gives f_det a share of its rate in proportion; 0: always the whole rate. In RGB, f_base
+            moves at 0.28 of the rate of its SH coefficients, and a short run ends before it has followed f_det.
+        decay: share of f_det, in [0, 1), that is lost at every step in which HR takes part. L_HF does not change with a
+            constant colour, so nothing else keeps f_det near 0; the paper has none, 0 (F35).
+
+    Raises:
+        SettingError: a setting is outside its range.
+    """
+
+    rate: float = 2.5e-3
+    steps: int = 1_500
+    decay: float = 0.002
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rate <= LARGEST_RATE:
+            raise SettingError(f"detail must lie in [0, {LARGEST_RATE:g}], got {self.rate}.")
+        if not 0 <= self.decay < 1:
+            raise SettingError(f"detail_decay must lie in [0, 1), got {self.decay}.")
+        if self.steps < 0:
+            raise SettingError(f"detail_steps must be at least 0 iterations, got {self.steps}.")
+
+    def of_run(self, iterations: int) -> DetailRates:
+        """The rates of a run of this length; see `steps`."""
+        if iterations >= self.steps:
+            return self
+        rate = self.rate * iterations / self.steps
+        _log.debug(
+            "f_det learns at a rate of %.2g instead of %.2g: the run has %d iterations (optim.detail_steps: %d).",
+            rate, self.rate, iterations, self.steps,
+        )  # fmt: skip
+        return replace(self, rate=rate)
