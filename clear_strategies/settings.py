@@ -123,7 +123,7 @@ def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
     """The message with the key of the configuration in front, which is that of the field that the message begins with."""
     if not key or message.startswith((f"{key}.", f"{key}:")):
         return message
-    return f"{key}.{message}" if message.partition(" ")[0] in parameters else f"{key}: {message}"
+    return f"{key}.{message}" if message.partition(" ")[0].rstrip(":") in parameters else f"{key}: {message}"
 
 
 _VARIADIC: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)

@@ -21,6 +21,8 @@ class Inner:
     def __post_init__(self) -> None:
         if self.size < 1:
             raise SettingError(f"size must be at least 1, got {self.size}.")
+        if self.size == 8:
+            raise SettingError("size: must not be 8, got 8: size=7")
         if self.size > 9:
             raise ValueError("it is too large.")
 
@@ -96,6 +98,7 @@ REFUSED = {
     "inner.size: must be a whole number, got 2.0": {"share": 1, "inner": target(Inner, size=2.0)},
     "inner.mode: must be a or b, got 'c'": {"share": 1, "inner": target(Inner, mode="c")},
     "inner.size must be at least 1, got 0.": {"share": 1, "inner": target(Inner, size=0)},
+    "inner.size: must not be 8, got 8: size=7": {"share": 1, "inner": target(Inner, size=8)},
     "inner: it is too large.": {"share": 1, "inner": target(Inner, size=10)},
     "inner: nowhere.Mine cannot be imported": {"share": 1, "inner": {TARGET: "nowhere.Mine"}},
     "inner: _target_ must name a class of this package or of a plug-in for it, got builtins.nothing.": {

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from numpy.lib.recfunctions import structured_to_unstructured
 from torch import Tensor
 
-from clear_strategies.data.scene import PointCloud
+from clear_strategies.core.points import PointCloud
 from clear_strategies.errors import DataError
 from clear_strategies.files import require_regular, write_bytes
 from rasterizers.geometry import SH_C0

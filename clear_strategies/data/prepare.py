@@ -16,14 +16,14 @@ import numpy as np
 from torch import Tensor
 
 from clear_strategies.core import images
+from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.images import DownKernel
+from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.data.photo_files import image_size, inside, list_images, read_image, write_png
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
 from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of, super_resolved
-from clear_strategies.data.progress import Progress
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera

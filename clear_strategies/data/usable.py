@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final, Literal, TypeVar, get_args
 
-from clear_strategies.data.checks import require_choice
+from clear_strategies.core.checks import require_choice
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import DataError
 

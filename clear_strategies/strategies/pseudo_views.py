@@ -15,8 +15,8 @@ from typing import Final
 import torch
 
 from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
-from clear_strategies.data.pseudo_views import cut_out, pseudo_views
 from clear_strategies.errors import SettingError
+from clear_strategies.geometry.pseudo_views import cut_out, pseudo_views
 from clear_strategies.strategies.base import Strategy
 
 _log = logging.getLogger(__name__)

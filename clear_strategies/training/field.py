@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from clear_strategies.core import images
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
+from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import View
-from clear_strategies.data.scene import PointCloud
 from clear_strategies.training.mip import filter_std
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from clear_strategies.data.scene import PointCloud
+from clear_strategies.core.points import PointCloud
 
 WIDTH, HEIGHT = 16, 12
 FOCAL = 20.0

@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo
 from clear_strategies.data.capture import SfmPoints
-from clear_strategies.data.scene import PointCloud
 from rasterizers.interface import Camera
 
 

@@ -9,8 +9,9 @@ from torch import Tensor
 
 import rasterizers
 from clear_strategies.core import images
+from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo, View
-from clear_strategies.data.scene import PointCloud, Scene
+from clear_strategies.data.scene import Scene
 from rasterizers import Camera, Splats
 
 FACTOR = 4

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from clear_strategies import files
 from clear_strategies.core import images
+from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo, View
-from clear_strategies.data.scene import PointCloud, Scene
+from clear_strategies.data.scene import Scene
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.image_scores import PSNR_CAP, score
 from rasterizers.interface import Camera

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from clear_strategies import SVS, Conductor, Update
 from clear_strategies.core.gradients import Grads
-from clear_strategies.data.scene import PointCloud
+from clear_strategies.core.points import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.density.base import DensityError, cameras_extent
 from clear_strategies.errors import SettingError

@@ -10,8 +10,8 @@ import torch
 
 from clear_strategies.core import deferred
 from clear_strategies.core.view import DepthMap
-from clear_strategies.data.pseudo_views import PseudoView
 from clear_strategies.errors import DivergedError, SettingError
+from clear_strategies.geometry.pseudo_views import PseudoView
 from clear_strategies.training import pseudo_views
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.pseudo_views import LOSS, PseudoViews, PseudoViewSettings

@@ -13,26 +13,24 @@ from typing import Literal, get_args
 
 import torch
 
+from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
+from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import SfmPoints
-from clear_strategies.data.checks import refuse, require_choice, require_number, require_whole
-from clear_strategies.data.points.cleaning import remove_outliers, voxel_grid
 from clear_strategies.data.points.files import from_ply, from_sfm, from_tracks
-from clear_strategies.data.points.interpolation import densify, pixel_grid
 from clear_strategies.data.points.random import random_cloud
-from clear_strategies.data.points.sift import TriangulationSettings, triangulate
-from clear_strategies.data.points.stereo.cloud import points_of, shows
-from clear_strategies.data.points.stereo.filling import fill
-from clear_strategies.data.points.stereo.maps import depth_maps
-from clear_strategies.data.points.stereo.settings import StereoSettings
-from clear_strategies.data.scene import PointCloud
 from clear_strategies.errors import DataError
+from clear_strategies.geometry.cleaning import remove_outliers, voxel_grid
+from clear_strategies.geometry.dense_stereo.cloud import points_of, shows
+from clear_strategies.geometry.dense_stereo.filling import fill
+from clear_strategies.geometry.dense_stereo.maps import depth_maps
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.interpolation import densify, pixel_grid
+from clear_strategies.geometry.sift import TriangulationSettings, triangulate
 
 __all__ = [
     "CloudSettings",
     "InitialPoints",
-    "StereoSettings",
-    "TriangulationSettings",
     "initial_points",
     "require_source",
 ]

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import torch
 
+from clear_strategies.core.points import PointCloud
 from clear_strategies.data.capture import SfmPoints
 from clear_strategies.data.ply import read_points
-from clear_strategies.data.scene import PointCloud
 from clear_strategies.errors import DataError
 
 

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
+from clear_strategies.core.checks import require_choice, require_whole
 from clear_strategies.core.images import DownKernel
-from clear_strategies.data.checks import require_choice, require_whole
 from clear_strategies.data.priors.cache import cached
 from clear_strategies.data.priors.interface import Prior, SuperResolved
 

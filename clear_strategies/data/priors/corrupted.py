@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.data.checks import require_number, require_whole
+from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.data.priors.cache import cached
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError

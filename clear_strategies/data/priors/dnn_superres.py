@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.data.checks import require_choice
+from clear_strategies.core.checks import require_choice
 from clear_strategies.data.priors.interface import log_result, require_file, require_path, warn_if_far_from_lr
 from clear_strategies.errors import DataError
 

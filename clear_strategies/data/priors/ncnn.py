@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.data.checks import refuse, require_choice
+from clear_strategies.core.checks import refuse, require_choice
 from clear_strategies.data.priors.interface import log_result, warn_if_far_from_lr
 from clear_strategies.data.priors.tiling import require_tiles, tiled
 from clear_strategies.errors import DataError, SettingError

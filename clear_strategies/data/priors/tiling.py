@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.checks import require_whole
-from clear_strategies.data.progress import Progress
+from clear_strategies.core.checks import require_whole
+from clear_strategies.core.progress import Progress
 from clear_strategies.errors import SettingError
 
 

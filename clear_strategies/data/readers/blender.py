@@ -9,10 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from clear_strategies.core.checks import as_color
 from clear_strategies.data import strict_json
 from clear_strategies.data.cameras import Lens, pose_from_opengl
 from clear_strategies.data.capture import Capture, Color, Frame, sorted_by_name
-from clear_strategies.data.checks import as_color
 from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
 from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError

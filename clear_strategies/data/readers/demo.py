@@ -19,8 +19,8 @@ from PIL import Image
 from torch import Tensor
 
 from clear_strategies.core import images
+from clear_strategies.core.checks import require_whole
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.checks import require_whole
 from clear_strategies.errors import DataError, SettingError
 from rasterizers.interface import Camera
 

@@ -11,10 +11,10 @@ from typing import Any, Final
 
 import torch
 
+from clear_strategies.core.checks import as_color
 from clear_strategies.data import strict_json
 from clear_strategies.data.cameras import Lens, pose_from_opengl
 from clear_strategies.data.capture import Capture, Color, Frame, SfmPoints, lens_notes, sorted_by_name
-from clear_strategies.data.checks import as_color
 from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.usable import Fault, usable

@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
 
+from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import Capture
-from clear_strategies.data.checks import require_choice, require_number, require_whole
 from clear_strategies.data.exif import Exif, read_exif
 from clear_strategies.data.photo_files import image_size, inside, list_images
 from clear_strategies.data.priors import cache_folder

@@ -20,9 +20,9 @@ from typing import Any, Final
 
 from PIL import Image as Picture
 
+from clear_strategies.core.progress import EVERY, Progress
 from clear_strategies.data.exif import Exif
 from clear_strategies.data.photo_files import read_image, write_jpeg
-from clear_strategies.data.progress import EVERY, Progress
 from clear_strategies.data.usable import some
 from clear_strategies.errors import DataError
 

@@ -12,10 +12,10 @@ import torch
 from clear_strategies.core import images
 from clear_strategies.core.view import Photo
 from clear_strategies.data.points import CloudSettings, initial_points
-from clear_strategies.data.points.projection import project
 from clear_strategies.data.prepare import ViewSettings, split
 from clear_strategies.data.readers import llff
 from clear_strategies.errors import DataError, SettingError
+from clear_strategies.geometry.projection import project
 from tests.helpers.captures import write_points
 from tests.helpers.planes import cloud_of, photo, plane_photos, sfm
 

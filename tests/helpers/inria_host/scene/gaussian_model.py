@@ -3,7 +3,7 @@
 import torch
 from safetensors.torch import save_file
 
-from clear_strategies.data.scene import PointCloud
+from clear_strategies.core.points import PointCloud
 from clear_strategies.training.field import GaussianField
 from rasterizers.geometry import rotation_matrix
 

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo
-from clear_strategies.data.points.projection import back_project, project, sample_colors
-from clear_strategies.data.scene import PointCloud
+from clear_strategies.geometry.projection import back_project, project, sample_colors
 
 _log = logging.getLogger(__name__)
 

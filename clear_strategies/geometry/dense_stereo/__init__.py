@@ -1,4 +1,4 @@
-"""Dense stereo: the depth of every training photo under known poses, from LR images alone.
+"""Dense stereo: the depth of every photo under known poses, from the photos alone.
 
 A plane sweep (`cost`) over source photos chosen by angle and overlap (`sources`), semi-global smoothing (`smoothing`),
 depth between planes (`depth`), and what other photos confirm (`consistency`). `maps` puts them together, `cloud` makes

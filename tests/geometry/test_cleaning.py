@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clear_strategies.data.points.cleaning import remove_outliers, voxel_grid
+from clear_strategies.geometry.cleaning import remove_outliers, voxel_grid
 
 
 @pytest.fixture

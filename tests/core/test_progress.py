@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 
-from clear_strategies.data import progress
-from clear_strategies.data.progress import EVERY, Progress
+from clear_strategies.core import progress
+from clear_strategies.core.progress import EVERY, Progress
 
 
 def test_a_line_now_and_then_and_only_where_something_has_happened(monkeypatch, caplog):

@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies.core.view import Photo
-from clear_strategies.data.points.projection import project, sample_colors
-from clear_strategies.data.points.sift import (
+from clear_strategies.errors import SettingError
+from clear_strategies.geometry.projection import project, sample_colors
+from clear_strategies.geometry.sift import (
     Features,
     Pairs,
     TriangulationSettings,
@@ -21,7 +22,6 @@ from clear_strategies.data.points.sift import (
     triangulate,
     triangulate_pair,
 )
-from clear_strategies.errors import SettingError
 from rasterizers.interface import Camera
 from tests.helpers.planes import camera, plane_photos
 
@@ -170,5 +170,5 @@ def test_tracks_keep_their_widest_pair_and_contradictions_go() -> None:
     [("enlarge", 0), ("contrast", 0.0), ("ratio", 1.1), ("epipolar", -1.0), ("reprojection", math.nan), ("angle", 0.0)],
 )
 def test_settings_out_of_range_are_named(field: str, value: float) -> None:
-    with pytest.raises(SettingError, match=f"data.cloud.triangulation.{field}: must .* got {value}"):
+    with pytest.raises(SettingError, match=f"{field}: must .* got {value}"):
         TriangulationSettings(**{field: value})  # type: ignore[arg-type]

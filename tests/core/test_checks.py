@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from clear_strategies.data.checks import as_color, require_choice, require_number, require_whole
+from clear_strategies.core.checks import as_color, require_choice, require_number, require_whole
 from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio, photos
 from clear_strategies.errors import SettingError
 

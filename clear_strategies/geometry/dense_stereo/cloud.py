@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.data.points.projection import back_project, inside_of, project
+from clear_strategies.geometry.projection import back_project, inside_of, project
 
 
 def points_of(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from clear_strategies.data.points.projection import sample_colors
+from clear_strategies.geometry.projection import sample_colors
 
 
 def test_colours_are_sampled_between_pixel_centres() -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.data.points.projection import back_project, inside_of, project, sample_colors
+from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
 from rasterizers.interface import Camera
 
 _SOURCES: Final = 4  # the nearest photos that a pseudo view is made of

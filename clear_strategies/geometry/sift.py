@@ -19,10 +19,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from clear_strategies.core.checks import require_number, require_whole
+from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo
-from clear_strategies.data.checks import require_number, require_whole
-from clear_strategies.data.points.projection import project, projection_matrix, sample_colors
-from clear_strategies.data.scene import PointCloud
+from clear_strategies.geometry.projection import project, projection_matrix, sample_colors
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -56,12 +56,12 @@ class TriangulationSettings:
     angle: float = 1.0
 
     def __post_init__(self) -> None:
-        require_whole("data.cloud.triangulation.enlarge", self.enlarge, least=1)
+        require_whole("enlarge", self.enlarge, least=1)
         if self.max_features is not None:
-            require_whole("data.cloud.triangulation.max_features", self.max_features, least=1)
-        require_number("data.cloud.triangulation.ratio", self.ratio, above=0, most=1)
+            require_whole("max_features", self.max_features, least=1)
+        require_number("ratio", self.ratio, above=0, most=1)
         for name in ("contrast", "epipolar", "reprojection", "angle"):
-            require_number(f"data.cloud.triangulation.{name}", getattr(self, name), above=0)
+            require_number(name, getattr(self, name), above=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

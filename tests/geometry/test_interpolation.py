@@ -9,8 +9,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies.data.points.interpolation import densify
-from clear_strategies.data.points.projection import project
+from clear_strategies.geometry.interpolation import densify
+from clear_strategies.geometry.projection import project
 from tests.helpers.planes import cloud_of, photo
 
 

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from clear_strategies.data.points.stereo.depth import Estimate
-from clear_strategies.data.points.stereo.settings import StereoSettings
+from clear_strategies.geometry.dense_stereo.depth import Estimate
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 
 
 @dataclass(frozen=True, slots=True, eq=False)

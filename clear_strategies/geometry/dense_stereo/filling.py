@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.data.points.interpolation import interpolate_depth, pixel_grid
-from clear_strategies.data.points.projection import back_project, inside_of, project, sample_colors
+from clear_strategies.geometry.interpolation import interpolate_depth, pixel_grid
+from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
 
 _NEARER = 0.95  # a filled point in front of this share of another photo's depth floats in free space
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from clear_strategies.data.checks import refuse, require_number, require_whole
+from clear_strategies.core.checks import refuse, require_number, require_whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +49,13 @@ class StereoSettings:
 
     def __post_init__(self) -> None:
         for name, least in (("enlarge", 1), ("max_pixels", 1), ("sources", 1), ("max_planes", 4), ("window", 3)):
-            require_whole(f"data.cloud.stereo.{name}", getattr(self, name), least=least)
+            require_whole(name, getattr(self, name), least=least)
         if self.window % 2 == 0:
-            refuse("data.cloud.stereo.window", "must be odd", self.window, "data.cloud.stereo.window=5")
+            refuse("window", "must be odd", self.window, "window=5")
         if self.agreeing is not None:
-            require_whole("data.cloud.stereo.agreeing", self.agreeing, least=1)
+            require_whole("agreeing", self.agreeing, least=1)
         for name in ("plane_step", "small_step", "large_step", "tolerance", "reprojection"):
-            require_number(f"data.cloud.stereo.{name}", getattr(self, name), above=0)
-        require_number("data.cloud.stereo.spacing", self.spacing, least=1)
+            require_number(name, getattr(self, name), above=0)
+        require_number("spacing", self.spacing, least=1)
         for name in ("min_correlation", "trust"):
-            require_number(f"data.cloud.stereo.{name}", getattr(self, name), least=0, most=1)
+            require_number(name, getattr(self, name), least=0, most=1)

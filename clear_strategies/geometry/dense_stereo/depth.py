@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.points.stereo.cost import cost_volume
-from clear_strategies.data.points.stereo.image import Grey
-from clear_strategies.data.points.stereo.settings import StereoSettings
-from clear_strategies.data.points.stereo.smoothing import smooth
-from clear_strategies.data.points.stereo.sources import Comparison, plane_count
+from clear_strategies.geometry.dense_stereo.cost import cost_volume
+from clear_strategies.geometry.dense_stereo.image import Grey
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.dense_stereo.smoothing import smooth
+from clear_strategies.geometry.dense_stereo.sources import Comparison, plane_count
 
 
 @dataclass(frozen=True, slots=True, eq=False)

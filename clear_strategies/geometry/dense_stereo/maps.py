@@ -10,14 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.data.points.projection import inside_of, project
-from clear_strategies.data.points.stereo.consistency import confirm
-from clear_strategies.data.points.stereo.depth import Estimate, estimate
-from clear_strategies.data.points.stereo.image import Grey, grey
-from clear_strategies.data.points.stereo.settings import StereoSettings
-from clear_strategies.data.points.stereo.sources import Comparison, comparisons
-from clear_strategies.data.progress import Progress
+from clear_strategies.geometry.dense_stereo.consistency import confirm
+from clear_strategies.geometry.dense_stereo.depth import Estimate, estimate
+from clear_strategies.geometry.dense_stereo.image import Grey, grey
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons
+from clear_strategies.geometry.projection import inside_of, project
 
 _log = logging.getLogger(__name__)
 

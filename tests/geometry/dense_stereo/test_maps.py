@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.data.points.stereo.maps import depth_maps
-from clear_strategies.data.points.stereo.settings import StereoSettings
+from clear_strategies.geometry.dense_stereo.maps import depth_maps
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from tests.helpers.textured import Surface, bump, camera, cast, slanted
 
 NONE = torch.zeros(0, 3)

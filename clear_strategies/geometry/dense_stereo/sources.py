@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
-from clear_strategies.data.points.projection import back_project, inside_of, project
-from clear_strategies.data.points.random import common_box
+from clear_strategies.geometry.cameras import common_box
+from clear_strategies.geometry.projection import back_project, inside_of, project
 from rasterizers.interface import Camera
 
 _FEW: Final = 20  # points in a photo, below which a grid at guessed depths replaces them

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from clear_strategies.data.points.stereo.image import Grey
+from clear_strategies.geometry.dense_stereo.image import Grey
 
 _VARIANCE_FLOOR: Final = 1e-5  # of grey in [0, 1]: windows with less contrast than noise correlate with nothing
 _UNSEEN: Final = 0.5  # cost of a plane that a photo does not see: that of unrelated windows

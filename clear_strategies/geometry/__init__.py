@@ -1,0 +1,1 @@
+"""Geometry from posed photos: depth by dense stereo, a cloud of points, pseudo views."""
