@@ -1,7 +1,7 @@
 """How right the depth of the training photos is, how much of them it covers, and how long it takes.
 
-The reference is the demo's exact depth, or else the SfM points that a photo observes. These come from all photos, test views
-too; stereo does not see them.
+The reference is the capture's exact depth where it is known (the demo), or else the SfM points that a photo observes.
+These come from all photos, test views too; stereo does not see them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from clear_strategies.compose import composed, tree
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.prepare import lr_photos, split
-from clear_strategies.data.readers import demo
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.projection import inside_of, project
 from clear_strategies.geometry.sift import triangulate
@@ -84,8 +83,8 @@ def _errors(capture: Capture, frame: Frame, photo: Photo, found: DepthMap) -> tu
 
 def _reference(capture: Capture, frame: Frame, photo: Photo) -> tuple[Int[Tensor, "N 2"], Float[Tensor, " N"]]:
     """(columns and rows, depth) of what is known of this photo."""
-    if capture.name == "demo":
-        exact = demo.depth(photo.camera).double()
+    if capture.depth is not None:
+        exact = capture.depth(photo.camera).double()
         row, column = torch.nonzero(exact.isfinite(), as_tuple=True)
         return torch.stack((column, row), dim=1), exact[row, column]
     if capture.points is None:

@@ -1,12 +1,13 @@
 """Posed photos, as readers return them: frames, the capture that holds them, and its structure-from-motion points.
 
-Readers know files. They know nothing of splits, scales, priors or training; `prepare.py` makes a `Scene` of a capture.
+Readers know files. They know nothing of splits, scales or training, nor of priors unless the data set has one of its own (the
+demo); `prepare.py` makes a `Scene` of a capture.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from clear_strategies.data.cameras import Lens
 from clear_strategies.data.photo_files import image_size, is_turned, read_image
+from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
 
@@ -90,6 +92,10 @@ class Capture:
     Args:
         background: the colour behind the scene (white for Blender's RGBA).
         notes: label -> fact for the printed plan (where poses came from, what was undistorted …).
+        own_prior: makes the prior that belongs to this capture, from what loads each photo, by the frame's name;
+            `prior=auto` takes it. None: the capture has none, as every capture of real photos.
+        depth: the exact depth (z) through each pixel's centre of a camera, float32 [H, W], infinite where there is no
+            surface; None: unknown.
     """
 
     name: str
@@ -97,6 +103,8 @@ class Capture:
     points: SfmPoints | None = None
     background: Color = (0.0, 0.0, 0.0)
     notes: dict[str, str] = field(default_factory=dict)
+    own_prior: Callable[[Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]], Prior] | None = None
+    depth: Callable[[Camera], Float[Tensor, "H W"]] | None = None
 
 
 def sorted_by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:

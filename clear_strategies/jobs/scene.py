@@ -12,7 +12,7 @@ from clear_strategies.data.capture import Capture
 from clear_strategies.data.hr_limit import within_limit
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import ViewSettings, prepare
-from clear_strategies.data.priors import Bicubic, DemoPrior, Ncnn, Prior, cached, network_of
+from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
 from clear_strategies.data.priors.ncnn import factors, missing_packages
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.usable import Fault, require_faults
@@ -60,14 +60,14 @@ class DataSettings:
 
 @dataclass(frozen=True, slots=True)
 class AutoPrior:
-    """The demo's own prior for the demo; for everything else waifu2x, where it is installed and reaches the factor, else
-    bicubic.
+    """The capture's own prior where its reader gives it one, as the demo's does; for all other captures waifu2x, where it is
+    installed and reaches the factor, else bicubic.
     """
 
     def of(self, capture: Capture, factor: int) -> Prior:
         """The prior for this capture."""
-        if capture.name == "demo":
-            return DemoPrior(_photos(capture))
+        if capture.own_prior is not None:
+            return capture.own_prior(_photos(capture))
         usable = factor in factors(_NETWORK) and not missing_packages(_NETWORK)
         return Ncnn(_NETWORK) if usable else Bicubic()
 

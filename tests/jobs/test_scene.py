@@ -11,13 +11,13 @@ from hydra import compose, initialize_config_dir
 from clear_strategies.compose import CONF, tree
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import ViewSettings
-from clear_strategies.data.priors import Corrupted, Ncnn, ncnn
-from clear_strategies.data.readers import demo
+from clear_strategies.data.priors import Bicubic, Corrupted, Ncnn, ncnn
+from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import job
 from clear_strategies.jobs.scene import AutoPrior, DataSettings, load, require_factor
-from tests.helpers import fake_ncnn
+from tests.helpers import captures, fake_ncnn
 
 
 def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
@@ -34,7 +34,7 @@ def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
 
 def of_photos(factor: int = 4) -> Scene:
     """The demo's photos as a data set that is not the demo."""
-    capture = replace(demo.read(width=96, height=48, views=4, train=2), name="mine")
+    capture = replace(demo.read(width=96, height=48, views=4, train=2), name="mine", own_prior=None)
     views = ViewSettings(train=2, sr_scale=factor, photos_are="hr")
     data = DataSettings(reader=lambda: capture, views=views, cloud=CloudSettings(init="random", random_points=20))
     return load(data, AutoPrior(), 0)
@@ -55,6 +55,31 @@ def test_auto_takes_waifu2x_where_it_is_installed_and_says_nothing_else_of_it(tm
         again = of_photos()
     assert caplog.text.count("SR image from the cache (waifu2x (photo model))") == 4
     assert [(v.hr.image == w.hr.image).all() for v, w in zip(scene.train, again.train, strict=True)] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("write", "reader"),
+    [
+        (captures.llff, llff.read),
+        (captures.colmap_bin, colmap.read),
+        (captures.nerfstudio, nerfstudio.read),
+        (captures.blender, blender.read),
+    ],
+)
+def test_no_photos_of_a_folder_called_demo_are_taken_for_their_own_sr_images(write, reader, tmp_path, monkeypatch):
+    monkeypatch.setattr(ncnn, "find_spec", lambda name: None)
+    root = write(tmp_path / "demo")
+    assert reader(root=str(root)).name == "demo"
+    views = ViewSettings(photos_are="hr", sr_scale=2, train=2, test_limit=1)
+    cloud = CloudSettings(init="random", random_points=20)
+    scene = load(DataSettings(reader=lambda: reader(root=str(root)), views=views, cloud=cloud), AutoPrior(), 0)
+    assert {view.sr_source for view in scene.train} == {Bicubic().label}
+    assert not scene.synthetic_prior
+
+
+def test_the_demo_brings_its_own_prior_whatever_it_is_called():
+    called = replace(demo.read(width=64, height=48, views=4, train=2), name="mine")
+    assert AutoPrior().of(called, 4).label.startswith("demo (synthetic")
 
 
 def test_auto_without_the_extra_says_in_one_line_what_to_install(monkeypatch, caplog):

@@ -1,7 +1,7 @@
 """The demo, the default data set: a procedural room, which needs no download.
 
 It holds pictures, boxes and balls at several depths, textured with photographs that scikit-image ships inside its wheel,
-and is ray-cast with anti-aliasing from exact poses. Its prior, `priors.DemoPrior`, is synthetic.
+and is ray-cast with anti-aliasing from exact poses. The capture brings its own prior, `priors.DemoPrior`, which is synthetic.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.checks import require_whole
 from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.priors.corrupted import DemoPrior
 from clear_strategies.errors import DataError, SettingError
 from rasterizers.interface import Camera
 
@@ -70,6 +71,8 @@ def read(*, width: int = 256, height: int = 192, views: int = 12, train: int = 3
         "demo",
         tuple(frames),
         notes={"poses": "exact", "scene": "procedural room, photographs from scikit-image"},
+        own_prior=DemoPrior,
+        depth=depth,
     )
 
 
