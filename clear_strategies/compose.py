@@ -177,12 +177,13 @@ def require_each_once(overrides: Iterable[str]) -> None:
 
 
 def _members(name: str) -> list[str]:
-    """The strategies that an option of conf/strategy consists of."""
+    """The strategies that an option of conf/strategy consists of, those of the options that it names included."""
     file = CONF / "strategy" / f"{name}.yaml"
     if not file.is_file():
         return [name]
     parts = OmegaConf.to_container(OmegaConf.load(file)).get("defaults", [])  # type: ignore[union-attr]
-    return [part for part in parts if isinstance(part, str) and not part.startswith(("/", "_"))] or [name]
+    named = [part for part in parts if isinstance(part, str) and not part.startswith(("/", "_"))]
+    return [member for part in named for member in _members(part)] or [name]
 
 
 class _ConfSource(FileConfigSource):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from clear_strategies import GCO, P2G, SVS, Conductor
-from clear_strategies.compose import CONF, conductor, tree
+from clear_strategies import compose as compose_module
+from clear_strategies.compose import CONF, conductor, require_each_once, tree
 from clear_strategies.data.prepare import ViewSettings
 from clear_strategies.errors import SettingError, StrategyConflict
 from clear_strategies.jobs import device, job
@@ -50,12 +52,38 @@ def test_milestones_stretch_to_the_hosts_length():
         (("gco", "strategies.gco.tau=1"), "strategies.gco.tau"),
         (("gco", "strategies.gco.tolerance=2"), "tolerance must lie in"),
         (("gco,gco",), "gco twice"),
+        (("gco,clear",), "gco twice"),
+        (("gco,best",), "gco twice"),
+        (("best,svs",), "svs twice"),
         (("gco", "fit.iterations=3"), "fit"),
     ],
 )
 def test_what_does_not_exist_is_named(said, named):
     with pytest.raises(SettingError, match=named):
         conductor(*said)
+
+
+def test_a_strategy_is_found_twice_however_deep_it_is_named(tmp_path, monkeypatch):
+    """conf/strategy/*.yaml that name others, which name others."""
+    options = {
+        "gco": [], "p2g": [], "extra": [], "clear": ["gco", "p2g"], "best": ["clear", "extra", "_self_"],
+        "all": ["/readings/literal", "best"],
+    }  # fmt: skip
+    for name, parts in options.items():
+        file = tmp_path / "strategy" / f"{name}.yaml"
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(f"defaults: {json.dumps(parts)}\n" if parts else "{}\n")
+    monkeypatch.setattr(compose_module, "CONF", tmp_path)
+    require_each_once(["+strategy=all"])
+    require_each_once(["+strategy=[clear,extra]"])
+    for said, twice in (
+        ("[p2g,all]", "p2g"),
+        ("[extra,best]", "extra"),
+        ("[all,clear]", "gco"),
+        ("[best,best]", "gco"),
+    ):
+        with pytest.raises(SettingError, match=f"got {twice} twice"):
+            require_each_once([f"+strategy={said}"])
 
 
 def test_two_that_answer_one_question_are_refused():
