@@ -2,12 +2,13 @@
 
 One training iteration:
 
-1. The host renders. The gate zᵗ is sampled, Î_HR is rendered and its gradients are taken. Then Î_LR is rendered with the
-   same zᵗ and the same random numbers, and returned to the host.
+1. The host renders. The gate zᵗ is sampled, Î_HR is rendered and its gradients are taken. Each extra view is rendered and
+   its gradient is taken. Then Î_LR is rendered with the same zᵗ and the same random numbers, and returned to the host.
 2. The host calls `backward()` on its own loss, whatever it is: that is the LR side. When this pass ends, `.grad` of every
    parameter becomes the merged gradient. If a strategy has a densification score, the tensor that the densifier reads
    holds it; otherwise the densifier's statistic stays the host's own.
 3. Gradient clipping, unscaling, the optimizer step and densification are the host's, in any order.
+4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view.
 
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
 optimizers other than `torch.optim.Optimizer` work, and so do hosts that densify before the step (3DGS) as well as hosts
@@ -16,9 +17,10 @@ that densify after it (gsplat).
 
 from __future__ import annotations
 
+import inspect
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
@@ -30,6 +32,7 @@ from torch import Tensor
 from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import Grads, conflict_columns, to_ndc
+from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor, HrGradients, only
@@ -37,6 +40,7 @@ from integration.autograd_shot import AutogradShot
 from integration.detail import keep_from_drifting
 from integration.errors import HostError
 from integration.host_score import ScoreScaler, score_for_host
+from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -67,13 +71,17 @@ class RenderAt(Protocol):
         ...
 
 
+RenderCamera = Callable[[Camera], AutogradShot]
+"""Renders any camera, without a gate and without f_det."""
+
+
 class Attachment:
     """The strategies beside a host's training loop.
 
     Args:
         params: returns the leaves that the host optimizes, by gsplat's names (and "detail"). It is called at every
             iteration, since densifiers replace parameters.
-        n_views, seed: for the strategies' `on_fit_start`.
+        views: all training views. seed: of the strategies.
         poll_parents: called at every iteration. It returns parents[M] if the structure has changed since its last call
             (row i of every parameter now comes from row parents[i]), else None. Without this function the host cannot
             tell, and no strategy may hold per-Gaussian state when the number of Gaussians changes.
@@ -92,7 +100,7 @@ class Attachment:
         conductor: Conductor,
         params: Callable[[], Mapping[str, Tensor]],
         *,
-        n_views: int,
+        views: Sequence[View],
         seed: int = 0,
         poll_parents: Callable[[], Int[Tensor, " M"] | None] | None = None,
         threshold: float | None = None,
@@ -116,18 +124,26 @@ class Attachment:
         self._passes = 0  # backward passes of this iteration
         self._merges_before_step = 0  # at the host's last step
         self._pending: tuple[HostRendering, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
+        self._step: Step | None = None  # of the rendering, until `after_step`
+        self._extra: list[Grads] = []  # of the extra views, until the host has stepped
+        self._extra_params: Mapping[str, Tensor] = {}  # what they are gradients of
+        self._stepping = False  # on an extra view
         self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
         self._logged: dict[str, Number] = {}
-        conductor.on_fit_start(n_views, seed, params()["means"].device)
+        conductor.on_fit_start(len(views), seed, params()["means"].device, views)
+        for s in conductor.strategies:
+            if (prepared := s.summary()) is not None:
+                _log.info("%s: %s.", type(s).__name__, prepared)
         if not conductor.strategies:
             _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
 
-    def render_view(self, view: View, render_at: RenderAt) -> Any:
+    def render_view(self, view: View, render_at: RenderAt, render_camera: RenderCamera) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR."""
         if self.removed:
             return render_at("lr", None).returned
         self._finish_previous_step()
         conductor, t = self.conductor, self.t
+        conductor.forget_logs()
         z = conductor.gate(t, self._n)
         if z is not None:
             z = z.to(self.params()["means"])
@@ -136,7 +152,10 @@ class Attachment:
             self.counts["HR renders"] += 1
             with _random_state_kept(self.params()["means"].device):
                 hr_rendering = render_at("hr", z)
-            hr_grads = conductor.hr_gradients(hr_rendering.shot, view)
+            hr_grads = conductor.hr_gradients(hr_rendering.shot, view, t)
+        self._step = Step(t, view) if hr_grads is None else hr_grads.step
+        if self._passes == 0:  # one step of the host, however many passes it accumulates
+            self._render_extra_views(render_camera)
         rendering = render_at("lr", z)
         if rendering.output.requires_grad:
             self._pending = rendering, hr_grads
@@ -150,7 +169,7 @@ class Attachment:
         Raises:
             HostError: the host steps for the first time, and none of its renderings was recognised.
         """
-        if self.removed:
+        if self.removed or self._stepping:
             return
         merges = self.counts["merges"]
         if not merges:
@@ -162,6 +181,35 @@ class Attachment:
         if merges == self._merges_before_step:
             self.counts["steps of the host alone"] += 1
         self._merges_before_step = merges
+
+    @torch.no_grad()
+    def after_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """For a hook after each step of each of the host's optimizers: step once more for each extra view.
+
+        An optimizer whose parameters have been replaced since the views were rendered (3DGS densifies before it steps) does
+        not step again.
+        """
+        if self._stepping or self.removed or not self._extra:
+            return
+        mine = {id(p) for group in optimizer.param_groups for p in group["params"]}
+        rendered = {name: p for name, p in self._extra_params.items() if id(p) in mine}
+        if not rendered:
+            return
+        present = [p for group in optimizer.param_groups for p in group["params"]]
+        before, self._stepping = [p.grad for p in present], True
+        try:
+            for grads in self._extra:
+                for p in present:
+                    p.grad = None
+                for name, p in rendered.items():
+                    p.grad = grads[name].to(p)
+                _step(optimizer, rendered)
+        finally:
+            self._stepping = False
+            for p, grad in zip(present, before, strict=True):
+                p.grad = grad
+        if any(p is self._extra_params.get("means") for p in rendered.values()):
+            self.counts["extra views"] += len(self._extra)
 
     def state_dict(self) -> dict[str, Any]:
         """The iteration, and what the strategies store per Gaussian, for the host's checkpoint."""
@@ -185,13 +233,28 @@ class Attachment:
     def remove(self) -> None:
         """Stop: the host's renderings pass through, and the gradients of one that is still pending stay unmerged."""
         self.removed, self._pending = True, None
+        self._extra, self._extra_params = [], {}
+        self.conductor.on_fit_end()
+
+    def _render_extra_views(self, render_camera: RenderCamera) -> None:
+        """Take the gradient of each extra view; it is stepped on after the host's own step."""
+        conductor, self._extra = self.conductor, []
+        if not (extra_views := conductor.extra_views(self.t)):
+            return
+        self._extra_params = {name: p for name, p in self.params().items() if name != "detail"}
+        for extra in extra_views:
+            with _random_state_kept(self._extra_params["means"].device):
+                shot = render_camera(extra.photo.camera)
+            losses = conductor.extra_loss(shot.image, extra, self.t)
+            self._extra += shot.vjp(losses.cotangents)
 
     def _finish_previous_step(self) -> None:
         """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified."""
         params = self.params()
         self._resize(len(params["means"]))
         if self._passes >= self.accumulation:
-            self.conductor.after_step({name: p.detach() for name, p in params.items()}, self.t)
+            if self._step is not None:
+                self.conductor.after_step({name: p.detach() for name, p in params.items()}, self._step)
             self.t += 1
             self._passes = 0
 
@@ -201,6 +264,8 @@ class Attachment:
         if parents is None and n == self._n:
             return
         state = ", ".join(self.conductor.state_dict())
+        if self._step is not None:  # without parents nobody may remember Gaussians, so nobody needs to know them
+            self._step = Step(self._step.t, self._step.view) if parents is None else self._step.resized(parents)
         if parents is not None:
             self.conductor.on_resize(parents)
         elif state:
@@ -245,7 +310,7 @@ class Attachment:
         hr_trained = None if hr_grads is None else only(hr_grads, trained)
         merged = self.conductor.merge(values, g_lr, hr_trained, self.t)
         if "detail" in merged.grads:
-            keep_from_drifting(trained["detail"], self.accumulation)
+            keep_from_drifting(trained["detail"], self.conductor.detail.decay / self.accumulation)
         for name, p in trained.items():
             # Without HR the gradient of f_det is 0 and not None, so that its Adam counts every step.
             g = merged.grads[name] * grad_scale if name in merged.grads else torch.zeros_like(p)
@@ -291,6 +356,16 @@ class Attachment:
         if written is not None:
             slot.write(grad_scale * written)
             self.counts["scores written"] += 1
+
+
+def _step(optimizer: torch.optim.Optimizer, rendered: Mapping[str, Tensor]) -> None:
+    """One step; 3DGS's SparseGaussianAdam wants to know which Gaussians move, and how many there are."""
+    if "visibility" in inspect.signature(type(optimizer).step).parameters:
+        n = len(next(iter(rendered.values())))
+        moves = torch.ones(n, dtype=torch.bool, device=next(iter(rendered.values())).device)
+        optimizer.step(moves, n)  # type: ignore[call-overload]
+    else:
+        optimizer.step()
 
 
 @contextmanager

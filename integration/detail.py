@@ -3,36 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Final
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from clear_strategies.training.optim import LearningRates
+from clear_strategies.merging.detail import DetailRates
 from integration.errors import HostError
 from integration.lineage import Change, Lineage
 from rasterizers.geometry import SH_C0
 
-
-def detail_rates(iterations: int | None) -> LearningRates:
-    """Our trainer's learning rates in a run of this length; None: it is unknown, and taken to be long."""
-    return LearningRates() if iterations is None else LearningRates().of_run(iterations)
+_EPS: Final = 1e-15  # Adam's, as in 3DGS: gradients of mean losses are near 1e-6
 
 
-def detail_adam(detail: torch.nn.Parameter, rates: LearningRates) -> torch.optim.Adam:
+def detail_adam(detail: torch.nn.Parameter, rates: DetailRates) -> torch.optim.Adam:
     """An Adam for f_det."""
-    return torch.optim.Adam([detail], lr=rates.detail, eps=rates.eps)
+    return torch.optim.Adam([detail], lr=rates.rate, eps=_EPS)
 
 
-def keep_from_drifting(detail: Float[Tensor, "N 3"], accumulation: int = 1) -> None:
-    """Lose the share of f_det that our trainer loses per step: L_HF does not change with a constant added to the colours,
-    so that nothing else would hold the mean of f_det.
+def keep_from_drifting(detail: Float[Tensor, "N 3"], share: float) -> None:
+    """Lose this share of f_det: L_HF does not change with a constant added to the colours, so that nothing else would hold
+    the mean of f_det.
 
     Args:
-        accumulation: merges per step of the host.
+        share: `DetailRates.decay`, over the merges per step of the host.
     """
-    detail.mul_(1 - LearningRates().detail_decay / accumulation)
+    detail.mul_(1 - share)
 
 
 def sh0_offset(detail: Float[Tensor, "N 3"], sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
@@ -48,11 +45,11 @@ class DetailFeature:
     Args:
         means: returns the host's current positions.
         lineage: finds the host's changes of structure.
-        iterations: of the run; None: unknown.
+        rates: of the run's conductor.
     """
 
-    def __init__(self, means: Callable[[], Tensor], lineage: Lineage, iterations: int | None = None) -> None:
-        self._means, self._lineage, self._rates = means, lineage, detail_rates(iterations)
+    def __init__(self, means: Callable[[], Tensor], lineage: Lineage, rates: DetailRates | None = None) -> None:
+        self._means, self._lineage, self._rates = means, lineage, rates or DetailRates()
         self._parents: Int[Tensor, " M"] | None = None  # since the last `poll_parents`
         self._value = torch.nn.Parameter(torch.zeros_like(means(), requires_grad=False))
         self._adam = detail_adam(self._value, self._rates)

@@ -25,14 +25,17 @@ from torch import Tensor
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment, HostRendering, Resolution
+from integration.autograd_shot import AutogradShot
 from integration.densification import end_with_strategies
 from integration.detail import DetailFeature, sh0_offset
 from integration.errors import HostError
+from integration.host_cameras import enlarged_camera, replaced_camera
 from integration.host_score import warn_if_score_is_unused
 from integration.log import show_log
-from integration.model_proxy import ModelRenderer, Role, enlarged_camera
+from integration.model_proxy import ModelRenderer, Role
 from integration.rows import ROWS, RowNumbers
 from integration.views import sr_images, sr_source, view
+from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -150,19 +153,19 @@ class Attached:
                 f"{type(module.renderer).__name__} trains an appearance model of its own, which two scales do not share. Use a "
                 "renderer without one."
             )
-        self._detail = DetailFeature(
-            lambda: self._host_params()["means"], self._carry_rows(), self._conductor.iterations
-        )
+        self._detail = DetailFeature(lambda: self._host_params()["means"], self._carry_rows(), self._conductor.detail)
         self._renderer = ModelRenderer(
             module.gaussian_model, _ROLES, self._host_params, self._detail if settings.detail else None, self._conductor
         )
         self._views_from_dataset(module.trainer.train_dataloader.dataset)
         self._filter_at_hr()
         attachment = Attachment(
-            self._conductor, self._renderer.params, n_views=len(self._views), seed=settings.seed, threshold=threshold,
+            self._conductor, self._renderer.params, views=list(self._views.values()), seed=settings.seed, threshold=threshold,
             poll_parents=lambda: self._detail.poll_parents(self._conductor.state_dict),
         )  # fmt: skip
         module.gaussian_optimizers[0].register_step_pre_hook(lambda *_: attachment.before_step())
+        for optimizer in module.gaussian_optimizers:
+            optimizer.register_step_post_hook(lambda o, *_: attachment.after_optimizer_step(o))
         if self._resumed:
             self._detail.load_state_dict(self._resumed["detail"])
             attachment.load_state_dict(self._resumed["attachment"])
@@ -236,7 +239,14 @@ class Attached:
 
             return self._renderer.render(render, current, resolution, gate, _to_pixels, mask)
 
-        return self.attachment.render_view(current, render_at)
+        def render_camera(other: Camera) -> AutogradShot:
+            def render(model: Any) -> Any:
+                with self._using(model):
+                    return original(replaced_camera(camera, other), *args, **kwargs)
+
+            return self._renderer.draw(render, other, _to_pixels)
+
+        return self.attachment.render_view(current, render_at, render_camera)
 
     @contextmanager
     def _using(self, model: Any) -> Iterator[None]:

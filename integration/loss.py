@@ -15,6 +15,7 @@ from torch import Tensor
 
 from clear_strategies.core.deferred import Scalar
 from clear_strategies.core.gradients import Grads, Shot
+from clear_strategies.core.view import ExtraView, View
 from clear_strategies.merging.conductor import Conductor, Update
 from integration.autograd_shot import AutogradShot
 from integration.host_score import ScoreScaler, score_for_host
@@ -25,31 +26,21 @@ def joint_loss(
     params: Mapping[str, Tensor],
     lr: Shot,
     hr: Shot | None,
-    view: Any,
-    t: int,
-    scaler: ScoreScaler | None = None,
-) -> Float[Tensor, ""]:
-    """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF); its gradient is the conductor's merged gradient.
-
-    Args:
-        params: the leaves that the host optimizes, by gsplat's names (and "detail", if the host has it).
-        lr, hr: the renderings of this view at both scales, e.g. `AutogradShot`. view: a `clear_strategies.core.view.View`.
-        scaler: for hosts with a densifier; `backward()` then also writes the score where the densifier reads the screen
-            gradient.
-    """
-    return joint_update(conductor, params, lr, hr, view, t, scaler)[0]
-
-
-def joint_update(
-    conductor: Conductor,
-    params: Mapping[str, Tensor],
-    lr: Shot,
-    hr: Shot | None,
-    view: Any,
+    view: View,
     t: int,
     scaler: ScoreScaler | None = None,
 ) -> tuple[Float[Tensor, ""], Update]:
-    """`joint_loss` together with its `Update`, which holds the densification scores and the conflict ratios."""
+    """λ_LR L_LR + λ_HR (L_base + λ_HF L_HF), whose gradient is the conductor's merged gradient, and what was decided.
+
+    Args:
+        params: the leaves that the host optimizes, by gsplat's names (and "detail", if the host has it).
+        lr, hr: the renderings of this view at both scales, e.g. `AutogradShot`. t: the iteration, from 1.
+        scaler: for hosts with a densifier; `backward()` then also writes the score where the densifier reads the screen
+            gradient.
+
+    Returns:
+        The loss, and the `Update`: the step for `Conductor.after_step`, densification scores, conflict ratios.
+    """
     values = {name: p.detach() for name, p in params.items()}
     update = conductor.update(values, lr, hr, view, t)
     objective, λ = conductor.objective, conductor.objective.lambda_hr(t)
@@ -70,6 +61,23 @@ def joint_update(
 
     loss: Tensor = _GivenGradients.apply(value, gradients, write_score, *trained.values())  # type: ignore[no-untyped-call]
     return loss, update
+
+
+def extra_loss(conductor: Conductor, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Float[Tensor, ""]:
+    """λ_LR L_LR of an extra view, weighted by pixel.
+
+        for extra in conductor.extra_views(t):
+            optimizer.zero_grad()
+            extra_loss(conductor, render(extra.photo.camera), extra, t).backward()
+            optimizer.step()
+
+    Args:
+        image: rendered by the camera of `extra`, without a gate and without f_det.
+    """
+    losses = conductor.extra_loss(image, extra, t)
+    value = conductor.objective.lambda_lr * losses.values["lr"]
+    loss: Tensor = _GivenGradients.apply(value, [losses.cotangents[0]], lambda scale: None, image)  # type: ignore[no-untyped-call]
+    return loss
 
 
 class _GivenGradients(torch.autograd.Function):

@@ -4,13 +4,12 @@ in its colours, at LR or HR.
 
 from __future__ import annotations
 
-import copy
 import inspect
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -29,11 +28,6 @@ _log = logging.getLogger(__name__)
 
 Role = Literal["gate", "detail"]
 """What an override changes: opacities are multiplied by the gate, colours are offset by f_det."""
-
-# Attributes that hold pixels in the cameras of the supported hosts; each host has some of them.
-_IN_PIXELS: Final = (
-    "image_width", "image_height", "width", "height", "focal_x", "focal_y", "fx", "fy", "cx", "cy",
-)  # fmt: skip
 
 
 @dataclass(slots=True, eq=False)
@@ -185,6 +179,20 @@ class ModelRenderer:
             )  # fmt: skip
         return rendering
 
+    def draw(
+        self,
+        render: Callable[[Any], Any],
+        camera: Camera,
+        to_pixels: Callable[[Mapping[str, Any]], tuple[float, float] | None] = lambda result: None,
+    ) -> AutogradShot:
+        """The model drawn by a camera of which there is no photo: without a gate and without f_det.
+
+        Args:
+            render: the host's function of the model alone, by that camera. to_pixels: see `host_rendering`.
+        """
+        trained = {name: p for name, p in self._host_params().items() if p.requires_grad}
+        return host_rendering(render(self._model), camera, trained, None, to_pixels).shot
+
     def warn_once(self, message: str, *values: Any) -> None:
         """Log a warning the first time that it comes up."""
         if message not in self._warned:
@@ -242,12 +250,3 @@ def project(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 2"]
     x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     z = z.clamp_min(torch.finfo(z.dtype).eps)
     return torch.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy), -1)
-
-
-def enlarged_camera(camera: Any, factor: int) -> Any:
-    """A copy of a host's camera with `factor` times as many pixels per edge; fields of view and projections stay."""
-    larger = copy.copy(camera)
-    for name in _IN_PIXELS:
-        if hasattr(camera, name):
-            setattr(larger, name, getattr(camera, name) * factor)
-    return larger

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import Photo, View
+from clear_strategies.data.priors.interface import super_resolved
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from rasterizers.interface import Camera
@@ -46,7 +47,8 @@ def view(
     h, w = image.shape[:2]
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
     camera = Camera(world_to_camera.detach().float(), fx, fy, cx, cy, w, h)
-    sr_image = sr(name, image.cpu(), factor).to(image)
+    made = super_resolved(sr, name, image.cpu(), factor)
+    sr_image = made.image.to(image)
     if sr_image.shape != (h * factor, w * factor, 3):
         raise DataError(
             name, "SR image", f"is {sr_image.shape[1]}x{sr_image.shape[0]}, but {factor} times {w}x{h} is "
@@ -55,8 +57,9 @@ def view(
     if mask is not None:
         image, sr_image = image * mask[..., None], sr_image * enlarged_mask(mask, factor)[..., None]
     return View(
-        name, Photo(camera, image), Photo(camera.scaled(factor), sr_image), sr_source=getattr(sr, "label", "unknown")
-    )
+        name, Photo(camera, image), Photo(camera.scaled(factor), sr_image), sr_source=getattr(sr, "label", "unknown"),
+        disagreement=None if made.disagreement is None else made.disagreement.to(image),
+    )  # fmt: skip
 
 
 def enlarged_mask(mask: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "H W"]:
@@ -78,13 +81,14 @@ def sr_images(sr: SuperResolve | str | Path | None, suffix: str = "") -> SuperRe
 
 
 def sr_source(sr: SuperResolve | str | Path | None, conductor: Conductor, factor: int) -> tuple[SuperResolve, int]:
-    """The function that gives SR images, and their factor. Without SR images the "HR" view is the LR view.
+    """What makes the SR images, with the conductor's decorators around it, and their factor. Without SR images the "HR" view
+    is the LR view.
 
     Raises:
         SettingError: there are no SR images, but the objective or a strategy needs them.
     """
     if (images := sr_images(sr)) is not None:
-        return images, factor
+        return conductor.prior(images), factor
     λ = conductor.objective.lambda_hr
     if λ.peak > 0 or λ.final > 0 or conductor.owner("observe") is not None:
         raise SettingError(

@@ -17,8 +17,10 @@ from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies import compose as compose_module
 from clear_strategies.compose import CONF, conductor, require_each_once, tree
 from clear_strategies.data.prepare import ViewSettings
+from clear_strategies.data.priors import BackProjected, Bicubic
 from clear_strategies.errors import SettingError, StrategyConflict
 from clear_strategies.jobs import device, job
+from clear_strategies.merging.detail import DetailRates
 from clear_strategies.settings import TARGET, with_defaults
 
 
@@ -250,7 +252,19 @@ def test_a_setting_that_cannot_be_used_is_named_by_its_key(overrides, message):
     assert message in str(refused.value)
 
 
-def test_a_host_gets_the_strategies_of_best_and_is_told_that_it_makes_no_pseudo_views(caplog):
-    best, clear = conductor("best"), conductor("clear")
-    assert [type(s) for s in best.strategies] == [type(s) for s in clear.strategies]
-    assert "pseudo views" in caplog.text
+def test_a_host_gets_the_strategies_and_the_decorators_of_best():
+    run = job.settings_of(tree(composed("+strategy=best")))
+    best = conductor("best")
+    assert [type(s) for s in best.strategies] == [type(s) for s in run.conductor(1.0).strategies]
+    assert [type(s).__name__ for s in best.strategies] == ["GCO", "P2G", "SVS", "PseudoViews"]
+    assert best.prior(Bicubic()) == run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic())
+
+
+def test_back_projection_reduces_by_the_operator_that_made_the_photos():
+    run = job.settings_of(tree(composed("+strategy=[gco,back_projected]", "data.views.downsample=area")))
+    assert run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic(), down="area")
+
+
+def test_the_rates_of_f_det_in_a_host_are_those_of_its_readings():
+    assert conductor("clear", iterations=300).detail == DetailRates().of_run(300)
+    assert conductor("clear_paper", iterations=300).detail == DetailRates(steps=0, decay=0.0)

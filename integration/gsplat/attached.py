@@ -17,13 +17,14 @@ from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment, HostRendering, Resolution
 from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 from integration.densification import require_end
-from integration.detail import detail_adam, detail_rates, sh0_offset
+from integration.detail import detail_adam, sh0_offset
 from integration.errors import HostError
 from integration.host_score import warn_if_score_is_unused
 from integration.replacing import Replaced
 from integration.rows import RowNumbers
 from integration.views import enlarged_mask
 from rasterizers.geometry import SH_C0
+from rasterizers.interface import Camera
 
 _PARAMETERS: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _ATTACHED: Final = "clear_attached"  # attribute of a wrapped function: its Attached
@@ -78,7 +79,7 @@ class Attached:
         means = params[self._host_name("means")]
         if detail and "detail" not in params:
             params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
-            optimizers["detail"] = detail_adam(params["detail"], detail_rates(conductor.iterations))
+            optimizers["detail"] = detail_adam(params["detail"], conductor.detail)
         self._rows = RowNumbers(
             params if state is None else state,
             lambda: self._params[self._host_name("means")],
@@ -90,12 +91,16 @@ class Attached:
         self._replaced: list[Replaced] = []
         require_end(conductor, _refine_stop(strategy), "refine_stop_iter", first=0)
         self.attachment = Attachment(
-            conductor, self.params, n_views=len(self._views), seed=seed, loss_scale=loss_scale, accumulation=accumulation,
+            conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=self._poll_parents, threshold=_threshold(strategy, conductor),
         )  # fmt: skip
-        self._hook = optimizers[self._host_name("means")].register_step_pre_hook(
-            lambda *_: self.attachment.before_step()
-        )
+        self._hooks = [
+            optimizers[self._host_name("means")].register_step_pre_hook(lambda *_: self.attachment.before_step()),
+            *(
+                optimizers[name].register_step_post_hook(lambda o, *_: self.attachment.after_optimizer_step(o))
+                for name in host_names
+            ),
+        ]
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
@@ -130,7 +135,10 @@ class Attached:
             def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
                 return self._render(rasterization, call, view, resolution, gate)
 
-            return self.attachment.render_view(view, render_at)  # type: ignore[no-any-return]
+            def render_camera(camera: Camera) -> AutogradShot:
+                return self._render_camera(rasterization, call, camera)
+
+            return self.attachment.render_view(view, render_at, render_camera)  # type: ignore[no-any-return]
 
         setattr(wrapped, _ATTACHED, self)
         return wrapped
@@ -161,7 +169,8 @@ class Attached:
     def remove(self) -> None:
         """Restore the loop; f_det stays a parameter, see `fold_detail`."""
         self.attachment.remove()
-        self._hook.remove()
+        for hook in self._hooks:
+            hook.remove()
         for replaced in self._replaced:
             replaced.undo()
         self._replaced.clear()
@@ -232,6 +241,28 @@ class Attached:
             image = image * enlarged_mask(mask.to(image), view.factor)[..., None]
         shot = AutogradShot(image, means2d, visible, params, ScreenGradientSlot(info["means2d"], size, rows=rows))
         return HostRendering(shot, renders, (renders, alphas, info))
+
+    def _render_camera(
+        self, rasterization: Rasterization, arguments: Mapping[str, Any], camera: Camera
+    ) -> AutogradShot:
+        """The Gaussians of a call, drawn by another camera."""
+        call, Ks = dict(arguments), arguments["Ks"]
+        K = Ks.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        call |= {
+            "viewmats": camera.world_to_camera.to(call["viewmats"]).reshape(call["viewmats"].shape),
+            "Ks": K.reshape(Ks.shape),
+            "width": camera.width,
+            "height": camera.height,
+            "render_mode": "RGB",
+        }
+        renders, _, info = rasterization(**call)
+        params = self.params()
+        params.pop("detail", None)
+        image = renders[..., :3].reshape(camera.height, camera.width, 3)
+        n, size = len(params["means"]), (camera.width, camera.height)
+        rows = info["gaussian_ids"] if info["means2d"].dim() == 2 else None
+        nothing = image.new_zeros(n, 2), torch.ones(n, dtype=torch.bool, device=image.device)
+        return AutogradShot(image, *nothing, params, ScreenGradientSlot(info["means2d"], size, rows=rows))
 
     def _with_detail(self, arguments: Mapping[str, Any], *, trained: bool) -> dict[str, Any]:
         """The same call with colours f_base + f_det; f_det gets a gradient only if it is trained by the rendering."""

@@ -12,15 +12,18 @@ from torch import Tensor
 
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment, HostRendering, Resolution
+from integration.autograd_shot import AutogradShot
 from integration.densification import require_end
 from integration.detail import DetailFeature
 from integration.errors import HostError
+from integration.host_cameras import enlarged_camera, replaced_camera
 from integration.host_score import warn_if_score_is_unused
 from integration.inria.cameras import HostView, HostViews
 from integration.inria.rows import CarriedRows
-from integration.model_proxy import ModelRenderer, Role, enlarged_camera
+from integration.model_proxy import ModelRenderer, Role
 from integration.replacing import Replaced
 from integration.views import SuperResolve, sr_source
+from rasterizers.interface import Camera
 
 Render = Callable[..., Any]
 
@@ -91,12 +94,12 @@ class Attached:
         self._model, self._conductor = gaussians, conductor
         self.views = HostViews(cameras, *sr_source(sr, conductor, factor), gaussians._xyz.device)
         self._rows = CarriedRows(gaussians, self._host_params)
-        self._detail = DetailFeature(lambda: gaussians._xyz, self._rows, conductor.iterations)
+        self._detail = DetailFeature(lambda: gaussians._xyz, self._rows, conductor.detail)
         self._renderer = ModelRenderer(
             gaussians, _ROLES, self._host_params, self._detail if detail else None, conductor
         )
         self.attachment = Attachment(
-            conductor, self.params, n_views=len(self.views), seed=seed, threshold=threshold,
+            conductor, self.params, views=[host_view.view for host_view in self.views.all], seed=seed, threshold=threshold,
             poll_parents=lambda: self._detail.poll_parents(conductor.state_dict),
         )  # fmt: skip
         self._originals = {
@@ -168,7 +171,11 @@ class Attached:
                 lambda model: render(sized, model, *args, **kwargs), view, resolution, gate, mask=host_view.mask
             )
 
-        return self.attachment.render_view(view, render_at)
+        def render_camera(other: Camera) -> AutogradShot:
+            sized = replaced_camera(camera, other)
+            return self._renderer.draw(lambda model: render(sized, model, *args, **kwargs), other)
+
+        return self.attachment.render_view(view, render_at, render_camera)
 
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}
@@ -190,6 +197,7 @@ class Attached:
         self._hooks = [
             optimizer.register_step_pre_hook(lambda *_: self.attachment.before_step()),
             optimizer.register_step_post_hook(lambda *_: self._detail.step()),
+            optimizer.register_step_post_hook(lambda o, *_: self.attachment.after_optimizer_step(o)),
             optimizer.register_state_dict_post_hook(self._save_state),
             optimizer.register_load_state_dict_pre_hook(self._load_state),
         ]

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from clear_strategies.errors import SettingError
 from integration.densification import end_of_densification
-from integration.detail import detail_rates, sh0_offset
+from integration.detail import sh0_offset
 from integration.gsplat import Attached, attach
 from integration.nerfstudio.data import prior, save_lr, views_from_datamanager
 
@@ -142,7 +142,7 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
                 f"CLEAR: wrote the LR photos to {config.save_lr}; enlarge them x{config.factor} for pipeline.model.sr."
             )
         chosen = conductor(config.strategies, *config.overrides, iterations=trainer.config.max_num_iterations)
-        sr = prior(config.sr)
+        sr = chosen.prior(prior(config.sr))
         CONSOLE.log(
             f"CLEAR: {', '.join(type(s).__name__ for s in chosen.strategies) or 'no strategy'}; "
             f"SR images x{config.factor}: {sr.label}."
@@ -153,7 +153,7 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
             CONSOLE.log(f"CLEAR: densification ends at step {end} instead of {stop} (SVS: anchor_start).")
             self.strategy.refine_stop_iter = end
         for group in host.optimizers.optimizers["detail"].param_groups:
-            group["lr"] = detail_rates(chosen.iterations).detail
+            group["lr"] = chosen.detail.rate
         return attach(
             self.gauss_params, host.optimizers.optimizers, views_from_datamanager(datamanager, sr, config.factor, self.device),
             chosen,

@@ -14,7 +14,7 @@ from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import ViewSettings, check_headers, lr_size, prepare, resized, split
-from clear_strategies.data.priors import Bicubic, DemoPrior
+from clear_strategies.data.priors import BackProjected, Bicubic, DemoPrior
 from clear_strategies.data.readers import demo
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.strategies.p2g import P2G
@@ -226,7 +226,7 @@ def test_back_projected_sr_images_shrink_to_the_photos():
     prior = DemoPrior({f.name: f.load for f in capture.frames}, share=1.0, patch=16)
 
     def disagreement(rounds: int) -> tuple[float, str | None]:
-        scene = prepare(capture, papers(train=2, back_projection=rounds), prior, POINTS)
+        scene = prepare(capture, papers(train=2), BackProjected(prior, rounds) if rounds else prior, POINTS)
         differences = [images.downsample(v.hr.image, v.factor) - v.lr.image for v in (*scene.train, *scene.test)]
         return max(float(d.abs().mean()) for d in differences), scene.notes.get("back-projection")
 
@@ -240,7 +240,7 @@ def test_back_projected_sr_images_shrink_to_the_photos():
 def test_photos_that_are_the_hr_side_are_not_moved():
     capture = demo.read(width=64, height=48, views=5, train=2)
     prior = DemoPrior({f.name: f.load for f in capture.frames})
-    scene = prepare(capture, ViewSettings(photos_are="both", train=2, back_projection=10), prior, POINTS)
+    scene = prepare(capture, ViewSettings(photos_are="both", train=2), BackProjected(prior), POINTS)
     assert all(view.hr.image is view.truth for view in scene.train)
     assert "back-projection" not in scene.notes
 
@@ -248,7 +248,7 @@ def test_photos_that_are_the_hr_side_are_not_moved():
 def test_how_far_a_back_projected_sr_image_was_from_its_photo_is_kept():
     capture = demo.read(width=64, height=48, views=5, train=2)
     prior = DemoPrior({f.name: f.load for f in capture.frames}, share=0.5, patch=16)
-    made, moved = (prepare(capture, papers(train=2, back_projection=rounds), prior, POINTS).train for rounds in (0, 10))
+    made, moved = (prepare(capture, papers(train=2), sr, POINTS).train for sr in (prior, BackProjected(prior)))
     assert all(view.disagreement is None for view in made)
     for before, after in zip(made, moved, strict=True):
         wrong = (images.downsample(before.hr.image, before.factor) - before.lr.image).abs()

@@ -15,6 +15,7 @@ from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.compiled_step import Factors
 from clear_strategies.training.field import GaussianField
 from rasterizers.interface import SplatGradients
+from tests.helpers import toy
 
 T = 5  # any iteration at which λ_HR = 1
 HR_COTANGENTS = {"none": 0, "base": 1, "both": 2}
@@ -52,7 +53,7 @@ class Case:
         return a.vjp(self.lr, 0, detail=False), self._bundle(*hf)
 
     def _bundle(self, base, hf) -> HrGradients | None:
-        return None if base is None else HrGradients(base, hf, (1, 1), self.e, self.m)
+        return None if base is None else HrGradients(base, hf, (1, 1), toy.step(evidence=self.e), self.m)
 
 
 def readable_merge(conductor, params, g_lr, hr, t) -> tuple:
@@ -124,5 +125,5 @@ def conductors(*makers, anchored=None, hf=0.2, λ=ALWAYS) -> tuple[Conductor, Co
         conductor.on_fit_start(3, 0)
         for s in conductor.strategies:
             if isinstance(s, SVS) and anchored is not None:
-                s.after_step({name: p * 1.01 for name, p in anchored.raw().items()}, s.anchor_start)
+                s.after_step({name: p * 1.01 for name, p in anchored.raw().items()}, toy.step(s.anchor_start))
     return both

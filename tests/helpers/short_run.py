@@ -7,22 +7,21 @@ happen: 3 warm-up starts, 2 to 12 densify and prune, 6 and 12 reset, 8 warm, 12 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor, Objective
+from clear_strategies import GCO, P2G, SVS, Conductor, Objective, PseudoViews, Strategy
 from clear_strategies.core.view import DepthMap
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.density.base import cameras_extent
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.training.compiled_step import FusedMode
-from clear_strategies.training.depth_loss import DepthLoss
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.pseudo_views import PseudoViewSettings
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
@@ -52,8 +51,7 @@ def start(
     names: tuple[str, ...],
     iterations: int = ITERATIONS,
     *,
-    beside: PseudoViewSettings | None = None,
-    depth_loss: DepthLoss | None = None,
+    more: Sequence[Strategy] = (),
     fused: FusedMode = "auto",
 ) -> TrainState:
     make = {
@@ -65,11 +63,12 @@ def start(
             anchor_strength=0.01,
             anchor_weights={"means": 1.0, "scales": 1.0, "sh0": 0.1, "detail": 0.1},
         ),
+        "pseudo_views": lambda: PseudoViews(count=8, reach=0.1),
     }
     objective = Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
     return TrainState.start(
-        SCENE if beside is None and depth_loss is None else with_depth(SCENE),
-        Conductor(*(make[name]() for name in names), objective=objective, statistics_from=1),
+        with_depth(SCENE) if "pseudo_views" in names else SCENE,
+        Conductor(*(make[name]() for name in names), *more, objective=objective, statistics_from=1),
         settings=FitSettings(
             iterations=iterations,
             scale_schedule=False,
@@ -93,8 +92,6 @@ def start(
         ),
         rates=LearningRates(means=LogLinear(end=ITERATIONS), detail_decay=0.01),
         mip=MipFilter(every=7, last=1),
-        pseudo_views=beside,
-        depth_loss=depth_loss,
     )
 
 

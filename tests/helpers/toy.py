@@ -9,7 +9,9 @@ from torch import Tensor
 
 import rasterizers
 from clear_strategies.core import images
+from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.points import PointCloud
+from clear_strategies.core.step import Step
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.scene import Scene
 from rasterizers import Camera, Splats
@@ -69,3 +71,11 @@ def scene(n: int = 40, seed: int = 0, train: int = 3, test: int = 1) -> Scene:
 def cloud(n: int = 12, seed: int = 0) -> PointCloud:
     g = torch.Generator().manual_seed(seed)
     return PointCloud(torch.randn(n, 3, generator=g), torch.rand(n, 3, generator=g), "random")
+
+
+def step(t: int = 1, evidence: Evidence | None = None, visible: Tensor | None = None) -> Step:
+    """An iteration on a view that nobody looks at; Gaussians with evidence are visible unless `visible` says otherwise."""
+    photo = Photo(Camera(torch.eye(4), 8.0, 8.0, 4.0, 4.0, 8, 8), torch.zeros(8, 8, 3))
+    if visible is None and evidence is not None:
+        visible = torch.ones(len(evidence.demand), dtype=torch.bool)
+    return Step(t, View("toy", photo, photo), visible, evidence)

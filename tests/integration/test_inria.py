@@ -26,9 +26,9 @@ from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from integration import HostError
+from integration.host_cameras import enlarged_camera
 from integration.inria import attach
 from integration.inria.cameras import HostViews, intrinsics
-from integration.model_proxy import enlarged_camera
 from tests.helpers import toy
 from tests.helpers.inria import HR_FROM_START, WITHOUT_HR, N, loop, options
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor, Objective
+from clear_strategies import GCO, P2G, SVS, Conductor, ExtraView, Objective, Photo, Strategy
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.field import GaussianField
-from integration import AutogradShot, joint_loss, joint_update
+from integration import AutogradShot, extra_loss, joint_loss
 from rasterizers import Splats, autograd
 from tests.helpers import toy
 
@@ -41,7 +43,7 @@ def test_backward_gives_the_conductors_gradient(strategies):
     conductor.on_fit_start(3, 0)
     z = conductor.gate(5, 20)
     lr, hr = host.render(view.lr.camera, z, detail=False), host.render(view.hr.camera, z)
-    (2.0 * joint_loss(conductor, host.params, lr, hr, view, 5)).backward()
+    (2.0 * joint_loss(conductor, host.params, lr, hr, view, 5)[0]).backward()
 
     ours = Conductor(*strategies, objective=OBJECTIVE)
     ours.on_fit_start(3, 0)
@@ -57,7 +59,7 @@ def test_its_value_is_the_sum_of_the_losses():
     host, view = Host(scene), scene.train[0]
     conductor = Conductor(GCO(), objective=OBJECTIVE)
     lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
-    loss, update = joint_update(conductor, host.params, lr, hr, view, 50)
+    loss, update = joint_loss(conductor, host.params, lr, hr, view, 50)
     l = update.losses
     assert float(loss) == pytest.approx(l["lr"] + l["base"] + 0.2 * l["hf"], rel=1e-6)
     assert update.score.shape == (20,)
@@ -75,9 +77,38 @@ def test_a_loop_with_joint_loss_reduces_the_loss():
         z = conductor.gate(t, 20)
         lr, hr = host.render(view.lr.camera, z, detail=False), host.render(view.hr.camera, z)
         optimizer.zero_grad()
-        loss = joint_loss(conductor, host.params, lr, hr, view, t)
+        loss, update = joint_loss(conductor, host.params, lr, hr, view, t)
         loss.backward()
         optimizer.step()
-        conductor.after_step(host.params, t)
+        conductor.after_step(host.params, update.step)
         losses.append(float(loss))
     assert sum(losses[-3:]) < 0.9 * sum(losses[:3])
+
+
+def test_an_extra_view_is_learned_from_in_a_step_of_its_own():
+    scene = toy.scene(20)
+    host, photo = Host(scene), scene.train[0].lr
+    dark = ExtraView(Photo(photo.camera, torch.zeros_like(photo.image)), torch.ones(photo.image.shape[:2]))
+    conductor = Conductor(Shows(dark), objective=OBJECTIVE)
+    conductor.on_fit_start(3, 0)
+    optimizer = torch.optim.Adam(list(host.params.values()), lr=5e-3, eps=1e-15)
+    losses = []
+    for t in range(1, 25):
+        for extra in conductor.extra_views(t):
+            optimizer.zero_grad()
+            loss = extra_loss(conductor, host.render(extra.photo.camera, None, detail=False).image, extra, t)
+            loss.backward()
+            optimizer.step()
+            losses.append(float(loss))
+    assert len(losses) == 24
+    assert losses[-1] < 0.8 * losses[0]
+
+
+@dataclass(frozen=True)
+class Shows(Strategy):
+    """Shows one picture at every iteration."""
+
+    extra: ExtraView
+
+    def extra_views(self, t):
+        return (self.extra,)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, SplatSuRe, Strategy, StrategyConflict
+from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, SplatSuRe, Step, Strategy, StrategyConflict
 from clear_strategies.kernels import losses
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.testing import CHECKS, ContractError, check_strategy
@@ -25,7 +25,7 @@ class Halve(Strategy):
 
     share: float = 0.5
 
-    def correct(self, lr, hr, evidence):
+    def correct(self, lr, hr, step):
         return hr * self.share
 
 
@@ -43,7 +43,7 @@ def test_contract(make, check):
 class Careless(Strategy):
     """Changes what it was only shown."""
 
-    def correct(self, lr, hr, evidence):
+    def correct(self, lr, hr, step):
         hr["means"] *= 2
         return hr
 
@@ -60,7 +60,7 @@ class Forgetful(Strategy):
 class Secretive(Strategy):
     """Remembers outside `state`."""
 
-    def score(self, evidence, screens):
+    def score(self, step, screens):
         self.cache["calls"] = self.cache.get("calls", 0) + 1
         return screens.ordinary * self.cache["calls"]
 
@@ -190,7 +190,7 @@ def test_the_detail_feature_moves_by_routed_high_frequencies_alone():
     p2g = P2G()
     update = Conductor(GCO(), p2g, objective=objective).update(field.raw(), lr, hr, view, 5)
     _, g_hf = hr.vjp(objective.hr(hr.image, view.hr.image).cotangents)
-    m = p2g.route(update.evidence)
+    m = p2g.route(update.step)
     assert torch.allclose(update.grads["detail"], 0.2 * m[:, None] * g_hf["detail"], rtol=1e-6, atol=1e-15)
     without = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0))
     lr, hr = field.render_scales(toy.RASTERIZER, view)
@@ -206,7 +206,7 @@ def test_routing_weighs_the_high_frequency_gradient_only():
     update = Conductor(p2g, objective=objective).update(field.raw(), lr, hr, view, 5)
     (g_lr,) = lr.vjp(objective.lr(lr.image, view.lr.image).cotangents)
     g_base, g_hf = hr.vjp(objective.hr(hr.image, view.hr.image).cotangents)
-    m = p2g.route(update.evidence)[:, None]
+    m = p2g.route(update.step)[:, None]
     expected = g_lr["means"] + g_base["means"] + 0.2 * m * g_hf["means"]
     assert torch.allclose(update.grads["means"], expected, rtol=1e-6, atol=1e-15)
 
@@ -278,11 +278,11 @@ def test_two_strategies_of_one_class_keep_their_states_apart():
         def regularize(self, params, t):
             return None
 
-        def after_step(self, params, t):
+        def after_step(self, params, step):
             self.state["kept"] = torch.full((3,), self.value)
 
     first = Conductor(Remember(1.0), Remember(2.0))
-    first.after_step({}, 1)
+    first.after_step({}, Step(1, field_and_view()[1]))
     second = Conductor(Remember(1.0), Remember(2.0))
     second.load_state_dict(first.state_dict())
     assert [s.state["kept"][0].item() for s in second.strategies] == [1.0, 2.0]

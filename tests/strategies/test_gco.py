@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from clear_strategies import CONFLICT_GROUPS, GCO, Evidence, Grads
+from tests.helpers import toy
 
 WIDTHS = {"means": (3,), "sh0": (1, 3), "shN": (15, 3), "opacities": (), "scales": (3,), "quats": (4,)}
 
@@ -43,8 +44,8 @@ def test_values_worked_out_by_hand():
 def test_reliability_softens_the_correction_and_the_lower_bound_holds():
     l, h = torch.tensor([1.0, 0, 0]), torch.tensor([-3.0, 4, 0])
     for q, omega in ((0.5, 0.5 * 0.55 / 0.95), (1.0, 0.05), (0.0, 0.55 / 0.95)):
-        evidence = Evidence(torch.tensor([q]), torch.tensor([1.0]))
-        found = GCO(eps="relative:0").correct(grads("means", l), grads("means", h), evidence)["means"][0]
+        step = toy.step(evidence=Evidence(torch.tensor([q]), torch.tensor([1.0])))
+        found = GCO(eps="relative:0").correct(grads("means", l), grads("means", h), step)["means"][0]
         assert float(found[0]) == pytest.approx(-3 + omega * 2.75, rel=1e-6)
 
 
@@ -170,10 +171,10 @@ def test_an_absolute_epsilon_that_disables_correction_is_warned_of(caplog):
 def test_a_prior_that_agrees_with_lr_makes_it_inactive_and_the_end_of_the_run_says_so():
     lr, hr = random_pair(8)
     gco = GCO()
-    gco.correct(lr, hr, Evidence(torch.full((200,), 0.99), torch.ones(200)))
+    gco.correct(lr, hr, toy.step(evidence=Evidence(torch.full((200,), 0.99), torch.ones(200))))
     assert gco.logs["mean_omega"] == pytest.approx(0.05, abs=1e-3)
     assert "GCO was inactive: omega sat at its lower bound 0.05 in 100%" in gco.in_hindsight(gco.logs)
-    gco.correct(lr, hr, Evidence(torch.zeros(200), torch.ones(200)))
+    gco.correct(lr, hr, toy.step(evidence=Evidence(torch.zeros(200), torch.ones(200))))
     assert gco.in_hindsight(gco.logs) is None
     assert gco.in_hindsight({}) is None
 

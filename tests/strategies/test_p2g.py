@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies import P2G, Conductor, Evidence, ScreenGradients
+from clear_strategies import P2G, Conductor, Evidence, ScreenGradients, Step
 from clear_strategies.core import images
 from clear_strategies.core.evidence import lift
 from clear_strategies.strategies.p2g import patch_evidence
@@ -87,20 +87,28 @@ def test_lifting_takes_the_patch_of_the_centre_and_the_border_outside():
 @given(q=st.floats(0, 1, width=32), a=st.floats(0, 1, width=32), floor=st.floats(0, 1))
 @settings(max_examples=50, deadline=None)
 def test_routing_as_printed_lies_between_the_floor_and_one(q, a, floor):
-    m = P2G(floor=floor, normalize=False).route(Evidence(torch.tensor([q]), torch.tensor([a])))
+    m = P2G(floor=floor, normalize=False).route(toy.step(evidence=Evidence(torch.tensor([q]), torch.tensor([a]))))
     assert float(m) == pytest.approx(floor + (1 - floor) * q * a, rel=1e-5, abs=1e-6)
 
 
 def test_normalized_routing_moves_detail_and_removes_none():
     q, a = torch.tensor([1.0, 1.0, 0.5, 0.0]), torch.tensor([1.0, 0.2, 0.4, 0.0])  # the last one is invisible
-    printed, m = (P2G(normalize=normalize).route(Evidence(q, a)) for normalize in (False, True))
+    step = toy.step(evidence=Evidence(q, a), visible=torch.tensor([True, True, True, False]))
+    printed, m = (P2G(normalize=normalize).route(step) for normalize in (False, True))
     assert float(m[:3].mean()) == pytest.approx(1)
     assert torch.allclose(m[:3] / m[0], printed[:3] / printed[0])
 
 
 def test_normalized_routing_of_no_visible_gaussian_is_finite():
-    assert bool(P2G().route(Evidence(torch.zeros(3), torch.zeros(3))).isfinite().all())
-    assert bool(P2G(floor=0).route(Evidence(torch.ones(3), torch.zeros(3))).isfinite().all())
+    none = torch.zeros(3, dtype=torch.bool)
+    assert bool(P2G().route(toy.step(evidence=Evidence(torch.zeros(3), torch.zeros(3)), visible=none)).isfinite().all())
+    assert bool(P2G(floor=0).route(toy.step(evidence=Evidence(torch.ones(3), torch.zeros(3)))).isfinite().all())
+
+
+def test_an_unreliable_gaussian_is_visible_all_the_same():
+    q, a = torch.tensor([1.0, 0.0, 0.0]), torch.ones(3)
+    m = P2G(floor=0.25).route(toy.step(evidence=Evidence(q, a), visible=torch.tensor([True, True, False])))
+    assert m[:2].tolist() == pytest.approx([1.6, 0.4])  # (1, 0.25) over their mean
 
 
 def test_observation_is_made_once_a_view_and_invisible_gaussians_have_none(caplog):
@@ -108,7 +116,7 @@ def test_observation_is_made_once_a_view_and_invisible_gaussians_have_none(caplo
     _, shot = GaussianField.from_cloud(toy.scene().cloud).render_scales(toy.RASTERIZER, view)
     p2g = P2G()
     with caplog.at_level("DEBUG"):
-        first, second = p2g.observe(view, shot), p2g.observe(view, shot)
+        first, second = (p2g.observe(Step(t, view, shot.visible), shot) for t in (1, 2))
     assert caplog.text.count(view.name) == 1
     assert torch.equal(first.reliability, second.reliability)
     assert not first.weight[~shot.visible].any()
@@ -121,14 +129,14 @@ def screens(ordinary, hf):
 
 
 def test_scores():
-    e = Evidence(torch.tensor([1.0, 0.5]), torch.tensor([0.5, 0.5]))
+    e = toy.step(evidence=Evidence(torch.tensor([1.0, 0.5]), torch.tensor([0.5, 0.5])))
     s = screens([1.0, 3.0], [[3.0, 4.0], [0.0, 2.0]])
     assert P2G(score_by="evidence").score(e, s).tolist() == pytest.approx([2.5, 0.5])
     assert P2G(score_by="gradient").score(e, s) is None
     # S has mean 1.5, the ordinary statistic 2: S counts 4/3.
     assert P2G(score_by="sum").score(e, s).tolist() == pytest.approx([1 + 2.5 * 4 / 3, 3 + 0.5 * 4 / 3])
     assert P2G(score_by="max").score(e, s).tolist() == pytest.approx([2.5 * 4 / 3, 3.0])
-    assert P2G().score(None, s) is None
+    assert P2G().score(toy.step(), s) is None
 
 
 @pytest.mark.parametrize(

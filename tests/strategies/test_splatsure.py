@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
 
-from clear_strategies import Grads, SplatSuRe
-from clear_strategies.strategies.testing import StubShot
+from clear_strategies import Grads, Photo, SplatSuRe, Step, View
 from rasterizers import Camera
 
 
@@ -22,11 +20,10 @@ def camera(distance: float, focal: float = 10.0) -> Camera:
 
 def visit(strategy: SplatSuRe, name: str, distance: float, shown: list[bool], means=None) -> torch.Tensor:
     """One iteration of a view: the weights of its HR gradients."""
-    view = SimpleNamespace(name=name, hr=SimpleNamespace(camera=camera(distance)))
-    visible = torch.tensor(shown)
-    strategy.observe(view, StubShot(torch.zeros(8, 8, 3), torch.zeros(len(shown), 2), visible, []))
-    corrected = strategy.correct(Grads(), Grads({"opacities": torch.ones(len(shown))}), None)["opacities"]
-    strategy.after_step({"means": torch.zeros(len(shown), 3) if means is None else means}, 1)
+    photo = Photo(camera(distance), torch.zeros(8, 8, 3))
+    step = Step(1, View(name, photo, photo), torch.tensor(shown))
+    corrected = strategy.correct(Grads(), Grads({"opacities": torch.ones(len(shown))}), step)["opacities"]
+    strategy.after_step({"means": torch.zeros(len(shown), 3) if means is None else means}, step)
     return corrected
 
 

@@ -72,9 +72,9 @@ def test_anchor_pulls_back_with_twice_the_weighted_distance():
     svs = SVS(anchor_start=10, anchor_strength=0.01, anchor_weights={"scales": 0.5, "opacities": 0.1})
     svs.on_fit_start(3, 0)
     theta = params()
-    svs.after_step(theta, 9)
+    svs.after_step(theta, toy.step(9))
     assert svs.regularize(theta, 10) is None
-    svs.after_step(theta, 10)
+    svs.after_step(theta, toy.step(10))
     assert all(not g.any() for g in svs.regularize(theta, 11).values())
     moved = {name: value + 0.3 for name, value in theta.items()}
     g = svs.regularize(moved, 11)
@@ -89,7 +89,7 @@ def test_anchored_positions_do_not_depend_on_the_unit_of_the_world():
         svs.on_fit_start(3, 0)
         theta = params()
         theta["means"] = theta["means"] * unit
-        svs.after_step(theta, 1)
+        svs.after_step(theta, toy.step(1))
         theta["means"] = theta["means"] * 1.1
         vjp = svs.regularize(theta, 2)["means"] * unit  # ∂/∂(x / unit)
         if unit == 1.0:
@@ -103,7 +103,7 @@ def test_the_mean_reading_divides_by_the_number_of_gaussians():
         svs = SVS(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS, reduction=reduction)
         svs.on_fit_start(3, 0)
         theta = params()
-        svs.after_step(theta, 1)
+        svs.after_step(theta, toy.step(1))
         theta["scales"] = theta["scales"] + 1
         pulls.append(svs.regularize(theta, 2)["scales"])
     assert torch.allclose(pulls[0], pulls[1] * 20)
@@ -118,7 +118,7 @@ def test_densification_ends_when_the_anchor_is_taken():
 def test_a_changed_number_of_gaussians_under_an_anchor_is_an_error():
     svs = SVS(anchor_start=5, anchor_strength=0.01)
     svs.on_fit_start(3, 0)
-    svs.after_step(params(), 5)
+    svs.after_step(params(), toy.step(5))
     with pytest.raises(AnchorError, match="t=5 for 20 Gaussians, now there are 21"):
         svs.regularize(params(21), 6)
     with pytest.raises(AnchorError, match="Stop densification at t_a"):

@@ -260,7 +260,7 @@ def test_rows_and_bands_that_are_left_out_would_not_have_moved(passes, degree, a
         both = conductors(GCO, SVS, anchored=c.fields[0] if anchored else None)
         if anchored:  # at θ^a itself nothing pulls
             for conductor in both:
-                conductor.after_step(c.fields[1].raw(), conductor.strategies[1].anchor_start)
+                conductor.after_step(c.fields[1].raw(), toy.step(conductor.strategies[1].anchor_start))
         adams = three_steps(passes, c, both, rates, skips=skips)
         states.append([*c.fields[1].raw().values(), *adams[1].first.values(), *adams[1].second.values()])
         ledgers.append(both[1].work_log.entries)
@@ -349,8 +349,8 @@ class Tuned(GCO):
 
 @dataclass(frozen=True)
 class Bolder(GCO):
-    def correct(self, lr, hr, evidence):
-        return super().correct(lr, hr, evidence) * 2.0
+    def correct(self, lr, hr, step=None):
+        return super().correct(lr, hr, step) * 2.0
 
 
 @dataclass(frozen=True)
@@ -360,7 +360,7 @@ class OtherEps(GCO):
 
 
 class Doubling:
-    def correct(self, lr, hr, evidence):
+    def correct(self, lr, hr, step=None):
         return hr * 2.0
 
 
@@ -373,8 +373,8 @@ class Mixed(Doubling, GCO):
 class Known(GCO):
     """States anew that its correction is that of the rule."""
 
-    def correct(self, lr, hr, evidence):
-        return super().correct(lr, hr, evidence)
+    def correct(self, lr, hr, step=None):
+        return super().correct(lr, hr, step)
 
     def correction_rule(self):
         return super().correction_rule()

@@ -183,7 +183,7 @@ def test_an_anchor_follows_a_reordering_of_its_gaussians():
     conductor = Conductor(svs)
     conductor.on_fit_start(3, 0)
     field, _, _ = tagged()
-    conductor.after_step(field.raw(), 1)
+    conductor.after_step(field.raw(), toy.step(1))
     order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
     field.take(order, torch.zeros(12, dtype=torch.bool))
     conductor.on_resize(order)

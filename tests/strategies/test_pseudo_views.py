@@ -1,0 +1,102 @@
+"""PseudoViews: which pictures it shows the field, when, and where it shows none."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import pytest
+import torch
+
+from clear_strategies import PseudoViews
+from clear_strategies.data.points import CloudSettings
+from clear_strategies.data.prepare import ViewSettings, prepare
+from clear_strategies.data.priors import Bicubic
+from clear_strategies.data.readers import demo
+from clear_strategies.errors import SettingError
+from clear_strategies.strategies.testing import check_strategy
+from tests.helpers.short_run import SCENE, with_depth
+
+FEW = PseudoViews(count=8, reach=0.1)
+
+
+def prepared(views, settings=FEW, seed=5):
+    made = replace(settings)
+    made.on_fit_start(len(views), seed)
+    made.on_views(views)
+    return made
+
+
+def test_it_keeps_the_contract():
+    check_strategy(PseudoViews)
+
+
+def test_one_comes_every_nth_iteration_and_the_choice_is_a_function_of_seed_and_iteration():
+    views = with_depth(SCENE).train
+    made = prepared(views)
+    assert [len(made.extra_views(t)) for t in range(1, 7)] == [0, 1, 0, 1, 0, 1]
+    chosen = [made.extra_views(t)[0] for t in range(2, 400, 2)]
+    assert len({id(view) for view in chosen}) == 8  # each has its turn
+    assert chosen == [made.extra_views(t)[0] for t in range(2, 400, 2)]
+    again = [prepared(views).extra_views(t)[0].photo.image for t in (2, 4)]
+    assert all(torch.equal(a, b.photo.image) for a, b in zip(again, chosen, strict=False))
+    other = prepared(views, seed=6)
+    assert any(not torch.equal(other.extra_views(t)[0].photo.image, made.extra_views(t)[0].photo.image) for t in (2, 4))
+
+
+def test_the_weight_is_that_of_the_settings_where_photos_tell_the_colour_and_0_elsewhere():
+    extra = prepared(with_depth(SCENE).train, replace(FEW, weight=0.5)).extra_views(2)[0]
+    assert set(extra.weight.unique().tolist()) <= {0.0, 0.5}
+    assert not extra.photo.image[extra.weight == 0].any()
+
+
+def test_views_without_depth_get_it_from_stereo():
+    capture = demo.read(width=128, height=96, views=6, train=3)
+    scene = prepare(
+        capture, ViewSettings(train=3, photos_are="hr"), Bicubic(), CloudSettings(init="random", random_points=10)
+    )
+    assert all(view.depth is None for view in scene.train)
+    made = prepared(scene.train)
+    assert "8 beside the training cameras" in (made.summary() or "")
+
+
+def test_after_the_run_none_is_kept():
+    made = prepared(with_depth(SCENE).train)
+    made.on_fit_end()
+    assert made.summary() is None
+    assert not made.extra_views(2)
+
+
+def test_a_loop_that_gives_no_views_is_warned(caplog):
+    made = prepared(())
+    assert "PseudoViews has no effect: at least two training views are needed, this training loop" in caplog.text
+    assert not made.extra_views(2)
+
+
+def test_an_object_cut_out_of_its_surroundings_needs_none(caplog):
+    white = tuple(
+        replace(
+            view,
+            lr=replace(view.lr, image=torch.where(torch.arange(24)[None, :, None] < 12, view.lr.image, 1.0)),
+            background=(1.0, 1.0, 1.0),
+        )
+        for view in SCENE.train
+    )
+    views = with_depth(replace(SCENE, train=white)).train
+    with caplog.at_level(logging.INFO):
+        assert prepared(views).summary() is None
+    assert "plain background" in caplog.text
+    assert prepared([replace(view, background=(0.5, 0.5, 0.5)) for view in views]).summary() is not None
+
+
+def test_without_an_lr_loss_it_has_no_effect():
+    assert "lambda_lr is 0" in (FEW.without_effect(lambda_lr=0.0, lambda_hr=1.0) or "")
+    assert FEW.without_effect(lambda_lr=1.0, lambda_hr=0.0) is None
+
+
+@pytest.mark.parametrize(
+    "bad", [{"every": 0}, {"count": 0}, {"reach": 0.0}, {"weight": 0.0}, {"tolerance": -1.0}, {"max_pixels": 0}]
+)
+def test_a_setting_outside_its_range_is_refused(bad):
+    with pytest.raises(SettingError, match=next(iter(bad))):
+        PseudoViews(**bad)

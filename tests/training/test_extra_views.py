@@ -1,0 +1,124 @@
+"""Extra views: each gets a step of the optimizer on the LR loss, weighted by pixel, besides that of the iteration's view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from clear_strategies import SVS, ExtraView, Photo, Strategy
+from clear_strategies.core import deferred
+from clear_strategies.errors import DivergedError
+from clear_strategies.training.extra_steps import LOSS, extra_steps
+from clear_strategies.training.loop import iterate
+from clear_strategies.training.state import TrainState
+from tests.helpers import toy
+from tests.helpers.short_run import ITERATIONS, start
+
+
+@dataclass(frozen=True)
+class Dark(Strategy):
+    """Shows the field a black picture at every `every`-th iteration."""
+
+    every: int = 2
+
+    def extra_views(self, t):
+        return () if t % self.every else (black(),)
+
+
+def black(weight: float = 1.0) -> ExtraView:
+    photo = toy.scene(16, seed=2, train=3, test=1).train[0].lr
+    return ExtraView(Photo(photo.camera, torch.zeros_like(photo.image)), torch.full(photo.image.shape[:2], weight))
+
+
+def parameters(state: TrainState) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in state.field.raw().items()}
+
+
+def test_they_come_when_a_strategy_says_so_and_their_loss_is_in_the_history():
+    state = start((), more=[Dark()])
+    for _ in range(ITERATIONS):
+        iterate(state, toy.RASTERIZER)
+    rows = state.history_as_floats()
+    assert [int(row["t"]) for row in rows if LOSS in row] == list(range(2, ITERATIONS + 1, 2))
+    assert all(row[LOSS] > 0 for row in rows if LOSS in row)
+    assert state.conductor.work_log.entries["extra views"].runs == ITERATIONS // 2
+
+
+def test_several_strategies_may_answer_and_each_view_has_its_own_step():
+    state = start((), more=[Dark(), Dark(every=3)])
+    state.t = 6
+    assert len(state.conductor.extra_views(6)) == 2
+    extra_steps(state, toy.RASTERIZER, state.conductor.extra_views(6))
+    assert state.conductor.work_log.entries["extra views"].runs == 2
+
+
+@pytest.mark.parametrize("fused", ["auto", "off"])
+def test_only_weighted_pixels_teach_and_the_learning_rates_follow_the_iteration(fused):
+    state = start((), fused=fused)
+    before, steps = parameters(state), state.optimizer.steps
+    row = extra_steps(state, toy.RASTERIZER, [black(weight=0.0)])
+    assert deferred.resolve([row])[0][LOSS] == 0
+    assert all(torch.equal(value, before[name]) for name, value in state.field.raw().items())
+    extra_steps(state, toy.RASTERIZER, [black()])
+    moved = {name for name, value in state.field.raw().items() if not torch.equal(value, before[name])}
+    assert {"means", "scales", "opacities", "sh0"} <= moved
+    assert "detail" not in moved
+    assert state.optimizer.steps == steps
+
+
+def test_the_weight_scales_the_gradient():
+    state = start((), fused="off")
+    extra, shot = black(), state.field.shot(toy.RASTERIZER, black().photo.camera)
+    whole = state.conductor.extra_loss(shot.image, extra, 1).cotangents
+    third = state.conductor.extra_loss(shot.image, black(weight=0.25), 1).cotangents
+    assert torch.equal(third, 0.25 * whole)
+
+
+def test_the_readable_and_the_compiled_step_agree():
+    ends = []
+    for fused in ("auto", "off"):
+        state = start((), fused=fused)
+        for _ in range(4):
+            state.optimizer.steps += 1  # an iteration's own step has come before
+            extra_steps(state, toy.RASTERIZER, [black()])
+        ends.append(parameters(state))
+    for name in ("means", "scales", "opacities", "sh0"):  # quats of round Gaussians have gradients of rounding noise
+        assert torch.allclose(ends[0][name], ends[1][name], rtol=1e-3, atol=1e-5), name
+
+
+@pytest.mark.parametrize("fused", ["auto", "off"])
+def test_the_anchor_does_not_pull_a_second_time(fused):
+    state = start((), more=[SVS(anchor_strength=0.1, anchor_weights={"scales": 1.0}, anchor_start=1)], fused=fused)
+    svs = state.conductor.strategies[0]
+    svs.state["scales"] = state.field.scales.data + 1.0
+    before = parameters(state)
+    extra_steps(state, toy.RASTERIZER, [black(weight=0.0)])
+    assert all(torch.equal(value, before[name]) for name, value in state.field.raw().items())
+
+
+def test_a_dark_view_darkens_the_field():
+    state = start(())
+    losses = []
+    for _ in range(30):
+        state.optimizer.steps += 1
+        losses.append(extra_steps(state, toy.RASTERIZER, [black()]))
+    read = deferred.resolve(losses)
+    assert read[-1][LOSS] < 0.8 * read[0][LOSS]
+
+
+def test_without_an_lr_loss_no_strategy_is_asked():
+    state = start((), more=[Dark()])
+    object.__setattr__(state.conductor.objective, "lambda_lr", 0.0)
+    assert state.conductor.extra_views(2) == []
+
+
+@pytest.mark.parametrize("fused", ["auto", "off"])
+def test_a_number_that_is_not_finite_is_found_before_the_step(fused):
+    state, extra = start((), fused=fused), black()
+    extra.photo.image[3, 4] = torch.nan
+    before = parameters(state)
+    with pytest.raises(DivergedError, match="t=1, an extra view"):
+        extra_steps(state, toy.RASTERIZER, [extra])
+    assert all(torch.equal(value, before[name]) for name, value in state.field.raw().items())
