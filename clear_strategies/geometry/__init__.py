@@ -1,1 +1,11 @@
-"""Geometry from posed photos: depth by dense stereo, a cloud of points, pseudo views."""
+"""Geometry from posed photos: `stereo` gives depth maps and a coloured cloud, `depth_maps` the maps alone.
+
+Needs torch, numpy and Pillow only. With OpenCV, kornia and SciPy (extra [train]) features bound the range of depth, outliers
+are removed and gaps are filled; the log says what is left out without them.
+"""
+
+from clear_strategies.geometry.dense_stereo.maps import depth_maps
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.reconstruction import Stereo, stereo
+
+__all__ = ["Stereo", "StereoSettings", "depth_maps", "stereo"]

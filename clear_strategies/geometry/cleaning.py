@@ -13,9 +13,34 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from clear_strategies.core.points import PointCloud
+
 _log = logging.getLogger(__name__)
 
+OUTLIER_NEIGHBOURS: Final = 16
+OUTLIER_RATIO: Final = 3.0
+"""The defaults of `without_outliers`' settings."""
+
 _LARGEST_CELL: Final = np.iinfo(np.int32).max  # Open3D counts voxels along an axis in an int
+
+
+def without_outliers(cloud: PointCloud, neighbours: int, ratio: float) -> PointCloud:
+    """The cloud without the points that `remove_outliers` removes; all of it where `neighbours` is 0 or too few points are there.
+
+    Args:
+        neighbours: 0, or at least 2.
+    """
+    if neighbours == 0:
+        return cloud
+    if len(cloud) <= neighbours:
+        _log.debug("outliers are kept: %d points are too few to tell them.", len(cloud))
+        return cloud
+    kept = remove_outliers(cloud.means, neighbours, ratio)
+    if len(kept) == 0:
+        _log.warning("outliers are kept: the points coincide, so all of them would be removed.")
+        return cloud
+    _log.debug("%d of %d points removed as outliers.", len(cloud) - len(kept), len(cloud))
+    return cloud[kept]
 
 
 def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) -> Int[Tensor, " K"]:

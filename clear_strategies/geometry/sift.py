@@ -1,4 +1,4 @@
-"""Triangulation of SIFT matches between the training LR images, under their known poses. No test view or HR pixel is used.
+"""Triangulation of SIFT matches between photos, under their known poses.
 
 SIFT finds features, and each pair of views matches them in both directions. A match is rejected if it violates the
 epipolar geometry of the known poses, or if its triangulated point lies behind a camera, reprojects too far away, or has
@@ -22,6 +22,7 @@ from torch import Tensor
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo
+from clear_strategies.geometry.libraries import REMEDY, missing
 from clear_strategies.geometry.projection import project, projection_matrix, sample_colors
 from rasterizers.interface import Camera
 
@@ -81,6 +82,14 @@ class Pairs:
     angles: Float[Tensor, " P"]
 
 
+def features_of(photos: Sequence[Photo]) -> PointCloud:
+    """The points of `triangulate`; none without OpenCV, kornia or SciPy, and the log and the cloud's `source` say so."""
+    if lacking := missing("cv2", "kornia", "scipy"):
+        _log.warning("no features are triangulated: %s is missing. %s", lacking, REMEDY)
+        return PointCloud(torch.zeros(0, 3), torch.zeros(0, 3), f"no triangulated features without {lacking}")
+    return triangulate(photos)
+
+
 def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None = None) -> PointCloud:
     """The points that at least two photos have in common; an empty cloud if nothing matches."""
     settings = settings or TriangulationSettings()
@@ -100,7 +109,7 @@ def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None 
     sampled = [sample_colors(photo.image, f.pixels) for photo, f in zip(photos, features, strict=True)]
     colors = torch.cat(sampled)[pairs.features[chosen]].mean(dim=1) if len(chosen) else torch.zeros(0, 3)
     _log.debug("%d features, %d pairs of them, %d points.", len(view), len(pairs.means), len(chosen))
-    source = f"{len(chosen):,} points triangulated from the {len(photos)} training LR images"
+    source = f"{len(chosen):,} points triangulated from the {len(photos)} photos"
     return PointCloud(pairs.means[chosen].float(), colors, source)
 
 

@@ -34,7 +34,7 @@ def test_a_plane_is_found_where_it_is(count: int) -> None:
     assert (cloud.means[:, 2] - 4).abs().median() < 0.02
     assert (cloud.means[:, 2] - 4).abs().quantile(0.95) < 0.15
     assert cloud.uses_test_views == "no"
-    assert f"the {count} training LR images" in cloud.source
+    assert f"the {count} photos" in cloud.source
     # The colour is the texture's at that place.
     pixels, _ = project(photos[0].camera, cloud.means)
     inside = (pixels[:, 0] < 120) & (pixels[:, 0] > 0)

@@ -20,9 +20,9 @@ from clear_strategies.data.capture import SfmPoints
 from clear_strategies.data.points.files import from_ply, from_sfm, from_tracks
 from clear_strategies.data.points.random import random_cloud
 from clear_strategies.errors import DataError
-from clear_strategies.geometry.cleaning import remove_outliers, voxel_grid
-from clear_strategies.geometry.dense_stereo.cloud import points_of, shows
-from clear_strategies.geometry.dense_stereo.filling import fill
+from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, voxel_grid, without_outliers
+from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
+from clear_strategies.geometry.dense_stereo.filling import STRIDE
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.interpolation import densify, pixel_grid
@@ -77,11 +77,11 @@ class CloudSettings:
     min_views: int = 2
     enough: int = 50
     densify: bool | Literal["auto"] = "auto"
-    stride: int = 2
+    stride: int = STRIDE
     random_points: int = 10_000
     box: float | None = None
-    outlier_neighbours: int = 16
-    outlier_ratio: float = 3.0
+    outlier_neighbours: int = OUTLIER_NEIGHBOURS
+    outlier_ratio: float = OUTLIER_RATIO
     voxel: float | None = None
     max_points: int = 200_000
     triangulation: TriangulationSettings = field(default_factory=TriangulationSettings)
@@ -208,7 +208,17 @@ def _from_photos(
     features = triangulate(photos, settings.triangulation) if known is None else known
     if settings.init != "triangulated":
         maps = depth_maps(photos, features.means, settings.stereo, background)
-        cloud = stereo_cloud(features, photos, maps, settings, background)
+        cloud = stereo_cloud(
+            features,
+            photos,
+            maps,
+            settings.stereo,
+            background=background,
+            fill=settings.densify is not False,
+            stride=settings.stride,
+            outlier_neighbours=settings.outlier_neighbours,
+            outlier_ratio=settings.outlier_ratio,
+        )
         if cloud is not None:
             if auto:
                 _log.debug("init: auto chose %s.", cloud.source)
@@ -229,59 +239,14 @@ def _from_photos(
     return _cleaned(settings, features, photos, background), ()
 
 
-def stereo_cloud(
-    features: PointCloud,
-    photos: Sequence[Photo],
-    maps: Sequence[DepthMap],
-    settings: CloudSettings,
-    background: tuple[float, float, float] | None,
-) -> PointCloud | None:
-    """The points of the depth maps, triangulated ones where no map knows depth, and what fills the rest; None: no depth."""
-    if not any(found.coverage > 0 for found in maps):
-        return None
-    stereo = settings.stereo
-    means, colors = points_of(photos, maps, stereo.spacing, stereo.tolerance)
-    known = torch.zeros(len(features), dtype=torch.bool)
-    for photo, found in zip(photos, maps, strict=True):
-        known |= shows(photo, found, features.means)
-    means = torch.cat((means, features.means[~known]))
-    colors = torch.cat((colors, features.colors[~known]))
-    shares = ", ".join(f"{found.coverage:.0%}" for found in maps)
-    silent = sum(found.coverage == 0 for found in maps)
-    source = (
-        f"{len(means):,} points of dense stereo between the {len(photos)} training LR images (depth known at {shares})"
-    )
-    if silent:
-        source += f", {silent} of them interpolated alone"
-    cloud = _without_outliers(settings, PointCloud(means, colors, source))
-    if settings.densify is False:
-        return cloud
-    added, shades = fill(cloud.means, photos, maps, settings.stride, background)
-    source = f"{source}, filled by {len(added):,} at interpolated inverse depth"
-    return PointCloud(torch.cat((cloud.means, added)), torch.cat((cloud.colors, shades)), source)
-
-
 def _cleaned(
     settings: CloudSettings,
     cloud: PointCloud,
     photos: Sequence[Photo],
     background: tuple[float, float, float] | None,
 ) -> PointCloud:
-    return _densified(settings, _without_outliers(settings, cloud), photos, background)
-
-
-def _without_outliers(settings: CloudSettings, cloud: PointCloud) -> PointCloud:
-    if settings.outlier_neighbours == 0:
-        return cloud
-    if len(cloud) <= settings.outlier_neighbours:
-        _log.debug("outliers are kept: %d points are too few to tell them.", len(cloud))
-        return cloud
-    kept = remove_outliers(cloud.means, settings.outlier_neighbours, settings.outlier_ratio)
-    if len(kept) == 0:
-        _log.warning("outliers are kept: the points coincide, so all of them would be removed.")
-        return cloud
-    _log.debug("%d of %d points removed as outliers.", len(cloud) - len(kept), len(cloud))
-    return cloud[kept]
+    cloud = without_outliers(cloud, settings.outlier_neighbours, settings.outlier_ratio)
+    return _densified(settings, cloud, photos, background)
 
 
 def _densified(

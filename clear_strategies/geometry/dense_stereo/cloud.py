@@ -2,14 +2,68 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import DepthMap, Photo
+from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, without_outliers
+from clear_strategies.geometry.dense_stereo import filling
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.libraries import REMEDY, missing
 from clear_strategies.geometry.projection import back_project, inside_of, project
+
+_log = logging.getLogger(__name__)
+
+
+def stereo_cloud(
+    features: PointCloud,
+    photos: Sequence[Photo],
+    maps: Sequence[DepthMap],
+    settings: StereoSettings,
+    *,
+    background: tuple[float, float, float] | None = None,
+    fill: bool = True,
+    stride: int = filling.STRIDE,
+    outlier_neighbours: int = OUTLIER_NEIGHBOURS,
+    outlier_ratio: float = OUTLIER_RATIO,
+) -> PointCloud | None:
+    """The points of the depth maps, features where no map knows depth, and what fills the rest; None: no depth.
+
+    Without SciPy no outlier is removed and nothing is filled; the log and the cloud's `source` say so.
+
+    Args:
+        features: points of the surfaces, e.g. triangulated ones; there may be none.
+        background: the colour of pixels without a surface.
+        fill: add a grid of `stride` px at interpolated inverse depth where a photo's depth is unknown.
+        outlier_neighbours, outlier_ratio: see `without_outliers`.
+    """
+    if not any(found.coverage > 0 for found in maps):
+        return None
+    means, colors = points_of(photos, maps, settings.spacing, settings.tolerance)
+    known = torch.zeros(len(features), dtype=torch.bool)
+    for photo, found in zip(photos, maps, strict=True):
+        known |= shows(photo, found, features.means)
+    means = torch.cat((means, features.means[~known]))
+    colors = torch.cat((colors, features.colors[~known]))
+    shares = ", ".join(f"{found.coverage:.0%}" for found in maps)
+    silent = sum(found.coverage == 0 for found in maps)
+    source = f"{len(means):,} points of dense stereo between the {len(photos)} photos (depth known at {shares})"
+    if (fill or outlier_neighbours) and (lacking := missing("scipy")):
+        _log.warning("no outlier is removed and nothing is filled: %s is missing. %s", lacking, REMEDY)
+        return PointCloud(means, colors, f"{source}, neither cleaned nor filled without {lacking}")
+    if silent and fill:
+        source += f", {silent} of them interpolated alone"
+    cloud = without_outliers(PointCloud(means, colors, source), outlier_neighbours, outlier_ratio)
+    if not fill:
+        return cloud
+    added, shades = filling.fill(cloud.means, photos, maps, stride, background)
+    source = f"{source}, filled by {len(added):,} at interpolated inverse depth"
+    return PointCloud(torch.cat((cloud.means, added)), torch.cat((cloud.colors, shades)), source)
 
 
 def points_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,7 +13,10 @@ from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.interpolation import interpolate_depth, pixel_grid
 from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
 
-_NEARER = 0.95  # a filled point in front of this share of another photo's depth floats in free space
+STRIDE: Final = 2
+"""LR px between the points of the grid, by default."""
+
+_NEARER: Final = 0.95  # a filled point in front of this share of another photo's depth floats in free space
 
 
 def fill(

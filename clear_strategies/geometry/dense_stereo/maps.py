@@ -18,6 +18,7 @@ from clear_strategies.geometry.dense_stereo.image import Grey, grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons
 from clear_strategies.geometry.projection import inside_of, project
+from clear_strategies.geometry.sift import features_of
 
 _log = logging.getLogger(__name__)
 
@@ -30,18 +31,25 @@ _CLOSE = 0.1  # relative error up to which depth agrees with a triangulated poin
 
 def depth_maps(
     photos: Sequence[Photo],
-    points: Float[Tensor, "N 3"],
+    points: Float[Tensor, "N 3"] | None = None,
     settings: StereoSettings | None = None,
     background: tuple[float, float, float] | None = None,
 ) -> list[DepthMap]:
     """The depth of each photo where others confirm it; unknown everywhere for photos whose stereo cannot be trusted.
 
     Args:
-        photos: posed, of any sizes.
-        points: triangulated points, which give the range of depth and judge the result; there may be none.
-        background: the colour of pixels without a surface.
+        photos: posed, of any sizes, on one device.
+        points: of the surfaces, world units, on the CPU: they give the range of depth and judge the result. There may be
+            none; then the cameras give the range. None: features are triangulated where OpenCV, kornia and SciPy are
+            installed.
+        background: the colour of pixels without a surface, RGB in [0, 1].
+
+    Returns:
+        A map for each photo, of its size and on its device.
     """
     settings = settings or StereoSettings()
+    if points is None:
+        points = features_of(photos).means
     compared = comparisons(photos, points)
     estimates = _estimates(photos, compared, settings)
     needed = settings.agreeing or (2 if len(photos) >= _MANY_PHOTOS else 1)

@@ -66,7 +66,7 @@ def test_auto_takes_stereo_keeps_its_depth_and_says_how_much_is_known(caplog: py
     caplog.set_level("DEBUG")
     found = initial_points(CloudSettings(stereo=StereoSettings(max_planes=64)), plane_photos(3, 64, 48))
     assert len(found.depths) == 3
-    assert "dense stereo between the 3 training LR images (depth known at" in found.cloud.source
+    assert "dense stereo between the 3 photos (depth known at" in found.cloud.source
     assert "init: auto chose" in caplog.text
     assert ((found.cloud.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.95
 

@@ -1,0 +1,154 @@
+"""Depth maps and a coloured cloud from photos and cameras as torch tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NoReturn
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.checks import as_color
+from clear_strategies.core.points import PointCloud
+from clear_strategies.core.view import DepthMap, Photo
+from clear_strategies.errors import DataError
+from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
+from clear_strategies.geometry.dense_stereo.maps import depth_maps
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.sift import features_of
+from rasterizers.interface import Camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stereo:
+    """What `stereo` returns, on the device of the photos.
+
+    Args:
+        depths: one for each photo: `depth` [h, w], z in world units at each pixel's centre, nan where unknown, and
+            `confidence` [h, w] in [0, 1], 0 where unknown.
+        means: positions of the points, world units.
+        colors: of the points, RGB in [0, 1].
+        summary: one line: the number of points, the share of each photo whose depth is known, and what was left out
+            because a library is missing.
+    """
+
+    depths: tuple[DepthMap, ...]
+    means: Float[Tensor, "N 3"]
+    colors: Float[Tensor, "N 3"]
+    summary: str
+
+
+def stereo(
+    images: Sequence[Tensor] | Tensor,
+    world_to_camera: Tensor,
+    Ks: Tensor,
+    *,
+    background: Sequence[float] | None = None,
+    settings: StereoSettings | None = None,
+    fill: bool = True,
+    features: tuple[Tensor, Tensor] | None = None,
+) -> Stereo:
+    """Dense stereo between photos with known poses: the same depth and the same cloud as data.cloud.init=stereo of the trainer.
+
+    It is deterministic, and its bits do not depend on the number of threads. The trainer reduces clouds of more than
+    200,000 points; here all of them are returned.
+
+    Args:
+        images: V >= 2 photos, each [h, w, 3] and of any size, or one tensor [V, h, w, 3]; uint8, or floating point in
+            [0, 1].
+        world_to_camera: [V, 4, 4], rigid, OpenCV axes (x right, y down, z forward).
+        Ks: [V, 3, 3], focal lengths and principal points in pixels of each photo, without skew; pixel (0, 0) spans
+            [0, 1)².
+        background: the colour of pixels without a surface, RGB in [0, 1], e.g. Blender's white; None: every pixel shows
+            a surface.
+        settings: of the comparison; None: `StereoSettings()`.
+        fill: add points at interpolated inverse depth where a photo's depth is unknown. Needs SciPy.
+        features: (means [N, 3] in world units, colors [N, 3] in [0, 1]) of points that are known already, e.g. COLMAP's.
+            They give the range of depth, judge the maps, and are part of the cloud where no map knows depth. None:
+            features of the photos are triangulated, which needs OpenCV, kornia and SciPy; without them, the cameras give
+            the range.
+
+    Raises:
+        DataError: a shape, range or camera is wrong, there are fewer than two photos, or stereo confirms no depth.
+        SettingError: `background` is no colour.
+    """
+    color = None if background is None else as_color("background", list(background))
+    settings = settings or StereoSettings()
+    photos = _photos(images, world_to_camera, Ks)
+    known = features_of(photos) if features is None else _features(*features)
+    maps = depth_maps(photos, known.means, settings, color)
+    cloud = stereo_cloud(known, photos, maps, settings, background=color, fill=fill)
+    if cloud is None:
+        remedy = (
+            "check the poses (world-to-camera, OpenCV axes) and Ks (in pixels of these photos), or give photos that see the "
+            "same surfaces from 1 to 45 degrees apart"
+        )
+        _refuse("images", f"stereo confirms no depth in any of the {len(photos)} photos", remedy)
+    summary = cloud.source if features is not None or len(known) else f"{cloud.source}; {known.source}"
+    device = photos[0].image.device
+    return Stereo(
+        tuple(maps), cloud.means.to(device), cloud.colors.to(device), f"{len(cloud):,} points in all: {summary}"
+    )
+
+
+def _photos(images: Sequence[Tensor] | Tensor, world_to_camera: Tensor, Ks: Tensor) -> list[Photo]:
+    count = len(images)
+    if count < 2:
+        _refuse("images", f"must be at least 2 photos, got {count}", "depth needs a second photo of the same surfaces")
+    for name, tensor, shape in (("world_to_camera", world_to_camera, (count, 4, 4)), ("Ks", Ks, (count, 3, 3))):
+        if tuple(tensor.shape) != shape:
+            _refuse(
+                name, f"must have shape {shape} for {count} photos, got {tuple(tensor.shape)}", "stack one per photo"
+            )
+    device = images[0].device
+    poses, intrinsics = world_to_camera.detach().cpu(), Ks.detach().cpu().double()
+    return [
+        Photo(_camera(i, poses[i], intrinsics[i], image), image.to(device))
+        for i, image in enumerate(_image(i, image) for i, image in enumerate(images))
+    ]
+
+
+def _image(i: int, image: Tensor) -> Float[Tensor, "h w 3"]:
+    name = f"images[{i}]"
+    if image.ndim != 3 or image.shape[-1] != 3 or image.numel() == 0:
+        _refuse(
+            name, f"must have shape [h, w, 3], got {tuple(image.shape)}", "put the RGB channels last, without alpha"
+        )
+    if image.dtype == torch.uint8:
+        return image.detach().float() / 255
+    if not image.is_floating_point():
+        _refuse(name, f"must be uint8 or floating point, got {image.dtype}", "give uint8 in 0…255, or float in [0, 1]")
+    low, high = (float(x) for x in image.detach().aminmax())
+    if not 0 <= low <= high <= 1:  # nan too
+        _refuse(name, f"must lie in [0, 1], spans [{low:g}, {high:g}]", "divide 8-bit values by 255, or clamp")
+    return image.detach().float()
+
+
+def _camera(i: int, pose: Tensor, K: Tensor, image: Tensor) -> Camera:
+    (fx, skew, cx), (below, fy, cy), last = K.tolist()
+    if skew != 0 or below != 0 or last != [0, 0, 1]:
+        _refuse(f"Ks[{i}]", f"must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}", "rectify the photo")
+    try:
+        return Camera(pose, fx, fy, cx, cy, image.shape[1], image.shape[0])
+    except ValueError as error:
+        raise DataError(
+            "stereo", f"camera {i}", str(error), "give rigid world-to-camera transforms, and Ks in pixels"
+        ) from error
+
+
+def _features(means: Tensor, colors: Tensor) -> PointCloud:
+    means, colors = (x.detach().cpu().float() for x in (means, colors))
+    if means.ndim != 2 or means.shape[1] != 3 or means.shape != colors.shape:
+        found = f"{tuple(means.shape)} and {tuple(colors.shape)}"
+        _refuse("features", f"must be positions [N, 3] and colours [N, 3], got {found}", "give a pair (means, colors)")
+    if not bool(means.isfinite().all()):
+        _refuse("features", "must have finite positions", "remove the others")
+    if not bool(((colors >= 0) & (colors <= 1)).all()):
+        _refuse("features", "must have colours in [0, 1]", "divide 8-bit values by 255")
+    return PointCloud(means, colors, f"{len(means):,} given points")
+
+
+def _refuse(field: str, problem: str, remedy: str) -> NoReturn:
+    raise DataError("stereo", field, problem, remedy)
