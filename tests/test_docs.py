@@ -189,6 +189,7 @@ def require_parsable(module: str, arguments: list[str], monkeypatch: pytest.Monk
 @pytest.mark.parametrize("block", PYTHON)
 def test_python_blocks_run(block, tmp_path, monkeypatch):
     (tmp_path / "documented.py").write_text(block)
+    monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "documented", raising=False)
     importlib.import_module("documented")

@@ -1,4 +1,4 @@
-"""PLY files: Gaussians in and out in the standard layout of 3DGS, and point clouds in.
+"""PLY files: Gaussians in the standard layout of 3DGS and point clouds, in and out.
 
 The reader is strict: the header has a largest size, and its counts are compared with the file's size before anything is
 allocated.
@@ -128,6 +128,36 @@ def read_gaussians(path: Path) -> GaussianPly:
         scales=_columns(path, table, _SCALE),
         quats=_columns(path, table, _ROTATION),
     )
+
+
+def write_points(path: Path, means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"]) -> None:
+    """Positions, normals of 0, and 8-bit colours: the layout of 3DGS' points3D.ply. Binary little-endian, atomically.
+
+    Args:
+        means: world units.
+        colors: RGB in [0, 1].
+
+    Raises:
+        ValueError: the shapes do not match, a position is not finite, or a colour is out of range.
+    """
+    n = len(means)
+    if tuple(means.shape) != (n, 3) or tuple(colors.shape) != (n, 3):
+        raise ValueError(
+            f"means and colors must have shape [N, 3], got {tuple(means.shape)} and {tuple(colors.shape)}."
+        )
+    if not bool(means.isfinite().all()):
+        raise ValueError("means must be finite: remove the other points.")
+    if not bool(((colors >= 0) & (colors <= 1)).all()):
+        raise ValueError("colors must lie in [0, 1]: divide 8-bit values by 255.")
+    row = [*((name, "<f4") for name in (*_XYZ, *_NORMAL)), *((name, "u1") for name in _RGB)]
+    table = np.zeros(n, row)
+    for k in range(3):
+        table[_XYZ[k]] = means[:, k].detach().cpu().numpy()
+        table[_RGB[k]] = (colors[:, k].detach().cpu() * 255).round().numpy()
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    lines += [f"property float {name}" for name in (*_XYZ, *_NORMAL)]
+    lines += [*(f"property uchar {name}" for name in _RGB), "end_header\n"]
+    write_bytes(path, "\n".join(lines).encode() + table.tobytes())
 
 
 def read_points(path: Path) -> PointCloud:

@@ -13,7 +13,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from clear_strategies.data.ply import GaussianPly, read_gaussians, read_points, write_gaussians
+from clear_strategies.data.ply import GaussianPly, read_gaussians, read_points, write_gaussians, write_points
 from clear_strategies.errors import DataError
 
 _ROUNDTRIP = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -53,6 +53,32 @@ def test_gaussians_are_written_byte_for_byte_in_the_standard_layout(tmp_path: Pa
     channel_major = (10, 13, 16, 11, 14, 17, 12, 15, 18)
     values = (1, 2, 3, 0, 0, 0, 4, 5, 6, *channel_major, 7, -1, -2, -3, 0.5, 0.25, 0.125, 0)
     assert (tmp_path / "g.ply").read_bytes() == text.encode() + struct.pack("<26f", *values)
+
+
+def test_points_are_written_byte_for_byte_as_3dgs_reads_them(tmp_path: Path) -> None:
+    write_points(tmp_path / "p.ply", torch.tensor([[1.0, 2, 3]]), torch.tensor([[0.0, 0.5, 1]]))
+    text = "ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
+    text += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    text += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
+    assert (tmp_path / "p.ply").read_bytes() == text.encode() + struct.pack("<6f3B", 1, 2, 3, 0, 0, 0, 0, 128, 255)
+    read = read_points(tmp_path / "p.ply")
+    assert read.means.tolist() == [[1, 2, 3]]
+    assert (read.colors - torch.tensor([[0.0, 0.5, 1]])).abs().max() <= 0.5 / 255 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("means", "colors", "message"),
+    [
+        (torch.full((1, 3), torch.nan), torch.zeros(1, 3), "finite"),
+        (torch.zeros(1, 3), torch.full((1, 3), 255.0), "divide 8-bit values by 255"),
+    ],
+)
+def test_points_that_no_file_should_hold_are_refused(
+    tmp_path: Path, means: torch.Tensor, colors: torch.Tensor, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        write_points(tmp_path / "p.ply", means, colors)
+    assert not (tmp_path / "p.ply").exists()
 
 
 @_ROUNDTRIP

@@ -13,8 +13,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from clear_strategies.core.points import PointCloud
-
 WIDTH, HEIGHT = 16, 12
 FOCAL = 20.0
 NAMES = ("a.png", "b.png", "c.png")
@@ -122,16 +120,6 @@ def nerfstudio(root: Path) -> Path:
     shared = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 8.0, "cy": 6.0, "w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV"}
     write_json(root / "transforms.json", {**shared, "frames": frames})
     return root
-
-
-def write_points(path: Path, cloud: PointCloud) -> None:
-    """A PLY file with float positions and 8-bit colours."""
-    lines = ["ply", "format ascii 1.0", f"element vertex {len(cloud)}"]
-    lines += [f"property float {axis}" for axis in "xyz"]
-    lines += [f"property uchar {color}" for color in ("red", "green", "blue")]
-    rows = zip(cloud.means.tolist(), (cloud.colors * 255).round().int().tolist(), strict=True)
-    lines += ["end_header", *(" ".join(map(repr, (*xyz, *rgb))) for xyz, rgb in rows)]
-    path.write_text("\n".join(lines) + "\n")
 
 
 def write_json(path: Path, value: object) -> None:

@@ -1,6 +1,7 @@
 """The core without the trainer's libraries, as a host has it: run in an environment where only the wheel is installed.
 
-Imports what a host imports, composes a conductor, and takes three steps of a loop that merges by GCO alone.
+Imports what a host imports, composes a conductor, takes three steps of a loop that merges by GCO alone, and finds the depth
+of a plane by stereo.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import integration.gsplat
 import rasterizers
 from clear_strategies import GCO, Conductor, Grads
 from clear_strategies.compose import conductor
+from clear_strategies.geometry import stereo
 
 TRAINERS = ("cv2", "kornia", "skimage", "matplotlib", "scipy", "open3d", "safetensors", "tqdm")
 
@@ -35,6 +37,7 @@ def main() -> None:
         means -= 0.1 * (lr["means"] + corrected["means"])
     if not bool(means.isfinite().all()):
         raise SystemExit("the loop diverged")
+    require_stereo()
     door = subprocess.run([sys.executable, "-m", "clear_strategies.run"], capture_output=True, text=True, check=False)
     if (
         door.returncode != 2
@@ -42,6 +45,19 @@ def main() -> None:
         or door.stderr.count("\n") != 1
     ):
         raise SystemExit(f"training without [train] says: {door.stdout}{door.stderr}")
+
+
+def require_stereo() -> None:
+    """Two photos of a plane at z = 4, from places 0.4 apart with f = 100 px: one is the other, moved by 10 px."""
+    grey = torch.rand(1, 3, 24, 40, generator=torch.Generator().manual_seed(0))
+    wide = torch.nn.functional.interpolate(grey, size=(48, 80), mode="bicubic")[0].clamp(0, 1).permute(1, 2, 0)
+    poses = torch.eye(4).repeat(2, 1, 1)
+    poses[1, 0, 3] = -0.4
+    K = torch.tensor([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
+    found = stereo([wide[:, :64], wide[:, 10:74]], poses, K.repeat(2, 1, 1))
+    off = (found.means[:, 2] / 4 - 1).abs()
+    if len(found.means) < 500 or float((off < 0.03).float().mean()) < 0.9 or "without scipy" not in found.summary:
+        raise SystemExit(f"stereo without [train] gives {found.summary}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Importing an adapter brings no heavy library into the host."""
+"""Importing an adapter, or the geometry, brings no heavy library into the host."""
 
 from __future__ import annotations
 
@@ -12,8 +12,13 @@ ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("cv2", "gsplat", "hydra", "kornia", "matplotlib", "nerfstudio", "open3d", "scipy", "skimage", "warp")
 
 
-@pytest.mark.parametrize("module", ["integration", "integration.gsplat", "integration.inria", "integration.nerfstudio"])
-def test_importing_an_adapter_is_light(module):
+MODULES = (
+    "integration", "integration.gsplat", "integration.inria", "integration.nerfstudio", "clear_strategies.geometry",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_importing_is_light(module):
     code = f"import sys, {module}; print([name for name in {HEAVY!r} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert result.stdout.strip() == "[]"

@@ -11,13 +11,18 @@ import torch
 
 from clear_strategies.core import images
 from clear_strategies.core.view import Photo
+from clear_strategies.data.ply import write_points
 from clear_strategies.data.points import CloudSettings, initial_points
 from clear_strategies.data.prepare import ViewSettings, split
 from clear_strategies.data.readers import llff
 from clear_strategies.errors import DataError, SettingError
+from clear_strategies.geometry import StereoSettings
 from clear_strategies.geometry.projection import project
-from tests.helpers.captures import write_points
-from tests.helpers.planes import cloud_of, photo, plane_photos, sfm
+from tests.helpers.planes import photo, plane_photos, sfm
+
+
+def colored(means: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    return means, torch.full_like(means, 0.5)
 
 
 def flat_photos() -> list[Photo]:
@@ -31,6 +36,25 @@ def test_auto_triangulates_where_it_can(caplog: pytest.LogCaptureFixture) -> Non
     assert cloud.uses_test_views == "no"
     assert "init: auto chose" in caplog.text
     assert "does not use the scene's own points" in caplog.text
+
+
+def test_auto_takes_stereo_keeps_its_depth_and_says_how_much_is_known(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("DEBUG")
+    found = initial_points(CloudSettings(stereo=StereoSettings(max_planes=64)), plane_photos(3, 64, 48))
+    assert len(found.depths) == 3
+    assert "dense stereo between the 3 photos (depth known at" in found.cloud.source
+    assert "init: auto chose" in caplog.text
+    assert ((found.cloud.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.95
+
+
+def test_other_clouds_have_no_depth() -> None:
+    assert initial_points(CloudSettings(init="triangulated"), plane_photos(2)).depths == ()
+
+
+def test_stereo_does_not_fall_back_when_asked_for() -> None:
+    views = [photo(0.0), photo(0.0)]
+    with pytest.raises(DataError, match="stereo confirms no depth in any of the 2 training LR images"):
+        initial_points(CloudSettings(init="stereo"), views)
 
 
 def test_auto_falls_back_to_random_and_logs_it(caplog: pytest.LogCaptureFixture) -> None:
@@ -54,7 +78,7 @@ def test_the_same_seed_gives_the_same_cloud() -> None:
 
 
 def test_a_given_file_is_read(tmp_path: Path) -> None:
-    write_points(tmp_path / "fused.ply", cloud_of(torch.rand(5, 3)))
+    write_points(tmp_path / "fused.ply", *colored(torch.rand(5, 3)))
     cloud = initial_points(CloudSettings(init="ply", path=str(tmp_path / "fused.ply"), densify=False), [photo()]).cloud
     assert len(cloud) == 5
     assert cloud.source == "5 points of fused.ply"
@@ -62,7 +86,7 @@ def test_a_given_file_is_read(tmp_path: Path) -> None:
 
 
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
-    write_points(tmp_path / "empty.ply", cloud_of(torch.zeros(0, 3)))
+    write_points(tmp_path / "empty.ply", *colored(torch.zeros(0, 3)))
     with pytest.raises(DataError, match="has no points"):
         initial_points(CloudSettings(init="ply", path=str(tmp_path / "empty.ply")), [photo()])
 
@@ -70,7 +94,7 @@ def test_an_empty_file_is_refused(tmp_path: Path) -> None:
 def test_auto_densifies_only_what_is_sparser_than_the_pixel_grid(tmp_path: Path) -> None:
     view, file = photo(), tmp_path / "p.ply"
     for count, grows in ((390, True), (410, False)):  # the grid has 20 · 20 = 400
-        write_points(file, cloud_of(torch.rand(count, 3) + torch.tensor([-0.5, -0.5, 5])))
+        write_points(file, *colored(torch.rand(count, 3) + torch.tensor([-0.5, -0.5, 5])))
         chosen = CloudSettings(init="ply", path=str(file), outlier_neighbours=0)
         assert (len(initial_points(chosen, [view]).cloud) > count) == grows
         assert len(initial_points(replace(chosen, densify=True), [view]).cloud) > count
@@ -79,7 +103,7 @@ def test_auto_densifies_only_what_is_sparser_than_the_pixel_grid(tmp_path: Path)
 
 def test_outliers_are_removed_before_densification_and_voxels_averaged_after(tmp_path: Path) -> None:
     stray = torch.cat((torch.rand(50, 3) * 0.1 + torch.tensor([0, 0, 5.0]), torch.tensor([[0, 0, 500.0]])))
-    write_points(tmp_path / "p.ply", cloud_of(stray))
+    write_points(tmp_path / "p.ply", *colored(stray))
     chosen = CloudSettings(init="ply", path=str(tmp_path / "p.ply"))
     assert initial_points(chosen, [photo()]).cloud.means[:, 2].max() < 6
     assert len(initial_points(replace(chosen, voxel=1000.0), [photo()]).cloud) == 1

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.data.points import CloudSettings, StereoSettings, initial_points
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import SettingError
 from clear_strategies.geometry.dense_stereo.cloud import points_of
 from clear_strategies.geometry.dense_stereo.filling import fill, floats
-from tests.helpers.planes import photo, plane_photos
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from tests.helpers.planes import photo
 
 
 def flat(view: Photo, depth: float) -> DepthMap:
@@ -62,28 +62,9 @@ def test_only_unknown_pixels_are_filled_and_never_in_known_free_space() -> None:
     assert len(seen) < 100
 
 
-def test_auto_takes_stereo_keeps_its_depth_and_says_how_much_is_known(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("DEBUG")
-    found = initial_points(CloudSettings(stereo=StereoSettings(max_planes=64)), plane_photos(3, 64, 48))
-    assert len(found.depths) == 3
-    assert "dense stereo between the 3 photos (depth known at" in found.cloud.source
-    assert "init: auto chose" in caplog.text
-    assert ((found.cloud.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.95
-
-
-def test_other_clouds_have_no_depth() -> None:
-    assert initial_points(CloudSettings(init="triangulated"), plane_photos(2)).depths == ()
-
-
-def test_stereo_does_not_fall_back_when_asked_for() -> None:
-    views = [photo(0.0), photo(0.0)]
-    with pytest.raises(DataError, match="stereo confirms no depth in any of the 2 training LR images"):
-        initial_points(CloudSettings(init="stereo"), views)
-
-
 @pytest.mark.parametrize(
     ("name", "value"), [("window", 4), ("spacing", 0.5), ("trust", 2), ("sources", 0), ("tolerance", 0)]
 )
 def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
-    with pytest.raises(SettingError, match=f"{name}"):
+    with pytest.raises(SettingError, match=f"^{name}: must "):
         StereoSettings(**{name: value})

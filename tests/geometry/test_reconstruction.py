@@ -1,0 +1,162 @@
+"""`stereo`: the trainer's cloud from plain tensors, in the light core too, and refusals that say what to give instead."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+import torch
+
+from clear_strategies.core.projection import intrinsics
+from clear_strategies.core.view import Photo
+from clear_strategies.data.points import CloudSettings, initial_points
+from clear_strategies.data.readers import demo
+from clear_strategies.errors import DataError, SettingError
+from clear_strategies.geometry import Stereo, StereoSettings, depth_maps, stereo
+from tests.helpers.planes import plane_photos
+
+QUICK = StereoSettings(enlarge=1, max_planes=32)
+
+
+def of(photos: Sequence[Photo], **settings: Any) -> Stereo:
+    return stereo(**{**arguments(photos), **settings})
+
+
+def arguments(photos: Sequence[Photo]) -> dict[str, Any]:
+    cameras = [photo.camera for photo in photos]
+    return {
+        "images": [photo.image for photo in photos],
+        "world_to_camera": torch.stack([camera.world_to_camera for camera in cameras]),
+        "Ks": torch.stack([intrinsics(camera) for camera in cameras]),
+        "settings": QUICK,
+    }
+
+
+def same(a: Stereo, b: Stereo) -> bool:
+    maps = [
+        torch.equal(x.depth.nan_to_num(-1), y.depth.nan_to_num(-1)) and torch.equal(x.confidence, y.confidence)
+        for x, y in zip(a.depths, b.depths, strict=True)
+    ]
+    return all(maps) and torch.equal(a.means, b.means) and torch.equal(a.colors, b.colors)
+
+
+@pytest.fixture(scope="module")
+def found() -> Stereo:
+    return of(plane_photos(3, 64, 48))
+
+
+def without(monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
+    for module in modules:
+        monkeypatch.setitem(sys.modules, module, None)
+
+
+@pytest.mark.parametrize("fill", [True, False])
+def test_the_cloud_of_the_demo_is_the_trainers_to_the_bit(fill: bool) -> None:
+    frames = demo.read(width=64, height=48, views=6, train=3).frames[:3]
+    photos = [Photo(frame.camera, frame.load()) for frame in frames]
+    trained = initial_points(CloudSettings(init="stereo", densify=fill), photos)
+    assert same(
+        of(photos, settings=None, fill=fill), Stereo(trained.depths, trained.cloud.means, trained.cloud.colors, "")
+    )
+
+
+def test_means_lie_on_the_plane_and_the_summary_says_how_much_is_known(found: Stereo) -> None:
+    assert ((found.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.95
+    assert found.colors.min() >= 0
+    assert found.colors.max() <= 1
+    shares = ", ".join(f"{depth.coverage:.0%}" for depth in found.depths)
+    assert found.summary.startswith(f"{len(found.means):,} points in all: ")
+    assert f"between the 3 photos (depth known at {shares}), filled by " in found.summary
+    assert "without" not in found.summary
+
+
+def test_one_tensor_is_a_list_of_photos_and_uint8_is_divided_by_255() -> None:
+    photos = plane_photos(2, 64, 48)
+    eight = [(photo.image * 255).round().to(torch.uint8) for photo in photos]
+    listed = of(photos, images=[image.float() / 255 for image in eight])
+    assert same(of(photos, images=torch.stack(eight)), listed)
+    assert same(of(photos, images=eight), listed)
+
+
+def test_given_features_take_the_place_of_triangulated_ones() -> None:
+    beside = torch.tensor([[0.4, 0.99, 4.0]])  # on the plane, below the border of all photos
+    given = of(plane_photos(3, 64, 48), features=(beside, torch.ones(1, 3)), fill=False)
+    assert (given.means == beside).all(dim=1).sum() == 1
+    assert "filled" not in given.summary
+
+
+def test_pixels_of_the_background_get_no_points() -> None:
+    photos = plane_photos(3, 64, 48)
+    for photo in photos:
+        photo.image[:10] = 1.0
+    assert not any(depth.known[:10].any() for depth in of(photos, background=(1, 1, 1)).depths)
+
+
+def test_without_opencv_and_kornia_the_cameras_give_the_range(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    without(monkeypatch, "cv2", "kornia")
+    found = of(plane_photos(3, 64, 48))
+    assert all(depth.coverage > 0.4 for depth in found.depths)
+    assert "no triangulated features without opencv-contrib-python-headless, kornia" in found.summary
+    (line,) = [record.message for record in caplog.records if "features" in record.message]
+    assert line.endswith("pip install 'clear-strategies[train]'")
+
+
+def test_without_scipy_nothing_is_filled_or_removed(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    without(monkeypatch, "scipy")
+    found = of(plane_photos(3, 64, 48))
+    assert len(found.means) > 500
+    assert "neither cleaned nor filled without scipy" in found.summary
+    assert sum("nothing is filled: scipy is missing" in record.message for record in caplog.records) == 1
+
+
+def test_depth_maps_alone_are_those_of_stereo(found: Stereo) -> None:
+    maps = depth_maps(plane_photos(3, 64, 48), settings=QUICK)
+    assert same(found, Stereo(tuple(maps), found.means, found.colors, ""))
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "one photo": ({"images": [torch.rand(48, 64, 3)]}, "images: must be at least 2 photos, got 1"),
+    "poses": (
+        {"world_to_camera": torch.eye(4)},
+        r"world_to_camera: must have shape \(2, 4, 4\) for 2 photos, got \(4, 4\)",
+    ),
+    "Ks": ({"Ks": torch.eye(3).expand(3, 3, 3)}, r"Ks: must have shape \(2, 3, 3\)"),
+    "alpha": ({"images": torch.rand(2, 48, 64, 4)}, r"images\[0\]: must have shape \[h, w, 3\], got \(48, 64, 4\)"),
+    "whole numbers": ({"images": torch.ones(2, 4, 4, 3, dtype=torch.long)}, "must be uint8 or floating point"),
+    "8 bits as floats": ({"images": 255 * torch.ones(2, 4, 4, 3)}, r"must lie in \[0, 1\], spans \[255, 255\]: divide"),
+    "nan": ({"images": torch.full((2, 4, 4, 3), torch.nan)}, r"must lie in \[0, 1\]"),
+    "skew": ({"Ks": torch.ones(2, 3, 3)}, r"Ks\[0\]: must be \[\[fx, 0, cx\]"),
+    "no rotation": (
+        {"world_to_camera": 2 * torch.eye(4).expand(2, 4, 4)},
+        "camera 0: world_to_camera must be a rotation",
+    ),
+    "normalized K": ({"Ks": torch.diag(torch.tensor([0.0, 0, 1])).expand(2, 3, 3)}, "camera 0: focal lengths"),
+    "features": ({"features": (torch.zeros(2, 3), torch.zeros(3, 3))}, "features: must be positions"),
+    "features far away": (
+        {"features": (torch.full((1, 3), torch.inf), torch.zeros(1, 3))},
+        "must have finite positions",
+    ),
+    "colours": ({"features": (torch.zeros(1, 3), torch.full((1, 3), 255.0))}, r"must have colours in \[0, 1\]"),
+    "one place": (
+        {"world_to_camera": torch.eye(4).expand(2, 4, 4)},
+        "images: stereo confirms no depth in any of the 2 photos: check the poses",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_used_is_refused_with_a_remedy(case: str) -> None:
+    changed, message = REFUSED[case]
+    with pytest.raises(DataError, match=message):
+        of(plane_photos(2, 64, 48), **changed)
+
+
+def test_a_background_must_be_a_colour() -> None:
+    with pytest.raises(SettingError, match="background: must be three numbers"):
+        of(plane_photos(2, 64, 48), background=(255, 255, 255))
