@@ -130,7 +130,7 @@ def read_gaussians(path: Path) -> GaussianPly:
     )
 
 
-def write_points(path: Path, means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"]) -> None:
+def write_points(path: Path | str, means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"]) -> None:
     """Positions, normals of 0, and 8-bit colours: the layout of 3DGS' points3D.ply. Binary little-endian, atomically.
 
     Args:
@@ -157,7 +157,7 @@ def write_points(path: Path, means: Float[Tensor, "N 3"], colors: Float[Tensor, 
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
     lines += [f"property float {name}" for name in (*_XYZ, *_NORMAL)]
     lines += [*(f"property uchar {name}" for name in _RGB), "end_header\n"]
-    write_bytes(path, "\n".join(lines).encode() + table.tobytes())
+    write_bytes(Path(path), "\n".join(lines).encode() + table.tobytes())
 
 
 def read_points(path: Path) -> PointCloud:

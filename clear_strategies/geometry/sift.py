@@ -85,7 +85,7 @@ class Pairs:
 def features_of(photos: Sequence[Photo]) -> PointCloud:
     """The points of `triangulate`; none without OpenCV, kornia or SciPy, and the log and the cloud's `source` say so."""
     if lacking := missing("cv2", "kornia", "scipy"):
-        _log.warning("no features are triangulated: %s is missing. %s", lacking, REMEDY)
+        _log.warning("no features are triangulated without %s: %s", lacking, REMEDY)
         return PointCloud(torch.zeros(0, 3), torch.zeros(0, 3), f"no triangulated features without {lacking}")
     return triangulate(photos)
 

@@ -54,7 +54,7 @@ def stereo_cloud(
     silent = sum(found.coverage == 0 for found in maps)
     source = f"{len(means):,} points of dense stereo between the {len(photos)} photos (depth known at {shares})"
     if (fill or outlier_neighbours) and (lacking := missing("scipy")):
-        _log.warning("no outlier is removed and nothing is filled: %s is missing. %s", lacking, REMEDY)
+        _log.warning("no outlier is removed and nothing is filled without %s: %s", lacking, REMEDY)
         return PointCloud(means, colors, f"{source}, neither cleaned nor filled without {lacking}")
     if silent and fill:
         source += f", {silent} of them interpolated alone"
