@@ -29,7 +29,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
-from clear_strategies.settings import build, one_line, with_defaults
+from clear_strategies.settings import CHANGES_NO_RESULT, build, one_line, with_defaults
 from clear_strategies.strategies.base import Strategy
 
 _PACKAGE: Final = Path(__file__).resolve().parent
@@ -208,5 +208,11 @@ class _ReadConf(SearchPathPlugin):
                 element.path = f"{_ConfSource.scheme()}://{CONF}"
 
 
+def _unnamed(*more: str) -> list[str]:
+    """`${settings_without_result:more, …}` in conf/: the keys of overrides that do not name a sweep's folders."""
+    return [*sorted(CHANGES_NO_RESULT), *more]
+
+
+OmegaConf.register_new_resolver("settings_without_result", _unnamed, replace=True)
 Plugins.instance().register(_ConfSource)
 Plugins.instance().register(_ReadConf)

@@ -35,6 +35,16 @@ _KEYWORDS: Final = (TARGET, _PARTIAL, _RECURSIVE, "_convert_")
 LISTED: Final = "listed"
 """False in the metadata of a dataclass field: its default is not written into the node."""
 _MISSING: Final = "???"
+CHANGES_NO_RESULT: Final = frozenset(
+    f"fit.{name}"
+    for name in (
+        "baseline", "checkpoint_every", "keep", "log", "map_views", "memory", "page", "probe_every", "probe_views", "resume",
+        "threads", "verbose", "video", "viewer",
+    )
+)  # fmt: skip
+"""Settings with which the same field is trained, bit for bit: what is kept, shown and written beside it, and how fast. Resuming
+does not compare them, a sweep's folders are not named by them, and a report does not tell runs apart by them.
+"""
 _NUMBERS: Final = BeartypeConf(is_pep484_tower=True)  # an int is accepted where a float is asked for
 _EMPTY: Final = inspect.Parameter.empty
 _ABSENT: Final = object()

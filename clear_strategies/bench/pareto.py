@@ -75,10 +75,9 @@ VARIANTS: Final = (
 _COMMON: Final = (
     "skips=none", "rasterizer.preset=fast", "fit.probe_every=0", "fit.checkpoint_every=0", "fit.map_views=0", "fit.video=0",
 )  # fmt: skip
-_RESERVED: Final = re.compile(
-    r"[+~]*(strategy|skips|rasterizer\.preset|hydra[./].*"
-    r"|fit\.(iterations|seed|threads|resume|probe_every|checkpoint_every|map_views|video))(=|$)"
-)
+_RESERVED: Final = {
+    "strategy", "fit.iterations", "fit.seed", "fit.threads", "fit.resume", *(override.partition("=")[0] for override in _COMMON)
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +193,8 @@ def folder_of(request: Request, variant: Variant, seed: int) -> tuple[Path, list
 
 def _chosen(request: Request) -> list[Variant]:
     for override in request.overrides:
-        if _RESERVED.match(override):
+        key = override.lstrip("+~").partition("=")[0]
+        if key in _RESERVED or key.startswith(("hydra.", "hydra/")):
             raise DataError("pareto", override, "is set by the benchmark", "leave it out")
     known = {variant.name: variant for variant in VARIANTS}
     for name in request.variants:

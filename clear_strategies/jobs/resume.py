@@ -11,6 +11,7 @@ from typing import Any, Final
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.baseline import FOLDER as BASELINE
+from clear_strategies.settings import CHANGES_NO_RESULT
 from clear_strategies.training import checkpoint
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.state import TrainState
@@ -22,24 +23,8 @@ AUTO: Final = "auto"  # the value of fit.resume that is not a path
 
 CHECKPOINTS: Final = "checkpoints"
 
-# What may differ between a run and the one that it resumes.
-_NOT_COMPARED: Final = {
-    "fit.resume",
-    "fit.baseline",
-    "fit.device",
-    "fit.threads",
-    "fit.keep",
-    "fit.checkpoint_every",
-    "fit.probe_every",
-    "fit.probe_views",
-    "fit.map_views",
-    "fit.memory",
-    "fit.video",
-    "fit.page",
-    "fit.viewer",
-    "fit.verbose",
-    "fit.log",
-}
+# What may differ between a run and the one that it resumes. Another device changes bits, which is logged.
+_NOT_COMPARED: Final = CHANGES_NO_RESULT | {"fit.device"}
 
 
 def comparable(values: Mapping[str, Any]) -> dict[str, Any]:

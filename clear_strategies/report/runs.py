@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import baseline, metrics
+from clear_strategies.settings import CHANGES_NO_RESULT
 
 _log = logging.getLogger(__name__)
 
@@ -25,12 +26,8 @@ _SEED: Final = "fit.seed="
 # The overrides that name a run; the others are its settings.
 _METHOD, _STRATEGY = "method=", "strategy="
 _STRATEGIES: Final = "strategies."
-# Overrides that change no result. So do paths: the scene has a name.
-_NEUTRAL: Final = (
-    "hydra", "fit.resume=", "fit.threads=", "fit.keep=", "fit.checkpoint_every=", "fit.probe_", "fit.map_views=", "fit.video=",
-    "fit.viewer=", "scene=",     "data.root=", "fit.baseline=",
-)  # fmt: skip
-_PATH: Final = re.compile(r"data\.[\w.]*path=")
+# Where the data lie: the scene has a name.
+_PATH: Final = re.compile(r"scene|data\.root|data\.[\w.]*path")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,8 +191,10 @@ def _overrides(folder: Path) -> tuple[str, ...]:
 
 
 def _is_setting(override: str) -> bool:
-    key = override.lstrip("+~")
-    return not (key.startswith((*_NEUTRAL, _SEED, _METHOD, _STRATEGY)) or _PATH.match(key))
+    override = override.lstrip("+~")
+    key = override.partition("=")[0]
+    named_elsewhere = override.startswith((_SEED, _METHOD, _STRATEGY)) or _PATH.fullmatch(key)
+    return not (named_elsewhere or key.startswith("hydra") or key in CHANGES_NO_RESULT)
 
 
 def _name(overrides: Sequence[str], strategies: Sequence[str]) -> str:

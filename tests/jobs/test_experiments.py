@@ -23,7 +23,7 @@ from clear_strategies import Conductor
 from clear_strategies.data.prepare import ViewSettings
 from clear_strategies.run import CONF
 from clear_strategies.schedules import scaled
-from clear_strategies.settings import build
+from clear_strategies.settings import CHANGES_NO_RESULT, build
 from clear_strategies.training.loop import fit, iterate
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
@@ -247,6 +247,31 @@ def test_methods_take_the_place_of_an_experiments_strategies():
         c = composed_job(job)
         assert (c.method, list(c.strategies)) == (method, strategies)
         assert c.hydra.sweep.subdir == f"+method={method},data.scene=horns,fit.seed=0"
+
+
+@pytest.mark.parametrize("rows", ["+strategy=clear", "+method=srgs"])
+def test_a_setting_that_changes_no_result_changes_no_folders_name(rows):
+    asked = ("experiment=llff_x4", "data.root=here", "data.scene=horns", "fit.seed=0", rows)
+    (one,), composed_job = jobs(*asked)
+    named = composed_job(one).hydra.sweep.subdir
+    for key in sorted(CHANGES_NO_RESULT):
+        (one,), composed_job = jobs(*asked, f"{key}=1")
+        assert composed_job(one).hydra.sweep.subdir == named, key
+
+
+def test_settings_that_change_no_result_exist():
+    config = composed()
+    assert [key for key in CHANGES_NO_RESULT if OmegaConf.select(config, key, default="nothing") == "nothing"] == []
+
+
+def test_a_finished_sweep_is_not_trained_again_when_more_is_said_and_shown(tmp_path: Path):
+    every = ["experiment=ablation", "~protocol", "fit.seed=0", *TINY, "fit.iterations=3", "+method=srgs"]
+    first = run(*every, "fit.map_views=0", cwd=tmp_path)
+    assert first.returncode == 0, first.stderr
+    again = run(*every, "-v", "fit.video=2", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert "nothing is trained" in again.stdout + again.stderr
+    assert len(list(tmp_path.glob("multirun/ablation/*/metrics.json"))) == 1
 
 
 def test_an_ablation_of_other_data():

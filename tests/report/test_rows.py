@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from clear_strategies import report
+from clear_strategies.settings import CHANGES_NO_RESULT
 from tests.helpers.finished_run import cells, make_run, rows_of, scores
 
 
@@ -32,7 +33,7 @@ def test_runs_that_differ_in_a_setting_have_rows_that_name_it(tmp_path: Path, se
 
 def test_settings_without_influence_on_results_do_not_separate_runs(tmp_path: Path) -> None:
     make_run(tmp_path / "0", "+strategy=clear", "fit.threads=1", "hydra.run.dir=here")
-    make_run(tmp_path / "1", "+strategy=clear", "fit.threads=2", "fit.probe_every=7", seed=1)
+    make_run(tmp_path / "1", "+strategy=clear", *(f"{key}=2" for key in CHANGES_NO_RESULT), seed=1)
     assert len(rows_of(tmp_path)["clear"].runs) == 2
 
 
