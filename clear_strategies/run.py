@@ -1,10 +1,9 @@
 """`clear-strategies +strategy=clear`, or `python -m clear_strategies.run`: the door to a whole run.
 
 `clear-strategies train …` and the other subcommands are in `clear_strategies.commands`. Without one, this composes the
-configuration, checks every setting, prints the plan, trains, and writes into Hydra's run folder: history.csv, conflict.csv,
-timing.csv, renders/, views/, maps/, contact_sheet.png, curves.png, point_cloud.ply, checkpoints/, baseline/ (with
-`fit.baseline`) and, last, so that its presence says that the run is finished, metrics.json. Exit codes:
-`clear_strategies.jobs.exit_codes`.
+configuration, checks every setting, prints the plan, trains, and writes its files into Hydra's run folder;
+`clear_strategies.outputs.results.FILES` lists them. metrics.json is written last, so a folder that has it holds a finished run.
+Exit codes: `clear_strategies.jobs.exit_codes`.
 """
 
 from __future__ import annotations
@@ -71,7 +70,7 @@ def _with_nearest_setting(message: str) -> str:
 
 
 def job(config: DictConfig) -> float | None:
-    """One job of Hydra's: returns the mean PSNR of the test views, which a sweeper may optimize."""
+    """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed or did not start."""
     hydra_config, ours = HydraConfig.get(), _sweep()
     if ours is not None and _launcher(hydra_config) == "joblib" and not ours.begun_here:
         # A terminal sends Ctrl-C to joblib's workers too; one stop is enough, and it comes from the sweep.

@@ -49,7 +49,7 @@ def main(arguments: Sequence[str]) -> None:
     """Print the findings.
 
     Raises:
-        SettingError: a backend that is here draws something else than the reference.
+        SettingError: a backend that is installed fails, or draws something else than the reference.
     """
     parser = parser_of("doctor", "Say what this machine has, what works, and what is missing.", run=False)
     parser.add_argument("--all", action="store_true", help="test backends as well that compile for a minute first")
@@ -111,7 +111,7 @@ def backends(*, slow: bool, broken: list[str]) -> Iterator[tuple[str, str]]:
     """Each backend: why it is not here, or how its picture compares with the reference's and how long it took.
 
     Args:
-        slow: test also those that compile for long first. broken: takes the names of those that differ.
+        slow: test also those that compile for long first. broken: takes the names of those that fail or differ.
     """
     splats, camera = _scene()
     exact = rasterizers.load("torch", preset="accurate")(splats, camera).image

@@ -1,14 +1,15 @@
-"""What a capture of any size is trained at: the HR side has at most `ViewSettings.max_hr_megapixels`.
+"""Keep the HR images within `ViewSettings.max_hr_megapixels`, whatever the size of the photos.
 
-x4 of a phone's photo of 4032x3024 has 195 megapixels. Which factor, and which of the photos' pixels, a limit leaves:
+A phone's photo has 4032x3024 pixels; four times as wide and as high, it would have 195 megapixels. The first of these that
+fits into the limit is taken:
 
-1. `sr_scale` times the photos, where that fits.
-2. Twice the photos, where that fits: every pixel of theirs is kept.
-3. The photos themselves as the HR side, reduced if they are larger than the limit, and LR made from them. Nothing has to be
-   super-resolved, because the photos know more than the HR side may hold.
+1. The HR images are `sr_scale` times as large as the photos.
+2. They are twice as large as the photos, which keep all of their pixels. The prior must be able to enlarge by 2.
+3. The photos are the HR images, reduced if they are larger than the limit, and the LR images are made from them. No image is
+   super-resolved: the photos already hold more detail than the HR images may.
 
-A prior that is chosen by name is asked for SR images in any case: 3 then becomes photos that are reduced until `sr_scale` times
-them fits.
+If the user has chosen a prior by name, SR images are always made. In place of 3, the photos are then reduced until `sr_scale`
+times their size fits.
 """
 
 from __future__ import annotations
@@ -38,11 +39,15 @@ _SETTING: Final = "data.views.max_hr_megapixels"
 def within_limit(
     capture: Capture, views: ViewSettings, *, reaches: Callable[[int], bool], super_resolve: bool
 ) -> tuple[Capture, ViewSettings]:
-    """The capture, its photos reduced where they must be, and the settings that hold its HR side within the limit.
+    """Reduce the photos and choose the factor so that the HR images fit into `views.max_hr_megapixels`.
 
     Args:
-        reaches: whether the prior enlarges by a factor.
-        super_resolve: the HR side must come from the prior.
+        reaches: takes a factor; returns whether the prior can enlarge by it.
+        super_resolve: the HR images must come from the prior, even if the photos are large enough.
+
+    Returns:
+        The capture, with reduced photos where needed, and the settings of its views. Both are unchanged if there is no
+        limit, if the HR images fit into it, or if `photos_are` is not "lr".
     """
     limit, largest = views.max_hr_megapixels, max(f.camera.width * f.camera.height for f in capture.frames)
     pixels = largest / views.shrink**2 / _MEGA
@@ -72,7 +77,7 @@ def _noted(capture: Capture, why: str) -> Capture:
 
 
 def _reduced(frames: Sequence[Frame], ratio: float, multiple: int, kernel: DownKernel) -> tuple[Frame, ...]:
-    """The frames with photos that are smaller by `ratio`, of sizes that are multiples of `multiple`."""
+    """Frames whose photos are `ratio` times smaller, rounded to sizes that `multiple` divides."""
     found = []
     for frame in frames:
         size = [max(1, round(s / ratio / multiple)) * multiple for s in (frame.camera.width, frame.camera.height)]

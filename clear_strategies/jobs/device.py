@@ -149,7 +149,11 @@ def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer], cho
 
 
 def drawn_on(devices: frozenset[str], name: str, asked: Device | None) -> Device:
-    """The device that was asked for, or else the best that this rasterizer draws on."""
+    """The device that was asked for, or else the best that this rasterizer draws on.
+
+    Raises:
+        SettingError: the rasterizer does not draw on the device that was asked for.
+    """
     if asked is None:
         return "cuda" if "cuda" in devices and torch.cuda.is_available() else "cpu"
     if asked not in devices:

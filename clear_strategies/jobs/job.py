@@ -52,24 +52,26 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunSettings(FitSettings):
-    """Settings of a run besides those of its training.
+    """Settings of a run: those of its training, what it shows and writes, and where it computes.
 
     Args:
         map_views: number of training views with maps of reliability and correction in maps/; 0: none.
-        video: frames of path.mp4 and path.gif, a loop through the training cameras, 24 a second; 0: none.
-        verbose: show on the console what run.log has of every step, too; `-v` on the command line.
-        page: the most Gaussians of a field that splat.html is written for, a page that shows it in any browser; 0: none.
+        video: number of frames of path.mp4 and path.gif, a loop through the training cameras, 24 a second; 0: none.
+        verbose: also show on the console the details that run.log holds; `-v` on the command line.
+        page: write splat.html, a page that shows the field in any browser, if the field has at most this many Gaussians;
+            0: never.
         log: tensorboard writes losses, PSNR, learning rates and a few pictures for TensorBoard; extra [log].
         viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
-        baseline: train first, on the same scene with the same settings, without any strategy, into the folder baseline/ of
-            the run; the contact sheet and the scores then show both. Without effect in a sweep, for a run that has no
+        baseline: first train the same scene with the same settings, but without any strategy, into the folder baseline/ of
+            the run. The contact sheet and the scores then show both. Without effect in a sweep, for a run that has no
             strategy, and with +method=NAME.
-        resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: in the run's own folder,
-            train nothing if the run is finished, else continue from its newest checkpoint, else start. The same holds of
-            the baseline beside it.
-        device: cpu or cuda, of field, views and optimizer; None: cuda where torch finds it and the rasterizer draws there,
-            else cpu. A run may be resumed on another device; its bits then differ.
-        threads: of torch and the kernels; None: all cores, divided by the jobs that run at once (joblib, Slurm).
+        resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: look into the run's own
+            folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
+            from the beginning. Both apply to the baseline, too.
+        device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
+            there, else cpu. A run may be resumed on another device; its bits then differ.
+        threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib,
+            Slurm).
     """
 
     map_views: int = 3
@@ -133,11 +135,11 @@ def settings_of(values: Mapping[str, Any]) -> JobSettings:
 
 @dataclass(frozen=True, slots=True)
 class _Training:
-    """What is trained: the run, or the baseline beside it.
+    """One training of a job: the run itself, or its baseline.
 
     Args:
-        compared: the configuration, as from `resume.comparable`.
-        folder: for its files.
+        compared: the configuration from `resume.comparable`, which a resumed run must have in common.
+        folder: where its files go.
     """
 
     settings: JobSettings
@@ -147,7 +149,7 @@ class _Training:
 
     @classmethod
     def of(cls, settings: JobSettings, values: Mapping[str, Any], folder: Path) -> _Training:
-        """The training of these settings, and the configuration that they were built of."""
+        """A training with these settings. `values` is the configuration that they were built from."""
         return cls(settings, settings.conductor(settings.fit.stretch), resume.comparable(values), folder)
 
     @property
@@ -155,7 +157,11 @@ class _Training:
         return plan.Chosen(self.settings.method, list(self.settings.strategies))
 
     def start(self, place: _Place, source: str | None) -> TrainState:
-        """The state to train from: the first one, or what `source`, a value of `fit.resume`, leads to."""
+        """The state that training starts from: the initial one, or the checkpoint that `source` asks for.
+
+        Args:
+            source: a value of `fit.resume`.
+        """
         settings, stretch = self.settings, self.settings.fit.stretch
         state = TrainState.start(
             place.there,
@@ -178,10 +184,12 @@ class _Training:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """Where the trainings of a job compute, and on which scene.
+    """What the trainings of a job share: the scene, the rasterizer and the device.
 
     Args:
-        scene: on the CPU. there: the same on the device of `drawing`.
+        scene: on the CPU.
+        there: the same scene on the device of `drawing`.
+        drawing: the rasterizer and its device.
         watch: called after each iteration.
     """
 
@@ -192,13 +200,21 @@ class _Place:
 
 
 def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = None) -> float | None:
-    """Train one job into `folder`, and return the mean PSNR of the test views, which a sweeper may optimize.
+    """Run one job and write its files into `folder`.
 
-    Every setting is checked before the folder is locked and before data is read. `watch` is called after each iteration.
+    Every setting is checked before the folder is locked and before data is read.
+
+    Args:
+        watch: called after each iteration.
+
+    Returns:
+        The mean PSNR of the test views, dB, which a sweeper may optimize; of the training views if there are no test views.
+        None if there is no score, e.g. because `data.save_lr` ends the job before training.
 
     Raises:
         SettingError, StrategyConflict: the configuration cannot be used.
-        DataError: a file cannot; or another job is at work in the folder, or wrote another configuration there.
+        DataError: a file cannot be used, another job is at work in the folder, or the folder holds a run of another
+            configuration.
     """
     values = tree(config)
     settings = settings_of(values)
@@ -245,7 +261,7 @@ def _run(
     device.log_choice(settings.rasterizer, drawing)
     drawing = drawing.over(loaded.background)
     place = _Place(loaded, loaded.to(drawing.device), drawing, watch)
-    # Both are made ready before the first trains, so that nothing is refused after it has.
+    # Run and baseline are set up before either trains, so that an error does not come after the first has trained.
     source, first = settings.fit.resume, None
     if baseline is not None:
         source, of_baseline = resume.of_both(source, ours.compared, baseline.compared)
@@ -253,7 +269,7 @@ def _run(
             first = baseline.start(place, of_baseline)
     state = ours.start(place, source)
     memory.release()
-    # Of many jobs the console shows a line each; the rest is in their run.log.
+    # In a sweep the console shows one line per job; the rest is in run.log.
     level = logging.DEBUG if _in_sweep() else logging.INFO
     found, most = memory.needs(state, drawing.rasterizer), getattr(state.density.settings, "max_gaussians", None)
     machine = {
@@ -281,7 +297,11 @@ def _run(
 
 
 def _trained_first(training: _Training, state: TrainState | None, place: _Place) -> Baseline:
-    """The baseline, trained unless it is finished: without a state."""
+    """Train the baseline and read its results.
+
+    Args:
+        state: to train from; None if the baseline is finished, so that its files are only read.
+    """
     if state is not None:
         _log.info(
             "the baseline trains first: no strategy, all else as above (fit.baseline=false leaves it out): %s",
@@ -296,7 +316,9 @@ def _trained_first(training: _Training, state: TrainState | None, place: _Place)
 
 @contextmanager
 def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[Callable[[], None]]:
-    """What is called after each iteration: the job's watch, the viewer's turn (`fit.viewer`) and the log (`fit.log`)."""
+    """Open the viewer (`fit.viewer`) and the log (`fit.log`), and yield a function to call after each iteration. It updates
+    both and calls the job's watch.
+    """
     fit_settings, painter = training.settings.fit, Painter(state.field, place.drawing.make)
     calls = [] if place.watch is None else [place.watch]
     with ExitStack() as open_:
@@ -321,10 +343,10 @@ def _tell_address(address: str) -> None:
 def _train(
     training: _Training, state: TrainState, place: _Place, beside: Baseline | None = None
 ) -> tuple[Evaluation, float]:
-    """Train to the end and write the files; returns the scores and the seconds of training.
+    """Train to the end and write the files; return the scores and the seconds of training.
 
     Args:
-        beside: the baseline to show with it.
+        beside: the finished baseline, to show next to the run's results.
     """
     settings, rasterizer = training.settings, place.drawing.rasterizer
     write_cameras(training.folder, place.scene)

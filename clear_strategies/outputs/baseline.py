@@ -36,7 +36,7 @@ class Baseline:
         """Read a run's folder.
 
         Raises:
-            DataError: metrics.json or a render is not there, or damaged.
+            DataError: metrics.json is not there or damaged, or a render of a test view is not there.
         """
         path = folder / "metrics.json"
         content = metrics.read(path, _TRAIN_AGAIN)

@@ -1,4 +1,4 @@
-"""A splat in the formats of viewers on the web: .splat by this module, the others by PlayCanvas's splat-transform.
+"""A splat in the formats of viewers: .ply and .splat by this package, the others by PlayCanvas's splat-transform.
 
 splat-transform is a program of npm (MIT). One that is on the PATH is taken; else `npx` downloads it once.
 """

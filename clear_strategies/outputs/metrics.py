@@ -5,7 +5,8 @@ metrics.json: {"scene", "method", "strategies", "seed", "iterations", "gaussians
 {view: {image: scores}}, "mean": {image: scores}}.
 
 - "method" is the name of a published baseline (`+method=`), null where none was chosen.
-- The images are "ours", "bicubic" (U of the view's own LR photo) and "prior" (the view's SR image).
+- The images are "ours", "bicubic" (U of the view's own LR photo) and "prior" (the view's SR image). "bicubic" is missing where
+  the HR photo is unknown, "prior" where the HR photo takes its place (`photos_are=both`).
 - "baseline" is the one that trained beside the run (`fit.baseline`), null where none did: {"folder", "seconds", "test":
   scores, "train": scores}, the means of its renders. A part without views is not there.
 - "against" says what they are compared with: "HR photos"; "LR photos", after D, where the HR photos are unknown; "HR and

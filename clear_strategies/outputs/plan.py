@@ -45,8 +45,8 @@ class Plan:
     """A line for each fact.
 
     Args:
-        short: for the console, at most fifteen lines.
-        details: the facts that are not in it.
+        short: for the console: what a user decides on, or wants to know before the result is there.
+        details: the other facts.
     """
 
     short: str

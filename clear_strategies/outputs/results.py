@@ -31,7 +31,7 @@ from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Rasterizer
 
-# What a run writes into its folder, in this order.
+# What a run writes into its folder, with Hydra's files; metrics.json comes last.
 FILES: Final[Mapping[str, str]] = {
     ".hydra/": "the configuration and the overrides that the run was started with",
     "run.log": "what the run printed, and the details that the console shows with `-v` alone",

@@ -22,7 +22,11 @@ def write_splat_page(
     title: str,
     background: tuple[float, float, float],
 ) -> None:
-    """Write splat.html for at most so many Gaussians; where there is none, a message says why."""
+    """Write splat.html, unless the field has more Gaussians than `most`, or the page cannot be made: a message then says why.
+
+    Args:
+        most: 0: write no page, without a message.
+    """
     count = len(painter.field)
     if most == 0:
         return
