@@ -11,6 +11,7 @@ import torch
 
 import rasterizers
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective
+from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.core.view import Photo, View
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.errors import SettingError
@@ -213,11 +214,11 @@ def test_renderings_without_gradients_show_the_detail_feature_and_train_nothing(
     assert clear.attachment.counts["LR renders"] == 0
 
 
-@pytest.mark.parametrize(("iterations", "share"), [(None, 1), (300, 0.2), (30_000, 1)])
+@pytest.mark.parametrize(("iterations", "share"), [(300, 0.2), (30_000, 1)])
 def test_f_det_learns_at_a_lower_rate_in_a_short_run(iterations, share, attached):
     scene = toy.scene(20)
     host = Host(scene)
-    attached(host, scene, Conductor(iterations=iterations))
+    attached(host, scene, composed_conductor("baseline", iterations=iterations))
     assert host.optimizers["detail"].param_groups[0]["lr"] == pytest.approx(LearningRates().detail * share)
 
 

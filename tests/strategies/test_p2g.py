@@ -193,7 +193,7 @@ def test_where_views_cannot_be_compared_a_warning_says_why_and_the_photo_counts(
     conductor = Conductor(P2G(agreement="both", patch=planes.PATCH))
     conductor.on_fit_start(len(views), 0, views=views)
     assert reason in caplog.text
-    assert "views compared" in conductor.work_log.entries
+    assert "views prepared" in conductor.work_log.entries
     view = planes.plane_views(1)[0]
     (ours,), photo = conductor.strategies, P2G(patch=planes.PATCH)
     assert torch.equal(ours.patch_maps(view).reliability, photo.patch_maps(view).reliability)
