@@ -34,7 +34,7 @@ from rasterizers.interface import Camera
 RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 
 
-def main(iterations: int, strategies: str | None) -> float:
+def main(iterations: int, strategies: str | None, seed: int = 0) -> float:
     """Train on the demo; returns the mean PSNR of its test views at HR in dB."""
     capture = demo.read(width=256, height=192, views=12, train=3)
     sr = DemoPrior(truth={frame.name: frame.load for frame in capture.frames})
@@ -53,11 +53,12 @@ def main(iterations: int, strategies: str | None) -> float:
 
     rasterization = cpu_rasterization
     if strategies is not None:
-        clear_conductor = conductor(strategies, iterations=iterations)  # +
+        chosen = conductor(strategies, iterations=iterations)  # +
+        made_by = chosen.prior(sr)  # + the SR images, back-projected where the strategies say so
         views = [
-            view(n, p.image, p.camera.world_to_camera, intrinsics(p.camera)[0], sr) for n, p in photos.items()
+            view(n, p.image, p.camera.world_to_camera, intrinsics(p.camera)[0], made_by) for n, p in photos.items()
         ]  # +
-        clear = attach(splats, optimizers, views, clear_conductor, strategy=strategy)  # +
+        clear = attach(splats, optimizers, views, chosen, strategy=strategy, seed=seed)  # +
         rasterization = clear.wrap(rasterization)  # +
 
     def render(camera: Camera) -> tuple[Tensor, dict[str, Any]]:
@@ -117,11 +118,12 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--iterations", type=int, default=500)
     parser.add_argument("--strategies", default="clear", help="as in +strategy=; none: the loop alone")
+    parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    torch.manual_seed(0)  # gsplat splits Gaussians with torch's global generator
+    torch.manual_seed(options.seed)  # gsplat splits Gaussians with torch's global generator
     with native.kernel_threads(
         native.threads()
     ):  # torch's threads would otherwise occupy the cores that the kernels use
-        result = main(options.iterations, None if options.strategies == "none" else options.strategies)
+        result = main(options.iterations, None if options.strategies == "none" else options.strategies, options.seed)
     sys.stdout.write(f"{options.strategies}: {result:.2f} dB on the test views at HR\n")
