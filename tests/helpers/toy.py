@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -12,8 +14,9 @@ from clear_strategies.core import images
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.step import Step
-from clear_strategies.core.view import Photo, View
+from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.scene import Scene
+from clear_strategies.strategies.base import Strategy
 from rasterizers import Camera, Splats
 
 FACTOR = 4
@@ -79,3 +82,26 @@ def step(t: int = 1, evidence: Evidence | None = None, visible: Tensor | None = 
     if visible is None and evidence is not None:
         visible = torch.ones(len(evidence.demand), dtype=torch.bool)
     return Step(t, View("toy", photo, photo), visible, evidence)
+
+
+@dataclass(frozen=True)
+class ShowsDark(Strategy):
+    """Shows the field a black picture at every iteration, by a camera that no photo has: moved, turned, off its centre."""
+
+    def wants_views(self) -> bool:
+        return True
+
+    def on_views(self, views: Sequence[View]) -> None:
+        camera, a = views[0].lr.camera, 0.05
+        moved = torch.eye(4)
+        moved[:3, :3] = torch.tensor([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])
+        moved[:3, 3] = torch.tensor([0.2, -0.1, 0.3])
+        aside = replace(
+            camera, world_to_camera=moved @ camera.world_to_camera.float(), fx=camera.fx * 1.1, cx=camera.cx - 1.5,
+            cy=camera.cy + 0.5, width=camera.width - 2,
+        )  # fmt: skip
+        black = Photo(aside, torch.zeros(aside.height, aside.width, 3))
+        self.cache["extra"] = ExtraView(black, torch.ones(aside.height, aside.width))
+
+    def extra_views(self, t: int) -> Sequence[ExtraView]:
+        return (self.cache["extra"],)

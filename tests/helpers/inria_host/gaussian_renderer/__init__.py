@@ -31,7 +31,11 @@ def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3
     w, h = viewpoint_camera.image_width, viewpoint_camera.image_height
     focal = [size / 2 / torch.tan(torch.tensor(fov, dtype=torch.float64) / 2)
              for size, fov in ((w, viewpoint_camera.FoVx), (h, viewpoint_camera.FoVy))]  # fmt: skip
-    camera = Camera(viewpoint_camera.world_view_transform.T, *map(float, focal), w / 2, h / 2, w, h)
+    # As the CUDA rasterizer: focal lengths from the fields of view, centres from the projection.
+    pose, full = viewpoint_camera.world_view_transform, viewpoint_camera.full_proj_transform
+    offset = torch.linalg.solve(pose.double(), full.double())[2, :2].tolist()
+    centre = [round((x + 1) * size / 2, 3) for x, size in zip(offset, (w, h), strict=True)]
+    camera = Camera(pose.T, *map(float, focal), *centre, w, h)
     xyz = pc.get_xyz
     dummy = torch.zeros(len(xyz), columns, dtype=xyz.dtype, requires_grad=True) + 0
     if dummy.requires_grad:

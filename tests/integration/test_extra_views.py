@@ -1,0 +1,173 @@
+"""Extra views in other trainers: drawn by the host's own renderer, and learned from in a step of the host's own optimizer."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+
+import rasterizers
+from clear_strategies import Conductor, SplatSuRe
+from clear_strategies.core import images
+from clear_strategies.data.photo_files import write_png
+from integration.gsplat import attach
+from rasterizers import Splats
+from tests.helpers import gsplat_host, inria, toy
+from tests.helpers.gsplat_host import Host
+from tests.integration.test_inria import trained as trained_inria
+from tests.integration.test_lightning import HR_FROM_START, attachment_of, fitted, host  # noqa: F401 - a fixture
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Every render of an extra view that a conductor gets a loss of."""
+    seen, loss = [], Conductor.extra_loss
+
+    def extra_loss(self, image, extra, t):
+        seen.append((image.detach().clone(), extra.photo.camera))
+        return loss(self, image, extra, t)
+
+    monkeypatch.setattr(Conductor, "extra_loss", extra_loss)
+    return seen
+
+
+def reference(params, camera, degree, **settings):
+    """The same Gaussians by the float64 rasterizer; f_det takes no part."""
+    p = {name: value.detach().double() for name, value in params.items()}
+    bands = (degree + 1) ** 2 - 1
+    splats = Splats(
+        p["means"], p["quats"], p["scales"].exp(), p["opacities"].reshape(-1).sigmoid(), p["sh0"].reshape(-1, 1, 3),
+        p["shN"][:, :bands],
+    )  # fmt: skip
+    return rasterizers.load("torch", near=0.01, kernel=0.3, antialiased=False, **settings)(splats, camera).image
+
+
+def dark():
+    return Conductor(toy.ShowsDark(), objective=inria.HR_FROM_START)
+
+
+def test_gsplat_draws_it_and_steps_once_more_on_its_gradient(drawn):
+    scene = toy.scene(20)
+    with_extra, alone = Host(scene), Host(scene)
+    for each in (with_extra, alone):
+        each.splats["scales"].data += torch.tensor([0.0, 0.3, 0.6])
+    start = {name: p.detach().clone() for name, p in with_extra.splats.items()}
+    clear = attach(with_extra.splats, with_extra.optimizers, scene.train, dark())
+    clear.replace_everywhere(gsplat_host.rasterization)
+    try:
+        with_extra.train([scene.train[0].name])
+    finally:
+        clear.remove()
+    image, camera = drawn[0]
+    assert torch.allclose(image.double(), reference(start, camera, 0), atol=1e-5)
+    assert clear.attachment.counts["extra views"] == 1
+
+    gradient = extra_gradient(alone, camera)
+    plain = attach(alone.splats, alone.optimizers, scene.train, Conductor(objective=inria.HR_FROM_START))
+    plain.replace_everywhere(gsplat_host.rasterization)
+    try:
+        alone.train([scene.train[0].name])
+    finally:
+        plain.remove()
+    for name, optimizer in alone.optimizers.items():
+        if name in gradient:
+            alone.splats[name].grad = gradient[name]
+            optimizer.step()
+    for name, p in alone.splats.items():
+        assert torch.allclose(with_extra.splats[name], p, rtol=1e-5, atol=1e-7), name
+
+
+def extra_gradient(a_host, camera):
+    """Of the LR loss of a black picture, at the host's parameters of now."""
+    view = toy.ShowsDark()
+    view.on_views(toy.scene(20).train)
+    conductor, extra = dark(), view.extra_views(1)[0]
+    p = a_host.splats
+    renders, _, _ = gsplat_host.rasterization(
+        p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), torch.cat([p["sh0"], p["shN"]], 1),
+        camera.world_to_camera[None], gsplat_host.intrinsics(camera), camera.width, camera.height, sh_degree=0, packed=False,
+    )  # fmt: skip
+    cotangent = conductor.extra_loss(renders[0], extra, 1).cotangents[0]
+    names = [name for name in p if name in ("means", "quats", "scales", "opacities", "sh0", "shN")]
+    found = torch.autograd.grad(
+        renders[0], [p[name] for name in names], cotangent, allow_unused=True, materialize_grads=True
+    )
+    return dict(zip(names, found, strict=True))
+
+
+def test_accumulated_passes_are_one_step_with_one_extra_step(drawn):
+    scene = toy.scene(20)
+    a_host = Host(scene, accumulation=2)
+    clear = attach(a_host.splats, a_host.optimizers, scene.train, dark(), accumulation=2)
+    clear.replace_everywhere(gsplat_host.rasterization)
+    try:
+        a_host.train([view.name for view in scene.train] * 2)
+    finally:
+        clear.remove()
+    assert len(drawn) == clear.attachment.counts["extra views"] == 3
+    assert clear.attachment.counts["steps of the host alone"] == 0
+
+
+@pytest.mark.parametrize("step_first", [False, True], ids=["densify, step", "step, densify"])
+def test_an_inria_style_host_draws_it_and_steps_on_it_whenever_it_densifies(
+    step_first, inria_host, inria_capture, drawn
+):
+    gaussians, clear, grads = trained_inria(
+        inria_host, inria_capture, [toy.ShowsDark()], iterations=26, step_first=step_first
+    )
+    assert len(gaussians._xyz) > inria.N
+    counts = clear.attachment.counts
+    assert counts["merges"] == len(drawn) == 26
+    assert 0 < counts["extra views"] <= 26
+    assert (
+        counts["extra views"] == 26
+    ) == step_first  # else 3DGS throws away the gradients of a step that it densifies before
+    assert counts["steps of the host alone"] == 0
+    assert all(bool(g.isfinite().all()) for g in grads.values())
+
+
+def test_an_inria_style_host_draws_any_camera(inria_host, inria_capture, drawn):
+    opt = inria.options(inria_host, inria_capture, iterations=1)
+    _, clear, _ = trained_inria(inria_host, inria_capture, [toy.ShowsDark()], iterations=1)
+    image, camera = drawn[0]
+    assert image.shape == (camera.height, camera.width, 3)
+    start, _ = inria_host.setup(opt)
+    before = copy.copy(clear.params())
+    before |= {name: getattr(start, attribute) for name, attribute in ATTRIBUTES.items()}
+    assert torch.allclose(image.double(), reference(before, camera, 0), atol=1e-4)
+
+
+ATTRIBUTES = {
+    "means": "_xyz", "quats": "_rotation", "scales": "_scaling", "opacities": "_opacity", "sh0": "_features_dc",
+    "shN": "_features_rest",
+}  # fmt: skip
+
+
+def test_a_lightning_host_draws_it_and_steps_on_it(host, tmp_path, drawn):  # noqa: F811 - the fixture
+    for view in host.scene.train:
+        write_png(tmp_path / f"{view.name}_x4.png", images.quantize(view.hr.image))
+    shown = [*HR_FROM_START[:2], "+strategies.dark._target_=tests.helpers.toy.ShowsDark"]
+    module = fitted(host, host.controller(strategies="baseline", sr=str(tmp_path), suffix="_x4", overrides=shown), 4)
+    assert len(drawn) == 4
+    assert attachment_of(module).counts["extra views"] == 4
+
+
+def test_splatsure_follows_a_host_that_densifies():
+    strategies = pytest.importorskip("gsplat.strategy", reason="pip install gsplat")
+    scene = toy.scene(40)
+    densifier = strategies.DefaultStrategy(
+        refine_start_iter=4, refine_stop_iter=24, refine_every=5, grow_grad2d=2e-4, prune_opa=0.02
+    )
+    torch.manual_seed(0)
+    a_host = Host(scene, extent=4.0, strategy=densifier)
+    conductor = Conductor(SplatSuRe(), objective=inria.HR_FROM_START)
+    clear = attach(a_host.splats, a_host.optimizers, scene.train, conductor, strategy=densifier)
+    clear.replace_everywhere(gsplat_host.rasterization)
+    try:
+        a_host.train([scene.train[i % 3].name for i in range(30)])
+    finally:
+        clear.remove()
+    n = len(a_host.splats["means"])
+    assert n != 40
+    assert {rows.shape for rows in conductor.state_dict().values()} == {(n,)}
