@@ -17,6 +17,7 @@ that densify after it (gsplat).
 
 from __future__ import annotations
 
+import functools
 import inspect
 import logging
 from collections import Counter
@@ -134,6 +135,11 @@ class Attachment:
         for s in conductor.strategies:
             if (prepared := s.summary()) is not None:
                 _log.info("%s: %s.", type(s).__name__, prepared)
+        if not conductor.decorated and any(view.factor > 1 for view in views):
+            _log.warning(
+                "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
+                ", ".join(_named(decorate) for decorate in conductor.decorators),
+            )
         if not conductor.strategies:
             _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
 
@@ -356,6 +362,11 @@ class Attachment:
         if written is not None:
             slot.write(grad_scale * written)
             self.counts["scores written"] += 1
+
+
+def _named(decorate: Callable[..., Any]) -> str:
+    called = decorate.func if isinstance(decorate, functools.partial) else decorate
+    return str(getattr(called, "__name__", called))
 
 
 def _step(optimizer: torch.optim.Optimizer, rendered: Mapping[str, Tensor]) -> None:

@@ -159,6 +159,9 @@ class Conductor:
         decorators: each takes a prior and returns one, e.g. `BackProjected`; `prior` applies them in this order.
         detail: the rates of f_det, for hosts.
 
+    Attributes:
+        decorated: whether `prior` has been asked, or has nothing to do.
+
     Raises:
         StrategyConflict: two strategies answer a question that only one may.
     """
@@ -171,6 +174,7 @@ class Conductor:
         self.objective = objective if objective is not None else Objective()
         self.statistics_from = statistics_from
         self.decorators, self.detail = tuple(decorators), detail if detail is not None else DetailRates()
+        self.decorated = not self.decorators
         self.work_log = WorkLog()
         self._one: dict[str, Strategy] = {}
         for hook in _ONE_ANSWER:
@@ -215,6 +219,7 @@ class Conductor:
         """The prior with every decorator around it: what makes the SR images of a run with this conductor."""
         for decorate in self.decorators:
             prior = decorate(prior)
+        self.decorated = True
         return prior
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:

@@ -9,8 +9,10 @@ import torch
 
 import rasterizers
 from clear_strategies import Conductor, SplatSuRe
+from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.priors import Bicubic
 from integration.gsplat import attach
 from rasterizers import Splats
 from tests.helpers import gsplat_host, inria, toy
@@ -171,3 +173,14 @@ def test_splatsure_follows_a_host_that_densifies():
     n = len(a_host.splats["means"])
     assert n != 40
     assert {rows.shape for rows in conductor.state_dict().values()} == {(n,)}
+
+
+def test_views_that_were_made_without_a_decorator_are_warned_of(caplog):
+    scene = toy.scene(20)
+    for prior_asked in (False, True):
+        caplog.clear()
+        conductor, a_host = composed_conductor("back_projected"), Host(scene)
+        if prior_asked:
+            conductor.prior(Bicubic())
+        attach(a_host.splats, a_host.optimizers, scene.train, conductor).remove()
+        assert ("BackProjected has no effect: the views were made without it" in caplog.text) != prior_asked

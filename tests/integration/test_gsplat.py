@@ -15,6 +15,7 @@ from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.core.view import Photo, View
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.errors import SettingError
+from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import LogLinear, WarmupDecay, scaled
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
@@ -220,6 +221,20 @@ def test_f_det_learns_at_a_lower_rate_in_a_short_run(iterations, share, attached
     host = Host(scene)
     attached(host, scene, composed_conductor("baseline", iterations=iterations))
     assert host.optimizers["detail"].param_groups[0]["lr"] == pytest.approx(LearningRates().detail * share)
+
+
+def test_f_det_fades_as_the_readings_of_the_conductor_say(attached):
+    scene = toy.scene(20)
+    for decay in (0.0, 0.5):
+        host = Host(scene)
+        clear = attached(
+            host, scene, Conductor(objective=Objective(lambda_hr=HR_FROM_START), detail=DetailRates(decay=decay))
+        )
+        host.splats["detail"].data += 1.0
+        host.optimizers["detail"].param_groups[0]["lr"] = 0.0
+        host.train([scene.train[0].name])
+        assert float(host.splats["detail"].mean()) == pytest.approx(1 - decay)
+        clear.remove()
 
 
 def test_remove_restores_the_loop(attached):

@@ -286,3 +286,13 @@ def test_two_strategies_of_one_class_keep_their_states_apart():
     second = Conductor(Remember(1.0), Remember(2.0))
     second.load_state_dict(first.state_dict())
     assert [s.state["kept"][0].item() for s in second.strategies] == [1.0, 2.0]
+
+
+def test_what_a_strategy_logged_belongs_to_its_iteration():
+    field, view = field_and_view()
+    view = _double(view)
+    conductor = Conductor(P2G(), objective=Objective(lambda_hr=ALWAYS))
+    lr, hr = field.render_scales(toy.RASTERIZER, view)
+    assert "mean_q" in conductor.update(field.raw(), lr, hr, view, 5).logs
+    lr, _ = field.render_scales(toy.RASTERIZER, view)
+    assert not conductor.update(field.raw(), lr, None, view, 6).logs
