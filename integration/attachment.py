@@ -18,7 +18,6 @@ that densify after it (gsplat).
 from __future__ import annotations
 
 import functools
-import inspect
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,8 +39,8 @@ from clear_strategies.merging.conductor import Conductor, HrGradients, only
 from integration.autograd_shot import AutogradShot
 from integration.detail import keep_from_drifting
 from integration.errors import HostError
+from integration.extra_steps import ExtraSteps, RenderCamera
 from integration.host_score import ScoreScaler, score_for_host
-from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -70,10 +69,6 @@ class RenderAt(Protocol):
     def __call__(self, resolution: Resolution, gate: Float[Tensor, " N"] | None) -> HostRendering:
         """At LR without f_det, or at HR with f_det; opacities are multiplied by `gate`."""
         ...
-
-
-RenderCamera = Callable[[Camera], AutogradShot]
-"""Renders any camera, without a gate and without f_det."""
 
 
 class Attachment:
@@ -126,9 +121,7 @@ class Attachment:
         self._merges_before_step = 0  # at the host's last step
         self._pending: tuple[HostRendering, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
         self._step: Step | None = None  # of the rendering, until `after_step`
-        self._extra: list[Grads] = []  # of the extra views, until the host has stepped
-        self._extra_params: Mapping[str, Tensor] = {}  # what they are gradients of
-        self._stepping = False  # on an extra view
+        self._extra = ExtraSteps(conductor, params)
         self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
         self._logged: dict[str, Number] = {}
         conductor.on_fit_start(len(views), seed, params()["means"].device, views)
@@ -161,7 +154,8 @@ class Attachment:
             hr_grads = conductor.hr_gradients(hr_rendering.shot, view, t)
         self._step = Step(t, view) if hr_grads is None else hr_grads.step
         if self._passes == 0:  # one step of the host, however many passes it accumulates
-            self._render_extra_views(render_camera)
+            with _random_state_kept(self.params()["means"].device):
+                self._extra.render(t, render_camera)
         rendering = render_at("lr", z)
         if rendering.output.requires_grad:
             self._pending = rendering, hr_grads
@@ -175,7 +169,7 @@ class Attachment:
         Raises:
             HostError: the host steps for the first time, and none of its renderings was recognised.
         """
-        if self.removed or self._stepping:
+        if self.removed or self._extra.stepping:
             return
         merges = self.counts["merges"]
         if not merges:
@@ -188,34 +182,10 @@ class Attachment:
             self.counts["steps of the host alone"] += 1
         self._merges_before_step = merges
 
-    @torch.no_grad()
     def after_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """For a hook after each step of each of the host's optimizers: step once more for each extra view.
-
-        An optimizer whose parameters have been replaced since the views were rendered (3DGS densifies before it steps) does
-        not step again.
-        """
-        if self._stepping or self.removed or not self._extra:
-            return
-        mine = {id(p) for group in optimizer.param_groups for p in group["params"]}
-        rendered = {name: p for name, p in self._extra_params.items() if id(p) in mine}
-        if not rendered:
-            return
-        present = [p for group in optimizer.param_groups for p in group["params"]]
-        before, self._stepping = [p.grad for p in present], True
-        try:
-            for grads in self._extra:
-                for p in present:
-                    p.grad = None
-                for name, p in rendered.items():
-                    p.grad = grads[name].to(p)
-                _step(optimizer, rendered)
-        finally:
-            self._stepping = False
-            for p, grad in zip(present, before, strict=True):
-                p.grad = grad
-        if any(p is self._extra_params.get("means") for p in rendered.values()):
-            self.counts["extra views"] += len(self._extra)
+        """For a hook after each step of each of the host's optimizers: the steps on extra views."""
+        if not self.removed and (made := self._extra.step(optimizer)):
+            self.counts["extra views"] += made
 
     def state_dict(self) -> dict[str, Any]:
         """The iteration, and what the strategies store per Gaussian, for the host's checkpoint."""
@@ -239,20 +209,8 @@ class Attachment:
     def remove(self) -> None:
         """Stop: the host's renderings pass through, and the gradients of one that is still pending stay unmerged."""
         self.removed, self._pending = True, None
-        self._extra, self._extra_params = [], {}
+        self._extra.forget()
         self.conductor.on_fit_end()
-
-    def _render_extra_views(self, render_camera: RenderCamera) -> None:
-        """Take the gradient of each extra view; it is stepped on after the host's own step."""
-        conductor, self._extra = self.conductor, []
-        if not (extra_views := conductor.extra_views(self.t)):
-            return
-        self._extra_params = {name: p for name, p in self.params().items() if name != "detail"}
-        for extra in extra_views:
-            with _random_state_kept(self._extra_params["means"].device):
-                shot = render_camera(extra.photo.camera)
-            losses = conductor.extra_loss(shot.image, extra, self.t)
-            self._extra += shot.vjp(losses.cotangents)
 
     def _finish_previous_step(self) -> None:
         """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified."""
@@ -367,16 +325,6 @@ class Attachment:
 def _named(decorate: Callable[..., Any]) -> str:
     called = decorate.func if isinstance(decorate, functools.partial) else decorate
     return str(getattr(called, "__name__", called))
-
-
-def _step(optimizer: torch.optim.Optimizer, rendered: Mapping[str, Tensor]) -> None:
-    """One step; 3DGS's SparseGaussianAdam wants to know which Gaussians move, and how many there are."""
-    if "visibility" in inspect.signature(type(optimizer).step).parameters:
-        n = len(next(iter(rendered.values())))
-        moves = torch.ones(n, dtype=torch.bool, device=next(iter(rendered.values())).device)
-        optimizer.step(moves, n)  # type: ignore[call-overload]
-    else:
-        optimizer.step()
 
 
 @contextmanager

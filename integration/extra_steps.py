@@ -1,0 +1,88 @@
+"""Steps of a host's optimizers on extra views: pictures that strategies want the field to match besides the training view."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+
+import torch
+from torch import Tensor
+
+from clear_strategies.core.gradients import Grads
+from clear_strategies.merging.conductor import Conductor
+from integration.autograd_shot import AutogradShot
+from rasterizers.interface import Camera
+
+RenderCamera = Callable[[Camera], AutogradShot]
+"""Renders any camera by the host's own renderer, without a gate and without f_det."""
+
+
+class ExtraSteps:
+    """Takes the gradient of each extra view before the host's step, and steps on it after that.
+
+    Both scales of the training view and its extra views are rendered from the same parameters, because a host may have
+    computed its activations before it calls its renderer.
+
+    Args:
+        params: returns the leaves that the host optimizes.
+
+    Attributes:
+        stepping: whether a step on an extra view is under way, so that hooks on the host's steps do not count it.
+    """
+
+    def __init__(self, conductor: Conductor, params: Callable[[], Mapping[str, Tensor]]) -> None:
+        self._conductor, self._params = conductor, params
+        self._gradients: list[Grads] = []
+        self._rendered: Mapping[str, Tensor] = {}  # what they are gradients of
+        self.stepping = False
+
+    def render(self, t: int, render_camera: RenderCamera) -> None:
+        """Render the extra views of iteration t; the gradients of an earlier one that nobody stepped on are dropped."""
+        self.forget()
+        if not (extra_views := self._conductor.extra_views(t)):
+            return
+        self._rendered = {name: p for name, p in self._params().items() if name != "detail"}
+        for extra in extra_views:
+            shot = render_camera(extra.photo.camera)
+            self._gradients += shot.vjp(self._conductor.extra_loss(shot.image, extra, t).cotangents)
+
+    @torch.no_grad()
+    def step(self, optimizer: torch.optim.Optimizer) -> int:
+        """One step of this optimizer for each extra view; returns how many positions have made.
+
+        An optimizer whose parameters were replaced after the views were rendered makes none (3DGS densifies before it steps).
+        """
+        if self.stepping or not self._gradients:
+            return 0
+        present = [p for group in optimizer.param_groups for p in group["params"]]
+        known = {id(p) for p in present}
+        mine = {name: p for name, p in self._rendered.items() if id(p) in known}
+        if not mine:
+            return 0
+        before, self.stepping = [p.grad for p in present], True
+        try:
+            for grads in self._gradients:
+                for p in present:
+                    p.grad = None
+                for name, p in mine.items():
+                    p.grad = grads[name].to(p)
+                _step(optimizer, mine)
+        finally:
+            self.stepping = False
+            for p, grad in zip(present, before, strict=True):
+                p.grad = grad
+        return len(self._gradients) if "means" in mine else 0
+
+    def forget(self) -> None:
+        """Drop the gradients."""
+        self._gradients, self._rendered = [], {}
+
+
+def _step(optimizer: torch.optim.Optimizer, mine: Mapping[str, Tensor]) -> None:
+    """One step; 3DGS's SparseGaussianAdam needs to know which Gaussians move, and how many there are."""
+    if "visibility" not in inspect.signature(type(optimizer).step).parameters:
+        optimizer.step()
+        return
+    rows = next(iter(mine.values()))
+    everywhere = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
+    optimizer.step(everywhere, len(rows))  # type: ignore[call-overload]
