@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Final
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+MAX_POINTS: Final = 200_000
+"""The most initial points by default, here and in other trainers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,3 +33,10 @@ class PointCloud:
     def __getitem__(self, index: Int[Tensor, " K"]) -> PointCloud:
         """The points with these indices."""
         return replace(self, means=self.means[index], colors=self.colors[index])
+
+    def at_most(self, count: int, seed: int = 0) -> PointCloud:
+        """The cloud itself, or `count` of its points, chosen at random by the seed and in their order."""
+        if len(self) <= count:
+            return self
+        chosen = torch.randperm(len(self), generator=torch.Generator().manual_seed(seed))[:count]
+        return self[chosen.sort().values]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.checks import as_color
@@ -17,6 +17,7 @@ from clear_strategies.errors import DataError
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.projection import inside_of, project
 from clear_strategies.geometry.sift import features_of
 from rasterizers.interface import Camera
 
@@ -46,6 +47,7 @@ def stereo(
     Ks: Tensor,
     *,
     background: Sequence[float] | None = None,
+    masks: Sequence[Tensor | None] | None = None,
     settings: StereoSettings | None = None,
     fill: bool = True,
     features: tuple[Tensor, Tensor] | None = None,
@@ -63,6 +65,8 @@ def stereo(
             [0, 1)².
         background: the colour of pixels without a surface, RGB in [0, 1], e.g. Blender's white; None: every pixel shows
             a surface.
+        masks: one for each photo, [h, w] of its size: 0 or False where the photo hides its pixels, which then give neither
+            depth nor points; None among them, or in their place: nothing is hidden.
         settings: of the comparison; None: `StereoSettings()`.
         fill: add points at interpolated inverse depth where a photo's depth is unknown. Needs SciPy.
         features: (means [N, 3] in world units, colors [N, 3] in [0, 1]) of points that are known already, e.g. COLMAP's.
@@ -77,9 +81,14 @@ def stereo(
     color = None if background is None else as_color("background", list(background))
     settings = settings or StereoSettings()
     photos = _photos(images, world_to_camera, Ks)
+    shown = None if masks is None else _masks(masks, photos)
+    if shown is not None:
+        photos = [replace(p, image=p.image * m[..., None]) for p, m in zip(photos, shown, strict=True)]
     known = features_of(photos) if features is None else _features(*features)
-    maps = depth_maps(photos, known.means, settings, color)
-    cloud = stereo_cloud(known, photos, maps, settings, background=color, fill=fill)
+    if shown is not None:
+        known = known[_unhidden(known.means, photos, shown).nonzero()[:, 0]]
+    maps = depth_maps(photos, known.means, settings, color, shown)
+    cloud = stereo_cloud(known, photos, maps, settings, background=color, masks=shown, fill=fill)
     if cloud is None:
         remedy = (
             "check the poses (world-to-camera, OpenCV axes) and Ks (in pixels of these photos), or give photos that see the "
@@ -124,6 +133,38 @@ def _image(i: int, image: Tensor) -> Float[Tensor, "h w 3"]:
     if not 0 <= low <= high <= 1:  # nan too
         _refuse(name, f"must lie in [0, 1], spans [{low:g}, {high:g}]", "divide 8-bit values by 255, or clamp")
     return image.detach().float()
+
+
+def _masks(masks: Sequence[Tensor | None], photos: Sequence[Photo]) -> list[Bool[Tensor, "h w"]]:
+    if len(masks) != len(photos):
+        _refuse(
+            "masks", f"must be one for each of {len(photos)} photos, got {len(masks)}", "give None where none hides"
+        )
+    found = []
+    for i, (mask, photo) in enumerate(zip(masks, photos, strict=True)):
+        shape = photo.image.shape[:2]
+        if mask is not None and mask.shape != shape:
+            _refuse(
+                f"masks[{i}]", f"must have shape {tuple(shape)}, got {tuple(mask.shape)}", "give [h, w] of the photo"
+            )
+        every = torch.ones(shape, dtype=torch.bool, device=photo.image.device)
+        found.append(every if mask is None else mask.detach().to(photo.image.device) > 0)
+    return found
+
+
+def _unhidden(
+    points: Float[Tensor, "N 3"], photos: Sequence[Photo], masks: Sequence[Bool[Tensor, "h w"]]
+) -> Bool[Tensor, " N"]:
+    """False for points that lie only at hidden pixels of the photos."""
+    shown, hidden = torch.zeros(len(points), dtype=torch.bool), torch.zeros(len(points), dtype=torch.bool)
+    for photo, mask in zip(photos, masks, strict=True):
+        pixels, depth = project(photo.camera, points)
+        inside = inside_of(photo.camera, pixels, depth)
+        x, y = pixels[inside].long().unbind(dim=1)
+        visible = mask.cpu()[y, x]
+        shown[inside] |= visible
+        hidden[inside] |= ~visible
+    return shown | ~hidden
 
 
 def _camera(i: int, pose: Tensor, K: Tensor, image: Tensor) -> Camera:

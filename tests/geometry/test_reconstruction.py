@@ -96,6 +96,35 @@ def test_pixels_of_the_background_get_no_points() -> None:
     assert not any(depth.known[:10].any() for depth in of(photos, background=(1, 1, 1)).depths)
 
 
+@pytest.mark.parametrize("fill", [True, False])
+def test_hidden_pixels_give_no_points_and_their_colours_do_not_matter(fill: bool) -> None:
+    photos = plane_photos(3, 64, 48)
+    masks = [torch.ones(48, 64), None, torch.ones(48, 64)]
+    masks[0][:, :32] = masks[2][20:] = 0
+    found = of(photos, masks=masks, fill=fill)
+    assert not found.depths[0].known[:, :32].any()
+    assert not found.depths[2].known[20:].any()
+    assert found.depths[0].known[:, 32:].any()
+    photos[0].image[:, :32], photos[2].image[20:] = 0.3, torch.rand(28, 64, 3)
+    assert same(of(photos, masks=masks, fill=fill), found)
+    everywhere = of(photos, masks=[None] * 3, fill=fill)
+    assert same(everywhere, of(photos, fill=fill))
+    with pytest.raises(DataError, match="confirms no depth"):
+        of(photos, masks=[torch.zeros(48, 64)] * 3, fill=fill)
+
+
+def test_no_filled_point_is_hidden_in_the_only_photo_that_sees_it() -> None:
+    photos = plane_photos(2, 64, 48)
+    masks = [torch.ones(48, 64, dtype=torch.bool) for _ in photos]
+    for mask in masks:
+        mask[30:] = False
+    found = of(photos, masks=masks)
+    rows = found.means[:, 1] / found.means[:, 2] * photos[0].camera.fy + photos[0].camera.cy
+    assert "filled by" in found.summary
+    assert float(rows.max()) <= 30
+    assert float(of(photos).means[:, 1].max()) > float(found.means[:, 1].max())
+
+
 def test_without_opencv_and_kornia_the_cameras_give_the_range(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -145,6 +174,11 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         "must have finite positions",
     ),
     "colours": ({"features": (torch.zeros(1, 3), torch.full((1, 3), 255.0))}, r"must have colours in \[0, 1\]"),
+    "too few masks": ({"masks": [None]}, "masks: must be one for each of 2 photos, got 1"),
+    "mask of another size": (
+        {"masks": [None, torch.ones(64, 48)]},
+        r"masks\[1\]: must have shape \(48, 64\), got \(64, 48\)",
+    ),
     "one place": (
         {"world_to_camera": torch.eye(4).expand(2, 4, 4)},
         "images: stereo confirms no depth in any of the 2 photos: check the poses",

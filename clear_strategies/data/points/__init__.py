@@ -11,10 +11,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-import torch
-
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
-from clear_strategies.core.points import PointCloud
+from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import SfmPoints
 from clear_strategies.data.points.files import from_ply, from_sfm, from_tracks
@@ -83,7 +81,7 @@ class CloudSettings:
     outlier_neighbours: int = OUTLIER_NEIGHBOURS
     outlier_ratio: float = OUTLIER_RATIO
     voxel: float | None = None
-    max_points: int = 200_000
+    max_points: int = MAX_POINTS
     triangulation: TriangulationSettings = field(default_factory=TriangulationSettings)
     stereo: StereoSettings = field(default_factory=StereoSettings)
 
@@ -173,10 +171,8 @@ def initial_points(
         means, colors = voxel_grid(cloud.means, cloud.colors, settings.voxel)
         cloud = replace(cloud, means=means, colors=colors, source=f"{cloud.source}, in voxels of {settings.voxel:g}")
     if len(cloud) > settings.max_points:
-        chosen = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(seed))[: settings.max_points]
         _log.debug("%d of %d points chosen at random (max_points).", settings.max_points, len(cloud))
-        cloud = cloud[chosen.sort().values]
-    return InitialPoints(cloud, depths)
+    return InitialPoints(cloud.at_most(settings.max_points, seed), depths)
 
 
 def _of_training_alone(settings: CloudSettings, sfm: SfmPoints | None, train_ids: Sequence[int]) -> PointCloud | None:

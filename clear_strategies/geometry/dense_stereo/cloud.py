@@ -27,6 +27,7 @@ def stereo_cloud(
     settings: StereoSettings,
     *,
     background: tuple[float, float, float] | None = None,
+    masks: Sequence[Bool[Tensor, "h w"]] | None = None,
     fill: bool = True,
     stride: int = filling.STRIDE,
     outlier_neighbours: int = OUTLIER_NEIGHBOURS,
@@ -39,6 +40,7 @@ def stereo_cloud(
     Args:
         features: points of the surfaces, e.g. triangulated ones; there may be none.
         background: the colour of pixels without a surface.
+        masks: of each photo, False where it hides pixels, which are not filled.
         fill: add a grid of `stride` px at interpolated inverse depth where a photo's depth is unknown.
         outlier_neighbours, outlier_ratio: see `without_outliers`.
     """
@@ -61,7 +63,7 @@ def stereo_cloud(
     cloud = without_outliers(PointCloud(means, colors, source), outlier_neighbours, outlier_ratio)
     if not fill:
         return cloud
-    added, shades = filling.fill(cloud.means, photos, maps, stride, background)
+    added, shades = filling.fill(cloud.means, photos, maps, stride, background, masks)
     source = f"{source}, filled by {len(added):,} at interpolated inverse depth"
     return PointCloud(torch.cat((cloud.means, added)), torch.cat((cloud.colors, shades)), source)
 

@@ -25,6 +25,7 @@ def fill(
     maps: Sequence[DepthMap],
     stride: int,
     background: tuple[float, float, float] | None = None,
+    masks: Sequence[Bool[Tensor, "h w"]] | None = None,
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """(positions, colours) of a grid of `stride` px over the unknown parts of each photo.
 
@@ -33,12 +34,16 @@ def fill(
     Args:
         means: the points between which inverse depth is interpolated.
         background: the colour of pixels without a surface.
+        masks: of each photo, False where it hides pixels.
     """
     added, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
     for i, (photo, found) in enumerate(zip(photos, maps, strict=True)):
         grid = pixel_grid(photo, stride)
         x, y = grid.long().unbind(dim=1)
-        grid = grid[~found.known.cpu()[y, x]]
+        unknown = ~found.known.cpu()
+        if masks is not None:
+            unknown &= masks[i].cpu()
+        grid = grid[unknown[y, x]]
         shade = sample_colors(photo.image, grid)
         if background is not None:
             surface = ((shade - torch.tensor(background)).abs() > 2 / 255).any(dim=1)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.progress import Progress
@@ -34,6 +34,7 @@ def depth_maps(
     points: Float[Tensor, "N 3"] | None = None,
     settings: StereoSettings | None = None,
     background: tuple[float, float, float] | None = None,
+    masks: Sequence[Bool[Tensor, "h w"]] | None = None,
 ) -> list[DepthMap]:
     """The depth of each photo where others confirm it; unknown everywhere for photos whose stereo cannot be trusted.
 
@@ -43,6 +44,7 @@ def depth_maps(
             none; then the cameras give the range. None: features are triangulated where OpenCV, kornia and SciPy are
             installed.
         background: the colour of pixels without a surface, RGB in [0, 1].
+        masks: of each photo, False where it hides pixels: they get no depth. None: every pixel counts.
 
     Returns:
         A map for each photo, of its size and on its device.
@@ -65,6 +67,8 @@ def depth_maps(
         if background is not None:
             color = torch.tensor(background).to(photo.image)
             good &= ((photo.image - color).abs() > _BACKGROUND).any(dim=-1)
+        if masks is not None:
+            good &= masks[i].to(good.device)
         confidence = mine.correlation.clamp(0, 1) * (confirmed.agreeing.float() / 2).clamp(max=1)
         depth = torch.where(good, 1 / confirmed.inverse_depth, torch.nan)
         found = DepthMap(depth, torch.where(good, confidence, 0.0))
