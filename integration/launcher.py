@@ -10,6 +10,7 @@ from typing import Any
 
 from clear_strategies.compose import conductor
 from clear_strategies.errors import DataError
+from integration.points import wants_stereo
 from integration.views import sr_images, sr_source
 
 
@@ -21,6 +22,11 @@ def parser(module: str, description: str) -> argparse.ArgumentParser:
     add(
         "--overrides", action="append", default=[], metavar="KEY=VALUE",
         help="e.g. strategies.gco.tolerance=0.1; repeatable",
+    )  # fmt: skip
+    add(
+        "--points", default="own", metavar="own|stereo",
+        help="what the Gaussians start from: the trainer's own points, or dense stereo between its training photos "
+        "(%(default)s)",
     )  # fmt: skip
     add("--sr", metavar="FOLDER", help="SR images, named like the photos")
     add("--suffix", default="", help="what the SR tool appended to the names, e.g. _x4")
@@ -42,18 +48,20 @@ class Launch:
 
     Raises:
         DataError: the script is missing.
-        SettingError: the configuration is refused, or HR is used without SR images.
+        SettingError: the configuration or `points` is refused, or HR is used without SR images.
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.script, self.arguments, self.save_lr = options.script, options.rest, options.save_lr
         if not self.script.is_file():
             raise DataError(self.script, "script", "is not there", "give the training script of your trainer")
+        wants_stereo(options.points)  # raises now and not after the host has loaded its scene
         sr = sr_images(options.sr, options.suffix)
         self.settings: dict[str, Any] = {
             "strategies": options.strategies, "overrides": options.overrides, "sr": sr, "factor": options.factor,
+            "points": options.points,
         }  # fmt: skip
-        if self.save_lr is None:  # raises now and not after the host has loaded its scene
+        if self.save_lr is None:  # as early
             sr_source(sr, conductor(options.strategies, *options.overrides), options.factor)
 
 

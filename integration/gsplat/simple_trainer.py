@@ -19,7 +19,9 @@ from integration.detail import sh0_offset
 from integration.errors import HostError
 from integration.gsplat.attached import Attached
 from integration.gsplat.data import masks_from_dataset, views_from_dataset
+from integration.gsplat.points import start_from_stereo
 from integration.log import show_log
+from integration.points import Points, wants_stereo
 from integration.replacing import Replaced
 from integration.views import SuperResolve, sr_images, sr_source
 
@@ -49,6 +51,7 @@ def install(
     sr: SuperResolve | str | Path | None = None,
     suffix: str = "",
     factor: int = 4,
+    points: Points = "own",
     seed: int = 0,
     installed: Callable[[Attached], None] = lambda attached: None,
 ) -> None:
@@ -64,9 +67,17 @@ def install(
         overrides: settings, e.g. "strategies.gco.tolerance=0.1", "objective=lr_only".
         sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names.
         factor: HR pixels per LR pixel.
+        points: "own": the splats start as the host's `init_type` says; "stereo": from dense stereo between its training
+            photos, in place of its SfM points.
         installed: called with every attachment.
+
+    Raises:
+        SettingError: `points` is neither of these.
+        HostError: points=stereo, and the module of the class has no `create_splats_with_optimizers` or no `Dataset`.
     """
     show_log()
+    if wants_stereo(points):
+        start_from_stereo(runner_class)
     images = sr_images(sr, suffix)
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
 

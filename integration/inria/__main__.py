@@ -50,6 +50,7 @@ class _Run:
     def __init__(self, launch: Launch) -> None:
         self._launch, self.script = launch, launch.script
         self._scenes: list[Any] = []
+        self._installing = False
         self.attached: Attached | None = None
 
     def start(self) -> None:
@@ -74,7 +75,7 @@ class _Run:
         @functools.wraps(setup)
         def setup_and_install(gaussians: Any, opt: Any, *args: Any, **kwargs: Any) -> Any:
             result = setup(gaussians, opt, *args, **kwargs)
-            if self.attached is None:
+            if self.attached is None and not self._installing:
                 self._install(gaussians, opt)
             return result
 
@@ -96,6 +97,7 @@ class _Run:
         if self._launch.save_lr is not None:
             save_lr(scene.getTrainCameras(), self._launch.save_lr)
             raise SystemExit(0)
+        self._installing = True  # points=stereo calls training_setup again
         self.attached = install(gaussians, scene, opt, **self._launch.settings)
 
 

@@ -11,7 +11,9 @@ from clear_strategies.compose import conductor
 from integration.densification import end_with_strategies
 from integration.errors import HostError
 from integration.inria.attached import Attached
+from integration.inria.points import start_from_stereo
 from integration.log import show_log
+from integration.points import Points, wants_stereo
 from integration.views import SuperResolve, sr_images
 
 
@@ -25,6 +27,7 @@ def install(
     sr: SuperResolve | str | Path | None = None,
     suffix: str = "",
     factor: int = 4,
+    points: Points = "own",
     seed: int = 0,
 ) -> Attached:
     """Train the host's Gaussians with CLEAR; `gaussian_renderer.render` is replaced wherever it was imported.
@@ -39,16 +42,22 @@ def install(
         overrides: settings, e.g. "strategies.gco.tolerance=0.1", "objective=lr_only".
         sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names.
         factor: HR pixels per LR pixel.
+        points: "own": the Gaussians stay as the host made them; "stereo": they are made again from dense stereo between
+            the training photos, by the host's `create_from_pcd` and `training_setup`. A checkpoint that is restored later
+            replaces them.
 
     Raises:
         HostError: the host has another shape than 3DGS.
-        SettingError, DataError: see `Attached`.
+        SettingError: `points` is neither of these, or see `Attached`.
+        DataError: see `Attached`; stereo confirms no depth.
     """
     show_log()
     iterations = getattr(opt, "iterations", None)
     if iterations is None:
         raise HostError(f"{type(opt).__name__} has no iterations, which the options of training_setup have in 3DGS.")
     chosen = conductor(strategies, *overrides, iterations=int(iterations))
+    if wants_stereo(points):
+        start_from_stereo(gaussians, scene, opt)
     end_with_strategies(chosen, opt, "densify_until_iter")
     attached = Attached(
         gaussians, scene.getTrainCameras(), chosen, sr=sr_images(sr, suffix), factor=factor, seed=seed,

@@ -14,6 +14,7 @@ from gsplat.distributed import cli
 from gsplat.rendering import rasterization
 from gsplat.strategy import DefaultStrategy
 
+from clear_strategies.core.points import PointCloud
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
 from tests.helpers.gsplat_host import Photometric, intrinsics
@@ -25,6 +26,7 @@ class Config:
     max_steps: int = 8
     pose_noise: float = 0.0
     app_opt: bool = False
+    init_type: str = "sfm"
     strategy: Any = field(
         default_factory=lambda: DefaultStrategy(
             refine_start_iter=2, refine_stop_iter=7, refine_every=3, grow_grad2d=2e-4
@@ -36,11 +38,13 @@ class Parser:
     def __init__(self, scene):
         self.scene = scene
         self.image_names = ["test.png", *(f"{view.name}.png" for view in scene.train)]
+        self.points, self.points_rgb = scene.cloud.means.numpy(), (scene.cloud.colors * 255).numpy()
 
 
 class Dataset:
-    def __init__(self, parser):
-        self.parser, self.indices = parser, list(range(1, len(parser.image_names)))
+    def __init__(self, parser, split="train"):
+        first = {"train": 1, "val": 0}[split]
+        self.parser, self.indices = parser, list(range(first, len(parser.image_names) if first else 1))
 
     def __len__(self):
         return len(self.indices)
@@ -53,16 +57,25 @@ class Dataset:
         }  # fmt: skip
 
 
+def create_splats_with_optimizers(parser, init_type="sfm", device="cpu"):
+    points, colors = torch.from_numpy(parser.points).float(), torch.from_numpy(parser.points_rgb / 255).float()
+    if init_type == "random":
+        points, colors = torch.rand(50, 3), torch.rand(50, 3)
+    raw = GaussianField.from_cloud(PointCloud(points, colors, init_type)).raw()
+    rates = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+    splats = torch.nn.ParameterDict({name: torch.nn.Parameter(raw[name].clone()) for name in rates}).to(device)
+    return splats, {n: torch.optim.Adam([splats[n]], lr=lr, eps=1e-15) for n, lr in rates.items()}
+
+
 class Runner:
     def __init__(self, local_rank, world_rank, world_size, cfg):
         torch.manual_seed(42)
         self.cfg, self.world_size, self.device = cfg, world_size, "cpu"
         self.parser = Parser(toy.scene(24))
         self.trainset = Dataset(self.parser)
-        raw = GaussianField.from_cloud(self.parser.scene.cloud).raw()
-        rates = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
-        self.splats = torch.nn.ParameterDict({name: torch.nn.Parameter(raw[name].clone()) for name in rates})
-        self.optimizers = {n: torch.optim.Adam([self.splats[n]], lr=lr, eps=1e-15) for n, lr in rates.items()}
+        self.splats, self.optimizers = create_splats_with_optimizers(
+            self.parser, init_type=cfg.init_type, device=self.device
+        )
         cfg.strategy.check_sanity(self.splats, self.optimizers)
         self.strategy_state = cfg.strategy.initialize_state(scene_scale=4.0)
         self.render = self.rasterize_splats  # 1.6 hands the bound method to its Stage
@@ -116,5 +129,6 @@ if __name__ == "__main__":
     parser.add_argument("--max_steps", type=int, default=8)
     parser.add_argument("--pose_noise", type=float, default=0.0)
     parser.add_argument("--app_opt", action="store_true")
+    parser.add_argument("--init_type", default="sfm")
     cfg = Config(**vars(parser.parse_args()))
     cli(main, cfg, verbose=True)

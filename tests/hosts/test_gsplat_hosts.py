@@ -44,9 +44,9 @@ def training(scene, results, **more):
     return [*named, "--save-ply", "--disable-viewer", "--disable-video"]
 
 
-def launched(host, scene, results, densifier="default", *extra, status=0, **more):
+def launched(host, scene, results, densifier="default", *extra, points="own", status=0, **more):
     overrides = [f"--overrides={override}" for override in FROM_START]
-    clear = ["-m", "integration.gsplat", "--sr", scene / "sr", *overrides]
+    clear = ["-m", "integration.gsplat", "--points", points, "--sr", scene / "sr", *overrides]
     return start(
         host, *clear, "simple_trainer.py", densifier, *training(scene, results, **more), *extra, status=status
     )  # fmt: skip
@@ -73,6 +73,20 @@ def test_it_trains_densifies_evaluates_and_saves(host, scene, tmp_path, densifie
     assert len(splats["means"]) > 60
     written = read_gaussians(next((tmp_path / "run" / "ply").glob("*.ply")))
     assert torch.allclose(written.sh0, splats["sh0"], atol=1e-6)  # f_base + f_det in both
+
+
+def test_it_starts_from_stereo_between_its_photos(host, scene, tmp_path):
+    said = launched(host, scene, tmp_path / "run", points="stereo", **{"strategy.refine-start-iter": STEPS})
+    (found,) = re.findall(
+        r"points=stereo: ([\d,]+) points in all: [\d,]+ points of dense stereo between the 3 photos", said
+    )
+    assert f"Number of GS: {found.replace(',', '')}" in said
+    assert counts(said)["merges"] == STEPS
+    assert len(stored(tmp_path / "run")["means"]) == int(found.replace(",", ""))
+    random = launched(
+        host, scene, tmp_path / "random", "default", "--init-type", "random", points="stereo", **{"init-num-pts": 80}
+    )
+    assert "points=stereo has no effect with init_type=random" in random
 
 
 def test_its_own_evaluation_reads_the_checkpoint(host, scene, tmp_path):

@@ -47,9 +47,9 @@ def training(host, **more):
     ]
 
 
-def launched(host, scene, model, *extra, status=0, **more):
+def launched(host, scene, model, *extra, points="own", status=0, **more):
     overrides = [f"--overrides={override}" for override in FROM_START]
-    clear = ["-m", "integration.inria", "--sr", scene / "sr", *overrides]
+    clear = ["-m", "integration.inria", "--points", points, "--sr", scene / "sr", *overrides]
     return run(
         host, *clear, "train.py", "-s", scene, "-m", model, *training(host, **more), *extra, status=status
     )  # fmt: skip
@@ -71,6 +71,16 @@ def test_it_trains_densifies_evaluates_saves_and_continues(host, scene, tmp_path
     resumed = launched(host, scene, tmp_path / "resumed", start_checkpoint=tmp_path / "whole" / "chkpnt20.pth")
     assert "10 merges" in resumed or "11 merges" in resumed  # FSGS writes its checkpoint before the step
     assert len(cloud(tmp_path / "resumed")) == len(whole)
+
+
+def test_it_starts_from_stereo_between_its_photos(host, scene, tmp_path):
+    said = launched(host, scene, tmp_path / "model", points="stereo", densify_until_iter=0)
+    (found,) = re.findall(
+        r"points=stereo: ([\d,]+) points in all: [\d,]+ points of dense stereo between the 3 photos", said
+    )
+    assert f"Number of points at initialisation :  {found.replace(',', '')}" in said
+    assert "30 merges" in said
+    assert len(cloud(tmp_path / "model")) == int(found.replace(",", ""))
 
 
 def test_one_line_in_train_py_does_the_same(host, scene, tmp_path):

@@ -8,7 +8,7 @@ import torch
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
-from scene.gaussian_model import GaussianModel
+from scene.gaussian_model import BasicPointCloud, GaussianModel
 
 __all__ = ["Camera", "GaussianModel", "Scene", "write"]
 
@@ -37,7 +37,9 @@ class Scene:
             )
             for name, c in stored["cameras"].items()
         ]
-        gaussians.create(torch.tensor(stored["points"]), torch.tensor(stored["colors"]))
+        self.cameras_extent = 4.0
+        points, colors = torch.tensor(stored["points"]), torch.tensor(stored["colors"])
+        gaussians.create_from_pcd(BasicPointCloud(points, colors, None), self.cameras_extent)
 
     def getTrainCameras(self, scale=1.0):
         return list(self.cameras)

@@ -1,5 +1,7 @@
 """A GaussianModel with the interface of 3DGS: one Adam with named groups; a changed structure replaces the parameters."""
 
+from typing import Any, NamedTuple
+
 import torch
 from safetensors.torch import save_file
 
@@ -13,11 +15,19 @@ GROUPS = {
 }  # fmt: skip
 
 
+class BasicPointCloud(NamedTuple):
+    points: Any
+    colors: Any
+    normals: Any
+
+
 class GaussianModel:
     def __init__(self):
         self.active_sh_degree, self.max_sh_degree, self.optimizer = 0, 3, None
 
-    def create(self, points, colors):
+    def create_from_pcd(self, pcd: BasicPointCloud, spatial_lr_scale: float):
+        self.spatial_lr_scale = spatial_lr_scale
+        points, colors = (torch.as_tensor(x).float() for x in (pcd.points, pcd.colors))
         raw = GaussianField.from_cloud(PointCloud(points, colors, source="points")).raw()
         tensors = (raw["means"], raw["sh0"], raw["shN"], raw["opacities"][:, None], raw["scales"], raw["quats"])
         for attribute, tensor in zip(GROUPS.values(), tensors, strict=True):
@@ -137,3 +147,11 @@ class GaussianModel:
     def _reset_statistics(self):
         self.xyz_gradient_accum = torch.zeros(len(self._xyz), 1)
         self.denom = torch.zeros(len(self._xyz), 1)
+
+
+class WithExposures(GaussianModel):
+    """The signature of 3DGS since 2024, which keeps an exposure for each photo by its name."""
+
+    def create_from_pcd(self, pcd: BasicPointCloud, cam_infos: int, spatial_lr_scale: float):
+        super().create_from_pcd(pcd, spatial_lr_scale)
+        self.exposed = [info.image_name for info in cam_infos]

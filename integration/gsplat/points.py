@@ -1,0 +1,80 @@
+"""simple_trainer's initial splats from dense stereo between its training photos."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import inspect
+import logging
+from typing import Any, Final
+
+import torch
+
+from clear_strategies.core.points import PointCloud
+from clear_strategies.core.view import Photo
+from integration.errors import HostError
+from integration.gsplat.data import mask_of
+from integration.points import ELSEWHERE, stereo_points
+from rasterizers.interface import Camera
+
+_log = logging.getLogger(__name__)
+
+_CREATE: Final = "create_splats_with_optimizers"
+
+
+def start_from_stereo(runner_class: Any) -> None:
+    """Make every later `Runner` start from the stereo cloud of its training photos.
+
+    simple_trainer's `create_splats_with_optimizers` gets a parser whose `points` and `points_rgb` are that cloud; the
+    runner's own parser stays as it is. With an `init_type` other than "sfm", which reads no points, a warning says so.
+
+    Args:
+        runner_class: simple_trainer's `Runner`.
+
+    Raises:
+        HostError: the module of the class has no create_splats_with_optimizers or no Dataset.
+    """
+    module = getattr(inspect.unwrap(runner_class.__init__), "__globals__", {})
+    if missing := [name for name in (_CREATE, "Dataset") if name not in module]:
+        raise HostError(
+            f"points=stereo: the module of {runner_class.__name__} has no {missing[0]}, which gsplat's simple_trainer.py has. "
+            f"{ELSEWHERE}"
+        )
+    create, dataset = module[_CREATE], module["Dataset"]
+
+    @functools.wraps(create)
+    def create_from_stereo(parser: Any, *args: Any, **kwargs: Any) -> Any:
+        given = inspect.signature(create).bind(parser, *args, **kwargs)
+        given.apply_defaults()
+        init_type = given.arguments.get("init_type", "sfm")
+        if init_type == "sfm":
+            parser = _with_points(parser, stereo_cloud(dataset(parser, split="train")))
+        else:
+            _log.warning("points=stereo has no effect with init_type=%s. Set init_type=sfm.", init_type)
+        return create(parser, *args, **kwargs)
+
+    module[_CREATE] = create_from_stereo
+
+
+def stereo_cloud(dataset: Any) -> PointCloud:
+    """The stereo cloud of all photos of a `Dataset` (`examples/datasets/colmap.py`), in the world of its parser.
+
+    Raises:
+        DataError: there are fewer than two photos, or stereo confirms no depth.
+    """
+    items = [dataset[i] for i in range(len(dataset))]
+    return stereo_points([_photo(item) for item in items], [mask_of(item) for item in items])
+
+
+def _photo(item: Any) -> Photo:
+    image = item["image"] / 255
+    (fx, _, cx), (_, fy, cy), _ = item["K"].tolist()
+    pose = torch.linalg.inv(item["camtoworld"])
+    return Photo(Camera(pose, fx, fy, cx, cy, image.shape[1], image.shape[0]), image)
+
+
+def _with_points(parser: Any, cloud: PointCloud) -> Any:
+    """A copy of the parser with other points; what else its points are used for (depths) needs its own."""
+    changed = copy.copy(parser)
+    changed.points, changed.points_rgb = cloud.means.numpy(), (cloud.colors * 255).numpy()
+    return changed

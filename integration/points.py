@@ -1,0 +1,68 @@
+"""A host's initial points: its own, or dense stereo between its training photos."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Final, Literal
+
+import torch
+from torch import Tensor
+
+from clear_strategies.core.points import MAX_POINTS, PointCloud
+from clear_strategies.core.projection import intrinsics
+from clear_strategies.core.view import Photo
+from clear_strategies.errors import SettingError
+from clear_strategies.geometry import stereo
+
+_log = logging.getLogger(__name__)
+
+Points = Literal["own", "stereo"]
+"""Whose points the Gaussians start from."""
+
+ELSEWHERE: Final = "Leave points at own, and write points3D.ply for the host to read: docs/how-to/stereo.md shows how."
+"""What to do in a host whose points cannot be replaced."""
+
+
+def wants_stereo(points: str) -> bool:
+    """Whether the Gaussians start from stereo, and not from the host's own points.
+
+    Args:
+        points: "own" or "stereo".
+
+    Raises:
+        SettingError: it is neither.
+    """
+    if points not in ("own", "stereo"):
+        raise SettingError(
+            f"points: must be own (the host's) or stereo (dense stereo between its training photos), got {points!r}."
+        )
+    return points == "stereo"
+
+
+def stereo_points(photos: Sequence[Photo], masks: Sequence[Tensor | None] | None = None) -> PointCloud:
+    """Dense stereo between a host's training photos; one line of the log says what was found.
+
+    Args:
+        photos: the training photos as the host trains on them, in its world. Stereo runs on their device.
+        masks: one for each photo, [h, w] in [0, 1]: below 0.5 the host hides the pixel, which gets no points. None among
+            them, or in their place: nothing is hidden.
+
+    Returns:
+        At most `MAX_POINTS` points on the CPU: world units, RGB in [0, 1]. More are reduced at random, always to the same.
+
+    Raises:
+        DataError: there are fewer than two photos, or stereo confirms no depth.
+    """
+    cameras = [photo.camera for photo in photos]
+    found = stereo(
+        [photo.image.clamp(0, 1) for photo in photos],
+        torch.stack([camera.world_to_camera.cpu() for camera in cameras]) if cameras else torch.zeros(0, 4, 4),
+        torch.stack([intrinsics(camera) for camera in cameras]) if cameras else torch.zeros(0, 3, 3),
+        masks=None if masks is None else [None if mask is None else mask >= 0.5 for mask in masks],
+    )
+    cloud = PointCloud(found.means.cpu(), found.colors.cpu(), found.summary)
+    kept = cloud.at_most(MAX_POINTS)
+    chosen = "" if len(kept) == len(cloud) else f"; {len(kept):,} of them, chosen at random, are used"
+    _log.info("points=stereo: %s%s.", found.summary, chosen)
+    return kept

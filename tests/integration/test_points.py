@@ -1,0 +1,278 @@
+"""Initial points by stereo in gsplat's simple_trainer and in a 3DGS-style train.py: where they lie, and who trains them."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import logging
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+
+from clear_strategies.core.projection import intrinsics
+from clear_strategies.errors import DataError, SettingError
+from clear_strategies.geometry import stereo
+from integration import HostError
+from integration import points as initial
+from integration.gsplat import points as gsplat_points
+from integration.inria.__main__ import main as inria_main
+from integration.inria.cameras import HostViews
+from integration.inria.from_options import install as install_in_inria
+from integration.inria.points import stereo_cloud
+from integration.points import stereo_points, wants_stereo
+from tests.helpers import toy
+from tests.helpers.inria import FOLDER, N, options
+
+SCRIPT = Path(__file__).parents[1] / "helpers" / "simple_trainer.py"
+ROWS = ["strategies.p2g.patch=4", "objective.lambda_hr.start=0", "objective.lambda_hr.full=0"]
+SH_C0 = 0.28209479177387814
+
+
+@cache
+def expected():
+    """What `stereo` gives for the photos of the toy scene."""
+    photos = [view.lr for view in toy.scene(N).train]
+    poses = torch.stack([photo.camera.world_to_camera for photo in photos])
+    return stereo([photo.image for photo in photos], poses, torch.stack([intrinsics(photo.camera) for photo in photos]))
+
+
+def assert_starts_there(means, sh0):
+    """As many Gaussians as points, at their places and with their colours; roundings move a few, far away."""
+    points, colors = expected().means, expected().colors
+    assert len(means) == len(points)
+    distance, nearest = (means[:, None] - points).norm(dim=2).min(1)
+    assert (distance < 0.01).float().mean() > 0.95
+    assert ((sh0.reshape(-1, 3) * SH_C0 + 0.5 - colors[nearest]).abs().amax(1) < 0.01).float().mean() > 0.95
+
+
+# ---- what hosts share
+
+
+@pytest.mark.parametrize("points", ["sfm", "", "Stereo"])
+def test_other_words_than_own_and_stereo_are_refused(points):
+    with pytest.raises(SettingError, match=rf"points: must be own \(.*\) or stereo \(.*\), got '{points}'"):
+        wants_stereo(points)
+
+
+def test_one_line_says_what_was_found_and_a_large_cloud_is_reduced(monkeypatch, caplog):
+    photos = [view.lr for view in toy.scene(N).train]
+    with caplog.at_level(logging.INFO):
+        whole = stereo_points(photos)
+    assert [r.message for r in caplog.records if r.name == "integration.points"] == [
+        f"points=stereo: {expected().summary}."
+    ]
+    monkeypatch.setattr(initial, "MAX_POINTS", 50)
+    with caplog.at_level(logging.INFO):
+        few = stereo_points(photos)
+    assert len(few) == 50
+    assert set(map(tuple, few.means.tolist())) <= set(map(tuple, whole.means.tolist()))
+    assert "50 of them, chosen at random, are used" in caplog.text
+    assert torch.equal(few.means, stereo_points(photos).means)
+
+
+def test_too_few_photos_are_refused():
+    for photos in ([], [toy.scene(N).train[0].lr]):
+        with pytest.raises(DataError, match="images: must be at least 2 photos"):
+            stereo_points(photos)
+
+
+# ---- gsplat's simple_trainer
+
+
+@pytest.fixture
+def trainer(monkeypatch):
+    """A fresh module of the stand-in."""
+    pytest.importorskip("gsplat", reason="pip install gsplat")
+    spec = importlib.util.spec_from_file_location("simple_trainer_of_a_test", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+def runner_of(trainer, tmp_path, **settings):
+    return trainer.Runner(0, 0, 1, trainer.Config(str(tmp_path), **settings))
+
+
+def install(trainer, **settings):
+    from integration.gsplat import install
+
+    install(trainer.Runner, strategies="svs", overrides=["objective=lr_only"], **settings)
+
+
+def test_splats_start_at_the_stereo_cloud_and_their_optimizers_have_them(trainer, tmp_path):
+    install(trainer, points="stereo")
+    runner = runner_of(trainer, tmp_path)
+    assert_starts_there(runner.splats["means"].detach(), runner.splats["sh0"].detach())
+    assert len(runner.parser.points) == N  # depths of the host's own points stay what they were
+    for name, p in runner.splats.items():
+        assert runner.optimizers[name].param_groups[0]["params"][0] is p
+        assert len(p) == len(expected().means)
+
+
+def test_splats_start_at_the_hosts_own_points_by_default(trainer, tmp_path):
+    own = runner_of(trainer, tmp_path).splats
+    install(trainer)
+    for name, p in runner_of(trainer, tmp_path).splats.items():
+        assert torch.equal(p, own[name])
+
+
+def test_points_have_no_effect_on_random_splats_and_a_warning_says_so(trainer, tmp_path, caplog):
+    own = runner_of(trainer, tmp_path, init_type="random").splats
+    install(trainer, points="stereo")
+    for name, p in runner_of(trainer, tmp_path, init_type="random").splats.items():
+        assert torch.equal(p, own[name])
+    assert "points=stereo has no effect with init_type=random. Set init_type=sfm." in caplog.text
+
+
+def test_the_hidden_half_of_a_photo_of_the_dataset_gives_no_points(trainer):
+    class Masked(trainer.Dataset):
+        def __getitem__(self, item):
+            return super().__getitem__(item) | {"mask": mask}
+
+    mask = torch.ones(16, 24, dtype=torch.bool)
+    dataset = Masked(trainer.Parser(toy.scene(N)))
+    assert len(gsplat_points.stereo_cloud(dataset)) == len(expected().means)
+    mask[:, 12:] = False
+    cloud = gsplat_points.stereo_cloud(dataset)
+    seen = torch.zeros(len(cloud), dtype=torch.bool)
+    for view in toy.scene(N).train:
+        camera = view.lr.camera
+        at = cloud.means @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        seen |= at[:, 0] / at[:, 2] * camera.fx + camera.cx < 12.5
+    assert len(cloud) < len(expected().means)
+    assert seen.all()
+
+
+def test_a_script_without_the_hosts_functions_is_refused(trainer):
+    class Runner:
+        def train(self):
+            """Nothing."""
+
+        rasterize_splats = train
+
+    with pytest.raises(HostError, match=r"has no create_splats_with_optimizers.*points3D\.ply"):
+        gsplat_points.start_from_stereo(Runner)
+    del trainer.Dataset
+    with pytest.raises(HostError, match="has no Dataset"):
+        install(trainer, points="stereo")
+    with pytest.raises(SettingError, match="points: must be own"):
+        install(trainer, points="random")
+
+
+# ---- 3DGS-style train.py
+
+
+def own_gaussians(host, folder, **settings):
+    opt = options(host, folder, **settings)
+    return *host.setup(opt), opt
+
+
+def install_stereo(gaussians, scene, opt, folder, **settings):
+    return install_in_inria(gaussians, scene, opt, points="stereo", sr=folder / "sr", overrides=ROWS, **settings)
+
+
+@pytest.mark.parametrize("newer", [False, True])
+def test_gaussians_are_made_again_at_the_stereo_cloud(newer, inria_host, inria_capture):
+    gaussians, scene, opt = own_gaussians(inria_host, inria_capture)
+    if newer:
+        gaussians.__class__ = sys.modules["scene.gaussian_model"].WithExposures
+    before = gaussians.optimizer
+    clear = install_stereo(gaussians, scene, opt, inria_capture)
+    assert_starts_there(gaussians._xyz.detach(), gaussians._features_dc.detach())
+    assert gaussians.optimizer is not before
+    (xyz,) = (g for g in gaussians.optimizer.param_groups if g["name"] == "xyz")
+    assert xyz["params"][0] is gaussians._xyz
+    assert clear.params()["means"] is gaussians._xyz
+    assert gaussians.spatial_lr_scale == scene.cameras_extent
+    assert len(gaussians.xyz_gradient_accum) == len(gaussians._xyz)
+    if newer:
+        assert gaussians.exposed == [camera.image_name for camera in scene.cameras]
+    clear.remove()
+
+
+def test_gaussians_stay_the_hosts_own_by_default(inria_host, inria_capture):
+    gaussians, scene, opt = own_gaussians(inria_host, inria_capture)
+    optimizer, xyz = gaussians.optimizer, gaussians._xyz
+    install_in_inria(gaussians, scene, opt, sr=inria_capture / "sr", overrides=ROWS).remove()
+    assert gaussians.optimizer is optimizer
+    assert gaussians._xyz is xyz
+
+
+def test_pixels_under_an_alpha_mask_give_no_points(inria_host, inria_capture):
+    _, scene, _ = own_gaussians(inria_host, inria_capture)
+    whole = stereo_cloud(scene.cameras)
+    for camera in scene.cameras:
+        camera.alpha_mask = torch.ones(1, 16, 24)
+        camera.alpha_mask[..., 12:] = 0
+    assert 0 < len(stereo_cloud(scene.cameras)) < 0.8 * len(whole)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("no function", "has no create_from_pcd, which a GaussianModel has"),
+        ("another signature", r"must take pcd, and .* got \(pcd, octree, spatial_lr_scale\)"),
+        ("no type", "has no BasicPointCloud"),
+        ("no extent", "has no cameras_extent"),
+    ],
+)
+def test_a_fork_of_another_shape_is_refused_with_the_file_as_remedy(
+    change, message, inria_host, inria_capture, monkeypatch
+):
+    gaussians, scene, opt = own_gaussians(inria_host, inria_capture)
+    model = type(gaussians)
+    if change == "no function":
+        monkeypatch.delattr(model, "create_from_pcd")
+    elif change == "another signature":
+        other = inspect.signature(lambda self, pcd, octree, spatial_lr_scale: None)
+        monkeypatch.setattr(model.create_from_pcd, "__signature__", other, raising=False)
+    elif change == "no type":
+        monkeypatch.delattr(sys.modules[model.__module__], "BasicPointCloud")
+    else:
+        del scene.cameras_extent, gaussians.spatial_lr_scale
+    with pytest.raises(HostError, match=message) as refused:
+        install_stereo(gaussians, scene, opt, inria_capture)
+    assert "docs/how-to/stereo.md" in str(refused.value)
+
+
+def test_the_launcher_trains_from_stereo_and_continues_from_its_checkpoint(inria_host, inria_capture, caplog):
+    from safetensors.torch import load_file
+
+    def run(name, *arguments):
+        script = [str(FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(inria_capture / name)]
+        clear = ["--points", "stereo", "--sr", str(inria_capture / "sr"), *(f"--overrides={row}" for row in ROWS)]
+        assert inria_main([*clear, *script, "--iterations", "6", "--densify_until_iter", "0", *arguments]) == 0
+        return load_file(inria_capture / name)
+
+    checkpoint = str(inria_capture / "4.pth")
+    with caplog.at_level(logging.INFO):
+        whole = run("whole", "--checkpoint", checkpoint, "--checkpoint_iteration", "4")
+    assert caplog.text.count("points=stereo: ") == 1
+    assert "6 merges" in caplog.text
+    assert whole["xyz"].shape == expected().means.shape
+    assert float((whole["xyz"] - expected().means).norm(dim=1).median()) < 0.02
+    resumed = run("resumed", "--start_checkpoint", checkpoint)
+    assert all(torch.allclose(rows, resumed[name], atol=1e-5) for name, rows in whole.items())
+
+
+def test_the_launchers_name_the_flag_and_refuse_other_words_before_the_host_starts(capsys, caplog):
+    from integration.gsplat.__main__ import main as gsplat_main
+
+    for main in (inria_main, gsplat_main):
+        with pytest.raises(SystemExit):
+            main(["--help"])
+        assert "--points own|stereo" in capsys.readouterr().out
+        assert main(["--points", "colmap", "--sr", ".", str(SCRIPT)]) == 2
+    assert caplog.text.count("points: must be own (the host's) or stereo") == 2
+
+
+def test_views_and_points_have_the_same_cameras(inria_host, inria_capture):
+    """A host's camera is read the same way for its view and for its points."""
+    _, scene, _ = own_gaussians(inria_host, inria_capture)
+    views = HostViews(scene.cameras, lambda name, image, factor: image, 1).all
+    cloud = stereo_points([host_view.view.lr for host_view in views])
+    assert torch.equal(cloud.means, stereo_cloud(scene.cameras).means)
