@@ -13,11 +13,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.view import View
+from clear_strategies.core.points import PointCloud
+from clear_strategies.core.view import Photo, View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors import Bicubic, Images, Onnx, Prior, cached
 from clear_strategies.errors import DataError, SettingError
+from integration.points import stereo_points
 from integration.views import view
+from rasterizers.interface import Camera
 
 
 def prior(sr: Path | None) -> Prior:
@@ -55,6 +58,42 @@ def views_from_datamanager(
     return tuple(found)
 
 
+def seed_with_stereo(datamanager: Any) -> None:
+    """Replace the data set's points, which the pipeline gives to its model, by the stereo cloud of the training photos.
+
+    Raises:
+        DataError: there are fewer than two photos, or stereo confirms no depth.
+        SettingError: the photos are not kept in memory.
+    """
+    cloud = stereo_cloud(datamanager)
+    points = {"points3D_xyz": cloud.means, "points3D_rgb": (cloud.colors * 255).round().to(torch.uint8)}
+    metadata = datamanager.train_dataparser_outputs.metadata
+    for name in [
+        name for name in metadata if name.startswith("points3D_")
+    ]:  # errors and tracks are those of the old points
+        del metadata[name]
+    metadata.update(points)
+
+
+def stereo_cloud(datamanager: Any) -> PointCloud:
+    """The stereo cloud of a `FullImageDatamanager`'s undistorted training photos, in the world of its cameras.
+
+    Pixels that a mask hides, or alpha, get no points.
+
+    Raises:
+        DataError: there are fewer than two photos, or stereo confirms no depth.
+        SettingError: the photos are not kept in memory.
+    """
+    cached = _cached(datamanager)  # read first: it undistorts the photos and corrects the cameras
+    cameras = datamanager.train_dataset.cameras
+    Ks, poses = cameras.get_intrinsics_matrices().tolist(), world_to_camera(cameras.camera_to_worlds)
+    photos = []
+    for item, ((fx, _, cx), (_, fy, cy), _), pose in zip(cached, Ks, poses, strict=True):
+        image = over_black(item["image"])
+        photos.append(Photo(Camera(pose.float(), fx, fy, cx, cy, image.shape[1], image.shape[0]), image))
+    return stereo_points(photos, [_mask(item) for item in cached])
+
+
 def save_lr(datamanager: Any, folder: Path) -> None:
     """Write the photos as splatfacto trains on them, as PNG, for an SR tool to enlarge."""
     files = datamanager.train_dataset.image_filenames
@@ -76,6 +115,18 @@ def over_black(image: Tensor) -> Float[Tensor, "H W 3"]:
     """RGB in [0, 1] of an 8-bit or float photo, composited over black as splatfacto does it."""
     values = image.float() / 255 if image.dtype == torch.uint8 else image
     return values[..., :3] * values[..., 3:] if values.shape[-1] == 4 else values
+
+
+def _mask(item: Any) -> Float[Tensor, "H W"] | None:
+    """1 where a photo shows the scene: what its mask shows, and not less than half transparent. None: everywhere."""
+    image, mask = item["image"], item.get("mask")
+    alpha = None
+    if image.shape[-1] == 4:
+        alpha = image[..., 3].float() / (255 if image.dtype == torch.uint8 else 1)
+    shown = None if mask is None else mask.reshape(image.shape[:2]).to(image.device).float()
+    if alpha is None or shown is None:
+        return alpha if shown is None else shown
+    return torch.minimum(alpha, shown)
 
 
 def _cached(datamanager: Any) -> Any:

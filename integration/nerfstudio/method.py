@@ -16,7 +16,6 @@ from typing import Any, Final, Literal
 import torch
 from jaxtyping import Float
 from nerfstudio.configs.base_config import ViewerConfig
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanagerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
@@ -34,6 +33,7 @@ from integration.densification import end_of_densification
 from integration.detail import sh0_offset
 from integration.gsplat import Attached, attach
 from integration.nerfstudio.data import prior, save_lr, views_from_datamanager
+from integration.nerfstudio.datamanager import ClearDatamanagerConfig
 
 NAMES: Final = {"sh0": "features_dc", "shN": "features_rest"}
 """gsplat's parameter name -> splatfacto's, where they differ."""
@@ -136,6 +136,8 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
                 f"gradient_accumulation_steps: clear-splatfacto merges the gradients of one view per step, got {accumulated}. "
                 "Leave them at 1."
             )
+        if config.random_init and getattr(datamanager.config, "points", "own") == "stereo":
+            CONSOLE.log("points=stereo has no effect with random_init. Set pipeline.model.random_init=False.")
         if config.save_lr is not None:
             save_lr(datamanager, config.save_lr)
             CONSOLE.log(
@@ -202,7 +204,7 @@ clear_splatfacto: Final = MethodSpecification(
         max_num_iterations=30_000,
         mixed_precision=False,
         pipeline=VanillaPipelineConfig(
-            datamanager=FullImageDatamanagerConfig(
+            datamanager=ClearDatamanagerConfig(
                 dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
             ),
             model=ClearSplatfactoModelConfig(),

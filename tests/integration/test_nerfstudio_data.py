@@ -18,9 +18,18 @@ from clear_strategies.data.cameras import pose_from_opengl
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.priors import Bicubic, Cached, Images
 from clear_strategies.errors import DataError, SettingError
+from clear_strategies.geometry import stereo
 from clear_strategies.schedules import WarmupDecay
 from integration.gsplat import attach
-from integration.nerfstudio.data import over_black, prior, save_lr, views_from_datamanager, world_to_camera
+from integration.nerfstudio.data import (
+    over_black,
+    prior,
+    save_lr,
+    seed_with_stereo,
+    stereo_cloud,
+    views_from_datamanager,
+    world_to_camera,
+)
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
 
@@ -104,6 +113,59 @@ def test_masks_and_equal_stems_are_refused():
     for call in (lambda: views_from_datamanager(twins, Bicubic(), 4), lambda: save_lr(twins, None)):
         with pytest.raises(DataError, match="stem"):
             call()
+
+
+class ToyManager:
+    """A data manager of the toy scene's photos, with another lens before they are undistorted."""
+
+    def __init__(self, kind=lambda image: (image * 255).round().to(torch.uint8), **extra):
+        photos = [view.lr for view in toy.scene(24).train]
+        flip = torch.tensor([1.0, -1, -1, 1])
+        Ks = torch.cat([gsplat_host.intrinsics(photo.camera) for photo in photos])
+        self.lens = Ks / 2
+        cameras = SimpleNamespace(
+            camera_to_worlds=torch.stack([p.camera.world_to_camera.inverse() * flip for p in photos])[:, :3],
+            get_intrinsics_matrices=lambda: self.lens,
+        )
+        self.train_dataset, self._corrected = SimpleNamespace(cameras=cameras), Ks
+        self.photos = [{"image": kind(photo.image)} | extra for photo in photos]
+        old = {"points3D_xyz": torch.zeros(5, 3), "points3D_rgb": torch.zeros(5, 3), "points3D_error": torch.zeros(5)}
+        self.train_dataparser_outputs = SimpleNamespace(metadata={"scale": 1.0} | old)
+
+    @functools.cached_property
+    def cached_train(self):
+        self.lens = self._corrected
+        return self.photos
+
+
+def test_seed_points_are_the_stereo_cloud_of_the_undistorted_photos():
+    manager = ToyManager()
+    cameras = [view.lr.camera for view in toy.scene(24).train]
+    seed_with_stereo(manager)
+    metadata = manager.train_dataparser_outputs.metadata
+    assert set(metadata) == {"scale", "points3D_xyz", "points3D_rgb"}
+    expected = stereo(
+        [item["image"] for item in manager.photos], torch.stack([camera.world_to_camera for camera in cameras]),
+        torch.cat([gsplat_host.intrinsics(camera) for camera in cameras]),
+    )  # fmt: skip
+    assert metadata["points3D_xyz"].shape == metadata["points3D_rgb"].shape == expected.means.shape
+    near = (metadata["points3D_xyz"] - expected.means).norm(dim=1) < 0.01
+    assert near.float().mean() > 0.95
+    assert metadata["points3D_rgb"].dtype == torch.uint8
+    assert ((metadata["points3D_rgb"] / 255 - expected.colors).abs().amax(1)[near] < 0.01).all()
+
+
+@pytest.mark.parametrize("by", ["mask", "alpha", "both"])
+def test_hidden_pixels_give_no_seed_points(by):
+    half = torch.ones(16, 24)
+    half[:, 12:] = 0
+
+    def with_alpha(image):
+        return torch.cat((image, (half if by == "alpha" else torch.ones(16, 24))[..., None]), -1)
+
+    kind = (lambda image: image) if by == "mask" else with_alpha
+    mask = {} if by == "alpha" else {"mask": half[..., None].bool()}
+    assert 0 < len(stereo_cloud(ToyManager(kind, **mask))) < 0.8 * len(stereo_cloud(ToyManager()))
 
 
 def test_photos_that_stay_on_disk_are_refused():

@@ -33,6 +33,8 @@ from nerfstudio.plugins.registry import discover_methods
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.errors import SettingError
 from integration.nerfstudio import clear_splatfacto
+from integration.nerfstudio.data import stereo_cloud
+from integration.nerfstudio.datamanager import ClearDatamanager, ClearDatamanagerConfig
 from integration.nerfstudio.method import ClearSplatfactoModel, ClearSplatfactoModelConfig
 from rasterizers import autograd
 from rasterizers.geometry import SH_C0
@@ -137,9 +139,11 @@ def test_the_command_line_has_its_settings():
 
     line = (
         "clear-splatfacto --data scene --pipeline.model.strategies gco,svs --pipeline.model.sr scene/sr "
-        "--pipeline.model.overrides strategies.gco.tolerance=0.1 objective=paper"
+        "--pipeline.model.overrides strategies.gco.tolerance=0.1 objective=paper --pipeline.datamanager.points stereo"
     )
-    model = tyro.cli(AnnotatedBaseConfigUnion, args=line.split()).pipeline.model
+    pipeline = tyro.cli(AnnotatedBaseConfigUnion, args=line.split()).pipeline
+    model = pipeline.model
+    assert pipeline.datamanager.points == "stereo"
     assert (model.strategies, model.sr) == ("gco,svs", Path("scene/sr"))
     assert model.overrides == ("strategies.gco.tolerance=0.1", "objective=paper")
 
@@ -188,6 +192,36 @@ def test_nerfstudios_trainer_trains_it(capture, tmp_path, clear):
     assert float(model.gauss_params["detail"].abs().max()) > 0
     assert model.attached is None
     assert splatfacto.rasterization is rasterization
+
+
+def test_it_starts_from_the_stereo_cloud_of_its_photos(capture, tmp_path):
+    config = configured(capture, tmp_path, strategies="svs", stop_split_at=0)
+    config.pipeline.datamanager.points = "stereo"
+    host = trainer(config)
+    model, manager = host.pipeline.model, host.pipeline.datamanager
+    assert isinstance(manager, ClearDatamanager)
+    cloud = stereo_cloud(manager)
+    assert torch.equal(model.gauss_params["means"], cloud.means)
+    colors = model.gauss_params["features_dc"].detach() * SH_C0 + 0.5
+    assert torch.allclose(colors, cloud.colors, atol=1 / 255)
+    for name, p in model.gauss_params.items():
+        assert len(p) == len(cloud), name
+        assert host.optimizers.optimizers[name].param_groups[0]["params"][0] is p, name
+    host.train()
+    assert bool(model.gauss_params["means"].isfinite().all())
+
+
+def test_it_starts_from_the_data_sets_points_by_default_and_in_evaluation(capture, tmp_path):
+    config = configured(capture, tmp_path)
+    assert config.pipeline.datamanager.points == "own"
+    assert len(config.pipeline.setup(device="cpu").model.gauss_params["means"]) == 40
+    config.pipeline.datamanager.points = "stereo"  # a checkpoint's Gaussians are loaded there
+    assert len(config.pipeline.setup(device="cpu", test_mode="test").model.gauss_params["means"]) == 40
+
+
+def test_points_are_own_or_stereo():
+    with pytest.raises(SettingError, match="points: must be own"):
+        ClearDatamanagerConfig(points="colmap")
 
 
 def test_with_hr_weight_0_it_is_splatfacto_to_the_bit(capture, tmp_path):
