@@ -2,21 +2,28 @@
 
 A strategy is a small object that answers questions about a training step. A `Conductor` asks the strategies in a fixed order
 and merges the gradients. Each strategy works alone and with others, in the trainer of this package and in other trainers.
+
+Each name is imported when it is first asked for, because most need torch, which takes seconds to import: `clear-strategies
+--help` and a host that asks for little do not wait for it.
 """
 
-from clear_strategies.core.evidence import Evidence
-from clear_strategies.core.gradients import ATTRIBUTES, CONFLICT_GROUPS, Grads, Shot
-from clear_strategies.core.step import Step
-from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
-from clear_strategies.errors import AnchorError, ClearError, DataError, StrategyConflict
-from clear_strategies.merging.conductor import Conductor, Update
-from clear_strategies.merging.objective import Objective
-from clear_strategies.strategies.base import ScreenGradients, Strategy
-from clear_strategies.strategies.gco import GCO
-from clear_strategies.strategies.p2g import P2G
-from clear_strategies.strategies.pseudo_views import PseudoViews
-from clear_strategies.strategies.splatsure import SplatSuRe
-from clear_strategies.strategies.svs import SVS
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from clear_strategies.core.evidence import Evidence
+    from clear_strategies.core.gradients import ATTRIBUTES, CONFLICT_GROUPS, Grads, Shot
+    from clear_strategies.core.step import Step
+    from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
+    from clear_strategies.errors import AnchorError, ClearError, DataError, StrategyConflict
+    from clear_strategies.merging.conductor import Conductor, Update
+    from clear_strategies.merging.objective import Objective
+    from clear_strategies.strategies.base import ScreenGradients, Strategy
+    from clear_strategies.strategies.gco import GCO
+    from clear_strategies.strategies.p2g import P2G
+    from clear_strategies.strategies.pseudo_views import PseudoViews
+    from clear_strategies.strategies.splatsure import SplatSuRe
+    from clear_strategies.strategies.svs import SVS
 
 __all__ = [
     "ATTRIBUTES",
@@ -44,3 +51,33 @@ __all__ = [
     "Update",
     "View",
 ]
+
+_NAMES: Final = {  # by the module of this package that they are defined in
+    "core.evidence": ("Evidence",),
+    "core.gradients": ("ATTRIBUTES", "CONFLICT_GROUPS", "Grads", "Shot"),
+    "core.step": ("Step",),
+    "core.view": ("DepthMap", "ExtraView", "Photo", "View"),
+    "errors": ("AnchorError", "ClearError", "DataError", "StrategyConflict"),
+    "merging.conductor": ("Conductor", "Update"),
+    "merging.objective": ("Objective",),
+    "strategies.base": ("ScreenGradients", "Strategy"),
+    "strategies.gco": ("GCO",),
+    "strategies.p2g": ("P2G",),
+    "strategies.pseudo_views": ("PseudoViews",),
+    "strategies.splatsure": ("SplatSuRe",),
+    "strategies.svs": ("SVS",),
+}
+_HOMES: Final = {name: f"{__name__}.{module}" for module, names in _NAMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Import one of `__all__`; called for names that the module does not have yet."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
