@@ -24,12 +24,12 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from clear_strategies.errors import SettingError
+from clear_strategies.errors import SettingError, one_line
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
-from clear_strategies.settings import CHANGES_NO_RESULT, build, one_line, with_defaults
+from clear_strategies.settings import CHANGES_NO_RESULT, build, with_defaults
 from clear_strategies.strategies.base import Strategy
 
 _PACKAGE: Final = Path(__file__).resolve().parent

@@ -19,7 +19,7 @@ class DataError(ClearError, ValueError):
 
     def __init__(self, file: str | Path, field: str, problem: str, remedy: str) -> None:
         self.file, self.field, self.problem, self.remedy = str(file), field, problem, remedy
-        super().__init__(": ".join(_one_line(part) for part in (self.file, field, problem, remedy)))
+        super().__init__(": ".join(one_line(part) for part in (self.file, field, problem, remedy)))
 
 
 class SettingError(ClearError, ValueError):
@@ -42,5 +42,6 @@ class AnchorError(ClearError, RuntimeError):
     """The number of Gaussians changed after their anchor was taken (Eq. 16)."""
 
 
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
+def one_line(told: object) -> str:
+    """A text, or the message of an error, without its line breaks."""
+    return " ".join(str(told).split())

@@ -25,7 +25,7 @@ from beartype import BeartypeConf
 from beartype.door import is_bearable
 from beartype.roar import BeartypeDecorHintPep585DeprecationWarning, BeartypeException
 
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import DataError, SettingError, one_line
 from rasterizers.interface import BackendUnavailable
 
 TARGET: Final = "_target_"
@@ -90,11 +90,6 @@ def build(node: Any, key: str = "") -> Any:
     if isinstance(node, float) and not math.isfinite(node):
         raise SettingError(f"{key}: must be a finite number, got {node}.")
     return node
-
-
-def one_line(error: BaseException) -> str:
-    """The message of an error without its line breaks."""
-    return " ".join(str(error).split())
 
 
 def _called(node: Mapping[str, Any], key: str) -> Any:

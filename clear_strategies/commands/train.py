@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from clear_strategies import run
-from clear_strategies.data.photo_files import SUFFIXES
 from clear_strategies.errors import SettingError
 
 # The photos are trained on at up to two megapixels, where an iteration takes about half a second of a core.
@@ -29,7 +27,7 @@ It trains what we use ourselves (+strategy=best) on all photos for fit.iteration
   clear-strategies train photos/ data.missing=skip data.broken=skip
   clear-strategies train photos/ fit.log=tensorboard -v           curves while it trains; every detail on the console
 
-`clear-strategies --cfg job data=photos` lists all settings.
+`clear-strategies settings data=photos` lists all settings.
 """
 # What decides which strategies train, and for how long, so that the defaults must not.
 _CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
@@ -49,7 +47,9 @@ def main(arguments: list[str]) -> None:
         return
     settings = overrides(arguments)
     sys.stdout.write(f"clear-strategies {shlex.join(settings)}\n")
-    run.hydra_main(settings)
+    from clear_strategies import hydra_app
+
+    hydra_app.main(settings)
 
 
 def overrides(arguments: Sequence[str]) -> list[str]:
@@ -84,6 +84,8 @@ def detect(folder: Path) -> tuple[str, Path]:
     for candidate in ("sparse/0", "sparse", "colmap/sparse/0", "."):
         if any((folder / candidate / f"cameras.{ending}").is_file() for ending in ("bin", "txt")):
             return "colmap", folder
+    from clear_strategies.data.photo_files import SUFFIXES
+
     has_photos = any(file.suffix.lower() in SUFFIXES for file in folder.iterdir())
     return "photos", folder / "images" if not has_photos and (folder / "images").is_dir() else folder
 

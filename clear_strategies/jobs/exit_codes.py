@@ -10,12 +10,7 @@ import signal
 from importlib.util import find_spec
 from typing import Final, NamedTuple
 
-from hydra.errors import HydraException
-from omegaconf.errors import OmegaConfBaseException
-
-from clear_strategies.errors import ClearError, SettingError
-from clear_strategies.settings import one_line
-from rasterizers.interface import BackendUnavailable
+from clear_strategies.errors import ClearError, SettingError, one_line
 
 _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
 _LESS_MEMORY: Final = (
@@ -43,7 +38,7 @@ def describe(error: BaseException) -> Ending | None:
         return Ending(error.exit_code, one_line(error))
     if isinstance(error, KeyboardInterrupt):
         return Ending(SIGNALS + signal.SIGINT, "stopped by SIGINT before training began. Nothing was saved.")
-    if isinstance(error, BackendUnavailable | HydraException | OmegaConfBaseException):
+    if isinstance(error, _told_by_libraries()):
         return Ending(UNUSABLE, one_line(error))  # before OSError: Hydra's error for an option that is not there is one
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
         return Ending(UNUSABLE, f"out of memory: {one_line(error) or 'Python had none left'} {_LESS_MEMORY}")
@@ -52,6 +47,16 @@ def describe(error: BaseException) -> Ending | None:
         where = f"{disk.filename or 'output'}: {disk.strerror or disk}"
         return Ending(NO_DISK, f"{where}. Earlier checkpoints are untouched.")
     return None
+
+
+def _told_by_libraries() -> tuple[type[Exception], ...]:
+    """Errors whose messages are for the user; imported here, so that a wrong word waits for none of these libraries."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from rasterizers.interface import BackendUnavailable
+
+    return BackendUnavailable, HydraException, OmegaConfBaseException
 
 
 def require_train() -> None:

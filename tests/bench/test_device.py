@@ -13,8 +13,8 @@ from clear_strategies.bench import device
 from clear_strategies.bench.__main__ import main, parser
 from clear_strategies.bench.device import Step
 from clear_strategies.bench.results import Results
+from clear_strategies.compose import CONF
 from clear_strategies.errors import DataError
-from clear_strategies.run import CONF
 
 
 def request(tmp_path: Path, **options) -> device.Request:

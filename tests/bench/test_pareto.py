@@ -16,8 +16,8 @@ from clear_strategies.bench.__main__ import main
 from clear_strategies.bench.device import TINY
 from clear_strategies.bench.pareto import BASE, VARIANTS
 from clear_strategies.bench.results import Results
+from clear_strategies.compose import CONF
 from clear_strategies.errors import DataError
-from clear_strategies.run import CONF
 
 BY_NAME = {variant.name: variant for variant in VARIANTS}
 REQUEST = pareto.Request((), (0, 1), 100, Path("out"), tuple(BY_NAME))

@@ -13,13 +13,13 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, Strategy, Update
+from clear_strategies.compose import CONF
 from clear_strategies.core.gradients import Grads
 from clear_strategies.density import gsplat
 from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.density.base import Densifier, DensifierSettings, DensityError
 from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings
 from clear_strategies.density.threshold import topk_threshold
-from clear_strategies.run import CONF
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, scaled
 from clear_strategies.settings import build
 from clear_strategies.strategies.testing import StubShot

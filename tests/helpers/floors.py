@@ -30,7 +30,8 @@ FLOORS: dict[str, tuple[set[str], set[str]]] = {
 }
 # The doors may import every floor.
 DOORS = {
-    "run": {"hydra", "omegaconf"},
+    "run": set(),
+    "hydra_app": {"hydra", "omegaconf"},
     "__main__": set(),
     "commands": set(),
     "report": set(),

@@ -38,7 +38,9 @@ def main() -> None:
     if not bool(means.isfinite().all()):
         raise SystemExit("the loop diverged")
     require_stereo()
-    door = subprocess.run([sys.executable, "-m", "clear_strategies.run"], capture_output=True, text=True, check=False)
+    door = subprocess.run(
+        [sys.executable, "-m", "clear_strategies.run", "+strategy=clear"], capture_output=True, text=True, check=False
+    )
     if (
         door.returncode != 2
         or "pip install 'clear-strategies[train]'" not in door.stderr

@@ -20,8 +20,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import Conductor
+from clear_strategies.compose import CONF
 from clear_strategies.data.prepare import ViewSettings
-from clear_strategies.run import CONF
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import CHANGES_NO_RESULT, build
 from clear_strategies.training.loop import fit, iterate

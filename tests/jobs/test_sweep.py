@@ -230,7 +230,7 @@ def test_the_slurm_configuration_is_one_that_submitit_takes(tmp_path):
     from omegaconf import OmegaConf
     from submitit.slurm.slurm import _make_sbatch_string
 
-    from clear_strategies.run import CONF
+    from clear_strategies.compose import CONF
 
     with initialize_config_dir(str(CONF), version_base="1.3"):
         launcher = compose("config", ["hydra/launcher=slurm"], return_hydra_config=True).hydra.launcher

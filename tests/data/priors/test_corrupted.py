@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from torch import Tensor
 
+from clear_strategies.compose import CONF
 from clear_strategies.core import images
 from clear_strategies.data.priors import Bicubic, Cached, Corrupted, DemoPrior
 from clear_strategies.data.readers import demo
 from clear_strategies.errors import DataError, SettingError
-from clear_strategies.run import CONF
 from clear_strategies.settings import build
 
 

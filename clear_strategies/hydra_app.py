@@ -1,0 +1,166 @@
+"""`clear-strategies +strategy=clear`: a whole run, or a sweep of runs, by Hydra's command line.
+
+This composes the configuration, checks every setting, prints the plan, trains, and writes its files into Hydra's run folder;
+`clear_strategies.outputs.results.FILES` lists them. metrics.json is written last, so a folder that has it holds a finished run.
+`clear_strategies.run` is the program: it calls this for whatever is no subcommand, and turns errors into exit codes.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import ConfigCompositionException
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from clear_strategies.compose import CONF, nearest_setting, require_each_once
+from clear_strategies.errors import ClearError, SettingError
+from clear_strategies.jobs import exit_codes, sweep
+from clear_strategies.jobs.sweep import Sweep
+
+_log = logging.getLogger(__name__)
+
+_VERBOSE: Final = "fit.verbose=true"
+
+
+def main(overrides: Sequence[str] | None = None) -> None:
+    """Hydra's command line, and `-v`.
+
+    Args:
+        overrides: in place of the program's arguments.
+
+    Raises:
+        SettingError: an override names no setting; or a library of the trainer is not installed.
+    """
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra passes errors on instead of printing them its own way
+    arguments = sys.argv[1:] if overrides is None else overrides
+    sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else a for a in arguments]  # Hydra reads them there
+    exit_codes.require_train()
+    try:
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(job)()
+    except ConfigCompositionException as error:
+        if (unknown := re.match(r"Could not override '([^']+)'", str(error))) is None:
+            raise
+        raise SettingError(_no_such_setting(unknown[1])) from error
+
+
+def _no_such_setting(key: str) -> str:
+    """The message for an override that names no setting, with the name that was probably meant."""
+    try:
+        near = nearest_setting(key, sys.argv[1:])
+    except SettingError:  # another override is wrong as well
+        near = None
+    remedy = f"Did you mean {near}?" if near else "clear-strategies settings lists all."
+    return f"{key}: there is no such setting. {remedy}"
+
+
+def job(config: DictConfig) -> float | None:
+    """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed or did not start."""
+    hydra_config, ours = HydraConfig.get(), _sweep()
+    if ours is not None and _launcher(hydra_config) == "joblib" and not ours.begun_here:
+        # A terminal sends Ctrl-C to joblib's workers too; one stop is enough, and it comes from the sweep.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if ours is not None and ours.stopped_by is not None:
+        _log.warning("job %s is not started: the sweep was stopped.", hydra_config.job.num)
+        return None
+    try:
+        from clear_strategies.jobs import job as one
+
+        require_each_once(hydra_config.overrides.task)
+        return one.run(config, Path(hydra_config.runtime.output_dir), _watch())
+    except (Exception, KeyboardInterrupt) as error:
+        if (ending := exit_codes.describe(error)) is None:
+            raise
+        _end(error, ending, config, hydra_config, ours)
+        return None
+
+
+def _end(
+    error: BaseException, ending: exit_codes.Ending, config: DictConfig, hydra_config: Any, ours: Sweep | None
+) -> None:
+    """Log why a job ended, and exit; in a sweep only where the other jobs cannot continue."""
+    from clear_strategies.jobs.lock import HeldError
+
+    code, message = ending.code, ending.message
+    number, launcher = hydra_config.job.get("num"), _launcher(hydra_config)
+    if ours is not None and isinstance(error, HeldError) and config.fit.get("resume") == "auto":
+        _log.warning("left to the other process: %s", message)
+        ours.note_left(number, message)
+        return
+    _log.log(logging.INFO if code > exit_codes.SIGNALS else logging.ERROR, "%s", message)  # a stop is no error
+    if code > exit_codes.SIGNALS:
+        signum = code - exit_codes.SIGNALS
+        if ours is not None and launcher == "joblib":
+            ours.stop(signum)  # ending a worker would have joblib kill the others before they have saved
+            return
+        if signum not in (signal.SIGINT, signal.SIGTERM):
+            signal.raise_signal(signum)  # all is saved: now the launcher's handler may resubmit the job
+        sys.exit(code)
+    if ours is None or (code == exit_codes.NO_DISK and launcher == "basic"):
+        sys.exit(code)
+    ours.note_failure(number, message)  # the other jobs continue, and jobs on other machines may have another disk
+
+
+class SweepCallback(Callback):
+    """Runs at the beginning and end of a sweep, in the process that was started; jobs may run in other processes.
+
+    Hydra pickles it for these processes, so it has no state.
+    """
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        ours = Sweep.begin(Path(config.hydra.sweep.dir))
+        if _launcher(config.hydra) == "joblib":
+            sweep.stop_on_signals(ours)
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        ours = Sweep.current()
+        if ours is None:
+            return
+        _report(Path(config.hydra.sweep.dir))
+        stopped, failed, left = ours.stopped_by, ours.failures, ours.left
+        if left:
+            _log.warning("%d job(s) were left to other processes: %s", len(left), " | ".join(left))
+        if failed:
+            _log.error("%d job(s) failed: %s", len(failed), " | ".join(failed))
+        if stopped is not None:
+            _log.info("stopped by %s. With fit.resume=auto the same command goes on.", signal.Signals(stopped).name)
+            sys.exit(exit_codes.SIGNALS + stopped)
+        if failed:
+            sys.exit(exit_codes.UNUSABLE)
+
+
+def _report(folder: Path) -> None:
+    """Write the report of the runs that have finished so far."""
+    from clear_strategies import report
+
+    try:
+        _log.info("%s", report.write(report.collect([folder]), folder))
+    except ClearError as error:  # nothing is finished yet, or a run's files are damaged; the jobs themselves are not
+        _log.warning("there is no report: %s", error)
+
+
+def _sweep() -> Sweep | None:
+    """The sweep of this job; a single run belongs to none, even if it was started from within a sweep."""
+    return Sweep.current() if HydraConfig.get().mode == RunMode.MULTIRUN else None
+
+
+def _launcher(hydra_config: Any) -> str:
+    """basic, joblib or submitit: the module of the launcher in Hydra's own configuration."""
+    target = str(hydra_config.launcher._target_)
+    return next((name for name in ("joblib", "submitit") if name in target), "basic")
+
+
+def _watch() -> Callable[[], None] | None:
+    """For joblib's jobs: checks after each iteration whether the sweep was stopped, by any process."""
+    ours = _sweep()
+    return sweep.Watch(ours) if ours is not None and _launcher(HydraConfig.get()) == "joblib" else None
