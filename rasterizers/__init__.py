@@ -42,6 +42,7 @@ __all__ = [
     "available",
     "fastest",
     "load",
+    "names",
 ]
 
 # The module and the class of each backend. A backend imports its library only when it is constructed.
@@ -95,7 +96,7 @@ def fastest(device: str | None = None) -> str:
 
 def _runnable() -> Iterator[tuple[str, Rasterizer]]:
     """The backends that run on this machine, fastest first; each is loaded when the iterator reaches it."""
-    for name in _fastest_first():
+    for name in names():
         try:
             yield name, load(name)
         except BackendUnavailable:
@@ -105,7 +106,7 @@ def _runnable() -> Iterator[tuple[str, Rasterizer]]:
 def available() -> dict[str, str | None]:
     """Every backend by name, fastest first; the value is None, or why the backend cannot run on this machine."""
     reasons: dict[str, str | None] = {}
-    for name in _fastest_first():
+    for name in names():
         try:
             load(name)
             reasons[name] = None
@@ -114,6 +115,9 @@ def available() -> dict[str, str | None]:
     return reasons
 
 
-def _fastest_first() -> list[str]:
-    """The CUDA backends come first where there is CUDA; without it they run slowly or not at all, and come last."""
+def names() -> list[str]:
+    """Every backend, fastest first, whether it runs here or not.
+
+    The CUDA backends come first where there is CUDA; without it they run slowly or not at all, and come last.
+    """
     return sorted(_BACKENDS, key=lambda name: (name in _ON_CUDA) != torch.cuda.is_available())

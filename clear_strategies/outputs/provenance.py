@@ -20,15 +20,18 @@ def provenance(**facts: Any) -> dict[str, Any]:
     """The facts to keep with every result; `facts` are those of the run (seed, backend, plan)."""
     from rasterizers import native
 
+    return {**origin(), "threads": native.threads(), **facts}
+
+
+def origin() -> dict[str, Any]:
+    """The facts that need no torch: when, by which versions, on which machine, from which source, by which command."""
     return {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "versions": {name: version for name in _PACKAGES if (version := _version(name)) is not None},
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}, {_processor()}",
-        "threads": native.threads(),
         "git": _git(),
         "command": sys.argv,
-        **facts,
     }
 
 

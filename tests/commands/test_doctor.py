@@ -36,7 +36,7 @@ def test_a_backend_that_draws_something_else_is_an_error(capsys, monkeypatch):
         return load(name, **settings) if name != "torch" or "alpha_max" in settings else load(name, alpha_max=0.3)
 
     reference = load("torch", preset="accurate")
-    monkeypatch.setattr(rasterizers, "available", lambda: {"torch": None})
+    monkeypatch.setattr(rasterizers, "names", lambda: ["torch"])
     calls = iter([reference])
     monkeypatch.setattr(rasterizers, "load", lambda name, **s: next(calls, None) or darker(name))
     with pytest.raises(SettingError, match="torch draws something else than the reference"):

@@ -1,0 +1,93 @@
+"""Each rasterizer's picture of a few Gaussians against the reference's, for `clear-strategies doctor`."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from importlib.util import find_spec
+from typing import Final
+
+import torch
+from torch import Tensor
+
+import rasterizers
+from rasterizers import native
+from rasterizers.interface import BackendUnavailable, Camera, Splats
+
+_TOLERANCE: Final = 2e-3  # backends differ in rounding, a wrong one by far more
+_GAUSSIANS, _SIZE = 300, 64
+_TENSORS: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
+_SLOW_TO_COMPILE: Final = ("warp",)  # on a CPU its first picture takes a minute, and its import half a second
+
+
+def backends(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
+    """Each backend: why it is not here, or how its picture compares with the reference's and how long it took.
+
+    Args:
+        broken: takes the names of those that fail or differ.
+        slow: test also those that compile for long first.
+    """
+    with native.kernel_threads(
+        native.threads()
+    ):  # for pictures this small, torch's own threads cost more than they bring
+        yield from _each(broken, slow=slow)
+
+
+def _each(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
+    splats, camera = _scene()
+    exact = rasterizers.load("torch", preset="accurate")(splats, camera).image
+    for name in rasterizers.names():
+        if name in _SLOW_TO_COMPILE and find_spec(name) is not None and not torch.cuda.is_available() and not slow:
+            yield name, "installed, not tested: it compiles for a minute first (--all tests it); slow without CUDA"
+            continue
+        try:
+            rasterizers.load(name)
+        except BackendUnavailable as reason:
+            yield name, f"not here: {reason}"
+            continue
+        try:
+            told, fine = _compared(name, splats, camera, exact)
+        except (BackendUnavailable, RuntimeError, ValueError) as error:
+            told, fine = f"FAILS: {' '.join(str(error).split())[:200]}", False
+        if not fine:
+            broken.append(name)
+        yield name, told
+
+
+def _compared(name: str, splats: Splats, camera: Camera, exact: Tensor) -> tuple[str, bool]:
+    """What to say of the backend's picture, and whether it is the reference's."""
+    rasterizer = rasterizers.load(name, preset="accurate")
+    device = "cuda" if "cuda" in rasterizer.traits.devices and torch.cuda.is_available() else "cpu"
+    there = Splats(**{tensor: getattr(splats, tensor).to(device) for tensor in _TENSORS})
+    rasterizer(there, camera)
+    began = time.perf_counter()
+    image = rasterizer(there, camera).image.cpu()
+    milliseconds = 1e3 * (time.perf_counter() - began)
+    off = float((image - exact).abs().max())
+    fine = off <= _TOLERANCE
+    module = getattr(rasterizer, "module", None)
+    which = f" ({module})" if isinstance(module, str) else ""
+    verdict = f"{'works' if fine else 'WRONG'}{which}"
+    return f"{verdict}: differs from the reference by {off:.1e}, {milliseconds:.1f} ms", fine
+
+
+def _scene() -> tuple[Splats, Camera]:
+    g = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=g)
+
+    n = _GAUSSIANS
+    splats = Splats(
+        normal(n, 3),
+        normal(n, 4),
+        (normal(n, 3) * 0.3 - 2).exp(),
+        normal(n).sigmoid(),
+        normal(n, 1, 3),
+        normal(n, 3, 3) * 0.2,
+    )
+    pose = torch.eye(4)
+    pose[2, 3] = 5
+    focal = _SIZE / 2 / math.tan(0.4)
+    return splats, Camera(pose, focal, focal, _SIZE / 2, _SIZE / 2, _SIZE, _SIZE)
