@@ -121,6 +121,8 @@ def test_commands_are_understood(words, monkeypatch, tmp_path):
         require_parsable("clear_strategies.run", words[1:], monkeypatch)
     elif words[:2] == ["clear-strategies", "train"]:
         require_composable(train.overrides([str(tmp_path), *words[3:]]))
+    elif words[:2] == ["clear-strategies", "settings"]:
+        require_composable(words[2:])
     elif words[:3] == ["python", "-m", "clear_strategies.run"] or words[0] == "clear-strategies":
         require_composable(words[1:] if words[0] == "clear-strategies" else words[3:])
     elif words[:3] == ["python", "-m", "pytest"]:
@@ -139,7 +141,7 @@ def require_composable(arguments: list[str]) -> None:
     """The configuration of a run, or of every value of a sweep, composes and makes a conductor."""
     overrides = [word for word in arguments if "=" in word or word.startswith("~")]
     flags = [word for word in arguments if word not in overrides]
-    assert set(flags) <= {"-m", "--cfg", "job", "--help"}, flags
+    assert set(flags) <= {"-m", "--cfg", "job"}, flags
     whole = loader().load_configuration("config", overrides, run_mode=RunMode.MULTIRUN, validate_sweep_overrides=False)
     if "-m" not in flags and whole.hydra.mode != RunMode.MULTIRUN:
         require_conductor(loader().load_configuration("config", overrides, run_mode=RunMode.RUN))

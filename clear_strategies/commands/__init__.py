@@ -2,15 +2,23 @@
 
 A command is a module of this folder with `main(arguments)`, imported only when it is called. It returns when it is done and
 raises a `ClearError` for what the user can solve. `clear_strategies.run` calls it, and turns errors into exit codes.
-Anything else on the command line is Hydra's.
+A command imports torch, Hydra and what needs them in the functions that use them, so that its `--help`, and what it says to
+a wrong argument, are there at once.
+
+What begins with an override or a flag is Hydra's: `+strategy=clear`, `fit.iterations=300`, `-m`, `--cfg job`.
 """
 
 from __future__ import annotations
 
+import difflib
+import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Final, NamedTuple
+
+from clear_strategies.errors import SettingError
 
 
 class Command(NamedTuple):
@@ -31,21 +39,61 @@ COMMANDS: Final = {
     "export": Command("RUN --to FORMAT", "a saved run as a file for viewers: ply, splat, spz, sog, or a page (html)"),
     "view": Command("RUN", "an interactive viewer in the browser of a saved run or a PLY file"),
     "doctor": Command("", "what this machine has, what works, and what is missing"),
+    "settings": Command("[setting=value …]", "every setting of a run with its value, and the choices of each group"),
+}
+
+
+_HELP: Final = ("help", "--help", "-h")
+_OF_HYDRA: Final = ("-", "+", "~")  # how flags and overrides without "=" begin
+
+_RESEARCH: Final = {
+    "clear-strategies +strategy=clear data=llff data.path=FOLDER": "one run of the whole configuration",
+    "clear-strategies -m +strategy=clear,gco fit.seed=0,1": "a sweep: a run for every combination",
+    "clear-strategies +strategy=clear --cfg job": "prints a run's configuration; nothing runs",
+    "clear-strategies --hydra-help": "the flags of Hydra, which reads these lines",
 }
 
 
 def named(arguments: Sequence[str]) -> Callable[[], None] | None:
-    """The call of the command that these arguments of the program name; None where they are Hydra's."""
-    name = arguments[0] if arguments else ""
-    if name == "help":
+    """The call of the command that these arguments of the program name; None where they are Hydra's.
+
+    Raises:
+        SettingError: the first is a word that is neither a command nor Hydra's.
+    """
+    name = arguments[0] if arguments else "help"
+    if name in _HELP:
         return _help
-    if name not in COMMANDS:
+    if name in COMMANDS:
+        return lambda: import_module(f"{__name__}.{name}").main(list(arguments[1:]))
+    if name.startswith(_OF_HYDRA) or "=" in name:
         return None
-    return lambda: import_module(f"{__name__}.{name}").main(list(arguments[1:]))
+    meant = _meant(name)
+    remedy = (
+        f"Did you mean {meant}?" if meant else "clear-strategies --help lists all; a setting is written name=value."
+    )
+    raise SettingError(f"{name}: there is no such command. {remedy}")
+
+
+def _meant(word: str) -> str | None:
+    """The command that a wrong one most resembles, or the one for the file or folder that it names; None for neither."""
+    quoted = shlex.quote(word)
+    if word.endswith(".ply"):
+        return f"clear-strategies view {quoted}"
+    if "/" in word or Path(word).exists():
+        return f"clear-strategies train {quoted}"
+    return next(iter(difflib.get_close_matches(word.lower(), COMMANDS, 1)), None)
 
 
 def _help() -> None:
-    rows = [(f"clear-strategies {name} {row.usage}".rstrip(), row.summary) for name, row in COMMANDS.items()]
-    rows.append(("clear-strategies [setting=value …]", "a run of the whole configuration; --help lists its groups"))
-    width = max(len(left) for left, _ in rows)
-    sys.stdout.writelines(f"{left:<{width}}  {right}\n" for left, right in rows)
+    commands = {f"{name} {row.usage}".rstrip(): row.summary for name, row in COMMANDS.items()}
+    sys.stdout.write(
+        "clear-strategies COMMAND …; --help behind a command tells more.\n\n"
+        f"{_rows(commands)}\n"
+        "clear-strategies setting=value …, for research: any strategies, data and settings, and sweeps.\n\n"
+        f"{_rows(_RESEARCH)}"
+    )
+
+
+def _rows(table: Mapping[str, str]) -> str:
+    width = max(map(len, table))
+    return "".join(f"  {left:<{width}}  {right}\n" for left, right in table.items())

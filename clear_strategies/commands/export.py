@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,10 +11,7 @@ from pathlib import Path
 from clear_strategies import console
 from clear_strategies.commands.options import parser_of
 from clear_strategies.errors import SettingError
-from clear_strategies.jobs.saved import open_splat
-from clear_strategies.outputs.export import gaussians_of
-from clear_strategies.outputs.formats import FORMATS, Start, write_format
-from clear_strategies.viewing import paths
+from clear_strategies.outputs.format_names import FORMATS
 
 _log = logging.getLogger(__name__)
 
@@ -41,6 +39,15 @@ def main(arguments: Sequence[str]) -> None:
     )
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
+    _export(options)
+
+
+def _export(options: argparse.Namespace) -> None:
+    from clear_strategies.jobs.saved import open_splat
+    from clear_strategies.outputs.export import gaussians_of
+    from clear_strategies.outputs.formats import Start, write_format
+    from clear_strategies.viewing import paths
+
     splat = open_splat(options.run, options.rasterizer)
     g = gaussians_of(splat.painter.field)
     g = replace(g, shN=g.shN[:, : (options.sh + 1) ** 2 - 1])

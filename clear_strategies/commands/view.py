@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import functools
 import logging
 import webbrowser
@@ -9,8 +10,6 @@ from collections.abc import Sequence
 
 from clear_strategies import console
 from clear_strategies.commands.options import parser_of
-from clear_strategies.jobs.saved import open_splat
-from clear_strategies.viewing import live, points
 
 _log = logging.getLogger(__name__)
 
@@ -31,6 +30,13 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
+    _view(options)
+
+
+def _view(options: argparse.Namespace) -> None:
+    from clear_strategies.jobs.saved import open_splat
+    from clear_strategies.viewing import live, points
+
     live.require_viewer()
     splat = open_splat(options.run, options.rasterizer)
     _log.info("%s", splat.source)

@@ -23,18 +23,12 @@ from jaxtyping import Float
 from clear_strategies import files
 from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.errors import SettingError
+from clear_strategies.outputs.format_names import FORMATS
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
-FORMATS: Final = {
-    "ply": "the standard layout of 3DGS; nothing is lost",
-    "splat": "32 bytes a Gaussian, 8-bit colours that do not depend on the direction",
-    "spz": "Niantic's: a tenth of the PLY, view-dependent colour included; needs Node.js",
-    "sog": "PlayCanvas's: view-dependent colour included; needs Node.js, and without a GPU minutes for large splats",
-    "html": "a page with PlayCanvas's viewer and a sog in it: no server, no network",
-}
 _CONVERTER: Final = "@playcanvas/splat-transform@2"
 _SPZ_VERSION: Final = "3"  # 4, the converter's default, is too new for most readers
 

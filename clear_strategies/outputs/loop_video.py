@@ -12,7 +12,7 @@ import torch
 
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.viewing import cameras, film, paths, video
+from clear_strategies.viewing import FPS, cameras, film, paths, video
 from clear_strategies.viewing.film import DepthScale
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera
@@ -31,7 +31,7 @@ def write_loop(folder: Path, train: Sequence[Camera], painter: Painter, frames: 
         return
     began = time.perf_counter()
     where = [cameras.at_most(camera, _LONGEST) for camera in paths.through(train, frames)]
-    video.write_videos([folder / "path.mp4", folder / "path.gif"], film.color_frames(painter, where), fps=film.FPS)
+    video.write_videos([folder / "path.mp4", folder / "path.gif"], film.color_frames(painter, where), fps=FPS)
     _log.debug(
         "path.mp4, path.gif: %d frames of %dx%d in %.1f s (fit.video=0 writes none).",
         frames, where[0].width, where[0].height, time.perf_counter() - began,

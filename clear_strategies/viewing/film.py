@@ -20,7 +20,6 @@ from clear_strategies.viewing.look import AS_MEASURED, Look, Painter
 from clear_strategies.viewing.video import Frame
 from rasterizers.interface import Camera
 
-FPS: Final = 24.0
 _SAMPLED: Final = 5  # pictures that the colours' range is taken from
 _EXTREMES: Final = (0.02, 0.98)  # quantiles of depth at the ends of the colours
 _COLORS: Final = "viridis_r"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from clear_strategies import commands
 from clear_strategies.commands import train
 from clear_strategies.compose import composed, tree
 from clear_strategies.errors import SettingError
@@ -69,13 +68,3 @@ def test_strategies_that_are_named_replace_the_whole_method(tmp_path):
 def test_a_missing_folder_is_refused_in_one_line(arguments):
     with pytest.raises(SettingError, match=r"train.*folder"):
         train.overrides(arguments)
-
-
-def test_the_table_names_modules_that_exist_and_leaves_the_rest_to_hydra(capsys):
-    for name in commands.COMMANDS:
-        assert commands.named([name, "--help"]) is not None
-    assert commands.named(["+strategy=clear"]) is None
-    assert commands.named([]) is None
-    commands.named(["help"])()
-    said = capsys.readouterr().out
-    assert all(name in said for name in commands.COMMANDS)

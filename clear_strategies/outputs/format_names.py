@@ -1,0 +1,13 @@
+"""The formats that `formats` writes, for whoever only lists them."""
+
+from __future__ import annotations
+
+from typing import Final
+
+FORMATS: Final = {
+    "ply": "the standard layout of 3DGS; nothing is lost",
+    "splat": "32 bytes a Gaussian, 8-bit colours that do not depend on the direction",
+    "spz": "Niantic's: a tenth of the PLY, view-dependent colour included; needs Node.js",
+    "sog": "PlayCanvas's: view-dependent colour included; needs Node.js, and without a GPU minutes for large splats",
+    "html": "a page with PlayCanvas's viewer and a sog in it: no server, no network",
+}

@@ -1,0 +1,112 @@
+"""What the first word of a command line does: a subcommand, help, Hydra, or an error that names what was meant."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from clear_strategies import commands, hydra_app
+from clear_strategies.commands import settings
+from clear_strategies.errors import SettingError
+from tests.helpers.command_line import ROOT
+
+SLOW = ("hydra", "numpy", "omegaconf", "torch")
+
+
+@pytest.mark.parametrize("arguments", [[], ["help"], ["--help"], ["-h"]], ids=" ".join)
+def test_help_lists_the_commands_and_then_where_research_begins(arguments, capsys):
+    commands.named(arguments)()
+    said = capsys.readouterr().out
+    rows = [line.split()[0] for line in said.splitlines() if line.startswith("  ")]
+    assert rows[: len(commands.COMMANDS)] == list(commands.COMMANDS)
+    for word in ("+strategy=clear", "-m ", "--cfg job", "--hydra-help"):
+        assert word in said[said.index("research") :]
+
+
+@pytest.mark.parametrize("first", ["+strategy=clear", "fit.iterations=3", "~data.reader.width", "-m", "--cfg", "-v"])
+def test_overrides_and_flags_are_hydras(first):
+    assert commands.named([first, "more"]) is None
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        ("trian", "Did you mean train?"),
+        ("Train", "Did you mean train?"),
+        ("setting", "Did you mean settings?"),
+        ("photos/", "Did you mean clear-strategies train photos/?"),
+        ("my photos/", "Did you mean clear-strategies train 'my photos/'?"),
+        ("views", "Did you mean clear-strategies train views?"),  # a folder that is there
+        ("point_cloud.ply", "Did you mean clear-strategies view point_cloud.ply?"),
+        ("fit.iterations", "clear-strategies --help lists all; a setting is written name=value."),
+    ],
+)
+def test_another_word_is_refused_with_what_was_meant(word, meant, tmp_path, monkeypatch):
+    (tmp_path / "views").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SettingError) as refused:
+        commands.named([word, "kit"])
+    assert str(refused.value) == f"{word}: there is no such command. {meant}"
+
+
+QUICK = {
+    "": 0,
+    "--help": 0,
+    **{f"{name} --help": 0 for name in commands.COMMANDS},
+    "trian kit": 2,
+    "photos/": 2,
+    "train nowhere": 2,
+    "render": 2,
+    "export run --to nothing": 2,
+}
+REPORTED = f"""
+import sys
+from clear_strategies.run import main
+try:
+    main()
+finally:
+    print("imported", sorted(sys.modules.keys() & set({SLOW!r})))
+"""
+
+
+@pytest.mark.parametrize(("line", "code"), QUICK.items(), ids=list(QUICK))
+def test_help_and_wrong_words_wait_for_neither_torch_nor_hydra(line, code, tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-c", REPORTED, *line.split()], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert result.returncode == code, result.stderr
+    assert result.stdout.splitlines()[-1] == "imported []"
+    assert result.stderr.count("\n") == (1 if code else 0), result.stderr
+
+
+def test_settings_lists_groups_choices_and_values(capsys, monkeypatch):
+    """Hydra's help of the application, with the overrides behind the word."""
+    monkeypatch.setattr(sys, "argv", ["clear-strategies"])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")  # so that what Hydra's door sets is undone
+    try:
+        with pytest.raises(SystemExit) as ended:
+            settings.main(["+strategy=gco", "strategies.gco.tolerance=0.25"])
+    finally:
+        GlobalHydra.instance().clear()
+    said = capsys.readouterr().out
+    assert ended.value.code in (0, None)
+    assert "clear-strategies is powered by Hydra" in said
+    assert "rasterizer: auto, cpp, gsplat, torch, warp" in said
+    assert "tolerance: 0.25" in said
+
+
+def test_a_setting_that_is_not_there_is_told_with_where_all_are(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["clear-strategies"])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    try:
+        with pytest.raises(
+            SettingError, match=r"fit.nothing_like_it: there is no such setting. clear-strategies settings"
+        ):
+            hydra_app.main(["fit.nothing_like_it=1"])
+    finally:
+        GlobalHydra.instance().clear()
