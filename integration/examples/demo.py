@@ -1,0 +1,102 @@
+"""The built-in demo as the loop of a host needs it: LR photos with their cameras, a prior, and gsplat's two dictionaries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core import images
+from clear_strategies.core.projection import intrinsics
+from clear_strategies.data.priors import DemoPrior
+from clear_strategies.data.readers import demo
+from rasterizers.geometry import SH_C0
+
+RATES: Final = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
+_NEIGHBOURS: Final = 3
+_ROWS: Final = 1_000  # of the table of distances at once
+_SMALLEST_DISTANCE: Final = 1e-4  # between points, world units
+
+Render = Callable[[Tensor, Tensor, int, int], Tensor]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Demo:
+    """The demo's training photos, reduced to LR, and the truth of its other views.
+
+    Args:
+        viewmats: world to camera, OpenCV axes. Ks: in pixels of the LR photos.
+        prior: makes the SR images, four times as large: the true photos with seeded errors.
+        tests: (viewmat, K, truth at HR) of the views that are not trained on.
+    """
+
+    names: list[str]
+    images: Float[Tensor, "V h w 3"]
+    viewmats: Float[Tensor, "V 4 4"]
+    Ks: Float[Tensor, "V 3 3"]
+    prior: DemoPrior
+    tests: list[tuple[Float[Tensor, "4 4"], Float[Tensor, "3 3"], Float[Tensor, "H W 3"]]]
+
+    @torch.no_grad()
+    def psnr(self, render: Render) -> float:
+        """The mean PSNR of the test views at HR, dB.
+
+        Args:
+            render: (viewmat, K, width, height) -> image [height, width, 3].
+        """
+        errors = [
+            (render(viewmat, K, truth.shape[1], truth.shape[0]).clamp(0, 1) - truth).square().mean()
+            for viewmat, K, truth in self.tests
+        ]
+        return float(torch.stack(errors).log10().mean() * -10)
+
+
+def load_demo(width: int = 256, height: int = 192, factor: int = 4, train: int = 3) -> Demo:
+    """The demo's twelve views, of which `train` are for training.
+
+    Args:
+        width, height: of the HR images, px; multiples of `factor`, by which the training photos are reduced (bicubic).
+    """
+    frames = demo.read(width=width, height=height, train=train).frames
+    trained = [frame for frame in frames if frame.split == "train"]
+    return Demo(
+        [frame.name for frame in trained],
+        torch.stack([images.downsample(frame.load(), factor) for frame in trained]),
+        torch.stack([frame.camera.world_to_camera for frame in trained]),
+        torch.stack([intrinsics(frame.camera.scaled(1 / factor)).float() for frame in trained]),
+        DemoPrior(truth={frame.name: frame.load for frame in trained}),
+        [(f.camera.world_to_camera, intrinsics(f.camera).float(), f.load()) for f in frames if f.split == "test"],
+    )
+
+
+def splats_with_optimizers(
+    means: Float[Tensor, "N 3"], colors: Float[Tensor, "N 3"], sh_degree: int = 3
+) -> tuple[dict[str, torch.nn.Parameter], dict[str, torch.optim.Adam]]:
+    """The dictionaries of parameters and optimizers of a gsplat loop, as `create_splats_with_optimizers` of gsplat's
+    simple_trainer.py makes them: round Gaussians as large as the distance to their neighbours, opacity 0.1.
+
+    Args:
+        means: world units. colors: RGB in [0, 1].
+    """
+    n = len(means)
+    start = {
+        "means": means,
+        "quats": torch.tensor([1.0, 0, 0, 0]).expand(n, 4),
+        "scales": _neighbour_distance(means).log()[:, None].expand(n, 3),
+        "opacities": torch.full((n,), 0.1).logit(),
+        "sh0": ((colors - 0.5) / SH_C0)[:, None],
+        "shN": torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3),
+    }
+    splats = {name: torch.nn.Parameter(value.to(means).clone()) for name, value in start.items()}
+    return splats, {name: torch.optim.Adam([p], lr=RATES[name], eps=1e-15) for name, p in splats.items()}
+
+
+def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+    """The root mean square distance to the three nearest points."""
+    k = min(_NEIGHBOURS, len(means) - 1) + 1  # the nearest is the point itself
+    nearest = torch.cat([torch.cdist(rows, means).topk(k, largest=False).values for rows in torch.split(means, _ROWS)])
+    return nearest[:, 1:].square().mean(1).sqrt().nan_to_num(_SMALLEST_DISTANCE).clamp_min(_SMALLEST_DISTANCE)
