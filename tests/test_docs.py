@@ -10,6 +10,7 @@ import importlib
 import importlib.util
 import inspect
 import itertools
+import json
 import os
 import re
 import runpy
@@ -38,6 +39,7 @@ from PIL import Image
 from clear_strategies import Conductor, Strategy
 from clear_strategies.commands import train
 from clear_strategies.compose import CONF
+from tests.helpers import documented
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -101,8 +103,12 @@ COMMANDS = {
     for block in blocks(page, "sh", "bash")
     for words in commands(block)
 }.values()
+README_LOOP, *_ = blocks(ROOT / "README.md", "python")
 PYTHON = [
-    pytest.param(block, id=f"{name(page)}-{i}") for page in PAGES for i, block in enumerate(blocks(page, "python"))
+    pytest.param(block, id=f"{name(page)}-{i}")
+    for page in PAGES
+    for i, block in enumerate(blocks(page, "python"))
+    if block != README_LOOP  # has a test of its own
 ]
 # Commands of other programs: nothing of them is checked, but that extras exist.
 FOREIGN = r"(python3? -m (venv|pip|build)|cibuildwheel|\.|pip install|for|done|wait|ns-train|mkdocs|pre-commit|tensorboard|cd) ?"
@@ -188,13 +194,85 @@ def require_parsable(module: str, arguments: list[str], monkeypatch: pytest.Monk
         runpy.run_module(module, run_name="__main__", alter_sys=False)
 
 
+@pytest.fixture
+def run_block(tmp_path, monkeypatch):
+    """Runs a Python block as a program of its own, in an empty folder."""
+
+    def run(block: str) -> None:
+        (tmp_path / "documented.py").write_text(block)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.delitem(sys.modules, "documented", raising=False)
+        importlib.import_module("documented")
+
+    return run
+
+
 @pytest.mark.parametrize("block", PYTHON)
-def test_python_blocks_run(block, tmp_path, monkeypatch):
-    (tmp_path / "documented.py").write_text(block)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "documented", raising=False)
-    importlib.import_module("documented")
+def test_python_blocks_run(block, run_block):
+    run_block(block)
+
+
+@pytest.mark.slow
+def test_the_readmes_loop_prints_the_number_of_its_table(run_block, capsys):
+    run_block(README_LOOP)
+    printed = float(capsys.readouterr().out.removesuffix(" dB\n"))
+    (shown,) = re.findall(
+        r'^\| with `conductor\("best"\)` \| ([\d.]+) dB', (ROOT / "README.md").read_text(), re.MULTILINE
+    )
+    assert printed == pytest.approx(float(shown), abs=0.15)
+
+
+def test_the_readmes_blocks_are_as_short_as_promised():
+    loop, gco = (
+        [line for line in block.splitlines() if line.strip()] for block in blocks(ROOT / "README.md", "python")
+    )
+    assert len(loop) <= 25
+    assert len(gco) <= 10
+    assert all(len(line) <= 120 for line in loop + gco)
+
+
+# Commands of the README and the guides that no test runs, and why; `test_commands_are_understood` reads all of them.
+NOT_RUN = {
+    "the reader's scenes": r"FOLDER|scenes/|multirun/",
+    "another trainer": r"-m integration\.(gsplat|inria) |^ns-train",
+    "installation, the gate": r"^(python3? -m (venv|build|pytest)|cibuildwheel|pip install)\b",
+    "other programs": r"^(for|done|wait|tensorboard)\b",
+    "an environment": r"^\. ",
+    "waits for a browser": r"^clear-strategies view",
+    "needs Node.js": r" --to (spz|html)",
+    "takes minutes, or a file that the viewer saves": r"--frames 240|flight\.json",
+    "a class that the reader names": r"YourStrategy",
+    "a wheel's first run, in the gate": r"^clear-strategies \+strategy=clear fit.iterations=10$",
+}
+
+
+def followed(page: Path) -> list[list[str]]:
+    """The commands of a guide that can be run here, each by the first guide that has it."""
+    lines = {" ".join(words): words for block in blocks(page, "sh") for words in commands(block)}
+    known = {line for earlier in FOLLOWED.values() for line in map(" ".join, earlier)}
+    return [
+        words
+        for line, words in lines.items()
+        if line not in known and not any(re.search(why, line) for why in NOT_RUN.values())
+    ]
+
+
+FOLLOWED: dict[Path, list[list[str]]] = {}
+for guide in [ROOT / "README.md", *sorted((DOCS / "how-to").glob("*.md"))]:
+    FOLLOWED[guide] = followed(guide)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page, lines in FOLLOWED.items() if lines], ids=name)
+def test_commands_of_the_guides_run(page, tmp_path):
+    (tmp_path / f"{documented.PACKAGE}.py").write_text("".join(blocks(page, "python")[:1]))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(tmp_path / "cache")}
+    command = [sys.executable, "-m", "tests.helpers.documented", json.dumps(FOLLOWED[page])]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -215,6 +293,31 @@ def test_paths_that_pages_name_exist(page):
         cells = [row.split("|")[1] for row in rows.splitlines()]
         named += [f"{folder}/{file}" for cell in cells for file in re.findall(r"`([^`]+)`", cell)]
     assert not [path for path in named if not (ROOT / path).exists()]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_symbols_that_pages_name_are_in_their_files(page):
+    stations = re.findall(r"`([\w./-]+\.(?:py|cpp|hpp|yaml|md)):([\w.]+)`", page.read_text())
+    assert stations or page.name != "CONTRIBUTING.md"
+    assert not [f"{file}:{symbol}" for file, symbol in stations if not holds(ROOT / file, symbol)]
+
+
+def holds(file: Path, symbol: str) -> bool:
+    """Whether a file defines a symbol; one that is not Python, whether it has the word."""
+    if file.suffix != ".py":
+        return file.is_file() and re.search(rf"\b{symbol}\b", file.read_text()) is not None
+    body = ast.parse(file.read_text()).body if file.is_file() else []
+    for part in symbol.split("."):
+        defined = next((node for node in body if part in names_of(node)), None)
+        if defined is None:
+            return False
+        body = getattr(defined, "body", [])
+    return True
+
+
+def names_of(node: ast.stmt) -> set[str]:
+    targets = [*getattr(node, "targets", []), getattr(node, "target", None)]
+    return {getattr(node, "name", ""), *(target.id for target in targets if isinstance(target, ast.Name))}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -259,7 +362,7 @@ def test_pages_that_the_code_names_exist():
 
 def test_the_readme_has_the_two_commands_of_the_gate():
     assert len(blocks(ROOT / "README.md", "bash")) == 2
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 80
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 160
 
 
 @cache
@@ -354,10 +457,11 @@ def test_every_test_that_the_paper_page_names_exists():
 
 
 def test_config_fields_that_pages_name_exist():
-    groups = "data|strategies|objective|density|optim|mip|rasterizer|fit|skips"
+    groups = "data|strategies|decorators|objective|density|optim|mip|rasterizer|fit|skips"
     for page in PAGES:
+        today = re.sub(r"\n### Breaking\n.*?\n### ", "", page.read_text(), flags=re.DOTALL)  # it names what is gone
         # "strategies.svs.anchor_strength=0" and "fit.resume=…" name a field, too
-        for field in re.findall(rf"`((?:{groups})\.[\w.]+)(?:=[^`]*)?`", page.read_text()):
+        for field in re.findall(rf"`((?:{groups})\.[\w.]+)(?:=[^`]*)?`", today):
             if field.startswith(("density.strategy", "objective.kernels", "skips.hr")) or "mine" in field:
                 continue
             assert exists_in_config(field), f"{name(page)}: {field}"
@@ -431,12 +535,11 @@ def test_the_architecture_page_shows_the_floors():
 
 def test_the_table_of_hooks_shows_the_hooks_of_a_strategy():
     page = (DOCS / "how-to" / "own-strategy.md").read_text()
-    shown = {
-        hook: arguments.split(", ") for hook, arguments in re.findall(r"^\| `(\w+)\(([^)]*)\)`", page, re.MULTILINE)
-    }
+    rows = re.findall(r"^\| `(\w+)\(([^)]*)\)`", page, re.MULTILINE)
+    shown = {hook: arguments.split(", ") if arguments else [] for hook, arguments in rows}
     hooks = {hook: list(inspect.signature(getattr(Strategy, hook)).parameters)[1:] for hook in shown}
     assert shown == hooks
-    assert len(shown) == 10
+    assert len(shown) == 14
 
 
 def test_pictures_are_drawn_from_the_tables(tmp_path):
@@ -446,6 +549,15 @@ def test_pictures_are_drawn_from_the_tables(tmp_path):
     named = set(re.findall(r"images/(evidence_\w+\.svg)", page))
     assert named == {path.name for path in tmp_path.iterdir()}
     assert all((DOCS / "images" / picture).exists() for picture in named)
+
+
+def test_the_gains_that_the_readme_names_are_those_of_the_evidence():
+    text = (ROOT / "README.md").read_text()
+    table = re.search(r"^\| what you add .*\n\|[-|]+\|\n((?:\|.*\n)+)", text, re.MULTILINE)
+    assert table
+    gains = set(re.findall(r"\+\d\.\d+", table[1]))
+    assert len(gains) == 4
+    assert not [gain for gain in gains if f"{gain[1:]}" not in (DOCS / "explanation" / "evidence.md").read_text()]
 
 
 def test_numbers_of_a_summary_are_those_of_its_table():
