@@ -76,7 +76,7 @@ def look(made: Densifier, score, ordinary=None, *, t: int = 1, seen=None) -> Non
     ordinary = score if ordinary is None else ordinary
     seen = torch.ones(N, dtype=torch.bool) if seen is None else seen
     shot = StubShot(torch.zeros(48, 64, 3), torch.zeros(len(seen), 2), seen, [])
-    made.accumulate(Update(Grads(), score, ordinary, None), shot, t)
+    made.accumulate(Update(toy.step(), Grads(), score, ordinary), shot, t)
 
 
 def grown(made: Densifier, theta: GaussianField, optimizer: Adam, t: int = 1) -> list[int]:
@@ -435,7 +435,7 @@ def test_our_mcmc_is_gsplats_but_for_its_cuda_kernels(monkeypatch):
             settings(MCMC), kind(refine_start_iter=0, refine_every=1, noise_lr=100.0), 60, extent=1.0, seed=7
         )
         shot = StubShot(torch.zeros(48, 64, 3), torch.zeros(60, 2), torch.ones(60, dtype=torch.bool), [])
-        made.accumulate(Update(Grads(), torch.ones(60), torch.ones(60), None), shot, 1)
+        made.accumulate(Update(toy.step(), Grads(), torch.ones(60), torch.ones(60)), shot, 1)
         assert made.step(theta, optimizer, 1, lambda _: None)
         left.append({**theta.raw(), **optimizer.state_dict()})
     assert len(left[0]["means"]) == 63

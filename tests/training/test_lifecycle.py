@@ -145,9 +145,9 @@ def test_statistics_are_means_over_the_views_that_saw_a_gaussian():
     seen = StubShot(torch.zeros(2, 2, 3), torch.zeros(3, 2), torch.tensor([True, True, False]), [])
     for value in (1.0, 3.0):
         score = torch.full((3,), value)
-        density.accumulate(Update(Grads(), score, score * 2, None), seen, 5)
+        density.accumulate(Update(toy.step(), Grads(), score, score * 2), seen, 5)
     seen.visible = torch.tensor([True, False, False])
-    density.accumulate(Update(Grads(), torch.full((3,), 8.0), torch.zeros(3), None), seen, 6)
+    density.accumulate(Update(toy.step(), Grads(), torch.full((3,), 8.0), torch.zeros(3)), seen, 6)
     assert (density.score / density.count.clamp_min(1)).tolist() == pytest.approx([4, 2, 0])
     assert density.count.tolist() == [3, 2, 0]
 

@@ -55,8 +55,10 @@ _REFUSED: dict[str, str] = {
     "optim.rows=some": "all",
     "optim.means.initial=0": r"\(0, 100\]",
     "skips.hr_every=0": "at least 1",
-    "+strategy=back_projected decorators.back_projected.rounds=0": "at least 1",
-    "+strategy=back_projected decorators.back_projected.rounds=1000000000000": "at most 100",
+    "decorators.back_projected.rounds=0": "at least 1",
+    "decorators.back_projected.rounds=1000000000000": "at most 100",
+    "strategies.pseudo_views.every=0": "at least 1",
+    "strategies.pseudo_views.weight=0": "must be > 0",
     "skips.flat=1": r"\[0, 1\)",
     "skips.plateau_gain=-1": r"\[0, 1\)",
     "skips.coarse_until=-1": "at least 0",
@@ -117,7 +119,7 @@ _REFUSED: dict[str, str] = {
 @cache
 def _sound() -> DictConfig:
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", ["+strategy=clear"])
+        return compose("config", ["+strategy=best"])
 
 
 def _given(override: str) -> Callable[[Path], object]:
