@@ -34,20 +34,11 @@ class PseudoView:
 
     Args:
         photo: the colours, 0 where unknown, and the camera.
-        depth: of the surfaces whose colour photos tell, all of full confidence.
+        known: where photos tell the colour.
     """
 
     photo: Photo
-    depth: DepthMap
-
-    @property
-    def known(self) -> Bool[Tensor, "h w"]:
-        """Where photos tell the colour."""
-        return self.depth.known
-
-    def to(self, device: torch.device | str) -> PseudoView:
-        """The same pseudo view on `device`."""
-        return PseudoView(self.photo.to(device), self.depth.to(device))
+    known: Bool[Tensor, "h w"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,8 +158,7 @@ def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Pse
     known[known.clone()] = weight > 0
     around = 9 * torch.nn.functional.avg_pool2d(known[None, None].float(), 3, 1, 1)[0, 0]
     known &= around >= _NEIGHBOURS - 0.5
-    there = DepthMap(torch.where(known, depth, torch.nan).float(), known.float())
-    return PseudoView(Photo(camera, torch.where(known[..., None], image, 0.0).clamp(0, 1)), there)
+    return PseudoView(Photo(camera, torch.where(known[..., None], image, 0.0).clamp(0, 1)), known)
 
 
 def _front(camera: Camera, points: Float[Tensor, "N 3"]) -> Float[Tensor, "h w"]:
