@@ -11,15 +11,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
+from clear_strategies.core.points import PointCloud
 from clear_strategies.core.projection import intrinsics
 from clear_strategies.data.priors import DemoPrior
 from clear_strategies.data.readers import demo
-from rasterizers.geometry import SH_C0
+from clear_strategies.training.field import GaussianField
 
 RATES: Final = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
-_NEIGHBOURS: Final = 3
-_ROWS: Final = 1_000  # of the table of distances at once
-_SMALLEST_DISTANCE: Final = 1e-4  # between points, world units
 
 Render = Callable[[Tensor, Tensor, int, int], Tensor]
 
@@ -82,21 +80,6 @@ def splats_with_optimizers(
     Args:
         means: world units. colors: RGB in [0, 1].
     """
-    n = len(means)
-    start = {
-        "means": means,
-        "quats": torch.tensor([1.0, 0, 0, 0]).expand(n, 4),
-        "scales": _neighbour_distance(means).log()[:, None].expand(n, 3),
-        "opacities": torch.full((n,), 0.1).logit(),
-        "sh0": ((colors - 0.5) / SH_C0)[:, None],
-        "shN": torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3),
-    }
-    splats = {name: torch.nn.Parameter(value.to(means).clone()) for name, value in start.items()}
+    start = GaussianField.from_cloud(PointCloud(means.cpu(), colors.cpu(), "given"), max_degree=sh_degree).raw()
+    splats = {name: torch.nn.Parameter(start[name].to(means).clone()) for name in RATES}
     return splats, {name: torch.optim.Adam([p], lr=RATES[name], eps=1e-15) for name, p in splats.items()}
-
-
-def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-    """The root mean square distance to the three nearest points."""
-    k = min(_NEIGHBOURS, len(means) - 1) + 1  # the nearest is the point itself
-    nearest = torch.cat([torch.cdist(rows, means).topk(k, largest=False).values for rows in torch.split(means, _ROWS)])
-    return nearest[:, 1:].square().mean(1).sqrt().nan_to_num(_SMALLEST_DISTANCE).clamp_min(_SMALLEST_DISTANCE)

@@ -18,20 +18,19 @@ from torch import Tensor
 
 from clear_strategies.compose import conductor
 from clear_strategies.core import images
+from clear_strategies.core.projection import intrinsics
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import ViewSettings, prepare
 from clear_strategies.data.priors import DemoPrior
 from clear_strategies.data.readers import demo
 from clear_strategies.data.scene import Scene
 from clear_strategies.kernels import losses
-from clear_strategies.training.field import GaussianField
+from integration.examples.demo import splats_with_optimizers
 from integration.gsplat import attach
 from integration.views import view
 from rasterizers import native
 from rasterizers.autograd import rasterization as cpu_rasterization
 from rasterizers.interface import Camera
-
-RATES = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 
 
 def main(iterations: int, strategies: str | None, seed: int = 0) -> float:
@@ -41,9 +40,7 @@ def main(iterations: int, strategies: str | None, seed: int = 0) -> float:
     scene = prepare(capture, ViewSettings(train=3, test_every=8, photos_are="hr"), sr, CloudSettings())
     photos = {v.name: v.lr for v in scene.train}  # what a host has: LR photos and their cameras
 
-    start = GaussianField.from_cloud(scene.cloud).raw()
-    splats = {name: torch.nn.Parameter(start[name].clone()) for name in RATES}
-    optimizers = {name: torch.optim.Adam([p], lr=RATES[name], eps=1e-15) for name, p in splats.items()}
+    splats, optimizers = splats_with_optimizers(scene.cloud.means, scene.cloud.colors)
     strategy = DefaultStrategy(
         refine_start_iter=iterations // 20, refine_stop_iter=iterations // 2, refine_every=max(1, iterations // 40),
         grow_grad2d=1.5e-3,
@@ -56,7 +53,7 @@ def main(iterations: int, strategies: str | None, seed: int = 0) -> float:
         chosen = conductor(strategies, iterations=iterations)  # +
         made_by = chosen.prior(sr)  # + the SR images, back-projected where the strategies say so
         views = [
-            view(n, p.image, p.camera.world_to_camera, intrinsics(p.camera)[0], made_by) for n, p in photos.items()
+            view(n, p.image, p.camera.world_to_camera, intrinsics(p.camera), made_by) for n, p in photos.items()
         ]  # +
         clear = attach(splats, optimizers, views, chosen, strategy=strategy, seed=seed)  # +
         rasterization = clear.wrap(rasterization)  # +
@@ -65,8 +62,8 @@ def main(iterations: int, strategies: str | None, seed: int = 0) -> float:
         p = splats
         image, _, info = rasterization(
             p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), torch.cat((p["sh0"], p["shN"]), 1),
-            camera.world_to_camera[None], intrinsics(camera), camera.width, camera.height, sh_degree=3, packed=False,
-            rasterize_mode="antialiased",
+            camera.world_to_camera[None], intrinsics(camera).float()[None], camera.width, camera.height, sh_degree=3,
+            packed=False, rasterize_mode="antialiased",
         )  # fmt: skip
         return image[0], info
 
@@ -99,10 +96,6 @@ class Photometric(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, scale: Tensor) -> tuple[Tensor, None]:
         return ctx.gradient * scale, None
-
-
-def intrinsics(camera: Camera) -> Tensor:
-    return torch.tensor([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]])
 
 
 def psnr(scene: Scene, render: Callable[[Camera], tuple[Tensor, Any]]) -> float:
