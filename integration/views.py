@@ -19,6 +19,22 @@ SuperResolve = Callable[[str, Float[Tensor, "h w 3"], int], Float[Tensor, "H W 3
 """I_HR of a view from its name, its LR image and the factor: a prior of `clear_strategies.data.priors`, or your function."""
 
 
+def posed_photo(image: Float[Tensor, "h w C"], world_to_camera: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"]) -> Photo:
+    """A host's photo and its camera.
+
+    Args:
+        image: RGB in [0, 1] or 8 bits; further channels are left out.
+        world_to_camera: OpenCV axes (x right, y down, z forward).
+        K: focal lengths and principal point in pixels of `image`; pixel (0, 0) spans [0, 1)².
+    """
+    if image.dtype == torch.uint8:
+        image = image.float() / 255
+    image = image[..., :3].float()
+    h, w = image.shape[:2]
+    (fx, _, cx), (_, fy, cy), _ = K.tolist()
+    return Photo(Camera(world_to_camera.detach().float(), fx, fy, cx, cy, w, h), image)
+
+
 def view(
     name: str,
     image: Float[Tensor, "h w 3"],
@@ -31,9 +47,7 @@ def view(
     """One training view of a host, on the device of its image.
 
     Args:
-        image: the real photo, in [0, 1] or 8 bits.
-        world_to_camera: OpenCV axes (x right, y down, z forward).
-        K: focal lengths and principal point in pixels of `image`; pixel (0, 0) spans [0, 1)².
+        image: the real photo. world_to_camera, K: see `posed_photo`.
         sr: gives the SR image. factor: HR pixels per LR pixel.
         mask: what the host's loss multiplies its rendering by, in [0, 1]. Photo and SR image are multiplied by it, so that
             a pixel that the host hides is hidden at both scales; the HR rendering must be as well, see `enlarged_mask`.
@@ -41,12 +55,9 @@ def view(
     Raises:
         DataError: the SR image is not `factor` times as large as the photo.
     """
-    if image.dtype == torch.uint8:
-        image = image.float() / 255
-    image = image[..., :3].float()
-    h, w = image.shape[:2]
-    (fx, _, cx), (_, fy, cy), _ = K.tolist()
-    camera = Camera(world_to_camera.detach().float(), fx, fy, cx, cy, w, h)
+    lr = posed_photo(image, world_to_camera, K)
+    image, camera = lr.image, lr.camera
+    w, h = camera.width, camera.height
     made = super_resolved(sr, name, image.cpu(), factor)
     sr_image = made.image.to(image)
     if sr_image.shape != (h * factor, w * factor, 3):

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from clear_strategies.core.projection import intrinsics
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment, HostRendering, Resolution
@@ -246,11 +247,10 @@ class Attached:
         self, rasterization: Rasterization, arguments: Mapping[str, Any], camera: Camera
     ) -> AutogradShot:
         """The Gaussians of a call, drawn by another camera."""
-        call, Ks = dict(arguments), arguments["Ks"]
-        K = Ks.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        call = dict(arguments)
         call |= {
             "viewmats": camera.world_to_camera.to(call["viewmats"]).reshape(call["viewmats"].shape),
-            "Ks": K.reshape(Ks.shape),
+            "Ks": intrinsics(camera).to(call["Ks"]).reshape(call["Ks"].shape),
             "width": camera.width,
             "height": camera.height,
             "render_mode": "RGB",

@@ -11,11 +11,10 @@ from typing import Any, Final
 import torch
 
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.view import Photo
 from integration.errors import HostError
 from integration.gsplat.data import mask_of
 from integration.points import ELSEWHERE, stereo_points
-from rasterizers.interface import Camera
+from integration.views import posed_photo
 
 _log = logging.getLogger(__name__)
 
@@ -63,14 +62,8 @@ def stereo_cloud(dataset: Any) -> PointCloud:
         DataError: there are fewer than two photos, or stereo confirms no depth.
     """
     items = [dataset[i] for i in range(len(dataset))]
-    return stereo_points([_photo(item) for item in items], [mask_of(item) for item in items])
-
-
-def _photo(item: Any) -> Photo:
-    image = item["image"] / 255
-    (fx, _, cx), (_, fy, cy), _ = item["K"].tolist()
-    pose = torch.linalg.inv(item["camtoworld"])
-    return Photo(Camera(pose, fx, fy, cx, cy, image.shape[1], image.shape[0]), image)
+    photos = [posed_photo(item["image"] / 255, torch.linalg.inv(item["camtoworld"]), item["K"]) for item in items]
+    return stereo_points(photos, [mask_of(item) for item in items])
 
 
 def _with_points(parser: Any, cloud: PointCloud) -> Any:

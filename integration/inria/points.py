@@ -13,7 +13,7 @@ from clear_strategies.core.view import Photo
 from integration.errors import HostError
 from integration.inria.cameras import intrinsics, mask_of
 from integration.points import ELSEWHERE, stereo_points
-from rasterizers.interface import Camera
+from integration.views import posed_photo
 
 _OPEN: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
@@ -55,10 +55,8 @@ def stereo_cloud(cameras: Sequence[Any], device: torch.device | str = "cpu") -> 
 
 
 def _photo(camera: Any, device: torch.device | str) -> Photo:
-    image = camera.original_image[:3].permute(1, 2, 0).detach().float().to(device)
-    (fx, _, cx), (_, fy, cy), _ = intrinsics(camera).tolist()
-    pose = camera.world_view_transform.T.detach().float()
-    return Photo(Camera(pose, fx, fy, cx, cy, image.shape[1], image.shape[0]), image)
+    image = camera.original_image.permute(1, 2, 0).detach().to(device)
+    return posed_photo(image, camera.world_view_transform.T, intrinsics(camera))
 
 
 def _host_functions(gaussians: Any) -> tuple[Any, Any]:

@@ -14,13 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.view import Photo, View
+from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors import Bicubic, Images, Onnx, Prior, cached
 from clear_strategies.errors import DataError, SettingError
 from integration.points import stereo_points
-from integration.views import view
-from rasterizers.interface import Camera
+from integration.views import posed_photo, view
 
 
 def prior(sr: Path | None) -> Prior:
@@ -86,11 +85,8 @@ def stereo_cloud(datamanager: Any) -> PointCloud:
     """
     cached = _cached(datamanager)  # read first: it undistorts the photos and corrects the cameras
     cameras = datamanager.train_dataset.cameras
-    Ks, poses = cameras.get_intrinsics_matrices().tolist(), world_to_camera(cameras.camera_to_worlds)
-    photos = []
-    for item, ((fx, _, cx), (_, fy, cy), _), pose in zip(cached, Ks, poses, strict=True):
-        image = over_black(item["image"])
-        photos.append(Photo(Camera(pose.float(), fx, fy, cx, cy, image.shape[1], image.shape[0]), image))
+    Ks, poses = cameras.get_intrinsics_matrices(), world_to_camera(cameras.camera_to_worlds)
+    photos = [posed_photo(over_black(item["image"]), pose, K) for item, pose, K in zip(cached, poses, Ks, strict=True)]
     return stereo_points(photos, [_mask(item) for item in cached])
 
 
