@@ -35,7 +35,8 @@ from clear_strategies.core.gradients import Grads, conflict_columns, to_ndc
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
-from clear_strategies.merging.conductor import Conductor, HrGradients, only
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.iteration import HrGradients, only
 from integration.autograd_shot import AutogradShot
 from integration.detail import keep_from_drifting
 from integration.errors import HostError
@@ -154,8 +155,10 @@ class Attachment:
             hr_grads = conductor.hr_gradients(hr_rendering.shot, view, t)
         self._step = Step(t, view) if hr_grads is None else hr_grads.step
         if self._passes == 0:  # one step of the host, however many passes it accumulates
-            with _random_state_kept(self.params()["means"].device):
-                self._extra.render(t, render_camera)
+            self._extra.forget()
+            if extra_views := conductor.extra_views(t):
+                with _random_state_kept(self.params()["means"].device):
+                    self._extra.render(extra_views, t, render_camera)
         rendering = render_at("lr", z)
         if rendering.output.requires_grad:
             self._pending = rendering, hr_grads

@@ -16,7 +16,8 @@ from torch import Tensor
 from clear_strategies.core.deferred import Scalar
 from clear_strategies.core.gradients import Grads, Shot
 from clear_strategies.core.view import ExtraView, View
-from clear_strategies.merging.conductor import Conductor, Update
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.iteration import Update
 from integration.autograd_shot import AutogradShot
 from integration.host_score import ScoreScaler, score_for_host
 

@@ -23,7 +23,7 @@ class Drawn(NamedTuple):
     """An image, and its depth if it was asked for, in the autograd graph of their splats.
 
     Args:
-        depth: the expected depth, see `rasterizers.interface.Rendering.depth`.
+        depth: the expected depth, see `rasterizers.interface.Rendering.depth`. A loss must not depend on it.
         means2d: projected centres, pixels. After `backward()` its `.grad` is the screen gradient in 1/pixel; the gradient
             of the positions does not pass through it.
     """
@@ -38,7 +38,7 @@ class Drawn(NamedTuple):
 def draw(
     rasterizer: Rasterizer, splats: Splats, camera: Camera, means2d: Tensor | None = None, *, depth: bool = False
 ) -> Drawn:
-    """Draw the splats. Gradients flow from image and depth to the splats' tensors; alpha is not differentiable.
+    """Draw the splats. Gradients flow from the image to the splats' tensors; alpha and depth have none.
 
     Args:
         means2d: a tensor that receives the projected centres and whose `.grad` will be the screen gradient; None makes one.
@@ -46,6 +46,7 @@ def draw(
 
     Raises:
         ValueError: depth is asked of a rasterizer without the trait.
+        NotImplementedError: in `backward`, if the loss depends on the depth.
     """
     if depth:
         require_depth(rasterizer)
@@ -76,14 +77,17 @@ class _Draw(torch.autograd.Function):
         ctx.rendering = rasterizer(detached, camera, depth=True) if depth else rasterizer(detached, camera)
         means2d.data.copy_(ctx.rendering.means2d)
         ctx.mark_non_differentiable(ctx.rendering.alpha, ctx.rendering.visible)
-        ctx.set_materialize_grads(False)  # without a gradient of depth, three channels do
+        ctx.set_materialize_grads(False)
         return ctx.rendering.image, ctx.rendering.alpha, ctx.rendering.visible, ctx.rendering.depth
 
     @staticmethod
     def backward(ctx: Any, of_image: Tensor | None, _alpha: None, _visible: None, of_depth: Tensor | None) -> Any:
+        if of_depth is not None and bool(of_depth.any()):  # silence would leave out a part of the loss
+            raise NotImplementedError(
+                "the loss depends on a rendered depth, which has no gradient in this package; detach it, or draw with "
+                "gsplat's own rasterization on a GPU."
+            )
         cotangent = torch.zeros_like(ctx.rendering.image) if of_image is None else of_image
-        if of_depth is not None:
-            cotangent = torch.cat((cotangent, of_depth[..., None]), dim=-1)
         g = ctx.rendering.vjp(cotangent[None])
         gradients = (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN)
         return None, None, None, g.screen[0], g.rgb[0] if ctx.offset else None, *(x[0] for x in gradients)
@@ -114,7 +118,8 @@ def rasterization(
 
     Args:
         colors: [N, K, 3] spherical harmonics with `sh_degree` the active degree, or [N, 3] RGB if `sh_degree` is None.
-        render_mode: "RGB", or "RGB+ED" with the expected depth as a fourth channel of the images.
+        render_mode: "RGB", or "RGB+ED" with the expected depth as a fourth channel of the images, to look at: a loss of
+            it raises `NotImplementedError` in `backward`.
         packed: has no effect; `info` is always unpacked.
         ignored: gsplat's other arguments (sparse_grad, tile_size, far_plane …) have no effect.
         backend: a name of `rasterizers.load`.

@@ -6,7 +6,7 @@ from dataclasses import fields
 from typing import Final
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from rasterizers.interface import Camera, Rasterizer, Splats, Traits
@@ -65,21 +65,15 @@ def require_finite(splats: Splats) -> None:
             raise ValueError(f"splats.{field.name} must be finite; Gaussian {index} is not ({int(bad.sum())} in all).")
 
 
-def require_cotangents(cotangents: Tensor, image: Tensor, depth: Tensor | None = None) -> None:
-    """Refuse cotangents that are not [K, H, W, 3] for an image [H, W, 3], or [K, H, W, 4] if depth was drawn, too.
+def require_cotangents(cotangents: Tensor, image: Tensor) -> None:
+    """Refuse cotangents that are not [K, H, W, 3] for an image [H, W, 3].
 
     Raises:
         ValueError: they have another shape.
     """
-    height, width, _ = image.shape
-    channels = (3,) if depth is None else (3, 4)
-    if cotangents.dim() == 4 and tuple(cotangents.shape[1:3]) == (height, width) and cotangents.shape[3] in channels:
-        return
-    undrawn = cotangents.dim() == 4 and cotangents.shape[3] == 4 and depth is None
-    raise ValueError(
-        f"cotangents must be [K, {height}, {width}, {' or '.join(map(str, channels))}], got {tuple(cotangents.shape)}"
-        + (": the fourth channel is that of depth, which was not drawn; draw with depth=True." if undrawn else ".")
-    )
+    if cotangents.dim() != 4 or cotangents.shape[1:] != image.shape:
+        height, width, _ = image.shape
+        raise ValueError(f"cotangents must be [K, {height}, {width}, 3], got {tuple(cotangents.shape)}.")
 
 
 def require_depth(rasterizer: Rasterizer) -> None:
@@ -94,30 +88,11 @@ def require_depth(rasterizer: Rasterizer) -> None:
         )
 
 
-def require_tiles(tiles: Tensor, width: int, height: int, tile: int) -> None:
-    """Refuse a tile mask that does not have one entry per tile.
-
-    Raises:
-        ValueError: it has another shape.
-    """
-    rows, columns = -(-height // tile), -(-width // tile)
-    if tuple(tiles.shape) != (rows, columns):
-        raise ValueError(
-            f"the tile mask must be [{rows}, {columns}] for {width}x{height} pixels "
-            f"in tiles of {tile}, got {tuple(tiles.shape)}."
-        )
-
-
 def same_gaussians_and_pose(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
     """Whether two jobs draw the same tensor objects from the same pose; opacities and offsets may differ."""
     (a, from_a), (b, from_b) = first, other
     same = all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
     return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
-
-
-def refine_mask(mask: Bool[Tensor, "h w"], factor: int, height: int, width: int) -> Bool[Tensor, "H W"]:
-    """The mask on a grid that is `factor` times finer, cropped to `height` by `width`."""
-    return mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)[:height, :width]
 
 
 def packed_rows(shN: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import refine_mask, require_cotangents, require_finite, require_splats, require_tiles
+from rasterizers.checks import require_cotangents, require_finite, require_splats
 from rasterizers.geometry import SH_C0, spherical_harmonics
 from rasterizers.interface import (
     BackendUnavailable,
@@ -75,17 +75,13 @@ class GsplatRasterizer(RasterSettings):
     def traits(self) -> Traits:
         return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}), depth=True)
 
-    def __call__(
-        self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None, *, depth: bool = False
-    ) -> GsplatRendering:
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> GsplatRendering:
         """Draw; depth by gsplat's render mode "RGB+ED".
 
         Raises:
             TypeError: the splats are on another device, or not float32.
-            ValueError: they are not finite, or a tensor or the tile mask has a wrong shape.
+            ValueError: they are not finite, or a tensor has a wrong shape.
         """
-        if tiles is not None:
-            require_tiles(tiles, camera.width, camera.height, self.tile)
         require_splats(splats, self.traits)
         require_finite(splats)
         names = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -106,31 +102,23 @@ class GsplatRasterizer(RasterSettings):
                 rasterize_mode="antialiased" if self.antialiased else "classic",
                 **({"render_mode": "RGB+ED"} if depth else {}),
             )  # fmt: skip
+            drawn = images[..., :3]
         radii = info["radii"][0]
         visible = (radii > 0).all(-1) if radii.dim() == 2 else radii > 0
-        requested = None if tiles is None else refine_mask(tiles, self.tile, camera.height, camera.width)[..., None]
         pixels = images[0].detach()
-        if requested is not None:
-            pixels = torch.where(requested, pixels, pixels.new_tensor((*self.background, 0.0)[: pixels.shape[-1]]))
         direction = torch.nn.functional.normalize(splats.means.detach() - camera.center.to(splats.means), dim=-1)
         basis = spherical_harmonics(direction, splats.shN.shape[1])
-        alpha = alphas[0, ..., 0].detach()
-        alpha = alpha if requested is None else alpha * requested[..., 0]
         return GsplatRendering(
-            pixels[..., :3].contiguous(), alpha, pixels[..., 3] if depth else None, info["means2d"].detach()[0], visible,
-            images, {**leaves, "screen": info["means2d"]}, basis, requested,
+            pixels[..., :3].contiguous(), alphas[0, ..., 0].detach(), pixels[..., 3] if depth else None,
+            info["means2d"].detach()[0], visible,
+            drawn, {**leaves, "screen": info["means2d"]}, basis,
         )  # fmt: skip
 
     def render_scales(
-        self,
-        jobs: Sequence[tuple[Splats, Camera]],
-        tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None,
-        *,
-        depth: Sequence[bool] | None = None,
+        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
     ) -> list[Rendering]:
         """Draws the jobs one after the other; nothing is shared."""
-        masks, depths = tiles or [None] * len(jobs), depth or [False] * len(jobs)
-        return [self(*job, mask, depth=z) for job, mask, z in zip(jobs, masks, depths, strict=True)]
+        return [self(*job, depth=z) for job, z in zip(jobs, depth or [False] * len(jobs), strict=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,8 +126,7 @@ class GsplatRendering:
     """An image, and its VJP through gsplat's autograd graph.
 
     Args:
-        drawn: image and depth, in the graph of `leaves`.
-        requested: the pixels of the tile mask; None: all.
+        drawn: the image, in the graph of `leaves`.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -147,18 +134,16 @@ class GsplatRendering:
     depth: Float[Tensor, "H W"] | None
     means2d: Float[Tensor, "N 2"]
     visible: Bool[Tensor, " N"]
-    drawn: Float[Tensor, "1 H W C"]
+    drawn: Float[Tensor, "1 H W 3"]
     leaves: dict[str, Tensor]
     basis: Float[Tensor, "N B1"]
-    requested: Bool[Tensor, "H W 1"] | None
 
-    def vjp(self, cotangents: Float[Tensor, "K H W C"]) -> SplatGradients:
-        require_cotangents(cotangents, self.image, self.depth)
-        channels = self.drawn[..., : cotangents.shape[-1]]
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
+        require_cotangents(cotangents, self.image)
         gradients = []
-        for cotangent in cotangents if self.requested is None else cotangents * self.requested:
+        for cotangent in cotangents:
             found = torch.autograd.grad(
-                channels, list(self.leaves.values()), cotangent[None], retain_graph=True, materialize_grads=True
+                self.drawn, list(self.leaves.values()), cotangent[None], retain_graph=True, materialize_grads=True
             )
             gradients.append(dict(zip(self.leaves, found, strict=True)))
 

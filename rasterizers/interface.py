@@ -170,7 +170,7 @@ class SplatGradients:
 
 @runtime_checkable
 class Rendering(Protocol):
-    """An image, its depth if it was asked for, and the VJP that maps their gradients to those of the splats."""
+    """An image, its depth if it was asked for, and the VJP that maps gradients of the image to those of the splats."""
 
     @property
     def image(self) -> Float[Tensor, "H W 3"]: ...
@@ -184,7 +184,7 @@ class Rendering(Protocol):
 
         E = Σ wᵢ zᵢ / Σ wᵢ with the blending weights wᵢ = Tᵢ αᵢ and the depths zᵢ of the centres along the camera's axis: "ED"
         in gsplat's terms, the accumulated depth "D" divided by alpha. It is 0 where nothing is drawn. Where alpha is small it
-        is that of a few faint Gaussians, so a loss of depth should be weighted by alpha.
+        is that of a few faint Gaussians. It has no gradient.
         """
         ...
 
@@ -198,11 +198,8 @@ class Rendering(Protocol):
         """Whether the Gaussian may contribute to a pixel of the image."""
         ...
 
-    def vjp(self, cotangents: Float[Tensor, "K H W C"]) -> SplatGradients:
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         """The gradients of the splats for K gradients of the image (cotangents), in one pass where the backend can.
-
-        A fourth channel of the cotangents is the gradient of `depth`. It reaches the depths zᵢ and the weights wᵢ, and
-        through them every tensor of the geometry. Three channels cost no more than without depth.
 
         Backends may read the splats' tensors again: call this before they are changed in place.
         """
@@ -233,30 +230,18 @@ class Rasterizer(Protocol):
     @property
     def traits(self) -> Traits: ...
 
-    def __call__(
-        self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None, *, depth: bool = False
-    ) -> Rendering:
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
         """Draw the splats.
 
         Args:
-            tiles: the mask of requested tiles; the others show the background and send no gradient. None requests all.
             depth: also draw `Rendering.depth`, for a rasterizer with the trait `depth`.
         """
         ...
 
-    @property
-    def tile(self) -> int:
-        """Edge of the square tiles of the tile mask, px."""
-        ...
-
     def render_scales(
-        self,
-        jobs: Sequence[tuple[Splats, Camera]],
-        tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None,
-        *,
-        depth: Sequence[bool] | None = None,
+        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
     ) -> list[Rendering]:
-        """Draw several resolutions from one pose, each with its tile mask, and with depth or without; None: none with it.
+        """Draw several resolutions from one pose, each with depth or without; None: none with it.
 
         Backends may share work between jobs whose splats hold the same tensor objects.
         """
@@ -287,7 +272,6 @@ class RasterSettings:
         alpha_min: a contribution below it is not blended (1/255: the usual default).
         alpha_max: cap on a single contribution, in (0, 1).
         transmittance_min: a pixel ends before its transmittance falls below it.
-        tile: edge of the square tiles of the tile mask, px.
         background: RGB in [0, 1].
         antialiased: scale the opacity to make up for the blur of the 2D kernel (Mip-Splatting).
 
@@ -300,7 +284,6 @@ class RasterSettings:
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
     transmittance_min: float = 1e-4
-    tile: int = 16
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     antialiased: bool = True
 
@@ -315,8 +298,6 @@ class RasterSettings:
             )
         if not 0 <= self.transmittance_min < 1:
             raise ValueError(f"transmittance_min must lie in [0, 1), got {self.transmittance_min}.")
-        if self.tile < 1:
-            raise ValueError(f"tile must be at least 1 pixel, got {self.tile}.")
         object.__setattr__(self, "background", tuple(float(c) for c in self.background))  # any sequence, e.g. Hydra's
         if len(self.background) != 3 or not all(0 <= c <= 1 for c in self.background):
             raise ValueError(f"background must be three numbers in [0, 1], got {self.background}.")

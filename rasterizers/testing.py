@@ -49,14 +49,13 @@ def check_rasterizer(make: Make) -> None:
         check(make)
 
 
-def check_gradients_are_finite_differences(make: Make, *, depth: bool = False) -> None:
+def check_gradients_are_finite_differences(make: Make) -> None:
     """The VJP agrees with finite differences along random directions, for every attribute."""
     rasterizer = make(background=(0.2, 0.5, 0.9), **_SMOOTH)
     dtype = _widest(rasterizer)
     splats, camera = scene(24, dtype=dtype, seed=1), _camera(40, 30)
     g = torch.Generator().manual_seed(2)
-    draw = _drawing(rasterizer, depth)
-    rendering = draw(splats, camera)
+    rendering = rasterizer(splats, camera)
     v = _cotangents(rendering, 1, g)
     gradients = rendering.vjp(v)
     step, tolerance = (1e-6, 1e-4) if dtype == torch.float64 else (1e-2, 2e-2)
@@ -67,7 +66,8 @@ def check_gradients_are_finite_differences(make: Make, *, depth: bool = False) -
             if name in ("opacities", "scales"):
                 direction = direction * value * 0.3
             direction = direction / torch.linalg.vector_norm(direction)
-            ends = [pixels_of(draw(replace(splats, **{name: value + s * step * direction}), camera)) for s in (1, -1)]
+            moved = [replace(splats, **{name: value + s * step * direction}) for s in (1, -1)]
+            ends = [rasterizer(m, camera).image for m in moved]
             numeric = float(((ends[0] - ends[1]) * v[0]).sum()) / (2 * step)
             analytic = float((gradient * direction).sum())
             scale = max(abs(numeric), float(gradient.abs().max()) * 1e-2, 1e-9)
@@ -76,11 +76,11 @@ def check_gradients_are_finite_differences(make: Make, *, depth: bool = False) -
             )
 
 
-def check_cotangents_together_equal_one_by_one(make: Make, *, depth: bool = False) -> None:
+def check_cotangents_together_equal_one_by_one(make: Make) -> None:
     """One call with K cotangents equals K calls with one."""
     rasterizer = make()
     splats, camera = scene(60, dtype=_widest(rasterizer)), _camera(48, 33)
-    rendering = _drawing(rasterizer, depth)(splats, camera)
+    rendering = rasterizer(splats, camera)
     v = _cotangents(rendering, 3, torch.Generator().manual_seed(3))
     together = rendering.vjp(v)
     for k in range(3):
@@ -100,7 +100,7 @@ def check_dropped_equals_absent(make: Make, *, depth: bool = False) -> None:
     rendering, without = draw(gated, camera), draw(select(splats, kept), camera)
     _close(pixels_of(rendering), pixels_of(without), 1e-6, "the image")
     _require(not bool(rendering.visible[~kept].any()), "a dropped Gaussian counts as visible")
-    v = torch.ones_like(pixels_of(rendering))[None]
+    v = torch.ones_like(rendering.image)[None]
     gradients, expected = rendering.vjp(v), without.vjp(v)
     for name in _ATTRIBUTES:
         rows = gradient_of(gradients, name)[0]
@@ -120,37 +120,27 @@ def check_nothing_to_draw(make: Make, *, depth: bool = False) -> None:
         _close(rendering.image, torch.tensor(background, dtype=dtype).expand(11, 19, 3), 1e-7, "the background")
         _require(float(rendering.alpha.abs().max()) == 0, "alpha is not 0 where nothing is")
         _require(rendering.depth is None or not bool(rendering.depth.any()), "depth is not 0 where nothing is")
-        gradients = rendering.vjp(torch.ones_like(pixels_of(rendering)).expand(2, -1, -1, -1))
+        gradients = rendering.vjp(torch.ones_like(rendering.image).expand(2, -1, -1, -1))
         for name in _ATTRIBUTES:
             found = gradient_of(gradients, name)
             _require(found.shape[:2] == (2, len(splats)), f"the gradient of {name} has shape {tuple(found.shape)}")
             _require(found.numel() == 0 or float(found.abs().max()) == 0, f"the gradient of {name} is not 0")
 
 
-def check_tile_mask(make: Make, *, depth: bool = False) -> None:
-    """Requested tiles are as without a mask; the others show the background and depth 0, and send no gradient."""
-    rasterizer = make(tile=8)
+def check_scales_together_equal_one_by_one(make: Make, *, depth: bool = False) -> None:
+    """`render_scales` draws each job as if alone; depth is asked of one of two."""
+    rasterizer = make()
     splats, camera = scene(60, dtype=_widest(rasterizer)), _camera(48, 33)
-    draw = _drawing(rasterizer, depth)
-    mask = torch.rand(5, 6, generator=torch.Generator().manual_seed(4)) < 0.5
-    pixels = mask.repeat_interleave(8, 0).repeat_interleave(8, 1)[:33, :48]
-    full, partial = draw(splats, camera), draw(splats, camera, tiles=mask)
-    _close(pixels_of(partial)[pixels], pixels_of(full)[pixels], 1e-6, "requested pixels")
-    _require(float(pixels_of(partial)[~pixels].abs().max()) == 0, "pixels that were not requested are not background")
-    v = _cotangents(full, 1, torch.Generator().manual_seed(5))
-    found, expected = partial.vjp(v), full.vjp(v * pixels[None, :, :, None])
-    for name in _ATTRIBUTES:
-        _close(gradient_of(found, name), gradient_of(expected, name), 1e-5, f"the gradient of {name} under a mask")
     jobs = [(splats, camera.scaled(1 / 3)), (splats, camera)]
-    together = functools.partial(rasterizer.render_scales, jobs, [None, mask])
-    whole, masked = together(depth=[False, True]) if depth else together()
+    low, high = rasterizer.render_scales(jobs, depth=[False, True]) if depth else rasterizer.render_scales(jobs)
+    _require(low.depth is None, "an image has a depth that was not asked for")
+    _close(low.image, rasterizer(*jobs[0]).image, 1e-6, "an image drawn together with a larger one")
     _close(
-        pixels_of(whole),
-        rasterizer(*jobs[0]).image,
+        pixels_of(high),
+        pixels_of(_drawing(rasterizer, depth)(*jobs[1])),
         1e-6,
-        "an image without a mask, drawn together with a masked one",
+        "an image drawn together with a smaller one",
     )
-    _close(pixels_of(masked), pixels_of(partial), 1e-6, "an image with a mask, drawn together with another")
 
 
 def check_equal_depths_have_an_order(make: Make) -> None:
@@ -182,7 +172,7 @@ def check_agrees_with_the_reference(make: Make, *, depth: bool = False) -> None:
 
 
 def _of_depth(check: Callable[..., None]) -> Check:
-    """The same check with depth as a fourth channel, for rasterizers that draw it."""
+    """The same check of a rendering with depth, for rasterizers that draw it."""
 
     @functools.wraps(check)
     def of_depth(make: Make) -> None:
@@ -195,18 +185,18 @@ def _of_depth(check: Callable[..., None]) -> Check:
     return of_depth
 
 
-_OF_EACH_CHANNEL: Final = (
-    check_gradients_are_finite_differences,
-    check_cotangents_together_equal_one_by_one,
+_WITH_OR_WITHOUT_DEPTH: Final = (
     check_dropped_equals_absent,
     check_nothing_to_draw,
-    check_tile_mask,
+    check_scales_together_equal_one_by_one,
     check_agrees_with_the_reference,
 )
 CHECKS: Final[Sequence[Check]] = (
-    *_OF_EACH_CHANNEL,
+    check_gradients_are_finite_differences,
+    check_cotangents_together_equal_one_by_one,
+    *_WITH_OR_WITHOUT_DEPTH,
     check_equal_depths_have_an_order,
-    *(_of_depth(check) for check in _OF_EACH_CHANNEL),
+    *(_of_depth(check) for check in _WITH_OR_WITHOUT_DEPTH),
 )
 
 
@@ -265,11 +255,7 @@ def _drawing(rasterizer: Rasterizer, depth: bool) -> Callable[..., Rendering]:
 
 
 def _cotangents(like: Rendering, k: int, generator: torch.Generator) -> Tensor:
-    """Random cotangents of `pixels_of`. Those of depth are weighted by alpha, because E is not smooth where little is drawn."""
-    image = like.image
-    v = torch.randn(k, *image.shape[:2], 3 if like.depth is None else 4, generator=generator).to(image)
-    v[..., 3:] *= like.alpha[..., None]
-    return v
+    return torch.randn(k, *like.image.shape, generator=generator).to(like.image)
 
 
 def _map(splats: Splats, f: Callable[[Tensor], Tensor]) -> Splats:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core import deferred
-from clear_strategies.core.deferred import Number, Scalar
+from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence
 
 # A Gaussian whose axes are equally long does not change when it is rotated: in exact arithmetic its
@@ -26,7 +23,6 @@ class GroupReport:
     Args:
         compared, corrected: Gaussians. omega: the sum of ω over the corrected ones.
         at_lower_bound: how many of these have ω at its lower bound.
-        margin: the median of ‖g_LR‖‖g_HR‖ over an absolute ε; None where ε is relative.
     """
 
     group: str
@@ -34,7 +30,6 @@ class GroupReport:
     corrected: Number
     omega: Number
     at_lower_bound: Number
-    margin: Number | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,10 +38,7 @@ class CorrectionRule:
 
     Args:
         groups: the attributes that are compared and corrected.
-        tolerance: τ_c. weight_min, weight_max: bounds of ω, or of the coefficient ω|d|/‖g_LR‖².
-        bounds_omega: whether the bounds hold ω (else the coefficient).
-        epsilons: (mean ‖g_LR‖, mean ‖g_HR‖) of a group -> ε of the cosine and of the correction.
-        absolute_eps: the cosine's ε where it is one number for all groups; None: it is relative.
+        tolerance: τ_c. weight_min, weight_max: bounds of ω.
         report: called with one `GroupReport` per group, and the evidence, after every step.
     """
 
@@ -54,9 +46,6 @@ class CorrectionRule:
     tolerance: float
     weight_min: float
     weight_max: float
-    bounds_omega: bool
-    epsilons: Callable[[Scalar, Scalar], tuple[Scalar, Scalar]]
-    absolute_eps: float | None
     report: Callable[[Sequence[GroupReport], Evidence | None], None]
 
 
@@ -70,8 +59,3 @@ class Anchor:
 
     targets: Mapping[str, Tensor]
     stiffness: Mapping[str, float]
-
-
-def margin(product: Float[Tensor, " N"], eps: float) -> Number:
-    """The median of ‖g_LR‖‖g_HR‖ over an absolute ε > 0; NaN where nothing is compared."""
-    return deferred.defer(operator.truediv, deferred.median(product, product > 0), eps)

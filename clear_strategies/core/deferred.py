@@ -100,16 +100,6 @@ def mean(values: Float[Tensor, " N"], chosen: Bool[Tensor, " N"]) -> Scalar:
     return scalar(values.masked_fill(~chosen, 0).sum() / chosen.sum())
 
 
-def median(values: Float[Tensor, " N"], chosen: Bool[Tensor, " N"]) -> Scalar:
-    """The lower median of the chosen rows; NaN where there are none."""
-    if is_immediate(values):
-        return float(values[chosen].median()) if bool(chosen.any()) else math.nan
-    ranked = values.masked_fill(~chosen, torch.inf).sort().values
-    count = chosen.sum()
-    middle = ranked.gather(0, ((count - 1).clamp_min(0) // 2)[None])[0]
-    return torch.where(count > 0, middle, torch.nan)
-
-
 def _tensors(x: Number) -> Iterator[Tensor]:
     if isinstance(x, Deferred):
         for part in x.parts:

@@ -20,13 +20,12 @@ class PatchMaps:
 
     Args:
         reliability: agreement of the SR image with the LR photo. demand: share of detail that it adds.
-        patch: edge of a patch, LR pixels. compared: patches that other views show too; None where views are not compared.
+        patch: edge of a patch, LR pixels.
     """
 
     reliability: Float[Tensor, "ph pw"]
     demand: Float[Tensor, "ph pw"]
     patch: int
-    compared: Bool[Tensor, "ph pw"] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,19 +7,16 @@ reaches the margin, for each Gaussian and each attribute group. LR gradients are
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Final, Literal, overload
+from typing import Final
 
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule, GroupReport, margin
-from clear_strategies.core.deferred import Scalar
+from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule, GroupReport
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot, row_norm, scale_rows
 from clear_strategies.core.step import Step
@@ -40,15 +37,10 @@ class GCO(Strategy):
     Args:
         tolerance: τ_c in [0, 1): cosines down to -τ_c are no conflict.
         weight_min, weight_max: bounds of ω where a conflict is corrected, 0 <= min <= max <= 1.
-        bound: what the bounds limit: "omega", or the "coefficient" ω|d|/‖g_LR‖² (F28), whose lower bound makes the
-            correction jump by weight_min ‖g_LR‖ where the cosine passes -τ_c.
-        eps: "relative:0", the default, has no ε: norms and products are in float64, where those of float32 gradients do not
-            vanish, and a zero norm is no conflict. "relative:r" scales ε with the mean gradient norms of the group, so
-            that no change of the losses' unit changes a decision; one huge gradient then raises ε for all. "absolute:x"
-            takes the paper's symbol literally (1e-8 finds almost no conflict, F27).
         groups: the attributes that are compared and corrected, each separately.
 
-    The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
+    There is no ε: norms and products are in float64, where those of float32 gradients do not vanish, and a zero norm is no
+    conflict (F27). The opacity group has one dimension: its cosine is ±1, so every disagreement is a full conflict.
     Without evidence q = 0, and the LR gradient prevails (F32).
 
     Raises:
@@ -58,8 +50,6 @@ class GCO(Strategy):
     tolerance: float = 0.05
     weight_min: float = 0.05
     weight_max: float = 0.75
-    bound: Literal["omega", "coefficient"] = "omega"
-    eps: str = "relative:0"
     groups: Sequence[str] = CONFLICT_GROUPS
 
     def __post_init__(self) -> None:
@@ -70,12 +60,9 @@ class GCO(Strategy):
             raise SettingError(
                 f"0 <= weight_min <= weight_max <= 1 must hold, got {self.weight_min} and {self.weight_max}."
             )
-        if self.bound not in ("omega", "coefficient"):
-            raise SettingError(f"bound must be omega or coefficient, got {self.bound!r}.")
         unknown = sorted(set(self.groups) - set(CONFLICT_GROUPS))
         if unknown:
             raise SettingError(f"groups must be among {', '.join(CONFLICT_GROUPS)}, got {unknown[0]!r}.")
-        _parse_eps(self.eps)
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
         if lambda_lr == 0:
@@ -92,10 +79,7 @@ class GCO(Strategy):
         )
 
     def correction_rule(self) -> CorrectionRule:
-        return CorrectionRule(
-            self.groups, self.tolerance, self.weight_min, self.weight_max, self.bound == "omega", self.epsilons,
-            self._absolute_eps, self.report,
-        )  # fmt: skip
+        return CorrectionRule(self.groups, self.tolerance, self.weight_min, self.weight_max, self.report)
 
     def correct(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], step: Step | None = None) -> Grads:
         """g̃_HR for every group; logs what was corrected.
@@ -119,9 +103,8 @@ class GCO(Strategy):
         g_lr, g_hr = lr[group], hr[group]
         dot, n_lr, n_hr = row_dot(g_lr, g_hr), row_norm(g_lr), row_norm(g_hr)
         both = (n_lr > 0) & (n_hr > 0)
-        eps_cos, eps_corr = self.epsilons(deferred.mean(n_lr, both), deferred.mean(n_hr, both))
         n = n_lr * n_hr
-        c = torch.where(n > 0, dot / (n + eps_cos).clamp_min(_TINY), 0.0)  # Eq. 6
+        c = torch.where(n > 0, dot / n.clamp_min(_TINY), 0.0)  # Eq. 6
         conflict = c < -self.tolerance
         if group == "quats":
             conflict &= ~(_turns_nothing(lr) | _turns_nothing(hr))
@@ -132,43 +115,18 @@ class GCO(Strategy):
         hit = conflict[i]
         q = evidence.reliability[i].double() if evidence is not None else 0.0
         s = ((-c[i] - self.tolerance) / (1 - self.tolerance)).clamp(0, 1)
-        omega = s * (1 - q)  # Eq. 11
+        omega = (s * (1 - q)).clamp(self.weight_min, self.weight_max)  # Eq. 11
         d = dot[i] + self.tolerance * n[i]
-        coefficient = d / (n_lr[i].square() + eps_corr)
-        if self.bound == "omega":
-            omega = omega.clamp(self.weight_min, self.weight_max)
-            step = omega * coefficient
-        else:
-            step = -(omega * coefficient).abs().clamp(self.weight_min, self.weight_max)
+        step = omega * (d / n_lr[i].square())
         corrected = g_hr.clone()
         moved = (g_hr[i].double() - scale_rows(g_lr[i].double(), step)).to(g_hr.dtype)  # Eq. 7
         corrected[i] = torch.where(hit.view(-1, *[1] * (moved.dim() - 1)), moved, corrected[i])
         at_bound = hit & (omega <= self.weight_min)
         compared, touched, bound = (deferred.scalar(rows.sum()) for rows in (both, conflict, at_bound))
-        return corrected, GroupReport(
-            group,
-            compared,
-            touched,
-            deferred.total(omega, hit),
-            bound,
-            margin(n, self._absolute_eps) if self._absolute_eps else None,
-        )
-
-    @overload
-    def epsilons(self, mean_lr: float, mean_hr: float) -> tuple[float, float]: ...
-
-    @overload
-    def epsilons(self, mean_lr: Scalar, mean_hr: Scalar) -> tuple[Scalar, Scalar]: ...
-
-    def epsilons(self, mean_lr: Scalar, mean_hr: Scalar) -> tuple[Scalar, Scalar]:
-        """ε of the cosine and of the correction, in gradient², from the mean norms over the compared Gaussians."""
-        kind, value = _parse_eps(self.eps)
-        if kind == "absolute" or value == 0:
-            return value, value
-        return value * mean_lr * mean_hr, value * mean_lr**2
+        return corrected, GroupReport(group, compared, touched, deferred.total(omega, hit), bound)
 
     def report(self, done: Sequence[GroupReport], evidence: Evidence | None) -> None:
-        """Log what was corrected, and warn where ε makes GCO inactive."""
+        """Log what was corrected."""
         compared, corrected, omega, at_bound = (
             deferred.defer(deferred.added, *(getattr(c, name) for c in done))
             for name in ("compared", "corrected", "omega", "at_lower_bound")
@@ -176,35 +134,9 @@ class GCO(Strategy):
         self.log("corrected", deferred.defer(deferred.ratio, corrected, compared))
         self.log("mean_omega", deferred.defer(deferred.ratio, omega, corrected))
         for c in done:
-            margin = math.nan if c.margin is None else c.margin
-            share = partial(self._share_of_group, c.group)
-            self.log(f"corrected_{c.group}", deferred.defer(share, c.corrected, c.compared, margin))
+            self.log(f"corrected_{c.group}", deferred.defer(deferred.ratio, c.corrected, c.compared))
         if corrected != 0 and evidence is not None and self.weight_min > 0:
             self.log(_AT_LOWER_BOUND, deferred.defer(deferred.ratio, at_bound, corrected))
-
-    @property
-    def _absolute_eps(self) -> float | None:
-        kind, value = _parse_eps(self.eps)
-        return value if kind == "absolute" else None
-
-    def _share_of_group(self, group: str, corrected: float, compared: float, margin: float) -> float:
-        """Warns where ε hides conflicts: below 20 ε a conflict is weakened; below τ/(1 - τ) ε none is found."""
-        if margin < self.tolerance / (1 - self.tolerance) and self._first(f"eps cannot {group}"):
-            _log.warning(
-                "GCO cannot fire for %s: the median of |g_LR||g_HR| is %.2g of eps=%s. Use eps=relative:0.",
-                group, margin, self.eps,
-            )  # fmt: skip
-        elif margin < 20 and self._first(f"eps weak {group}"):
-            _log.warning(
-                "GCO is weakened for %s: the median of |g_LR||g_HR| is only %.2g times eps=%s.",
-                group, margin, self.eps,
-            )  # fmt: skip
-        return deferred.ratio(corrected, compared)
-
-    def _first(self, what: str) -> bool:
-        known = what in self.cache
-        self.cache[what] = True
-        return not known
 
 
 _TINY: Final = torch.finfo(torch.float64).tiny
@@ -214,14 +146,3 @@ def _turns_nothing(g: Mapping[str, Tensor]) -> Bool[Tensor, " N"]:
     if "scales" not in g:
         return torch.zeros_like(g["quats"][:, 0], dtype=torch.bool)
     return row_norm(g["quats"]) <= ROTATION_NOISE * row_norm(g["scales"])
-
-
-def _parse_eps(eps: str) -> tuple[str, float]:
-    kind, _, number = str(eps).partition(":")
-    try:
-        value = float(number)
-    except ValueError:
-        value = -1.0
-    if kind not in ("relative", "absolute") or not 0 <= value < float("inf"):
-        raise SettingError(f'eps must be "relative:<number >= 0>" or "absolute:<number >= 0>", got {eps!r}.')
-    return kind, value

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
@@ -18,7 +17,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.agreement import ViewAgreement, compare_views
 from clear_strategies.core.evidence import Evidence, Lookup, Outside, PatchMaps, lift
 from clear_strategies.core.gradients import Shot, screen_norm
 from clear_strategies.core.images import DownKernel, UpKernel, downsample, patch_means, quantize, upsample
@@ -30,7 +28,6 @@ from clear_strategies.strategies.base import ScreenGradients, Strategy
 _log = logging.getLogger(__name__)
 
 ScoreBy = Literal["evidence", "gradient", "sum", "max"]
-Agreement = Literal["photo", "views", "both"]
 
 
 @dataclass(frozen=True)
@@ -38,10 +35,6 @@ class P2G(Strategy):
     """Weigh SR detail by evidence.
 
     Args:
-        agreement: what R measures. "photo": the SR image, as the prior made it, agrees with its own LR photo (the paper);
-            "views": its detail agrees with that of other training views' SR images, at the place that the depth says;
-            "both": the product. The last two need depth (data.cloud.init=stereo); patches that no other view shows keep the
-            photo's R times the mean agreement of the view's other patches.
         reliability_scale: τ_r > 0, the mean |D(I_HR) - I_LR| (images in [0, 1]) at which R falls to 1/e; "relative:k" is k
             times the view's own mean, so that R covers its range whatever the prior is.
         floor: q_min in [0, 1], the share of its high-frequency gradient that every Gaussian keeps.
@@ -59,7 +52,6 @@ class P2G(Strategy):
         SettingError: a setting is outside its range.
     """
 
-    agreement: Agreement = "photo"
     reliability_scale: float | str = 0.01
     floor: float = 0.25
     normalize: bool = True
@@ -79,28 +71,10 @@ class P2G(Strategy):
             raise SettingError(f"patch must be at least 1 LR pixel, got {self.patch}.")
         if not self.detail_eps > 0:
             raise SettingError(f"detail_eps must be > 0, got {self.detail_eps}.")
-        for name, kind in (("agreement", Agreement), ("down", DownKernel), ("up", UpKernel), ("lookup", Lookup),
+        for name, kind in (("down", DownKernel), ("up", UpKernel), ("lookup", Lookup),
                            ("outside", Outside), ("score_by", ScoreBy)):  # fmt: skip
             if getattr(self, name) not in get_args(kind):
                 raise SettingError(f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}.")
-
-    def wants_views(self) -> bool:
-        return self.agreement != "photo"
-
-    def on_views(self, views: Sequence[View]) -> None:
-        """Compare the SR images of the training views with each other."""
-        found = compare_views(views, self.patch, self.down, self.up)
-        if not found:
-            _log.warning("agreement=%s has no effect, R is that of the photos: %s.", self.agreement, _why_none(views))
-        for view in views:
-            if (agreement := found.get(view.name)) is None:
-                continue
-            self.cache[_VIEWS, view.name, view.factor] = agreement
-            _log.debug(
-                "%s: other views show %.0f %% of its patches and confirm their detail by %.2f on average; R of the rest is "
-                "the photo's.", view.name, 100 * float(agreement.known.double().mean()),
-                float(agreement.reliability[agreement.known].mean()),
-            )  # fmt: skip
 
     def observe(self, step: Step, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""
@@ -138,8 +112,7 @@ class P2G(Strategy):
 
     def patch_maps(self, view: View) -> PatchMaps:
         """R and A of this view."""
-        of_views = self._of_views(view)
-        return PatchMaps(*self._patches(view), self.patch, None if of_views is None else of_views.known)
+        return PatchMaps(*self._patches(view), self.patch)
 
     def _cached_patches(self, view: View) -> tuple[Tensor, Tensor]:
         key = (view.name, view.factor)
@@ -153,30 +126,10 @@ class P2G(Strategy):
         return R, A
 
     def _patches(self, view: View) -> tuple[Tensor, Tensor]:
-        R, A = patch_evidence(
+        return patch_evidence(
             view.lr.image, view.hr.image, view.factor, self.patch, self.reliability_scale, self.detail_eps, self.down,
             self.up, view.disagreement,
         )  # fmt: skip
-        of_views = self._of_views(view)
-        if of_views is None:
-            return R, A
-        both = R * of_views.reliability
-        return both if self.agreement == "both" else torch.where(of_views.known, of_views.reliability, both), A
-
-    def _of_views(self, view: View) -> ViewAgreement | None:
-        found: ViewAgreement | None = self.cache.get((_VIEWS, view.name, view.factor))
-        return found
-
-
-_VIEWS: Final = "agreement of views"
-
-
-def _why_none(views: Sequence[View]) -> str:
-    if len(views) < 2:
-        return "one view has no other to agree with" if views else "this training loop does not give its views"
-    if not any(view.depth is not None and bool(view.depth.known.any()) for view in views):
-        return f"none of the {len(views)} training views has depth; data.cloud.init=stereo gives it"
-    return f"the detail of the {len(views)} training views' SR images agrees no better than chance"
 
 
 def patch_evidence(

@@ -21,7 +21,8 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.view import Photo, View
-from clear_strategies.merging.conductor import Conductor, Update
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.iteration import Update
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import WarmupDecay, scaled
 from clear_strategies.strategies.base import Strategy

@@ -22,13 +22,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.compiled_rules import ROTATION_NOISE, Anchor, CorrectionRule, GroupReport, margin
+from clear_strategies.core.compiled_rules import ROTATION_NOISE, Anchor, CorrectionRule, GroupReport
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels import gaussian_step as kernel
 from clear_strategies.kernels.gaussian_step import cpp
-from clear_strategies.merging.conductor import Conductor, HrGradients
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.iteration import HrGradients
 from clear_strategies.strategies.base import Strategy, describes, overrides
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT, Activation, FieldShot
 from clear_strategies.training.optim import BETA1, BETA2, Adam
@@ -199,14 +200,13 @@ class CompiledStep:
         )
         λ = o.lambda_hr(t)
         conflict: dict[str, Number] = {}
-        correction, compared, margins = None, None, None
+        correction, compared = None, None
         if hr is not None and λ > 0:
-            products = self._products(a.sigmoid)
-            compared = gaussians.compare(products)  # before correction
+            compared = gaussians.compare()  # before correction
             shares = zip((*CONFLICT_GROUPS, "gaussian"), compared.opposed, compared.comparable, strict=True)
             conflict = {group: deferred.defer(deferred.ratio, opposed, n) for group, opposed, n in shares}
             if self._rule is not None:
-                correction, margins = self._correction(self._rule, compared, products, e)
+                correction = _correction(self._rule, e)
         anchor = self._anchor(len(a.sigmoid)) if anchor is None else anchor
         decays = (hr is not None and hr.hf is not None) or "detail" in anchor.targets
         keep = 1 - self.optimizer.rates.detail_decay if decays else 1.0
@@ -228,37 +228,11 @@ class CompiledStep:
                 None if visible is None else visible.contiguous().view(torch.uint8), skips, 3 * bands,
             ),
         )  # fmt: skip
-        if self._rule is not None and compared is not None and margins is not None:
-            self._rule.report(_reports(self._rule, compared, margins, stepped), e)
+        if self._rule is not None and compared is not None:
+            self._rule.report(_reports(self._rule, compared, stepped), e)
         if merged is None:
             self._note_skips(stepped, bands, shN.shape[1])
         return conflict
-
-    def _products(self, like: Float[Tensor, " N"]) -> Float[Tensor, "6 N"] | None:
-        """Storage for ‖g_LR‖‖g_HR‖ by group, which only an absolute ε is compared with."""
-        if self._rule is None or self._rule.absolute_eps is None:
-            return None
-        return like.new_empty(len(CONFLICT_GROUPS), len(like), dtype=torch.float64)
-
-    def _correction(
-        self, rule: CorrectionRule, compared: kernel.Comparison, products: Tensor | None, e: Evidence | None
-    ) -> tuple[kernel.Correction, list[Number | None]]:
-        eps_cos, eps_corr = _epsilons(rule, compared)
-        margins: list[Number | None] = [None] * len(CONFLICT_GROUPS)
-        if products is not None and rule.absolute_eps:
-            margins = [margin(x, rule.absolute_eps) for x in products]
-        correction = kernel.Correction(
-            [group in rule.groups for group in CONFLICT_GROUPS],
-            eps_cos,
-            eps_corr,
-            rule.tolerance,
-            rule.weight_min,
-            rule.weight_max,
-            ROTATION_NOISE,
-            rule.bounds_omega,
-            None if e is None else e.reliability.float().contiguous(),
-        )
-        return correction, margins
 
     def _anchor(self, n: int) -> Anchor:
         if self._regularizer is None:
@@ -298,25 +272,20 @@ class CompiledStep:
             skip("SH bands in the optimizer", "above the active degree", all_bands - bands)
 
 
-def _epsilons(rule: CorrectionRule, c: kernel.Comparison) -> tuple[Sequence[float] | Tensor, Sequence[float] | Tensor]:
-    """ε of the cosine and of the correction by group; on the device, if the mean norms are there."""
-    if isinstance(c.comparable, Tensor):
-        n = c.comparable[:-1].clamp_min(1)  # where nothing could be compared, the sums are 0
-        lr, hr = (torch.as_tensor(norms) / n for norms in (c.norm_lr, c.norm_hr))
-        cos, corr = (x if isinstance(x, Tensor) else torch.full_like(lr, x) for x in rule.epsilons(lr, hr))
-        return cos, corr
-    norms = zip(c.norm_lr, c.norm_hr, c.comparable, strict=False)
-    each = [rule.epsilons(lr / n, hr / n) if n else rule.epsilons(0.0, 0.0) for lr, hr, n in norms]
-    return [float(cos) for cos, _ in each], [float(corr) for _, corr in each]
+def _correction(rule: CorrectionRule, e: Evidence | None) -> kernel.Correction:
+    return kernel.Correction(
+        [group in rule.groups for group in CONFLICT_GROUPS],
+        rule.tolerance,
+        rule.weight_min,
+        rule.weight_max,
+        ROTATION_NOISE,
+        None if e is None else e.reliability.float().contiguous(),
+    )
 
 
-def _reports(
-    rule: CorrectionRule, compared: kernel.Comparison, margins: Sequence[Number | None], stepped: kernel.StepCounts
-) -> list[GroupReport]:
+def _reports(rule: CorrectionRule, compared: kernel.Comparison, stepped: kernel.StepCounts) -> list[GroupReport]:
     index = {group: k for k, group in enumerate(CONFLICT_GROUPS)}
     return [
-        GroupReport(
-            group, compared.comparable[k], stepped.corrected[k], stepped.omega[k], stepped.at_lower_bound[k], margins[k]
-        )
+        GroupReport(group, compared.comparable[k], stepped.corrected[k], stepped.omega[k], stepped.at_lower_bound[k])
         for group, k in ((group, index[group]) for group in rule.groups)
-    ]  # fmt: skip
+    ]

@@ -1,8 +1,8 @@
 """Work that a scene does not need, decided from the scene itself while it trains.
 
-Exact skips (rows that do not move, tiles that are not requested, HR while λ_HR = 0) are always on, because they change
-nothing. The skips here change the result a little. Each is a setting whose default was chosen by measurement
-(docs/explanation/evidence-sparse.md); the plan lists those that are on, and the work log counts the iterations and tiles skipped.
+Exact skips (rows that do not move, HR while λ_HR = 0) are always on, because they change nothing. The
+skips here change the result a little. Each is a setting whose default was chosen by measurement
+(docs/explanation/evidence-sparse.md); the plan lists those that are on, and the work log counts the iterations skipped.
 """
 
 from __future__ import annotations
@@ -11,9 +11,6 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
-
-from jaxtyping import Bool
-from torch import Tensor
 
 from clear_strategies.core import deferred, images
 from clear_strategies.core.deferred import Number
@@ -38,8 +35,6 @@ class Skips:
         coarse_until: until this iteration HR is rendered and compared at half its size; 0: never.
         hr_every: from `hr_every_from` on, HR is rendered in every n-th iteration only.
         hr_every_from: iteration, see `hr_every`.
-        flat: HR tiles are not rendered where the SR image adds less than this to U(I_LR), mean over the tile, image units
-            in [0, 1); only LR trains there. 0: all tiles are rendered.
         plateau_gain: once the loss of the training views, drawn whole, has not fallen by at least this share within
             `plateau_window` iterations, training continues at iteration `plateau_to`; 0: never.
         plateau_window: iterations between two measurements.
@@ -53,7 +48,6 @@ class Skips:
     coarse_until: int = milestone(0)
     hr_every: int = 1
     hr_every_from: int = milestone(5_000)
-    flat: float = 0.0
     plateau_gain: float = 0.0
     plateau_window: int = milestone(500)
     plateau_from: int = milestone(5_000)
@@ -62,8 +56,6 @@ class Skips:
     def __post_init__(self) -> None:
         if self.hr_every < 1:
             raise SettingError(f"hr_every must be at least 1 iteration, got {self.hr_every}.")
-        if not 0 <= self.flat < 1:
-            raise SettingError(f"flat must lie in [0, 1) image units, got {self.flat}.")
         if not 0 <= self.plateau_gain < 1:
             raise SettingError(f"plateau_gain must lie in [0, 1), got {self.plateau_gain}.")
         if self.coarse_until < 0:
@@ -76,8 +68,6 @@ class Skips:
             phrases.append(f"HR at half its size until iteration {self.coarse_until}")
         if self.hr_every > 1:
             phrases.append(f"HR except every {self.hr_every} iterations from {self.hr_every_from}")
-        if self.flat > 0:
-            phrases.append(f"HR tiles to which the SR image adds less than {self.flat:.4f}")
         if self.plateau_gain > 0:
             phrases.append(
                 f"the iterations until {self.plateau_to} once {self.plateau_window} iterations gain less than "
@@ -92,7 +82,6 @@ class SkipPolicy:
     def __init__(self, skips: Skips | None = None) -> None:
         self.skips = skips if skips is not None else Skips()
         self._coarse: dict[str, View] = {}
-        self._wanted: dict[tuple[str, int], tuple[Bool[Tensor, "_ _"], int]] = {}  # and how many are not
 
     def view(self, view: View, t: int) -> View:
         """The view of iteration t: with a coarse SR image at first, where the factor is even."""
@@ -110,19 +99,6 @@ class SkipPolicy:
             return True
         work_log.skip("HR scale", f"every {s.hr_every} iterations (skips.hr_every)")
         return False
-
-    def wanted(self, view: View, tile: int, work_log: WorkLog) -> Bool[Tensor, "th tw"] | None:
-        """The HR tiles, `tile` px wide, that are rendered; None: all of them."""
-        if self.skips.flat == 0:
-            return None
-        key = (view.name, view.factor)
-        if key not in self._wanted:
-            self._wanted[key] = self._with_detail(view, tile)
-        wanted, flat = self._wanted[key]
-        if not flat:
-            return None
-        work_log.skip("HR tiles", "flat SR image (skips.flat)", flat)
-        return wanted
 
     def measured(self, t: int) -> bool:
         """Whether the training views are drawn whole after iteration t, to find a plateau."""
@@ -142,13 +118,3 @@ class SkipPolicy:
         rows = deferred.resolve(history)
         before, now = rows[t - window - 1], rows[t - 1]
         return now[PLATEAU_LOSS] > (1 - self.skips.plateau_gain) * before[PLATEAU_LOSS]
-
-    def _with_detail(self, view: View, tile: int) -> tuple[Bool[Tensor, "th tw"], int]:
-        added = (view.hr.image - images.upsample(view.lr.image, view.factor)).abs()
-        wanted = images.patch_means(added, tile) >= self.skips.flat
-        flat = int((~wanted).sum())
-        _log.debug(
-            "%s: %d of %d HR tiles (%d px) are flat and trained on LR alone.",
-            view.name, flat, wanted.numel(), tile,
-        )  # fmt: skip
-        return wanted, flat

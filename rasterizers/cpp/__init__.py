@@ -23,7 +23,6 @@ from rasterizers.checks import (
     require_cotangents,
     require_finite,
     require_splats,
-    require_tiles,
     same_gaussians_and_pose,
 )
 from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
@@ -36,7 +35,6 @@ _TRAITS: Final = Traits(
     depth=True,
 )
 _LONGEST_SIDE: Final = 32 << 15  # px: bins of 32 px are numbered in 16 bits
-_BLOCK: Final = 4  # px, the block that the kernels blend at once; tiles are a multiple of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +42,6 @@ class CppRasterizer(RasterSettings):
     """Compiled kernels for the CPU.
 
     Args:
-        tile: edge of the tile mask's tiles, px, a multiple of 4. Tiles of 32 px are skipped at no cost.
         memory: MiB that the lists of one image, and of its gradients, may take; beyond it the image is drawn in parts, with
             the same bits. `MemoryError` before anything is drawn, where a single part of 32 px is beyond it.
         threads: None: `rasterizers.native.threads()`.
@@ -55,15 +52,12 @@ class CppRasterizer(RasterSettings):
         ValueError: a setting is out of range.
     """
 
-    tile: int = 32
     memory: int = 4096
     threads: int | None = None
     isa: str | None = None
 
     def __post_init__(self) -> None:
         RasterSettings.__post_init__(self)
-        if self.tile % _BLOCK:
-            raise ValueError(f"tile must be a multiple of {_BLOCK} pixels, got {self.tile}.")
         if self.memory < 1:
             raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
         if self.threads is not None and self.threads < 1:
@@ -79,29 +73,23 @@ class CppRasterizer(RasterSettings):
     def traits(self) -> Traits:
         return _TRAITS
 
-    def __call__(
-        self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None, *, depth: bool = False
-    ) -> Rendering:
-        return CppRendering(_Frame(self, [(splats, camera)], [tiles]), 0, depth=depth)
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
+        return CppRendering(_Frame(self, [(splats, camera)]), 0, depth=depth)
 
     def list_bytes(self, splats: Splats, camera: Camera) -> int:
         """See `interface.CountsLists`; projects the Gaussians and draws nothing."""
-        pairs: int = _Frame(self, [(splats, camera)], [None]).native.pairs(0)
+        pairs: int = _Frame(self, [(splats, camera)]).native.pairs(0)
         return pairs * (_PAIR_BYTES + _SUMS_BYTES)
 
     def render_scales(
-        self,
-        jobs: Sequence[tuple[Splats, Camera]],
-        tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None,
-        *,
-        depth: Sequence[bool] | None = None,
+        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
     ) -> list[Rendering]:
         """Jobs with the same pose and tensor objects share projection, colour and depth order."""
-        masks, depths = tiles or [None] * len(jobs), depth or [False] * len(jobs)
+        depths = depth or [False] * len(jobs)
         if len(jobs) > 1 and all(same_gaussians_and_pose(jobs[0], job) for job in jobs[1:]):
-            frame = _Frame(self, jobs, masks)
+            frame = _Frame(self, jobs)
             return [CppRendering(frame, i, depth=depths[i]) for i in range(len(jobs))]
-        return [self(*job, mask, depth=z) for job, mask, z in zip(jobs, masks, depths, strict=True)]
+        return [self(*job, depth=z) for job, z in zip(jobs, depths, strict=True)]
 
 
 _PAIR_BYTES: Final = 16  # its Gaussian, its place, and the blocks of its bin that the ellipse reaches
@@ -123,17 +111,8 @@ def _kernels(dtype: torch.dtype, isa: str | None) -> ModuleType:
 class _Frame:
     """One projection for several pixel grids: the native frame, and the tensors that its VJP reads again."""
 
-    def __init__(
-        self,
-        settings: CppRasterizer,
-        jobs: Sequence[tuple[Splats, Camera]],
-        tiles: Sequence[Bool[Tensor, "_ _"] | None],
-    ) -> None:
+    def __init__(self, settings: CppRasterizer, jobs: Sequence[tuple[Splats, Camera]]) -> None:
         splats, camera = jobs[0]
-        masks = [None if mask is None else mask.to("cpu", torch.bool).contiguous() for mask in tiles]
-        for mask, (_, view) in zip(masks, jobs, strict=True):
-            if mask is not None:
-                require_tiles(mask, view.width, view.height, settings.tile)
         for job, view in jobs:
             require_splats(job, _TRAITS)
             _require_side(view)
@@ -162,15 +141,7 @@ class _Frame:
         self._basis: Tensor | None = None
         grids = [[c.fx, c.fy, c.cx, c.cy, float(c.width), float(c.height)] for c in self.cameras]
         if not self.native.project(
-            *self.shared,
-            grids,
-            self.opacities,
-            self.offsets,
-            self.means2d,
-            self.visible,
-            masks,
-            settings.tile,
-            self.threads,
+            *self.shared, grids, self.opacities, self.offsets, self.means2d, self.visible, self.threads
         ):
             for job, _ in jobs:
                 require_finite(job)
@@ -202,9 +173,9 @@ class CppRendering:
         self.visible: Bool[Tensor, " N"] = frame.visible[grid]
         frame.native.draw(grid, self.image, self.alpha, self.depth, frame.threads)
 
-    def vjp(self, cotangents: Float[Tensor, "K H W C"]) -> SplatGradients:
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         """One pass for up to three cotangents; see `Rendering.vjp`."""
-        require_cotangents(cotangents, self.image, self.depth)
+        require_cotangents(cotangents, self.image)
         k, n, frame = len(cotangents), len(self.visible), self._frame
         means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
         opacities = frame.empty(k, n)

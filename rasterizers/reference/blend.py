@@ -25,14 +25,11 @@ from rasterizers.reference.tiles import TileGrid, TileLists
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pass:
-    """What the VJP needs of a batch: its tiles, each slab's pairs with the T in front of it, T_end, and if depth is drawn
-    E with Σ T_i α_i.
-    """
+    """What the VJP needs of a batch: its tiles, each slab's pairs with the T in front of it, and T_end."""
 
     tiles: Int[Tensor, " B"]
     slabs: list[tuple[Int[Tensor, "B _"], Float[Tensor, "B P"]]]
     end: Float[Tensor, "B P"]
-    depth: tuple[Float[Tensor, "B P"], Float[Tensor, "B P"]] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,12 +85,11 @@ def blend(
             if draws_depth:
                 cover += weights.sum(1)  # not 1 - T_end, which has no digits left where little is drawn
             through, end = slab.after[:, -1], slab.end(end)
-        depth = None
         if draws_depth:
-            depth = color[..., 3].div_(cover.where(cover > 0, 1.0)), cover
+            color[..., 3] /= cover.where(cover > 0, 1.0)
         colors[tiles] = color + end[..., None] * background
         transmittance[tiles] = end
-        passes.append(Pass(tiles, slabs, end, depth))
+        passes.append(Pass(tiles, slabs, end))
     return colors, transmittance, passes
 
 
@@ -103,24 +99,19 @@ def blend_vjp(
     passes: list[Pass],
     grid: TileGrid,
     settings: RasterSettings,
-    cotangents: Float[Tensor, "K T P C"],
+    cotangents: Float[Tensor, "K T P 3"],
 ) -> Float[Tensor, "K M1 W"]:
     """Gradient of Σ cotangent·image with respect to the table, back to front.
 
     With s_i = c_i·v and `behind` = Σ_{j>i} T_j α_j s_j + T_end background·v:  ∂/∂α_i = T_i s_i - behind / (1 - α_i).
-    A cotangent v_E of depth adds (z_i - E) v_E / Σ_j T_j α_j to s_i: at the E that was drawn, E has the gradient of
-    Σ_i T_i α_i (z_i - E) / Σ_j T_j α_j with E and the denominator held.
+    That of the column of depths is 0.
     """
-    has_depth = cotangents.shape[-1] == 4
     background = table.new_tensor(settings.background)
     monomials = _monomials(grid.tile, table)
     gradients = table.new_zeros(len(cotangents), *table.shape)
     for batch in passes:
         v = cotangents[:, batch.tiles]
-        if has_depth and batch.depth is not None:
-            expected, cover = batch.depth
-            v[..., 3] /= cover.where(cover > 0, 1.0)
-        behind = batch.end * (v[..., :3] @ background)
+        behind = batch.end * (v @ background)
         for pairs, through in reversed(batch.slabs):
             slab = _composite(table[pairs], batch.tiles, grid, settings, through)
             weights = slab.weights
@@ -130,9 +121,7 @@ def blend_vjp(
                 sensitivity *= slab.kept
             one_minus_alpha = 1 - slab.alpha
             for k, v_k in enumerate(v):
-                s = slab.rows[..., RGB] @ v_k[..., :3].transpose(1, 2)
-                if has_depth:
-                    s += (slab.rows[..., DEPTH] - expected[:, None]) * v_k[:, None, :, 3]
+                s = slab.rows[..., RGB] @ v_k.transpose(1, 2)
                 blended = weights * s
                 tail = blended.flip(1).cumsum(1).flip(1)  # includes i itself
                 d_alpha = slab.before * s - (tail - blended + behind[k][:, None]) / one_minus_alpha

@@ -54,13 +54,9 @@ class Projection:
 
     def table(self) -> Float[Tensor, "M1 W"]:
         """The columns that blending reads, plus an empty row that pads the tile lists."""
-        table = torch.column_stack([x.detach() for x in self._columns()])
-        return torch.cat((table, table.new_zeros(1, table.shape[1])))
-
-    def _columns(self) -> tuple[Tensor, ...]:
-        """MEAN, CONIC, OPACITY, RGB and, if it is drawn, DEPTH."""
         columns = (self.means2d, self.conics, self.opacities, self.rgb)
-        return (*columns, self.depths) if self.draws_depth else columns
+        table = torch.column_stack([x.detach() for x in ((*columns, self.depths) if self.draws_depth else columns)])
+        return torch.cat((table, table.new_zeros(1, table.shape[1])))
 
     def scatter(self, values: Tensor, n: int) -> Tensor:
         """The values at their rows among all N splats; zeros (or False) elsewhere."""
@@ -70,12 +66,12 @@ class Projection:
 
     def vjp(self, table_gradients: Float[Tensor, "K M1 W"]) -> SplatGradients:
         """The splats' gradients from those of the table."""
-        outputs = self._columns()
+        outputs = (self.means2d, self.conics, self.opacities, self.rgb)
         inputs = (*self.leaves, self.raw_rgb)
         by_cotangent = []
         for g in table_gradients[:, : self.rows.shape[0]]:
-            parts = (g[:, MEAN], g[:, CONIC], g[:, OPACITY], g[:, RGB], g[:, DEPTH])
-            cotangents = [part.reshape(x.shape) for part, x in zip(parts, outputs, strict=False)]
+            parts = (g[:, MEAN], g[:, CONIC], g[:, OPACITY], g[:, RGB])
+            cotangents = [part.reshape(x.shape) for part, x in zip(parts, outputs, strict=True)]
             gradients = torch.autograd.grad(outputs, inputs, cotangents, retain_graph=True, materialize_grads=True)
             by_cotangent.append([*gradients, g[:, MEAN]])
         means, quats, scales, opacities, rgb, screen = (

@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rasterizers.checks import require_tiles
 from rasterizers.reference.projection import Projection
 
 
@@ -84,15 +83,9 @@ _SLAB = 64  # pairs of a tile that are blended at a time; opaque tiles stop betw
 
 
 @torch.no_grad()
-def list_tiles(projection: Projection, grid: TileGrid, mask: Bool[Tensor, "th tw"] | None) -> TileLists:
-    """Pair each projected Gaussian with the tiles its ellipse of alpha >= alpha_min may reach.
-
-    Raises:
-        ValueError: the tile mask does not have one entry per tile.
-    """
+def list_tiles(projection: Projection, grid: TileGrid) -> TileLists:
+    """Pair each projected Gaussian with the tiles its ellipse of alpha >= alpha_min may reach."""
     n_tiles = grid.rows * grid.columns
-    if mask is not None:
-        require_tiles(mask, grid.width, grid.height, grid.tile)
     rows = torch.argsort(projection.depths, stable=True)
     means, half = projection.means2d.detach()[rows], projection.half_extents[rows]
     first, last = _tile_range(means - half, grid), _tile_range(means + half, grid)
@@ -110,9 +103,6 @@ def list_tiles(projection: Projection, grid: TileGrid, mask: Bool[Tensor, "th tw
 
     visible = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)
     visible[rows[owner]] = True
-    if mask is not None:
-        requested = mask.to(tile.device).flatten()[tile]
-        owner, tile = owner[requested], tile[requested]
 
     by_tile = torch.argsort(tile, stable=True)  # keeps the depth order within each tile
     lengths = torch.bincount(tile, minlength=n_tiles)

@@ -86,18 +86,13 @@ def chord(ellipse: Ellipse, dy: wp.float32, side: wp.float32) -> wp.float32:
 
 
 @wp.func
-def count_tiles(ellipse: Ellipse, grid: Grid, masked: wp.bool, requested: wp.array2d[wp.bool]) -> wp.int32:
-    """The number of requested tiles that the ellipse may reach."""
+def count_tiles(ellipse: Ellipse, grid: Grid) -> wp.int32:
+    """The number of tiles that the ellipse may reach."""
     count = wp.int32(0)
     top, bottom = rows_of(ellipse, grid)
     for row in range(top, bottom + 1):
         begin, end = columns_of(ellipse, row, grid)
-        if masked:
-            for column in range(begin, end):
-                if requested[row, column]:
-                    count += 1
-        else:
-            count += wp.max(end - begin, 0)
+        count += wp.max(end - begin, 0)
     return count
 
 
@@ -108,8 +103,6 @@ def list_pairs(
     ends: wp.array[wp.int64],
     rows: wp.array[Row],
     grid: Grid,
-    masked: wp.bool,
-    requested: wp.array2d[wp.bool],
     capacity: wp.int32,
     firsts: wp.array[wp.int32],
     tiles: wp.array[wp.int32],
@@ -138,7 +131,7 @@ def list_pairs(
     for row in range(top, bottom + 1):
         begin, end = columns_of(ellipse, row, grid)
         for column in range(begin, end):
-            if place < count and (not masked or requested[row, column]):
+            if place < count:
                 tiles[first + place] = row * grid.tiles[0] + column
                 place += 1
     for unused in range(place, count):

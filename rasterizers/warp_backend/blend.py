@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from rasterizers.warp_backend.bins import exponent
-from rasterizers.warp_backend.types import DEEP, PIXELS, SUMS, TILE, Cuts, Ellipse, Grid, Row, ellipse_of
+from rasterizers.warp_backend.types import PIXELS, SUMS, TILE, Cuts, Ellipse, Grid, Row, ellipse_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -47,7 +47,7 @@ def colour(ellipse: Ellipse) -> wp.vec3:
 
 @cache
 def blend(depth: bool) -> Any:
-    """The kernel that draws the image, and with `depth` E and 1 / Σ T_i α_i, which is 0 where nothing is drawn."""
+    """The kernel that draws the image, and with `depth` E, which is 0 where nothing is drawn."""
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend(
@@ -64,7 +64,6 @@ def blend(depth: bool) -> Any:
         ended: wp.array2d[wp.int32],
         reached: wp.array[wp.int32],
         expected: wp.array2d[wp.float32],
-        over_weight: wp.array2d[wp.float32],
     ) -> None:
         """One thread per pixel. `ended`: the first pair that it did not blend; `reached`: the largest such of the tile."""
         thread = wp.tid()
@@ -100,47 +99,30 @@ def blend(depth: bool) -> Any:
             if weights > 0.0:
                 over = 1.0 / weights
             expected[pixel[1], pixel[0]] = weighted * over
-            over_weight[pixel[1], pixel[0]] = over
         wp.atomic_max(reached, tile, at)
 
     return blend
 
 
-@wp.func
-def colour_alone(ellipse: Ellipse, depths: wp.array[wp.float32], i: wp.int32, expected: wp.float32) -> wp.vec3:
-    return colour(ellipse)
-
-
-@wp.func
-def colour_and_depth(ellipse: Ellipse, depths: wp.array[wp.float32], i: wp.int32, expected: wp.float32) -> wp.vec4:
-    rgb = colour(ellipse)
-    return wp.vec4(rgb[0], rgb[1], rgb[2], depths[i] - expected)
-
-
 @cache
-def blend_vjp(K: int, C: int, lanes: int) -> Any:
-    """The VJP kernel for K cotangents of C channels, three or with depth four, with `lanes` threads per tile.
-
-    Depth is a channel like the others with the value z_i - E and a cotangent that is divided by Σ w: at the E that was drawn,
-    E has the gradient of Σ w_i (z_i - E) / Σ w with E and Σ w held. The difference is small and loses no digits.
+def blend_vjp(K: int, lanes: int) -> Any:
+    """The VJP kernel for K cotangents, with `lanes` threads per tile.
 
     Each lane has `64 / lanes` pixels. For every pair it sums over its pixels, the lanes' sums are reduced, and the result is
     stored at the pair's place: no atomics, a fixed order. A GPU uses a warp per tile, a CPU one thread.
     """
-    own, W = PIXELS // lanes, SUMS + C
+    own, W = PIXELS // lanes, SUMS + 3
     PairSums = wp.types.vector(length=W * K, dtype=wp.float32)
     Pixels = wp.types.vector(length=own, dtype=wp.float32)
     Ends = wp.types.vector(length=own, dtype=wp.int32)
     Behind = wp.types.matrix(shape=(own, K), dtype=wp.float32)
-    Cotangents = wp.types.matrix(shape=(own * K, C), dtype=wp.float32)
-    Channels, channels_of = (wp.vec4, colour_and_depth) if C == DEEP else (wp.vec3, colour_alone)
+    Cotangents = wp.types.matrix(shape=(own * K, 3), dtype=wp.float32)
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend_vjp(
         grid: Grid,
         cuts: Cuts,
         rows: wp.array[Row],
-        depths: wp.array[wp.float32],
         listed: wp.array[wp.int32],
         pairs: wp.array[wp.int32],
         starts: wp.array[wp.int32],
@@ -148,25 +130,22 @@ def blend_vjp(K: int, C: int, lanes: int) -> Any:
         transmittance: wp.array2d[wp.float32],
         ended: wp.array2d[wp.int32],
         reached: wp.array[wp.int32],
-        expected: wp.array2d[wp.float32],
-        cotangents: wp.array3d[Channels],
+        cotangents: wp.array3d[wp.vec3],
         pair_sums: wp.array[PairSums],
     ) -> None:
         tile, lane = wp.tid()
         begin, last = starts[tile], wp.max(starts[tile], reached[tile])
-        through, stop, behind, v, middle = Pixels(), Ends(), Behind(), Cotangents(), Pixels()
+        through, stop, behind, v = Pixels(), Ends(), Behind(), Cotangents()
         for j in range(own):
             pixel = pixel_of(tile, j * lanes + lane, grid)
             if inside(pixel, grid):
                 through[j] = transmittance[pixel[1], pixel[0]]
                 stop[j] = ended[pixel[1], pixel[0]]
-                if C == DEEP:
-                    middle[j] = expected[pixel[1], pixel[0]]
                 for k in range(K):
-                    w = Channels(cotangents[k, pixel[1], pixel[0]])  # by name, so that Warp finds the type
+                    w = cotangents[k, pixel[1], pixel[0]]
                     v[j * K + k] = w
                     # Σ_{j>i} T_j α_j (c_j·v) + T_end background·v, here with i the last Gaussian.
-                    behind[j, k] = through[j] * wp.dot(wp.vec3(w[0], w[1], w[2]), cuts.background)
+                    behind[j, k] = through[j] * wp.dot(w, cuts.background)
 
         for back in range(last - begin):
             at = last - 1 - back
@@ -180,9 +159,9 @@ def blend_vjp(K: int, C: int, lanes: int) -> Any:
                     over = 1.0 / (1.0 - share)
                     through[j] = through[j] * over
                     weight = through[j] * share
-                    channels = channels_of(ellipse, depths, listed[at], middle[j])
+                    rgb = colour(ellipse)
                     for k in range(K):
-                        light = wp.dot(v[j * K + k], channels)
+                        light = wp.dot(v[j * K + k], rgb)
                         if free <= cuts.alpha_max:  # where α is capped, the image does not depend on the ellipse
                             q = share * (through[j] * light - behind[j, k] * over)
                             part[W * k] += q
@@ -191,7 +170,7 @@ def blend_vjp(K: int, C: int, lanes: int) -> Any:
                             part[W * k + 3] += q * d[0] * d[0]
                             part[W * k + 4] += q * d[0] * d[1]
                             part[W * k + 5] += q * d[1] * d[1]
-                        for c in range(C):
+                        for c in range(3):
                             part[W * k + SUMS + c] += weight * v[j * K + k, c]
                         behind[j, k] = behind[j, k] + weight * light
             wp.tile_store(pair_sums, wp.tile_sum(wp.tile(part, preserve_type=True)), offset=(pairs[at],))

@@ -23,11 +23,9 @@ from torch import Tensor
 
 from rasterizers.checks import (
     packed_rows,
-    refine_mask,
     require_cotangents,
     require_finite,
     require_splats,
-    require_tiles,
 )
 from rasterizers.interface import Camera, SplatGradients, Splats
 from rasterizers.warp_backend import types
@@ -49,15 +47,12 @@ LANES: Final = {"cuda": 32, "cpu": 1}
 class _View:
     """One pixel grid of a frame: its inputs, and its results on the device."""
 
-    def __init__(
-        self, settings: WarpRasterizer, splats: Splats, camera: Camera, mask: Tensor | None, *, has_depth: bool
-    ) -> None:
+    def __init__(self, splats: Splats, camera: Camera, *, has_depth: bool) -> None:
         n, like = len(splats), splats.means
         self.camera, self.has_depth = camera, has_depth
         self.columns, self.rows_of_tiles = -(-camera.width // TILE), -(-camera.height // TILE)
         self.opacities = splats.opacities.detach().contiguous()
         self.offsets = None if splats.rgb_offset is None else splats.rgb_offset.detach().contiguous()
-        self.requested = None if mask is None else _tiles_of(mask, camera, settings.tile).to(like.device)
         self.grid = _grid_struct(camera, self.columns, self.rows_of_tiles)
         self.ellipses = like.new_empty(n, _ROW)
         self.means2d = like.new_empty(n, 2)
@@ -86,13 +81,9 @@ class Frame:
         self,
         settings: WarpRasterizer,
         jobs: Sequence[tuple[Splats, Camera]],
-        tiles: Sequence[Bool[Tensor, "_ _"] | None],
         depth: Sequence[bool],
     ) -> None:
         splats, camera = jobs[0]
-        for mask, (_, view) in zip(tiles, jobs, strict=True):
-            if mask is not None:
-                require_tiles(mask, view.width, view.height, settings.tile)
         for job, _ in jobs:
             require_splats(job, settings.traits)
         self.settings, self.jobs, self.n, self.like = settings, jobs, len(splats), splats.means.detach()
@@ -105,7 +96,7 @@ class Frame:
         self.colours = self.empty(self.n, 3)
         self.slopes = self.empty(self.n if self.bands else 0, 3, 3)
         self.depths = self.empty(self.n if any(depth) else 0)
-        self.views = [_View(settings, *job, mask, has_depth=z) for job, mask, z in zip(jobs, tiles, depth, strict=True)]
+        self.views = [_View(*job, has_depth=z) for job, z in zip(jobs, depth, strict=True)]
         self._basis: Tensor | None = None
         self._resolved = False
 
@@ -171,7 +162,7 @@ class Frame:
                 array(self.means, wp.vec3), array(self.quats, wp.vec4), array(self.scales, wp.vec3),
                 array(view.opacities), array(self.sh0, wp.vec3), array(self.shN, wp.vec3),
                 view.offsets is not None, array(view.offsets, wp.vec3),
-                view.requested is not None, array(view.requested), nth == 0,
+                nth == 0,
                 array(keys), array(self.colours, wp.vec3), array(self.slopes, wp.mat33),
                 array(self.depths), array(view.ellipses, types.Row), array(view.means2d, wp.vec2), array(view.visible),
                 array(view.counts), array(not_finite),
@@ -202,7 +193,7 @@ class Frame:
         starts, ends = self.like.new_zeros(2, n_tiles + 1, dtype=torch.int32)
         self.launch(
             list_pairs, self.n, array(self._order), array(view.counts), array(after),
-            array(view.ellipses, types.Row), view.grid, view.requested is not None, array(view.requested), capacity,
+            array(view.ellipses, types.Row), view.grid, capacity,
             array(view.firsts), array(tiles), array(pairs), array(splats),
         )  # fmt: skip
         sorted_tiles, places = _sorted(tiles, pairs, capacity, n_tiles.bit_length())
@@ -224,7 +215,7 @@ class WarpRendering:
         self._image, self._alpha = frame.empty(height, width, 3), frame.empty(height, width)
         self._transmittance = frame.empty(height, width)
         self._ended = frame.empty(height, width, dtype=torch.int32)
-        self._depth, self._over_weight = (frame.empty(height, width) if view.has_depth else None for _ in range(2))
+        self._depth = frame.empty(height, width) if view.has_depth else None
         self._blend()
 
     @property
@@ -256,16 +247,14 @@ class WarpRendering:
             array(view.ellipses, types.Row), array(frame.depths), array(lists.gaussians), array(lists.starts),
             array(lists.ends),
             array(self._image, wp.vec3), array(self._alpha), array(self._transmittance), array(self._ended),
-            array(self._reached), array(self._depth), array(self._over_weight),
+            array(self._reached), array(self._depth),
         )  # fmt: skip
 
-    def vjp(self, cotangents: Float[Tensor, "K H W C"]) -> SplatGradients:
+    def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         """One pass for up to three cotangents; see `Rendering.vjp`."""
-        require_cotangents(cotangents, self.image, self.depth)
+        require_cotangents(cotangents, self.image)
         k, n, frame = len(cotangents), len(self.visible), self._frame
         v = cotangents.detach().to(self._image).contiguous()
-        if self._over_weight is not None and v.shape[-1] == types.DEEP:
-            v = torch.cat((v[..., :3], v[..., 3:] * self._over_weight[..., None]), dim=-1)
         means, quats, scales, screen, rgb = (frame.empty(k, n, width) for width in (3, 4, 3, 2, 3))
         opacities = frame.empty(k, n)
         capacity = padded(self._view.pairs)
@@ -279,25 +268,25 @@ class WarpRendering:
 
     def _fill(self, v: Tensor, *out: Tensor) -> None:
         """Fill the gradients for one to three cotangents."""
-        frame, view, lists, k, channels = self._frame, self._view, self._drawn_from, len(v), v.shape[-1]
-        width = k * (types.SUMS + channels)
+        frame, view, lists, k = self._frame, self._view, self._drawn_from, len(v)
+        width = k * (types.SUMS + 3)
         pair_sums = frame.empty(padded(view.pairs), width)
         row = wp.types.vector(length=width, dtype=wp.float32)
         lanes = LANES[frame.settings.device]
         wp.launch_tiled(
-            blend_vjp(k, channels, lanes), block_dim=lanes,
+            blend_vjp(k, lanes), block_dim=lanes,
             dim=[len(lists.starts)],  # includes the tile of unused places, see list_pairs
             device=wp.device_from_torch(frame.like.device),
             inputs=[
-                view.grid, frame.cuts, array(view.ellipses, types.Row), array(frame.depths), array(lists.gaussians),
+                view.grid, frame.cuts, array(view.ellipses, types.Row), array(lists.gaussians),
                 array(lists.places), array(lists.starts), array(lists.ends), array(self._transmittance),
-                array(self._ended), array(self._reached), array(self._depth),
-                array(v, wp.types.vector(length=channels, dtype=wp.float32)), wp.from_torch(pair_sums, row),
+                array(self._ended), array(self._reached), array(v, wp.vec3),
+                wp.from_torch(pair_sums, row),
             ],
         )  # fmt: skip
         widths = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec2, wp.vec3)
         frame.launch(
-            project_vjp(k, channels), frame.n, frame.pose, view.grid, frame.cuts,
+            project_vjp(k), frame.n, frame.pose, view.grid, frame.cuts,
             array(frame.means, wp.vec3), array(frame.quats, wp.vec4), array(frame.scales, wp.vec3),
             array(view.opacities), array(frame.slopes, wp.mat33), frame.bands > 0,
             array(view.ellipses, types.Row), array(view.counts), array(view.firsts), array(pair_sums, row),
@@ -326,12 +315,6 @@ def _read_deferred(numbers: Tensor) -> Any:
         return found
 
     return wait
-
-
-def _tiles_of(mask: Tensor, camera: Camera, edge: int) -> Tensor:
-    """The tile mask for tiles of `TILE` px, contiguous."""
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
-    return refine_mask(mask.bool(), edge // TILE, rows, columns).contiguous()
 
 
 def _pose_struct(camera: Camera) -> Any:

@@ -17,7 +17,7 @@ from rasterizers.warp_backend.geometry import (
     geometry_of,
     geometry_vjp,
 )
-from rasterizers.warp_backend.types import DEEP, FAR, SUMS, Cuts, Ellipse, Grid, Pose, Row, ellipse_of, row_of
+from rasterizers.warp_backend.types import FAR, SUMS, Cuts, Ellipse, Grid, Pose, Row, ellipse_of, row_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,8 +69,6 @@ def project(
     shN: wp.array2d[wp.vec3],
     has_offsets: wp.bool,
     offsets: wp.array[wp.vec3],
-    masked: wp.bool,
-    requested: wp.array2d[wp.bool],
     first: wp.bool,
     keys: wp.array[wp.int32],
     colours: wp.array[wp.vec3],
@@ -109,7 +107,7 @@ def project(
             ellipse = ellipse_at(u, v, footprint, opacity, cuts)
             if is_visible(ellipse, grid):
                 visible[i] = True
-                count = count_tiles(ellipse, grid, masked, requested)
+                count = count_tiles(ellipse, grid)
                 if count > 0:
                     counts[i] = count
                     if keys[i] == FAR:
@@ -130,9 +128,9 @@ def project(
 
 
 @cache
-def project_vjp(K: int, C: int) -> Any:
-    """The VJP kernel for K cotangents of C channels, three or with depth four."""
-    W = SUMS + C
+def project_vjp(K: int) -> Any:
+    """The VJP kernel for K cotangents."""
+    W = SUMS + 3
     PairSums = wp.types.vector(length=W * K, dtype=wp.float32)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -188,8 +186,6 @@ def project_vjp(K: int, C: int) -> Any:
                     rgb[c] = total[W * k + SUMS + c]
             if has_slopes:
                 out.mean += wp.transpose(slopes[i]) * rgb
-            if C == DEEP:
-                out.mean += total[W * k + SUMS + 3] * pose.rotation[2]
             d_means[k, i] = out.mean
             d_quats[k, i] = out.quat
             d_scales[k, i] = out.scale

@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from rasterizers.checks import same_gaussians_and_pose
 from rasterizers.interface import Camera, RasterSettings, Rendering, Splats, Traits
@@ -17,7 +15,7 @@ from rasterizers.warp_runtime import require_warp
 TILE: Final = 8
 """Edge of the tiles that Gaussians are listed for, px."""
 PAIR_BYTES: Final = 24  # tile and place, twice for the sort, and the Gaussian, before and after it
-SUMS_BYTES: Final = 40  # a pair's sums for one cotangent: ten with depth, nine without
+SUMS_BYTES: Final = 36  # a pair's nine sums for one cotangent
 
 
 def _default_device() -> str:
@@ -29,7 +27,6 @@ class WarpRasterizer(RasterSettings):
     """Warp kernels for CUDA; the same kernels run on a CPU, slowly, to check them.
 
     Args:
-        tile: edge of the tile mask's tiles, px, a multiple of 8. Tiles that are not requested are not listed.
         memory: MiB that one image's lists may take, together with the sums that their pairs send back.
         device: "cuda" or "cpu", where the splats' tensors are; by default "cuda" where there is one.
         capacities: the number of pairs to allocate for the next image of each size, from the images before it.
@@ -45,8 +42,6 @@ class WarpRasterizer(RasterSettings):
 
     def __post_init__(self) -> None:
         RasterSettings.__post_init__(self)
-        if self.tile % TILE:
-            raise ValueError(f"tile must be a multiple of {TILE} pixels, got {self.tile}.")
         if self.memory < 1:
             raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
         if self.device not in ("cpu", "cuda"):
@@ -70,27 +65,21 @@ class WarpRasterizer(RasterSettings):
         """Whether the lists of this many pairs, which are counted in 32 bits, fit the budget."""
         return mebibytes(pairs) <= self.memory and pairs < 2**31
 
-    def __call__(
-        self, splats: Splats, camera: Camera, tiles: Bool[Tensor, "th tw"] | None = None, *, depth: bool = False
-    ) -> Rendering:
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
         from rasterizers.warp_backend.frame import Frame
 
-        return Frame(self, [(splats, camera)], [tiles], [depth]).draw()[0]
+        return Frame(self, [(splats, camera)], [depth]).draw()[0]
 
     def render_scales(
-        self,
-        jobs: Sequence[tuple[Splats, Camera]],
-        tiles: Sequence[Bool[Tensor, "_ _"] | None] | None = None,
-        *,
-        depth: Sequence[bool] | None = None,
+        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
     ) -> list[Rendering]:
         """Jobs with the same pose and tensor objects share colour and depth order."""
         from rasterizers.warp_backend.frame import Frame
 
-        masks, depths = tiles or [None] * len(jobs), depth or [False] * len(jobs)
+        depths = depth or [False] * len(jobs)
         if len(jobs) > 1 and all(same_gaussians_and_pose(jobs[0], job) for job in jobs[1:]):
-            return [*Frame(self, jobs, masks, depths).draw()]
-        return [self(*job, mask, depth=z) for job, mask, z in zip(jobs, masks, depths, strict=True)]
+            return [*Frame(self, jobs, depths).draw()]
+        return [self(*job, depth=z) for job, z in zip(jobs, depths, strict=True)]
 
 
 def padded(count: int) -> int:

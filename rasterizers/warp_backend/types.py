@@ -14,9 +14,7 @@ TILE: Final = wp.constant(rasterizer.TILE)
 PIXELS: Final = wp.constant(rasterizer.TILE**2)
 """Pixels of a tile."""
 SUMS: Final = wp.constant(6)
-"""Sums of a pair for one cotangent before those of the channels: q = ∂L/∂(log alpha) and its moments."""
-DEEP: Final = wp.constant(4)
-"""Channels of a cotangent with depth."""
+"""Sums of a pair for one cotangent before those of the colour: q = ∂L/∂(log alpha) and its moments."""
 FAR: Final = wp.constant(2**31 - 1)
 """The depth key of a Gaussian that is not drawn."""
 

@@ -23,14 +23,12 @@ class Backend:
     """A rasterizer by name.
 
     Args:
-        edges: the tile sizes that it supports, px.
         cases: the number of images that a test with many of them may draw.
         device: where it draws; tensors are copied there and results back, so that tests work on the CPU.
         isa: the instruction set of compiled kernels in float32; None: the fastest here.
     """
 
     name: str
-    edges: tuple[int, ...]
     cases: int
     device: str = "cpu"
     isa: str | None = None
@@ -62,17 +60,15 @@ class OnDevice:
 
     def __init__(self, rasterizer: Rasterizer, device: str) -> None:
         self.rasterizer, self.device = rasterizer, device
-        self.traits, self.tile = rasterizer.traits, rasterizer.tile
+        self.traits = rasterizer.traits
 
-    def __call__(
-        self, splats: Splats, camera: Camera, tiles: torch.Tensor | None = None, *, depth: bool = False
-    ) -> Rendering:
-        return CopiedBack(self.rasterizer(moved(splats, self.device), camera, tiles, depth=depth))
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
+        return CopiedBack(self.rasterizer(moved(splats, self.device), camera, depth=depth))
 
-    def render_scales(self, jobs, tiles=None, *, depth=None) -> list[Rendering]:
+    def render_scales(self, jobs, *, depth=None) -> list[Rendering]:
         there: dict[int, torch.Tensor] = {}  # the same tensor stays the same tensor
         jobs = [(moved(splats, self.device, there), camera) for splats, camera in jobs]
-        return [CopiedBack(rendering) for rendering in self.rasterizer.render_scales(jobs, tiles, depth=depth)]
+        return [CopiedBack(rendering) for rendering in self.rasterizer.render_scales(jobs, depth=depth)]
 
 
 class CopiedBack:
@@ -99,11 +95,11 @@ def moved(tensors, device: str, there: dict[int, torch.Tensor] | None = None):
 
 
 BACKENDS = {
-    "cpp": Backend("cpp", (4, 8, 16, 32, 64), 400),
-    "cpp-avx2": Backend("cpp", (4, 8, 16, 32, 64), 100, isa="avx2"),
-    "cpp-baseline": Backend("cpp", (4, 8, 16, 32, 64), 100, isa="baseline"),
-    "warp": Backend("warp", (8, 16, 32, 64), 100),
-    "warp-cuda": Backend("warp", (8, 16, 32, 64), 400, "cuda"),
+    "cpp": Backend("cpp", 400),
+    "cpp-avx2": Backend("cpp", 100, isa="avx2"),
+    "cpp-baseline": Backend("cpp", 100, isa="baseline"),
+    "warp": Backend("warp", 100),
+    "warp-cuda": Backend("warp", 400, "cuda"),
 }
 
 
@@ -134,8 +130,8 @@ def camera(width=65, height=47) -> Camera:
     return Camera(torch.eye(4), 0.9 * width, 0.9 * width, 0.52 * width, 0.47 * height, width, height)
 
 
-def cotangents(k, height, width, seed=0, *, channels=3) -> torch.Tensor:
-    return torch.randn(k, height, width, channels, generator=torch.Generator().manual_seed(seed))
+def cotangents(k, height, width, seed=0) -> torch.Tensor:
+    return torch.randn(k, height, width, 3, generator=torch.Generator().manual_seed(seed))
 
 
 def everything(rendering, v):

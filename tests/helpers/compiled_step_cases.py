@@ -10,7 +10,7 @@ import torch
 
 from clear_strategies import SVS, Conductor, Evidence, Objective
 from clear_strategies.core import deferred
-from clear_strategies.merging.conductor import HrGradients
+from clear_strategies.merging.iteration import HrGradients
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.compiled_step import Factors
 from clear_strategies.training.field import GaussianField

@@ -20,7 +20,7 @@ from clear_strategies.strategies.base import Strategy
 from rasterizers import Camera, Splats
 
 FACTOR = 4
-RASTERIZER = rasterizers.load("torch", tile=8)
+RASTERIZER = rasterizers.load("torch")
 
 
 def camera(angle: float, width: int = 96, height: int = 64) -> Camera:

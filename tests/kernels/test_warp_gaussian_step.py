@@ -29,10 +29,10 @@ def warp_step():
     return warp
 
 
-def started(warp_step, **settings) -> tuple[Case, CompiledStep]:
+def started(warp_step) -> tuple[Case, CompiledStep]:
     """A case with all strategies, still rows, inactive bands and invisible rows."""
     c = case(1000, degree=2, kind="sparse")
-    _, conductor = conductors(lambda: GCO(**settings), P2G, SVS, anchored=c.fields[0])
+    _, conductor = conductors(GCO, P2G, SVS, anchored=c.fields[0])
     adam = Adam(c.fields[1].raw(), LearningRates(detail_decay=0.1, rows="visible"), 1.0)
     return c, CompiledStep(conductor, adam, passes=warp_step.WarpGaussianStep)
 
@@ -46,6 +46,7 @@ def two_steps(warp_step):
     return state, conflicts, numbers, step.conductor.work_log.entries["optimizer rows"].skipped
 
 
+@pytest.mark.slow
 def test_blocks_of_many_threads_give_the_same_bits(warp_step, monkeypatch):
     """As on CUDA, where lanes sum together and the last block is not full; Warp can emulate this on a CPU."""
     import warp as wp
@@ -80,9 +81,8 @@ class Synchronisations(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("eps", ["relative:0", "relative:1e-12", "absolute:0"])
-def test_the_host_does_not_wait_for_the_device(warp_step, eps):
-    c, step = started(warp_step, eps=eps)
+def test_the_host_does_not_wait_for_the_device(warp_step):
+    c, step = started(warp_step)
     factors = c.factors(1)
     step.step(c.fields[1].raw(), *factors, T)  # reads what changes only with the number of Gaussians
     with Synchronisations() as recorded:
@@ -120,6 +120,7 @@ def test_cuda_fields_without_warp_use_the_readable_path_and_log_why(adam_on_cuda
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp for macOS brings no compiler for CUDA")
 def test_the_kernels_compile_for_cuda_on_a_machine_without(warp_step, monkeypatch, tmp_path):
     import warp as wp

@@ -107,6 +107,7 @@ def test_repeated_losses_have_the_same_bits(loss):
         assert torch.equal(again.gradient, gradient)
 
 
+@pytest.mark.slow
 @needs_warp
 @pytest.mark.parametrize("loss", TRAINING_LOSSES.values(), ids=TRAINING_LOSSES)
 def test_blocks_of_many_threads_agree_with_one_thread(monkeypatch, loss):
@@ -126,6 +127,7 @@ def test_blocks_of_many_threads_agree_with_one_thread(monkeypatch, loss):
     assert torch.allclose(together.gradient, alone.gradient, rtol=1e-5, atol=1e-6 * float(alone.gradient.abs().max()))
 
 
+@pytest.mark.slow
 @needs_warp
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp for macOS brings no compiler for CUDA")
 def test_the_kernels_compile_for_cuda_on_a_machine_without(monkeypatch, tmp_path):

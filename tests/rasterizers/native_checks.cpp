@@ -85,7 +85,7 @@ void check_pick() {
   for (int i = 0; i < kLanes; ++i) check(found[i] == table[indices[i]], "pick", i);
 }
 
-// An image with its depth, and the gradients of two cotangents of both.
+// An image with its depth, and the gradients of two cotangents.
 template <class T>
 std::vector<double> drawn(int threads) {
   constexpr int n = 1003, width = 97, height = 66, bands = 15, K = 2;
@@ -99,7 +99,7 @@ std::vector<double> drawn(int threads) {
   std::vector<T> means = filled(3 * n, spread(2)), quats = filled(4 * n, spread(2)), sh0 = filled(3 * n, spread(2));
   std::vector<T> scales = filled(3 * n, [&] { return 0.01 + 0.06 * random(); }), shN = filled(3 * bands * n, spread(0.4));
   std::vector<T> opacities = filled(n, [&] { return 0.05 + 0.9 * random(); }), offset = filled(3 * n, spread(0.2));
-  std::vector<T> cotangents = filled(K * width * height * kColourAndDepth, spread(2));
+  std::vector<T> cotangents = filled(K * width * height * kColour, spread(2));
   for (int i = 0; i < n; ++i) means[3 * i + 2] += T(3);
 
   const Settings<T> settings{T(0.3), T(0.01), T(1e-6), T(0.999), T(1e-9), {T(0.2), T(0.4), T(0.6)}, true};
@@ -116,7 +116,7 @@ std::vector<double> drawn(int threads) {
   check(frame.project(splats, std::move(targets), threads), "finite");
   frame.draw(0, image.data(), alpha.data(), depth.data(), threads);
   std::vector<T> d_means(K * 3 * n), d_quats(K * 4 * n), d_scales(K * 3 * n), d_opacities(K * n), d_screen(K * 2 * n), d_rgb(K * 3 * n);
-  frame.template vjp<kColourAndDepth>(0, K, cotangents.data(), splats,
+  frame.vjp(0, K, cotangents.data(), splats,
             {d_means.data(), d_quats.data(), d_scales.data(), d_opacities.data(), d_screen.data(), d_rgb.data()}, threads);
   std::vector<double> all;
   for (const std::vector<T>* part : {&image, &alpha, &depth, &d_means, &d_quats, &d_scales, &d_opacities, &d_screen, &d_rgb})

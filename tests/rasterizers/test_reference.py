@@ -27,7 +27,7 @@ def test_a_rasterizer_that_ignores_the_background_fails_the_checks():
         def __init__(self, **settings):
             settings["background"] = (0.0, 0.0, 0.0)
             self.inner = rasterizers.load("torch", **settings)
-            self.traits, self.tile = self.inner.traits, self.inner.tile
+            self.traits = self.inner.traits
 
         def __call__(self, *arguments, **options):
             return self.inner(*arguments, **options)
@@ -88,12 +88,11 @@ def test_a_pixel_ends_before_its_transmittance_falls_below_the_limit():
         assert 1 - rasterizer(five, odd_camera()).alpha[10, 10] == pytest.approx(left, rel=1e-9)
 
 
-@pytest.mark.parametrize("tile", [4, 8, 16, 32])
 @pytest.mark.parametrize("lanes", [1, 4096, 1 << 20])
-def test_tiles_and_batches_do_not_change_the_picture(tile, lanes):
+def test_batches_do_not_change_the_picture(lanes):
     splats, camera = scene(200, dtype=torch.float64), Camera(torch.eye(4), 40.0, 40.0, 20.0, 15.0, 41, 33)
-    expected = rasterizers.load("torch", tile=8)(splats, camera)
-    found = rasterizers.load("torch", tile=tile, lanes=lanes)(splats, camera)
+    expected = rasterizers.load("torch")(splats, camera)
+    found = rasterizers.load("torch", lanes=lanes)(splats, camera)
     assert torch.allclose(found.image, expected.image, atol=1e-14)
     v = torch.ones(1, 33, 41, 3, dtype=torch.float64)
     assert torch.allclose(found.vjp(v).means, expected.vjp(v).means, rtol=1e-9, atol=1e-12)
@@ -156,7 +155,6 @@ def test_a_number_that_is_not_finite_is_refused(field, value):
         ({"near": 0}, "near must be"),
         ({"alpha_min": 0}, "alpha_min"),
         ({"alpha_max": 1.5}, "alpha_max"),
-        ({"tile": 0}, "tile must be"),
         ({"background": (0, 0, 2)}, "background must be"),
         ({"kernels": 0.1}, "unknown rasterizer setting 'kernels'"),
     ],

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 from hydra.utils import instantiate
-from torch import Tensor
 
 import rasterizers
 from rasterizers import Camera, Rasterizer, RasterSettings, Rendering, Splats, Traits, autograd
@@ -26,7 +25,7 @@ class ThirdParty(RasterSettings):
     @property
     def inner(self) -> ReferenceRasterizer:
         return ReferenceRasterizer(
-            kernel=self.kernel, near=self.near, alpha_min=self.alpha_min, alpha_max=self.alpha_max, tile=self.tile,
+            kernel=self.kernel, near=self.near, alpha_min=self.alpha_min, alpha_max=self.alpha_max,
             transmittance_min=self.transmittance_min, background=self.background, antialiased=self.antialiased,
             lanes=self.lanes_per_pass,
         )  # fmt: skip
@@ -35,19 +34,16 @@ class ThirdParty(RasterSettings):
     def traits(self) -> Traits:
         return self.inner.traits
 
-    def __call__(
-        self, splats: Splats, camera: Camera, tiles: Tensor | None = None, *, depth: bool = False
-    ) -> Rendering:
-        return self.inner(splats, camera, tiles, depth=depth)
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
+        return self.inner(splats, camera, depth=depth)
 
     def render_scales(
         self,
         jobs: Sequence[tuple[Splats, Camera]],
-        tiles: Sequence[Tensor | None] | None = None,
         *,
         depth: Sequence[bool] | None = None,
     ) -> list[Rendering]:
-        return self.inner.render_scales(jobs, tiles, depth=depth)
+        return self.inner.render_scales(jobs, depth=depth)
 
 
 class Flat:
@@ -55,17 +51,16 @@ class Flat:
 
     def __init__(self, **settings) -> None:
         self.inner = rasterizers.load("torch", **settings)
-        self.tile = self.inner.tile
 
     @property
     def traits(self) -> Traits:
         return replace(self.inner.traits, depth=False)
 
-    def __call__(self, splats, camera, tiles=None):
-        return self.inner(splats, camera, tiles)
+    def __call__(self, splats, camera):
+        return self.inner(splats, camera)
 
-    def render_scales(self, jobs, tiles=None):
-        return self.inner.render_scales(jobs, tiles)
+    def render_scales(self, jobs):
+        return self.inner.render_scales(jobs)
 
 
 def test_a_third_partys_rasterizer_passes_the_checks_and_is_built_by_its_path():
@@ -79,7 +74,7 @@ def test_a_third_partys_rasterizer_passes_the_checks_and_is_built_by_its_path():
 def test_a_rasterizer_without_depth_passes_the_checks_and_is_refused_by_name_where_depth_is_asked(caplog):
     with caplog.at_level("INFO", "rasterizers"):
         check_rasterizer(Flat)
-    assert "check_tile_mask_of_depth: not checked, the rasterizer's traits.depth is False" in caplog.text
+    assert "check_nothing_to_draw_of_depth: not checked, the rasterizer's traits.depth is False" in caplog.text
     splats, camera = scene(5), Camera(torch.eye(4), 40.0, 40.0, 20.0, 15.0, 40, 30)
     assert autograd.draw(Flat(), splats, camera).depth is None
     with pytest.raises(ValueError, match=r"Flat draws no depth \(its traits\.depth is False\)"):
@@ -97,5 +92,5 @@ def test_a_rasterizer_without_depth_passes_the_checks_and_is_refused_by_name_whe
 def test_the_backends_are_built_by_their_paths(name, path):
     if name in BACKENDS and why_not(name):
         pytest.skip(str(why_not(name)))
-    settings = {"near": 0.01, "kernel": 0.3, "tile": 16, "antialiased": False}
+    settings = {"near": 0.01, "kernel": 0.3, "antialiased": False}
     assert instantiate({"_target_": path, **settings}) == rasterizers.load(name, **settings)

@@ -143,7 +143,7 @@ def test_errors_are_raised_when_an_image_is_accessed(deferred):
     rasterizer(splats, view)
 
     def launched(splats):  # not by `rasterizer(…)`: the tests' type checks would access the image that it returns
-        return frame.Frame(rasterizer, [(splats, view)], [None], [False]).draw()[0]
+        return frame.Frame(rasterizer, [(splats, view)], [False]).draw()[0]
 
     huge = launched(dataclasses.replace(splats, scales=splats.scales * 100))
     with pytest.raises(MemoryError, match="Raise `memory`"):
@@ -198,6 +198,7 @@ def test_no_local_name_hides_a_constant_of_warp():
         assert not names & constants, path.name
 
 
+@pytest.mark.slow
 @installed
 @pytest.mark.skipif(sys.platform == "darwin", reason="Warp for macOS brings no compiler for CUDA")
 def test_the_kernels_compile_for_cuda_on_a_machine_without(monkeypatch, tmp_path):
@@ -206,10 +207,9 @@ def test_the_kernels_compile_for_cuda_on_a_machine_without(monkeypatch, tmp_path
     from rasterizers.warp_backend import bins, blend, colour, project
 
     kernels = [bins.list_pairs, colour.basis, project.project]
-    for channels in (3, 4):
-        back = blend.blend_vjp(1, channels, 32)
-        monkeypatch.setitem(back.module.options, "block_dim", 32)
-        kernels += [blend.blend(channels == 4), back, project.project_vjp(1, channels)]
+    back = blend.blend_vjp(1, 32)
+    monkeypatch.setitem(back.module.options, "block_dim", 32)
+    kernels += [blend.blend(False), blend.blend(True), back, project.project_vjp(1)]
     for i, kernel in enumerate(kernels):
         wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path / str(i), use_ptx=True)
         (compiled,) = (tmp_path / str(i)).glob("*.ptx")

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clear_strategies import P2G, Conductor, Evidence, ScreenGradients, Step
+from clear_strategies import P2G, Evidence, ScreenGradients, Step
 from clear_strategies.core import images
 from clear_strategies.core.evidence import lift
 from clear_strategies.strategies.p2g import patch_evidence
 from clear_strategies.training.field import GaussianField
-from tests.helpers import textured_plane as planes
 from tests.helpers import toy
 
 
@@ -162,46 +160,3 @@ def test_a_flat_image_asks_for_no_detail_on_and_off_the_8_bit_grid(grey, down):
     hr = torch.full((64, 64, 3), grey)
     _, A = patch_evidence(torch.full((16, 16, 3), grey), hr, 4, down=down)
     assert float(A.max()) < 1e-3
-
-
-def test_the_agreement_of_views_sees_an_invention_that_the_photo_cannot_see(caplog):
-    caplog.set_level("DEBUG")
-    views = planes.with_invention(planes.plane_views(), 1, row=2, column=3)
-    R = {}
-    for agreement in ("photo", "views", "both"):
-        p2g = P2G(agreement=agreement, patch=planes.PATCH)
-        assert p2g.wants_views() == (agreement != "photo")
-        if p2g.wants_views():
-            p2g.on_views(views)
-        R[agreement] = p2g.patch_maps(views[1]).reliability
-    assert float(R["photo"][2, 3]) > 0.8
-    assert float(R["views"][2, 3]) < 0.3
-    assert torch.allclose(R["both"][2, 3], R["photo"][2, 3] * R["views"][2, 3])
-    assert float(R["both"].median()) > 0.6
-    assert "confirm their detail" in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("views", "reason"),
-    [
-        ([], "does not give its views"),
-        (planes.plane_views(1), "one view"),
-        ([replace(v, depth=None) for v in planes.plane_views()], "data.cloud.init=stereo"),
-    ],
-)
-def test_where_views_cannot_be_compared_a_warning_says_why_and_the_photo_counts(views, reason, caplog):
-    conductor = Conductor(P2G(agreement="both", patch=planes.PATCH))
-    conductor.on_fit_start(len(views), 0, views=views)
-    assert reason in caplog.text
-    assert "views prepared" in conductor.work_log.entries
-    view = planes.plane_views(1)[0]
-    (ours,), photo = conductor.strategies, P2G(patch=planes.PATCH)
-    assert torch.equal(ours.patch_maps(view).reliability, photo.patch_maps(view).reliability)
-    assert ours.patch_maps(view).compared is None
-
-
-def test_the_paper_s_agreement_asks_no_views(caplog):
-    conductor = Conductor(P2G())
-    conductor.on_fit_start(1, 0, views=planes.plane_views(1))
-    assert not conductor.work_log.entries
-    assert not caplog.text

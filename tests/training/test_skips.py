@@ -1,4 +1,4 @@
-"""What is left out: only what its setting says, said in the work_log, and harmless where nothing is flat or settled."""
+"""What is left out: only what its setting says, said in the work_log, and harmless where nothing is settled."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ import pytest
 import torch
 
 from clear_strategies.core import images
-from clear_strategies.core.view import Photo
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import Ramp, WarmupDecay, scaled
 from clear_strategies.strategies.svs import SVS
 from clear_strategies.training.evaluation import loss_of_views
-from clear_strategies.training.field import GaussianField, filled
 from clear_strategies.training.loop import fit, iterate
 from clear_strategies.training.skips import PLATEAU_LOSS, SkipPolicy, Skips
 from tests.helpers import toy
@@ -30,7 +28,6 @@ def test_nothing_is_left_out_by_default():
     view, skip_policy, work_log = toy.scene().train[0], SkipPolicy(), WorkLog()
     assert skip_policy.view(view, 1) is view
     assert skip_policy.hr_due(10_000, work_log)
-    assert skip_policy.wanted(view, 8, work_log) is None
     assert not skip_policy.settled(loss_rows(*[1.0] * 20_000), 20_000)
     assert not work_log.entries
 
@@ -56,41 +53,6 @@ def test_hr_takes_part_in_every_nth_iteration_and_the_ledger_says_why_not_in_the
     skip_policy, work_log = SkipPolicy(Skips(hr_every=3, hr_every_from=6)), WorkLog()
     assert [t for t in range(1, 16) if skip_policy.hr_due(t, work_log)] == [1, 2, 3, 4, 5, 6, 9, 12, 15]
     assert sum(work_log.entries["HR scale"].skipped.values()) == 6
-
-
-def test_tiles_are_flat_where_the_reference_adds_nothing_to_lr():
-    view = toy.scene().train[0]
-    smooth = images.upsample(view.lr.image, view.factor)
-    busy = smooth.clone()
-    busy[:8, :8] = 1 - busy[:8, :8]  # the first tile
-    camera, skip_policy, work_log = view.hr.camera, SkipPolicy(Skips(flat=0.01)), WorkLog()
-    wanted = skip_policy.wanted(replace(view, hr=Photo(camera, busy)), 8, work_log)
-    assert wanted is not None
-    assert wanted.nonzero().tolist() == [[0, 0]]
-    assert sum(work_log.entries["HR tiles"].skipped.values()) == wanted.numel() - 1
-
-
-def test_where_every_tile_has_detail_nothing_is_masked():
-    view = toy.scene().train[0]
-    busy = Photo(view.hr.camera, 1 - images.upsample(view.lr.image, view.factor).round())
-    assert SkipPolicy(Skips(flat=1e-6)).wanted(replace(view, hr=busy), 8, WorkLog()) is None
-
-
-def test_undrawn_tiles_show_the_reference_and_send_no_gradient():
-    view = toy.scene().train[0]
-    field = GaussianField.from_cloud(toy.scene().cloud)
-    height, width = view.hr.image.shape[:2]
-    tiles = torch.zeros(-(-height // 8), -(-width // 8), dtype=torch.bool)
-    tiles[0, 0] = True
-    _, shot = field.render_scales(toy.RASTERIZER, view, tiles=tiles)
-    _, whole = field.render_scales(toy.RASTERIZER, view)
-    assert torch.equal(shot.image[:8, :8], whole.image[:8, :8])
-    assert torch.equal(shot.image[8:], view.hr.image[8:])
-    cotangent = torch.ones(1, height, width, 3)
-    drawn = filled(cotangent[0], tiles, torch.zeros(height, width, 3), 8)[None]
-    found, expected = shot.vjp(cotangent)[0], whole.vjp(drawn)[0]
-    for name in ("means", "opacities", "sh0"):
-        torch.testing.assert_close(found[name], expected[name], rtol=1e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize(("now", "ends"), [(0.99, True), (0.97, False), (1.10, True)])
@@ -136,7 +98,7 @@ def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
     assert sum(state.conductor.work_log.entries["iterations"].skipped.values()) == 9
 
 
-@pytest.mark.parametrize("skips", [Skips(coarse_until=12), Skips(hr_every=2, hr_every_from=3), Skips(flat=0.02)])
+@pytest.mark.parametrize("skips", [Skips(coarse_until=12), Skips(hr_every=2, hr_every_from=3)])
 def test_every_skip_trains(skips):
     state = start(("gco", "p2g", "svs"))
     state.skip_policy = SkipPolicy(skips)
@@ -145,9 +107,7 @@ def test_every_skip_trains(skips):
     assert all(bool(p.isfinite().all()) for p in state.field.raw().values())
 
 
-@pytest.mark.parametrize(
-    "bad", [{"hr_every": 0}, {"flat": -0.1}, {"flat": 1.0}, {"plateau_gain": 1.0}, {"coarse_until": -1}]
-)
+@pytest.mark.parametrize("bad", [{"hr_every": 0}, {"plateau_gain": 1.0}, {"coarse_until": -1}])
 def test_settings_out_of_range_are_refused(bad):
     with pytest.raises(ValueError, match="must"):
         Skips(**bad)

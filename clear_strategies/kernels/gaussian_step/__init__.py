@@ -25,18 +25,15 @@ class Comparison:
     Args:
         comparable: Gaussians whose LR and HR gradients are both nonzero.
         opposed: comparable Gaussians whose LR and HR gradients have a negative inner product.
-        norm_lr, norm_hr: Σ ‖g_LR‖ and Σ ‖g_HR‖ over the comparable Gaussians, by group.
     """
 
     comparable: Sequence[int] | Int[Tensor, " 7"]
     opposed: Sequence[int] | Int[Tensor, " 7"]
-    norm_lr: Sequence[float] | Float[Tensor, " 6"]
-    norm_hr: Sequence[float] | Float[Tensor, " 6"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Correction:
-    """GCO's settings as numbers, by conflict group where they differ.
+    """GCO's settings as numbers.
 
     Args:
         groups: whether each group is corrected.
@@ -44,13 +41,10 @@ class Correction:
     """
 
     groups: Sequence[bool]
-    eps_cos: Sequence[float] | Float[Tensor, " 6"]
-    eps_corr: Sequence[float] | Float[Tensor, " 6"]
     tolerance: float
     weight_min: float
     weight_max: float
     rotation_noise: float
-    bounds_hold_omega: bool
     reliability: Tensor | None
 
 
@@ -118,8 +112,8 @@ class StepCounts:
 class GaussianStep(Protocol):
     """The two passes over one view's gradients. Implementations take them as `cpp.CppGaussianStep` does."""
 
-    def compare(self, products: Float[Tensor, "6 N"] | None = None) -> Comparison:
-        """Count the conflicts before correction. `products`, float64, receives ‖g_LR‖‖g_HR‖ by group."""
+    def compare(self) -> Comparison:
+        """Count the conflicts before correction."""
         ...
 
     def step(

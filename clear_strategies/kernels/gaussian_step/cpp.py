@@ -36,8 +36,8 @@ class CppGaussianStep:
         kernels: Any = load_kernels("clear_strategies.kernels")
         self._step = kernels.GaussianStep(dict(activation), lr, base, hf, lr["basis"].shape[1], lambda_hf)
 
-    def compare(self, products: Tensor | None = None) -> Comparison:
-        return Comparison(*self._step.compare({"products": products}, threads()))
+    def compare(self) -> Comparison:
+        return Comparison(*self._step.compare(threads()))
 
     def step(
         self, attributes: Mapping[str, Attribute], correction: Correction | None, settings: StepSettings

@@ -66,17 +66,15 @@ class GaussianStep {
     if (base.is_none() && !hf.is_none()) throw nb::value_error("hf needs base");
   }
 
-  // Returns (comparable, opposed, norm_lr, norm_hr) by group; `out` is {"products": [6, N] or None}.
-  nb::tuple compare(nb::dict out, int threads) const {
+  // Returns (comparable, opposed) by group.
+  nb::tuple compare(int threads) const {
     if (g_.n && !g_.base) throw nb::value_error("there is no HR gradient to compare with");
-    Tensors tensors;
-    double* products = tensors.rows<double>(out, "products", kGroups, g_.n, true);
     Comparison c;
     {
       nb::gil_scoped_release release;
-      c = clear::compare(g_, products, threads);
+      c = clear::compare(g_, threads);
     }
-    return nb::make_tuple(list(c.comparable), list(c.opposed), list(c.norm_lr), list(c.norm_hr));
+    return nb::make_tuple(list(c.comparable), list(c.opposed));
   }
 
   // Steps `attributes` {name: {p, m, v, anchor, merged, width, stiffness, rate, keep, limit}} in place.
@@ -141,13 +139,10 @@ class GaussianStep {
     auto number = [&](const char* name) { return nb::cast<double>(t[name]); };
     Correction c;
     auto groups = nb::cast<std::vector<bool>>(t["groups"]);
-    auto eps_cos = nb::cast<std::vector<double>>(t["eps_cos"]), eps_corr = nb::cast<std::vector<double>>(t["eps_corr"]);
-    if (groups.size() != kGroups || eps_cos.size() != kGroups || eps_corr.size() != kGroups)
-      throw nb::value_error("groups, eps_cos and eps_corr must have one entry per conflict group");
-    for (int k = 0; k < kGroups; ++k) c.corrects[k] = groups[k], c.eps_cos[k] = eps_cos[k], c.eps_corr[k] = eps_corr[k];
+    if (groups.size() != kGroups) throw nb::value_error("groups must have one entry per conflict group");
+    for (int k = 0; k < kGroups; ++k) c.corrects[k] = groups[k];
     c.tolerance = number("tolerance"), c.weight_min = number("weight_min"), c.weight_max = number("weight_max");
     c.rotation_noise = number("rotation_noise");
-    c.bounds_hold_omega = nb::cast<bool>(t["bounds_hold_omega"]);
     c.reliability = tensors.rows<const float>(t, "reliability", g_.n, 1, true);
     return c;
   }
@@ -164,7 +159,7 @@ inline void bind_step(nb::module_& m) {
   nb::class_<GaussianStep>(m, "GaussianStep")
       .def(nb::init<nb::dict, nb::dict, nb::object, nb::object, std::int64_t, double>(), nb::arg("activation"), nb::arg("lr"),
            nb::arg("base").none(), nb::arg("hf").none(), nb::arg("bases"), nb::arg("lambda_hf"))
-      .def("compare", &GaussianStep::compare, nb::arg("out"), nb::arg("threads"))
+      .def("compare", &GaussianStep::compare, nb::arg("threads"))
       .def("step", &GaussianStep::step, nb::arg("attributes"), nb::arg("correction").none(), nb::arg("settings"),
            nb::arg("threads"));
 }

@@ -45,21 +45,17 @@ CLEAR_INLINE void group_products(const Gradients& g, const Block& b, std::int64_
 // Counts over a chunk of Gaussians, before correction; chunks are added up in order.
 struct Comparison {
   std::int64_t comparable[kGroups + 1] = {}, opposed[kGroups + 1] = {};
-  double norm_lr[kGroups] = {}, norm_hr[kGroups] = {};  // Σ ‖l‖, Σ ‖h‖ over comparable Gaussians
 
   void add(const Comparison& o) {
     for (int k = 0; k <= kGroups; ++k) comparable[k] += o.comparable[k], opposed[k] += o.opposed[k];
-    for (int k = 0; k < kGroups; ++k) norm_lr[k] += o.norm_lr[k], norm_hr[k] += o.norm_hr[k];
   }
 };
 
-// GCO's settings, with ε as numbers.
+// GCO's settings.
 struct Correction {
   bool corrects[kGroups] = {};
-  double eps_cos[kGroups] = {}, eps_corr[kGroups] = {};
   double tolerance, weight_min, weight_max;
   double rotation_noise;           // a ‖g_quats‖ up to this times ‖g_scales‖ counts as rounding
-  bool bounds_hold_omega;          // weight_min and weight_max bound ω, else the coefficient
   const float* reliability;        // q_i, or null for 0
 };
 
@@ -99,18 +95,12 @@ CLEAR_INLINE bool correction_multiples(const Correction& c, Group group, const P
   if (!apart.any()) return false;
   Doubles n = root(p.l2 * p.h2);  // ‖l‖‖h‖; a product of four floats fits a double
   Doubles low = c.weight_min, high = c.weight_max;
-  Doubles cosine = p.dot / maximum(n + Doubles(c.eps_cos[group]), Doubles(std::numeric_limits<double>::min()));  // Eq. 6
+  Doubles cosine = p.dot / maximum(n, Doubles(std::numeric_limits<double>::min()));  // Eq. 6
   auto conflict = (n > zero) & (cosine < -tau) & apart;
   if (!conflict.any()) return false;
   Doubles s = clamp((-cosine - tau) / (one - tau), zero, one);
-  Doubles omega = s * (one - q);  // Eq. 11
-  Doubles coefficient = (p.dot + tau * n) / (p.l2 + Doubles(c.eps_corr[group]));
-  if (c.bounds_hold_omega) {
-    omega = clamp(omega, low, high);
-    multiple = where(conflict, omega * coefficient);
-  } else {
-    multiple = where(conflict, -clamp(absolute(omega * coefficient), low, high));
-  }
+  Doubles omega = clamp(s * (one - q), low, high);  // Eq. 11
+  multiple = where(conflict, omega * ((p.dot + tau * n) / p.l2));
   done.omega[group] += where(conflict, omega);
   done.rows[group] += __builtin_popcount(conflict.bits());
   done.at_lower_bound[group] += __builtin_popcount((conflict & (omega <= low)).bits());

@@ -23,10 +23,8 @@ CLEAR_INLINE void each_sixteen(std::int64_t n, std::int64_t number, Task&& task)
   for (std::int64_t i = number * kChunk; i < end; i += kLanes) task(i, int(std::min<std::int64_t>(kLanes, end - i)));
 }
 
-Comparison compare_chunk(const Gradients& g, double* norm_products, std::int64_t number) {
+Comparison compare_chunk(const Gradients& g, std::int64_t number) {
   Comparison c;
-  Doubles norm_lr[kGroups], norm_hr[kGroups];
-  for (int k = 0; k < kGroups; ++k) norm_lr[k] = norm_hr[k] = 0.0;
   each_sixteen(g.n, number, [&](std::int64_t i, int count) {
     fetch(g, i + kLanes);
     Block b;
@@ -39,17 +37,8 @@ Comparison compare_chunk(const Gradients& g, double* norm_products, std::int64_t
       auto comparable = (p[k].l2 > zero) & (p[k].h2 > zero);
       c.comparable[k] += __builtin_popcount(comparable.bits());
       c.opposed[k] += __builtin_popcount((comparable & (p[k].dot < zero)).bits());
-      if (k == kGaussian) continue;
-      Doubles l = root(p[k].l2), h = root(p[k].h2);
-      norm_lr[k] += where(comparable, l), norm_hr[k] += where(comparable, h);
-      if (norm_products) {
-        double values[kLanes];
-        (l * h).store(values);
-        std::copy(values, values + count, norm_products + k * g.n + i);
-      }
     }
   });
-  for (int k = 0; k < kGroups; ++k) c.norm_lr[k] = sum(norm_lr[k]), c.norm_hr[k] = sum(norm_hr[k]);
   return c;
 }
 
@@ -278,10 +267,9 @@ class ChunkStep {
 
 }  // namespace
 
-Comparison compare(const Gradients& g, double* norm_products, int threads) {
+Comparison compare(const Gradients& g, int threads) {
   std::vector<Comparison> parts(chunks(g.n));
-  Pool::instance().run(threads, std::int64_t(parts.size()),
-                       [&](std::int64_t k) { parts[k] = compare_chunk(g, norm_products, k); });
+  Pool::instance().run(threads, std::int64_t(parts.size()), [&](std::int64_t k) { parts[k] = compare_chunk(g, k); });
   Comparison total;
   for (const Comparison& part : parts) total.add(part);
   return total;

@@ -24,8 +24,8 @@ struct Stepped {
   std::int64_t still = 0, invisible = 0;  // rows that took no step, and why
 };
 
-// Counts comparable and opposed Gaussians by group. Writes ‖l‖‖h‖ to `norm_products` [6, N] unless it is null.
-Comparison compare(const Gradients& g, double* norm_products, int threads);
+// Counts comparable and opposed Gaussians by group.
+Comparison compare(const Gradients& g, int threads);
 
 // Steps every attribute in place, or writes its merged gradient where `merged` is set.
 Stepped step(const Gradients& g, const Correction* correction, const Step& s, int threads);

@@ -85,14 +85,12 @@ void bind_frame(nb::module_& m) {
            [](F& self, Read<T, -1, 3> means, Read<T, -1, 4> quats, Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0,
               Rows<T> shN, std::vector<std::vector<double>> grids, std::vector<Read<T, -1>> opacities,
               std::vector<std::optional<Read<T, -1, 3>>> offsets, std::vector<Write<T, -1, 2>> means2d,
-              std::vector<Write<bool, -1>> visible, std::vector<std::optional<Read<bool, -1, -1>>> tiles, int edge,
-              int threads) {
-             require(edge >= kBlock && edge % kBlock == 0, "tiles must be a multiple of 4 px");
+              std::vector<Write<bool, -1>> visible, int threads) {
              Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
              const std::size_t n = std::size_t(splats.n), count = grids.size();
              require(count >= 1 && count <= 4 && opacities.size() == count && offsets.size() == count &&
-                         means2d.size() == count && visible.size() == count && tiles.size() == count,
-                     "one to four pixel grids, each with its opacities, offset, tiles and outputs");
+                         means2d.size() == count && visible.size() == count,
+                     "one to four pixel grids, each with its opacities, offset and outputs");
              std::vector<Target<T>> targets(count);
              for (std::size_t i = 0; i < count; ++i) {
                const std::vector<double>& g = grids[i];
@@ -105,14 +103,12 @@ void bind_frame(nb::module_& m) {
                targets[i].rgb_offset = offsets[i] ? offsets[i]->data() : nullptr;
                targets[i].means2d = means2d[i].data();
                targets[i].visible = visible[i].data();
-               if (tiles[i]) targets[i].request = Request(tiles[i]->data(), edge, int(g[4]), int(g[5]));
              }
              nb::gil_scoped_release release;
              return self.project(splats, std::move(targets), threads);
            },
            tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"), tensor("shN"), nb::arg("grids"),
-           tensor("opacities"), tensor("offsets"), tensor("means2d"), tensor("visible"), tensor("tiles"), nb::arg("edge"),
-           nb::arg("threads"))
+           tensor("opacities"), tensor("offsets"), tensor("means2d"), tensor("visible"), nb::arg("threads"))
       .def_static("empty", &empty<T>, nb::rv_policy::reference)
       .def("pairs", &F::pairs)
       .def("draw",
@@ -124,20 +120,17 @@ void bind_frame(nb::module_& m) {
            },
            nb::arg("grid"), tensor("image"), tensor("alpha"), tensor("depth").none(), nb::arg("threads"))
       .def("vjp",
-           [](F& self, int i, Read<T, -1, -1, -1, -1> cotangents, Read<T, -1, 3> means, Read<T, -1, 4> quats,
+           [](F& self, int i, Read<T, -1, -1, -1, 3> cotangents, Read<T, -1, 3> means, Read<T, -1, 4> quats,
               Read<T, -1, 3> scales, Read<T, -1, 1, 3> sh0, Rows<T> shN, Write<T, -1, -1, 3> d_means,
               Write<T, -1, -1, 4> d_quats, Write<T, -1, -1, 3> d_scales, Write<T, -1, -1> d_opacities,
               Write<T, -1, -1, 2> d_screen, Write<T, -1, -1, 3> d_rgb, int threads) {
              Splats<T> splats = splats_of<T>(means, quats, scales, sh0, shN);
              Gradients<T> out{d_means.data(),     d_quats.data(),  d_scales.data(),
                               d_opacities.data(), d_screen.data(), d_rgb.data()};
-             const int K = int(cotangents.shape(0)), C = int(cotangents.shape(3));
-             require(C == kColour || (C == kColourAndDepth && self.has_depth(i)),
-                     "cotangents must have three channels, or a fourth one for the depth that was drawn");
+             const int K = int(cotangents.shape(0));
              const T* v = cotangents.data();
              nb::gil_scoped_release release;
-             if (C == kColour) self.template vjp<kColour>(i, K, v, splats, out, threads);
-             else self.template vjp<kColourAndDepth>(i, K, v, splats, out, threads);
+             self.vjp(i, K, v, splats, out, threads);
            },
            nb::arg("grid"), tensor("cotangents"), tensor("means"), tensor("quats"), tensor("scales"), tensor("sh0"),
            tensor("shN"), tensor("d_means"), tensor("d_quats"), tensor("d_scales"), tensor("d_opacities"),

@@ -8,9 +8,25 @@
 
 #include "groups.hpp"
 #include "pool.hpp"
-#include "request.hpp"
 
 namespace clear {
+
+// A rectangle of bins, both ends included; empty if x1 = x0 - 1 or y1 = y0 - 1.
+struct BinRange {
+  std::int16_t x0 = 0, x1 = -1, y0 = 0, y1 = -1;
+  std::int64_t count() const { return std::int64_t(x1 + 1 - x0) * std::int64_t(y1 + 1 - y0); }
+
+  // Calls visit(x, y) for each bin, row by row: one loop, because the ends of two are harder for a processor to foresee.
+  template <class Visit>
+  void each(Visit&& visit) const {
+    std::int64_t left = count();
+    for (int x = x0, y = y0; left; --left) {
+      visit(x, y);
+      const bool last = x == x1;
+      x = last ? x0 : x + 1, y += last;
+    }
+  }
+};
 
 // A rectangle of bins whose pairs are listed at once, ends excluded: whole rows of bins, or a part of one row. There is one
 // band, unless its pairs would not fit the memory budget.
@@ -45,14 +61,14 @@ class Coverage {
     ++top[0], --top[across], --bottom[0], ++bottom[across];
   }
 
-  // Calls visit(bin of the band, its place on the pixel grid, count) for each bin. `columns` are those of the grid.
+  // Calls visit(bin of the band, count) for each bin.
   template <class Visit>
-  void each(int columns, Visit&& visit) {
+  void each(Visit&& visit) {
     for (int y = band_.y0, bin = 0; y < band_.y1; ++y) {
       std::uint32_t running = 0;
       for (int x = band_.x0; x < band_.x1; ++x, ++bin) {
         running += *at(x, y);
-        visit(bin, std::int64_t(y) * columns + x, *at(x, y) = running + (y > band_.y0 ? *at(x, y - 1) : 0));
+        visit(bin, *at(x, y) = running + (y > band_.y0 ? *at(x, y - 1) : 0));
       }
     }
   }
@@ -65,9 +81,9 @@ class Coverage {
   std::vector<std::uint32_t> steps_;
 };
 
-// Lists the pairs of a band of the image on the requested bins.
+// Lists the pairs of a band of the image.
 inline void list_pairs(const Band& band, const Band& image, const Drawn& drawn, const Buffer<std::uint32_t>& order,
-                       const Buffer<BinRange>& ranges, const Request& request, Bins& out, int threads) {
+                       const Buffer<BinRange>& ranges, Bins& out, int threads) {
   out.band = band, out.has_masks = false;
   const int bins = band.bins();
   auto clipped = [&](std::uint32_t i) {
@@ -77,7 +93,7 @@ inline void list_pairs(const Band& band, const Band& image, const Drawn& drawn, 
     return r;
   };
   auto each_bin = [&](const BinRange& r, auto&& visit) {
-    request.each_bin(r, [&](int x, int y) { visit((y - band.y0) * band.columns() + x - band.x0); });
+    r.each([&](int x, int y) { visit((y - band.y0) * band.columns() + x - band.x0); });
   };
 
   // Count each Gaussian's pairs, and add the counts up.
@@ -88,12 +104,12 @@ inline void list_pairs(const Band& band, const Band& image, const Drawn& drawn, 
   Pool::instance().run(threads, chunks, [&](std::int64_t c) {
     const std::int64_t begin = c * kChunk, end = std::min(n, begin + kChunk);
     std::uint32_t pairs = 0;
-    if (request.all() && band == image) {  // a loop that the compiler turns into one over registers
+    if (band == image) {  // a loop that the compiler turns into one over registers
       for (std::int64_t i = begin; i < end; ++i) pairs += counts[i] = std::uint32_t(ranges[i].count());
     } else {
       std::fill(counts + begin, counts + end, 0);
       for (const std::uint32_t* i = drawn.begin(c); i < drawn.end(c); ++i)
-        pairs += counts[*i] = std::uint32_t(request.bins_in(clipped(*i)));
+        pairs += counts[*i] = std::uint32_t(clipped(*i).count());
     }
     base[c + 1] = pairs;
   });
@@ -129,9 +145,7 @@ inline void list_pairs(const Band& band, const Band& image, const Drawn& drawn, 
       ranked[k] = {clipped(order[k]), order[k], out.first[order[k]]};
       coverage.add(ranked[k].range);
     }
-    coverage.each(image.columns(), [&](int bin, std::int64_t place, std::uint32_t count) {
-      places[part * stride + bin] = request.blocks(place) ? count : 0;
-    });
+    coverage.each([&](int bin, std::uint32_t count) { places[part * stride + bin] = count; });
   });
   out.starts.assign(bins + 1, 0);
   std::uint32_t place = 0;

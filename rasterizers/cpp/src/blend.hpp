@@ -4,7 +4,8 @@
 //
 // A Gaussian with α_i < α_min is skipped; a pixel ends before the Gaussian that would take its T below transmittance_min.
 //
-// C is the number of channels: kColour, or kColourAndDepth with expected depth, E = Σ T_i α_i z_i / Σ T_i α_i.
+// C is the number of channels that are drawn: kColour, or kColourAndDepth with expected depth, E = Σ T_i α_i z_i / Σ T_i α_i.
+// Cotangents are those of the colour.
 #pragma once
 
 #include <climits>
@@ -47,12 +48,6 @@ template <class T, int C>
 struct BlockBlend {
   static constexpr int kSums = C == kColourAndDepth ? C + 1 : C;
   T sums[kSums][kLanes];
-};
-
-// What the backward pass of depth needs of each pixel: the expected depth E, and 1 / Σ w, which is 0 where nothing is drawn.
-template <class T>
-struct BlockDepth {
-  T expected[kLanes], over_weight[kLanes];
 };
 
 // Loads a block's pixels from a [height, width, C] image; zeros beyond the image's edge. Whole blocks go from memory to
@@ -138,16 +133,16 @@ void blend_block(const Segment<T>& segment, int block, const Settings<T>& s, Blo
 }
 
 // Sums over a block's pixels for the Gaussians of its bin.
-template <class T, int K, int C>
+template <class T, int K>
 struct BlockSums {
-  using Sums = PairSums<T, K, C>;
+  using Sums = PairSums<T, K>;
   static constexpr int kRows = kLanes;  // Gaussians are collected until every lane has one
   T q[K][kRows][kLanes], weight[kRows][kLanes];
   T offset_x[kRows], offset_y[kRows];  // from the Gaussian's centre to the block's
   int place[kRows];
 
   // Not inlined: two copies beside the loop over Gaussians would exceed the instruction cache.
-  __attribute__((noinline)) void flush(int count, const T (&cotangent)[K][C][kLanes], Sums* sums) {
+  __attribute__((noinline)) void flush(int count, const T (&cotangent)[K][kColour][kLanes], Sums* sums) {
     if constexpr (kByQuads)
       for (int i = 0; i < count; ++i) add_by_quads(i, cotangent, sums);
     else if (count)
@@ -159,7 +154,7 @@ struct BlockSums {
   static constexpr bool kByQuads = sizeof(T) == 4 && Lanes<T>::registers > 1;
 
   // A sum over pixels is the sum of a register's quads, four sums at a time.
-  CLEAR_INLINE void add_by_quads(int row, const T (&cotangent)[K][C][kLanes], Sums* sums) const {
+  CLEAR_INLINE void add_by_quads(int row, const T (&cotangent)[K][kColour][kLanes], Sums* sums) const {
     using L = Lanes<T>;
     using Register = typename L::Register;
     constexpr int n = L::registers;
@@ -177,7 +172,7 @@ struct BlockSums {
       for (int i = 1; i < n; ++i) m += v.r[i], my += along.r[i], myy += along.r[i] * dy.r[i];
       const Register x = dx.r[0], mx = m * x;  // every register holds whole rows of pixels
       out[0] = m, out[1] = mx, out[2] = my, out[3] = mx * x, out[4] = my * x, out[5] = myy;
-      for (int c = 0; c < C; ++c) {
+      for (int c = 0; c < kColour; ++c) {
         const L parts = L::load(cotangent[k][c]);
         out[6 + c] = w.r[0] * parts.r[0];
         for (int i = 1; i < n; ++i) out[6 + c] += w.r[i] * parts.r[i];
@@ -192,7 +187,7 @@ struct BlockSums {
   }
 
   // Transposed, a lane is a Gaussian; a sum over pixels is then fifteen additions for sixteen Gaussians.
-  CLEAR_INLINE void add_by_transposes(int count, const T (&cotangent)[K][C][kLanes], Sums* sums) {
+  CLEAR_INLINE void add_by_transposes(int count, const T (&cotangent)[K][kColour][kLanes], Sums* sums) {
     using L = Lanes<T>;
     for (int i = count; i < kRows; ++i) {
       L(T(0)).store(weight[i]);
@@ -210,11 +205,11 @@ struct BlockSums {
       for (int i = 0; i < kRows; ++i) v[i] = L::load(q[k][i]);
       transpose(v);
       moments(v, ox, oy, out);
-      L channels[C];
+      L channels[kColour];
       for (L& channel : channels) channel = T(0);
       for (int p = 0; p < kLanes; ++p)
-        for (int c = 0; c < C; ++c) channels[c] += w[p] * L(cotangent[k][c][p]);
-      for (int c = 0; c < C; ++c) out[6 + c] = channels[c];
+        for (int c = 0; c < kColour; ++c) channels[c] += w[p] * L(cotangent[k][c][p]);
+      for (int c = 0; c < kColour; ++c) out[6 + c] = channels[c];
     }
     constexpr int last = Sums::kRows - 1, rest = K * Sums::kWidth - last * kLanes;
     for (int r = 0; r < (rest > kQuad ? last + 1 : last); ++r) {
@@ -264,14 +259,10 @@ struct BlockBack {
 };
 
 //   ∂I·v/∂α_i = T_i (c_i·v) - behind / (1 - α_i)
-// Where α is capped, the image does not depend on the ellipse. Depth is a channel like the others with the value z_i - E and
-// a cotangent that was divided by Σ w: at the E that was drawn, E has the gradient of Σ w_i (z_i - E) / Σ w with E and Σ w held.
-// The difference is small and loses no digits. `depth` is null without depth.
-template <class T, int K, int C>
+// Where α is capped, the image does not depend on the ellipse.
+template <class T, int K>
 void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s, const BlockEnd<T>& end,
-                     const BlockDepth<T>* depth, const T (&cotangent)[K][C][kLanes], BlockBack<T, K>& back,
-                     PairSums<T, K, C>* sums) {
-  constexpr bool has_depth = C == kColourAndDepth;
+                     const T (&cotangent)[K][kColour][kLanes], BlockBack<T, K>& back, PairSums<T, K>* sums) {
   using L = Lanes<T>;
   const PixelCentres<T> pixel(block);
   const L alpha_min = s.alpha_min, alpha_max = s.alpha_max, one = T(1);
@@ -292,13 +283,12 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
   if (last < segment.count) n = int(std::lower_bound(list, list + n, last) - list);
   if (!n) return;
 
-  L through = L::load(back.transmittance), v[K][C], behind[K], expected = T(0);
-  if constexpr (has_depth) expected = L::load(depth->expected);
+  L through = L::load(back.transmittance), v[K][kColour], behind[K];
   for (int k = 0; k < K; ++k) {
     behind[k] = L::load(back.behind[k]);
-    for (int c = 0; c < C; ++c) v[k][c] = L::load(cotangent[k][c]);
+    for (int c = 0; c < kColour; ++c) v[k][c] = L::load(cotangent[k][c]);
   }
-  BlockSums<T, K, C> collected;
+  BlockSums<T, K> collected;
   int count = 0;
   const Ellipse<T>* ellipses = segment.ellipses.data();
   for (int i = n - 1; i >= 0; --i) {
@@ -315,8 +305,7 @@ void blend_block_vjp(const Segment<T>& segment, int block, const Settings<T>& s,
     const Mask<T> moves = kept & (free <= alpha_max);
     weight.store(collected.weight[count]);
     for (int k = 0; k < K; ++k) {
-      L light = v[k][0] * L(e.r) + v[k][1] * L(e.g) + v[k][2] * L(e.b);
-      if constexpr (has_depth) light += v[k][3] * (L(e.z) - expected);
+      const L light = v[k][0] * L(e.r) + v[k][1] * L(e.g) + v[k][2] * L(e.b);
       const L d_alpha = through * light - behind[k] * over;
       where(moves, alpha * d_alpha).store(collected.q[k][count]);
       behind[k] += weight * light;

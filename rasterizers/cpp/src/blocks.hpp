@@ -79,7 +79,7 @@ inline std::uint64_t blocks_in_image(int bin_x, int bin_y, int width, int height
 
 // Gathers a segment's Gaussians and lists those of each block. Masks are computed once and kept for the backward pass.
 template <class T>
-void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_t first, std::uint64_t requested,
+void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_t first, std::uint64_t inside,
             Segment<T>& out) {
   const std::int64_t begin = bins.starts[bin] + first;
   const int n = out.count = int(std::min<std::int64_t>(kSegment, bins.starts[bin + 1] - begin));
@@ -109,7 +109,7 @@ void gather(const Buffer<Ellipse<T>>& ellipses, Bins& bins, int bin, std::int64_
       std::uint64_t fresh[kLanes];
       transpose(rows);
       block_masks(rows, rows[kU] + (rows[kWholeU] - Lanes<T>(X)), rows[kV] + (rows[kWholeV] - Lanes<T>(Y)), fresh);
-      for (int i = 0; i < count; ++i) masks[start + i] = fresh[i] & requested;
+      for (int i = 0; i < count; ++i) masks[start + i] = fresh[i] & inside;
     }
     for (int i = 0; i < count; ++i)
       for (std::uint64_t m = masks[start + i]; m; m &= m - 1) *next[__builtin_ctzll(m)]++ = std::uint16_t(start + i);

@@ -50,9 +50,7 @@ class Frame {
     const Grid<T>& grid = view.target.grid;
     const std::size_t blocks = std::size_t(grid.columns()) * grid.rows() * kBlocks;
     view.ends.reserve_lost(blocks);
-    if (depth) view.depths.reserve_lost(blocks);
-    view.has_depth = depth != nullptr;
-    bands_of(view, kBytesPerPair + sizeof(PairSums<T, kMostCotangents, kColourAndDepth>));  // throws now where the gradients would not fit
+    bands_of(view, kBytesPerPair + sizeof(PairSums<T, kMostCotangents>));  // throws now where the gradients would not fit
     for (const Band& band : bands_of(view, kBytesPerPair)) {
       list(view, band, threads);
       Pool::instance().run(threads, band.bins(), [&](std::int64_t bin) {
@@ -63,22 +61,19 @@ class Frame {
     }
   }
 
-  bool has_depth(int i) const { return views_.at(i).has_depth; }
-
-  // The gradients [K, n, …] for K cotangents [K, height, width, C].
-  template <int C>
+  // The gradients [K, n, …] for K cotangents [K, height, width, 3].
   void vjp(int i, int K, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
     View& view = views_.at(i);
-    const std::int64_t image = std::int64_t(view.target.grid.width) * view.target.grid.height * C;
+    const std::int64_t image = std::int64_t(view.target.grid.width) * view.target.grid.height * kColour;
     for (int k = 0; k < K;) {
       const int now = std::min(kMostCotangents, K - k);
       const std::int64_t at = k * n_;
       Gradients<T> part{out.means + 3 * at,     out.quats + 4 * at,  out.scales + 3 * at,
                         out.opacities + at, out.screen + 2 * at, out.rgb + 3 * at};
-      if (now == 1) vjp_of<1, C>(view, cotangents + k * image, splats, part, threads);
+      if (now == 1) vjp_of<1>(view, cotangents + k * image, splats, part, threads);
       if constexpr (kMostCotangents > 1) {
-        if (now == 2) vjp_of<2, C>(view, cotangents + k * image, splats, part, threads);
-        if (now == 3) vjp_of<3, C>(view, cotangents + k * image, splats, part, threads);
+        if (now == 2) vjp_of<2>(view, cotangents + k * image, splats, part, threads);
+        if (now == 3) vjp_of<3>(view, cotangents + k * image, splats, part, threads);
       }
       k += now;
     }
@@ -127,8 +122,6 @@ class Frame {
   struct View {
     Target<T> target;
     Buffer<BlockEnd<T>> ends;           // [bins, 64]
-    Buffer<BlockDepth<T>> depths;       // [bins, 64] if depth was drawn
-    bool has_depth = false;
     Bins bins;                          // the last listed band
   };
 
@@ -154,13 +147,13 @@ class Frame {
     return bands;
   }
 
-  // The pairs of each bin of the image, requested or not.
+  // The pairs of each bin of the image.
   std::vector<std::uint32_t> pairs_in_bins(const View& view) const {
     Coverage coverage(whole(view.target.grid));
     for (std::int64_t c = 0; c < drawn_.chunks(); ++c)
       for (const std::uint32_t* i = drawn_.begin(c); i < drawn_.end(c); ++i) coverage.add(view.target.ranges[*i]);
     std::vector<std::uint32_t> pairs(whole(view.target.grid).bins());
-    coverage.each(view.target.grid.columns(), [&](int bin, std::int64_t, std::uint32_t count) { pairs[bin] = count; });
+    coverage.each([&](int bin, std::uint32_t count) { pairs[bin] = count; });
     return pairs;
   }
 
@@ -192,16 +185,15 @@ class Frame {
   static Band whole(const Grid<T>& grid) { return {0, grid.columns(), 0, grid.rows()}; }
 
   void list(View& view, const Band& band, int threads) {
-    list_pairs(band, whole(view.target.grid), drawn_, order_, view.target.ranges, view.target.request, view.bins, threads);
+    list_pairs(band, whole(view.target.grid), drawn_, order_, view.target.ranges, view.bins, threads);
   }
 
-  // The job of a bin of the band, with its requested blocks.
+  // The job of a bin of the band.
   BinJob<T> job(View& view, std::int64_t bin) const {
     const Grid<T>& s = view.target.grid;
     const Band& band = view.bins.band;
     const int x = band.x0 + int(bin) % band.columns(), y = band.y0 + int(bin) / band.columns();
     const std::size_t place = std::size_t(y) * s.columns() + x;
-    const std::uint64_t inside = blocks_in_image(x, y, s.width, s.height);
     return {settings_,
             s,
             view.target.ellipses,
@@ -209,15 +201,13 @@ class Frame {
             int(bin),
             x,
             y,
-            inside,
-            inside & view.target.request.blocks(std::int64_t(place)),
-            view.ends.data() + place * kBlocks,
-            view.has_depth ? view.depths.data() + place * kBlocks : nullptr};
+            blocks_in_image(x, y, s.width, s.height),
+            view.ends.data() + place * kBlocks};
   }
 
-  template <int K, int C>
+  template <int K>
   void vjp_of(View& view, const T* cotangents, const Splats<T>& splats, const Gradients<T>& out, int threads) {
-    using Sums = PairSums<T, K, C>;
+    using Sums = PairSums<T, K>;
     const std::vector<Band> bands = bands_of(view, kBytesPerPair + sizeof(Sums));
     const bool whole = bands.size() == 1;
     Buffer<Sums> pair_sums, splat_sums;  // by pair; by Gaussian, when there are several bands
@@ -229,7 +219,7 @@ class Frame {
       if (view.bins.band != band) list(view, band, threads);
       pair_sums.reserve_lost(view.bins.pairs.size());
       Pool::instance().run(threads, band.bins(),
-                           [&](std::int64_t bin) { blend_vjp_bin<T, K, C>(job(view, bin), cotangents, pair_sums.data()); });
+                           [&](std::int64_t bin) { blend_vjp_bin<T, K>(job(view, bin), cotangents, pair_sums.data()); });
       view.bins.has_masks = true;
       if (whole) break;
       Pool::instance().run(threads, chunks_of(n_),
@@ -260,8 +250,8 @@ class Frame {
   }
 
   // The gradients of a chunk's Gaussians from `sums`, by pair where one band is the whole image, else by Gaussian.
-  template <int K, int C>
-  void vjp_of_chunk(const View& view, const Splats<T>& splats, std::int64_t chunk, bool whole, const PairSums<T, K, C>* sums,
+  template <int K>
+  void vjp_of_chunk(const View& view, const Splats<T>& splats, std::int64_t chunk, bool whole, const PairSums<T, K>* sums,
                     const Gradients<T>& out) {
     constexpr std::int64_t ahead = 6 * kLanes;
     const std::int64_t first = chunk * kChunk, end = std::min(n_, first + kChunk);
@@ -281,7 +271,7 @@ class Frame {
     const std::int64_t known = sparse ? count : count + ahead;
     for (std::int64_t at = 0; at < count; at += kLanes) {
       const Group group(numbers + at, count - at);
-      Lanes<T> rows[PairSums<T, K, C>::kRows][kLanes];
+      Lanes<T> rows[PairSums<T, K>::kRows][kLanes];
       fetch_rows(splats, view.target, slopes_, numbers + std::min(known, at + 2 * kLanes),
                  numbers + std::min(known, at + 3 * kLanes));
       if (whole) {
@@ -295,7 +285,7 @@ class Frame {
       for (auto& row : rows) transpose(row);
       std::uint32_t bits = 0;
       for (int i = 0; i < group.count; ++i) bits |= std::uint32_t(sparse || touched(group.rows[i])) << i;
-      project_vjp_group(pose_, settings_, splats, view.target, slopes_, group, K, C, rows[0], bits, out);
+      project_vjp_group(pose_, settings_, splats, view.target, slopes_, group, K, rows[0], bits, out);
     }
   }
 

@@ -26,7 +26,7 @@ struct Group {
   }
 };
 
-// The Gaussians that some grid draws: visible, and on a requested bin. By chunk, ascending.
+// The Gaussians that some grid draws. By chunk, ascending.
 class Drawn {
  public:
   void reserve(std::int64_t n) {

@@ -13,9 +13,8 @@ struct BinJob {
   const Buffer<Ellipse<T>>& ellipses;
   Bins& bins;
   int bin, x, y;                 // its index in the band, and its place on the pixel grid
-  std::uint64_t inside, requested;  // blocks in the image; the requested ones among them
+  std::uint64_t inside;          // blocks in the image
   BlockEnd<T>* ends;             // [64]
-  BlockDepth<T>* depths;         // [64], or null if depth is not drawn
 
   std::int64_t pairs() const { return bins.starts[bin + 1] - bins.starts[bin]; }
   int block_x(int block) const { return x * kBin + block % kBlocksAcross * kBlock; }
@@ -28,46 +27,17 @@ Segment<T>& thread_segment() {
   return segment;
 }
 
-// Copies numbers to memory past the caches, where their places are aligned.
+// The expected depth of a block's pixels, 0 where nothing is drawn.
 template <class T>
-CLEAR_INLINE void stream_copy(const T* from, int count, T* to) {
-  if (count % kLanes || reinterpret_cast<std::uintptr_t>(to) % (kLanes * sizeof(T))) {
-    std::memcpy(to, from, sizeof(T) * count);
-  } else {
-    for (int i = 0; i < count; i += kLanes) Lanes<T>::load(from + i).stream(to + i);
-  }
-}
-
-// A bin without a requested block shows the background, and depth 0 if it is not null.
-template <class T>
-void fill_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
-  const int x = job.x * kBin, columns = std::min(kBin, job.grid.width - x);
-  T pixels[3 * kBin], zeros[kBin] = {};
-  for (int i = 0; i < 3 * kBin; ++i) pixels[i] = job.settings.background[i % 3];
-  for (int y = job.y * kBin; y < std::min(job.grid.height, (job.y + 1) * kBin); ++y) {
-    const std::int64_t at = std::int64_t(y) * job.grid.width + x;
-    stream_copy(pixels, 3 * columns, image + 3 * at);
-    stream_copy(zeros, columns, alpha + at);
-    if (depth) stream_copy(zeros, columns, depth + at);
-  }
-  end_of_stream();
-}
-
-// The expected depth of a block's pixels.
-template <class T>
-CLEAR_INLINE Lanes<T> expected_depth(const BlockBlend<T, kColourAndDepth>& blend, BlockDepth<T>& out) {
+CLEAR_INLINE Lanes<T> expected_depth(const BlockBlend<T, kColourAndDepth>& blend) {
   using L = Lanes<T>;
   const L weight = L::load(blend.sums[kColourAndDepth]);
-  const L over = where(weight > L(T(0)), L(T(1)) / weight), expected = L::load(blend.sums[kColour]) * over;
-  expected.store(out.expected), over.store(out.over_weight);
-  return expected;
+  return L::load(blend.sums[kColour]) * where(weight > L(T(0)), L(T(1)) / weight);
 }
 
 // Draws the bin's pixels into an image [height, width, 3] and alpha and depth [height, width]; depth is null for C = kColour.
-// Blocks not requested show the background.
 template <class T, int C>
 void draw_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
-  if (!job.requested) return fill_bin(job, image, alpha, depth);
   using L = Lanes<T>;
   static thread_local BlockBlend<T, C> scratch[kBlocks];
   BlockBlend<T, C>* blends = scratch;
@@ -77,10 +47,10 @@ void draw_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
     blends[b] = {};
   });
   const std::int64_t n = job.pairs();
-  std::uint64_t open = job.requested;
+  std::uint64_t open = job.inside;
   for (std::int64_t first = 0; first < n && open; first += kSegment) {
     Segment<T>& part = thread_segment<T>();
-    gather(job.ellipses, job.bins, job.bin, first, job.requested, part);
+    gather(job.ellipses, job.bins, job.bin, first, job.inside, part);
     each_bit(open, [&](int b) {
       if (!part.lengths[b]) return;
       blend_block(part, b, job.settings, blends[b], job.ends[b]);
@@ -94,72 +64,69 @@ void draw_bin(const BinJob<T>& job, T* image, T* alpha, T* depth) {
     store_block<3>(image, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), pixel);
     store_block<1>(alpha, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), cover);
     if constexpr (C == kColourAndDepth) {
-      const L expected[1] = {expected_depth(blends[b], job.depths[b])};
+      const L expected[1] = {expected_depth(blends[b])};
       store_block<1>(depth, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), expected);
     }
   });
 }
 
 // The state of a bin's blocks in the backward pass.
-template <class T, int K, int C>
+template <class T, int K>
 struct BinVjp {
   BlockBack<T, K> back[kBlocks];
-  T cotangent[kBlocks][K][C][kLanes];
+  T cotangent[kBlocks][K][kColour][kLanes];
 };
 
-template <class T, int K, int C>
-void start_vjp(const BinJob<T>& job, const T* cotangents, BinVjp<T, K, C>& out) {
+template <class T, int K>
+void start_vjp(const BinJob<T>& job, const T* cotangents, BinVjp<T, K>& out) {
   using L = Lanes<T>;
-  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * C;
-  each_bit(job.requested, [&](int b) {
+  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * kColour;
+  each_bit(job.inside, [&](int b) {
     const L through = L::load(job.ends[b].transmittance);
     through.store(out.back[b].transmittance);
     for (int k = 0; k < K; ++k) {
-      L v[C], light = T(0);
-      load_block<C>(cotangents + k * image, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), v);
+      L v[kColour], light = T(0);
+      load_block<kColour>(cotangents + k * image, job.grid.width, job.grid.height, job.block_x(b), job.block_y(b), v);
       for (int c = 0; c < kColour; ++c) light += v[c] * L(job.settings.background[c]);
-      if constexpr (C == kColourAndDepth) v[kColour] *= L::load(job.depths[b].over_weight);
-      for (int c = 0; c < C; ++c) v[c].store(out.cotangent[b][k][c]);
+      for (int c = 0; c < kColour; ++c) v[c].store(out.cotangent[b][k][c]);
       (through * light).store(out.back[b].behind[k]);
     }
   });
 }
 
 // Prefetches a bin's cotangents, whose rows lie far apart in memory, while its Gaussians are gathered.
-template <class T, int K, int C>
+template <class T, int K>
 CLEAR_INLINE void fetch_cotangents(const BinJob<T>& job, const T* cotangents) {
-  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * C;
+  const std::int64_t image = std::int64_t(job.grid.width) * job.grid.height * kColour;
   for (int k = 0; k < K; ++k)
     for (int y = job.y * kBin; y < std::min(job.grid.height, (job.y + 1) * kBin); ++y)
-      for (int x = 0; x < C * kBin; x += kLanes)
-        __builtin_prefetch(cotangents + k * image + (std::int64_t(y) * job.grid.width + job.x * kBin) * C + x);
+      for (int x = 0; x < kColour * kBin; x += kLanes)
+        __builtin_prefetch(cotangents + k * image + (std::int64_t(y) * job.grid.width + job.x * kBin) * kColour + x);
 }
 
 // The backward pass of a bin, back to front. Writes the sums of all its pairs.
-template <class T, int K, int C>
-void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T, K, C>* pair_sums) {
+template <class T, int K>
+void blend_vjp_bin(const BinJob<T>& job, const T* cotangents, PairSums<T, K>* pair_sums) {
   const std::int64_t n = job.pairs();
   if (!n) return;
-  static thread_local BinVjp<T, K, C> scratch;
-  BinVjp<T, K, C>& mine = scratch;
-  fetch_cotangents<T, K, C>(job, cotangents);
+  static thread_local BinVjp<T, K> scratch;
+  BinVjp<T, K>& mine = scratch;
+  fetch_cotangents<T, K>(job, cotangents);
   std::int64_t end = 0;  // no pixel blended a pair from here on, and their segments may not have been listed
-  each_bit(job.requested, [&](int b) {
+  each_bit(job.inside, [&](int b) {
     for (std::int32_t e : job.ends[b].ended) end = std::max<std::int64_t>(end, std::min<std::int64_t>(e, n));
   });
   bool started = false;
   for (std::int64_t first = (n - 1) / kSegment * kSegment; first >= 0; first -= kSegment) {
     const std::int64_t count = std::min<std::int64_t>(kSegment, n - first);
-    PairSums<T, K, C>* sums = pair_sums + job.bins.starts[job.bin] + first;
+    PairSums<T, K>* sums = pair_sums + job.bins.starts[job.bin] + first;
     std::memset(static_cast<void*>(sums), 0, sizeof *sums * count);
     if (first >= end) continue;
     Segment<T>& part = thread_segment<T>();
-    gather(job.ellipses, job.bins, job.bin, first, job.requested, part);
+    gather(job.ellipses, job.bins, job.bin, first, job.inside, part);
     if (!std::exchange(started, true)) start_vjp(job, cotangents, mine);
-    each_bit(job.requested, [&](int b) {
-      if (part.lengths[b])
-        blend_block_vjp<T, K, C>(part, b, job.settings, job.ends[b], job.depths ? job.depths + b : nullptr,
-                                 mine.cotangent[b], mine.back[b], sums);
+    each_bit(job.inside, [&](int b) {
+      if (part.lengths[b]) blend_block_vjp<T, K>(part, b, job.settings, job.ends[b], mine.cotangent[b], mine.back[b], sums);
     });
   }
 }

@@ -1,8 +1,6 @@
 // Projects every group of sixteen Gaussians onto each pixel grid of a pose, and computes the colours of those that are drawn.
 #pragma once
 
-#include <bit>
-
 #include "bins.hpp"
 #include "colour.hpp"
 #include "columns.hpp"
@@ -24,7 +22,6 @@ struct Target {
   const T* rgb_offset;  // [n, 3] or null
   T* means2d;           // out [n, 2]
   bool* visible;        // out [n]
-  Request request;
   Buffer<BinRange> ranges;       // [n]; empty if the Gaussian is not drawn
   Buffer<Ellipse<T>> ellipses;   // [n]; of the drawn Gaussians
   Buffer<std::uint8_t> lit;      // [n]; bit c: channel c was not clamped at 0, and so has a gradient
@@ -47,23 +44,6 @@ CLEAR_INLINE void bins_of(const Grid<T>& grid, const Lanes<T> (&e)[kLanes], std:
   for (int i = 0; i < count; ++i)
     out[i] = (shown >> i) & 1 ? BinRange{std::int16_t(x0[i]), std::int16_t(x1[i]), std::int16_t(y0[i]), std::int16_t(y1[i])}
                               : BinRange{};
-}
-
-// The visible Gaussians with a requested bin; the ranges of the others become empty.
-// Not inlined: `project_group` has no registers left for its loop.
-template <class T>
-__attribute__((noinline)) std::uint32_t keep_requested(const Target<T>& target, std::uint32_t visible, int count,
-                                                       BinRange* ranges) {
-  if (target.request.all()) return visible;
-  std::uint32_t kept = 0;
-  for (int i = 0; i < count; ++i) {
-    const bool any = target.request.bins_in(ranges[i]) > 0;
-    const std::uint64_t keep = -std::uint64_t(any);
-    const auto range = std::bit_cast<std::uint64_t>(ranges[i]), none = std::bit_cast<std::uint64_t>(BinRange{});
-    ranges[i] = std::bit_cast<BinRange>((range & keep) | (none & ~keep));
-    kept |= std::uint32_t(any) << i;
-  }
-  return kept;
 }
 
 // Whether the minimum of A dx² + B dx dy + C dy² over the box of the image's pixel centres is within reach; exact. A convex
@@ -157,13 +137,12 @@ std::uint32_t project_group(const Pose& pose, const Settings<T>& s, const Splats
     store_rows<2>(target.means2d, first, count, uv);
     store_bits(target.visible + first, count, visible);
     bins_of(target.grid, e, visible, count, target.ranges.data() + first);
-    const std::uint32_t drawn = keep_requested(target, visible, count, target.ranges.data() + first);
-    any |= drawn;
-    if (!drawn) continue;
+    any |= visible;
+    if (!visible) continue;
     e[kRed] = e[kGreen] = e[kBlue] = e[15] = T(0);  // the colour is written by `colour_group`
     e[kDepth] = g.z;
     transpose(e);
-    each_bit(drawn, [&](int i) CLEAR_LAMBDA { e[i].store(&target.ellipses[first + i].u); });
+    each_bit(visible, [&](int i) CLEAR_LAMBDA { e[i].store(&target.ellipses[first + i].u); });
   }
   finite &= (poison >= L(T(0))).bits() == 0xffff;
   return any;

@@ -55,7 +55,7 @@ CLEAR_INLINE void fetch_rows(const Splats<T>& splats, const Target<T>& target, c
 // The gradients of a group from its Gaussians' sums, `PairSums` in columns; those of its lanes that are not `touched` are zeros.
 template <class T>
 void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& splats, const Target<T>& target,
-                       const Buffer<Slope<T>>& slopes, const Group& group, int K, int C, const Lanes<T>* sums,
+                       const Buffer<Slope<T>>& slopes, const Group& group, int K, const Lanes<T>* sums,
                        std::uint32_t touched, const Gradients<T>& out) {
   using L = Lanes<T>;
   const Mask<T> real = Mask<T>::from_bits(touched);
@@ -74,7 +74,7 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
     transpose(slope);
   }
   for (int k = 0; k < K; ++k) {
-    const L* sum = sums + k * (6 + C);
+    const L* sum = sums + k * PairSums<T, 1>::kWidth;
     LaneGradients<T> gradient;
     project_vjp(pose, target.grid, s, g, f, scale, opacity, sum[0], sum[1], sum[2], sum[3], sum[4], sum[5], gradient);
     L rgb[3];
@@ -86,8 +86,6 @@ void project_vjp_group(const Pose& pose, const Settings<T>& s, const Splats<T>& 
     auto keep = [&](auto& columns) {
       for (L& column : columns) column = where(real, column);
     };
-    if (C == kColourAndDepth)
-      for (int axis = 0; axis < 3; ++axis) gradient.mean[axis] += L(T(pose.R[6 + axis])) * sum[9];
     L alone[1] = {gradient.opacity};
     keep(gradient.mean), keep(gradient.quat), keep(gradient.scale), keep(gradient.screen), keep(rgb), keep(alone);
     const std::int64_t at = k * splats.n;

@@ -88,13 +88,13 @@ static_assert(sizeof(Ellipse<float>) == 64);
 // Indices of an Ellipse's fields among its sixteen numbers.
 enum Field { kU, kV, kA, kB, kC, kPeak, kReach, kHalfX, kHalfY, kRed, kGreen, kBlue, kDepth, kWholeU, kWholeV };
 
-inline constexpr int kColour = 3, kColourAndDepth = 4;  // channels of an image
+inline constexpr int kColour = 3, kColourAndDepth = 4;  // channels that are blended
 
 // Sums over the pixels of a (Gaussian, bin) pair, for each of K cotangents: q = ∂L/∂(log alpha), q's moments about the centre
-// x, y, xx, xy, yy, and ∂L/∂(r, g, b) or (r, g, b, z). Packed, because they are written, read and transposed by sixteen.
-template <class T, int K, int C>
+// x, y, xx, xy, yy, and ∂L/∂(r, g, b). Packed, because they are written, read and transposed by sixteen.
+template <class T, int K>
 struct alignas(kLanes * sizeof(T)) PairSums {
-  static constexpr int kWidth = 6 + C, kRows = (K * kWidth + kLanes - 1) / kLanes;
+  static constexpr int kWidth = 6 + kColour, kRows = (K * kWidth + kLanes - 1) / kLanes;
   T numbers[kRows * kLanes];
 };
 

@@ -68,19 +68,13 @@ class WarpGaussianStep:
             view,
         )
 
-    def compare(self, products: Tensor | None = None) -> Comparison:
+    def compare(self) -> Comparison:
         if self._n and not self._has_base:
             raise ValueError("there is no HR gradient to compare with.")
-        if products is not None:
-            self._required("products", products, (_GROUPS, self._n), torch.float64)
-        counts, norms = self._blocks(passes.Counts, torch.int32), self._blocks(passes.Norms, torch.float64)
+        counts = self._blocks(passes.Counts, torch.int32)
         with on_stream(self._like.device):
-            self._launch_tiled(
-                passes.compare, *self._gradients, products is not None, array(products),
-                array(counts, passes.Counts), array(norms, passes.Norms),
-            )  # fmt: skip
-        (comparable, opposed), (norm_lr, norm_hr) = counts.sum(0).view(2, -1), norms.sum(0).view(2, -1)
-        return Comparison(comparable, opposed, norm_lr, norm_hr)
+            self._launch_tiled(passes.compare, *self._gradients, array(counts, passes.Counts))
+        return Comparison(*counts.sum(0).view(2, -1))
 
     def step(
         self, attributes: Mapping[str, Attribute], correction: Correction | None, settings: StepSettings
@@ -99,10 +93,11 @@ class WarpGaussianStep:
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
         counts, omegas = self._blocks(passes.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
-        (rule, *numbers), adam_step = self._rule(correction), _adam(settings)
+        rule, adam_step = self._rule(correction), _adam(settings)
+        reliability = None if correction is None else correction.reliability
         with on_stream(self._like.device):
             self._launch_tiled(
-                passes.step, *self._gradients, rule, *(array(x) for x in numbers), self._options(correction, settings),
+                passes.step, *self._gradients, rule, array(reliability), self._options(correction, settings),
                 adam_step, *parameters.values(), bands, array(settings.visible), array(colours), array(moving),
                 array(counts, passes.Counts), array(omegas, conflict.Six),
             )  # fmt: skip
@@ -152,23 +147,19 @@ class WarpGaussianStep:
         out.corrects, out.has_visible = correction is not None, settings.visible is not None
         return out
 
-    def _rule(self, c: Correction | None) -> tuple[Any, Tensor | None, Tensor | None, Tensor | None]:
-        """The settings, and ε of the cosine, ε of the correction and q as tensors."""
+    def _rule(self, c: Correction | None) -> Any:
         rule = conflict.Rule()
         if c is None:
-            return rule, None, None, None
+            return rule
+        if len(c.groups) != _GROUPS:
+            raise ValueError(f"groups must have one entry for each of {_GROUPS} conflict groups.")
         rule.groups = sum(on << k for k, on in enumerate(c.groups))
         rule.tolerance, rule.weight_min, rule.weight_max = c.tolerance, c.weight_min, c.weight_max
-        rule.rotation_noise, rule.bounds_hold_omega = c.rotation_noise, c.bounds_hold_omega
-        eps_cos, eps_corr = (
-            torch.as_tensor(x, dtype=torch.float64, device=self._like.device) for x in (c.eps_cos, c.eps_corr)
-        )
-        if not len(c.groups) == len(eps_cos) == len(eps_corr) == _GROUPS:
-            raise ValueError(f"groups, eps_cos and eps_corr must have one entry for each of {_GROUPS} conflict groups.")
+        rule.rotation_noise = c.rotation_noise
         rule.has_reliability = c.reliability is not None
         if c.reliability is not None:
             self._required("reliability", c.reliability, (self._n,), torch.float32)
-        return rule, eps_cos, eps_corr, c.reliability
+        return rule
 
     def _structure(
         self,

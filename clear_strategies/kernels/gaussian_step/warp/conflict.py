@@ -38,14 +38,13 @@ class Products:
 @wp.struct
 @no_type_check
 class Rule:
-    """GCO's settings without ε, which is read from device memory because it may depend on the comparison."""
+    """GCO's settings."""
 
     groups: wp.int32  # bit k: group k is corrected
     tolerance: wp.float64
     weight_min: wp.float64
     weight_max: wp.float64
     rotation_noise: wp.float64  # a ‖g_quats‖ up to this times ‖g_scales‖ counts as rounding
-    bounds_hold_omega: wp.bool  # weight_min and weight_max bound ω, else the coefficient
     has_reliability: wp.bool  # else q = 0
 
 
@@ -110,8 +109,6 @@ def turns_something(p: Products, rotation_noise: wp.float64) -> wp.bool:
 def correct(
     p: Products,
     rule: Rule,
-    eps_cos: wp.array[wp.float64],
-    eps_corr: wp.array[wp.float64],
     reliability: wp.array[wp.float32],
     i: wp.int32,
 ) -> Corrected:
@@ -126,15 +123,11 @@ def correct(
             apart = apart and turns_something(p, rule.rotation_noise)
         if apart:
             n = wp.sqrt(p.l2[k] * p.h2[k])  # ‖low‖‖high‖; a product of four floats fits a float64
-            cosine = p.dot[k] / wp.max(n + eps_cos[k], SMALLEST)  # Eq. 6
+            cosine = p.dot[k] / wp.max(n, SMALLEST)  # Eq. 6
             if n > wp.float64(0.0) and cosine < -tolerance:
                 omega = wp.clamp((-cosine - tolerance) / (one - tolerance), wp.float64(0.0), one) * (one - q)  # Eq. 11
-                coefficient = (p.dot[k] + tolerance * n) / (p.l2[k] + eps_corr[k])
-                if rule.bounds_hold_omega:
-                    omega = wp.clamp(omega, rule.weight_min, rule.weight_max)
-                    multiple[k] = omega * coefficient
-                else:
-                    multiple[k] = -wp.clamp(wp.abs(omega * coefficient), rule.weight_min, rule.weight_max)
+                omega = wp.clamp(omega, rule.weight_min, rule.weight_max)
+                multiple[k] = omega * ((p.dot[k] + tolerance * n) / p.l2[k])
                 omegas[k] = omega
                 rows |= 1 << k
                 if omega <= rule.weight_min:

@@ -42,8 +42,6 @@ Counts: Final[Any] = wp.types.vector(length=14, dtype=wp.int32)
 """For `compare`: comparable and opposed Gaussians, [7] each. For `step`: rows corrected, and with ω at its lower bound, [6]
 each; then still and invisible rows.
 """
-Norms: Final[Any] = wp.types.vector(length=12, dtype=wp.float64)
-"""Σ ‖l‖ and Σ ‖h‖ [6] each."""
 
 
 @wp.struct
@@ -66,15 +64,12 @@ def compare(
     base: Gradient,
     hf: Gradient,
     view: View,
-    has_products: wp.bool,
-    norm_products: wp.array2d[wp.float64],
     counts: wp.array[Counts],
-    norms: wp.array[Norms],
 ) -> None:
-    """One thread per Gaussian: whether its gradients are comparable and opposed, and their norms."""
+    """One thread per Gaussian: whether its gradients are comparable and opposed."""
     block, lane = wp.tid()
     i = block * wp.block_dim() + lane
-    found, lengths = Counts(), Norms()
+    found = Counts()
     if i < view.n:
         g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
         p = group_products(g_lr, g_hr, lr, base, view, i)
@@ -84,15 +79,7 @@ def compare(
                 found[k] = 1
                 if p.dot[k] < wp.float64(0.0):
                     found[GROUPS + 1 + k] = 1
-            if k < GROUPS:
-                norm_l, norm_h = wp.sqrt(p.l2[k]), wp.sqrt(p.h2[k])
-                if comparable:
-                    lengths[k] = norm_l
-                    lengths[GROUPS + k] = norm_h
-                if has_products:
-                    norm_products[k, i] = norm_l * norm_h
     wp.tile_store(counts, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(block,))
-    wp.tile_store(norms, wp.tile_sum(wp.tile(lengths, preserve_type=True)), offset=(block,))
 
 
 @wp.kernel
@@ -104,8 +91,6 @@ def step(
     hf: Gradient,
     view: View,
     rule: Rule,
-    eps_cos: wp.array[wp.float64],
-    eps_corr: wp.array[wp.float64],
     reliability: wp.array[wp.float32],
     options: StepOptions,
     adam: AdamStep,
@@ -138,7 +123,7 @@ def step(
     change = Corrected()
     if options.corrects:
         products = group_products(g_lr, g_hr, lr, base, view, i)
-        change = correct(products, rule, eps_cos, eps_corr, reliability, i)
+        change = correct(products, rule, reliability, i)
 
     moves, λ = may_step and not still, options.lambda_hr
     d_means = merged3(g_lr.means, g_hr.means, change.multiple[MEANS], λ)
