@@ -17,7 +17,7 @@ from clear_strategies.core.gradients import Shot
 from clear_strategies.density.base import DensityError, require_in_range, structure_marks
 from clear_strategies.density.threshold import count_passing, topk_mask
 from clear_strategies.errors import SettingError
-from clear_strategies.merging.conductor import Update
+from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import milestone
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam

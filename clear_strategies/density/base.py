@@ -11,7 +11,7 @@ from torch import Tensor
 
 from clear_strategies.core.gradients import Shot
 from clear_strategies.errors import ClearError, SettingError
-from clear_strategies.merging.conductor import Update
+from clear_strategies.merging.iteration import Update
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam
 

@@ -1,40 +1,47 @@
-"""Density control by a strategy of gsplat's interface, over our field.
+"""Density control by a strategy of gsplat's interface, over this trainer's field.
 
 gsplat's strategies rewrite dicts of parameters and of optimizers by gathering rows, and read the gradient of the projected
-centres. They receive our parameters, our Adam's moments and our score in that form, and their result is copied back. Row
-numbers are passed as one more parameter and gathered with the others, which gives parents[M] exactly.
+centres. They receive the field's parameters, Adam's moments and the score in that form (`lent`), and their result is copied back.
 """
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import logging
 import sys
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import metadata
 from typing import Any, Final, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 from torch import Tensor, nn
 
 from clear_strategies.core.finite import require_finite
-from clear_strategies.core.gradients import ATTRIBUTES, Shot
+from clear_strategies.core.gradients import Shot
 from clear_strategies.density.base import DensityError, require_in_range, structure_marks
+from clear_strategies.density.lent import (
+    ROWS,
+    Info,
+    Optimizer,
+    RowNumbers,
+    ViewScores,
+    gsplat_version,
+    info_of,
+    lend,
+    take_back,
+)
+from clear_strategies.density.strategy_class import strategy_class, unusable
 from clear_strategies.density.threshold import topk_threshold
-from clear_strategies.errors import DataError, SettingError
-from clear_strategies.merging.conductor import Update
+from clear_strategies.errors import SettingError
+from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import milestone
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam
 
 _log = logging.getLogger(__name__)
 
-_ROWS: Final = "rows"  # the parameter that holds the row numbers
 # gsplat's name of a setting -> ours.
 _OURS: Final = {
     "refine_start_iter": "start",
@@ -44,7 +51,6 @@ _OURS: Final = {
     "grow_grad2d": "threshold",
     "cap_max": "max_gaussians",
 }
-_NEEDS_CUDA: Final = "gsplat.strategy.mcmc.MCMCStrategy"
 # Settings that need statistics which this trainer does not report -> the value that needs none, and what they need.
 _NOT_REPORTED: Final = {
     "absgrad": (False, "absolute screen gradients"),
@@ -105,10 +111,10 @@ class GsplatSettings:
 
     def _build(self, device: torch.device) -> Any:
         given = dict(self.strategy)
-        kind = _imported(given.pop("_target_", None), device)
+        kind = strategy_class(given.pop("_target_", None), device)
         for name, (silent, what) in _NOT_REPORTED.items():
             if given.get(name, silent) != silent:
-                raise _unusable(name, f"asks for {what}, which our rasterizers do not report", f"leave it at {silent}")
+                raise unusable(name, f"asks for {what}, which our rasterizers do not report", f"leave it at {silent}")
         ours = {theirs: getattr(self, name) for theirs, name in _OURS.items()}
         ours["reset_every"] = self.reset_every or sys.maxsize
         accepted = inspect.signature(kind).parameters
@@ -120,19 +126,7 @@ class GsplatSettings:
         try:
             return kind(**given, **taken)
         except (TypeError, ValueError) as error:
-            raise _unusable("", f"{kind.__name__} cannot be built: {error}", "see its own documentation") from error
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _ViewScores:
-    """The scores of one view; `score` is the same tensor as `ordinary` where no strategy gives another."""
-
-    score: Float[Tensor, " N"]
-    ordinary: Float[Tensor, " N"]
-    visible: Bool[Tensor, " N"]
-    means2d: Float[Tensor, "N 2"]
-    width: int
-    height: int
+            raise unusable("", f"{kind.__name__} cannot be built: {error}", "see its own documentation") from error
 
 
 class GsplatDensifier:
@@ -159,13 +153,13 @@ class GsplatDensifier:
         self.kind = type(strategy).__name__
         self.state = self._initial_state()
         self.score, self.ordinary, self.count = (torch.zeros(n, device=device) for _ in range(3))
-        self._view_scores: _ViewScores | None = None
+        self._view_scores: ViewScores | None = None
         self._checked = False
         self._warned: set[str] = set()
 
     @property
     def name(self) -> str:
-        version = _gsplat_version()
+        version = gsplat_version()
         return self.kind if version is None else f"{self.kind} (gsplat {version})"
 
     @property
@@ -176,7 +170,7 @@ class GsplatDensifier:
         """Keep this view's scores for `step`."""
         height, width = shot.image.shape[:2]
         visible = shot.visible if t > self.settings.statistics_from else torch.zeros_like(shot.visible)
-        self._view_scores = _ViewScores(update.score, update.ordinary, visible, shot.means2d.detach(), width, height)
+        self._view_scores = ViewScores(update.score, update.ordinary, visible, shot.means2d.detach(), width, height)
 
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         """Run the strategy for iteration t.
@@ -197,14 +191,14 @@ class GsplatDensifier:
         params, optimizers = lend(field, optimizer, rates)
         if not self._checked:
             self._check(params, optimizers)
-        info = _Info(_info(seen))
+        info = Info(info_of(seen))
         accepted = inspect.signature(self.strategy.step_post_backward).parameters
         rest = {"lr": rates["means"]} if "lr" in accepted else {}
-        lent = _RowNumbers(params[_ROWS])
+        lent = RowNumbers(params[ROWS])
         with torch.no_grad(), _seeded(self.seed * 1_000_003 + t, lent.rows.device), self._threshold(t):
             self.strategy.step_pre_backward(params, optimizers, self.state, t, info)
             self.strategy.step_post_backward(params, optimizers, self.state, t, info, **rest)
-        moved = not lent.unchanged(params[_ROWS])
+        moved = not lent.unchanged(params[ROWS])
         if moved:  # NaN fails every comparison: such a Gaussian would be pruned as if it were faint
             require_finite(f"t={t}: before densification, the parameter", before)
         parents = take_back(field, optimizer, params, optimizers, self.kind, moved=moved)
@@ -305,7 +299,7 @@ class GsplatDensifier:
     def reset_due(self, t: int) -> bool:
         return t < self.settings.stop and t % getattr(self.strategy, "reset_every", sys.maxsize) == 0
 
-    def _remark(self, t: int, seen: _ViewScores, info: _Info, optimizer: Adam) -> None:
+    def _remark(self, t: int, seen: ViewScores, info: Info, optimizer: Adam) -> None:
         """Warn once of settings that have no effect."""
         if seen.score is not seen.ordinary and "means2d" not in info.read:
             self._warn_once(
@@ -324,126 +318,6 @@ class GsplatDensifier:
             _log.warning("%s", message)
 
 
-class Optimizer:
-    """What a strategy of gsplat's shape may touch of a torch optimizer: one group, and its one parameter's moments."""
-
-    def __init__(self, parameter: nn.Parameter, lr: float, moments: Mapping[str, Tensor]) -> None:
-        self.param_groups: list[dict[str, Any]] = [{"params": [parameter], "lr": lr}]
-        self.state: defaultdict[Tensor, dict[str, Tensor]] = defaultdict(dict, {parameter: dict(moments)})
-
-
-class _RowNumbers:
-    """The row numbers as they were passed in; whether they were gathered is known without reading them."""
-
-    def __init__(self, rows: nn.Parameter) -> None:
-        self.rows, self._version = rows, rows._version
-
-    def unchanged(self, now: Tensor) -> bool:
-        return now is self.rows and now._version == self._version
-
-
-class _Info(dict[str, Any]):
-    """gsplat's `info`, which records the keys that are read."""
-
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        super().__init__(values)
-        self.read: set[str] = set()
-
-    def __getitem__(self, key: str) -> Any:
-        self.read.add(key)
-        return super().__getitem__(key)
-
-    def __missing__(self, key: str) -> Any:
-        raise DensityError(f"the strategy reads info[{key!r}]; this trainer has {', '.join(self)}.")
-
-
-def lend(
-    field: GaussianField, optimizer: Adam, rates: Mapping[str, float]
-) -> tuple[dict[str, nn.Parameter], dict[str, Optimizer]]:
-    """Field and moments as gsplat's dicts, sharing memory, with the row numbers as one more parameter."""
-    params = {name: nn.Parameter(p) for name, p in field.raw().items()}
-    steps = torch.tensor(float(optimizer.steps), device="cpu")  # as torch's Adam keeps it
-    optimizers = {
-        name: Optimizer(
-            p, rates[name], {"step": steps, "exp_avg": optimizer.first[name], "exp_avg_sq": optimizer.second[name]}
-        )
-        for name, p in params.items()
-    }
-    # In float64: a parameter that an optimizer holds cannot be of integers, and these are exact up to 2⁵³.
-    params[_ROWS] = nn.Parameter(torch.arange(len(field), dtype=torch.float64, device=field.means.device))
-    optimizers[_ROWS] = Optimizer(params[_ROWS], 0.0, {})
-    return params, optimizers
-
-
-def take_back(
-    field: GaussianField,
-    optimizer: Adam,
-    params: Mapping[str, Tensor],
-    optimizers: Mapping[str, Optimizer],
-    kind: str = "the strategy",
-    *,
-    moved: bool = True,
-) -> Int[Tensor, " M"]:
-    """Copy a strategy's result into field and moments; returns parents[M].
-
-    Args:
-        moved: whether the row numbers may have changed.
-
-    Raises:
-        DensityError: the rows of parameters, moments and row numbers do not belong together.
-    """
-    rows = params[_ROWS].detach()
-    parents = rows.long()
-    if moved and not bool(((parents == rows) & (parents >= 0) & (parents < len(field))).all()):
-        raise DensityError(f"{kind} changed the parameter {_ROWS!r}; row numbers may only be gathered.")
-    for name in ATTRIBUTES:
-        p = params[name]
-        moments = optimizers[name].state.get(p, {})
-        for found in (p, moments.get("exp_avg"), moments.get("exp_avg_sq")):
-            if found is None or len(found) != len(parents):
-                raise DensityError(
-                    f"{kind} left {name} with {'no moments' if found is None else f'{len(found)} rows'} where {_ROWS!r} "
-                    f"has {len(parents)}; it must rewrite every entry of params and optimizers alike."
-                )  # fmt: skip
-        getattr(field, name).data = p.detach().contiguous()
-        optimizer.first[name] = moments["exp_avg"].detach().contiguous()
-        optimizer.second[name] = moments["exp_avg_sq"].detach().contiguous()
-    if moved:
-        field.filter_3d = field.filter_3d[parents]
-    field.constrain()
-    return parents
-
-
-def _info(seen: _ViewScores) -> dict[str, Any]:
-    """One camera's `info`, not packed; the screen gradient is the score, along x.
-
-    gsplat takes the gradient in pixels to NDC by W/2 times the number of cameras; so its statistic is the score itself.
-    """
-    means2d = seen.means2d[None].clone().requires_grad_()
-    means2d.grad = torch.zeros_like(means2d)
-    means2d.grad[0, :, 0] = seen.score / (seen.width / 2)
-    radii = seen.visible.float()[None]  # 1 where seen: our rasterizers report no size
-    if _radii_by_axis():
-        radii = radii[..., None].expand(-1, -1, 2)
-    return {
-        "means2d": means2d, "radii": radii, "width": seen.width, "height": seen.height, "n_cameras": 1,
-        "gaussian_ids": None, "camera_ids": None,
-    }  # fmt: skip
-
-
-def _gsplat_version() -> str | None:
-    try:
-        return metadata.version("gsplat")
-    except metadata.PackageNotFoundError:
-        return None
-
-
-def _radii_by_axis() -> bool:
-    """Whether radii are [C, N, 2], as since gsplat 1.5; before they are [C, N]."""
-    version = _gsplat_version()
-    return version is None or tuple(int(part) for part in version.split(".")[:2]) >= (1, 5)
-
-
 @contextmanager
 def _seeded(seed: int, device: torch.device) -> Iterator[None]:
     """Seed torch's global generators, which gsplat uses, and restore them afterwards."""
@@ -453,29 +327,3 @@ def _seeded(seed: int, device: torch.device) -> Iterator[None]:
         if on_cuda:
             torch.cuda.manual_seed(seed)
         yield
-
-
-def _imported(target: str | None, device: torch.device) -> Any:
-    """The class with this dotted name."""
-    if target is None:
-        example = "density.strategy._target_=your_package.YourStrategy"
-        raise _unusable("_target_", "no strategy is named", f"{example}, or density=gsplat_default")
-    module, _, name = target.rpartition(".")
-    try:
-        kind = getattr(importlib.import_module(module), name)
-    except ImportError as error:
-        gsplat = "gsplat" in f"{target} {error}"
-        remedy = "pip install 'clear-strategies[gsplat]'" if gsplat else "correct its dotted name"
-        raise _unusable("_target_", f"{target} cannot be imported ({error})", remedy) from error
-    except (AttributeError, ValueError) as error:
-        raise _unusable("_target_", f"{target} is not there ({error})", "correct its dotted name") from error
-    if f"{kind.__module__}.{kind.__qualname__}" == _NEEDS_CUDA and device.type != "cuda":
-        raise _unusable(
-            "_target_", "gsplat's MCMCStrategy moves Gaussians by CUDA kernels, and these are on the CPU",
-            "take density=gsplat_mcmc, the same strategy with those computations in torch",
-        )  # fmt: skip
-    return kind
-
-
-def _unusable(field: str, problem: str, remedy: str) -> DataError:
-    return DataError("config", f"density.strategy.{field}".rstrip("."), problem, remedy)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -17,15 +16,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from clear_strategies import files
-from clear_strategies.compose import ConductorSettings, tree
+from clear_strategies.compose import tree
 from clear_strategies.data.prepare import save_lr
-from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.scene import Scene
-from clear_strategies.density.base import DensifierSettings
-from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device, resume, scene
-from clear_strategies.jobs.device import Device, RasterizerSettings
 from clear_strategies.jobs.lock import hold
+from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import plan, results, score_table, tensorboard
 from clear_strategies.outputs.baseline import FOLDER as BASELINE
@@ -34,13 +30,8 @@ from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.outputs.remarks import remarks
 from clear_strategies.schedules import scaled
-from clear_strategies.settings import build
 from clear_strategies.training import memory
 from clear_strategies.training.loop import fit
-from clear_strategies.training.mip import MipFilter
-from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.settings import FitSettings
-from clear_strategies.training.skips import Skips
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing import live
 from clear_strategies.viewing.cameras import FILE as CAMERAS
@@ -50,89 +41,6 @@ from clear_strategies.viewing.look import Painter
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunSettings(FitSettings):
-    """Settings of a run: those of its training, what it shows and writes, and where it computes.
-
-    Args:
-        map_views: number of training views with maps of reliability and correction in maps/; 0: none.
-        video: number of frames of path.mp4 and path.gif, a loop through the training cameras, 24 a second; 0: none.
-        verbose: also show on the console the details that run.log holds; `-v` on the command line.
-        page: write splat.html, a page that shows the field in any browser, if the field has at most this many Gaussians;
-            0: never.
-        log: tensorboard writes losses, PSNR, learning rates and a few pictures for TensorBoard; extra [log].
-        viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
-        baseline: first train the same scene with the same settings, but without any strategy, into the folder baseline/ of
-            the run. The contact sheet and the scores then show both. Without effect in a sweep, for a run that has no
-            strategy, and with +method=NAME.
-        resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: look into the run's own
-            folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
-            from the beginning. Both apply to the baseline, too.
-        device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
-            there, else cpu. A run may be resumed on another device; its bits then differ.
-        threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib,
-            Slurm).
-    """
-
-    map_views: int = 3
-    video: int = 72
-    page: int = 500_000
-    log: Literal["tensorboard"] | None = None
-    verbose: bool = False
-    viewer: bool = False
-    baseline: bool = False
-    resume: str | None = None
-    device: Device | None = None
-    threads: int | None = None
-
-    def __post_init__(self) -> None:
-        FitSettings.__post_init__(self)
-        if self.map_views < 0:
-            raise SettingError(f"map_views must be at least 0, got {self.map_views}. 0 writes no maps.")
-        if self.video < 0:
-            raise SettingError(f"video must be at least 0 frames, got {self.video}. 0 writes no video.")
-        if self.page < 0:
-            raise SettingError(f"page must be at least 0 Gaussians, got {self.page}. 0 writes no page.")
-        if self.threads is not None and self.threads < 1:
-            raise SettingError(f"threads must be at least 1, got {self.threads}. null takes all cores.")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JobSettings(ConductorSettings):
-    """The whole of conf/config.yaml, as objects.
-
-    Args:
-        method: which baseline of the papers' tables this is, for the plan and the tables; set by +method=NAME.
-    """
-
-    rasterizer: RasterizerSettings | functools.partial[Any]
-    prior: scene.PriorSettings
-    data: scene.DataSettings
-    density: DensifierSettings
-    optim: LearningRates
-    skips: Skips
-    fit: RunSettings = field(default_factory=RunSettings)
-    mip: MipFilter = field(default_factory=MipFilter)
-    method: str | None = None
-
-    def __post_init__(self) -> None:
-        if isinstance(self.prior, functools.partial):
-            self.prior(truth={})  # it waits for the photos; its own settings are refused now
-        for decorate in self.decorators.values():
-            decorate(Bicubic())  # likewise
-        scene.require_factor(self.prior, self.data.views.sr_scale)
-
-
-def settings_of(values: Mapping[str, Any]) -> JobSettings:
-    """The settings of a resolved configuration, see `compose.tree`.
-
-    Raises:
-        SettingError: one cannot be used; the message begins with its key.
-    """
-    settings: JobSettings = build({**values, "rasterizer": device.rasterizer_node(values["rasterizer"])})
-    return settings
-
-
 @dataclass(frozen=True, slots=True)
 class _Training:
     """One training of a job: the run itself, or its baseline.
@@ -140,17 +48,27 @@ class _Training:
     Args:
         compared: the configuration from `resume.comparable`, which a resumed run must have in common.
         folder: where its files go.
+        pictures: what shows it there; None for a baseline, which the run's own pictures show.
     """
 
     settings: JobSettings
     conductor: Conductor
     compared: Mapping[str, Any]
     folder: Path
+    pictures: results.Pictures | None
 
     @classmethod
     def of(cls, settings: JobSettings, values: Mapping[str, Any], folder: Path) -> _Training:
-        """A training with these settings. `values` is the configuration that they were built from."""
-        return cls(settings, settings.conductor(settings.fit.stretch), resume.comparable(values), folder)
+        """The run itself, with these settings. `values` is the configuration that they were built from."""
+        fit, conductor = settings.fit, settings.conductor(settings.fit.stretch)
+        pictures = results.Pictures(fit.map_views, fit.video, fit.page)
+        return cls(settings, conductor, resume.comparable(values), folder, pictures)
+
+    def baseline(self, values: Mapping[str, Any]) -> _Training:
+        """The training beside this one, without any strategy, in a folder within its folder."""
+        without = replace(self.settings, strategies={})
+        alone = _Training.of(without, {**values, "strategies": {}}, self.folder / BASELINE)
+        return replace(alone, pictures=None)
 
     @property
     def chosen(self) -> plan.Chosen:
@@ -224,8 +142,7 @@ def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = Non
         tensorboard.require_tensorboard()
     ours, baseline = _Training.of(settings, values, folder), None
     if settings.fit.baseline and _why_without_baseline(settings) is None:
-        values_without = {**values, "strategies": {}}
-        baseline = _Training.of(replace(settings, strategies={}), values_without, folder / BASELINE)
+        baseline = ours.baseline(values)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
     with hold(folder):
         files.sweep(folder)
@@ -367,10 +284,8 @@ def _train(
         training.chosen,
         backend=place.drawing.name,
         down=settings.data.views.downsample,
-        map_views=settings.fit.map_views,
         painter=Painter(state.field, place.drawing.make),
-        video_frames=settings.fit.video,
-        page_gaussians=settings.fit.page,
+        pictures=training.pictures,
         seconds=seconds,
         config=training.compared,
         baseline=beside,

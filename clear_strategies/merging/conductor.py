@@ -5,17 +5,16 @@ Eq. 8, 13
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Final, Generic, Protocol, TypeVar, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final, TypeVar
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.core.deferred import Number, Scalar
-from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
 from clear_strategies.core.gradients import Grads, Shot, conflict_ratio, screen_norm, to_ndc
 from clear_strategies.core.step import Step
@@ -23,129 +22,15 @@ from clear_strategies.core.view import ExtraView, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import StrategyConflict
 from clear_strategies.merging.detail import DetailRates
+from clear_strategies.merging.iteration import HrGradients, Merged, Stepper, Update, require_finite_parts
 from clear_strategies.merging.objective import Losses, Objective
 from clear_strategies.strategies.base import ScreenGradients, Strategy, overrides
 
 _log = logging.getLogger(__name__)
 
-_ONE_ANSWER: Final = ("gate", "observe", "route", "correct", "score")
-
-
-@runtime_checkable
-class ScreenGradient(Protocol):
-    """The gradient of one loss in whatever form a `Stepper` takes; dense in the readable path (`Grads`)."""
-
-    @property
-    def screen(self) -> Float[Tensor, "N 2"] | None: ...
-
-    def table(self) -> Mapping[str, Tensor]:
-        """What must be finite before a step, one row per Gaussian, by name."""
-        ...
-
-
-G = TypeVar("G", bound=ScreenGradient)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HrGradients(Generic[G]):
-    """What the HR render of one view gives: its gradients, the evidence, and the routing weights.
-
-    Args:
-        base, hf: ∇L_base and ∇L_HF, each with `.screen` in 1/pixel of an image of `size` (width, height); hf is None
-            where λ_HF = 0.
-        step: the iteration, with the answer of `observe`. m: the answer of `route`, [N] or 1.
-        losses: L_base and L_HF by name.
-    """
-
-    base: G
-    hf: G | None
-    size: tuple[int, int]
-    step: Step
-    m: float | Float[Tensor, " N"] = 1.0
-    losses: Mapping[str, Scalar] = field(default_factory=dict)
-
-    @property
-    def evidence(self) -> Evidence | None:
-        """The answer of `observe`."""
-        return self.step.evidence
-
-
-def only(hr: HrGradients[Grads], names: Collection[str]) -> HrGradients[Grads]:
-    """The gradients of these attributes, e.g. of those that a host optimizes."""
-
-    def chosen(g: Grads) -> Grads:
-        return Grads({name: value for name, value in g.items() if name in names}, screen=g.screen)
-
-    return replace(hr, base=chosen(hr.base), hf=None if hr.hf is None else chosen(hr.hf))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Merged:
-    """One view's gradients, merged.
-
-    Args:
-        grads: g_LR + λ_HR ĝ_HR + λ∇L_stab, for the optimizer.  Eq. 8, 16
-        hr: g^HR before correction (Eq. 13), without f_det. corrected: the same after correction; None without HR.
-        conflict: share of Gaussians in conflict before correction, by group and as "gaussian".
-    """
-
-    grads: Grads
-    hr: Grads | None = None
-    corrected: Grads | None = None
-    conflict: Mapping[str, Number] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Update:
-    """What one iteration decided.
-
-    Args:
-        step: the iteration, for `Conductor.after_step`.
-        grads: the merged gradient by attribute, for the optimizer; None where a `Stepper` has made the step.
-        score: S_i, the statistic that densification uses; `ordinary` is that of 3DGS, without strategies.
-        conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
-        losses: scalars by name. logs: the scalars that the strategies logged.
-
-    On a device, losses, conflict and logs are not floats yet: `deferred.read`.
-    """
-
-    step: Step
-    grads: Grads | None
-    score: Float[Tensor, " N"]
-    ordinary: Float[Tensor, " N"]
-    conflict: Mapping[str, Number] = field(default_factory=dict)
-    losses: Mapping[str, Scalar] = field(default_factory=dict)
-    logs: Mapping[str, Number] = field(default_factory=dict)
-
-    @property
-    def evidence(self) -> Evidence | None:
-        """The answer of `observe`; None without HR."""
-        return self.step.evidence
-
-
 P = TypeVar("P")
 
-
-@runtime_checkable
-class Stepper(Protocol[G]):
-    """Merges and steps in one pass: the same arithmetic as `Conductor.merge` and the optimizer, with no gradient left."""
-
-    @property
-    def stage(self) -> str:
-        """The stage of the work log that the pass is timed as."""
-        ...
-
-    def vjp(self, shot: Any, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[G]:
-        """One gradient per cotangent, in the form that `step` takes."""
-        ...
-
-    def step(self, params: Mapping[str, Tensor], g_lr: G, hr: HrGradients[G] | None, t: int) -> Mapping[str, Number]:
-        """Merge, and step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
-        ...
-
-    def step_extra(self, params: Mapping[str, Tensor], g_lr: G, t: int) -> None:
-        """Step on the gradient of an extra view alone; nothing is regularized."""
-        ...
+_ONE_ANSWER: Final = ("gate", "observe", "route", "correct", "score")
 
 
 class Conductor:
@@ -301,7 +186,7 @@ class Conductor:
                 require_finite(f"{where}: the merged gradient", merged.grads)
                 grads, conflict = merged.grads, merged.conflict
             else:
-                _require_finite_parts(where, g_lr, from_hr)
+                require_finite_parts(where, g_lr, from_hr)
                 grads, conflict = None, stepper.step(params, g_lr, from_hr, t)
         losses = {} if from_hr is None else from_hr.losses
         return Update(step, grads, score, ordinary, conflict, {**l_lr.values, **losses}, self.logs())
@@ -463,18 +348,6 @@ class Conductor:
             else:
                 total = total + g
         return total
-
-
-def _require_finite_parts(where: str, g_lr: Any, hr: HrGradients[Any] | None) -> None:
-    """Check what a `Stepper` merges: the gradients, and the weights of the strategies."""
-    parts: dict[str, Mapping[str, Tensor]] = {"∇L_LR": g_lr.table()}
-    if hr is not None:
-        parts |= {"∇L_base": hr.base.table()} | ({} if hr.hf is None else {"∇L_HF": hr.hf.table()})
-        weights = {} if hr.evidence is None else {"reliability": hr.evidence.reliability}
-        parts["the evidence"] = weights | ({"m": hr.m} if isinstance(hr.m, Tensor) else {})
-    for part, tensors in parts.items():
-        # The spherical harmonics of a direction are finite wherever the Gaussian is drawn, and are a third of the numbers.
-        require_finite(f"{where}: {part}", {name: x for name, x in tensors.items() if name != "basis"})
 
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:

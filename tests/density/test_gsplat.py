@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from clear_strategies import GCO, P2G, SVS, Conductor, DataError, Objective, Strategy, Update
 from clear_strategies.compose import CONF
 from clear_strategies.core.gradients import Grads
-from clear_strategies.density import gsplat
+from clear_strategies.density import lent
 from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.density.base import Densifier, DensifierSettings, DensityError
 from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings
@@ -154,7 +154,7 @@ def test_the_strategys_statistic_is_the_score_that_it_was_given():
 
 @pytest.mark.parametrize(("version", "shape"), [("1.4.0", (1, N)), ("1.5.3", (1, N, 2)), (None, (1, N, 2))])
 def test_radii_have_the_layout_of_the_installed_gsplat(version, shape, monkeypatch):
-    monkeypatch.setattr(gsplat, "_gsplat_version", lambda: version)
+    monkeypatch.setattr(lent, "gsplat_version", lambda: version)
     theta, optimizer, made = tagged()
     look(made, torch.ones(N))
     made.strategy.step_post_backward = lambda p, o, s, t, info: made.strategy.infos.append(info)
@@ -456,6 +456,7 @@ def test_any_class_of_that_shape_is_chosen_by_its_name():
     assert made.strategy.refine_start_iter == 500
 
 
+@pytest.mark.slow
 def test_from_the_command_line(tmp_path):
     own = ["density=gsplat", f"density.strategy._target_={TINY_ONE}"]
     if find_spec("gsplat") is not None:

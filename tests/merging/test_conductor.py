@@ -8,7 +8,20 @@ import pytest
 import torch
 from torch import Tensor
 
-from clear_strategies import GCO, P2G, SVS, Conductor, Grads, Objective, SplatSuRe, Step, Strategy, StrategyConflict
+from clear_strategies import (
+    GCO,
+    P2G,
+    SVS,
+    Conductor,
+    FadingOpacity,
+    Grads,
+    Objective,
+    PseudoViews,
+    SplatSuRe,
+    Step,
+    Strategy,
+    StrategyConflict,
+)
 from clear_strategies.kernels import losses
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.testing import CHECKS, ContractError, check_strategy
@@ -31,8 +44,8 @@ class Halve(Strategy):
 
 @pytest.mark.parametrize(
     "make",
-    [GCO, P2G, SVS, SplatSuRe, Halve, lambda: SVS(anchor_strength=0.01)],
-    ids=["GCO", "P2G", "SVS", "SplatSuRe", "own", "loose"],
+    [GCO, P2G, SVS, SplatSuRe, PseudoViews, FadingOpacity, Halve, lambda: SVS(anchor_strength=0.01)],
+    ids=["GCO", "P2G", "SVS", "SplatSuRe", "PseudoViews", "FadingOpacity", "own", "loose"],
 )
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
 def test_contract(make, check):

@@ -14,7 +14,9 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import demo
-from clear_strategies.data.readers.demo import Ball, Finish, Panel
+from clear_strategies.data.readers.demo.room import _FLOOR, _box, room
+from clear_strategies.data.readers.demo.surfaces import Ball, Finish, Panel, Rays
+from clear_strategies.data.readers.demo.textures import Texture
 from clear_strategies.errors import SettingError
 from rasterizers import Camera
 
@@ -107,8 +109,8 @@ def test_photos_are_free_of_aliasing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Near the limit of many rays without prefiltering; one ray a pixel, which does alias, is five times further away."""
     camera = demo.read(width=96, height=72).frames[5].camera
     photo = demo.render(camera)
-    sample = demo._Texture.sample
-    monkeypatch.setattr(demo._Texture, "sample", lambda self, at, footprint: sample(self, at, np.ones_like(footprint)))
+    sample = Texture.sample
+    monkeypatch.setattr(Texture, "sample", lambda self, at, footprint: sample(self, at, np.ones_like(footprint)))
     monkeypatch.setattr(demo, "_RAYS", 16)
     limit = demo.render(camera)
     monkeypatch.setattr(demo, "_RAYS", 1)
@@ -156,7 +158,7 @@ def test_lr_has_features_that_triangulate_onto_the_surfaces() -> None:
 
 def test_depth_of_a_panel_is_its_plane() -> None:
     panel = Panel(Finish("brick"), center=(0.0, 0.0, 4.0), right=(2.0, 0.0, 0.0), down=(0.0, 1.0, 0.0))
-    depth = panel.depth(demo._Rays.through(frontal(), 0, 30, 1))
+    depth = panel.depth(Rays.through(frontal(), 0, 30, 1))
     # 90 degrees wide: at z = 4 the picture is 8 wide and 6 high, 5 px a unit; the panel is 4 by 2 units.
     assert np.isfinite(depth).sum() == 20 * 10
     assert np.all(depth[10:20, 10:30] == 4)
@@ -164,7 +166,7 @@ def test_depth_of_a_panel_is_its_plane() -> None:
 
 def test_depth_of_a_ball_is_nearest_at_its_centre() -> None:
     ball = Ball(Finish("moon"), center=(0.0, 0.0, 3.0), radius=1.0)
-    depth = ball.depth(demo._Rays.through(frontal(101, 101), 0, 101, 1))
+    depth = ball.depth(Rays.through(frontal(101, 101), 0, 101, 1))
     assert depth[50, 50] == pytest.approx(2)
     assert np.nanmin(depth) == depth[50, 50]
     # Its outline is seen at sin(angle) = 1/3, tan(angle) = 0.3536: 17.86 px from the middle.
@@ -173,7 +175,7 @@ def test_depth_of_a_ball_is_nearest_at_its_centre() -> None:
 
 @pytest.mark.parametrize("k", range(19))
 def test_charts_invert_and_normals_have_unit_length(k: int) -> None:
-    surface = demo._room()[k]
+    surface = room()[k]
     at = np.random.default_rng(k).uniform(0.05, 0.95, (50, 2))
     points = surface.points(at)
     assert np.allclose(surface.chart(points), at, atol=1e-4)
@@ -181,8 +183,8 @@ def test_charts_invert_and_normals_have_unit_length(k: int) -> None:
 
 
 def test_a_box_is_closed_and_faces_outwards() -> None:
-    faces = demo._box("coffee", x=0.0, z=5.0, size=(2.0, 1.0, 1.0), turn=0.3)
-    middle = np.array([0.0, demo._FLOOR - 0.5, 5.0])
+    faces = _box("coffee", x=0.0, z=5.0, size=(2.0, 1.0, 1.0), turn=0.3)
+    middle = np.array([0.0, _FLOOR - 0.5, 5.0])
     for face in faces:
         outwards = np.asarray([face.center]) - middle
         normal = face.normal(outwards)
@@ -203,7 +205,7 @@ def test_shadows_fall_behind_what_stands_in_the_light() -> None:
 
 def test_textures_are_means_at_coarser_levels_and_mirrored_when_repeated() -> None:
     image = np.arange(64, dtype=np.float32).reshape(8, 8, 1)
-    texture = demo._Texture.of(image)
+    texture = Texture.of(image)
     assert texture.widths.tolist() == [8, 4]
     middle = np.array([[0.5, 0.5]], np.float32)
     assert texture.sample(middle, np.array([2.0], np.float32)) == pytest.approx(31.5)

@@ -1,0 +1,193 @@
+"""The vertices of a PLY file, ascii or binary, as a table.
+
+The reader is strict: the header has a largest size, and its counts are compared with the file's size before anything is
+allocated.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.lib.recfunctions import structured_to_unstructured
+from torch import Tensor
+
+from clear_strategies.errors import DataError
+from clear_strategies.files import require_regular
+
+_TYPES: Final = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_FORMATS: Final = ("ascii", "binary_little_endian", "binary_big_endian")
+_LONGEST_HEADER: Final = 1 << 16  # bytes
+_LONGEST_COUNT: Final = 20  # digits
+
+
+@dataclass(frozen=True, slots=True)
+class _Element:
+    """`element name count`, and the names and types of its row; None if a list makes rows of unequal length."""
+
+    name: str
+    count: int
+    row: dict[str, str] | None
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        return np.dtype(list((self.row or {}).items()))
+
+    @property
+    def bytes(self) -> int:
+        return self.count * self.dtype.itemsize
+
+    @property
+    def values(self) -> int:
+        return self.count * len(self.row or {})
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    """A file's header: elements before the vertices (all of fixed length), the vertices, elements after them.
+
+    Args:
+        body: offset of the first byte after the header.
+    """
+
+    form: str
+    before: tuple[_Element, ...]
+    vertex: _Element
+    after: tuple[_Element, ...]
+    body: int
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """The vertex element as a structured array."""
+    require_regular(path)
+    try:
+        with path.open("rb") as file:
+            header = _parse_header(path, file.read(_LONGEST_HEADER))
+            file.seek(header.body)
+            if header.form == "ascii":
+                return _read_ascii(path, header, file.read())
+            return _read_binary(path, header, file, path.stat().st_size - header.body)
+    except OSError as error:
+        raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
+
+
+def _read_binary(path: Path, header: _Header, file: BinaryIO, left: int) -> np.ndarray:
+    vertex, skipped = header.vertex, sum(e.bytes for e in header.before)
+    _check_length(path, header, skipped + vertex.bytes, sum(e.bytes for e in header.after), left, "bytes")
+    file.seek(skipped, os.SEEK_CUR)
+    row = vertex.dtype.newbyteorder("<" if header.form == "binary_little_endian" else ">")
+    return np.frombuffer(file.read(vertex.bytes), row, vertex.count)
+
+
+def _read_ascii(path: Path, header: _Header, body: bytes) -> np.ndarray:
+    """By number of values, because line breaks in ASCII PLY files have no meaning."""
+    vertex, skipped, words = header.vertex, sum(e.values for e in header.before), body.split()
+    _check_length(path, header, skipped + vertex.values, sum(e.values for e in header.after), len(words), "values")
+    try:
+        numbers = np.array([float(word) for word in words[skipped : skipped + vertex.values]])
+    except ValueError as error:
+        raise DataError(path, "element vertex", f"is not numeric ({error})", "export it again") from error
+    table = np.zeros(vertex.count, vertex.dtype)
+    for name, column in zip(names_of(table), numbers.reshape(-1, len(names_of(table))).T, strict=True):
+        kind = table.dtype[name]
+        if kind.kind in "iu":
+            limits = np.iinfo(kind)
+            wrong = ~((column >= limits.min) & (column <= limits.max) & (column == np.round(column)))
+            if wrong.any():
+                problem = f"must be whole and in [{limits.min}, {limits.max}], is {column[wrong][0]:g}"
+                raise DataError(path, name, problem, "export it again")
+        with np.errstate(over="ignore"):  # overflow gives infinity, which `_columns` refuses
+            table[name] = column
+    return table
+
+
+def _check_length(path: Path, header: _Header, needed: int, after: int, left: int, unit: str) -> None:
+    """Compare the header's counts with the data that follow it."""
+    if needed > left:
+        problem = f"has a count of {header.vertex.count}, which needs {needed} {unit}, but {left} are left"
+        raise DataError(path, "element vertex", problem, "the file is truncated; write it again")
+    if all(e.row is not None for e in header.after) and needed + after != left:
+        problem = f"needs {needed + after} {unit} after it, but {left} follow"
+        raise DataError(path, "header", problem, "the file is damaged; write it again")
+
+
+def _parse_header(path: Path, head: bytes) -> _Header:
+    lines, body = _header_lines(path, head)
+    form, elements = "", list[_Element]()
+    for line in lines:
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case ["format", kind, "1.0"] if kind in _FORMATS and not form:
+                form = kind
+            case ["element", name, count] if form and name not in {e.name for e in elements}:
+                elements.append(_Element(name, _count(path, name, count), {}))
+            case ["property", "list", _, _, _] if elements and elements[-1].name != "vertex":
+                elements[-1] = replace(elements[-1], row=None)
+            case ["property", kind, name] if elements and kind in _TYPES and name not in (elements[-1].row or {}):
+                if elements[-1].row is not None:
+                    elements[-1].row[name] = _TYPES[kind]
+            case _:
+                problem = f"has a line that is not understood there: {line[:80]!r}"
+                raise DataError(path, "header", problem, "export it again, with plain numbers in the vertices")
+    at = next((i for i, e in enumerate(elements) if e.name == "vertex"), None)
+    if at is None or not elements[at].row:
+        raise DataError(path, "element vertex", "is missing or has no properties", "give a file of points")
+    before, vertex, after = tuple(elements[:at]), elements[at], tuple(elements[at + 1 :])
+    if any(e.row is None for e in before):
+        raise DataError(path, "element vertex", "comes after an element with lists", "write the vertices first")
+    return _Header(form, before, vertex, after, body)
+
+
+def _header_lines(path: Path, head: bytes) -> tuple[list[str], int]:
+    """(lines between `ply` and `end_header`, offset after them)."""
+    if head.split(b"\n", 1)[0].strip() != b"ply":
+        raise DataError(path, "header", "does not begin with a line `ply`", "give a .ply file")
+    lines, body = list[str](), 0
+    for line in head.split(b"\n")[:-1]:  # the rest after the last newline is no whole line
+        body += len(line) + 1
+        lines.append(line.decode("latin-1").strip())
+        if lines[-1] == "end_header":
+            return lines[1:-1], body
+    problem = f"has no line `end_header` in its first {_LONGEST_HEADER} bytes"
+    raise DataError(path, "header", problem, "the file is truncated; write it again")
+
+
+def _count(path: Path, element: str, text: str) -> int:
+    if not (text.isascii() and text.isdecimal() and len(text) <= _LONGEST_COUNT):
+        problem = f"must have a whole number >= 0 as its count, has {text[:40]!r}"
+        raise DataError(path, f"element {element}", problem, "export it again")
+    return int(text)
+
+
+def names_of(table: np.ndarray) -> tuple[str, ...]:
+    return table.dtype.names or ()
+
+
+def columns(
+    path: Path, table: np.ndarray, names: Sequence[str], *, infinite: float | None = None
+) -> Float[Tensor, "N C"]:
+    """Properties as float32; each must exist and be finite, unless this number stands for infinity."""
+    missing = [name for name in names if name not in names_of(table)]
+    if missing:
+        problem = f"is missing from the vertices, which have {', '.join(names_of(table))}"
+        raise DataError(path, missing[0], problem, "export it again, with this property")
+    with np.errstate(over="ignore"):  # overflow gives infinity
+        columns = np.array(structured_to_unstructured(table[list(names)], np.float32))
+    if infinite is not None:
+        columns = np.where(np.isinf(columns), np.copysign(np.float32(infinite), columns), columns)
+    finite = np.isfinite(columns)
+    if not finite.all():
+        i, k = np.argwhere(~finite)[0]
+        raise DataError(path, names[k], f"is not finite in vertex {i}", "remove the vertex, or export it again")
+    return torch.from_numpy(columns)

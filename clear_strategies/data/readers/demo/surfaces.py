@@ -1,0 +1,206 @@
+"""The shapes of the demo: rectangles and balls, and the rays that meet them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from rasterizers.interface import Camera
+
+Array = np.ndarray
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rays:
+    """The rays of a pixel grid, origin + t · (x · right + y · down + forward), where t is the depth.
+
+    They are linear in x and y, so their dot product with a fixed vector is the sum of a row and a column. That makes
+    intersections with planes and spheres cheap.
+    """
+
+    origin: Float[Array, " 3"]
+    axes: Float[Array, "3 3"]
+    x: Float[Array, "1 w"]
+    y: Float[Array, "h 1"]
+    spacing: float
+
+    @staticmethod
+    def through(camera: Camera, first: int, last: int, per_pixel: int) -> Rays:
+        """The rays of the image rows from `first` up to `last`, `per_pixel`² per pixel."""
+        x = (np.arange(camera.width * per_pixel) + 0.5) / per_pixel
+        y = (np.arange(first * per_pixel, last * per_pixel) + 0.5) / per_pixel
+        return Rays(
+            camera.center.double().numpy(),
+            camera.world_to_camera[:3, :3].double().numpy(),
+            ((x - camera.cx) / camera.fx)[None, :].astype(np.float32),
+            ((y - camera.cy) / camera.fy)[:, None].astype(np.float32),
+            1 / (camera.fx * per_pixel),
+        )
+
+    def dot(self, vector: Array) -> Float[Array, "h w"]:
+        right, down, forward = f32(self.axes @ vector)
+        return np.asarray(self.x * right + (self.y * down + forward))
+
+    def directions(self, which: Int[Array, " n"]) -> Float[Array, "n 3"]:
+        """Of the rays with these indices into the grid, counted row by row."""
+        right, down, forward = f32(self.axes)
+        row, column = np.divmod(which, self.x.size)
+        return np.asarray(self.x[0, column, None] * right + (self.y * down + forward)[row])
+
+
+@dataclass(frozen=True, slots=True)
+class Finish:
+    """How a surface looks.
+
+    Args:
+        texture: a photograph of scikit-image.
+        tint: factor of its colour.
+        repeat, shift: its scale and offset on the surface's chart. Every second repetition is mirrored, so that there
+            is no seam.
+        gloss: strength of the lamp's reflection.
+    """
+
+    texture: str
+    tint: Vector = (1.0, 1.0, 1.0)
+    repeat: tuple[float, float] = (1.0, 1.0)
+    shift: tuple[float, float] = (0.0, 0.0)
+    gloss: float = 0.0
+
+
+@runtime_checkable
+class Surface(Protocol):
+    """A shape with a chart: coordinates in [0, 1]² for its texture and its light."""
+
+    def __hash__(self) -> int: ...
+
+    @property
+    def finish(self) -> Finish: ...
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """The chart's width and height, world units."""
+        ...
+
+    def depth(self, rays: Rays) -> Float[Array, "h w"]:
+        """Along each ray; infinite if the ray misses the shape."""
+        ...
+
+    def chart(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]: ...
+
+    def points(self, chart: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+        """The inverse of `chart`."""
+        ...
+
+    def normal(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        """Unit length, towards the outside."""
+        ...
+
+    def blocks(self, points: Float[Array, "n 3"], lamp: Float[Array, " 3"]) -> Bool[Array, " n"]:
+        """Whether the shape is between the points and the lamp."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """A rectangle: its centre, and half its sides as vectors. Its normal is down × right."""
+
+    finish: Finish
+    center: Vector
+    right: Vector
+    down: Vector
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        return 2 * math.hypot(*self.right), 2 * math.hypot(*self.down)
+
+    def depth(self, rays: Rays) -> Float[Array, "h w"]:
+        offset = rays.origin - np.asarray(self.center)
+        right, down = dual(self.right), dual(self.down)
+        normal = self._normal
+        facing = rays.dot(normal)
+        # A ray parallel to the plane divides by zero, and misses.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = np.float32(-offset @ normal) / facing
+            u = np.float32(offset @ right) + t * rays.dot(right)
+            v = np.float32(offset @ down) + t * rays.dot(down)
+            inside = (t > 0) & (np.abs(u) <= 1) & (np.abs(v) <= 1)
+        return np.asarray(np.where(inside, t, np.float32(np.inf)))
+
+    def chart(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
+        basis = np.stack((dual(self.right), dual(self.down)), -1)
+        return np.asarray((points - f32(self.center)) @ f32(basis) / 2 + np.float32(0.5))
+
+    def points(self, chart: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+        return np.asarray(np.asarray(self.center) + (2 * chart - 1) @ np.array((self.right, self.down)))
+
+    def normal(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        return np.broadcast_to(self._normal, points.shape)
+
+    def blocks(self, points: Float[Array, "n 3"], lamp: Float[Array, " 3"]) -> Bool[Array, " n"]:
+        normal = self._normal
+        here, there = (points - self.center) @ normal, (lamp - self.center) @ normal
+        apart = (np.abs(here) > 1e-4) & (here * there < 0)
+        s = (here / np.where(apart, here - there, 1))[:, None]
+        return np.asarray(apart & (np.abs(2 * self.chart(points + s * (lamp - points)) - 1) <= 1).all(-1))
+
+    @property
+    def _normal(self) -> Float[Array, " 3"]:
+        return unit(np.cross(self.down, self.right))
+
+
+@dataclass(frozen=True, slots=True)
+class Ball:
+    """A sphere. Its chart is longitude and latitude."""
+
+    finish: Finish
+    center: Vector
+    radius: float
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        return 2 * math.pi * self.radius, math.pi * self.radius
+
+    def depth(self, rays: Rays) -> Float[Array, "h w"]:
+        offset = rays.origin - np.asarray(self.center)
+        b, square = rays.dot(offset), 1 + rays.x**2 + rays.y**2
+        discriminant = b * b - square * np.float32(offset @ offset - self.radius**2)
+        t = (-b - np.sqrt(np.maximum(discriminant, 0))) / square
+        return np.where((discriminant > 0) & (t > 0), t, np.float32(np.inf))
+
+    def chart(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
+        x, y, z = self.normal(points).T
+        longitude, latitude = np.arctan2(x, -z) / (2 * math.pi), np.arccos(np.clip(-y, -1, 1)) / math.pi
+        return np.stack((longitude + 0.5, latitude), -1).astype(np.float32)
+
+    def points(self, chart: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
+        longitude, latitude = 2 * math.pi * (chart[:, 0] - 0.5), math.pi * chart[:, 1]
+        ring = np.sin(latitude)
+        unit = np.stack((ring * np.sin(longitude), -np.cos(latitude), -ring * np.cos(longitude)), -1)
+        return np.asarray(self.center) + self.radius * unit
+
+    def normal(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+        return np.asarray((points - np.asarray(self.center, points.dtype)) / self.radius)
+
+    def blocks(self, points: Float[Array, "n 3"], lamp: Float[Array, " 3"]) -> Bool[Array, " n"]:
+        way = lamp - points
+        s = np.clip(((self.center - points) * way).sum(-1) / (way * way).sum(-1), 0, 1)[:, None]
+        return np.asarray(np.linalg.norm(points + s * way - self.center, axis=-1) < self.radius * (1 - 1e-4))
+
+
+def unit(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def dual(side: Vector) -> Float[Array, " 3"]:
+    """The vector whose dot product with `side` is one."""
+    return np.asarray(np.asarray(side) / np.dot(side, side))
+
+
+def f32(values: Array | tuple[float, ...]) -> Float[Array, "*shape"]:
+    """In single precision: rays are cast twice as fast, and the error is far below a texel."""
+    return np.asarray(values, np.float32)

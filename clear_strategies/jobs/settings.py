@@ -1,0 +1,103 @@
+"""The settings of a job: the whole of conf/config.yaml, as objects."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from clear_strategies.compose import ConductorSettings
+from clear_strategies.data.priors import Bicubic
+from clear_strategies.density.base import DensifierSettings
+from clear_strategies.errors import SettingError
+from clear_strategies.jobs import device, scene
+from clear_strategies.jobs.device import Device, RasterizerSettings
+from clear_strategies.settings import build
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.skips import Skips
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunSettings(FitSettings):
+    """Settings of a run: those of its training, what it shows and writes, and where it computes.
+
+    Args:
+        map_views: number of training views with maps of reliability and correction in maps/; 0: none.
+        video: number of frames of path.mp4 and path.gif, a loop through the training cameras, 24 a second; 0: none.
+        verbose: also show on the console the details that run.log holds; `-v` on the command line.
+        page: write splat.html, a page that shows the field in any browser, if the field has at most this many Gaussians;
+            0: never.
+        log: tensorboard writes losses, PSNR, learning rates and a few pictures for TensorBoard; extra [log].
+        viewer: look at the field in the browser while it trains; the address is logged. Extra [view].
+        baseline: first train the same scene with the same settings, but without any strategy, into the folder baseline/ of
+            the run. The contact sheet and the scores then show both. Without effect in a sweep, for a run that has no
+            strategy, and with +method=NAME.
+        resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: look into the run's own
+            folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
+            from the beginning. Both apply to the baseline, too.
+        device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
+            there, else cpu. A run may be resumed on another device; its bits then differ.
+        threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib,
+            Slurm).
+    """
+
+    map_views: int = 3
+    video: int = 72
+    page: int = 500_000
+    log: Literal["tensorboard"] | None = None
+    verbose: bool = False
+    viewer: bool = False
+    baseline: bool = False
+    resume: str | None = None
+    device: Device | None = None
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        FitSettings.__post_init__(self)
+        if self.map_views < 0:
+            raise SettingError(f"map_views must be at least 0, got {self.map_views}. 0 writes no maps.")
+        if self.video < 0:
+            raise SettingError(f"video must be at least 0 frames, got {self.video}. 0 writes no video.")
+        if self.page < 0:
+            raise SettingError(f"page must be at least 0 Gaussians, got {self.page}. 0 writes no page.")
+        if self.threads is not None and self.threads < 1:
+            raise SettingError(f"threads must be at least 1, got {self.threads}. null takes all cores.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JobSettings(ConductorSettings):
+    """The whole of conf/config.yaml, as objects.
+
+    Args:
+        method: which baseline of the papers' tables this is, for the plan and the tables; set by +method=NAME.
+    """
+
+    rasterizer: RasterizerSettings | functools.partial[Any]
+    prior: scene.PriorSettings
+    data: scene.DataSettings
+    density: DensifierSettings
+    optim: LearningRates
+    skips: Skips
+    fit: RunSettings = field(default_factory=RunSettings)
+    mip: MipFilter = field(default_factory=MipFilter)
+    method: str | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.prior, functools.partial):
+            self.prior(truth={})  # it waits for the photos; its own settings are refused now
+        for decorate in self.decorators.values():
+            decorate(Bicubic())  # likewise
+        scene.require_factor(self.prior, self.data.views.sr_scale)
+
+
+def settings_of(values: Mapping[str, Any]) -> JobSettings:
+    """The settings of a resolved configuration, see `compose.tree`.
+
+    Raises:
+        SettingError: one cannot be used; the message begins with its key.
+    """
+    settings: JobSettings = build({**values, "rasterizer": device.rasterizer_node(values["rasterizer"])})
+    return settings

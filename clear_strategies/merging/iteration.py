@@ -1,0 +1,142 @@
+"""What one iteration gives and decides: the gradients of HR, the merged ones, the update, and whoever steps by them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.deferred import Number, Scalar
+from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.finite import require_finite
+from clear_strategies.core.gradients import Grads
+from clear_strategies.core.step import Step
+
+
+@runtime_checkable
+class ScreenGradient(Protocol):
+    """The gradient of one loss in whatever form a `Stepper` takes; dense in the readable path (`Grads`)."""
+
+    @property
+    def screen(self) -> Float[Tensor, "N 2"] | None: ...
+
+    def table(self) -> Mapping[str, Tensor]:
+        """What must be finite before a step, one row per Gaussian, by name."""
+        ...
+
+
+G = TypeVar("G", bound=ScreenGradient)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HrGradients(Generic[G]):
+    """What the HR render of one view gives: its gradients, the evidence, and the routing weights.
+
+    Args:
+        base, hf: ∇L_base and ∇L_HF, each with `.screen` in 1/pixel of an image of `size` (width, height); hf is None
+            where λ_HF = 0.
+        step: the iteration, with the answer of `observe`. m: the answer of `route`, [N] or 1.
+        losses: L_base and L_HF by name.
+    """
+
+    base: G
+    hf: G | None
+    size: tuple[int, int]
+    step: Step
+    m: float | Float[Tensor, " N"] = 1.0
+    losses: Mapping[str, Scalar] = field(default_factory=dict)
+
+    @property
+    def evidence(self) -> Evidence | None:
+        """The answer of `observe`."""
+        return self.step.evidence
+
+
+def only(hr: HrGradients[Grads], names: Collection[str]) -> HrGradients[Grads]:
+    """The gradients of these attributes, e.g. of those that a host optimizes."""
+
+    def chosen(g: Grads) -> Grads:
+        return Grads({name: value for name, value in g.items() if name in names}, screen=g.screen)
+
+    return replace(hr, base=chosen(hr.base), hf=None if hr.hf is None else chosen(hr.hf))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Merged:
+    """One view's gradients, merged.
+
+    Args:
+        grads: g_LR + λ_HR ĝ_HR + λ∇L_stab, for the optimizer.  Eq. 8, 16
+        hr: g^HR before correction (Eq. 13), without f_det. corrected: the same after correction; None without HR.
+        conflict: share of Gaussians in conflict before correction, by group and as "gaussian".
+    """
+
+    grads: Grads
+    hr: Grads | None = None
+    corrected: Grads | None = None
+    conflict: Mapping[str, Number] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Update:
+    """What one iteration decided.
+
+    Args:
+        step: the iteration, for `Conductor.after_step`.
+        grads: the merged gradient by attribute, for the optimizer; None where a `Stepper` has made the step.
+        score: S_i, the statistic that densification uses; `ordinary` is that of 3DGS, without strategies.
+        conflict: share of Gaussians in conflict before correction, by group and as "gaussian"; empty without HR.
+        losses: scalars by name. logs: the scalars that the strategies logged.
+
+    On a device, losses, conflict and logs are not floats yet: `deferred.read`.
+    """
+
+    step: Step
+    grads: Grads | None
+    score: Float[Tensor, " N"]
+    ordinary: Float[Tensor, " N"]
+    conflict: Mapping[str, Number] = field(default_factory=dict)
+    losses: Mapping[str, Scalar] = field(default_factory=dict)
+    logs: Mapping[str, Number] = field(default_factory=dict)
+
+    @property
+    def evidence(self) -> Evidence | None:
+        """The answer of `observe`; None without HR."""
+        return self.step.evidence
+
+
+@runtime_checkable
+class Stepper(Protocol[G]):
+    """Merges and steps in one pass: the same arithmetic as `Conductor.merge` and the optimizer, with no gradient left."""
+
+    @property
+    def stage(self) -> str:
+        """The stage of the work log that the pass is timed as."""
+        ...
+
+    def vjp(self, shot: Any, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[G]:
+        """One gradient per cotangent, in the form that `step` takes."""
+        ...
+
+    def step(self, params: Mapping[str, Tensor], g_lr: G, hr: HrGradients[G] | None, t: int) -> Mapping[str, Number]:
+        """Merge, and step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
+        ...
+
+    def step_extra(self, params: Mapping[str, Tensor], g_lr: G, t: int) -> None:
+        """Step on the gradient of an extra view alone; nothing is regularized."""
+        ...
+
+
+def require_finite_parts(where: str, g_lr: Any, hr: HrGradients[Any] | None) -> None:
+    """Check what a `Stepper` merges: the gradients, and the weights of the strategies."""
+    parts: dict[str, Mapping[str, Tensor]] = {"∇L_LR": g_lr.table()}
+    if hr is not None:
+        parts |= {"∇L_base": hr.base.table()} | ({} if hr.hf is None else {"∇L_HF": hr.hf.table()})
+        weights = {} if hr.evidence is None else {"reliability": hr.evidence.reliability}
+        parts["the evidence"] = weights | ({"m": hr.m} if isinstance(hr.m, Tensor) else {})
+    for part, tensors in parts.items():
+        # The spherical harmonics of a direction are finite wherever the Gaussian is drawn, and are a third of the numbers.
+        require_finite(f"{where}: {part}", {name: x for name, x in tensors.items() if name != "basis"})
