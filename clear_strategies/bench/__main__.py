@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from clear_strategies import console
-from clear_strategies.bench import device, evidence, iteration, kernels, pareto, rasterizers, stereo
+from clear_strategies.bench import device, evidence, iteration, kernels, pareto, rasterizers, seconds, stereo
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
 from clear_strategies.errors import ClearError
@@ -101,19 +101,7 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--backend", metavar="NAME", help="default: the fastest that runs here")
     ask.add_argument("--preset", default="fast", choices=list(PRESETS), help="default: fast")
 
-    ask = questions.add_parser("pareto", parents=[common], help="seconds against PSNR and SSIM of whole trainings")
-    ask.add_argument(
-        "overrides", nargs="*", metavar="OVERRIDE", help="of all trainings, as for a run (default: the demo)"
-    )
-    ask.add_argument("--seeds", nargs="+", type=int, default=[0, 1], metavar="SEED", help="default: 0 1")
-    ask.add_argument("--iterations", type=_positive, default=1500, metavar="N", help="default: 1500")
-    ask.add_argument(
-        "--out", type=Path, default=Path("outputs/pareto"), metavar="FOLDER",
-        help="holds tables, figure and trainings; finished trainings are kept (default: %(default)s)",
-    )  # fmt: skip
-    names = [variant.name for variant in pareto.VARIANTS]
-    ask.add_argument("--variants", nargs="+", default=names, metavar="NAME", help=f"default: {', '.join(names)}")
-
+    _add_trainings(questions, common)
     for name, what, chosen in (
         ("stereo", "error, coverage and seconds of the depth of the training photos", "settings"),
         ("evidence", "how well reliability finds the known errors of a corrupted prior", "prior"),
@@ -133,9 +121,47 @@ def parser() -> argparse.ArgumentParser:
     return result
 
 
+def _add_trainings(questions: Any, common: argparse.ArgumentParser) -> None:
+    """The questions that are answered by whole trainings."""
+    ask = questions.add_parser("pareto", parents=[common], help="seconds against PSNR and SSIM of whole trainings")
+    ask.add_argument(
+        "overrides", nargs="*", metavar="OVERRIDE", help="of all trainings, as for a run (default: the demo)"
+    )
+    ask.add_argument("--seeds", nargs="+", type=int, default=[0, 1], metavar="SEED", help="default: 0 1")
+    ask.add_argument("--iterations", type=_positive, default=1500, metavar="N", help="default: 1500")
+    ask.add_argument(
+        "--out", type=Path, default=Path("outputs/pareto"), metavar="FOLDER",
+        help="holds tables, figure and trainings; finished trainings are kept (default: %(default)s)",
+    )  # fmt: skip
+    names = [variant.name for variant in pareto.VARIANTS]
+    ask.add_argument("--variants", nargs="+", default=names, metavar="NAME", help=f"default: {', '.join(names)}")
+
+    ask = questions.add_parser(
+        "seconds", parents=[common], help="seconds until a variant is as good as the reference at its end"
+    )
+    ask.add_argument(
+        "overrides", nargs="*", metavar="OVERRIDE", help="of all trainings, as for a run (default: the demo)"
+    )
+    ask.add_argument("--scene", nargs="+", default=[], metavar="SCENE", help="of conf/scene, one after the other")
+    ask.add_argument(
+        "--variant", nargs="*", action="append", required=True, dest="variants", metavar="OVERRIDE",
+        help="a variant's own overrides, the reference first; once for each variant; none: the defaults",
+    )  # fmt: skip
+    ask.add_argument("--seeds", nargs="+", type=int, default=[0, 1], metavar="SEED", help="default: 0 1")
+    ask.add_argument(
+        "--probes", type=_positive, default=20, metavar="N", help="evaluations of the test views in a run (default 20)"
+    )
+    ask.add_argument(
+        "--out", type=Path, default=Path("outputs/seconds"), metavar="FOLDER",
+        help="holds tables and trainings; finished trainings are kept (default: %(default)s)",
+    )  # fmt: skip
+
+
 def _measure(question: str, options: dict[str, Any], results: Results) -> None:
     if question == "pareto":
         pareto.measure(results, pareto.Request(**options))
+    elif question == "seconds":
+        seconds.measure(results, seconds.Request(**options))
     elif question == "device":
         device.measure(results, device.Request(**options))
     else:

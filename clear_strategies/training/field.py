@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from clear_strategies.core import images
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import View
@@ -101,24 +100,12 @@ class GaussianField(nn.Module):
         gate: Float[Tensor, " N"] | None = None,
         lr: bool = True,
         hr: bool = True,
-        tiles: Bool[Tensor, "th tw"] | None = None,
     ) -> tuple[FieldShot | None, FieldShot | None]:
-        """Î_LR without f_det and Î_HR with it, of the same gated geometry; None for a scale that is not wanted.  Eq. 2, 3
-
-        Args:
-            tiles: the tiles of Î_HR that are rendered, see `Rasterizer.tile`; the others show I_HR and have no loss.
-        """
+        """Î_LR without f_det and Î_HR with it, of the same gated geometry; None for a scale that is not wanted.  Eq. 2, 3"""
         active = self._activate(gate)
-        wanted = [
-            (detail, photo.camera, mask)
-            for detail, photo, on, mask in ((False, view.lr, lr, None), (True, view.hr, hr, tiles))
-            if on
-        ]
-        splats = [(active.splats(detail=detail), camera) for detail, camera, _ in wanted]
-        renderings = rasterizer.render_scales(splats, [mask for *_, mask in wanted])
-        shots = {d: FieldShot(r, active, detail=d) for (d, *_), r in zip(wanted, renderings, strict=True)}
-        if hr and tiles is not None:
-            shots[True].image = filled(shots[True].image, tiles, view.hr.image, rasterizer.tile)
+        wanted = [(detail, photo.camera) for detail, photo, on in ((False, view.lr, lr), (True, view.hr, hr)) if on]
+        renderings = rasterizer.render_scales([(active.splats(detail=detail), camera) for detail, camera in wanted])
+        shots = {d: FieldShot(r, active, detail=d) for (d, _), r in zip(wanted, renderings, strict=True)}
         return shots.get(False), shots.get(True)
 
     def shot(self, rasterizer: Rasterizer, camera: Camera) -> FieldShot:
@@ -242,15 +229,6 @@ class FieldShot:
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
         g = self.gradients(cotangents)
         return [self.activation.vjp(g, k, detail=self._detail) for k in range(len(cotangents))]
-
-
-def filled(
-    image: Float[Tensor, "H W 3"], tiles: Bool[Tensor, "th tw"], elsewhere: Float[Tensor, "H W 3"], tile: int
-) -> Float[Tensor, "H W 3"]:
-    """`image` where its tiles were rendered, else the other image: no residual there, and no edge in an SSIM window."""
-    height, width = image.shape[:2]
-    drawn = images.upsample(tiles[..., None].to(image), tile, "nearest")[:height, :width]
-    return torch.where(drawn > 0, image, elsewhere)
 
 
 def _neighbour_distance(means: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:

@@ -6,7 +6,6 @@ functions of (seed, t), so a resumed run has the same bits as one that was never
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -21,8 +20,9 @@ from clear_strategies.core.gradients import conflict_columns
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DivergedError
-from clear_strategies.merging.conductor import Update
+from clear_strategies.merging.iteration import Update
 from clear_strategies.training import checkpoint
+from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
 from clear_strategies.training.extra_steps import extra_steps
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
@@ -38,10 +38,9 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = s.skip_policy.view(s.view(), t)
     scales = {"lr": ask.wants_lr, "hr": ask.wants_hr(t) and (not ask.wants_lr or s.skip_policy.hr_due(t, ask.work_log))}
-    tiles = s.skip_policy.wanted(view, rasterizer.tile, ask.work_log) if scales["hr"] else None
     z = ask.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in scales.items() if wanted)}"):
-        lr, hr = θ.render_scales(rasterizer, view, gate=z, tiles=tiles, **scales)  # Î_LR, Î_HR     Eq. 2, 3
+        lr, hr = θ.render_scales(rasterizer, view, gate=z, **scales)  # Î_LR, Î_HR     Eq. 2, 3
     drawn = [shot for shot in (lr, hr) if shot is not None]
     u = ask.update(θ.raw(), lr, hr, view, t, s.compiled_step)
     if u.grads is not None:  # else the compiled step has made the step
@@ -101,7 +100,7 @@ def fit(
             return None
         return checkpoint.save(checkpoints, state.checkpoint(config or {}), keep=settings.keep)
 
-    began = time.perf_counter() - state.seconds
+    clock = Clock(state.history_as_floats()[-1] if state.history else {})
     with deferred_signals() as pending, kernel_threads(state, rasterizer):
         ended = state.ended
         while not ended:
@@ -111,9 +110,11 @@ def fit(
             except DivergedError as error:
                 raise DivergedError(f"{error} {_what_to_do(save())}") from error
             ended = state.ended
-            state.history[-1]["seconds"] = time.perf_counter() - began
+            state.history[-1].update(clock.read())
             if settings.probe_every and (done % settings.probe_every == 0 or ended):
-                evaluate(state, scene, rasterizer, done)
+                with clock.paused() as spent:
+                    evaluate(state, scene, rasterizer, done)
+                state.history[-1].update(spent)
             if progress is not None:
                 progress(state)
             if pending:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
@@ -15,18 +16,24 @@ from clear_strategies.errors import SettingError
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import LARGEST_RATE, LogLinear
 
+_log = logging.getLogger(__name__)
+
 BETA1: Final = 0.9
 BETA2: Final = 0.999
+_GEOMETRY_POWER: Final = 1 / 3
 
 
 @dataclass(frozen=True, slots=True)
 class LearningRates:
-    """Learning rates per step, by attribute; those of 3DGS's first release, which sparse-view forks use (F8).
+    """Learning rates per step, by attribute; those of 3DGS's first release, which sparse-view forks use (F8), for its 30,000
+    iterations.
 
     Args:
         means: log-linear decay, in units of the scene's extent.
         quats, scales, opacities, sh0, shN: of the raw parameters (any norm, log, logit, SH coefficients).
         detail, detail_steps, detail_decay: rate, steps and decay of `DetailRates`.
+        geometry_steps: the iterations that the rates of means, scales and quats are for. In a run of T < geometry_steps
+            these are (geometry_steps / T)^(1/3) times as high, see `of_run`; 0: as they stand in a run of any length.
         eps: Adam's. Gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
         rows: "all", or only the rows "visible" in this step (faster but not exact: the others' momentum waits).
 
@@ -43,6 +50,7 @@ class LearningRates:
     detail: float = DetailRates().rate
     detail_steps: int = DetailRates().steps
     detail_decay: float = DetailRates().decay
+    geometry_steps: int = 30_000
     eps: float = 1e-15
     rows: Literal["all", "visible"] = "all"
 
@@ -52,6 +60,8 @@ class LearningRates:
                 raise SettingError(f"{name} must lie in [0, {LARGEST_RATE:g}], got {getattr(self, name)}.")
         if not 0 <= self.eps < 1:
             raise SettingError(f"eps must lie in [0, 1), got {self.eps}.")
+        if self.geometry_steps < 0:
+            raise SettingError(f"geometry_steps must be at least 0 iterations, got {self.geometry_steps}.")
         self.of_detail  # noqa: B018 - its ranges are checked here
         if self.rows not in ("all", "visible"):
             raise SettingError(f"rows must be all or visible, got {self.rows!r}.")
@@ -62,8 +72,23 @@ class LearningRates:
         return DetailRates(self.detail, self.detail_steps, self.detail_decay)
 
     def of_run(self, iterations: int) -> LearningRates:
-        """The rates of a run of this length; see `DetailRates.of_run`."""
-        return replace(self, detail=self.of_detail.of_run(iterations).rate)
+        """The rates of a run of this length, which `geometry_steps` and `detail_steps` tell.
+
+        A Gaussian begins round, as large as the distance to its neighbours, and has to become the disc that the photos ask for.
+        Adam moves a parameter by at most its rate in a step, so a run of a twentieth of the iterations ends on the way. The
+        factor that is best grows more slowly than T shrinks, because the noise at the end grows with the rate. Colours need
+        none: they begin as the photos show them, and higher rates of theirs only fit the training views more closely.
+        """
+        rates = replace(self, detail=self.of_detail.of_run(iterations).rate)
+        if iterations >= self.geometry_steps:
+            return rates
+        factor = (self.geometry_steps / iterations) ** _GEOMETRY_POWER
+        _log.debug(
+            "means, scales and quats learn %.2f times as fast: the run has %d iterations (optim.geometry_steps: %d).",
+            factor, iterations, self.geometry_steps,
+        )  # fmt: skip
+        means = replace(self.means, initial=factor * self.means.initial, final=factor * self.means.final)
+        return replace(rates, means=means, scales=factor * self.scales, quats=factor * self.quats)
 
     def at(self, t: int, extent: float) -> dict[str, float]:
         """Every attribute's rate at iteration t, in its own unit."""

@@ -1,0 +1,46 @@
+"""How long training has taken."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Final
+
+WALL: Final = "seconds"
+PROCESSOR: Final = "processor_seconds"
+"""Columns of the history. On a busy machine the processors' seconds say more than the wall's."""
+PROBE: Final = "probe_"
+"""Before a column's name: the seconds of a row's evaluation of test views, which are not in that column."""
+
+
+class Clock:
+    """Seconds of training by the wall, and of this process on all processors. A pause does not count.
+
+    Args:
+        before: the last row of the history of a run that goes on; its seconds count.
+    """
+
+    def __init__(self, before: Mapping[str, float]) -> None:
+        self._start(before)
+
+    def read(self) -> dict[str, float]:
+        """The seconds until now, by the history's columns."""
+        return {name: now - self._began[name] for name, now in _now().items()}
+
+    @contextmanager
+    def paused(self) -> Iterator[dict[str, float]]:
+        """A context whose time does not count; it yields what holds that time afterwards, by the columns with `PROBE`."""
+        before, spent = self.read(), dict[str, float]()
+        try:
+            yield spent
+        finally:
+            spent |= {PROBE + name: now - before[name] for name, now in self.read().items()}
+            self._start(before)
+
+    def _start(self, before: Mapping[str, float]) -> None:
+        self._began = {name: now - before.get(name, 0.0) for name, now in _now().items()}
+
+
+def _now() -> dict[str, float]:
+    return {WALL: time.perf_counter(), PROCESSOR: time.process_time()}

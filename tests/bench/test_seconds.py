@@ -1,0 +1,116 @@
+"""Seconds until a variant is as good as the reference at its end: what is trained, and what is compared."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from clear_strategies.bench import seconds
+from clear_strategies.bench.__main__ import main
+from clear_strategies.bench.device import TINY
+from clear_strategies.bench.results import Results
+from clear_strategies.errors import DataError
+
+QUICK = "optim.scales=0.01"
+REQUEST = seconds.Request((), ((), (QUICK,)), ("toy",), (0,), 2, Path("out"))
+
+
+def write_run(folder: Path, probes: list[tuple[int, float, float]]) -> None:
+    """The files of a run that the benchmark reads; of each probe the iteration, the seconds until then and the PSNR."""
+    folder.mkdir(parents=True)
+    (folder / "metrics.json").write_text(json.dumps({"scene": "toy", "gaussians": 7}))
+    columns = "t,seconds,processor_seconds,probe_seconds,probe_processor_seconds,psnr_test"
+    rows = [f"{t},{s},{2 * s},1,2,{psnr}" for t, s, psnr in probes]
+    (folder / "history.csv").write_text("\n".join((columns, "1,0.5,1,,,", *rows)) + "\n")
+
+
+class Trainer:
+    """Writes runs at once: the reference ends with 20 dB after 10 s, the variant has it after 6 s and ends with 21."""
+
+    def __init__(self) -> None:
+        self.trained: list[str] = []
+
+    def __call__(self, folder: Path, overrides: list[str]) -> str | None:
+        quick = QUICK in overrides
+        self.trained.append("quick" if quick else "reference")
+        write_run(folder, [(50, 6.0, 20.5), (100, 12.0, 21.0)] if quick else [(50, 5.0, 19.0), (100, 10.0, 20.0)])
+        return None
+
+
+def test_the_first_evaluation_that_has_the_target_counts(tmp_path):
+    results = Results("seconds", lambda line: None)
+    seconds.measure(results, replace(REQUEST, out=tmp_path), Trainer())
+    turns, table = results.tables["seconds_turns"], results.tables["seconds"].set_index("variant")
+    assert list(turns["reached"]) == [100, 50]
+    assert list(turns["reached_training_s"]) == [10.0, 6.0]
+    assert table.loc[QUICK, "training"] == pytest.approx(0.6)
+    assert table.loc[QUICK, "of_run"] == pytest.approx(0.6)
+    assert table.loc[QUICK, "psnr_over"] == pytest.approx(1.0)
+    assert table.loc[seconds.DEFAULTS, "training"] == 1.0
+
+
+def test_the_command_pays_for_all_but_the_evaluations_on_the_way():
+    probes = [{"t": 5.0, "seconds": 2.0, "processor_seconds": 4.0, "psnr_test": 20.0},
+              {"t": 9.0, "seconds": 3.0, "processor_seconds": 6.0, "psnr_test": 19.0}]  # fmt: skip
+    row = seconds.Training({}, probes, {"seconds": 13.0, "processor_seconds": 16.0}).row(20.0)
+    assert (row["reached"], row["reached_command_s"], row["reached_command_processor_s"]) == (5, 12.0, 14.0)
+    never = seconds.Training({}, probes, {"seconds": 13.0, "processor_seconds": 16.0}).row(20.1)
+    assert math.isnan(never["reached"])
+    assert math.isnan(never["reached_command_s"])
+    assert never["psnr"] == 19.0
+
+
+def test_a_seed_that_never_has_the_target_is_counted():
+    rows = [
+        seconds.Training(
+            {"scene": "toy", "variant": variant, "seed": seed},
+            [{"t": 9.0, "seconds": s, "processor_seconds": s, "psnr_test": psnr}],
+            {"seconds": 20.0, "processor_seconds": 20.0},
+        ).row(20.0)
+        for variant, seed, s, psnr in (("a", 0, 10, 20.0), ("a", 1, 10, 20.0), ("b", 0, 5, 20.0), ("b", 1, 5, 19.0))
+    ]
+    table = seconds.summary(pd.DataFrame(rows)).set_index("variant")
+    assert list(table["seeds"]) == [2, 2]
+    assert list(table["seeds_reached"]) == [2, 1]
+    assert table.loc["b", "training"] == 0.5
+    assert (table.loc["b", "psnr_over_low"], table.loc["b", "psnr_over_high"]) == (-1.0, 0.0)
+
+
+def test_finished_trainings_are_kept_and_a_variant_that_fails_leaves_the_others(tmp_path):
+    trainer = Trainer()
+    for variants in (REQUEST.variants, (*REQUEST.variants, ("optim.no=1",))):
+        request = replace(REQUEST, out=tmp_path, variants=variants)
+        results = Results("seconds", lambda line: None)
+        seconds.measure(results, request, lambda f, o: "no such key" if "optim.no=1" in o else trainer(f, o))
+    assert trainer.trained == ["reference", "quick"]
+    assert "no such key" in results.notes[0]
+    assert len(results.tables["seconds"]) == 2
+
+
+def test_without_a_reference_there_is_nothing_to_compare_with(tmp_path):
+    with pytest.raises(DataError, match="no reference finished"):
+        seconds.measure(Results("seconds", print), replace(REQUEST, out=tmp_path), lambda folder, overrides: "broken")
+
+
+@pytest.mark.parametrize("override", ["fit.seed=3", "+scene=fern", "hydra.run.dir=x", "fit.probe_every=7"])
+def test_settings_of_the_benchmark_are_refused(override):
+    with pytest.raises(DataError, match="is set by the benchmark"):
+        replace(REQUEST, variants=((), (override,)))
+
+
+@pytest.mark.slow
+def test_the_command_trains_a_tiny_demo_and_writes_its_tables(tmp_path, caplog, monkeypatch):
+    monkeypatch.setenv("CLEAR_CACHE", str(tmp_path / "cache"))
+    out = tmp_path / "out"
+    asked = ["seconds", *TINY, "--variant", "--variant", "fit.iterations=6", "--seeds", "0", "--probes", "4"]
+    assert main([*asked, "--out", str(out), "--threads", "1"]) == 0, caplog.text
+    turns = pd.read_csv(out / "seconds_turns.csv").set_index("variant")
+    assert dict(turns["iterations"]) == {"defaults": 12, "fit.iterations=6": 6}
+    assert (turns["command_s"] > turns["training_s"]).all()
+    assert turns.loc["defaults", "reached"] <= 12
+    assert str(tmp_path) not in (out / "seconds.json").read_text()
