@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from clear_strategies.core.gradients import Grads
+from clear_strategies.core.view import ExtraView
 from clear_strategies.merging.conductor import Conductor
 from integration.autograd_shot import AutogradShot
 from rasterizers.interface import Camera
@@ -36,11 +37,8 @@ class ExtraSteps:
         self._rendered: Mapping[str, Tensor] = {}  # what they are gradients of
         self.stepping = False
 
-    def render(self, t: int, render_camera: RenderCamera) -> None:
-        """Render the extra views of iteration t; the gradients of an earlier one that nobody stepped on are dropped."""
-        self.forget()
-        if not (extra_views := self._conductor.extra_views(t)):
-            return
+    def render(self, extra_views: Sequence[ExtraView], t: int, render_camera: RenderCamera) -> None:
+        """Render the extra views of iteration t and take their gradients."""
         self._rendered = {name: p for name, p in self._params().items() if name != "detail"}
         for extra in extra_views:
             shot = render_camera(extra.photo.camera)
@@ -74,7 +72,7 @@ class ExtraSteps:
         return len(self._gradients) if "means" in mine else 0
 
     def forget(self) -> None:
-        """Drop the gradients."""
+        """Before an iteration: drop the gradients of the one before, stepped on or not."""
         self._gradients, self._rendered = [], {}
 
 

@@ -3,6 +3,7 @@
 A few photos leave much space that no camera looks through closely, and a Gaussian there costs nothing while it hides
 behind the borders of the photos. Each pseudo view is a training camera moved aside. Its depth is that of the nearest
 photos' surfaces, its colours are those of the photos that see the same surface; where no photo does, nothing is known.
+A border view is a training camera with a wider field: it knows its photo, and nothing around it.
 """
 
 from __future__ import annotations
@@ -87,6 +88,16 @@ def pseudo_views(
     return made
 
 
+def border_views(photos: Iterable[Photo], *, field: float, max_pixels: int) -> list[PseudoView]:
+    """Each photo as the middle of a picture `field` times as wide and as high.
+
+    Args:
+        field: at least 1.
+        max_pixels: larger photos are reduced by a whole factor first.
+    """
+    return [_widened(_smaller(photo, _factor(photo, max_pixels)), field) for photo in photos]
+
+
 def cut_out(photos: Iterable[Photo], background: tuple[float, float, float]) -> bool:
     """Whether the photos show an object cut out of its surroundings: a good part of them is the background's colour."""
     shares = [float(_blank(photo, background).float().mean()) for photo in photos]
@@ -112,18 +123,39 @@ def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.
     return replace(camera, world_to_camera=turned.to(camera.world_to_camera))
 
 
-def _reduced(photo: Photo, found: DepthMap, max_pixels: int) -> tuple[Photo, DepthMap]:
-    """Both at the size of the first whole factor that leaves at most `max_pixels`; the depth of each block's middle."""
-    factor = max(1, math.ceil(math.sqrt(photo.camera.width * photo.camera.height / max_pixels)))
+def _widened(photo: Photo, field: float) -> PseudoView:
+    c = photo.camera
+    x, y = (round(n * (field - 1) / 2) for n in (c.width, c.height))
+    wide = replace(c, cx=c.cx + x, cy=c.cy + y, width=c.width + 2 * x, height=c.height + 2 * y)
+    image = torch.nn.functional.pad(photo.image, (0, 0, x, x, y, y))
+    known = torch.zeros(wide.height, wide.width, dtype=torch.bool)
+    known[y : y + c.height, x : x + c.width] = True
+    return PseudoView(Photo(wide, image), known)
+
+
+def _factor(photo: Photo, max_pixels: int) -> int:
+    """The first whole factor that leaves at most `max_pixels`."""
+    return max(1, math.ceil(math.sqrt(photo.camera.width * photo.camera.height / max_pixels)))
+
+
+def _smaller(photo: Photo, factor: int) -> Photo:
     if factor == 1:
-        return photo, found
+        return photo
     image = images.area_mean(images.crop_to_multiple(photo.image, factor), factor)
     camera = replace(photo.camera, width=image.shape[1] * factor, height=image.shape[0] * factor).scaled(1 / factor)
+    return Photo(camera, image)
+
+
+def _reduced(photo: Photo, found: DepthMap, max_pixels: int) -> tuple[Photo, DepthMap]:
+    """Both at the size of the first whole factor that leaves at most `max_pixels`; the depth of each block's middle."""
+    factor = _factor(photo, max_pixels)
+    smaller = _smaller(photo, factor)
+    height, width = smaller.image.shape[:2]
     depth, confidence = (
-        values[factor // 2 :: factor, factor // 2 :: factor][: camera.height, : camera.width]
+        values[factor // 2 :: factor, factor // 2 :: factor][:height, :width]
         for values in (found.depth, found.confidence)
     )
-    return Photo(camera, image), DepthMap(depth, confidence)
+    return smaller, DepthMap(depth, confidence)
 
 
 def _source(photo: Photo, found: DepthMap, background: tuple[float, float, float]) -> _Source:

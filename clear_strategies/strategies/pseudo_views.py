@@ -2,27 +2,33 @@
 
 A few photos leave much space that no camera looks through closely, and a Gaussian there costs nothing while it hides behind the
 borders of the photos. A pseudo view is a training camera moved aside; its picture is warped from the photos by their depth
-(`clear_strategies.geometry.pseudo_views`), and has weight 0 where no photo tells the colour.
+(`clear_strategies.geometry.pseudo_views`). Where no photo tells the colour it continues those around smoothly, and so does the
+border of a training camera with a wider field: at a small weight, so that what no photo shows is neither black nor invented.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
 
 from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
 from clear_strategies.errors import SettingError
-from clear_strategies.geometry.pseudo_views import cut_out, pseudo_views
+from clear_strategies.geometry.continuation import continued
+from clear_strategies.geometry.pseudo_views import PseudoView, border_views, cut_out, pseudo_views
 from clear_strategies.strategies.base import Strategy
 
 _log = logging.getLogger(__name__)
 
 _MADE: Final = "views"
+_BORDERS: Final = "borders"
+_KNOWN: Final = "known"
 _SEED: Final = "seed"
+_BORDER_SHARE: Final = 4  # of so many extra views one is a training camera with a wider field
 
 
 @dataclass(frozen=True)
@@ -37,6 +43,10 @@ class PseudoViews(Strategy):
         reach: largest distance of a pseudo camera from its photo's, > 0, as a multiple of the photo's median depth.
         weight: of their LR loss, > 0, as a multiple of a photo's, which is λ_LR.
         tolerance: largest relative difference, > 0, between the depth of a point and that of a photo that shows its colour.
+        continued: weight of the pixels that no photo tells, in [0, 1], as a multiple of `weight`: they continue the colours
+            around them smoothly. 0: they count nothing, and no border is shown.
+        border: width of the training cameras' field, at least 1, where they show the continued border of their photos, as a
+            multiple of the photo's. 1: no border is shown.
         max_pixels: larger LR photos are first reduced by a whole factor; bounds time and memory.
 
     Raises:
@@ -48,6 +58,8 @@ class PseudoViews(Strategy):
     reach: float = 1.2
     weight: float = 1.0
     tolerance: float = 0.02
+    continued: float = 0.1
+    border: float = 1.3
     max_pixels: int = 64_000
 
     def __post_init__(self) -> None:
@@ -57,10 +69,14 @@ class PseudoViews(Strategy):
         for name in ("reach", "weight", "tolerance"):
             if not getattr(self, name) > 0:
                 raise SettingError(f"{name} must be > 0, got {getattr(self, name)}.")
+        if not 0 <= self.continued <= 1:
+            raise SettingError(f"continued must lie in [0, 1], got {self.continued}.")
+        if not 1 <= self.border < math.inf:
+            raise SettingError(f"border must be at least 1 and finite, got {self.border}.")
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
-        self.cache[_SEED], self.cache[_MADE] = seed, ()
+        self.cache[_SEED], self.cache[_MADE], self.cache[_BORDERS] = seed, (), ()
 
     def wants_views(self) -> bool:
         return True
@@ -71,9 +87,8 @@ class PseudoViews(Strategy):
         """
         photos = {view.name: view.lr.to("cpu") for view in views}
         background = views[0].background if views else (0.0, 0.0, 0.0)
-        if len(photos) < 2:
-            given = f"there are {len(photos)}" if photos else "this training loop does not give its views"
-            _log.warning("PseudoViews has no effect: at least two training views are needed, %s.", given)
+        if not photos:
+            _log.warning("PseudoViews has no effect: this training loop does not give its views.")
             return
         if cut_out(photos.values(), background):
             _log.info(
@@ -81,39 +96,60 @@ class PseudoViews(Strategy):
                 "the background nothing can hide."
             )
             return
-        made = pseudo_views(
+        made = self._moved_aside(views, photos)
+        borders = []
+        if self.continued > 0 and self.border > 1:
+            borders = border_views(photos.values(), field=self.border, max_pixels=self.max_pixels)
+        if not made:
+            left = "only shows the borders of the photos" if borders else "has no effect"
+            _log.warning("PseudoViews %s: stereo finds depth in fewer than two of %d photos.", left, len(photos))
+        self.cache[_KNOWN] = sum(float(view.known.float().mean()) for view in made) / max(1, len(made))
+        self.cache[_MADE] = tuple(self._target(view) for view in made)
+        self.cache[_BORDERS] = tuple(self._target(view) for view in borders)
+
+    def _moved_aside(self, views: Sequence[View], photos: dict[str, Photo]) -> list[PseudoView]:
+        if len(photos) < 2:
+            return []
+        return pseudo_views(
             photos,
             _depths(views, photos),
             count=self.count,
             reach=self.reach,
             tolerance=self.tolerance,
             max_pixels=self.max_pixels,
-            background=background,
+            background=views[0].background,
             seed=self.cache[_SEED],
         )
-        if not made:
-            _log.warning("PseudoViews has no effect: stereo finds depth in fewer than two of %d photos.", len(photos))
-        self.cache[_MADE] = tuple(
-            ExtraView(view.photo, view.known * self.weight).to(self.device) for view in made
-        )  # fmt: skip
+
+    def _target(self, view: PseudoView) -> ExtraView:
+        weight = torch.where(view.known, 1.0, self.continued if bool(view.known.any()) else 0.0) * self.weight
+        image = continued(view.photo.image, view.known) if self.continued > 0 else view.photo.image
+        return ExtraView(replace(view.photo, image=image), weight).to(self.device)
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         """One of them every `every` iterations: a function of (seed, t)."""
         made: Sequence[ExtraView] = self.cache.get(_MADE, ())
-        if not made or t % self.every:
+        borders: Sequence[ExtraView] = self.cache.get(_BORDERS, ())
+        if not (made or borders) or t % self.every:
             return ()
         generator = torch.Generator().manual_seed(self.cache[_SEED] * 1_000_003 + t)
-        return (made[int(torch.randint(len(made), (), generator=generator))],)
+
+        def drawn(n: int) -> int:
+            return int(torch.randint(n, (), generator=generator))
+
+        among = borders if borders and not (made and drawn(_BORDER_SHARE)) else made
+        return (among[drawn(len(among))],)
 
     def on_fit_end(self) -> None:
-        self.cache[_MADE] = ()
+        self.cache[_MADE] = self.cache[_BORDERS] = ()
 
     def summary(self) -> str | None:
-        made: Sequence[ExtraView] = self.cache.get(_MADE, ())
-        if not made:
+        made, borders = (len(self.cache.get(which, ())) for which in (_MADE, _BORDERS))
+        if not (made or borders):
             return None
-        known = sum(float((view.weight > 0).float().mean()) for view in made) / len(made)
-        return f"{len(made)} beside the training cameras, {known:.0%} of their pixels known, one every {self.every} iterations"
+        beside = f"{made} beside the training cameras, {self.cache[_KNOWN]:.0%} of their pixels known, " if made else ""
+        wide = f"{borders} with a field {self.border:g} times as wide, " if borders else ""
+        return f"{beside}{wide}one every {self.every} iterations"
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
         return "it is the LR loss that pseudo views are trained by, and lambda_lr is 0" if lambda_lr == 0 else None

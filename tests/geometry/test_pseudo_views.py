@@ -8,7 +8,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.projection import back_project, project, sample_colors
-from clear_strategies.geometry.pseudo_views import PseudoView, moved_aside, pseudo_views
+from clear_strategies.geometry.pseudo_views import PseudoView, border_views, moved_aside, pseudo_views
 from tests.helpers import planes
 
 DEPTH = 4.0
@@ -113,3 +113,20 @@ def test_large_photos_are_reduced_and_still_show_the_plane():
     camera = made[0].photo.camera
     assert (camera.width, camera.height, camera.fx) == (60, 45, 50.0)
     assert made[0].known.float().mean() > 0.5
+
+
+@pytest.mark.parametrize("max_pixels", [10**6, 3_000])
+def test_a_border_view_shows_its_photo_in_the_middle_of_a_wider_field(max_pixels):
+    photo = planes.plane_photos(1)[0]
+    (wide,) = border_views([photo], field=1.3, max_pixels=max_pixels)
+    c, (column, row) = wide.photo.camera, (int(wide.known.any(0).sum()), int(wide.known.any(1).sum()))
+    assert (c.width, c.height) == (pytest.approx(1.3 * column, abs=2), pytest.approx(1.3 * row, abs=2))
+    assert bool(wide.known.sum() == column * row)
+    if max_pixels == 10**6:
+        assert torch.equal(wide.photo.image[wide.known], photo.image.reshape(-1, 3))
+    assert not wide.photo.image[~wide.known].any()
+    point = torch.tensor([[0.3, -0.2, DEPTH]], dtype=torch.float64)
+    (there,), (here,) = (project(camera, point)[0] for camera in (c, photo.camera))
+    y, x = (int(axis.nonzero()[0]) for axis in (wide.known.any(1), wide.known.any(0)))
+    scale = column / photo.camera.width
+    assert there.tolist() == pytest.approx((here * scale + torch.tensor([x, y])).tolist(), abs=1e-4)

@@ -10,9 +10,10 @@ import torch
 
 from clear_strategies import PseudoViews
 from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.prepare import ViewSettings, prepare
+from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.readers import demo
+from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import SettingError
 from clear_strategies.strategies.testing import check_strategy
 from tests.helpers.short_run import SCENE, with_depth
@@ -36,18 +37,50 @@ def test_one_comes_every_nth_iteration_and_the_choice_is_a_function_of_seed_and_
     made = prepared(views)
     assert [len(made.extra_views(t)) for t in range(1, 7)] == [0, 1, 0, 1, 0, 1]
     chosen = [made.extra_views(t)[0] for t in range(2, 400, 2)]
-    assert len({id(view) for view in chosen}) == 8  # each has its turn
+    assert len({id(view) for view in chosen}) == 8 + len(views)  # each has its turn
     assert chosen == [made.extra_views(t)[0] for t in range(2, 400, 2)]
     again = [prepared(views).extra_views(t)[0].photo.image for t in (2, 4)]
     assert all(torch.equal(a, b.photo.image) for a, b in zip(again, chosen, strict=False))
-    other = prepared(views, seed=6)
-    assert any(not torch.equal(other.extra_views(t)[0].photo.image, made.extra_views(t)[0].photo.image) for t in (2, 4))
+    others = prepared(views, seed=6)
+    assert any(differ(others.extra_views(t)[0].photo.image, made.extra_views(t)[0].photo.image) for t in range(2, 9, 2))
 
 
-def test_the_weight_is_that_of_the_settings_where_photos_tell_the_colour_and_0_elsewhere():
-    extra = prepared(with_depth(SCENE).train, replace(FEW, weight=0.5)).extra_views(2)[0]
+def differ(a, b):
+    return a.shape != b.shape or not torch.equal(a, b)
+
+
+def test_a_quarter_are_training_cameras_with_a_wider_field():
+    views = with_depth(SCENE).train
+    made = prepared(views)
+    width = views[0].lr.camera.width
+    wide = [made.extra_views(t)[0].photo.camera.width > width for t in range(2, 802, 2)]
+    assert 60 < sum(wide) < 140
+    for off in ({"border": 1.0}, {"continued": 0.0}):
+        none = prepared(views, replace(FEW, **off))
+        assert all(none.extra_views(t)[0].photo.camera.width == width for t in range(2, 100, 2))
+
+
+def test_the_weight_is_that_of_the_settings_where_photos_tell_the_colour_and_small_elsewhere():
+    made = prepared(with_depth(SCENE).train, replace(FEW, weight=0.5, continued=0.2))
+    extras = [made.extra_views(t)[0] for t in range(2, 60, 2)]
+    assert {round(w, 6) for extra in extras for w in extra.weight.unique().tolist()} == {0.1, 0.5}
+    black = (extras[0].photo.image == 0).all(-1)
+    assert not black.any()
+
+
+def test_without_a_continuation_what_no_photo_tells_counts_nothing():
+    extra = prepared(with_depth(SCENE).train, replace(FEW, weight=0.5, continued=0.0)).extra_views(2)[0]
     assert set(extra.weight.unique().tolist()) <= {0.0, 0.5}
     assert not extra.photo.image[extra.weight == 0].any()
+
+
+def test_without_stereo_only_the_borders_are_shown(caplog):
+    made = prepared(SCENE.train[:1])
+    assert "only shows the borders of the photos" in caplog.text
+    extra = made.extra_views(2)[0]
+    assert extra.photo.camera.width > SCENE.train[0].lr.camera.width
+    assert (made.summary() or "").startswith("1 with a field 1.3 times as wide")
+    assert prepared(SCENE.train[:1], replace(FEW, border=1.0)).summary() is None
 
 
 def test_views_without_depth_get_it_from_stereo():
@@ -69,7 +102,7 @@ def test_after_the_run_none_is_kept():
 
 def test_a_loop_that_gives_no_views_is_warned(caplog):
     made = prepared(())
-    assert "PseudoViews has no effect: at least two training views are needed, this training loop" in caplog.text
+    assert "PseudoViews has no effect: this training loop does not give its views" in caplog.text
     assert not made.extra_views(2)
 
 
@@ -95,7 +128,19 @@ def test_without_an_lr_loss_it_has_no_effect():
 
 
 @pytest.mark.parametrize(
-    "bad", [{"every": 0}, {"count": 0}, {"reach": 0.0}, {"weight": 0.0}, {"tolerance": -1.0}, {"max_pixels": 0}]
+    "bad",
+    [
+        {"every": 0},
+        {"count": 0},
+        {"reach": 0.0},
+        {"weight": 0.0},
+        {"tolerance": -1.0},
+        {"max_pixels": 0},
+        {"continued": -0.1},
+        {"continued": 1.5},
+        {"border": 0.9},
+        {"border": float("inf")},
+    ],
 )
 def test_a_setting_outside_its_range_is_refused(bad):
     with pytest.raises(SettingError, match=next(iter(bad))):

@@ -49,6 +49,7 @@ def test_two_views_are_enough() -> None:
     assert all(found.coverage > 0.4 for found in depth_maps(photos_of(slanted, 2), NONE, QUICK))
 
 
+@pytest.mark.slow
 def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
     photos, threads = photos_of(bump, 2, (200, 170)), torch.get_num_threads()
     settings = StereoSettings(max_planes=8)

@@ -1,0 +1,69 @@
+"""FadingOpacity: every Gaussian fades a little at each iteration, so that one stays only where a loss holds it.
+
+A Gaussian that no training view needs keeps the opacity it has: it floats in free space, or hides at the border of a photo,
+until a test view shows it. Where opacities fade, the gradient must bring them back again and again.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from clear_strategies.core.step import Step
+from clear_strategies.errors import SettingError
+from clear_strategies.schedules import milestone
+from clear_strategies.strategies.base import Strategy
+
+_log = logging.getLogger(__name__)
+
+_FEW_VIEWS: Final = 3  # the whole rate is for runs with at most so many views,
+_LONG_RUN: Final = 1_350  # that fade for at least so many iterations
+_LOWEST: Final = -11.5  # an opacity of 1e-5: no renderer draws it, and no gradient reaches it
+
+
+@dataclass(frozen=True)
+class FadingOpacity(Strategy):
+    """Opacity × (1 - rate) after each iteration.
+
+    Args:
+        rate: share of its opacity that a Gaussian loses at an iteration, in [0, 1). It is for three training views; with more
+            of them it is lower in proportion, so that a Gaussian fades equally between two looks at one view. Where `until`
+            comes before 1,350, it is lower in proportion, too: opacities start low, and a short run must first raise them.
+        until: the iteration after which opacities are left alone.
+
+    Raises:
+        SettingError: a setting is outside its range.
+    """
+
+    rate: float = 0.005
+    until: int = milestone(9_000)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rate < 1:
+            raise SettingError(f"rate must lie in [0, 1), got {self.rate}.")
+
+    def on_fit_start(self, n_views: int, seed: int) -> None:
+        super().on_fit_start(n_views, seed)
+        share = min(1.0, _FEW_VIEWS / max(1, n_views)) * min(1.0, self.until / _LONG_RUN)
+        self.cache["rate"] = self.rate * share
+        if share < 1:
+            _log.debug("opacities fade by %.5f an iteration instead of %.5f (%d views, until t=%d).",
+                       self.rate * share, self.rate, n_views, self.until)  # fmt: skip
+
+    def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
+        """The logit of (1 - rate) σ(o), which is log(1 - rate) - log(rate + exp(-o))."""
+        rate: float = self.cache.get("rate", self.rate)
+        if step.t > self.until or rate == 0:
+            return
+        o = params["opacities"]
+        faded = math.log(1 - rate) - torch.log(rate + torch.exp(-o))
+        o.copy_(torch.where(o > _LOWEST, faded, o))
+
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+        return "no opacity fades: its rate is 0" if self.rate == 0 else None

@@ -1,0 +1,97 @@
+"""FadingOpacity: which share of its opacity a Gaussian loses, when, and how many views slow it down."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from clear_strategies import FadingOpacity
+from clear_strategies.core.step import Step
+from clear_strategies.errors import SettingError
+from clear_strategies.schedules import scaled
+from clear_strategies.strategies.testing import check_strategy
+from clear_strategies.training.loop import iterate
+from tests.helpers.short_run import SCENE, start, tensors
+from tests.helpers.toy import RASTERIZER
+
+LOGITS = torch.tensor([-20.0, -11.6, -11.4, -5.0, 0.0, 3.0, 15.0])
+
+
+def faded(settings, t=1, views=3, opacities=LOGITS):
+    strategy = replace(settings)
+    strategy.on_fit_start(views, seed=0)
+    params = {"opacities": opacities.clone(), "means": torch.ones(len(opacities), 3)}
+    strategy.after_step(params, Step(t, SCENE.train[0], None, None))
+    return params
+
+
+def test_it_keeps_the_contract():
+    check_strategy(FadingOpacity)
+
+
+def test_every_opacity_loses_the_same_share_and_nothing_else_changes():
+    params = faded(FadingOpacity(rate=0.02))
+    visible = LOGITS > -11.5
+    expected = LOGITS.double().sigmoid() * 0.98
+    assert torch.allclose(params["opacities"].double().sigmoid()[visible], expected[visible], rtol=1e-6)
+    assert torch.equal(params["means"], torch.ones(len(LOGITS), 3))
+
+
+def test_an_opacity_that_no_renderer_draws_stays_as_it_is_so_that_logits_stay_finite():
+    params = {"opacities": torch.tensor([-200.0, -11.6, 2.0])}
+    strategy = FadingOpacity(rate=0.5)
+    strategy.on_fit_start(3, seed=0)
+    for t in range(1, 1000):
+        strategy.after_step(params, Step(t, SCENE.train[0], None, None))
+    assert params["opacities"][:2].tolist() == [-200.0, pytest.approx(-11.6)]
+    assert -13 < params["opacities"][2] <= -11.5
+
+
+def test_the_more_views_there_are_the_slower_it_fades():
+    for views, rate in ((1, 0.02), (3, 0.02), (6, 0.01), (12, 0.005)):
+        lost = 1 - faded(FadingOpacity(rate=0.02), views=views)["opacities"][4].sigmoid() / 0.5
+        assert float(lost) == pytest.approx(rate, rel=1e-4)
+
+
+def test_a_short_run_fades_more_slowly():
+    for until, rate in ((9_000, 0.02), (1_350, 0.02), (270, 0.004)):
+        lost = 1 - faded(FadingOpacity(rate=0.02, until=until))["opacities"][4].sigmoid() / 0.5
+        assert float(lost) == pytest.approx(rate, rel=1e-4)
+
+
+def test_after_nine_tenths_of_the_run_opacities_are_left_alone():
+    short = scaled(FadingOpacity(), 0.15)
+    assert not torch.equal(faded(short, t=1350)["opacities"], LOGITS)
+    assert torch.equal(faded(short, t=1351)["opacities"], LOGITS)
+
+
+def test_without_a_rate_it_has_no_effect_and_says_so():
+    off = FadingOpacity(rate=0.0)
+    assert torch.equal(faded(off)["opacities"], LOGITS)
+    assert "rate is 0" in (off.without_effect(lambda_lr=1.0, lambda_hr=1.0) or "")
+    assert FadingOpacity().without_effect(lambda_lr=1.0, lambda_hr=1.0) is None
+
+
+@pytest.mark.parametrize("bad", [-0.1, 1.0, float("nan")])
+def test_a_rate_outside_its_range_is_refused(bad):
+    with pytest.raises(SettingError, match="rate"):
+        FadingOpacity(rate=bad)
+
+
+def test_a_run_fades_and_every_row_has_the_bits_of_the_pass_that_skips_some():
+    states = {
+        name: start(("gco", "svs"), more=more, fused=fused)
+        for name, fused, more in (
+            ("plain", "auto", ()),
+            ("fading", "auto", (FadingOpacity(rate=0.05),)),
+            ("every row", "every_row", (FadingOpacity(rate=0.05),)),
+        )
+    }
+    for state in states.values():
+        while not state.ended:
+            iterate(state, RASTERIZER)
+    plain, fading, every_row = (tensors(state) for state in states.values())
+    assert fading["field/opacities"].sigmoid().mean() < 0.9 * plain["field/opacities"].sigmoid().mean()
+    assert all(torch.equal(value, every_row[name]) for name, value in fading.items())
