@@ -1,4 +1,4 @@
-"""A splat in the formats of viewers: .ply and .splat by this package, the others by PlayCanvas's splat-transform.
+"""A splat in the formats of viewers: .ply, .glb and .splat by this package, the others by PlayCanvas's splat-transform.
 
 splat-transform is a program of npm (MIT). One that is on the PATH is taken; else `npx` downloads it once.
 """
@@ -24,6 +24,7 @@ from clear_strategies import files
 from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.errors import SettingError
 from clear_strategies.outputs.format_names import FORMATS
+from clear_strategies.outputs.gltf import glb_bytes
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
@@ -75,6 +76,8 @@ def write_format(path: Path, g: GaussianPly, form: str, start: Start) -> None:
         write_gaussians(path, g)
     elif form == "splat":
         files.write_bytes(path, splat_bytes(g))
+    elif form == "glb":
+        files.write_bytes(path, glb_bytes(g))
     else:
         _convert(path, g, form, start)
 
@@ -109,7 +112,7 @@ def converter() -> list[str]:
         return [npx, "--yes", _CONVERTER]
     raise SettingError(
         "spz, sog and html are written by PlayCanvas's splat-transform, which needs Node.js 20 or later: install it from "
-        "nodejs.org, or choose --to ply or --to splat."
+        "nodejs.org, or choose --to ply, --to glb or --to splat."
     )
 
 

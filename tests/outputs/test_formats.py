@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import struct
 import subprocess
 
 import numpy as np
@@ -63,6 +64,50 @@ def test_a_ply_is_the_one_of_the_run(run, tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == (folder / "point_cloud.ply").read_bytes()
     export.main([str(folder), "--to", "ply", "--sh", "1"])
     assert read_gaussians(folder / f"{folder.name}.ply").shN.shape[1] == 3
+
+
+def read_glb(path):
+    """(content, attributes) of a .glb, by the letter of glTF 2.0."""
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    content = json.loads(data[20 : 20 + size])
+    rest, binary = struct.unpack_from("<I4s", data, 20 + size)
+    assert (kind, binary, size % 4, rest % 4) == (b"JSON", b"BIN\0", 0, 0)
+    buffer = data[28 + size :]
+    assert len(buffer) == rest
+    found = {}
+    for name, index in content["meshes"][0]["primitives"][0]["attributes"].items():
+        accessor = content["accessors"][index]
+        view, width = (
+            content["bufferViews"][accessor["bufferView"]],
+            {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]],
+        )
+        assert accessor["componentType"] == 5126
+        values = np.frombuffer(buffer, "<f4", accessor["count"] * width, view["byteOffset"])
+        found[name] = values.reshape(accessor["count"], width)
+    return content, found
+
+
+def test_a_glb_holds_the_splats_of_the_ply(run, tmp_path):
+    folder, _ = run
+    export.main([str(folder), "--to", "glb", "--out", str(tmp_path / "a.glb")])
+    content, found = read_glb(tmp_path / "a.glb")
+    g, prefix = read_gaussians(folder / "point_cloud.ply"), "KHR_gaussian_splatting:"
+    exact = {
+        "POSITION": g.means, f"{prefix}SCALE": g.scales.exp(), f"{prefix}OPACITY": g.opacities.sigmoid()[:, None],
+        f"{prefix}ROTATION": torch.nn.functional.normalize(g.quats, dim=1)[:, [1, 2, 3, 0]],
+        "COLOR_0": torch.cat([(g.sh0[:, 0] * SH_C0 + 0.5).clamp(0, 1), g.opacities.sigmoid()[:, None]], 1),
+        f"{prefix}SH_DEGREE_0_COEF_0": g.sh0[:, 0], f"{prefix}SH_DEGREE_1_COEF_2": g.shN[:, 2],
+        f"{prefix}SH_DEGREE_2_COEF_0": g.shN[:, 3], f"{prefix}SH_DEGREE_3_COEF_6": g.shN[:, 14],
+    }  # fmt: skip
+    assert len(found) == 5 + 16
+    for name, values in exact.items():
+        np.testing.assert_allclose(found[name], values.numpy(), rtol=1e-6, atol=1e-7, err_msg=name)
+    position = content["accessors"][content["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(position["max"], found["POSITION"].max(0))
+    assert content["extensionsUsed"] == ["KHR_gaussian_splatting"]
 
 
 @by_another_program

@@ -17,8 +17,9 @@ from clear_strategies.data.photo_files import image_size, inside, list_images
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
 from clear_strategies.data.readers.colmap_model import Model, read_model
+from clear_strategies.data.readers.video import CHOICE, frames_of
 from clear_strategies.data.usable import Fault, some, usable
-from clear_strategies.errors import DataError
+from clear_strategies.errors import DataError, SettingError
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +31,7 @@ def read(
     root: str | Path,
     cache: str | Path | None = None,
     *,
+    frames: int | None = None,
     max_side: int = 1600,
     max_features: int = 8192,
     precise: bool | Literal["auto"] = "auto",
@@ -40,10 +42,12 @@ def read(
     missing: Fault = "refuse",
     broken: Fault = "refuse",
 ) -> Capture:
-    """Read a folder of photos of one scene. Poses are estimated from all of them and kept in a cache.
+    """Read a folder of photos of one scene, or a video. Poses are estimated from all of them and kept in a cache.
 
     Args:
+        root: the folder, or the file of a video: its sharpest frames, evenly spread over the camera's path, are the photos.
         cache: folder of the poses; None: ~/.cache/clear-strategies/sfm, or $CLEAR_CACHE/sfm. Not in the photos' folder.
+        frames: of a video, how many are chosen; None: one for each eighth of the width that the picture moves, 12 to 40.
         max_side: features are extracted from photos reduced to this many pixels.
         max_features: of a photo, those of the coarsest scales; memory and time of matching grow with its square.
         precise: features that follow a surface's tilt (affine shape, domain-size pooling), matched once more along the
@@ -65,7 +69,15 @@ def read(
     require_number("data.reader.least_placed", least_placed, above=0, most=1)
     require_whole("data.reader.threads", threads, least=-1)
     require_whole("data.reader.seed", seed, least=0)
-    root = Path(root)
+    root, notes = Path(root), {}
+    if frames is not None:
+        require_whole("data.reader.frames", frames, least=sfm.FEWEST)
+    if root.is_file():
+        video = root
+        root = frames_of(video, frames)
+        notes["photos"] = f"{video.name}: {(root / CHOICE).read_text()}"
+    elif frames is not None:
+        raise SettingError(f"data.reader.frames: {root} is no video. Leave frames out.")
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
@@ -83,7 +95,8 @@ def read(
     else:
         settings = sfm.SfmSettings(max_side, max_features, careful, least_placed, threads, seed)
         sfm.reconstruct(root, photos, folder, settings)
-    return _capture(root, paths, photos, read_model(folder))
+    found = _capture(root, paths, photos, read_model(folder))
+    return replace(found, notes={**found.notes, **notes})
 
 
 def _capture(root: Path, paths: Sequence[Path], photos: Mapping[Path, Exif], model: Model) -> Capture:

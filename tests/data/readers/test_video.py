@@ -1,0 +1,98 @@
+"""Of a video, the sharp frames along the camera's path become photos; blurred and repeated ones do not."""
+
+from __future__ import annotations
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+import skimage.data
+
+from clear_strategies.commands.train import overrides
+from clear_strategies.data.readers import photos, video
+from clear_strategies.data.readers.video import choose, frames_of
+from clear_strategies.errors import DataError, SettingError
+from clear_strategies.viewing.video import write_videos
+
+SIZE = (180, 320)
+BLURRED, STILL = range(20, 24), range(40, 48)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """A camera that pans 4 px a frame, shakes for four frames and stands still for eight."""
+    picture = cv2.resize(skimage.data.astronaut(), (800, 800))
+    at, frames = 0, []
+    for i in range(80):
+        at += 0 if i in STILL else 4
+        frame = picture[200 : 200 + SIZE[0], at : at + SIZE[1]]
+        frames.append(cv2.GaussianBlur(frame, (0, 0), 4) if i in BLURRED else frame)
+    path = tmp_path_factory.mktemp("clip") / "around the room.mp4"
+    write_videos([path], frames, fps=30)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("CLEAR_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
+def test_the_chosen_frames_are_sharp_and_lie_evenly_along_the_path(clip):
+    sharpness, movement = video._judged(clip)
+    assert len(sharpness) == 80
+    assert movement[1:20] == pytest.approx(4 / 320, abs=1e-3)
+    choice = choose(sharpness, movement, 12)
+    assert choice.blurred == len(BLURRED)
+    assert len(STILL) - 1 <= choice.still <= len(STILL)
+    assert len(choice.frames) == 12
+    assert not set(choice.frames) & set(BLURRED)
+    steps = np.diff(np.cumsum(movement)[choice.frames])
+    part = movement.sum() / 12
+    assert (steps > 0).all()
+    assert steps.max() <= 2 * part
+
+
+def test_the_frames_are_files_that_are_made_once(clip):
+    folder = frames_of(clip, 5)
+    files = sorted(folder.glob("*.jpg"))
+    assert [file.name for file in files] == [f"around the room_{k:03d}.jpg" for k in range(1, 6)]
+    assert cv2.imread(str(files[0])).shape == (*SIZE, 3)
+    assert re.match(r"5 of 80 frames \(4 blurred, \d without movement\)", (folder / video.CHOICE).read_text())
+    before = files[0].stat().st_mtime_ns
+    assert frames_of(clip, 5) == folder
+    assert files[0].stat().st_mtime_ns == before
+
+
+def test_the_number_of_frames_follows_the_path():
+    steady = np.ones(1000)
+    assert len(choose(steady, np.full(1000, 0.003), None).frames) == 25  # three widths
+    assert len(choose(steady, np.full(1000, 0.03), None).frames) == 40
+    assert len(choose(steady, np.full(1000, 0.0003), None).frames) == 12
+
+
+def test_photos_of_a_video_are_its_frames(clip, monkeypatch):
+    seen = []
+    monkeypatch.setattr(photos.sfm, "reconstruct", lambda root, found, *_: seen.extend(found) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        photos.read(clip, frames=6)
+    assert [path.name for path in seen] == [f"around the room_{k:03d}.jpg" for k in range(1, 7)]
+
+
+def test_train_takes_a_video(clip):
+    assert "data=photos" in overrides([str(clip), "data.reader.frames=9"])
+
+
+@pytest.mark.parametrize("content", [b"", b"no video at all", b"\0\0\0\x18ftypmp42"])
+def test_what_is_no_video_is_refused_in_one_line(tmp_path, content):
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=r"ffmpeg finds 0 frames in it.*or the folder of its photos"):
+        frames_of(path, None)
+
+
+def test_frames_are_of_a_video(tmp_path):
+    with pytest.raises(SettingError, match=r"data\.reader\.frames: .* is no video"):
+        photos.read(tmp_path, frames=5)
+    with pytest.raises(SettingError, match=r"data\.reader\.frames: must be"):
+        photos.read(tmp_path, frames=2)
