@@ -16,9 +16,11 @@ if TYPE_CHECKING:
     from clear_strategies.core.step import Step
     from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
     from clear_strategies.errors import AnchorError, ClearError, DataError, StrategyConflict
-    from clear_strategies.merging.conductor import Conductor, Update
+    from clear_strategies.merging.conductor import Conductor
+    from clear_strategies.merging.iteration import Update
     from clear_strategies.merging.objective import Objective
     from clear_strategies.strategies.base import ScreenGradients, Strategy
+    from clear_strategies.strategies.fading_opacity import FadingOpacity
     from clear_strategies.strategies.gco import GCO
     from clear_strategies.strategies.p2g import P2G
     from clear_strategies.strategies.pseudo_views import PseudoViews
@@ -38,6 +40,7 @@ __all__ = [
     "DepthMap",
     "Evidence",
     "ExtraView",
+    "FadingOpacity",
     "Grads",
     "Objective",
     "Photo",
@@ -58,9 +61,11 @@ _NAMES: Final = {  # by the module of this package that they are defined in
     "core.step": ("Step",),
     "core.view": ("DepthMap", "ExtraView", "Photo", "View"),
     "errors": ("AnchorError", "ClearError", "DataError", "StrategyConflict"),
-    "merging.conductor": ("Conductor", "Update"),
+    "merging.conductor": ("Conductor",),
+    "merging.iteration": ("Update",),
     "merging.objective": ("Objective",),
     "strategies.base": ("ScreenGradients", "Strategy"),
+    "strategies.fading_opacity": ("FadingOpacity",),
     "strategies.gco": ("GCO",),
     "strategies.p2g": ("P2G",),
     "strategies.pseudo_views": ("PseudoViews",),

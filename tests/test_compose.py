@@ -16,10 +16,11 @@ from omegaconf import OmegaConf
 from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies import compose as compose_module
 from clear_strategies.compose import CONF, conductor, require_each_once, tree
-from clear_strategies.data.prepare import ViewSettings
 from clear_strategies.data.priors import BackProjected, Bicubic
+from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import SettingError, StrategyConflict
-from clear_strategies.jobs import device, job
+from clear_strategies.jobs import device
+from clear_strategies.jobs.settings import RunSettings, settings_of
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.settings import TARGET, with_defaults
 
@@ -115,7 +116,7 @@ def composed(*overrides: str) -> Any:
 def test_clear_on_the_command_line_is_clear_in_python():
     """The defaults have one owner, the class: strategies, objective and all numbers are the same, field by field."""
     ours = Conductor(GCO(), P2G(), SVS())
-    run = job.settings_of(tree(composed("+strategy=clear")))
+    run = settings_of(tree(composed("+strategy=clear")))
     for theirs in (conductor("clear"), run.conductor(1.0)):
         assert theirs.strategies == ours.strategies
         assert theirs.objective == ours.objective
@@ -123,24 +124,42 @@ def test_clear_on_the_command_line_is_clear_in_python():
     kinds = {"optim": run.optim, "mip": run.mip, "cloud": run.data.cloud}
     assert kinds == {k: type(v)() for k, v in kinds.items()}
     assert run.data.views == ViewSettings(photos_are="hr")  # the demo's
-    assert run.fit == job.RunSettings(iterations=900, baseline=True)  # the demo's
+    assert run.fit == RunSettings(iterations=650, baseline=True)  # the demo's
 
 
 def test_the_two_sets_of_readings_differ_where_they_say():
-    measured, literal = (job.settings_of(tree(composed(f"+strategy={name}"))) for name in ("clear", "clear_paper"))
+    measured, literal = (settings_of(tree(composed(f"+strategy={name}"))) for name in ("clear", "clear_paper"))
     assert (measured.strategies["p2g"].score_by, literal.strategies["p2g"].score_by) == ("sum", "evidence")
     assert (measured.objective.lambda_hr.final, literal.objective.lambda_hr.final) == (1.0, 0.1)
     assert (measured.optim.detail_decay, literal.optim.detail_decay) == (0.002, 0.0)
+    assert (measured.optim.geometry_steps, literal.optim.geometry_steps) == (30_000, 0)
     assert (measured.strategies["svs"].anchor_strength, literal.strategies["svs"].anchor_strength) == (0.0, 0.01)
     assert literal.strategies["svs"].anchor_weights["means"] == 1.0
     assert literal.strategies["svs"].anchor_weights["detail"] == 0.0
     assert literal.skips == type(literal.skips)(plateau_window=250)  # nothing is left out
 
 
+@pytest.mark.parametrize(
+    ("chosen", "steps"),
+    [
+        ((), 30_000),
+        (("+strategy=best", "+scene=fern"), 30_000),
+        (("optim=3dgs",), 0),
+        (("+method=srgs",), 0),
+        (("+method=dropgaussian_srgs", "optim=by_length"), 30_000),
+        (("+protocol=llff_x4",), 0),
+        (("+protocol=llff_x4", "+strategy=best", "optim=by_length"), 30_000),
+        (("experiment=llff_x4",), 0),
+        (("experiment=evidence",), 0),
+    ],
+    ids=str,
+)
+def test_what_was_published_keeps_its_rates(chosen, steps):
+    assert composed(*chosen).optim.geometry_steps == steps
+
+
 def test_p2g_takes_the_operator_that_makes_the_lr_images():
-    assert (
-        job.settings_of(tree(composed("+strategy=p2g", "data.views.downsample=area"))).strategies["p2g"].down == "area"
-    )
+    assert settings_of(tree(composed("+strategy=p2g", "data.views.downsample=area"))).strategies["p2g"].down == "area"
 
 
 GROUPS = ("strategy", "rasterizer", "data", "prior", "objective", "density", "optim", "skips", "method")
@@ -156,7 +175,7 @@ def test_every_option_composes_into_settings(group):
     for name in options(group):
         chosen = f"{'+' if group in ('strategy', 'method') else ''}{group}={name}"
         config = composed(chosen, *([NEEDED[chosen]] if chosen in NEEDED else []))
-        assert isinstance(job.settings_of(tree(config)).conductor(1.0), Conductor), name
+        assert isinstance(settings_of(tree(config)).conductor(1.0), Conductor), name
 
 
 def options(group: str) -> list[str]:
@@ -196,6 +215,7 @@ def default_at(path: tuple[str, ...], whole: Any) -> Any:
     return default
 
 
+@pytest.mark.slow
 def test_no_default_stands_in_a_class_and_in_conf():
     """A file may give a class's default only where it takes back what another file says."""
     whole = [OmegaConf.to_container(composed(*o)) for group in GROUPS for name in options(group)
@@ -219,10 +239,9 @@ REFUSED = {
     "fit.fused=sometimes": "fit.fused: must be auto or every_row or off, got 'sometimes'",
     "fit.max_degree=true": "fit.max_degree: must be a whole number, got True",
     "+fit.iteration=1": "Did you mean fit.iterations?",
-    "+typo=1": "typo: clear_strategies.jobs.job.JobSettings has no such setting",
+    "+typo=1": "typo: clear_strategies.jobs.settings.JobSettings has no such setting",
     "data.views.sizes=pad": "data.views.sizes: must be crop or round, got 'pad'",
     "data.cloud.voxel=nan": "data.cloud.voxel: must be a finite number, got nan",
-    "+strategy=gco strategies.gco.bound=both": "strategies.gco.bound: must be omega or coefficient, got 'both'",
     "+strategy=gco strategies.gco.tolerance=7": "strategies.gco.tolerance must lie in [0, 1), got 7",
     "+strategy=p2g strategies.p2g.score_by=best": "strategies.p2g.score_by: must be evidence or gradient or sum or max",
     "+strategy=svs strategies.svs.dropout.maximum=1": "strategies.svs.dropout: a dropout rate must lie in [0, 1)",
@@ -244,7 +263,7 @@ REFUSED = {
 @pytest.mark.parametrize(("overrides", "message"), REFUSED.items(), ids=list(REFUSED))
 def test_a_setting_that_cannot_be_used_is_named_by_its_key(overrides, message):
     def settle() -> None:
-        settings = job.settings_of(tree(composed(*overrides.split())))
+        settings = settings_of(tree(composed(*overrides.split())))
         device.drawing(settings.rasterizer, settings.fit.device)
 
     with pytest.raises(SettingError) as refused:
@@ -253,15 +272,15 @@ def test_a_setting_that_cannot_be_used_is_named_by_its_key(overrides, message):
 
 
 def test_a_host_gets_the_strategies_and_the_decorators_of_best():
-    run = job.settings_of(tree(composed("+strategy=best")))
+    run = settings_of(tree(composed("+strategy=best")))
     best = conductor("best")
     assert [type(s) for s in best.strategies] == [type(s) for s in run.conductor(1.0).strategies]
-    assert [type(s).__name__ for s in best.strategies] == ["GCO", "P2G", "SVS", "PseudoViews"]
+    assert [type(s).__name__ for s in best.strategies] == ["GCO", "P2G", "SVS", "PseudoViews", "FadingOpacity"]
     assert best.prior(Bicubic()) == run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic())
 
 
 def test_back_projection_reduces_by_the_operator_that_made_the_photos():
-    run = job.settings_of(tree(composed("+strategy=[gco,back_projected]", "data.views.downsample=area")))
+    run = settings_of(tree(composed("+strategy=[gco,back_projected]", "data.views.downsample=area")))
     assert run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic(), down="area")
 
 

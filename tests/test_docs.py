@@ -11,7 +11,6 @@ import importlib.util
 import inspect
 import itertools
 import json
-import os
 import re
 import runpy
 import shlex
@@ -39,7 +38,7 @@ from PIL import Image
 from clear_strategies import Conductor, Strategy
 from clear_strategies.commands import train
 from clear_strategies.compose import CONF
-from tests.helpers import documented
+from tests.helpers import command_line, documented
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -208,6 +207,7 @@ def run_block(tmp_path, monkeypatch):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", PYTHON)
 def test_python_blocks_run(block, run_block):
     run_block(block)
@@ -240,6 +240,7 @@ NOT_RUN = {
     "other programs": r"^(for|done|wait|tensorboard)\b",
     "an environment": r"^\. ",
     "waits for a browser": r"^clear-strategies view",
+    "a video whose poses take a minute; tests/data/readers/test_video.py reads one": r"^clear-strategies train clip\.mp4",
     "needs Node.js": r" --to (spz|html)",
     "takes minutes, or a file that the viewer saves": r"--frames 240|flight\.json",
     "a class that the reader names": r"YourStrategy",
@@ -263,16 +264,17 @@ for guide in [ROOT / "README.md", *sorted((DOCS / "how-to").glob("*.md"))]:
     FOLLOWED[guide] = followed(guide)
 
 
+def follow(lines: list[list[str]], folder: Path) -> None:
+    """Run documented commands in a folder, one after the other; a training is a tiny one, and draws no pictures."""
+    done = command_line.run(json.dumps(lines), cwd=folder, module="tests.helpers.documented")
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page, lines in FOLLOWED.items() if lines], ids=name)
 def test_commands_of_the_guides_run(page, tmp_path):
     (tmp_path / f"{documented.PACKAGE}.py").write_text("".join(blocks(page, "python")[:1]))
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(tmp_path / "cache")}
-    command = [sys.executable, "-m", "tests.helpers.documented", json.dumps(FOLLOWED[page])]
-    done = subprocess.run(
-        command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600, check=False
-    )
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    follow(FOLLOWED[page], tmp_path)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -370,43 +372,30 @@ def composed() -> DictConfig:
     return loader().load_configuration("config", ["+strategy=clear"], run_mode=RunMode.RUN)
 
 
-TINY = {"fit.iterations": "10", "data.reader.width": "96", "data.reader.height": "64"}
-
-
-def executed(words: list[str], folder: Path) -> str:
-    """Run a documented command in `folder`; a training is a tiny one. Returns what it printed."""
-    arguments = words[1:]
-    if words[2] == "clear_strategies.run":
-        own = [word for word in arguments[2:] if word.split("=")[0] not in TINY]
-        arguments = [*arguments[:2], *(f"{key}={value}" for key, value in TINY.items()), *own]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, f"{' '.join(words)}: {done.stderr}"
-    return done.stdout
-
-
 @pytest.mark.slow
 def test_the_first_tutorial_works(tmp_path):
     page = blocks(DOCS / "tutorial" / "first-scene.md", "sh")
     followed = [words for block in page for words in commands(block) if words[:2] == ["python", "-m"]]
     assert len(followed) > 5
-    for words in followed:
-        executed(words, tmp_path)
+    follow(followed, tmp_path)
     assert (tmp_path / "outputs" / "compared" / "report.html").is_file()
 
 
-def test_the_readmes_first_run_leaves_the_files_that_the_reference_lists(tmp_path):
+@pytest.fixture(scope="module")
+def first_run(tmp_path_factory) -> tuple[Path, str]:
+    """The README's first run as a tiny one: its folder, and what it printed."""
     *_, first = commands(blocks(ROOT / "README.md", "bash")[0])
     assert first[:3] == ["python", "-m", "clear_strategies.run"]
-    printed = executed([*first, f"hydra.run.dir={tmp_path}"], tmp_path)
+    folder = tmp_path_factory.mktemp("first")
+    tiny = ["fit.iterations=10", "data.reader.width=96", "data.reader.height=64"]
+    done = command_line.run(*first[3:], *tiny, f"hydra.run.dir={folder}", cwd=folder, drawn=True)
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
+
+
+@pytest.mark.slow
+def test_the_readmes_first_run_leaves_the_files_that_the_reference_lists(first_run):
+    folder, printed = first_run
     for block in blocks(DOCS / "tutorial" / "first-scene.md", "text"):
         assert not set(map(without_numbers, block.splitlines())) - set(map(without_numbers, printed.splitlines()))
     table = (DOCS / "reference" / "files.md").read_text().split("`run.lock`")[0]
@@ -415,7 +404,8 @@ def test_the_readmes_first_run_leaves_the_files_that_the_reference_lists(tmp_pat
         for row in re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)
         for path in re.findall(r"`([^`]+)`", row)
     ]
-    written = [p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file() and p.name != "run.lock"]
+    files = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file() and path.name != "run.lock"]
+    written = [path.as_posix() for path in files if path.parts[0] != "cache"]  # of this test's own
     assert not [path for path in written if not any(fnmatch.fnmatch(path, pattern) for pattern in listed)]
     assert not [pattern for pattern in listed if not any(fnmatch.fnmatch(path, pattern) for path in written)]
 
@@ -427,8 +417,8 @@ def without_numbers(line: str) -> str:
 
 
 @pytest.mark.slow
-def test_the_readmes_picture_is_drawn_from_a_run_of_the_demo(tmp_path):
-    loaded(DOCS / "figures.py").demo(tmp_path, *(f"{key}={value}" for key, value in TINY.items()))
+def test_the_readmes_picture_is_drawn_from_a_run_of_the_demo(first_run, tmp_path):
+    loaded(DOCS / "figures.py").readme_picture(first_run[0], tmp_path / "demo.png")
     with Image.open(tmp_path / "demo.png") as picture, Image.open(DOCS / "images" / "demo.png") as shown:
         assert picture.width > picture.height
         assert shown.format == "PNG"

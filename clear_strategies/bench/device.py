@@ -116,11 +116,12 @@ def _run(step: Step, request: Request, log: Path) -> dict[str, Any]:
 
 
 def _tests(request: Request) -> Step:
-    """`-rs` logs which tests did not run, and why."""
+    """Both tiers; `-rs` logs which tests did not run, and why."""
     tests = ROOT / "tests"
     why_not = None if tests.is_dir() else "the tests are in a checkout, not in an installed package"
     which = tests / "test_floors.py" if request.quick else tests
-    return Step("tests", (sys.executable, "-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", str(which)), why_not)
+    command = (sys.executable, "-m", "pytest", "-q", "-rs", "-m", "", "-p", "no:cacheprovider", str(which))
+    return Step("tests", command, why_not)
 
 
 def _table(request: Request, name: str, *arguments: str, why_not: str | None = None) -> Step:

@@ -7,10 +7,9 @@ so that the LR photo cannot tell (`SeededErrors.hidden`).
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 import pandas as pd
 import torch
@@ -24,41 +23,36 @@ from clear_strategies.compose import composed, tree
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors.corrupted import SeededErrors
 from clear_strategies.errors import SettingError
-from clear_strategies.jobs.job import settings_of
 from clear_strategies.jobs.scene import load
-from clear_strategies.strategies.p2g import P2G, Agreement
+from clear_strategies.jobs.settings import settings_of
+from clear_strategies.strategies.p2g import P2G
 
 _DEMO: Final = ("prior=demo",)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """What one setting of P2G says of the training views' patches.
+    """What P2G says of the training views' patches.
 
     Args:
-        R: per view. wrong: the known mask. known: patches that other views show; None where they are not asked.
+        R: per view. wrong: the known mask.
     """
 
     R: list[Float[Tensor, "ph pw"]]
     wrong: list[Bool[Tensor, "ph pw"]]
-    known: list[Bool[Tensor, "ph pw"]] | None
-    seconds: float
 
     def row(self) -> dict[str, float]:
         R, wrong = (torch.cat([x.reshape(-1) for x in maps]) for maps in (self.R, self.wrong))
-        known = 1.0 if self.known is None else torch.cat([k.reshape(-1) for k in self.known]).double().mean().item()
         return {
             "auc": auc(R[~wrong], R[wrong]),
             "R right": R[~wrong].mean().item(),
             "R wrong": R[wrong].mean().item(),
             "patches": float(len(R)),
-            "compared": known,
-            "seconds": self.seconds,
         }
 
 
 def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
-    """Fill `results` with a row for each kind of error and each `P2G.agreement`, and a picture of the first view's R.
+    """Fill `results` with a row for each kind of error, and a picture of the first view's R.
 
     Raises:
         SettingError, DataError: the overrides, or the data, cannot be used; or the prior has no seeded errors.
@@ -72,20 +66,15 @@ def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
             f"prior.patch: must be P2G's patch of {patch} HR px, got {errors.patch}. Set prior.patch={patch}."
         )
     scene = load(settings.data, settings.prior, settings.fit.seed)
-    rows, shown = [], {}
+    p2g, rows = P2G(down=settings.data.views.downsample), []
     for kind, wanted in (("seeded", replace(errors, hidden=False)), ("hidden", replace(errors, hidden=True))):
         views = [_with_errors(view, wanted) for view in scene.train]
-        for agreement in get_args(Agreement):
-            found = _ask(P2G(agreement=agreement, down=settings.data.views.downsample), views, wanted)
-            rows.append({"scene": scene.name, "errors": kind, "agreement": agreement, **found.row()})
-            shown[kind, agreement] = found
-        results.figures[f"evidence_{kind}"] = _picture(
-            views[0], {agreement: shown[kind, agreement] for agreement in get_args(Agreement)}, errors.patch
-        )
+        found = _ask(p2g, views, wanted)
+        rows.append({"scene": scene.name, "errors": kind, **found.row()})
+        results.figures[f"evidence_{kind}"] = _picture(views[0], found, errors.patch)
     results.tables["evidence"] = pd.DataFrame(rows)
     results.note(
-        f"{scene.name}, {len(scene.train)} training views, errors in {errors.share:.0%} of the patches of {errors.patch} HR "
-        f"px, {torch.get_num_threads()} threads. Seconds are processor time of comparing all views."
+        f"{scene.name}, {len(scene.train)} training views, errors in {errors.share:.0%} of the patches of {errors.patch} HR px."
     )
 
 
@@ -119,34 +108,25 @@ def _with_errors(view: View, errors: SeededErrors) -> View:
 
 def _ask(p2g: P2G, views: Sequence[View], errors: SeededErrors) -> _Found:
     """R of every view."""
-    start, known = time.process_time(), None
-    if p2g.wants_views():
-        p2g.on_views(views)
-    seconds = time.process_time() - start
-    maps = [p2g.patch_maps(view) for view in views]
-    if p2g.wants_views():
-        known = [torch.zeros_like(m.reliability, dtype=torch.bool) if m.compared is None else m.compared for m in maps]
     wrong = [errors.wrong(v.hr.camera.height, v.hr.camera.width, v.factor, v.name) for v in views]
-    return _Found([m.reliability for m in maps], wrong, known, seconds)
+    return _Found([p2g.patch_maps(view).reliability for view in views], wrong)
 
 
-def _picture(view: View, found: Mapping[str, _Found], patch: int) -> Figure:
-    """The SR image and R by each agreement, with the wrong patches framed."""
+def _picture(view: View, found: _Found, patch: int) -> Figure:
+    """The SR image and R of it, with the wrong patches framed."""
     height, width = view.hr.image.shape[:2]
-    figure = Figure(figsize=(3 * (1 + len(found)), 3 * height / width + 0.4), layout="constrained")
-    axes = figure.subplots(1, 1 + len(found))
-    axes[0].imshow(view.hr.image.cpu().numpy(), interpolation="nearest")
-    axes[0].set_title("SR image, wrong patches framed", fontsize=9)
-    for axis, (agreement, of_view) in zip(axes[1:], found.items(), strict=True):
-        R = of_view.R[0].cpu().numpy()
-        extent = (0, R.shape[1] * patch, R.shape[0] * patch, 0)
-        axis.imshow(R, vmin=0, vmax=1, cmap="gray", extent=extent, interpolation="nearest")
-        axis.set(xlim=(0, width), ylim=(height, 0))
-        axis.set_title(f"R, agreement={agreement}", fontsize=9)
-    wrong = next(iter(found.values())).wrong[0]
+    figure = Figure(figsize=(6, 3 * height / width + 0.4), layout="constrained")
+    image, of_patches = axes = figure.subplots(1, 2)
+    image.imshow(view.hr.image.cpu().numpy(), interpolation="nearest")
+    image.set_title("SR image, wrong patches framed", fontsize=9)
+    R = found.R[0].cpu().numpy()
+    extent = (0, R.shape[1] * patch, R.shape[0] * patch, 0)
+    of_patches.imshow(R, vmin=0, vmax=1, cmap="gray", extent=extent, interpolation="nearest")
+    of_patches.set(xlim=(0, width), ylim=(height, 0))
+    of_patches.set_title("R", fontsize=9)
     for axis in axes:
         axis.axis("off")
-        for row, column in torch.nonzero(wrong).tolist():
+        for row, column in torch.nonzero(found.wrong[0]).tolist():
             box = (column * patch + 2, row * patch + 2)
             axis.add_patch(Rectangle(box, patch - 4, patch - 4, fill=False, edgecolor="tab:red", linewidth=1.2))
     return figure

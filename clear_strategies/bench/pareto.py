@@ -47,7 +47,7 @@ class Variant:
 
 
 _CLEAR: Final = "+strategy=clear"
-_COARSE, _SELDOM, _FLAT = "skips.coarse_until=3000", "skips.hr_every=2", "skips.flat=0.01"
+_COARSE, _SELDOM = "skips.coarse_until=3000", "skips.hr_every=2"
 _PLATEAU: Final = ("skips.plateau_gain=0.01", "skips.plateau_window=250")
 
 BASE: Final = Variant("clear", STRATEGIES, (_CLEAR,))
@@ -61,9 +61,8 @@ VARIANTS: Final = (
     BASE,
     Variant("coarse first", SKIPS, (_CLEAR, _COARSE)),
     Variant("HR every 2nd", SKIPS, (_CLEAR, _SELDOM)),
-    Variant("no flat tiles", SKIPS, (_CLEAR, _FLAT)),
     Variant("no plateau", SKIPS, (_CLEAR, *_PLATEAU)),
-    Variant("all four skips", SKIPS, (_CLEAR, _COARSE, _SELDOM, _FLAT, *_PLATEAU)),
+    Variant("all three skips", SKIPS, (_CLEAR, _COARSE, _SELDOM, *_PLATEAU)),
     Variant("default skips", SKIPS, (_CLEAR, "skips=measured")),
     Variant("3/4 as long", LENGTH, (_CLEAR,), length=0.75),
     Variant("1/2 as long", LENGTH, (_CLEAR,), length=0.5),

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import pandas as pd
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 import rasterizers
@@ -21,12 +21,11 @@ from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.bench.timing import interleaved, medians, milliseconds
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
-from rasterizers.interface import PRESETS, Rasterizer
+from rasterizers.interface import PRESETS
 
 SCENES: Final = ("small", "s100k", "s100k-lr", "s500k")
 COTANGENTS: Final = 3
-FORWARD, QUARTER, TOGETHER, SEPARATE = "forward", "quarter_tiles", "lr_hr_together", "lr_hr_separate"
-DEPTH = "with_depth"
+FORWARD, TOGETHER, SEPARATE = "forward", "lr_hr_together", "lr_hr_separate"
 BACKWARD: Final = tuple(f"backward_k{k}" for k in range(1, COTANGENTS + 1))
 SAME, NONE = "same cut-offs", "no cut-offs"
 
@@ -180,13 +179,6 @@ def random_cotangents(workload: Workload) -> Float[Tensor, "K H W 3"]:
     return values.to(workload.splats.means.device)
 
 
-def quarter_of_tiles(rasterizer: Rasterizer, workload: Workload) -> Bool[Tensor, "th tw"]:
-    """A random quarter of the tiles: scattered, so the worst case for sharing work between neighbours."""
-    rows, columns = -(-workload.camera.height // rasterizer.tile), -(-workload.camera.width // rasterizer.tile)
-    order = torch.randperm(rows * columns, generator=torch.Generator().manual_seed(0))
-    return (order < round(0.25 * rows * columns)).view(rows, columns).to(workload.splats.means.device)
-
-
 def _affordable(backend: str, workload: Workload, what: str, note: Callable[[str], None]) -> bool:
     affordable = backend != REFERENCE or len(workload.splats) <= REFERENCE_LIMIT
     if not affordable:
@@ -195,19 +187,13 @@ def _affordable(backend: str, workload: Workload, what: str, note: Callable[[str
 
 
 def backend_on(workload: Workload, backend: str, preset: str, isa: str | None = None) -> Contestant:
-    """One of our backends, with the stages that peers lack: demanded tiles, depth, both scales together."""
+    """One of our backends, with the stages that peers lack: both scales together."""
     kernels = {"isa": isa} if isa else {}
     rasterizer = rasterizers.load(backend, preset=preset, **kernels, **SETTINGS)
-    cotangents = random_cotangents(workload)
-    splats, camera, tiles = workload.splats, workload.camera, quarter_of_tiles(rasterizer, workload)
-    with_depth = torch.cat((cotangents[:1], cotangents[1:2, ..., :1]), dim=-1)
+    splats, camera = workload.splats, workload.camera
     lr = camera.scaled(1 / workload.lr_factor) if workload.lr_factor else None
 
     def stages(work_log: WorkLog) -> None:
-        with work_log.stage(QUARTER):
-            rasterizer(splats, camera, tiles=tiles).vjp(cotangents[:1])
-        with work_log.stage(DEPTH):
-            rasterizer(splats, camera, depth=True).vjp(with_depth)
         if lr is not None:
             with work_log.stage(TOGETHER):
                 rasterizer.render_scales([(splats, lr), (splats, camera)])
@@ -241,10 +227,6 @@ def _time_rows(workload: Workload, contestants: Sequence[Contestant], median: pd
         row: dict[str, Any] = {"scene": workload.name, "backend": c.backend, "module": c.module, "preset": c.preset}
         row |= {f"{stage}_ms": value for stage, value in ms.items() if stage != SEPARATE}
         row |= {f"k{k}_over_k1": ms[BACKWARD[k - 1]] / ms[BACKWARD[0]] for k in range(2, COTANGENTS + 1)}
-        if QUARTER in ms:
-            row["quarter_over_all_tiles"] = ms[QUARTER] / (ms[FORWARD] + ms[BACKWARD[0]])
-        if DEPTH in ms:
-            row["depth_over_colour"] = ms[DEPTH] / (ms[FORWARD] + ms[BACKWARD[0]])
         if SEPARATE in ms:
             row["together_over_separate"] = ms[TOGETHER] / ms[SEPARATE]
         if cotangents.is_cuda:

@@ -56,23 +56,17 @@ class RecordedRasterizer:
     """Draws both scales once and repeats these renderings and their gradients ever after."""
 
     def __init__(self, rasterizer: Rasterizer) -> None:
-        self.rasterizer, self.tile, self.traits = rasterizer, rasterizer.tile, rasterizer.traits
+        self.rasterizer, self.traits = rasterizer, rasterizer.traits
         self.renderings: list[Rendering] = []
 
-    def __call__(
-        self, splats: Splats, camera: Camera, tiles: Tensor | None = None, *, depth: bool = False
-    ) -> Rendering:
-        return self.rasterizer(splats, camera, tiles, depth=depth)
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
+        return self.rasterizer(splats, camera, depth=depth)
 
     def render_scales(
-        self,
-        jobs: Sequence[tuple[Splats, Camera]],
-        tiles: Sequence[Tensor | None] | None = None,
-        *,
-        depth: Sequence[bool] | None = None,
+        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
     ) -> list[Rendering]:
         if not self.renderings:
-            self.renderings = [_Recorded(r) for r in self.rasterizer.render_scales(jobs, tiles, depth=depth)]
+            self.renderings = [_Recorded(r) for r in self.rasterizer.render_scales(jobs, depth=depth)]
         return self.renderings
 
 

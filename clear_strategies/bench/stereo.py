@@ -20,7 +20,8 @@ from clear_strategies.bench.results import Results
 from clear_strategies.compose import composed, tree
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.prepare import lr_photos, split
+from clear_strategies.data.prepare import lr_photos
+from clear_strategies.data.view_settings import split
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.projection import inside_of, project
 from clear_strategies.geometry.sift import triangulate

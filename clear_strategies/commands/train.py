@@ -1,4 +1,4 @@
-"""`clear-strategies train PHOTOS`: a run on a folder of photos or a capture, by the same configuration as every other run.
+"""`clear-strategies train PHOTOS`: a run on photos, a video or a capture, by the same configuration as every other.
 
 The reader is the one of what lies in the folder. Everything behind the folder goes to Hydra unchanged.
 """
@@ -18,12 +18,14 @@ from clear_strategies.errors import SettingError
 _ITERATIONS: Final = 1000
 _USAGE: Final = f"""clear-strategies train PHOTOS [setting=value …]
 
-PHOTOS is a folder of photos, or a capture: COLMAP's sparse/, a transforms.json, a poses_bounds.npy or a Blender scene in it.
+PHOTOS is a folder of photos, a video of a still scene, or a capture: COLMAP's sparse/, a transforms.json, a poses_bounds.npy
+or a Blender scene in the folder.
 It trains what we use ourselves (+strategy=best) on all photos for fit.iterations={_ITERATIONS}; settings change that, e.g.
 
   clear-strategies train photos/ fit.iterations=3000
   clear-strategies train photos/ data.views.test_every=8          every 8th photo is kept for testing
   clear-strategies train photos/ data.views.max_hr_megapixels=8   sharper, slower, more memory
+  clear-strategies train clip.mp4 data.reader.frames=24           so many of its sharpest frames
   clear-strategies train photos/ data.missing=skip data.broken=skip
   clear-strategies train photos/ fit.log=tensorboard -v           curves while it trains; every detail on the console
 
@@ -40,7 +42,7 @@ def main(arguments: list[str]) -> None:
     """Train on what the first argument names.
 
     Raises:
-        SettingError: there is no first argument, or it is no folder.
+        SettingError: there is no first argument, or it is neither a folder nor a video.
     """
     if "--help" in arguments or "-h" in arguments:
         sys.stdout.write(_USAGE)
@@ -59,17 +61,19 @@ def overrides(arguments: Sequence[str]) -> list[str]:
         SettingError: as `main`.
     """
     if not arguments or arguments[0].startswith(("-", "+", "~")):
-        raise SettingError("train needs a folder of photos first: clear-strategies train PHOTOS [setting=value …].")
+        raise SettingError(
+            "train needs a folder of photos or a video first: clear-strategies train PHOTOS [setting=value …]."
+        )
     path, rest = Path(arguments[0]), list(arguments[1:])
     if path.name == "transforms.json":
         path = path.parent
-    if not path.is_dir():
-        raise SettingError(f"train: {path} is no folder. Name the folder of the photos, or of the capture.")
+    if not path.is_dir() and not path.is_file():
+        raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture, or a video.")
     chosen = [] if any(override.startswith(_CHOOSE_STRATEGIES) for override in rest) else ["+strategy=best"]
     chosen += (
         [] if any(override.startswith(_CHOOSE_ITERATIONS) for override in rest) else [f"fit.iterations={_ITERATIONS}"]
     )
-    reader, root = detect(path)
+    reader, root = detect(path) if path.is_dir() else ("photos", path)
     return [*chosen, f"data={reader}", f"data.path={_quoted(str(root))}", *rest]
 
 

@@ -27,7 +27,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.prepare import ViewSettings, resized
+from clear_strategies.data.view_settings import ViewSettings, resized
 
 _log = logging.getLogger(__name__)
 

@@ -32,7 +32,7 @@ class RasterizerSettings:
     Args:
         name: auto, or a name that `rasterizers.load` knows.
         preset: cut-offs by name, see `rasterizers.PRESETS`; alpha_min and transmittance_min win over it.
-        kernel, near, alpha_min, alpha_max, transmittance_min, tile, antialiased: see `RasterSettings`.
+        kernel, near, alpha_min, alpha_max, transmittance_min, antialiased: see `RasterSettings`.
         background: RGB in [0, 1]; None: the data set's own.
         memory: MiB that the lists of one image may take (cpp, warp).
         threads: of the kernels (cpp); None: as many as torch has.
@@ -48,7 +48,6 @@ class RasterizerSettings:
     alpha_min: float | None = None
     alpha_max: float = _SHARED.alpha_max
     transmittance_min: float | None = None
-    tile: int | None = None
     background: Color | None = None
     antialiased: bool = _SHARED.antialiased
     memory: int | None = None

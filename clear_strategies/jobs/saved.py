@@ -107,7 +107,8 @@ def _of_checkpoint(path: Path, folder: Path, rasterizer: str | None) -> SavedSpl
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(path, "tensors", f"hold no field ({error})", "give a run of this program") from error
     known = _cameras_near(folder, 0)
-    own = _unflat(saved.config, "rasterizer")
+    # None is the default, also of a field that only an earlier version had.
+    own = {key: value for key, value in _unflat(saved.config, "rasterizer").items() if value is not None}
     drawing = _drawing(own, rasterizer).over(known[0].background if known else (0.0, 0.0, 0.0))
     source = f"{folder}, {saved.t - 1} iterations, {len(field):,} Gaussians"
     return SavedSplat(folder, source, _painter(field, drawing), known, baked=False)

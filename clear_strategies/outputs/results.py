@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,7 +37,7 @@ FILES: Final[Mapping[str, str]] = {
     ".hydra/": "the configuration and the overrides that the run was started with",
     "run.log": "what the run printed, and the details that the console shows with `-v` alone",
     "checkpoints/": "states to resume from (`fit.resume`), the newest `fit.keep` of them",
-    "baseline/": "the baseline that trained beside the run (`fit.baseline`), with all these files of its own",
+    "baseline/": "the baseline that trained beside the run (`fit.baseline`): its scores, renders, field, checkpoints and tables",
     "cameras.json": "the cameras, in the layout of Inria's 3DGS, which SuperSplat and SIBR open",
     "cameras/": "small pictures of the training views, for viewers",
     "maps/": "where the prior was trusted, and where the photos overruled it, for `fit.map_views` training views",
@@ -59,6 +60,21 @@ FILES: Final[Mapping[str, str]] = {
 _SHEET_VIEWS: Final = 4  # test views on the contact sheet, in views/ and in depth/, at most
 
 
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """What shows a run, besides its scores and the renders of its test views.
+
+    Args:
+        map_views: how many training views get maps, at most.
+        video_frames: of the loop through the training cameras; 0: none.
+        page_gaussians: a field of more gets no page.
+    """
+
+    map_views: int
+    video_frames: int
+    page_gaussians: int
+
+
 def write_results(
     folder: Path,
     scene: Scene,
@@ -68,10 +84,8 @@ def write_results(
     *,
     backend: str,
     down: DownKernel,
-    map_views: int,
     painter: Painter,
-    video_frames: int,
-    page_gaussians: int,
+    pictures: Pictures | None,
     seconds: float,
     config: Mapping[str, Any],
     baseline: Baseline | None = None,
@@ -81,10 +95,8 @@ def write_results(
     Args:
         scene: on the CPU, wherever the field is.
         down: D, by which the LR images were made.
-        map_views: how many training views get maps, at most.
         painter: of the state's field, for depth and video.
-        video_frames: of the loop through the training cameras; 0: none.
-        page_gaussians: a field of more gets no page.
+        pictures: None writes none but the renders, which is all that another run's contact sheet needs.
         seconds: training time.
         config: the run's configuration, kept in metrics.json.
         baseline: the one that trained beside it, for the contact sheet and metrics.json.
@@ -92,25 +104,20 @@ def write_results(
     field, work_log, history = state.field, state.conductor.work_log, state.history_as_floats()
     with work_log.stage("evaluate"):
         evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera).cpu(), down=down)
-    with work_log.stage("maps"):
-        if mapped := spaced(state.views, map_views):
-            write_maps(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
-    memory.release()  # the gradients that the maps are made of: several times the field
+    for name, image in evaluation.renders.items():
+        write_png(folder / "renders" / f"{Path(name).stem}.png", image)
     export_ply(folder / "point_cloud.ply", field)
-
-    title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}"
-    if scene.synthetic_prior:
-        title += " · SYNTHETIC prior"
-    _write_images(folder, scene, evaluation, title, baseline)
-    with work_log.stage("depth pictures"):
-        write_depths(folder / "depth", _shown(scene), painter)
-    with work_log.stage("video"):
-        write_loop(folder, [view.hr.camera for view in scene.train], painter, video_frames)
-    with work_log.stage("page"):
-        write_splat_page(
-            folder, [view.hr.camera for view in scene.train], painter, page_gaussians, title, scene.background
-        )
-    write_curves(folder / "curves.png", history, marks(state), title)
+    if pictures is not None:
+        with work_log.stage("maps"):
+            if mapped := spaced(state.views, pictures.map_views):
+                write_maps(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
+        memory.release()  # the gradients that the maps are made of: several times the field
+        title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}"
+        if scene.synthetic_prior:
+            title += " · SYNTHETIC prior"
+        _write_sheet(folder, scene, evaluation, title, baseline)
+        _write_views(folder, scene, painter, pictures, work_log, title)
+        write_curves(folder / "curves.png", history, marks(state), title)
     _write_tables(folder, history, work_log)
     files.write_json(
         folder / "metrics.json",
@@ -133,9 +140,20 @@ def write_results(
     return evaluation
 
 
-def _write_images(folder: Path, scene: Scene, evaluation: Evaluation, title: str, baseline: Baseline | None) -> None:
-    for name, image in evaluation.renders.items():
-        write_png(folder / "renders" / f"{Path(name).stem}.png", image)
+def _write_views(
+    folder: Path, scene: Scene, painter: Painter, pictures: Pictures, work_log: WorkLog, title: str
+) -> None:
+    """The field from the cameras of the contact sheet, along a loop, and in a page."""
+    cameras = [view.hr.camera for view in scene.train]
+    with work_log.stage("depth pictures"):
+        write_depths(folder / "depth", _shown(scene), painter)
+    with work_log.stage("video"):
+        write_loop(folder, cameras, painter, pictures.video_frames)
+    with work_log.stage("page"):
+        write_splat_page(folder, cameras, painter, pictures.page_gaussians, title, scene.background)
+
+
+def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str, baseline: Baseline | None) -> None:
     rows, part = [], evaluation.test if scene.test else evaluation.train
     for view in _shown(scene):
         for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():

@@ -25,7 +25,8 @@ _LONGEST: Final = 960  # px, of a picture
 # Columns of the history by the beginning of their names; what begins with none of these is a number of a strategy.
 _GROUPS: Final = {
     "loss_": "loss/", "psnr_": "psnr/", "conflict": "conflict/", "corrected": "corrected/", "n_gaussians": "field/",
-    "detail_abs": "field/", "lambda_hr": "schedule/", "seconds": "schedule/",
+    "detail_abs": "field/", "lambda_hr": "schedule/", "seconds": "schedule/", "processor_seconds": "schedule/",
+    "probe_": "schedule/",
 }  # fmt: skip
 
 

@@ -23,7 +23,7 @@ def test_rasterizers_writes_tables_figure_and_machine(tmp_path, capsys):
     assert main([*asked, "--out", str(out)]) == 0
     assert list(pd.read_csv(out / "rasterizers_time.csv")["backend"]) == ["torch"]
     assert len(pd.read_csv(out / "rasterizers_error.csv")) == 2
-    assert len(pd.read_csv(out / "rasterizers_turns.csv")) == 8
+    assert len(pd.read_csv(out / "rasterizers_turns.csv")) == 6
     assert (out / "time_against_error.png").stat().st_size > 5_000
     machine = json.loads((out / "rasterizers.json").read_text())["machine"]
     assert {"date", "platform", "python", "torch", "nvidia_gpu_models"} <= set(machine)
@@ -41,14 +41,15 @@ def test_stereo_measures_the_demos_depth(tmp_path, capsys):
     assert "depth in" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_evidence_measures_reliability_against_the_demos_known_errors(tmp_path, capsys):
     smaller = ["prior=demo", "data.reader.width=256", "data.reader.height=192", "prior.share=0.5"]
     assert main(["evidence", *smaller, "--out", str(tmp_path)]) == 0
-    table = pd.read_csv(tmp_path / "evidence.csv").set_index(["errors", "agreement"])
-    assert list(table.index) == [(e, a) for e in ("seeded", "hidden") for a in ("photo", "views", "both")]
-    assert table.loc[("seeded", "photo"), "auc"] > 0.95
-    assert table.loc[("seeded", "photo"), "R wrong"] < table.loc[("hidden", "photo"), "R wrong"]
-    assert table.loc[("hidden", "photo"), "R wrong"] > 0.9
+    table = pd.read_csv(tmp_path / "evidence.csv").set_index("errors")
+    assert list(table.index) == ["seeded", "hidden"]
+    assert table.loc["seeded", "auc"] > 0.95
+    assert table.loc["seeded", "R wrong"] < table.loc["hidden", "R wrong"]
+    assert table.loc["hidden", "R wrong"] > 0.9
     assert table["R right"].between(0, 1).all()
     assert (tmp_path / "evidence_hidden.png").stat().st_size > 5_000
     assert "training views" in capsys.readouterr().out

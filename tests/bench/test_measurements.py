@@ -71,7 +71,7 @@ def test_medians_leave_out_stages_that_a_contender_has_not():
 def test_the_tables_hold_every_stage_and_both_errors():
     tables = measured(drawing, scene=["tiny"], backend=["torch"], preset=["fast"], repeats=1).tables
     time, error = tables["rasterizers_time"], tables["rasterizers_error"]
-    stages = (drawing.FORWARD, *drawing.BACKWARD, drawing.QUARTER, drawing.DEPTH, drawing.TOGETHER, drawing.SEPARATE)
+    stages = (drawing.FORWARD, *drawing.BACKWARD, drawing.TOGETHER, drawing.SEPARATE)
     assert list(tables["rasterizers_turns"]["stage"]) == list(stages)
     assert time.loc[0, "k2_over_k1"] == pytest.approx(time.loc[0, "backward_k2_ms"] / time.loc[0, "backward_k1_ms"])
     same, none = error["means_relative"]
@@ -94,12 +94,6 @@ def test_the_reference_takes_no_part_in_large_scenes():
     with pytest.raises(DataError, match="measures none of these scenes"):
         drawing.measure(results, scene=["s100k-lr"], backend=["torch"], preset=["fast"], repeats=1)
     assert any("at most 10,000 Gaussians" in note for note in results.notes)
-
-
-def test_a_quarter_of_the_tiles_is_demanded(tiny):
-    mask = drawing.quarter_of_tiles(rasterizers.load("torch", tile=8), tiny)
-    assert mask.shape == (9, 12)
-    assert int(mask.sum()) == 27
 
 
 def test_unknown_backends_are_refused_and_unavailable_ones_noted(monkeypatch):

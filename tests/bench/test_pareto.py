@@ -90,8 +90,7 @@ def test_every_variant_composes():
             _, overrides = pareto.folder_of(REQUEST, variant, 3)
             config = compose("config", overrides)
             assert (config.fit.seed, config.fit.iterations) == (3, round(100 * variant.length)), variant.name
-            inexact = config.skips.flat + config.skips.plateau_gain > 0
-            skips = config.skips.coarse_until > 0 or config.skips.hr_every > 1 or inexact
+            skips = config.skips.coarse_until > 0 or config.skips.hr_every > 1 or config.skips.plateau_gain > 0
             assert skips == (variant.kind == pareto.SKIPS), variant.name
             assert config.rasterizer.preset == ("accurate" if variant.name == "accurate" else "fast")
 

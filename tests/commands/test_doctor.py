@@ -46,4 +46,4 @@ def test_a_backend_that_draws_something_else_is_an_error(capsys, monkeypatch):
 
 def test_every_extra_is_one_of_the_projects():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    assert set(doctor.EXTRAS) == set(extras) - {"docs", "dev"}
+    assert set(doctor.EXTRAS) == set(extras) - {"photos", "docs", "dev"}

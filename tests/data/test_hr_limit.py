@@ -8,8 +8,9 @@ import torch
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.hr_limit import within_limit
 from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.prepare import ViewSettings, prepare
+from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
+from clear_strategies.data.view_settings import ViewSettings
 from rasterizers import Camera
 
 

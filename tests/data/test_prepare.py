@@ -10,12 +10,15 @@ import pytest
 import torch
 
 from clear_strategies.core import images
+from clear_strategies.core.view import DepthMap
+from clear_strategies.data import points
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.prepare import ViewSettings, check_headers, lr_size, prepare, resized, split
+from clear_strategies.data.prepare import check_headers, prepare
 from clear_strategies.data.priors import BackProjected, Bicubic, DemoPrior
 from clear_strategies.data.readers import demo
+from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.strategies.p2g import P2G
 from rasterizers import Camera
@@ -257,3 +260,21 @@ def test_how_far_a_back_projected_sr_image_was_from_its_photo_is_kept():
         assert torch.equal(R[0], R[1])
         assert float(R[0].min()) < 0.1  # what was wrong is still known, and would not be without
         assert float(R[2].min()) > 0.9
+
+
+@pytest.mark.parametrize(("photos_are", "compared"), [("both", [64, 64]), ("hr", [])])
+def test_stereo_compares_the_hr_side_where_it_is_photos_and_no_sr_images(photos_are, compared, monkeypatch):
+    capture, seen = demo.read(width=64, height=48, views=5, train=2), []
+
+    def found(photos, sharper, *_):
+        seen.extend(sharp.camera.width for sharp in sharper)
+        return depth_maps(photos, *_)
+
+    def depth_maps(photos, *_):
+        return [DepthMap(torch.full(p.image.shape[:2], 4.0), torch.ones(p.image.shape[:2])) for p in photos]
+
+    monkeypatch.setattr(points, "depth_maps_from_sharper", found)
+    monkeypatch.setattr(points, "depth_maps", depth_maps)
+    scene = prepare(capture, ViewSettings(photos_are=photos_are, train=2), Bicubic(), CloudSettings(init="stereo"))
+    assert seen == compared
+    assert all(view.depth.depth.shape == view.lr.image.shape[:2] for view in scene.train)

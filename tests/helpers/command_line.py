@@ -4,24 +4,53 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.helpers.forked import ROOT, Forked
+
 TINY = ["data.reader.width=64", "data.reader.height=48", "fit.iterations=12", "fit.max_degree=1", "data.cloud.init=random",
         "data.cloud.random_points=60", "data.reader.views=5", "data.reader.train=2", "data.views.train=2",
-        "skips=none", "fit.baseline=false", "fit.page=0"]  # fmt: skip
+        "skips=none", "fit.baseline=false", "fit.page=0", "fit.video=0", "fit.map_views=0"]  # fmt: skip
+
+
+def environment(cwd: Path) -> dict[str, str]:
+    return {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
 
 
 def run(
-    *arguments: str, cwd: Path, module: str = "clear_strategies.run", **options
+    *arguments: str, cwd: Path, module: str = "clear_strategies.run", drawn: bool = False
 ) -> subprocess.CompletedProcess[str]:
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", module, *arguments]
-    return subprocess.run(
-        command, cwd=cwd, env=env, capture_output=True, text=True, timeout=240, check=False, **options
+    """A run to its end, as subprocess.run; without pictures, where they are not asked for."""
+    with tempfile.TemporaryFile("w+") as said, tempfile.TemporaryFile("w+") as errors:
+        process = Forked("-m", module, *arguments, cwd=cwd, env=environment(cwd), said=said, errors=errors, drawn=drawn)
+        code = process.wait()
+        for file in (said, errors):
+            file.seek(0)
+        return subprocess.CompletedProcess([module, *arguments], code, said.read(), errors.read())
+
+
+def started(*arguments: str, said: Path, cwd: Path, session: bool = False) -> Forked:
+    """A run that goes on; what it says goes to a file. `arguments` begin with those of python, `-c …` or `-m …`."""
+    with said.open("w") as file:
+        return Forked(*arguments, cwd=cwd, env=environment(cwd), said=file, errors=file, session=session)
+
+
+def stopped_by(*signals: int, after: int) -> str:
+    """Code of a run that gets these signals after some iterations."""
+    return (
+        "import itertools, os\n"
+        "from clear_strategies import hydra_app\n"
+        "from clear_strategies.run import main\n"
+        "done = itertools.count(1)\n"
+        "def watch():\n"
+        f"    if next(done) == {after}:\n"
+        f"        for number in {[int(number) for number in signals]}:\n"
+        "            os.kill(os.getpid(), number)\n"
+        "hydra_app._watch = lambda: watch\n"
+        "main()\n"
     )
 
 

@@ -53,7 +53,8 @@ def follow(words: list[str]) -> None:
         sys.argv = words
         run.main()
     else:
-        sys.argv = [words[2], *words[3:], "--iterations", "4"]
+        trains = words[2] != "clear_strategies.report"
+        sys.argv = [words[2], *words[3:], *(["--iterations", "4"] if trains else [])]
         runpy.run_module(words[2], run_name="__main__")
 
 

@@ -8,12 +8,13 @@ import pytest
 import torch
 
 import rasterizers
-from clear_strategies import Conductor, SplatSuRe
+from clear_strategies import Conductor, FadingOpacity, SplatSuRe
 from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors import Bicubic
 from integration.gsplat import attach
+from integration.inria.attached import _ATTRIBUTES
 from rasterizers import Splats
 from tests.helpers import gsplat_host, inria, toy
 from tests.helpers.gsplat_host import Host
@@ -86,12 +87,9 @@ def extra_gradient(a_host, camera):
     view.on_views(toy.scene(20).train)
     conductor, extra = dark(), view.extra_views(1)[0]
     p = a_host.splats
-    renders, _, _ = gsplat_host.rasterization(
-        p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), torch.cat([p["sh0"], p["shN"]], 1),
-        camera.world_to_camera[None], gsplat_host.intrinsics(camera), camera.width, camera.height, sh_degree=0, packed=False,
-    )  # fmt: skip
+    renders, _, _ = a_host.render(camera, 0)
     cotangent = conductor.extra_loss(renders[0], extra, 1).cotangents[0]
-    names = [name for name in p if name in ("means", "quats", "scales", "opacities", "sh0", "shN")]
+    names = [name for name in p if name in _ATTRIBUTES]
     found = torch.autograd.grad(
         renders[0], [p[name] for name in names], cotangent, allow_unused=True, materialize_grads=True
     )
@@ -136,14 +134,8 @@ def test_an_inria_style_host_draws_any_camera(inria_host, inria_capture, drawn):
     assert image.shape == (camera.height, camera.width, 3)
     start, _ = inria_host.setup(opt)
     before = copy.copy(clear.params())
-    before |= {name: getattr(start, attribute) for name, attribute in ATTRIBUTES.items()}
+    before |= {name: getattr(start, attribute) for name, attribute in _ATTRIBUTES.items()}
     assert torch.allclose(image.double(), reference(before, camera, 0), atol=1e-4)
-
-
-ATTRIBUTES = {
-    "means": "_xyz", "quats": "_rotation", "scales": "_scaling", "opacities": "_opacity", "sh0": "_features_dc",
-    "shN": "_features_rest",
-}  # fmt: skip
 
 
 def test_a_lightning_host_draws_it_and_steps_on_it(host, tmp_path, drawn):  # noqa: F811 - the fixture
@@ -153,6 +145,31 @@ def test_a_lightning_host_draws_it_and_steps_on_it(host, tmp_path, drawn):  # no
     module = fitted(host, host.controller(strategies="baseline", sr=str(tmp_path), suffix="_x4", overrides=shown), 4)
     assert len(drawn) == 4
     assert attachment_of(module).counts["extra views"] == 4
+
+
+def test_opacities_fade_in_a_gsplat_host():
+    scene, after = toy.scene(20), {}
+    for strategies in ((), (FadingOpacity(rate=0.5),)):
+        a_host = Host(scene)
+        clear = attach(
+            a_host.splats, a_host.optimizers, scene.train, Conductor(*strategies, objective=inria.HR_FROM_START)
+        )
+        clear.replace_everywhere(gsplat_host.rasterization)
+        try:
+            a_host.train([view.name for view in scene.train] + [scene.train[0].name])
+        finally:
+            clear.remove()
+        after[len(strategies)] = a_host.splats["opacities"].detach().sigmoid()
+    assert after[1].mean() < 0.4 * after[0].mean()  # three steps, and what the optimizer gives back
+    assert after[1].min() > 0.005
+
+
+def test_opacities_fade_in_an_inria_style_host(inria_host, inria_capture):
+    opacities = [
+        trained_inria(inria_host, inria_capture, strategies, iterations=4)[0]._opacity.detach().sigmoid()
+        for strategies in ([], [FadingOpacity(rate=0.5)])
+    ]
+    assert opacities[1].mean() < 0.4 * opacities[0].mean()
 
 
 def test_splatsure_follows_a_host_that_densifies():

@@ -70,6 +70,7 @@ def attached():
         handle.remove()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SUBSETS)
 def test_fifty_steps_equal_those_of_our_own_trainer(name, attached):
     """In float64 and with a larger ε: otherwise Adam follows the sign of gradients that consist of rounding errors."""

@@ -12,10 +12,10 @@ import torch
 
 from clear_strategies.commands import train
 from clear_strategies.compose import composed, tree
-from clear_strategies.data.prepare import split
 from clear_strategies.data.scene import Scene
-from clear_strategies.jobs.job import JobSettings, settings_of
+from clear_strategies.data.view_settings import split
 from clear_strategies.jobs.scene import load
+from clear_strategies.jobs.settings import JobSettings, settings_of
 from tests.helpers import captures
 
 

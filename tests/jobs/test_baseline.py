@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import re
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,12 +19,13 @@ from clear_strategies.compose import CONF
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import job, scene
-from clear_strategies.outputs import results
 from clear_strategies.outputs.score_table import OURS_MINUS_BASELINE
 from clear_strategies.training.signals import Interrupted
+from tests.helpers import pictures
 from tests.helpers.command_line import TINY
 
 ITERATIONS = 12
+SLOW = pytest.mark.slow
 SMALL = [o for o in TINY if not o.startswith("fit.baseline")] + [
     "fit.map_views=0", "fit.video=0", "fit.probe_every=0", "fit.checkpoint_every=0", "fit.threads=1", "prior=bicubic",
 ]  # fmt: skip
@@ -30,7 +33,7 @@ SMALL = [o for o in TINY if not o.startswith("fit.baseline")] + [
 
 @pytest.fixture(scope="module", autouse=True)
 def short() -> Iterator[None]:
-    """Pictures, and reading the same scene again, take most of the time of a short run."""
+    """Reading the same scene again takes most of the time of a short run without pictures."""
     scenes: list[Scene] = []
     load = scene.load
 
@@ -41,9 +44,8 @@ def short() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene, "load", load_once)
-        for name in ("write_curves", "write_contact_sheet"):
-            patch.setattr(results, name, lambda *arguments: None)
-        yield
+        with pictures.not_drawn():
+            yield
 
 
 @pytest.fixture(autouse=True)
@@ -89,6 +91,22 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, Path], Interrupted]:
+    """Copies the folder of a run that was stopped after some iterations, which is trained once, to another."""
+    runs: dict[int, tuple[Path, Interrupted]] = {}
+
+    def copy(after: int, to: Path) -> Interrupted:
+        if after not in runs:
+            folder = tmp_path_factory.mktemp("cut")
+            runs[after] = folder, stopped(folder, after)
+        folder, told = runs[after]
+        shutil.copytree(folder, to)
+        return told
+
+    return copy
+
+
 def test_the_baseline_is_the_run_without_strategies_on_the_same_scene(whole, tmp_path, monkeypatch, caplog):
     loads = []
     prepare = scene.load
@@ -122,13 +140,15 @@ def test_a_finished_run_is_not_trained_again_with_auto(whole, caplog):
     assert "nothing is trained" in caplog.text
 
 
-@pytest.mark.parametrize("leads_to", ["auto", "run", "baseline", "checkpoint"])
-def test_a_run_that_was_stopped_in_its_baseline_goes_on_there(whole, tmp_path, leads_to, caplog):
-    told = stopped(tmp_path / "cut", 5)
+@pytest.mark.parametrize(
+    "leads_to", ["auto", *(pytest.param(s, marks=SLOW) for s in ("run", "baseline", "checkpoint"))]
+)
+def test_a_run_that_was_stopped_in_its_baseline_goes_on_there(whole, cut, tmp_path, leads_to, caplog):
+    told = cut(5, tmp_path / "cut")
     assert told.exit_code == 128 + signal.SIGINT
     assert not list((tmp_path / "cut").rglob("metrics.json"))
     (saved,) = (tmp_path / "cut" / "baseline" / "checkpoints").iterdir()
-    assert f"fit.resume={saved}" in str(told)
+    assert re.search(rf"fit\.resume=\S*{saved.relative_to(tmp_path / 'cut')}", str(told))
     paths = {"auto": "auto", "run": tmp_path / "cut", "baseline": tmp_path / "cut" / "baseline", "checkpoint": saved}
     folder, watch = tmp_path / ("cut" if leads_to == "auto" else "resumed"), Iterations()
     train(folder, f"fit.resume={paths[leads_to]}", watch=watch)
@@ -138,9 +158,11 @@ def test_a_run_that_was_stopped_in_its_baseline_goes_on_there(whole, tmp_path, l
     assert field(folder) == field(whole)
 
 
-@pytest.mark.parametrize("leads_to", ["auto", "run", "checkpoints", "checkpoint"])
-def test_a_run_that_was_stopped_after_its_baseline_does_not_train_it_again(whole, tmp_path, leads_to):
-    stopped(tmp_path / "cut", ITERATIONS + 5)
+@pytest.mark.parametrize(
+    "leads_to", ["auto", *(pytest.param(s, marks=SLOW) for s in ("run", "checkpoints", "checkpoint"))]
+)
+def test_a_run_that_was_stopped_after_its_baseline_does_not_train_it_again(whole, cut, tmp_path, leads_to):
+    cut(ITERATIONS + 5, tmp_path / "cut")
     assert (tmp_path / "cut" / "baseline" / "metrics.json").is_file()
     assert not (tmp_path / "cut" / "metrics.json").exists()
     checkpoints = tmp_path / "cut" / "checkpoints"

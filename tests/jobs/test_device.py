@@ -11,8 +11,9 @@ from hydra import compose, initialize_config_dir
 
 from clear_strategies.compose import CONF, tree
 from clear_strategies.errors import SettingError
-from clear_strategies.jobs import device, job
+from clear_strategies.jobs import device
 from clear_strategies.jobs.device import RasterizerSettings, drawn_on
+from clear_strategies.jobs.settings import JobSettings, settings_of
 from rasterizers.interface import RasterSettings, Traits
 from rasterizers.reference import ReferenceRasterizer
 
@@ -27,17 +28,16 @@ class Theirs(ReferenceRasterizer):
 class Blank:
     """Draws nothing."""
 
-    tile = 8
     traits = Traits(frozenset({"cpu", "meta"}), frozenset({torch.float32}))
 
-    def __call__(self, splats, camera, tiles=None): ...
+    def __call__(self, splats, camera): ...
 
-    def render_scales(self, jobs, tiles=None): ...
+    def render_scales(self, jobs): ...
 
 
-def settings(*overrides: str) -> job.JobSettings:
+def settings(*overrides: str) -> JobSettings:
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return job.settings_of(tree(compose("config", list(overrides))))
+        return settings_of(tree(compose("config", list(overrides))))
 
 
 def test_a_device_that_is_not_there_is_refused_in_one_sentence(monkeypatch):

@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import Conductor
 from clear_strategies.compose import CONF
-from clear_strategies.data.prepare import ViewSettings
+from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import CHANGES_NO_RESULT, build
 from clear_strategies.training.loop import fit, iterate
@@ -66,7 +66,7 @@ def pieces(config: DictConfig, stretch: float = 1.0):
 
 
 @pytest.mark.parametrize("name", names("method"))
-@pytest.mark.parametrize("fused", ["off", "auto"])
+@pytest.mark.parametrize("fused", [pytest.param("off", marks=pytest.mark.slow), "auto"])
 def test_every_method_trains(name, fused):
     """Few iterations of a toy, through every phase; the loss that it is about falls."""
     # After a reset the loss has to fall anew; a toy that doubles its Gaussians in 24 iterations does not settle.
@@ -254,9 +254,8 @@ def test_a_setting_that_changes_no_result_changes_no_folders_name(rows):
     asked = ("experiment=llff_x4", "data.root=here", "data.scene=horns", "fit.seed=0", rows)
     (one,), composed_job = jobs(*asked)
     named = composed_job(one).hydra.sweep.subdir
-    for key in sorted(CHANGES_NO_RESULT):
-        (one,), composed_job = jobs(*asked, f"{key}=1")
-        assert composed_job(one).hydra.sweep.subdir == named, key
+    (one,), composed_job = jobs(*asked, *(f"{key}=1" for key in sorted(CHANGES_NO_RESULT)))
+    assert composed_job(one).hydra.sweep.subdir == named
 
 
 def test_settings_that_change_no_result_exist():
@@ -264,6 +263,7 @@ def test_settings_that_change_no_result_exist():
     assert [key for key in CHANGES_NO_RESULT if OmegaConf.select(config, key, default="nothing") == "nothing"] == []
 
 
+@pytest.mark.slow
 def test_a_finished_sweep_is_not_trained_again_when_more_is_said_and_shown(tmp_path: Path):
     every = ["experiment=ablation", "~protocol", "fit.seed=0", *TINY, "fit.iterations=3", "+method=srgs"]
     first = run(*every, "fit.map_views=0", cwd=tmp_path)
@@ -283,6 +283,7 @@ def test_an_ablation_of_other_data():
     assert (composed_job(own[0]).data.path, composed_job(own[0]).data.views.shrink) == ("mine", 1)
 
 
+@pytest.mark.slow
 def test_one_command_runs_all_and_the_report_tells_the_rows_apart(tmp_path: Path):
     tiny = ["experiment=ablation", "~protocol", "fit.seed=0", *TINY, "fit.iterations=3"]
     for rows in ("+strategy=baseline,clear", "+method=srgs"):

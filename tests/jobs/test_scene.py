@@ -10,13 +10,13 @@ from hydra import compose, initialize_config_dir
 
 from clear_strategies.compose import CONF, tree
 from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.prepare import ViewSettings
 from clear_strategies.data.priors import Bicubic, Corrupted, Ncnn, ncnn
 from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio
 from clear_strategies.data.scene import Scene
+from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import SettingError
-from clear_strategies.jobs import job
 from clear_strategies.jobs.scene import AutoPrior, DataSettings, load, require_factor
+from clear_strategies.jobs.settings import settings_of
 from tests.helpers import captures, fake_ncnn
 
 
@@ -106,7 +106,7 @@ def test_a_factor_that_the_network_has_not_is_refused_before_data_is_read(prior:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         values = tree(compose("config", [f"prior={prior}", "data.views.sr_scale=3"]))
     with pytest.raises(SettingError, match=rf"^data\.views\.sr_scale: must be (2 or )?4 with {prior}, got 3: "):
-        job.settings_of(values)
+        settings_of(values)
 
 
 def test_a_network_with_errors_added_is_asked_for_its_factors_too(tmp_path: Path, monkeypatch):

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -16,24 +14,19 @@ import torch
 from clear_strategies.jobs import sweep
 from clear_strategies.jobs.sweep import Sweep, Watch
 from clear_strategies.training import checkpoint
-from tests.helpers.command_line import ROOT, TINY, run, trains, wait_for
+from tests.helpers.command_line import TINY, run, started, stopped_by, trains, wait_for
 
 AUTO = ["fit.resume=auto", *TINY]
 SWEEP = ["-m", "hydra.sweep.dir=all", *AUTO]
 LONG = ["fit.iterations=400"]  # two seconds: time enough for a signal
-
-
-def start(*overrides: str, cwd: Path) -> subprocess.Popen[str]:
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(cwd / "cache"), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "clear_strategies.run", *overrides]
-    return subprocess.Popen(command, cwd=cwd, env=env, stderr=subprocess.STDOUT, stdout=subprocess.PIPE, text=True)
+DOOR = ["-m", "clear_strategies.run"]
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory) -> Path:
     """A run that nothing disturbed, of 40 iterations."""
     folder = tmp_path_factory.mktemp("whole")
-    result = run("+strategy=clear", "hydra.run.dir=here", *AUTO, "fit.iterations=40", cwd=folder)
+    result = run("+strategy=clear", "hydra.run.dir=here", *AUTO, "fit.iterations=40", cwd=folder, drawn=True)
     assert result.returncode == 0, result.stderr
     return folder / "here"
 
@@ -63,14 +56,15 @@ def test_metrics_json_is_the_last_file_a_run_writes(whole):
     assert max(results) <= (whole / "metrics.json").stat().st_mtime_ns
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same(whole, tmp_path):
     """SIGKILL, then a damaged newest checkpoint: the one before it is taken; seconds and counts go on."""
     every = [*AUTO, "fit.iterations=40", "fit.checkpoint_every=2500", "+strategy=clear", "hydra.run.dir=here"]
-    process = start(*every, cwd=tmp_path)
+    process = started(*DOOR, *every, cwd=tmp_path, said=tmp_path / "said")
     saved = tmp_path / "here" / "checkpoints"
     wait_for(lambda: len(checkpoint.saved(saved)) >= 2)
     process.kill()
-    process.communicate()
+    process.wait()
     (tmp_path / "here" / "metrics.json").unlink(missing_ok=True)  # on a fast machine it had ended before
     newest, before = checkpoint.saved(saved)[-1], checkpoint.saved(saved)[-2]
     (newest / "tensors.safetensors").write_bytes(b"torn")
@@ -89,21 +83,15 @@ def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same
     assert json.loads((tmp_path / "here" / "metrics.json").read_text())["seconds"] >= seconds[-1]
 
 
-def test_a_stopped_run_goes_on_by_itself_and_ends_the_same(tmp_path):
-    every = [*AUTO, *LONG, "+strategy=clear", "hydra.run.dir=here"]
-    process = start(*every, cwd=tmp_path)
-    wait_for(lambda: trains(tmp_path / "here"))
-    process.send_signal(signal.SIGTERM)
-    said, _ = process.communicate(timeout=120)
-    assert process.returncode == 143, said
+def test_a_stopped_run_goes_on_by_itself_and_ends_the_same(whole, tmp_path):
+    every = [*AUTO, "fit.iterations=40", "+strategy=clear", "hydra.run.dir=here"]
+    process = started("-c", stopped_by(signal.SIGTERM, after=20), *every, cwd=tmp_path, said=tmp_path / "said")
+    assert process.wait() == 143, (tmp_path / "said").read_text()
     assert not (tmp_path / "here" / "metrics.json").exists()
     result = run(*every, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "resumed from" in result.stdout + result.stderr
-    whole = run(*AUTO, *LONG, "+strategy=clear", "hydra.run.dir=whole", cwd=tmp_path)
-    assert whole.returncode == 0, whole.stderr
-    plys = [(tmp_path / name / "point_cloud.ply").read_bytes() for name in ("here", "whole")]
-    assert plys[0] == plys[1]
+    assert (tmp_path / "here" / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
 
 
 def test_torch_and_kernels_divide_the_cores_among_the_jobs(monkeypatch):
@@ -142,6 +130,7 @@ joblib = pytest.mark.skipif(
 JOBLIB = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
 
 
+@pytest.mark.slow
 @joblib
 def test_in_other_processes_a_failed_job_stops_no_other_and_is_told(tmp_path):
     result = run(
@@ -161,18 +150,13 @@ def test_in_other_processes_a_failed_job_stops_no_other_and_is_told(tmp_path):
 def test_a_stopped_joblib_sweep_saves_its_jobs_and_goes_on(tmp_path, whom):
     """Ctrl-C reaches the workers too, SIGTERM only the process that was started; both save and begin no other job."""
     sweep_of_three = [*SWEEP, *JOBLIB, "+strategy=baseline,gco,svs", *LONG]
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
-    with (tmp_path / "said").open("w") as said:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "clear_strategies.run", *sweep_of_three], cwd=tmp_path, env=env, stdout=said,
-            stderr=said, start_new_session=True,
-        )  # fmt: skip
-        wait_for(lambda: all(trains(tmp_path / "all" / job) for job in ("0", "1")))
-        if whom == "group":
-            os.killpg(process.pid, signal.SIGINT)
-        else:
-            process.terminate()
-        code = process.wait(120)
+    process = started(*DOOR, *sweep_of_three, cwd=tmp_path, said=tmp_path / "said", session=True)
+    wait_for(lambda: all(trains(tmp_path / "all" / job) for job in ("0", "1")))
+    if whom == "group":
+        os.killpg(process.pid, signal.SIGINT)
+    else:
+        process.terminate()
+    code = process.wait()
     text = (tmp_path / "said").read_text()
     assert code == (130 if whom == "group" else 143), text
     assert "the same command goes on" in text
@@ -190,27 +174,18 @@ def test_a_stopped_joblib_sweep_saves_its_jobs_and_goes_on(tmp_path, whom):
 
 def test_a_clusters_announcement_saves_before_its_handler_acts(tmp_path):
     """SIGUSR2, as submitit handles it: what it would do at once is done after the checkpoint."""
-    code = (
+    handler = (
         "import signal, sys\n"
         "def hand_in_again(signum, frame):\n"
         "    from clear_strategies.training import checkpoint\n"
         "    from pathlib import Path\n"
         "    sys.exit(90 + len(checkpoint.saved(Path('here/checkpoints'))))\n"
         "signal.signal(signal.SIGUSR2, hand_in_again)\n"
-        "from clear_strategies.run import main\n"
-        "main()\n"
     )
-    env = {**os.environ, "PYTHONPATH": str(ROOT), "CLEAR_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", code, "+strategy=clear", "hydra.run.dir=here", *AUTO, *LONG]
-    command.append("fit.checkpoint_every=0")
-    with subprocess.Popen(
-        command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        wait_for(lambda: trains(tmp_path / "here"))
-        process.send_signal(signal.SIGTERM)  # some clusters send it first
-        process.send_signal(signal.SIGUSR2)
-        said, _ = process.communicate(timeout=120)
-    assert process.returncode == 91, said
+    code = handler + stopped_by(signal.SIGTERM, signal.SIGUSR2, after=5)  # some clusters send SIGTERM first
+    every = ["+strategy=clear", "hydra.run.dir=here", *AUTO, "fit.checkpoint_every=0"]
+    process = started("-c", code, *every, cwd=tmp_path, said=tmp_path / "said")
+    assert process.wait() == 91, (tmp_path / "said").read_text()
 
 
 def test_the_threads_of_one_job_are_not_those_of_the_next():

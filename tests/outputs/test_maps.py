@@ -148,7 +148,7 @@ def test_maps_are_drawn_over_black_whatever_the_background() -> None:
     import rasterizers
 
     state = trained(Halve())
-    white = rasterizers.load("torch", tile=8, background=(1.0, 1.0, 1.0))
+    white = rasterizers.load("torch", background=(1.0, 1.0, 1.0))
     state.field.opacities.data[:] = -4.0  # little is drawn
     found = view_maps(state.field, state.conductor, white, state.views[0])
     assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)

@@ -19,7 +19,7 @@ from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.figures import magnification
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen
-from clear_strategies.outputs.results import FILES, write_results
+from clear_strategies.outputs.results import FILES, Pictures, write_results
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
@@ -33,6 +33,7 @@ from tests.helpers.image_files import holds, read
 WRITTEN_BY_OTHERS = {".hydra/", "run.log", "checkpoints/", "baseline/", "cameras.json", "cameras/", "tensorboard/"}
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
 SCENE = toy.scene()
+PICTURES = Pictures(map_views=1, video_frames=2, page_gaussians=1000)
 
 
 @pytest.fixture(scope="module")
@@ -49,17 +50,15 @@ def state() -> TrainState:
 def write(
     folder: Path,
     state: TrainState,
-    map_views: int = 1,
     baseline: Baseline | None = None,
     *,
     scene: Scene = SCENE,
-    video: int = 2,
-    page: int = 1000,
+    pictures: Pictures | None = PICTURES,
 ) -> Evaluation:
     return write_results(
         folder, scene, state, toy.RASTERIZER, Chosen(None, ["gco", "p2g"]), backend="torch", down="bicubic",
-        map_views=map_views, painter=Painter(state.field, lambda **_: toy.RASTERIZER), video_frames=video, page_gaussians=page,
-        seconds=1.5, config={"fit": {"seed": 0}}, baseline=baseline,
+        painter=Painter(state.field, lambda **_: toy.RASTERIZER), pictures=pictures, seconds=1.5, config={"fit": {"seed": 0}},
+        baseline=baseline,
     )  # fmt: skip
 
 
@@ -82,7 +81,9 @@ def test_every_file_of_a_run_is_listed(tmp_path: Path, state: TrainState) -> Non
 
 
 def test_the_baseline_beside_a_run_is_shown_and_its_means_are_kept(tmp_path: Path, state: TrainState) -> None:
-    write(tmp_path / "run" / "baseline", state)
+    write(tmp_path / "run" / "baseline", state, pictures=None)
+    scores = {"renders/", "point_cloud.ply", "history.csv", "conflict.csv", "timing.csv", "metrics.json"}
+    assert names(tmp_path / "run" / "baseline") == scores
     baseline = Baseline.read(tmp_path / "run" / "baseline")
     (view,) = SCENE.test
     marked = torch.rand(view.hr.image.shape, generator=torch.Generator().manual_seed(0)).mul(255).round() / 255
@@ -99,7 +100,7 @@ def test_the_baseline_beside_a_run_is_shown_and_its_means_are_kept(tmp_path: Pat
 
 
 def test_conflict_csv_holds_columns_of_history_csv(tmp_path: Path, state: TrainState) -> None:
-    write(tmp_path, state)
+    write(tmp_path, state, pictures=None)
     history, conflict = (
         list(csv.DictReader((tmp_path / f"{name}.csv").open(newline=""))) for name in ("history", "conflict")
     )
@@ -110,13 +111,13 @@ def test_conflict_csv_holds_columns_of_history_csv(tmp_path: Path, state: TrainS
 
 
 def test_no_map_views_means_no_maps(tmp_path: Path, state: TrainState) -> None:
-    write(tmp_path, state, map_views=0)
+    write(tmp_path, state, pictures=replace(PICTURES, map_views=0))
     assert not (tmp_path / "maps").exists()
 
 
 def test_a_run_without_test_views_shows_training_views(tmp_path: Path, state: TrainState) -> None:
     scene = replace(SCENE, test=(), train=SCENE.train * 2)
-    write(tmp_path, state, map_views=0, scene=scene, video=0)
+    write(tmp_path, state, scene=scene, pictures=replace(PICTURES, map_views=0, video_frames=0))
     assert names(tmp_path / "renders") == {f"{view.name}.png" for view in SCENE.train}
     assert names(tmp_path / "depth") == names(tmp_path / "renders")
     shown = read(tmp_path / "contact_sheet.png")
@@ -130,7 +131,7 @@ def test_a_video_that_cannot_be_written_is_named(
 ) -> None:
     monkeypatch.setattr("clear_strategies.viewing.video.find_spec", lambda _: None)
     with caplog.at_level("DEBUG"):
-        write(tmp_path, state, map_views=0)
+        write(tmp_path, state, pictures=replace(PICTURES, map_views=0))
     assert "pip install imageio-ffmpeg" in caplog.text
     assert not (tmp_path / "path.mp4").exists()
 
@@ -143,5 +144,5 @@ def test_metrics_json_is_missing_where_another_file_could_not_be_written(
 
     monkeypatch.setattr(files, "write_csv", full)
     with pytest.raises(OSError, match="No space left"):
-        write(tmp_path, state)
+        write(tmp_path, state, pictures=None)
     assert not (tmp_path / "metrics.json").exists()

@@ -12,7 +12,6 @@ import pytest
 from tests.slurm import ablation_and_requeue, one_machine
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not os.environ.get("CLEAR_TEST_SLURM"), reason="not asked for: CLEAR_TEST_SLURM=1")
 @pytest.mark.skipif(
     bool(one_machine.missing()),

@@ -11,9 +11,7 @@ import random
 import signal
 import time
 import traceback
-from contextlib import ExitStack
 from pathlib import Path
-from unittest import mock
 
 import torch
 from hydra import compose, initialize_config_dir
@@ -23,8 +21,8 @@ from clear_strategies.compose import CONF
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import job
 from clear_strategies.jobs.resume import CHECKPOINTS
-from clear_strategies.outputs import results
 from clear_strategies.training import checkpoint
+from tests.helpers import pictures
 from tests.helpers.command_line import TINY
 from tests.stress.rows import Row, Worst
 
@@ -34,16 +32,12 @@ _RUN = [
     "+strategy=clear", "fit.iterations=60", "fit.checkpoint_every=500", "fit.keep=2", "fit.video=0", "fit.map_views=0",
     "fit.resume=auto", "fit.threads=1", "density.max_gaussians=300",
 ]  # fmt: skip
-# Drawn by matplotlib in nine tenths of so short a run, and written by the same function as the other files.
-_PICTURES = ("write_curves", "write_contact_sheet", "write_depths")
 _MOST_KILLS = 6  # of one run, before it may end
 
 
 def measure(folder: Path, kills: int, *, seed: int = 0) -> Row:
     """Kill runs `kills` times in all; a failure is a checkpoint lost, a rest after the end, or another result."""
-    with ExitStack() as stack:
-        for name in _PICTURES:
-            stack.enter_context(mock.patch.object(results, name))
+    with pictures.not_drawn():
         return _measure(folder, kills, seed)
 
 

@@ -78,10 +78,9 @@ def _tests(folder: Path, isa: str) -> Row:
         for module in (build / package).glob(f"_{isa}*"):
             shutil.copy(module, tree / package / module.name)
     _log.info("sanitizers: testing %s …", isa)
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *_TESTS], cwd=tree, capture_output=True,
-        text=True, check=False, env=_environment(CLEAR_ISA=isa, PYTHONPATH=str(tree), LD_PRELOAD=_runtimes()),
-    )  # fmt: skip
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-m", "", "-p", "no:cacheprovider", *_TESTS]
+    environment = _environment(CLEAR_ISA=isa, PYTHONPATH=str(tree), LD_PRELOAD=_runtimes())
+    done = subprocess.run(command, cwd=tree, capture_output=True, text=True, check=False, env=environment)
     counted = re.search(r"(\d+) passed", done.stdout)
     return _row(isa, int(counted[1]) if counted else 0, done)
 

@@ -23,7 +23,7 @@ from tests.stress.bad_inputs import BadInput
 from tests.stress.rows import Row, Worst, read, table, write
 
 EVERY = {"torch": 97, "warp": 499}
-MUTANTS = {fuzz.binary: 100_000, fuzz.text: 5_000, fuzz.scenes: 500}
+MUTANTS = {fuzz.binary: 10_000, fuzz.text: 1_000, fuzz.scenes: 100}  # of each format
 
 
 @pytest.mark.parametrize("name", ["torch", *BACKENDS])
@@ -99,6 +99,7 @@ def test_an_export_that_writes_in_place_would_be_found(tmp_path: Path, monkeypat
     assert not faults.measure(tmp_path, most=250).met
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the run that is killed is a forked process")
 def test_killed_runs_end_as_one_that_was_not(tmp_path: Path) -> None:
     kills.measure(tmp_path, 5).require()
@@ -159,6 +160,7 @@ def test_a_program_a_secret_and_a_file_outside_would_be_found(tmp_path: Path) ->
     assert "canary" in (attacks.trace(refused_after(lambda there: (there / "canary").mkdir()), folder) or "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("targets", MUTANTS, ids=lambda targets: targets.__name__)
 def test_damaged_files_are_refused_or_sound(targets: fuzz.Targets) -> None:
     """In a process of its own, without the checks of types that tests run with."""
@@ -186,8 +188,9 @@ def test_mutants_are_the_same_in_any_number_of_processes() -> None:
     assert first[0] == first[1] != first[2]
 
 
+@pytest.mark.slow
 def test_a_short_soak_stays_finite() -> None:
-    _, open_files, finite = soak.run(200)
+    _, open_files, finite = soak.run(80)
     open_files.require()
     finite.require()
 

@@ -210,15 +210,29 @@ def test_adam_is_torchs_adam():
 
 
 def test_a_short_run_gives_f_det_a_share_of_its_rate(caplog):
+    plain = LearningRates(geometry_steps=0)
     with caplog.at_level("DEBUG"):
-        short = LearningRates().of_run(300)
-    assert short.detail == pytest.approx(LearningRates().detail / 5)
-    assert replace(short, detail=LearningRates().detail) == LearningRates()
+        short = plain.of_run(300)
+    assert short.detail == pytest.approx(plain.detail / 5)
+    assert replace(short, detail=plain.detail) == plain
     assert "rate of 0.0005 instead of 0.0025: the run has 300 iterations" in caplog.text
-    assert LearningRates().of_run(1_500) == LearningRates()
-    assert LearningRates(detail_steps=0).of_run(1) == LearningRates(detail_steps=0)
+    assert plain.of_run(1_500) == plain
+    assert replace(plain, detail_steps=0).of_run(1) == replace(plain, detail_steps=0)
     with pytest.raises(SettingError, match="detail_steps must be at least 0"):
         LearningRates(detail_steps=-1)
+
+
+def test_a_short_run_moves_the_geometry_faster_and_nothing_else():
+    rates, plain = LearningRates(), LearningRates(geometry_steps=0)
+    short = rates.of_run(3_750)
+    assert (short.scales, short.quats) == pytest.approx((2 * plain.scales, 2 * plain.quats))
+    for t in (1, 5_000, 10_000):
+        assert short.means(t) == pytest.approx(2 * plain.means(t))
+    assert replace(short, means=plain.means, scales=plain.scales, quats=plain.quats) == rates
+    assert rates.of_run(30_000) == rates.of_run(60_000) == rates
+    assert plain.of_run(1_500) == plain
+    with pytest.raises(SettingError, match="geometry_steps must be at least 0"):
+        LearningRates(geometry_steps=-1)
 
 
 def test_visible_rows_only_leaves_the_others_where_they_are():

@@ -11,23 +11,33 @@ import torch
 
 from clear_strategies import DataError
 from clear_strategies.training import checkpoint
+from clear_strategies.training.clock import WALL
 from clear_strategies.training.loop import fit, iterate
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
-from tests.helpers.short_run import ITERATIONS, SCENE, SUBSETS, start, tensors
+from tests.helpers.short_run import ITERATIONS, SCENE, start, tensors
 
 # Before and after each event of the schedule.
 CUTS = (2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 19)
 
 
 def without_time(history: list[dict[str, float]]) -> str:
-    return json.dumps([{k: v for k, v in row.items() if k != "seconds"} for row in history])
+    return json.dumps([{k: v for k, v in row.items() if not k.endswith(WALL)} for row in history])
 
 
-@pytest.mark.parametrize(
-    "names", [*SUBSETS, ("gco", "p2g", "svs", "pseudo_views")], ids=lambda x: "+".join(x) or "none"
-)
+STATES = [
+    (),
+    ("gco",),
+    ("p2g",),
+    ("svs",),
+    ("gco", "p2g", "svs"),
+    ("gco", "p2g", "svs", "pseudo_views", "fading_opacity"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", STATES, ids=lambda x: "+".join(x) or "none")
 def test_resuming_is_bitwise(names, tmp_path, caplog):
     whole = start(names)
     saved = {}

@@ -16,7 +16,7 @@ from clear_strategies.jobs.saved import open_splat
 from clear_strategies.viewing.page import write_page
 from tests.helpers import saved_run
 
-sync_api = pytest.importorskip("playwright.sync_api")
+sync_api = pytest.importorskip("playwright.sync_api", reason="apt install chromium && pip install playwright")
 server = pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -24,7 +24,10 @@ SOFTWARE = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enab
 PATIENCE = 120  # seconds; WebGL in software on a busy machine is slow
 LEFT = (20, 200, 200, 400)  # of the page: neither its panel nor its message covers this part
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="apt install chromium")]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="apt install chromium && pip install playwright"),
+]
 
 
 def picture(session) -> np.ndarray:

@@ -23,6 +23,7 @@ from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.filling import STRIDE
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.dense_stereo.sharper import depth_maps_from_sharper
 from clear_strategies.geometry.interpolation import densify, pixel_grid
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
 
@@ -133,6 +134,7 @@ def initial_points(
     settings: CloudSettings,
     photos: Sequence[Photo],
     *,
+    sharper: Sequence[Photo] = (),
     sfm: SfmPoints | None = None,
     train_ids: Sequence[int] = (),
     sfm_is_train: bool = False,
@@ -143,6 +145,7 @@ def initial_points(
 
     Args:
         photos: the training views at LR.
+        sharper: the same at HR, where photos show it: stereo compares these instead. None where HR is made by a prior.
         sfm: the scene's SfM points, if it has some.
         train_ids: their ids of the training frames.
         sfm_is_train: every photo of the capture trains, so that init=auto may use the SfM points in place of triangulating.
@@ -164,7 +167,7 @@ def initial_points(
             cloud = _cleaned(settings, from_tracks(sfm, train_ids, settings.min_views), photos, background)
         case _:
             known = _of_training_alone(settings, sfm, train_ids) if sfm_is_train else None
-            cloud, depths = _from_photos(settings, photos, sfm, known, background)
+            cloud, depths = _from_photos(settings, photos, sharper, sfm, known, background)
     if cloud is None:
         cloud = random_cloud(photos, settings.random_points, seed, settings.box)
     if settings.voxel is not None:
@@ -189,6 +192,7 @@ def _of_training_alone(settings: CloudSettings, sfm: SfmPoints | None, train_ids
 def _from_photos(
     settings: CloudSettings,
     photos: Sequence[Photo],
+    sharper: Sequence[Photo],
     sfm: SfmPoints | None,
     known: PointCloud | None,
     background: tuple[float, float, float] | None,
@@ -203,7 +207,10 @@ def _from_photos(
         _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
     features = triangulate(photos, settings.triangulation) if known is None else known
     if settings.init != "triangulated":
-        maps = depth_maps(photos, features.means, settings.stereo, background)
+        if sharper:
+            maps = depth_maps_from_sharper(photos, sharper, features.means, settings.stereo, background)
+        else:
+            maps = depth_maps(photos, features.means, settings.stereo, background)
         cloud = stereo_cloud(
             features,
             photos,

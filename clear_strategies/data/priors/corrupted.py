@@ -37,7 +37,7 @@ class SeededErrors:
         patch: edge of a patch, HR px; 64 is the patch of P2G's reliability.
         seed: of the errors; not the run's.
         hidden: leave of the errors only what the LR photo cannot show: the wrong patches shrink to the same LR pixels as
-            the right ones would. No comparison with the photo finds them, only other views do.
+            the right ones would. No comparison with the photo finds them.
 
     Raises:
         SettingError: a number is outside its range.

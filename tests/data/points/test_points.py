@@ -13,8 +13,8 @@ from clear_strategies.core import images
 from clear_strategies.core.view import Photo
 from clear_strategies.data.ply import write_points
 from clear_strategies.data.points import CloudSettings, initial_points
-from clear_strategies.data.prepare import ViewSettings, split
 from clear_strategies.data.readers import llff
+from clear_strategies.data.view_settings import ViewSettings, split
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry import StereoSettings
 from clear_strategies.geometry.projection import project

@@ -133,6 +133,7 @@ def test_realesrgan_shows_the_photo_and_is_another_than_waifu2x(caplog: pytest.L
     assert not torch.equal(sr, Ncnn()("view", lr, 4))
 
 
+@pytest.mark.slow
 @real
 def test_the_real_networks_repeat_with_any_number_of_threads() -> None:
     lr = photo(20, 31)
@@ -146,6 +147,7 @@ def test_the_real_networks_repeat_with_any_number_of_threads() -> None:
             torch.set_num_threads(1)
 
 
+@pytest.mark.slow
 @real
 def test_waifu2x_in_tiles_equals_waifu2x_at_once() -> None:
     lr = photo(60, 90)

@@ -15,10 +15,10 @@ from tests.helpers.networks import photo
 
 
 @given(
-    height=st.integers(1, 70), width=st.integers(1, 70), overlap=st.integers(0, 6), more=st.integers(1, 30),
+    height=st.integers(1, 40), width=st.integers(1, 40), overlap=st.integers(0, 4), more=st.integers(1, 20),
     factor=st.sampled_from([1, 2, 4]), seed=st.integers(0, 9),
 )  # fmt: skip
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_tiles_join_to_the_whole_where_the_overlap_reaches_as_far_as_the_network_sees(
     height: int, width: int, overlap: int, more: int, factor: int, seed: int
 ) -> None:

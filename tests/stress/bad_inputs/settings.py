@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies.compose import CONF, tree
 from clear_strategies.jobs import device
-from clear_strategies.jobs.job import settings_of
+from clear_strategies.jobs.settings import settings_of
 from tests.stress.bad_inputs import BadInput
 
 # An override, and what the message says beside the setting's name.
@@ -59,7 +59,9 @@ _REFUSED: dict[str, str] = {
     "decorators.back_projected.rounds=1000000000000": "at most 100",
     "strategies.pseudo_views.every=0": "at least 1",
     "strategies.pseudo_views.weight=0": "must be > 0",
-    "skips.flat=1": r"\[0, 1\)",
+    "strategies.pseudo_views.continued=2": r"\[0, 1\]",
+    "strategies.pseudo_views.border=0.5": "at least 1",
+    "strategies.fading_opacity.rate=1": r"\[0, 1\)",
     "skips.plateau_gain=-1": r"\[0, 1\)",
     "skips.coarse_until=-1": "at least 0",
     "rasterizer.alpha_max=1": "alpha_max",
@@ -77,9 +79,6 @@ _REFUSED: dict[str, str] = {
     "strategies.gco.tolerance=-0.1": r"\[0, 1\)",
     "strategies.gco.weight_min=0.9": "weight_min",
     "strategies.gco.weight_max=2": "weight_max",
-    "strategies.gco.bound=tight": "omega",
-    "strategies.gco.eps=tiny": "relative",
-    "strategies.gco.eps=relative:-1": "relative",
     "strategies.gco.groups=[colour]": "groups",
     "strategies.gco.tolerances=0.1": "",
     "strategies.p2g.reliability_scale=0": "reliability_scale",
@@ -91,7 +90,6 @@ _REFUSED: dict[str, str] = {
     "strategies.p2g.lookup=cubic": "nearest",
     "strategies.p2g.outside=mirror": "clamp",
     "strategies.p2g.score_by=luck": "evidence",
-    "strategies.p2g.agreement=some": "photo",
     "strategies.svs.looks=-1": "at least 0",
     "strategies.svs.anchor_strength=-1": ">= 0",
     "strategies.svs.reduction=max": "sum",
