@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from clear_strategies.core import images
 from rasterizers.interface import Camera
 
 
@@ -30,13 +32,25 @@ class Photo:
         """The same photo with its image on `device`. The camera stays on the CPU, where kernels read its numbers."""
         return replace(self, image=self.image.to(device))
 
+    def factor_to(self, max_pixels: int) -> int:
+        """The smallest whole factor that reduces it to at most `max_pixels`."""
+        return max(1, math.ceil(math.sqrt(self.camera.width * self.camera.height / max_pixels)))
+
+    def reduced(self, factor: int) -> Photo:
+        """The mean of each block of `factor` × `factor` pixels. What is left over at the right and at the bottom is cut off."""
+        if factor == 1:
+            return self
+        image = images.area_mean(images.crop_to_multiple(self.image, factor), factor)
+        camera = replace(self.camera, width=image.shape[1] * factor, height=image.shape[0] * factor)
+        return Photo(camera.scaled(1 / factor), image)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthMap:
     """The depth of a photo's surfaces, as far as it is known.
 
     Args:
-        depth: z in world units at each LR pixel's centre; nan where unknown.
+        depth: z in world units at each pixel's centre; nan where unknown.
         confidence: in [0, 1]; 0 where unknown.
     """
 
@@ -67,7 +81,8 @@ class View:
         hr: the super-resolved (SR) image of the prior; never the truth.
         truth: the real photo at HR, for evaluation only; training never uses it.
         sr_source: the prior's label, e.g. "onnx span_x4.onnx".
-        depth: of the LR photo's surfaces, from stereo; None where nobody asked for it, e.g. in test views.
+        depth: of the photo's surfaces, from stereo, on the pixels of `depth_photo`; None where nobody asked for it, e.g. in
+            test views.
         disagreement: |D(I) - I_LR|, where I is the SR image as the network made it and `hr` is I after back-projection, which
             removes that difference. P2G judges the network by it. None where `hr` is I itself.
         background: RGB in [0, 1] behind the scene; pixels of this colour belong to no surface.
@@ -86,6 +101,13 @@ class View:
     def factor(self) -> int:
         """HR pixels per LR pixel."""
         return self.hr.camera.width // self.lr.camera.width
+
+    @property
+    def depth_photo(self) -> Photo:
+        """The photo that `depth` is of: `lr`, or where HR is a photo, too, `hr` reduced to the size of the depth map."""
+        if self.depth is None or self.depth.depth.shape == self.lr.image.shape[:2]:
+            return self.lr
+        return self.hr.reduced(self.hr.camera.width // self.depth.depth.shape[1])
 
     def to(self, device: torch.device | str) -> View:
         """The same view with its images on `device`."""

@@ -8,7 +8,6 @@ A border view is a training camera with a wider field: it knows its photo, and n
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -17,7 +16,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from clear_strategies.core import images
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
 from rasterizers.interface import Camera
@@ -95,7 +93,7 @@ def border_views(photos: Iterable[Photo], *, field: float, max_pixels: int) -> l
         field: at least 1.
         max_pixels: larger photos are reduced by a whole factor first.
     """
-    return [_widened(_smaller(photo, _factor(photo, max_pixels)), field) for photo in photos]
+    return [_widened(photo.reduced(photo.factor_to(max_pixels)), field) for photo in photos]
 
 
 def cut_out(photos: Iterable[Photo], background: tuple[float, float, float]) -> bool:
@@ -133,23 +131,10 @@ def _widened(photo: Photo, field: float) -> PseudoView:
     return PseudoView(Photo(wide, image), known)
 
 
-def _factor(photo: Photo, max_pixels: int) -> int:
-    """The first whole factor that leaves at most `max_pixels`."""
-    return max(1, math.ceil(math.sqrt(photo.camera.width * photo.camera.height / max_pixels)))
-
-
-def _smaller(photo: Photo, factor: int) -> Photo:
-    if factor == 1:
-        return photo
-    image = images.area_mean(images.crop_to_multiple(photo.image, factor), factor)
-    camera = replace(photo.camera, width=image.shape[1] * factor, height=image.shape[0] * factor).scaled(1 / factor)
-    return Photo(camera, image)
-
-
 def _reduced(photo: Photo, found: DepthMap, max_pixels: int) -> tuple[Photo, DepthMap]:
     """Both at the size of the first whole factor that leaves at most `max_pixels`; the depth of each block's middle."""
-    factor = _factor(photo, max_pixels)
-    smaller = _smaller(photo, factor)
+    factor = photo.factor_to(max_pixels)
+    smaller = photo.reduced(factor)
     height, width = smaller.image.shape[:2]
     depth, confidence = (
         values[factor // 2 :: factor, factor // 2 :: factor][:height, :width]

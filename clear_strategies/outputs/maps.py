@@ -91,7 +91,7 @@ def write_maps(
             write_png(own / f"{name}.png", values)
         write_maps_picture(own / "maps.png", view, found.maps, found.means)
         if view.depth is not None:
-            write_depth(own / "depth.png", view.lr, view.depth, f"{view.name}: depth by stereo")
+            write_depth(own / "depth.png", view.depth_photo, view.depth, f"{view.name}: depth by stereo")
     corrector = conductor.owner("correct")
     if corrector is None:
         _log.debug("maps: no strategy of this run corrects, so there is no corrected.png.")

@@ -85,7 +85,7 @@ class PseudoViews(Strategy):
         """Make the pseudo views: a function of the views and the seed. None are made, and a message says why, where they
         would be of no use.
         """
-        photos = {view.name: view.lr.to("cpu") for view in views}
+        photos = {view.name: view.depth_photo.to("cpu") for view in views}
         background = views[0].background if views else (0.0, 0.0, 0.0)
         if not photos:
             _log.warning("PseudoViews has no effect: this training loop does not give its views.")

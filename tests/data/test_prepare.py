@@ -20,6 +20,7 @@ from clear_strategies.data.priors import BackProjected, Bicubic, DemoPrior
 from clear_strategies.data.readers import demo
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError, SettingError
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.strategies.p2g import P2G
 from rasterizers import Camera
 
@@ -262,19 +263,25 @@ def test_how_far_a_back_projected_sr_image_was_from_its_photo_is_kept():
         assert float(R[2].min()) > 0.9
 
 
-@pytest.mark.parametrize(("photos_are", "compared"), [("both", [64, 64]), ("hr", [])])
-def test_stereo_compares_the_hr_side_where_it_is_photos_and_no_sr_images(photos_are, compared, monkeypatch):
-    capture, seen = demo.read(width=64, height=48, views=5, train=2), []
+@pytest.mark.parametrize(
+    ("photos_are", "max_pixels", "compared"),
+    [("both", 250_000, (64, 48)), ("both", 1_000, (32, 24)), ("both", 200, (16, 12)), ("hr", 250_000, (16, 12))],
+)
+def test_stereo_compares_the_hr_side_where_it_is_photos_and_no_sr_images(photos_are, max_pixels, compared, monkeypatch):
+    capture, windows = demo.read(width=64, height=48, views=5, train=2), []
 
-    def found(photos, sharper, *_):
-        seen.extend(sharp.camera.width for sharp in sharper)
-        return depth_maps(photos, *_)
-
-    def depth_maps(photos, *_):
+    def depth_maps(photos, _, stereo, *__):
+        windows.append(stereo.window)
         return [DepthMap(torch.full(p.image.shape[:2], 4.0), torch.ones(p.image.shape[:2])) for p in photos]
 
-    monkeypatch.setattr(points, "depth_maps_from_sharper", found)
     monkeypatch.setattr(points, "depth_maps", depth_maps)
-    scene = prepare(capture, ViewSettings(photos_are=photos_are, train=2), Bicubic(), CloudSettings(init="stereo"))
-    assert seen == compared
-    assert all(view.depth.depth.shape == view.lr.image.shape[:2] for view in scene.train)
+    cloud = CloudSettings(init="stereo", stereo=StereoSettings(max_pixels=max_pixels))
+    scene = prepare(capture, ViewSettings(photos_are=photos_are, train=2), Bicubic(), cloud)
+    assert windows == [7 if compared[0] > 16 else 5]
+    for view in scene.train:
+        assert tuple(view.depth.depth.shape) == compared[::-1]
+        shown = view.depth_photo
+        factor = 64 // compared[0]
+        assert (shown.camera.width, shown.camera.fx) == (compared[0], view.hr.camera.fx / factor)
+        of = view.lr.image if compared[0] == 16 else images.area_mean(view.hr.image, factor)
+        assert torch.equal(shown.image, of)

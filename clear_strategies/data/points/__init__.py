@@ -23,7 +23,6 @@ from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.filling import STRIDE
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.dense_stereo.sharper import depth_maps_from_sharper
 from clear_strategies.geometry.interpolation import densify, pixel_grid
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
 
@@ -207,18 +206,19 @@ def _from_photos(
         _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
     features = triangulate(photos, settings.triangulation) if known is None else known
     if settings.init != "triangulated":
-        if sharper:
-            maps = depth_maps_from_sharper(photos, sharper, features.means, settings.stereo, background)
-        else:
-            maps = depth_maps(photos, features.means, settings.stereo, background)
+        stereo, stride = settings.stereo, settings.stride
+        if sharper and sharper[0].factor_to(stereo.max_pixels) < sharper[0].camera.width // photos[0].camera.width:
+            photos = [photo.reduced(photo.factor_to(stereo.max_pixels)) for photo in sharper]
+            stereo, stride = stereo.finer(), 2 * stride
+        maps = depth_maps(photos, features.means, stereo, background)
         cloud = stereo_cloud(
             features,
             photos,
             maps,
-            settings.stereo,
+            stereo,
             background=background,
             fill=settings.densify is not False,
-            stride=settings.stride,
+            stride=stride,
             outlier_neighbours=settings.outlier_neighbours,
             outlier_ratio=settings.outlier_ratio,
         )
