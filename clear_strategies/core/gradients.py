@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -48,6 +48,10 @@ class Grads(dict[str, Tensor]):
         return Grads({name: scale_rows(value, weight) for name, value in self.items()})
 
     __rmul__ = __mul__
+
+    def without_detail(self) -> Grads:
+        """The same without f_det, which is never corrected."""
+        return Grads({name: value for name, value in self.items() if name != "detail"})
 
 
 @runtime_checkable
@@ -132,6 +136,14 @@ def to_ndc(screen: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor,
     for axis, pixels in enumerate(size):
         ndc[:, axis] *= pixels / 2
     return ndc
+
+
+def screen_in_ndc(g: Any, size: tuple[int, int]) -> Float[Tensor, "N 2"]:
+    """`g.screen` in NDC; `g` is a `Grads`, or what a stepper has in its place."""
+    screen: Tensor | None = g.screen
+    if screen is None:
+        raise ValueError("a Shot's vjp() must set .screen on every Grads it returns.")
+    return to_ndc(screen, size)
 
 
 def screen_norm(screen: Float[Tensor, "N 2"]) -> Float[Tensor, " N"]:

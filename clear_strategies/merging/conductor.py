@@ -16,7 +16,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
-from clear_strategies.core.gradients import Grads, Shot, conflict_ratio, screen_norm, to_ndc
+from clear_strategies.core.gradients import Grads, Shot, conflict_ratio, screen_in_ndc, screen_norm
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.core.work_log import WorkLog
@@ -24,7 +24,7 @@ from clear_strategies.errors import StrategyConflict
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.iteration import HrGradients, Merged, Stepper, Update, require_finite_parts
 from clear_strategies.merging.objective import Losses, Objective
-from clear_strategies.strategies.base import ScreenGradients, Strategy, overrides
+from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
 
 _log = logging.getLogger(__name__)
 
@@ -180,7 +180,7 @@ class Conductor:
             g_lr = g_mean if reduced else g_lr
         step = Step(t, view) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else stepper.stage):
-            score, ordinary = self.scores(to_ndc(_screen(g_lr), _size(rendered.image)), from_hr, t)  # S^dens   Eq. 14
+            score, ordinary = self.scores(screen_in_ndc(g_lr, _size(rendered.image)), from_hr, t)  # S^dens   Eq. 14
             if stepper is None:
                 merged = self.merge(params, g_lr, from_hr, t)
                 require_finite(f"{where}: the merged gradient", merged.grads)
@@ -225,8 +225,8 @@ class Conductor:
             return Merged(g_lr + self._regularize(params, t))
         λ, λ_hf = self.objective.lambda_hr(t), self.objective.lambda_hf
         g_hf = None if hr.hf is None else hr.hf * hr.m * λ_hf  # m ∇L_HF        Eq. 12
-        g_hr = _without_detail(hr.base if g_hf is None else hr.base + g_hf)  # g^HR           Eq. 13
-        g_lr = _without_detail(g_lr)
+        g_hr = (hr.base if g_hf is None else hr.base + g_hf).without_detail()  # g^HR           Eq. 13
+        g_lr = g_lr.without_detail()
         conflict: Mapping[str, Number] = {}
         corrected = g_hr
         if λ > 0:
@@ -247,10 +247,10 @@ class Conductor:
         """
         λ, total, base, hf = self.objective.lambda_hr(t), screen_lr, None, None
         if hr is not None:
-            base = to_ndc(_screen(hr.base), hr.size)
+            base = screen_in_ndc(hr.base, hr.size)
             total = total + λ * base
             if hr.hf is not None:
-                hf = to_ndc(_screen(hr.hf), hr.size)
+                hf = screen_in_ndc(hr.hf, hr.size)
                 total = total + λ * self.objective.lambda_hf * hf
         screen = ScreenGradients(screen_lr, base, hf, screen_norm(total))
         score = None if hr is None else self._ask("score", None, hr.step, screen)
@@ -270,7 +270,9 @@ class Conductor:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Every strategy's per-Gaussian tensors, as "<class>.<name>" ("<class>2.<name>" for a second of one class)."""
-        return {f"{owner}.{name}": rows for owner, s in self._by_name().items() for name, rows in s.state.items()}
+        return {
+            f"{owner}.{name}": rows for owner, s in by_class(self.strategies).items() for name, rows in s.state.items()
+        }
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Give each strategy its tensors back.
@@ -278,7 +280,7 @@ class Conductor:
         Raises:
             ValueError: a tensor belongs to no strategy of this conductor.
         """
-        by_name = self._by_name()
+        by_name = by_class(self.strategies)
         for s in self.strategies:
             s.state.clear()
         for key, rows in tensors.items():
@@ -308,11 +310,7 @@ class Conductor:
         where: str,
         lr_cotangents: Tensor | None = None,
     ) -> tuple[Any | None, HrGradients[Any]]:
-        """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses.
-
-        Args:
-            where: for messages.
-        """
+        """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage, view = self.work_log.stage, step.view
         with stage("losses HR"):
             losses = self.objective.hr(hr.image.detach(), view.hr.image)  # Eq. 5
@@ -326,14 +324,6 @@ class Conductor:
             step = replace(step, evidence=self._ask("observe", None, step, hr))  # q, a, w        Eq. 9, 10
             m = 1.0 if hf is None else self._ask("route", 1.0, step)  # m              Eq. 12
         return g_lr, HrGradients(base, hf, _size(hr.image), step, m, losses.values)
-
-    def _by_name(self) -> dict[str, Strategy]:
-        named: dict[str, Strategy] = {}
-        for s in self.strategies:
-            kind = type(s).__name__
-            same = sum(type(other).__name__ == kind for other in named.values())
-            named[kind if same == 0 else f"{kind}{same + 1}"] = s
-        return named
 
     def _ask(self, hook: str, unanswered: Any, *arguments: Any) -> Any:
         owner = self._one.get(hook)
@@ -352,17 +342,6 @@ class Conductor:
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:
     return shot.vjp(cotangents)
-
-
-def _without_detail(g: Grads) -> Grads:
-    return Grads({name: value for name, value in g.items() if name != "detail"})
-
-
-def _screen(g: Any) -> Tensor:
-    screen: Tensor | None = g.screen
-    if screen is None:
-        raise ValueError("a Shot's vjp() must set .screen on every Grads it returns.")
-    return screen
 
 
 def _size(image: Float[Tensor, "H W 3"]) -> tuple[int, int]:

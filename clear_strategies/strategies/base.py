@@ -217,3 +217,13 @@ def _methods(cls: type) -> dict[str, Any]:
         for name, value in vars(base).items()
         if inspect.isfunction(value) and not (name.startswith("__") and name != "__post_init__")
     }
+
+
+def by_class(strategies: Sequence[Strategy]) -> dict[str, Strategy]:
+    """Each strategy by the name of its class; a second one of a class as "<class>2"."""
+    named: dict[str, Strategy] = {}
+    for s in strategies:
+        kind = type(s).__name__
+        same = sum(type(other).__name__ == kind for other in named.values())
+        named[kind if same == 0 else f"{kind}{same + 1}"] = s
+    return named
