@@ -1,7 +1,7 @@
 """`python -m clear_strategies.bench`: run time against error, and what a second of training buys.
 
 The questions are `rasterizers`, `kernels`, `iteration` (one training iteration, stage by stage),
-`pareto` (whole trainings: seconds against PSNR) and `device` (all checks that need a GPU). `scenes`
+`seconds` (whole trainings: seconds to the same PSNR) and `device` (all checks that need a GPU). `scenes`
 makes what is drawn; `timing` and `accuracy` take the measurements; `peers` wraps other rasterizers;
 `results` and `plots` write the files.
 """

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from clear_strategies import console
-from clear_strategies.bench import device, evidence, iteration, kernels, pareto, rasterizers, seconds, stereo
+from clear_strategies.bench import device, evidence, iteration, kernels, rasterizers, seconds, stereo
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
 from clear_strategies.errors import ClearError
@@ -123,19 +123,6 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_trainings(questions: Any, common: argparse.ArgumentParser) -> None:
     """The questions that are answered by whole trainings."""
-    ask = questions.add_parser("pareto", parents=[common], help="seconds against PSNR and SSIM of whole trainings")
-    ask.add_argument(
-        "overrides", nargs="*", metavar="OVERRIDE", help="of all trainings, as for a run (default: the demo)"
-    )
-    ask.add_argument("--seeds", nargs="+", type=int, default=[0, 1], metavar="SEED", help="default: 0 1")
-    ask.add_argument("--iterations", type=_positive, default=1500, metavar="N", help="default: 1500")
-    ask.add_argument(
-        "--out", type=Path, default=Path("outputs/pareto"), metavar="FOLDER",
-        help="holds tables, figure and trainings; finished trainings are kept (default: %(default)s)",
-    )  # fmt: skip
-    names = [variant.name for variant in pareto.VARIANTS]
-    ask.add_argument("--variants", nargs="+", default=names, metavar="NAME", help=f"default: {', '.join(names)}")
-
     ask = questions.add_parser(
         "seconds", parents=[common], help="seconds until a variant is as good as the reference at its end"
     )
@@ -158,9 +145,7 @@ def _add_trainings(questions: Any, common: argparse.ArgumentParser) -> None:
 
 
 def _measure(question: str, options: dict[str, Any], results: Results) -> None:
-    if question == "pareto":
-        pareto.measure(results, pareto.Request(**options))
-    elif question == "seconds":
+    if question == "seconds":
         seconds.measure(results, seconds.Request(**options))
     elif question == "device":
         device.measure(results, device.Request(**options))

@@ -35,23 +35,25 @@ def time_against_error(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
     return figure
 
 
-def time_against_quality(pareto: pd.DataFrame, title: str) -> Figure:
-    """Seconds of training against PSNR, one colour per kind of variant; upper left is better.
+def time_against_quality(probes: pd.DataFrame) -> Figure:
+    """Seconds of training against PSNR: one panel per scene, one colour per variant, one line per seed; upper left is better.
 
     Args:
-        pareto: the table `pareto`.
+        probes: the table `seconds_probes`.
     """
-    figure = Figure(figsize=(9, 5.6), layout="constrained")
-    axis = figure.subplots()
-    front = pareto[pareto["front"]]
-    axis.plot(front["seconds"], front["psnr"], color="black", linewidth=1, label="front")
-    for i, (_, rows) in enumerate(pareto.groupby("kind", sort=False)):
-        for marker, row in zip("osD^vPX*", rows.itertuples(), strict=False):
-            axis.errorbar(
-                row.seconds, row.psnr, row.psnr_std, row.seconds_std, fmt=marker, color=f"C{i}", elinewidth=0.7,
-                label=row.variant,
-            )  # fmt: skip
-    axis.set(title=title, xlabel="seconds of training", ylabel="PSNR of the test views, dB")
-    axis.grid(alpha=0.25)
-    figure.legend(loc="outside right center")
+    scenes = list(probes["scene"].unique())
+    figure = Figure(figsize=(1.2 + 3 * len(scenes), 3.6), layout="constrained")
+    axes = figure.subplots(1, len(scenes), squeeze=False)[0]
+    colours = {variant: f"C{i}" for i, variant in enumerate(probes["variant"].unique())}
+    for axis, scene in zip(axes, scenes, strict=True):
+        for (variant, seed), rows in probes[probes["scene"] == scene].groupby(["variant", "seed"], sort=False):
+            label = None if variant in axis.get_legend_handles_labels()[1] else variant
+            axis.plot(rows["training_s"], rows["psnr"], "o-", markersize=3, color=colours[variant], label=label)
+            axis.annotate(
+                f"{seed}", tuple(rows[["training_s", "psnr"]].iloc[-1]), (4, 0), textcoords="offset points", fontsize=7
+            )
+        axis.set(title=scene, xlabel="seconds of training")
+        axis.grid(alpha=0.25)
+    axes[0].set_ylabel("PSNR of the test views, dB")
+    axes[0].legend()
     return figure

@@ -11,6 +11,8 @@ import hashlib
 import itertools
 import os
 import re
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +23,7 @@ import pandas as pd
 import torch
 
 from clear_strategies import files
-from clear_strategies.bench import pareto
+from clear_strategies.bench import plots
 from clear_strategies.bench.results import Results
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
@@ -94,7 +96,31 @@ def _without_folders(overrides: Sequence[str]) -> str:
     return " ".join(override for override in overrides if os.sep not in override.partition("=")[2])
 
 
-def measure(results: Results, request: Request, trainer: Trainer = pareto.train) -> None:
+def train(folder: Path, overrides: Sequence[str]) -> str | None:
+    """Train in a process of its own; returns the line that says why it failed, or None."""
+    root = Path(__file__).resolve().parents[2]
+    paths = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
+    where = str(folder.resolve()).replace("\\", "\\\\").replace("'", "\\'")
+    command = [
+        sys.executable,
+        "-m",
+        "clear_strategies.run",
+        "fit.baseline=false",
+        *overrides,
+        f"hydra.run.dir='{where}'",
+    ]
+    child = subprocess.run(  # noqa: S603 - this interpreter
+        command, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True, errors="replace", check=False
+    )
+    if child.returncode == 0:
+        return None
+    lines = [line for line in (child.stdout + child.stderr).splitlines() if line.strip()]
+    # Hydra's own errors name the problem first; the run and Python name it last.
+    of_hydra = [line for line in lines if line.startswith(("In '", "Could not", "Error"))]
+    return (of_hydra or lines[-1:] or [f"its process ended with code {child.returncode}"])[0].strip()
+
+
+def measure(results: Results, request: Request, trainer: Trainer = train) -> None:
     """Train what is not finished yet, and say when each variant reached the reference.
 
     Args:
@@ -104,6 +130,7 @@ def measure(results: Results, request: Request, trainer: Trainer = pareto.train)
         DataError: no reference finished.
     """
     rows: list[dict[str, Any]] = []
+    probes: list[dict[str, Any]] = []
     scenes: Sequence[str | None] = request.scene or [None]
     reference, *others = request.variants
     for seed, scene in itertools.product(request.seeds, scenes):
@@ -111,11 +138,19 @@ def measure(results: Results, request: Request, trainer: Trainer = pareto.train)
         if first is None:
             continue  # there is nothing to compare with
         trainings = [first, *(_train(results, request, (scene, variant, seed), trainer) for variant in others)]
-        rows += [training.row(first.psnr) for training in trainings if training is not None]
+        finished = [training for training in trainings if training is not None]
+        rows += [training.row(first.psnr) for training in finished]
+        probes += [
+            {**training.facts, "t": int(probe["t"]), "training_s": probe[WALL], "psnr": probe["psnr_test"]}
+            for training in finished
+            for probe in training.probes
+        ]
     if not rows:
         raise DataError("seconds", "trainings", "no reference finished", "see the lines above")
     table = pd.DataFrame(rows)
-    results.tables |= {"seconds": summary(table), "seconds_turns": table}
+    curves = pd.DataFrame(probes)
+    results.tables |= {"seconds": summary(table), "seconds_turns": table, "seconds_probes": curves}
+    results.figures["time_against_quality"] = plots.time_against_quality(curves)
     shared = " ".join(filter(None, (_without_folders(request.overrides), *_COMMON)))
     results.note(
         f"the reference is {name_of(reference)!r}; test views are evaluated {request.probes} times a run; all trainings: {shared}"

@@ -52,6 +52,9 @@ def test_the_first_evaluation_that_has_the_target_counts(tmp_path):
     assert table.loc[QUICK, "of_run"] == pytest.approx(0.6)
     assert table.loc[QUICK, "psnr_over"] == pytest.approx(1.0)
     assert table.loc[seconds.DEFAULTS, "training"] == 1.0
+    assert list(results.tables["seconds_probes"]["psnr"]) == [19.0, 20.0, 20.5, 21.0]
+    (axis,) = results.figures["time_against_quality"].axes
+    assert [list(line.get_xdata()) for line in axis.get_lines()] == [[5.0, 10.0], [6.0, 12.0]]
 
 
 def test_the_command_pays_for_all_but_the_evaluations_on_the_way():
@@ -114,3 +117,4 @@ def test_the_command_trains_a_tiny_demo_and_writes_its_tables(tmp_path, caplog, 
     assert (turns["command_s"] > turns["training_s"]).all()
     assert turns.loc["defaults", "reached"] <= 12
     assert str(tmp_path) not in (out / "seconds.json").read_text()
+    assert (out / "time_against_quality.png").stat().st_size > 10_000
