@@ -265,7 +265,13 @@ def test_how_far_a_back_projected_sr_image_was_from_its_photo_is_kept():
 
 @pytest.mark.parametrize(
     ("photos_are", "max_pixels", "compared"),
-    [("both", 250_000, (64, 48)), ("both", 1_000, (32, 24)), ("both", 200, (16, 12)), ("hr", 250_000, (16, 12))],
+    [
+        ("both", 250_000, (64, 48)),
+        ("both", 1_000, (32, 24)),
+        ("both", 400, (21, 16)),
+        ("both", 200, (16, 12)),
+        ("hr", 250_000, (16, 12)),
+    ],
 )
 def test_stereo_compares_the_hr_side_where_it_is_photos_and_no_sr_images(photos_are, max_pixels, compared, monkeypatch):
     capture, windows = demo.read(width=64, height=48, views=5, train=2), []
@@ -281,7 +287,7 @@ def test_stereo_compares_the_hr_side_where_it_is_photos_and_no_sr_images(photos_
     for view in scene.train:
         assert tuple(view.depth.depth.shape) == compared[::-1]
         shown = view.depth_photo
-        factor = 64 // compared[0]
+        factor = round(64 / compared[0])
         assert (shown.camera.width, shown.camera.fx) == (compared[0], view.hr.camera.fx / factor)
         of = view.lr.image if compared[0] == 16 else images.area_mean(view.hr.image, factor)
         assert torch.equal(shown.image, of)

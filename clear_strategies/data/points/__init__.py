@@ -207,9 +207,11 @@ def _from_photos(
     features = triangulate(photos, settings.triangulation) if known is None else known
     if settings.init != "triangulated":
         stereo, stride = settings.stereo, settings.stride
-        if sharper and sharper[0].factor_to(stereo.max_pixels) < sharper[0].camera.width // photos[0].camera.width:
-            photos = [photo.reduced(photo.factor_to(stereo.max_pixels)) for photo in sharper]
-            stereo, stride = stereo.finer(), 2 * stride
+        if sharper:
+            finer = [photo.reduced(photo.factor_to(stereo.max_pixels)) for photo in sharper]
+            if (ratio := finer[0].camera.width / photos[0].camera.width) > 1:
+                # The points between them, whose depth is guessed, stay as few as at LR.
+                photos, stereo, stride = finer, stereo.finer(ratio), round(ratio * stride)
         maps = depth_maps(photos, features.means, stereo, background)
         cloud = stereo_cloud(
             features,

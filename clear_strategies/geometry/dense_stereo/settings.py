@@ -10,7 +10,7 @@ from clear_strategies.core.checks import refuse, require_number, require_whole
 # Of photos at HR in place of LR:
 _WIDER: Final = 2  # pixels that windows grow by: finer pixels hold less texture each
 _MORE: Final = 1.5  # factor of planes, and of the pixels by which a point may miss itself: a point moves further
-_APART: Final = 2  # factor of the distance of points, in pixels
+_APART: Final = 2.0  # largest factor of the distance of points, in pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +66,13 @@ class StereoSettings:
         for name in ("min_correlation", "trust"):
             require_number(name, getattr(self, name), least=0, most=1)
 
-    def finer(self) -> StereoSettings:
-        """These settings for the same photos several times as large: HR photos in place of LR photos."""
+    def finer(self, ratio: float) -> StereoSettings:
+        """These settings for the same photos `ratio` times as large: HR photos in place of LR photos."""
         return replace(
             self,
             enlarge=1,
             window=self.window + _WIDER,
             max_planes=round(_MORE * self.max_planes),
             reprojection=_MORE * self.reprojection,
-            spacing=_APART * self.spacing,
+            spacing=min(_APART, ratio) * self.spacing,
         )
