@@ -78,7 +78,7 @@ class View:
 
     Args:
         lr: the authentic low-resolution photo.
-        hr: the super-resolved (SR) image of the prior; never the truth.
+        hr: the super-resolved (SR) image of the prior; the truth only where photos train at both scales.
         truth: the real photo at HR, for evaluation only; training never uses it.
         sr_source: the prior's label, e.g. "onnx span_x4.onnx".
         depth: of the photo's surfaces, from stereo, on the pixels of `depth_photo`; None where nobody asked for it, e.g. in
@@ -103,6 +103,11 @@ class View:
         return self.hr.camera.width // self.lr.camera.width
 
     @property
+    def hr_is_photo(self) -> bool:
+        """Whether HR is the photo itself in place of an SR image (`data.views.photos_are=both`)."""
+        return self.truth is self.hr.image
+
+    @property
     def depth_photo(self) -> Photo:
         """The photo that `depth` is of: `lr`, or where HR is a photo, too, `hr` reduced to the size of the depth map."""
         if self.depth is None or self.depth.depth.shape == self.lr.image.shape[:2]:
@@ -111,12 +116,11 @@ class View:
 
     def to(self, device: torch.device | str) -> View:
         """The same view with its images on `device`."""
-        truth = None if self.truth is None else self.truth.to(device)
+        hr = self.hr.to(device)
+        truth = hr.image if self.hr_is_photo else None if self.truth is None else self.truth.to(device)
         depth = None if self.depth is None else self.depth.to(device)
         disagreement = None if self.disagreement is None else self.disagreement.to(device)
-        return replace(
-            self, lr=self.lr.to(device), hr=self.hr.to(device), truth=truth, depth=depth, disagreement=disagreement
-        )
+        return replace(self, lr=self.lr.to(device), hr=hr, truth=truth, depth=depth, disagreement=disagreement)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -64,7 +64,8 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     points = initial.cloud
     if initial.depths:
         train = tuple(replace(v, depth=depth) for v, depth in zip(train, initial.depths, strict=True))
-    sample, photo, network = train[0], train_frames[0].camera, network_of(prior)
+    sample, photo, sr = train[0], train_frames[0].camera, views.photos_are != "both"
+    network = network_of(prior) if sr else None
     made = {
         "hr": f"{'PIL ' if views.downsample != 'area' else ''}{views.downsample} of the HR photo"
         if views.lr_folder is None else f"read from {views.lr_folder} (D is taken to be {views.downsample})",
@@ -82,10 +83,10 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         **({"not used": f"{unused} photos, by data.views"} if unused and not test else {}),
         "sizes": f"photos of {_size(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
         "LR": f"{_size(sample.lr.camera)}, {made}",
-        "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), SR images: {sample.sr_source}",
+        "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), {'SR images: ' if sr else ''}{sample.sr_source}",
         **_moved(train, views.downsample),
         **({} if network is None else {"SR network": f"{fingerprint(network)} (SHA-256)"}),
-        "the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic, on average",
+        **({"the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic, on average"} if sr else {}),
         "initial points": f"{len(points):,}: {points.source}",
         "points use test views": points.uses_test_views,
     }
@@ -180,7 +181,7 @@ def _view(
             lr,
             Photo(hr_camera, truth),
             truth=truth,
-            sr_source="none, the photos themselves",
+            sr_source="the photos themselves",
             background=capture.background,
         )
     try:

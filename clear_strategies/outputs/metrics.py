@@ -6,7 +6,7 @@ metrics.json: {"scene", "method", "strategies", "seed", "iterations", "gaussians
 
 - "method" is the name of a published baseline (`+method=`), null where none was chosen.
 - The images are "ours", "bicubic" (U of the view's own LR photo) and "prior" (the view's SR image). "bicubic" is missing where
-  the HR photo is unknown, "prior" where the HR photo takes its place (`photos_are=both`).
+  the HR photo is unknown, both where the HR side is photos (`photos_are=both`).
 - "baseline" is the one that trained beside the run (`fit.baseline`), null where none did: {"folder", "seconds", "test":
   scores, "train": scores}, the means of its renders. A part without views is not there.
 - "against" says what they are compared with: "HR photos"; "LR photos", after D, where the HR photos are unknown; "HR and
@@ -142,8 +142,7 @@ def _scores_of(view: View, image: Float[Tensor, "H W 3"], down: DownKernel) -> d
     if view.truth is None:
         shown = {"ours": image, "prior": view.hr.image}
         return {name: score(images.downsample(i, view.factor, down), view.lr.image) for name, i in shown.items()}
-    bicubic = images.upsample(view.lr.image, view.factor)
-    shown = {"ours": image, "bicubic": bicubic}
-    if view.hr.image is not view.truth:  # photos_are=both: the photos stand in for SR images
-        shown["prior"] = view.hr.image
+    shown = {"ours": image}
+    if not view.hr_is_photo:  # else no SR has a part
+        shown |= {"bicubic": images.upsample(view.lr.image, view.factor), "prior": view.hr.image}
     return {name: score(i, view.truth) for name, i in shown.items()}

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from torch import Tensor
+
 from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
@@ -159,7 +161,10 @@ def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str,
         for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:
                 write_png(folder / "views" / f"{Path(view.name).stem}_{kind}.png", shown)
-        columns = {"LR, enlarged": images.upsample(view.lr.image, view.factor, "nearest"), "SR prior": view.hr.image}
+        columns: dict[str, Tensor] = {}
+        if not view.hr_is_photo:
+            columns["LR, enlarged"] = images.upsample(view.lr.image, view.factor, "nearest")
+            columns["SR prior"] = view.hr.image
         scores = {"ours": part[view.name]["ours"]}
         if baseline is not None and view.name in baseline.views:
             columns["baseline"] = read_image(baseline.render_of(view.name))
@@ -167,7 +172,7 @@ def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str,
         columns["ours"] = evaluation.renders[view.name]
         captions = {column: f"{s.psnr:.2f} dB, SSIM {s.ssim:.3f}" for column, s in scores.items()}
         rows.append(SheetRow(view.name, columns, view.truth, captions))
-    note = OWN_PHOTO if scene.test else TRAINED_ON
+    note = TRAINED_ON if not scene.test else "" if scene.test[0].hr_is_photo else OWN_PHOTO
     write_contact_sheet(folder / "contact_sheet.png", rows, title, note)
 
 

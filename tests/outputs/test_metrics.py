@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,16 @@ def test_where_hr_is_unknown_the_reduced_render_is_compared_with_lr() -> None:
     assert evaluation.test["unknown"]["ours"].psnr == PSNR_CAP
     assert set(evaluation.test["unknown"]) == {"ours", "prior"}
     assert evaluation.against == {"test": "LR photos", "train": "HR and LR photos"}
+
+
+def test_where_the_hr_side_is_photos_nothing_is_scored_but_the_render() -> None:
+    made = view("a", noise(3, 48, 64))
+    photos = replace(made, hr=replace(made.hr, image=made.truth))
+    assert photos.hr_is_photo
+    assert photos.to("cpu").hr_is_photo
+    assert not made.hr_is_photo
+    evaluation = metrics.evaluate(scene((photos,), (photos,)), lambda camera: photos.hr.image)
+    assert set(evaluation.test["a"]) == {"ours"}
 
 
 def test_a_scene_without_test_views_has_no_mean() -> None:

@@ -6,15 +6,18 @@ import csv
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from clear_strategies import GCO, P2G, Conductor, files
+from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
+from clear_strategies.outputs import results
 from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.figures import magnification
 from clear_strategies.outputs.metrics import Evaluation
@@ -124,6 +127,21 @@ def test_a_run_without_test_views_shows_training_views(tmp_path: Path, state: Tr
     times = round(magnification(SCENE.train[0].hr.image.shape[1]))
     assert holds(shown, SCENE.train[0].hr.image.numpy(), times=times)
     assert not (tmp_path / "path.mp4").exists()
+
+
+def test_the_sheet_of_photos_at_hr_shows_no_sr(
+    tmp_path: Path, state: TrainState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def photos(view: View) -> View:
+        return replace(view, hr=replace(view.hr, image=view.truth))
+
+    sheets: list[Any] = []
+    monkeypatch.setattr(results, "write_contact_sheet", lambda path, rows, title, note: sheets.append((rows, note)))
+    scene = replace(SCENE, train=tuple(map(photos, SCENE.train)), test=tuple(map(photos, SCENE.test)))
+    write(tmp_path, state, scene=scene, pictures=replace(PICTURES, map_views=0, video_frames=0))
+    (((row,), note),) = sheets
+    assert list(row.images) == ["ours"]
+    assert note == ""
 
 
 def test_a_video_that_cannot_be_written_is_named(
