@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from clear_strategies.merging.conductor import Conductor
     from clear_strategies.merging.iteration import Update
     from clear_strategies.merging.objective import Objective
+    from clear_strategies.notebook import Run, train
     from clear_strategies.strategies.base import ScreenGradients, Strategy
     from clear_strategies.strategies.fading_opacity import FadingOpacity
     from clear_strategies.strategies.gco import GCO
@@ -45,6 +46,7 @@ __all__ = [
     "Objective",
     "Photo",
     "PseudoViews",
+    "Run",
     "ScreenGradients",
     "Shot",
     "SplatSuRe",
@@ -53,6 +55,7 @@ __all__ = [
     "StrategyConflict",
     "Update",
     "View",
+    "train",
 ]
 
 _NAMES: Final = {  # by the module of this package that they are defined in
@@ -64,6 +67,7 @@ _NAMES: Final = {  # by the module of this package that they are defined in
     "merging.conductor": ("Conductor",),
     "merging.iteration": ("Update",),
     "merging.objective": ("Objective",),
+    "notebook": ("Run", "train"),
     "strategies.base": ("ScreenGradients", "Strategy"),
     "strategies.fading_opacity": ("FadingOpacity",),
     "strategies.gco": ("GCO",),

@@ -10,6 +10,8 @@ import contextlib
 import io
 import logging
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, Final, TextIO
 
 _OURS: Final = ("clear_strategies", "rasterizers", "integration")
@@ -45,3 +47,21 @@ def show(*, verbose: bool = False) -> None:
     logging.basicConfig(handlers=[Console(sys.stderr, verbose=verbose)], level=logging.INFO, format="%(message)s")
     for name in _OURS if verbose else ():
         logging.getLogger(name).setLevel(logging.DEBUG)
+
+
+@contextlib.contextmanager
+def logged(path: Path) -> Iterator[None]:
+    """Write all messages of the packages to a file, those that are shown with -v alone included, as Hydra does for its jobs."""
+    file = logging.FileHandler(path, encoding="utf-8")
+    file.setFormatter(logging.Formatter("%(asctime)s  %(message)s", "%H:%M:%S"))
+    before = {logger: logger.level for logger in map(logging.getLogger, _OURS)}
+    for logger in before:
+        logger.addHandler(file)
+        logger.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        for logger, level in before.items():
+            logger.removeHandler(file)
+            logger.setLevel(level)
+        file.close()

@@ -2,12 +2,15 @@
 
 `python docs/figures.py` draws those of docs/explanation/evidence-sparse.md from its CSV files. `python docs/figures.py demo`
 trains the demo, as the README's first command does, and draws the README's picture of it, docs/images/demo.png; further
-words are overrides of the run.
+words are overrides of the run. `python docs/figures.py notebook` runs docs/tutorial/notebook.ipynb and keeps what its
+cells show.
 """
 
 from __future__ import annotations
 
+import base64
 import csv
+import os
 import re
 import subprocess
 import sys
@@ -179,8 +182,36 @@ def readme_picture(run: Path, out: Path) -> None:
     plt.close(figure)
 
 
+def notebook(path: Path) -> None:
+    """Run the cells of a notebook in an empty folder, and write it back with their outputs."""
+    import nbformat
+    from IPython.core.interactiveshell import InteractiveShell
+    from IPython.utils.capture import capture_output
+
+    content, shell = nbformat.read(path, 4), InteractiveShell.instance()
+    with tempfile.TemporaryDirectory() as empty:
+        os.chdir(empty)  # the process ends with this
+        for count, cell in enumerate((cell for cell in content.cells if cell.cell_type == "code"), start=1):
+            with capture_output():
+                result = shell.run_cell(cell.source)
+            result.raise_error()
+            shown, metadata = shell.display_formatter.format(result.result)
+            data = {kind: base64.b64encode(x).decode() if isinstance(x, bytes) else x for kind, x in shown.items()}
+            if "image/jpeg" in data:
+                data.pop("image/png", None)  # eight times as large
+            cell.execution_count, cell.outputs = count, []
+            if result.result is not None:
+                cell.outputs.append(
+                    nbformat.v4.new_output("execute_result", data=data, metadata=metadata, execution_count=count)
+                )
+        os.chdir(DOCS)
+    nbformat.write(content, path)
+
+
 if __name__ == "__main__":
     if sys.argv[1:2] == ["demo"]:
         demo(DOCS / "images", *sys.argv[2:])
+    elif sys.argv[1:2] == ["notebook"]:
+        notebook(DOCS / "tutorial" / "notebook.ipynb")
     else:
         main(DOCS / "images")

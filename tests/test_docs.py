@@ -214,6 +214,14 @@ def test_python_blocks_run(block, run_block):
 
 
 @pytest.mark.slow
+def test_the_notebook_runs(run_block):
+    cells = json.loads((DOCS / "tutorial" / "notebook.ipynb").read_text())["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert all(cell["outputs"] for cell in cells if cell["cell_type"] == "code")  # python docs/figures.py notebook
+    run_block("\n".join(code).replace("fit.iterations=300", "fit.iterations=30"))
+
+
+@pytest.mark.slow
 def test_the_readmes_loop_prints_the_number_of_its_table(run_block, capsys):
     run_block(README_LOOP)
     printed = float(capsys.readouterr().out.removesuffix(" dB\n"))

@@ -32,7 +32,7 @@ It trains what we use ourselves (+strategy=best) on all photos for fit.iteration
 `clear-strategies settings data=photos` lists all settings.
 """
 # What decides which strategies train, and for how long, so that the defaults must not.
-_CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
+CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
 _PLAIN: Final = re.compile(r"(/|\./|(\.\./)+)?[A-Za-z_][\w./-]*", re.ASCII)  # needs no quotes, for Hydra or a shell
 _NO_TEXT: Final = ("null", "true", "false", "nan", "inf")
 _CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "+protocol=", "+scene=")
@@ -69,7 +69,7 @@ def overrides(arguments: Sequence[str]) -> list[str]:
         path = path.parent
     if not path.is_dir() and not path.is_file():
         raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture, or a video.")
-    chosen = [] if any(override.startswith(_CHOOSE_STRATEGIES) for override in rest) else ["+strategy=best"]
+    chosen = [] if any(override.startswith(CHOOSE_STRATEGIES) for override in rest) else ["+strategy=best"]
     chosen += (
         [] if any(override.startswith(_CHOOSE_ITERATIONS) for override in rest) else [f"fit.iterations={_ITERATIONS}"]
     )

@@ -34,6 +34,7 @@ DOORS = {
     "hydra_app": {"hydra", "omegaconf"},
     "__main__": set(),
     "commands": set(),
+    "notebook": {"PIL"},
     "report": set(),
     "bench": set(),
 }

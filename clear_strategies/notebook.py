@@ -1,0 +1,152 @@
+"""Train and look from Python: `run = clear_strategies.train("photos")`, and `run` in a notebook shows what came of it.
+
+The command line composes the same configuration and calls the same job (`clear-strategies train`, `clear_strategies.jobs.job`).
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies import console
+from clear_strategies.commands import train as train_command
+from clear_strategies.compose import composed
+from clear_strategies.data.ply import read_gaussians
+from clear_strategies.errors import DataError
+from clear_strategies.jobs import exit_codes, job
+from clear_strategies.jobs.saved import SavedSplat, open_splat
+from clear_strategies.outputs import metrics
+from rasterizers.interface import Camera
+
+_log = logging.getLogger(__name__)
+
+_SHEET_WIDTH: Final = 1200  # px of the contact sheet in a notebook, at most
+_ATTRIBUTES: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run. In a notebook it shows its scores, its contact sheet and a flight through its cameras.
+
+    Args:
+        folder: of its files, which `docs/reference/files.md` lists.
+
+    Raises:
+        DataError: the folder holds no finished run.
+    """
+
+    folder: Path
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "folder", Path(self.folder))
+        if not (self.folder / "metrics.json").is_file():
+            raise DataError(self.folder, "metrics.json", "is not there, so no run has finished here", "train first")
+
+    @cached_property
+    def metrics(self) -> Mapping[str, Any]:
+        """The content of metrics.json: scores of every view and their means, seconds, configuration, provenance."""
+        return metrics.read(self.folder / "metrics.json", "train again")
+
+    @cached_property
+    def splats(self) -> Mapping[str, Tensor]:
+        """The Gaussians by gsplat's names, on the CPU: means [N, 3], quats [N, 4] (w, x, y, z), log scales [N, 3], logit
+        opacities [N], sh0 [N, 1, 3] and shN [N, K, 3]. f_det and the 3D filter are part of them, as in point_cloud.ply.
+        """
+        found = read_gaussians(self.folder / "point_cloud.ply")
+        return {name: getattr(found, name) for name in _ATTRIBUTES}
+
+    @property
+    def cameras(self) -> Sequence[Camera]:
+        """The training cameras, at the size of HR."""
+        return self._splat.poses()
+
+    def render(self, camera: Camera | None = None) -> Float[Tensor, "H W 3"]:
+        """The picture from a camera, RGB in [0, 1], on the CPU, by the rasterizer that the run trained with.
+
+        Args:
+            camera: None: the first training camera. `dataclasses.replace` makes others of it.
+        """
+        return self._splat.painter.color(camera if camera is not None else self.cameras[0])
+
+    @cached_property
+    def _splat(self) -> SavedSplat:
+        return open_splat(self.folder)
+
+    def _repr_html_(self) -> str:
+        facts = self.metrics
+        scores = "".join(
+            f"<tr><td>{part}</td><td>{mean['psnr']:.2f} dB</td><td>{mean['ssim']:.3f}</td></tr>"
+            for part in ("test", "train")
+            if (mean := facts[part]["mean"].get("ours")) is not None
+        )
+        said = f"{facts['scene']}: {facts['gaussians']:,} Gaussians, {facts['iterations']} iterations, {facts['seconds']:.0f} s"
+        page = self.folder / "splat.html"
+        link = f' · <a href="{html.escape(str(page))}">turn it in the browser</a>' if page.is_file() else ""
+        return (
+            f"<p><b>{html.escape(said)}</b>{link}</p>"
+            f"<table><tr><th>views</th><th>PSNR</th><th>SSIM</th></tr>{scores}</table>"
+            f"{_picture(self.folder / 'contact_sheet.png')}{_film(self.folder / 'path.mp4')}"
+        )
+
+
+def train(photos: str | Path | None = None, *settings: str, folder: str | Path | None = None) -> Run:
+    """Train on photos, a video or a capture, as `clear-strategies train` does, and return the finished run.
+
+    Args:
+        photos: a folder of photos or of a capture, or a video; None: the demo scene.
+        settings: as on the command line: "fit.iterations=3000", "+strategy=clear".
+        folder: for the run's files; None: outputs/<name>/<time>.
+
+    Raises:
+        SettingError, StrategyConflict: a setting cannot be used.
+        DataError: a photo or a file cannot be used.
+    """
+    exit_codes.require_train()
+    console.show()
+    overrides = list(settings) if photos is None else train_command.overrides([str(photos), *settings])
+    if photos is None and not any(word.startswith(train_command.CHOOSE_STRATEGIES) for word in settings):
+        overrides.append("+strategy=best")
+    name = "demo" if photos is None else Path(photos).resolve().stem
+    into = Path(folder) if folder is not None else Path("outputs") / name / time.strftime("%Y-%m-%d_%H-%M-%S")
+    config = composed(overrides, "config")
+    into.mkdir(parents=True, exist_ok=True)
+    threads = torch.get_num_threads()
+    try:
+        with console.logged(into / "run.log"):
+            job.run(config, into)
+    finally:
+        torch.set_num_threads(threads)
+    _log.info("%s", into)
+    return Run(into)
+
+
+def _picture(path: Path) -> str:
+    if not path.is_file():
+        return ""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        shown = image.convert("RGB")
+        shown.thumbnail((_SHEET_WIDTH, 10 * _SHEET_WIDTH))
+        data = io.BytesIO()
+        shown.save(data, "JPEG", quality=80)
+    return f'<img style="max-width:100%" src="data:image/jpeg;base64,{base64.b64encode(data.getvalue()).decode()}"/>'
+
+
+def _film(path: Path) -> str:
+    if not path.is_file():
+        return ""
+    data = base64.b64encode(path.read_bytes()).decode()
+    return f'<video autoplay loop muted controls style="max-width:60%" src="data:video/mp4;base64,{data}"></video>'
