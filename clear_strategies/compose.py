@@ -8,6 +8,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from inspect import signature
 from pathlib import Path
 from typing import Any, Final
@@ -35,6 +37,9 @@ from clear_strategies.strategies.base import Strategy
 _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
 CONF: Final = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
+
+OPTIONS: Final = "clear_strategies_conf"
+"""The group of entry points by which other packages bring options, such as strategies; docs/template is such a package."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,12 +205,32 @@ class _ConfSource(FileConfigSource):
 
 
 class _ReadConf(SearchPathPlugin):
-    """Makes Hydra read conf/ by `_ConfSource`; other folders are read as usual."""
+    """Makes Hydra read conf/ by `_ConfSource`, and after it the folders that other packages bring; others are read as usual."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        for element in search_path.get_path():
-            if element.path is not None and element.path.removeprefix("file://") == str(CONF):
-                element.path = f"{_ConfSource.scheme()}://{CONF}"
+        ours = [e for e in search_path.get_path() if e.path is not None and e.path.removeprefix("file://") == str(CONF)]
+        for element in ours:
+            element.path = f"{_ConfSource.scheme()}://{CONF}"
+        for point in entry_points(group=OPTIONS) if ours else ():
+            search_path.append(point.name, f"{_ConfSource.scheme()}://{_folder_of(point)}")
+
+
+def _folder_of(point: EntryPoint) -> str:
+    """The folder of the package that an entry point of `OPTIONS` names.
+
+    Raises:
+        SettingError: there is no such package.
+    """
+    try:
+        spec = find_spec(point.value)
+    except ModuleNotFoundError:  # the package that it lies in
+        spec = None
+    if spec is None or not spec.submodule_search_locations:
+        raise SettingError(
+            f"the entry point {point.name} = {point.value!r} of {OPTIONS!r} must name a package, and there is none of this "
+            f"name. Mend or remove the package that brings it: pip show -f {point.dist.name if point.dist else point.name}."
+        )
+    return str(next(iter(spec.submodule_search_locations)))
 
 
 def _unnamed(*more: str) -> list[str]:

@@ -35,9 +35,10 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
+import clear_strategies
 from clear_strategies import Conductor, Strategy
 from clear_strategies.commands import train
-from clear_strategies.compose import CONF
+from clear_strategies.compose import CONF, OPTIONS
 from tests.helpers import command_line, documented
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -211,6 +212,16 @@ def run_block(tmp_path, monkeypatch):
 @pytest.mark.parametrize("block", PYTHON)
 def test_python_blocks_run(block, run_block):
     run_block(block)
+
+
+def test_every_name_of_the_public_api_exists():
+    page = (DOCS / "reference" / "public-api.md").read_text()
+    names = set(re.findall(r"`((?:clear_strategies|rasterizers|integration)\.[\w.]+)`", page)) - {OPTIONS}
+    assert {f"clear_strategies.{name}" for name in clear_strategies.__all__} <= names | {
+        "clear_strategies.ATTRIBUTES", "clear_strategies.CONFLICT_GROUPS",
+    }  # fmt: skip
+    for module, _, name in (whole.rpartition(".") for whole in names):
+        assert hasattr(importlib.import_module(module), name), f"{module}.{name}"
 
 
 @pytest.mark.slow
