@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from clear_strategies import console
-from clear_strategies.bench import device, evidence, iteration, kernels, rasterizers, seconds, stereo
+from clear_strategies.bench import device, errors, evidence, iteration, kernels, rasterizers, seconds, stereo
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
 from clear_strategies.errors import ClearError
@@ -112,6 +112,10 @@ def parser() -> argparse.ArgumentParser:
             help=f"the data set and its {chosen}, as for a run (default: the demo)",
         )  # fmt: skip
 
+    ask = questions.add_parser("errors", parents=[common, out], help="where a run's error on its test views lies")
+    ask.add_argument("run", type=Path, metavar="RUN", help="the folder of a finished run")
+    ask.add_argument("--reference", type=Path, metavar="RUN", help="another run of the same scene, beside it")
+
     ask = questions.add_parser("device", parents=[common, garden], help="all checks that need a GPU, into a folder")
     ask.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder for logs, tables and runs")
     ask.add_argument("--device", default="cuda", choices=["cpu", "cuda"], help="default: cuda")
@@ -151,7 +155,7 @@ def _measure(question: str, options: dict[str, Any], results: Results) -> None:
         device.measure(results, device.Request(**options))
     else:
         asked = {"rasterizers": rasterizers, "kernels": kernels, "iteration": iteration, "stereo": stereo}
-        module: Any = {**asked, "evidence": evidence}[question]
+        module: Any = {**asked, "evidence": evidence, "errors": errors}[question]
         module.measure(results, **{name: value for name, value in options.items() if name != "out"})
 
 

@@ -52,7 +52,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     require_source(cloud, capture.points)
     progress = Progress("photos and their SR images", "photos", len(train_frames) + len(test_frames))
     frames, found = (*train_frames, *test_frames), list[View]()
-    for frame, reduced in zip(frames, _photos(frames, views), strict=True):
+    for frame, reduced in zip(frames, photos_of(frames, views), strict=True):
         found.append(_view(frame, reduced, capture, views, prior, lr_files, required=len(found) < len(train_frames)))
         progress(len(found))
     train, test = tuple(found[: len(train_frames)]), tuple(found[len(train_frames) :])
@@ -96,7 +96,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
 
 def lr_photos(frames: Sequence[Frame], capture: Capture, views: ViewSettings) -> list[Photo]:
     """The LR photos of these frames, without SR images."""
-    lr_files, photos = check_headers(frames, views), _photos(frames, views)
+    lr_files, photos = check_headers(frames, views), photos_of(frames, views)
     return [
         _view(frame, photo, capture, views, Bicubic(), lr_files, required=True).lr
         for frame, photo in zip(frames, photos, strict=True)
@@ -148,8 +148,8 @@ def save_lr(scene: Scene, folder: Path) -> None:
     )
 
 
-def _photos(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:
-    """The photos at the sizes of their HR or LR images, in order; a few are read at once."""
+def photos_of(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:
+    """The photos of these frames at their HR size, where that is unknown at their LR size, in order; a few are read at once."""
     with ThreadPoolExecutor(min(torch.get_num_threads(), _READERS)) as pool:
         yield from pool.map(partial(_reduced, views=views), frames)
 

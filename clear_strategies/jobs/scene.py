@@ -100,7 +100,7 @@ def load(
         decorated: what becomes of the chosen prior, see `Conductor.prior`.
     """
     auto = isinstance(prior, AutoPrior) and data.save_lr is None
-    capture, views = within_limit(data.reader(), data.views, reaches=_reach(prior, auto), super_resolve=not auto)
+    capture, views = read(data, prior)
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
     elif isinstance(prior, AutoPrior):
@@ -116,6 +116,12 @@ def load(
         else:
             _log.debug("prior: auto chose %s.", chosen.label)
     return scene
+
+
+def read(data: DataSettings, prior: PriorSettings) -> tuple[Capture, ViewSettings]:
+    """The capture as the data set has it, and the settings of its views, both within the limit of the HR images."""
+    auto = isinstance(prior, AutoPrior) and data.save_lr is None
+    return within_limit(data.reader(), data.views, reaches=_reach(prior, auto), super_resolve=not auto)
 
 
 def _reach(prior: PriorSettings, auto: bool) -> Callable[[int], bool]:

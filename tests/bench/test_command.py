@@ -72,6 +72,7 @@ def test_auc_is_the_share_of_ordered_pairs():
         (["iteration", "--scene", "nowhere"], "nowhere: is no scene"),
         (["seconds", "fit.seed=3", "--variant"], "fit.seed=3: is set by the benchmark"),
         (["stereo", "data=nowhere"], "data=nowhere"),
+        (["errors", "nowhere"], "has neither a checkpoint nor a point_cloud.ply"),
         pytest.param(
             ["rasterizers", "--device", "cuda"],
             "no such device",

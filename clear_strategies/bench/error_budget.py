@@ -1,0 +1,180 @@
+"""Which pixels, which waves and which cameras a squared error belongs to.
+
+Every group of parts is a partition, so its shares add up to 1: pixels are counted once, and the waves are those of an
+orthonormal cosine transform, which keeps sums of squares.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from clear_strategies.geometry.projection import back_project, inside_of, project
+from rasterizers.interface import Camera
+
+TOLERANCE: Final = 0.03
+"""A camera sees a point whose depth there exceeds the rendered one by at most this share of it."""
+SOLID: Final = 0.9
+"""Alpha below it counts as a hole."""
+OUTSIDE: Final = 0.1
+"""A camera is outside of others that are further away than this, see `distance_from_hull`."""
+
+SEEN_BY: Final = ("no training view", "one", "several")
+_STEEPEST: Final = 0.2  # the share of a photo's pixels that are its edges
+_WAVES: Final = (1, 4, 16)  # the longest wave of each band, in the shortest waves that the LR photos hold
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """A test view, drawn.
+
+    Args:
+        images: renders in [0, 1] by the name of their run.
+        seen: how many training views see what the pixel shows.
+        distance: from the hull of the training cameras.
+        factor: pixels per LR pixel.
+    """
+
+    name: str
+    truth: Float[Tensor, "H W 3"]
+    images: Mapping[str, Float[Tensor, "H W 3"]]
+    alpha: Float[Tensor, "H W"]
+    seen: Int[Tensor, "H W"]
+    distance: float
+    factor: int
+
+
+def seen_by(
+    camera: Camera, depth: Float[Tensor, "H W"], others: Sequence[tuple[Camera, Float[Tensor, "h w"]]]
+) -> Int[Tensor, "H W"]:
+    """In how many other cameras the surface behind each pixel is inside the image and not hidden.
+
+    Args:
+        depth: z in world units, nan where there is no surface, which nobody sees.
+        others: cameras, each with its own depth.
+    """
+    rows, columns = torch.nonzero(depth.isfinite(), as_tuple=True)
+    surface = back_project(camera, torch.stack((columns, rows), dim=1) + 0.5, depth[rows, columns])
+    count = torch.zeros(len(surface), dtype=torch.long)
+    for other, its_depth in others:
+        pixels, z = project(other, surface)
+        inside = inside_of(other, pixels, z)
+        column, row = pixels[inside].long().unbind(1)
+        count[inside] += (z[inside] <= its_depth[row, column] * (1 + TOLERANCE)).long()  # False where it has none
+    seen = torch.zeros(depth.shape, dtype=torch.long)
+    seen[rows, columns] = count
+    return seen
+
+
+def distance_from_hull(center: Float[Tensor, " 3"], centers: Float[Tensor, "V 3"]) -> float:
+    """The distance from the convex hull of `centers`, as a share of the largest distance between two of them.
+
+    inf where the hull is a single point.
+    """
+    from scipy.optimize import nnls
+
+    points = (centers - center).double().numpy()
+    scale = float(torch.pdist(centers.double()).max()) if len(centers) > 1 else 0.0
+    # The nearest point of the hull is a mean with weights >= 0 whose sum a heavy equation holds at 1.
+    heavy = 1e3 * max(float(np.abs(points).max()), 1e-12)
+    _, residual = nnls(np.vstack((points.T, np.full(len(points), heavy))), np.array([0, 0, 0, heavy]))
+    return residual / scale if scale > 0 else math.inf
+
+
+def waves(error: Float[Tensor, "H W 3"], factor: int) -> dict[str, float]:
+    """The sum of squares of an error image by the length of its waves in pixels; "bias" is each channel's mean.
+
+    Waves shorter than 2 · `factor` pixels are beyond the LR photos.
+    """
+    from scipy.fft import dctn
+
+    height, width = error.shape[:2]
+    power = (dctn(error.double().numpy(), axes=(0, 1), norm="ortho") ** 2).sum(axis=2)
+    frequency = np.hypot(np.arange(height)[:, None] / height, np.arange(width) / width) / 2  # cycles per pixel
+    limits = [2 * factor * longest for longest in _WAVES]
+    band = np.searchsorted([1 / limit for limit in reversed(limits)], frequency, side="right")
+    band[0, 0] = -1
+    between = [f"{short} to {long} px" for short, long in itertools.pairwise(limits)]
+    names = ("bias", f"over {limits[-1]} px", *reversed(between), f"under {limits[0]} px, beyond LR")
+    return {name: float(power[band == i - 1].sum()) for i, name in enumerate(names)}
+
+
+def edges(image: Float[Tensor, "H W 3"]) -> Bool[Tensor, "H W"]:
+    """The fifth of the pixels where the brightness changes most."""
+    down, right = torch.gradient(image.mean(dim=2))
+    steepness = torch.hypot(down, right)
+    return steepness > torch.quantile(steepness.double().flatten()[:: max(1, steepness.numel() >> 20)], 1 - _STEEPEST)
+
+
+def parts(view: HeldOut) -> Iterator[dict[str, object]]:
+    """Of one view and each of its runs, the pixels and the squared error of every part of every group."""
+    several, edge, hole = view.seen.clamp(max=2), edges(view.truth), view.alpha < SOLID
+    outside = torch.full_like(hole, view.distance > OUTSIDE)
+    masks = [
+        *(("seen by", name, several == i) for i, name in enumerate(SEEN_BY)),
+        ("alpha", f"below {SOLID}", hole), ("alpha", f"from {SOLID}", ~hole),
+        ("edges", "steepest fifth", edge), ("edges", "the rest", ~edge),
+        ("camera", "in the training cameras' hull", ~outside), ("camera", "outside of it", outside),
+    ]  # fmt: skip
+    for run, image in view.images.items():
+        error = image - view.truth
+        squared = error.double().square().sum(dim=2)
+        for group, part, mask in masks:
+            of_part = float(squared[mask].sum())
+            yield {"run": run, "group": group, "part": part, "pixels": int(mask.sum()), "error": of_part}
+        for part, power in waves(error, view.factor).items():
+            yield {"run": run, "group": "waves", "part": part, "pixels": squared.numel(), "error": power}
+
+
+def budget(views: Sequence[HeldOut]) -> pd.DataFrame:
+    """Of all views together, a row for each part of each group.
+
+    Returns:
+        group, part; pixels: their share; of each run: its share of the squared error, its PSNR there, and what the PSNR of all
+        pixels would be if it had no error there, dB. PSNR is that of the mean over all pixels of all views.
+    """
+    rows = pd.DataFrame([row for view in views for row in parts(view)])
+    everything = sum(view.alpha.numel() for view in views)
+    columns: list[pd.DataFrame | pd.Series[float]] = []
+    for run, of_run in rows.groupby("run", sort=False):
+        table = of_run.groupby(["group", "part"], sort=False)[["pixels", "error"]].sum()
+        total = table.loc["edges", "error"].sum()
+        found = {
+            "share": table["error"] / total,
+            "psnr": _psnr(table["error"], table["pixels"]),
+            "if perfect": _psnr(total - table["error"], everything),
+        }
+        columns = columns or [table["pixels"] / everything]
+        columns.append(pd.DataFrame(found).add_prefix(f"{run}: "))
+    return pd.concat(columns, axis=1).reset_index()
+
+
+def by_view(views: Sequence[HeldOut]) -> pd.DataFrame:
+    """A row for each view: PSNR of each run, distance from the training cameras, and shares of its pixels."""
+    rows = []
+    for view in views:
+        squared = {f"{run}: psnr": (image - view.truth).double().square() for run, image in view.images.items()}
+        rows.append(
+            {
+                "view": view.name,
+                **{column: _psnr(float(error.sum()), view.alpha.numel()) for column, error in squared.items()},
+                "distance": view.distance,
+                **{name: float((view.seen.clamp(max=2) == i).double().mean()) for i, name in enumerate(SEEN_BY)},
+                "holes": float((view.alpha < SOLID).double().mean()),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _psnr(squared_error: Any, pixels: Any) -> Any:
+    """Decibels of a sum over pixels and channels; nan where there are none."""
+    return -10 * np.log10(np.maximum(squared_error / (3 * pixels), 1e-10))
