@@ -25,7 +25,7 @@ TOLERANCE: Final = 0.03
 """A camera sees a point whose depth there exceeds the rendered one by at most this share of it."""
 SOLID: Final = 0.9
 """Alpha below it counts as a hole."""
-OUTSIDE: Final = 0.1
+OUTSIDE: Final = 0.25
 """A camera is outside of others that are further away than this, see `distance_from_hull`."""
 
 SEEN_BY: Final = ("no training view", "one", "several")
@@ -120,6 +120,7 @@ def parts(view: HeldOut) -> Iterator[dict[str, object]]:
     several, edge, hole = view.seen.clamp(max=2), edges(view.truth), view.alpha < SOLID
     outside = torch.full_like(hole, view.distance > OUTSIDE)
     masks = [
+        ("all", "all pixels", torch.ones_like(hole)),
         *(("seen by", name, several == i) for i, name in enumerate(SEEN_BY)),
         ("alpha", f"below {SOLID}", hole), ("alpha", f"from {SOLID}", ~hole),
         ("edges", "steepest fifth", edge), ("edges", "the rest", ~edge),
@@ -147,7 +148,7 @@ def budget(views: Sequence[HeldOut]) -> pd.DataFrame:
     columns: list[pd.DataFrame | pd.Series[float]] = []
     for run, of_run in rows.groupby("run", sort=False):
         table = of_run.groupby(["group", "part"], sort=False)[["pixels", "error"]].sum()
-        total = table.loc["edges", "error"].sum()
+        total = table.loc[("all", "all pixels"), "error"]
         found = {
             "share": table["error"] / total,
             "psnr": _psnr(table["error"], table["pixels"]),

@@ -51,7 +51,7 @@ def test_the_shares_of_every_group_add_up_to_one():
     noise = [torch.randn(30, 47, 3, generator=torch.Generator().manual_seed(seed)) * 0.1 for seed in (0, 1)]
     some = torch.rand(30, 47, generator=torch.Generator().manual_seed(2))
     shares = rows(view(noise[0], alpha=some, seen=(some * 4).long()), view(noise[1], distance=1.0))["run: share"]
-    assert shares.groupby("group").sum().to_list() == pytest.approx([1.0] * 5)
+    assert shares.groupby("group").sum().to_list() == pytest.approx([1.0] * 6)
     assert shares[("camera", "outside of it")] == pytest.approx(
         float(noise[1].square().sum() / (noise[0].square().sum() + noise[1].square().sum())), rel=1e-4
     )
@@ -101,6 +101,6 @@ def test_the_command_reads_a_run_and_finds_its_own_psnr(tmp_path, capsys):
     views = pd.read_csv(tmp_path / "out" / "errors_views.csv")
     assert views["run: psnr"].mean() == pytest.approx(psnr, abs=1e-3)
     assert views["run: psnr"].equals(views["reference: psnr"])
-    assert len(pd.read_csv(tmp_path / "out" / "errors.csv")) == 14
+    assert len(pd.read_csv(tmp_path / "out" / "errors.csv")) == 15
     assert (tmp_path / "out" / "errors.png").stat().st_size > 5_000
     assert "if perfect" in capsys.readouterr().out
