@@ -26,7 +26,7 @@ from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from clear_strategies.errors import SettingError, one_line
+from clear_strategies.errors import SettingError, of_hydra, one_line
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
@@ -161,7 +161,8 @@ def composed(overrides: list[str], config: str = "conductor") -> DictConfig:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             return hydra.compose(config, overrides)
     except (HydraException, OmegaConfBaseException) as error:
-        raise SettingError(f"{' '.join(overrides)}: {one_line(error)}. See conf/ for what there is.") from error
+        told = of_hydra(error).rstrip(".")
+        raise SettingError(f"{' '.join(overrides)}: {told}. See conf/ for what there is.") from error
     finally:
         GlobalHydra.instance().hydra = theirs
 

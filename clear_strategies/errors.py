@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
+import re
 from pathlib import Path
+from typing import Final
 
 
 class ClearError(Exception):
@@ -45,3 +48,19 @@ class AnchorError(ClearError, RuntimeError):
 def one_line(told: object) -> str:
     """A text, or the message of an error, without its line breaks."""
     return " ".join(str(told).split())
+
+
+_NO_OPTION: Final = re.compile(
+    r"Could not find '([^']+)/([^'/]+)'\s+Available options in '[^']*':(.*?)Config search path", re.DOTALL
+)
+
+
+def of_hydra(error: Exception) -> str:
+    """The message of an error of Hydra's, in one line: of an option that is not there, the nearest one and all others."""
+    if (found := _NO_OPTION.search(str(error))) is None:
+        return one_line(error)
+    group, name, listed = found.groups()
+    options = [option for option in listed.split() if not option.startswith("_")]
+    near = difflib.get_close_matches(name, options, 1)
+    meant = f" Did you mean {near[0]}?" if near else ""
+    return f"{group}={name}: there is no such option.{meant} There are {', '.join(options)}."

@@ -51,7 +51,7 @@ def test_milestones_stretch_to_the_hosts_length():
 @pytest.mark.parametrize(
     ("said", "named"),
     [
-        (("nope",), "strategy/nope"),
+        (("nope",), "strategy=nope: there is no such option"),
         (("gco", "strategies.gco.tau=1"), "strategies.gco.tau"),
         (("gco", "strategies.gco.tolerance=2"), "tolerance must lie in"),
         (("gco,gco",), "gco twice"),

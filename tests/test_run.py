@@ -175,7 +175,7 @@ REFUSED = {
     "prior=onnx": "prior.path: is needed and missing",
     "prior=demo prior.share=7": "prior.share: must be a finite number and >= 0 and <= 1, got 7",
     "+strategy=[gco,gco]": "+strategy: must name each strategy once, got gco twice",
-    "+strategy=nope": "Could not find 'strategy/nope'",
+    "+strategy=claer": "strategy=claer: there is no such option. Did you mean clear? There are back_projected, baseline, best",
     "+strategy=[gco,splatsure]": "GCO and SplatSuRe both implement correct()",
     "objective.lambda_hr.peak=nan": "objective.lambda_hr.peak: must be a finite number, got nan",
     "objective.lambda_lr=0": "L_base must act from the first iteration",

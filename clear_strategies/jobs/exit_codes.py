@@ -10,7 +10,7 @@ import signal
 from importlib.util import find_spec
 from typing import Final, NamedTuple
 
-from clear_strategies.errors import ClearError, SettingError, one_line
+from clear_strategies.errors import ClearError, SettingError, of_hydra, one_line
 
 _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
 _LESS_MEMORY: Final = (
@@ -39,13 +39,16 @@ def describe(error: BaseException) -> Ending | None:
     if isinstance(error, KeyboardInterrupt):
         return Ending(SIGNALS + signal.SIGINT, "stopped by SIGINT before training began. Nothing was saved.")
     if isinstance(error, _told_by_libraries()):
-        return Ending(UNUSABLE, one_line(error))  # before OSError: Hydra's error for an option that is not there is one
+        return Ending(UNUSABLE, of_hydra(error))  # before OSError: Hydra's error for an option that is not there is one
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
         return Ending(UNUSABLE, f"out of memory: {one_line(error) or 'Python had none left'} {_LESS_MEMORY}")
     disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it where it cannot open its file
     if isinstance(disk, OSError):
         where = f"{disk.filename or 'output'}: {disk.strerror or disk}"
-        return Ending(NO_DISK, f"{where}. Earlier checkpoints are untouched.")
+        return Ending(
+            NO_DISK,
+            f"{where}. Free space, or write elsewhere (hydra.run.dir=FOLDER). Earlier checkpoints are untouched.",
+        )
     return None
 
 

@@ -111,14 +111,16 @@ def _require_placed(root: Path, sizes: Sequence[int], count: int, least: float) 
     remedy = MORE
     if placed >= FEWEST:
         remedy += f"; or go on with the {placed}: data.reader.least_placed={placed / count:.2g}"
-    raise DataError(root, "poses", f"only {placed} of {count} photos could be related to each other", remedy)
+    found = f"only {placed}" if placed else "none"
+    raise DataError(root, "poses", f"{found} of the {count} photos could be related to each other", remedy)
 
 
 def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSettings) -> list[Any]:
     """COLMAP's incremental pipeline: features, all pairs, mapping. Every model that it finds."""
     copies, database, count = work / "copies", work / "database.db", len(photos)
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value  # its progress is hundreds of lines
+    # Its progress is hundreds of lines, and `estimate` tells its errors.
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
         pycolmap.set_random_seed(settings.seed)
         groups = _write_copies(photos, copies, settings.max_side)

@@ -95,7 +95,7 @@ def test_a_run_that_is_terminated_while_it_reads_photos_ends_without_a_stack_tra
 
 
 def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_takes_them() -> None:
-    with pytest.raises(DataError, match=r"only 4 of 10 photos .*overlap.* data\.reader\.least_placed=0\.4"):
+    with pytest.raises(DataError, match=r"only 4 of the 10 photos .*overlap.* data\.reader\.least_placed=0\.4"):
         photos.sfm._require_placed(Path("mine"), [4, 2], 10, 0.5)
     photos.sfm._require_placed(Path("mine"), [6, 3], 10, 0.5)
 

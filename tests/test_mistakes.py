@@ -1,0 +1,83 @@
+"""docs/how-to/mistakes.md: each mistake of its table ends with the message and the exit code that the table says."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from tests.helpers import command_line
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "how-to" / "mistakes.md"
+ROW = re.compile(
+    r"^\| (?P<mistake>[^|]+) \| `clear-strategies ?(?P<command>[^`]*)` \| (?P<message>[^|]+) \| (?P<code>\d) \|$"
+)
+ROWS = [found.groupdict() for line in PAGE.read_text().splitlines() if (found := ROW.match(line))]
+OF_POSES = ("same", "apart", "flat")  # folders whose photos are matched first, which takes seconds
+
+
+def noise(seed: int) -> Image.Image:
+    return Image.fromarray(np.random.default_rng(seed).integers(0, 255, (240, 320, 3), dtype=np.uint8))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the commands of the table name."""
+    here = tmp_path_factory.mktemp("mistakes")
+    photos = {
+        "empty": [], "one": [noise(0)], "two": [noise(0), noise(1)], "same": [noise(0)] * 4,
+        "apart": [noise(i) for i in range(4)],
+        "flat": [Image.new("RGB", (320, 240), (60 * i, 90, 90)) for i in range(4)],
+        "huge": [noise(0), noise(1), Image.new("RGB", (10_000, 10_000))],
+    }  # fmt: skip
+    for name, images in photos.items():
+        (here / name).mkdir()
+        for i, image in enumerate(images):
+            image.save(here / name / f"{i}.png")
+    (here / "text").mkdir()
+    for i in range(3):
+        (here / "text" / f"{i}.jpg").write_text("no photo")
+    (here / "file").write_text("no folder")
+    (here / "half.mp4").write_bytes(b"\0\0\0\x20ftypisom" + bytes(2_000))
+    (here / "damaged.ply").write_text("ply\nformat ascii 1.0\n")
+    return here
+
+
+def test_the_table_has_its_rows() -> None:
+    assert len(ROWS) >= 20
+    assert len({row["command"] for row in ROWS}) == len(ROWS)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        pytest.param(
+            row,
+            id=row["mistake"],
+            marks=[pytest.mark.slow] * any(name in row["command"].split() for name in OF_POSES)
+            + [pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")] * ("cuda" in row["command"]),
+        )
+        for row in ROWS
+    ],
+)
+def test_a_mistake_is_told_with_its_remedy(row: dict[str, str], folder: Path) -> None:
+    before = {path for path in folder.iterdir() if path.name not in ("outputs", "cache")}
+    ended = command_line.run(*shlex.split(row["command"]), cwd=folder)
+    assert ended.returncode == int(row["code"]), ended.stdout + ended.stderr
+    told = [
+        line
+        for line in (ended.stdout + ended.stderr).splitlines()
+        if line and not line.startswith("clear-strategies +")
+    ]
+    error = [line for line in told if not re.match(r".*: estimating the poses|matching: |features: |SR ", line)]
+    assert 1 <= len(error) <= 3, told
+    assert row["message"].replace("\\[", "[").strip() in " ".join(error)
+    assert "Traceback" not in ended.stderr
+    assert {path for path in folder.iterdir() if path.name not in ("outputs", "cache")} == before
+    assert not list(folder.rglob("metrics.json"))
+    assert not list(folder.rglob("*.tmp"))
