@@ -16,7 +16,17 @@ from typing import Any
 import torch
 
 from clear_strategies import console
-from clear_strategies.bench import device, errors, evidence, iteration, kernels, rasterizers, seconds, stereo
+from clear_strategies.bench import (
+    device,
+    errors,
+    evidence,
+    iteration,
+    kernels,
+    next_photo,
+    rasterizers,
+    seconds,
+    stereo,
+)
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
 from clear_strategies.errors import ClearError
@@ -142,8 +152,19 @@ def _add_trainings(questions: Any, common: argparse.ArgumentParser) -> None:
     ask.add_argument(
         "--probes", type=_positive, default=20, metavar="N", help="evaluations of the test views in a run (default 20)"
     )
+    _add_kept(ask, "seconds")
+    ask = questions.add_parser("next_photo", parents=[common], help="what the photo that a run advises brings")
+    ask.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="of all trainings, as for a run")
+    ask.add_argument("--scene", nargs="+", required=True, metavar="SCENE", help="of conf/scene, one after the other")
+    ask.add_argument("--start", type=_positive, default=4, metavar="N", help="photos at first (default 4)")
+    ask.add_argument("--others", type=_positive, default=4, metavar="N", help="random photos beside it (default 4)")
+    ask.add_argument("--seed", type=int, default=0, help="of their choice (default 0)")
+    _add_kept(ask, "next_photo")
+
+
+def _add_kept(ask: argparse.ArgumentParser, question: str) -> None:
     ask.add_argument(
-        "--out", type=Path, default=Path("outputs/seconds"), metavar="FOLDER",
+        "--out", type=Path, default=Path("outputs") / question, metavar="FOLDER",
         help="holds tables and trainings; finished trainings are kept (default: %(default)s)",
     )  # fmt: skip
 
@@ -151,6 +172,8 @@ def _add_trainings(questions: Any, common: argparse.ArgumentParser) -> None:
 def _measure(question: str, options: dict[str, Any], results: Results) -> None:
     if question == "seconds":
         seconds.measure(results, seconds.Request(**options))
+    elif question == "next_photo":
+        next_photo.measure(results, next_photo.Request(**options))
     elif question == "device":
         device.measure(results, device.Request(**options))
     else:

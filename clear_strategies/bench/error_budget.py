@@ -18,11 +18,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.geometry.projection import back_project, inside_of, project
-from rasterizers.interface import Camera
-
-TOLERANCE: Final = 0.03
-"""A camera sees a point whose depth there exceeds the rendered one by at most this share of it."""
 SOLID: Final = 0.9
 """Alpha below it counts as a hole."""
 OUTSIDE: Final = 0.25
@@ -51,28 +46,6 @@ class HeldOut:
     seen: Int[Tensor, "H W"]
     distance: float
     factor: int
-
-
-def seen_by(
-    camera: Camera, depth: Float[Tensor, "H W"], others: Sequence[tuple[Camera, Float[Tensor, "h w"]]]
-) -> Int[Tensor, "H W"]:
-    """In how many other cameras the surface behind each pixel is inside the image and not hidden.
-
-    Args:
-        depth: z in world units, nan where there is no surface, which nobody sees.
-        others: cameras, each with its own depth.
-    """
-    rows, columns = torch.nonzero(depth.isfinite(), as_tuple=True)
-    surface = back_project(camera, torch.stack((columns, rows), dim=1) + 0.5, depth[rows, columns])
-    count = torch.zeros(len(surface), dtype=torch.long)
-    for other, its_depth in others:
-        pixels, z = project(other, surface)
-        inside = inside_of(other, pixels, z)
-        column, row = pixels[inside].long().unbind(1)
-        count[inside] += (z[inside] <= its_depth[row, column] * (1 + TOLERANCE)).long()  # False where it has none
-    seen = torch.zeros(depth.shape, dtype=torch.long)
-    seen[rows, columns] = count
-    return seen
 
 
 def distance_from_hull(center: Float[Tensor, " 3"], centers: Float[Tensor, "V 3"]) -> float:

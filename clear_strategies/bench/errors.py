@@ -12,11 +12,12 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from clear_strategies.bench.error_budget import SEEN_BY, SOLID, HeldOut, budget, by_view, distance_from_hull, seen_by
+from clear_strategies.bench.error_budget import SEEN_BY, SOLID, HeldOut, budget, by_view, distance_from_hull
 from clear_strategies.bench.results import Results
 from clear_strategies.data.prepare import photos_of
 from clear_strategies.data.view_settings import split
 from clear_strategies.errors import DataError
+from clear_strategies.geometry.visibility import seen_by
 from clear_strategies.jobs.saved import SavedSplat, open_splat
 from clear_strategies.jobs.scene import read
 from clear_strategies.jobs.settings import JobSettings, settings_of

@@ -96,6 +96,7 @@ class Capture:
             `prior=auto` takes it. None: the capture has none, as every capture of real photos.
         depth: the exact depth (z) through each pixel's centre of a camera, float32 [H, W], infinite where there is no
             surface; None: unknown.
+        unplaced: photos whose pose could not be estimated, and why.
     """
 
     name: str
@@ -105,6 +106,7 @@ class Capture:
     notes: dict[str, str] = field(default_factory=dict)
     own_prior: Callable[[Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]], Prior] | None = None
     depth: Callable[[Camera], Float[Tensor, "H W"]] | None = None
+    unplaced: Mapping[str, str] = field(default_factory=dict)
 
 
 def sorted_by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:

@@ -91,7 +91,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         "points use test views": points.uses_test_views,
     }
     synthetic = "synthetic" in sample.sr_source
-    return Scene(capture.name, train, test, points, capture.background, synthetic, notes)
+    return Scene(capture.name, train, test, points, capture.background, synthetic, notes, capture.unplaced)
 
 
 def lr_photos(frames: Sequence[Frame], capture: Capture, views: ViewSettings) -> list[Photo]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -18,6 +19,7 @@ class Scene:
         background: the colour behind the Gaussians, RGB in [0, 1].
         synthetic_prior: the SR images contain errors made on purpose, or the truth (the demo); reports say so.
         notes: label -> fact, in the order in which the plan prints them and the provenance keeps them.
+        unplaced: photos without a pose, which train nothing, and why.
     """
 
     name: str
@@ -27,6 +29,7 @@ class Scene:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     synthetic_prior: bool = False
     notes: dict[str, str] = field(default_factory=dict)
+    unplaced: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def device(self) -> torch.device:

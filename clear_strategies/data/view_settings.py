@@ -114,11 +114,11 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
                 capture.name, "views", f"{views.train} training views are asked for, there are {len(pool)}",
                 "lower data.views.train",
             )  # fmt: skip
-        pool = _evenly_spaced(pool, views.train)
+        pool = evenly_spaced(pool, views.train)
     if not pool:
         raise DataError(capture.name, "views", "none is left for training", "give more photos")
     if views.test_limit is not None and len(test) > views.test_limit:
-        test = _evenly_spaced(test, views.test_limit)
+        test = evenly_spaced(test, views.test_limit)
     return pool, test
 
 
@@ -137,6 +137,6 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-def _evenly_spaced(frames: Sequence[Frame], count: int) -> list[Frame]:
+def evenly_spaced(frames: Sequence[Frame], count: int) -> list[Frame]:
     """`count` of the frames by the papers' rule: round(linspace), halves to even."""
     return [frames[round(float(x))] for x in np.linspace(0, len(frames) - 1, count)]

@@ -1,15 +1,17 @@
-"""What several cameras look at."""
+"""What several cameras look at, and cameras beside a camera."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
+from rasterizers.interface import Camera
 
 
 def common_box(photos: Sequence[Photo]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
@@ -34,3 +36,22 @@ def common_box(photos: Sequence[Photo]) -> tuple[Float[Tensor, " 3"], Float[Tens
     narrowest = min(math.atan(min(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
     half = distance * math.sin(narrowest)  # the ball touches the sides of the narrowest frustum
     return (middle - half).float(), (middle + half).float()
+
+
+def moved(camera: Camera, step: Float[Tensor, " 3"], *, aim: float) -> Camera:
+    """The camera moved, and turned to keep in its middle what it saw there.
+
+    Args:
+        step: along its axes right, down and forward, world units, float64.
+        aim: the depth of what it saw in its middle, world units.
+    """
+    pose = camera.world_to_camera.double()
+    axes, centre = pose[:3, :3], camera.center.double()
+    target = centre + axes[2] * aim
+    centre = centre + axes.T @ step
+    z = torch.nn.functional.normalize(target - centre, dim=0)
+    x = torch.nn.functional.normalize(torch.linalg.cross(axes[1], z), dim=0)
+    axes = torch.stack((x, torch.linalg.cross(z, x), z))
+    turned = torch.eye(4, dtype=torch.float64)
+    turned[:3, :3], turned[:3, 3] = axes, -axes @ centre
+    return replace(camera, world_to_camera=turned.to(camera.world_to_camera))

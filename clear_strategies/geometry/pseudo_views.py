@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
+from clear_strategies.geometry.cameras import moved
 from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
 from rasterizers.interface import Camera
 
@@ -109,16 +110,7 @@ def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.
         direction / torch.linalg.vector_norm(direction) * torch.rand((), generator=generator, dtype=torch.float64)
     )
     direction[2] *= _ALONG
-    pose = camera.world_to_camera.double()
-    axes, centre = pose[:3, :3], camera.center.double()
-    aim = centre + axes[2] * distance
-    centre = centre + axes.T @ (direction * reach * distance)
-    z = torch.nn.functional.normalize(aim - centre, dim=0)
-    x = torch.nn.functional.normalize(torch.linalg.cross(axes[1], z), dim=0)
-    axes = torch.stack((x, torch.linalg.cross(z, x), z))
-    turned = torch.eye(4, dtype=torch.float64)
-    turned[:3, :3], turned[:3, 3] = axes, -axes @ centre
-    return replace(camera, world_to_camera=turned.to(camera.world_to_camera))
+    return moved(camera, direction * reach * distance, aim=distance)
 
 
 def _widened(photo: Photo, field: float) -> PseudoView:

@@ -17,7 +17,7 @@ from clear_strategies.core.view import View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.scene import Scene
-from clear_strategies.outputs import metrics
+from clear_strategies.outputs import coverage, metrics
 from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.contact_sheet import OWN_PHOTO, TRAINED_ON, SheetRow, write_contact_sheet
 from clear_strategies.outputs.curves import write_curves
@@ -50,6 +50,8 @@ FILES: Final[Mapping[str, str]] = {
     "path.mp4": "a loop through the training cameras (`fit.video`)",
     "path.gif": "the same, smaller",
     "splat.html": "the splat in a page that turns it, without a server or a network (`fit.page`)",
+    "coverage.png": "from above, how many photos see each part of the scene, and where to take the next two (`fit.page`)",
+    "coverage.html": "the same as a page that turns it",
     "tensorboard/": "the numbers of history.csv and a few pictures, for TensorBoard (`fit.log`)",
     "contact_sheet.png": "the same few views: LR photo, prior, baseline (if there is one), render, truth and error side by side",
     "curves.png": "losses, PSNR, number of Gaussians, conflict and correction over iterations",
@@ -69,7 +71,7 @@ class Pictures:
     Args:
         map_views: how many training views get maps, at most.
         video_frames: of the loop through the training cameras; 0: none.
-        page_gaussians: a field of more gets no page.
+        page_gaussians: a field of more gets no pages, and no picture of what the photos see.
     """
 
     map_views: int
@@ -153,6 +155,9 @@ def _write_views(
         write_loop(folder, cameras, painter, pictures.video_frames)
     with work_log.stage("page"):
         write_splat_page(folder, cameras, painter, pictures.page_gaussians, title, scene.background)
+    if len(painter.field) <= pictures.page_gaussians:
+        with work_log.stage("coverage"):
+            coverage.write_coverage(folder, scene, painter, title)
 
 
 def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str, baseline: Baseline | None) -> None:

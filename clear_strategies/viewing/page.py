@@ -1,6 +1,6 @@
-"""splat.html: a splat in a page that needs neither a server nor a network. viser's client draws it by WebGL.
+"""Pages that need neither a server nor a network: viser's client draws a splat, or points and cameras, by WebGL.
 
-Its Gaussians have one colour for all directions: here the mean of those that the run's cameras see.
+A splat's Gaussians have one colour for all directions: here the mean of those that the run's cameras see.
 """
 
 from __future__ import annotations
@@ -8,11 +8,11 @@ from __future__ import annotations
 import contextlib
 import html
 import io
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import torch
@@ -24,10 +24,29 @@ from clear_strategies.viewing import paths
 from rasterizers.geometry import rotation_matrix, spherical_harmonics
 from rasterizers.interface import Camera, Splats
 
+if TYPE_CHECKING:
+    import viser
+
 FILE: Final = "splat.html"
 _DISTANCE: Final = 20.0  # of the first camera from the scene in the page: covariances are float16 there
 _SEEN_FROM: Final = 16  # cameras whose colours are averaged, at most
+_POINT: Final = 0.03  # size of a point, in lengths of a camera
 _DARK: Final = 0.5  # mean of the background's RGB below which the page is dark
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownCamera:
+    """A camera in a page of points.
+
+    Args:
+        rgb: 0 to 255.
+        image: in its frustum, uint8 [h, w, 3]; None: the frustum is empty.
+    """
+
+    camera: Camera
+    label: str
+    rgb: tuple[int, int, int]
+    image: np.ndarray | None = None
 
 
 def missing() -> str | None:
@@ -48,6 +67,44 @@ def write_page(
     Raises:
         OSError: the file cannot be written, or this machine has no loopback address.
     """
+    with _page(path, cameras, title, dark=sum(background) / 3 < _DARK) as (server, times):
+        colors = colors_seen(splats, [c.center for c in cameras[:: -(-len(cameras) // _SEEN_FROM)]])
+        server.scene.add_gaussian_splats(
+            "/splat", (splats.means * times).cpu().numpy(), (covariances(splats) * times**2).cpu().numpy(),
+            colors.cpu().numpy(), splats.opacities[:, None].cpu().numpy(),
+        )  # fmt: skip
+
+
+def write_points_page(
+    path: Path, means: Float[Tensor, "N 3"], rgb: Float[Tensor, "N 3"], shown: Sequence[ShownCamera], title: str
+) -> None:
+    """Write a page of points and cameras; it begins at the first camera. viser must be installed, see `missing`.
+
+    Args:
+        rgb: colours of the points, in [0, 1].
+        shown: at least one.
+
+    Raises:
+        OSError: as `write_page`.
+    """
+    from clear_strategies.viewing.aim import add_camera, drawn_length
+
+    cameras = [marked.camera for marked in shown]
+    with _page(path, cameras, title, dark=False) as (server, times):
+        length = times * drawn_length(cameras)
+        points = (means * times).cpu().numpy()
+        server.scene.add_point_cloud("/points", points, rgb.cpu().numpy(), point_size=_POINT * length)
+        for i, marked in enumerate(shown):
+            camera = _magnified(marked.camera, times)
+            add_camera(server, f"/cameras/{i}", camera, length, color=marked.rgb, image=marked.image)
+            server.scene.add_label(f"/cameras/{i}/name", marked.label)
+
+
+@contextlib.contextmanager
+def _page(
+    path: Path, cameras: Sequence[Camera], title: str, *, dark: bool
+) -> Iterator[tuple[viser.ViserServer, float]]:
+    """A server whose scene becomes the page, and how many times larger than the world it is."""
     import viser
 
     from clear_strategies.viewing.aim import aim
@@ -60,12 +117,8 @@ def write_page(
         try:
             serializer = server.get_scene_serializer()
             aim(server, [_magnified(camera, times) for camera in cameras])
-            colors = colors_seen(splats, [c.center for c in cameras[:: -(-len(cameras) // _SEEN_FROM)]])
-            server.scene.add_gaussian_splats(
-                "/splat", (splats.means * times).cpu().numpy(), (covariances(splats) * times**2).cpu().numpy(),
-                colors.cpu().numpy(), splats.opacities[:, None].cpu().numpy(),
-            )  # fmt: skip
-            text = serializer.as_html(dark_mode=sum(background) / 3 < _DARK)
+            yield server, times
+            text = serializer.as_html(dark_mode=dark)
         finally:
             server.stop()
     files.write_text(path, text.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1))

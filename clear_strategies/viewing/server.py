@@ -27,8 +27,8 @@ from nerfview.render_panel import populate_general_render_tab
 from torch import Tensor
 
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.viewing import paths, video
-from clear_strategies.viewing.aim import aim
+from clear_strategies.viewing import video
+from clear_strategies.viewing.aim import add_camera, aim, drawn_length, wxyz
 from clear_strategies.viewing.cameras import SavedCamera
 from clear_strategies.viewing.film import DepthScale
 from clear_strategies.viewing.look import AS_MEASURED, Look, Painter
@@ -44,7 +44,6 @@ _SHARP: Final = 1024  # px: enlarged pixels fill at least so many, so that the b
 _LARGEST: Final = 2048  # px, longest edge of a picture
 _EVERY: Final = 1.0  # seconds between pictures of a run that trains, where nobody moves
 _MOST_FRUSTUMS: Final = 200
-_FRUSTUM: Final = 0.12  # size of a camera, in mean distances to the scene
 
 Points = Mapping[str, Float[Tensor, "N 3"]]
 """What the Gaussians can be coloured by: a name and RGB in [0, 1] each."""
@@ -239,9 +238,7 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         if not train:
             return
         poses = [saved.camera for saved in train]
-        focus = paths.look_at(poses)
-        distances = [float(np.linalg.norm(camera.center.double().numpy() - focus)) for camera in poses]
-        size = _FRUSTUM * sum(distances) / len(distances)
+        size = drawn_length(poses)
         gui, frustums = self.server.gui, []
         for saved in train:
             frustums.append(self._add_frustum(saved, size))
@@ -264,26 +261,18 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
     def _add_frustum(self, saved: SavedCamera, size: float) -> Any:
         camera = saved.camera
         image = None if saved.photo is None else video.to_bytes(read_image(saved.photo))
-        frustum = self.server.scene.add_camera_frustum(
-            f"/cameras/{saved.name}", fov=2 * math.atan(camera.height / 2 / camera.fy), aspect=camera.width / camera.height,
-            scale=size, color=(255, 180, 60), image=image, wxyz=_wxyz(camera), position=tuple(camera.center.tolist()),
-            visible=False,
-        )  # fmt: skip
-
+        frustum = add_camera(
+            self.server, f"/cameras/{saved.name}", camera, size, color=(255, 180, 60), image=image, visible=False
+        )
         frustum.on_click(lambda event: _go_to(event.client, camera))
         return frustum
 
 
 def _go_to(client: Any, camera: Camera) -> None:
     with client.atomic():
-        client.camera.wxyz = _wxyz(camera)
+        client.camera.wxyz = wxyz(camera)
         client.camera.position = tuple(camera.center.tolist())
         client.camera.fov = 2 * math.atan(camera.height / 2 / camera.fy)
-
-
-def _wxyz(camera: Camera) -> tuple[float, ...]:
-    rotation = viser.transforms.SO3.from_matrix(camera.world_to_camera[:3, :3].double().T.numpy())
-    return tuple(float(x) for x in rotation.wxyz)
 
 
 def _shrunk(camera: Camera) -> Camera:

@@ -10,7 +10,7 @@ import torch
 from hydra import compose, initialize_config_dir
 
 from clear_strategies.bench.__main__ import main
-from clear_strategies.bench.error_budget import HeldOut, budget, by_view, distance_from_hull, seen_by, waves
+from clear_strategies.bench.error_budget import HeldOut, budget, by_view, distance_from_hull, waves
 from clear_strategies.compose import CONF
 from clear_strategies.jobs import job
 from rasterizers.interface import Camera
@@ -66,17 +66,6 @@ def test_what_is_gained_where_all_error_lies_is_everything_and_elsewhere_nothing
     assert table.loc[("alpha", "from 0.9"), "run: if perfect"] == pytest.approx(23.01, abs=1e-2)
     assert math.isnan(table.loc[("seen by", "one"), "run: psnr"])
     assert by_view([view(error, alpha=alpha)]).loc[0, "run: psnr"] == pytest.approx(23.01, abs=1e-2)
-
-
-def test_a_pixel_is_seen_where_its_surface_is_inside_another_camera_and_not_hidden():
-    wall = torch.full((10, 10), 1.0)
-    beside = seen_by(camera(), wall, [(camera(0.5), wall), (camera(), wall)])  # 5 pixels aside
-    assert beside[:, :5].unique().tolist() == [1]
-    assert beside[:, 5:].unique().tolist() == [2]
-    assert seen_by(camera(), wall, [(camera(), wall * 0.5)]).max() == 0  # something stands before it
-    assert seen_by(camera(), wall, [(camera(), wall * 2)]).min() == 1
-    assert seen_by(camera(), torch.full((10, 10), torch.nan), [(camera(), wall)]).max() == 0
-    assert seen_by(camera(), wall, [(camera(), torch.full((10, 10), torch.nan))]).max() == 0
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,10 @@ FLOORS: dict[str, tuple[set[str], set[str]]] = {
     "training": (GROUND | {"core", "kernels", "geometry", "strategies", "merging", "data", "density"}, set()),
     "density": (GROUND | {"core", "strategies", "merging", "data", "training"}, {"gsplat"}),
     "viewing": (GROUND | {"core", "data", "training"}, set()),
-    "outputs": (GROUND | {"core", "strategies", "merging", "data", "training", "density", "viewing"}, set()),
+    "outputs": (
+        GROUND | {"core", "geometry", "strategies", "merging", "data", "training", "density", "viewing"},
+        set(),
+    ),
     "settings": ({"errors"}, set()),
     "compose": (GROUND | {"settings", "strategies", "merging"}, {"hydra", "omegaconf"}),
     "jobs": (

@@ -16,8 +16,9 @@ from clear_strategies.data.exif import Exif, read_exif
 from clear_strategies.data.photo_files import image_size, inside, list_images
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
-from clear_strategies.data.readers.colmap_model import Model, read_model
+from clear_strategies.data.readers.colmap_model import read_model
 from clear_strategies.data.readers.video import CHOICE, frames_of
+from clear_strategies.data.strict_json import read_object
 from clear_strategies.data.usable import Fault, some, usable
 from clear_strategies.errors import DataError, SettingError
 
@@ -95,23 +96,26 @@ def read(
     else:
         settings = sfm.SfmSettings(max_side, max_features, careful, least_placed, threads, seed)
         sfm.reconstruct(root, photos, folder, settings)
-    found = _capture(root, paths, photos, read_model(folder))
+    found = _capture(root, paths, photos, folder)
     return replace(found, notes={**found.notes, **notes})
 
 
-def _capture(root: Path, paths: Sequence[Path], photos: Mapping[Path, Exif], model: Model) -> Capture:
-    """The photos with their poses; the model knows them by their numbers."""
-    by_copy = {sfm.copy_name(i): path for i, path in enumerate(paths)}
+def _capture(root: Path, paths: Sequence[Path], photos: Mapping[Path, Exif], folder: Path) -> Capture:
+    """The photos with their poses, of the model in `folder`, which knows them by their numbers."""
+    model, by_copy = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(paths)}
     found = colmap.capture(root, model, root, {image.name: by_copy[image.name] for image in model.images}, upright=True)
-    placed = {frame.name for frame in found.frames}
-    sfm.unplaced_warning(root, [path.name for path in paths if path.name not in placed], len(paths))
+    placed, names = len(found.frames), {copy: path.name for copy, path in by_copy.items()}
+    reasons = read_object(folder / sfm.UNPLACED)
+    unplaced = {names[copy]: sfm.why_unplaced(facts, names) for copy, facts in reasons.items()}
+    sfm.unplaced_warning(root, unplaced, len(paths))
     notes = {
         **found.notes,
-        "poses": f"estimated by pycolmap from all {len(paths)} photos, {len(placed)} could be placed",
+        "poses": f"estimated by pycolmap from all {len(paths)} photos, {placed} could be placed",
         "photos": root.name,
         **_exposure(photos),
     }
-    return replace(found, points=colmap.sfm_points(model, "estimated here by pycolmap"), notes=notes)
+    points = colmap.sfm_points(model, "estimated here by pycolmap")
+    return replace(found, points=points, notes=notes, unplaced=unplaced)
 
 
 def _once_each(paths: Sequence[Path]) -> list[Path]:
@@ -143,7 +147,7 @@ def _exposure(photos: Mapping[Path, Exif]) -> dict[str, str]:
 
 
 def _key(paths: Sequence[Path], *settings: int) -> str:
-    digest = hashlib.sha256(repr(("upright copies, points of two views, guided", *settings)).encode())
+    digest = hashlib.sha256(repr(("upright copies, points of two views, guided, reasons", *settings)).encode())
     for path in paths:
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:24]

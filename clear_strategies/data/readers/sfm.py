@@ -13,23 +13,29 @@ import signal
 import sqlite3
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from PIL import Image as Picture
 
+from clear_strategies import files
 from clear_strategies.core.progress import EVERY, Progress
 from clear_strategies.data.exif import Exif
 from clear_strategies.data.photo_files import read_image, write_jpeg
-from clear_strategies.data.usable import some
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
 
 FEWEST: Final = 3
 MORE: Final = "take more photos that overlap by two thirds, with the same camera and zoom, of a scene with texture"
+UNPLACED: Final = "unplaced.json"
+"""Beside the model: of each photo without a pose, by the name of its copy, how it was related to the others."""
+_DATABASE: Final = "database.db"
+_PAIR: Final = 2147483647  # COLMAP's number of a pair of images is the first's times this, plus the second's
+_FEW_FEATURES: Final = 200  # of a photo that shows too little
+_TOLD: Final = 3  # photos without a pose whose reasons are told on the console
 _MEGA: Final = 1 << 20
 _DISTANCES: Final = 4  # bytes of each pair of features that are compared
 _MEMORY: Final = 4 << 30  # bytes that all threads together may take in matching
@@ -89,6 +95,8 @@ def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings:
             result = Path(work) / "result"
             result.mkdir()
             models[0].write_binary(str(result))
+            placed = {image.name for image in models[0].images.values()}
+            files.write_json(result / UNPLACED, _unplaced(Path(work) / _DATABASE, placed))
             result.rename(folder)
     except (RuntimeError, OSError) as error:
         raise DataError(root, "poses", f"structure-from-motion failed ({error})", MORE) from error
@@ -117,7 +125,7 @@ def _require_placed(root: Path, sizes: Sequence[int], count: int, least: float) 
 
 def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSettings) -> list[Any]:
     """COLMAP's incremental pipeline: features, all pairs, mapping. Every model that it finds."""
-    copies, database, count = work / "copies", work / "database.db", len(photos)
+    copies, database, count = work / "copies", work / _DATABASE, len(photos)
     level = pycolmap.logging.minloglevel
     # Its progress is hundreds of lines, and `estimate` tells its errors.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -240,10 +248,47 @@ def _pycolmap() -> Any:
     return pycolmap
 
 
-def unplaced_warning(root: Path, missing: Sequence[str], count: int) -> None:
-    """Say which photos the model leaves out."""
+def _unplaced(database: Path, placed: Set[str]) -> dict[str, dict[str, Any]]:
+    """Of each photo without a pose: its features, its most matches with a placed photo, and that photo's name."""
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        names = dict(connection.execute("SELECT image_id, name FROM images"))
+        features = dict(connection.execute("SELECT image_id, rows FROM keypoints"))
+        pairs = connection.execute("SELECT pair_id, rows FROM two_view_geometries").fetchall()
+    found = {
+        name: {"features": features.get(i, 0), "matches": 0, "with": ""}
+        for i, name in names.items()
+        if name not in placed
+    }
+    for pair, matches in pairs:
+        two = [names[i] for i in divmod(pair, _PAIR)]
+        for name, other in (two, two[::-1]):
+            if name in found and other in placed and matches > found[name]["matches"]:
+                found[name] |= {"matches": matches, "with": other}
+    return found
+
+
+def why_unplaced(found: Mapping[str, Any], names: Mapping[str, str]) -> str:
+    """Why a photo has no pose, in words.
+
+    Args:
+        found: its entry in `UNPLACED`.
+        names: of the photos, by those of COLMAP's copies.
+    """
+    if found["features"] < _FEW_FEATURES:
+        return f"{found['features']} features: blurred, dark, or without texture"
+    if not found["matches"]:
+        return "shares nothing with the placed photos: overlap by two thirds"
+    return (
+        f"{found['matches']} features in common with {names[found['with']]}, less with every other photo: more overlap"
+    )
+
+
+def unplaced_warning(root: Path, missing: Mapping[str, str], count: int) -> None:
+    """Say which photos the model leaves out, and why."""
     if missing:
+        told = "; ".join(f"{name} ({why})" for name, why in list(missing.items())[:_TOLD])
+        more = f"; and {len(missing) - _TOLD} more" if len(missing) > _TOLD else ""
         _log.warning(
-            "%s: %d of %d photos could be placed (%.0f%%); not used: %s. Photos with more overlap could be.",
-            root, count - len(missing), count, 100 * (count - len(missing)) / count, some(missing),
+            "%s: %d of %d photos could be placed (%.0f%%). Without a pose: %s%s.",
+            root, count - len(missing), count, 100 * (count - len(missing)) / count, told, more,
         )  # fmt: skip

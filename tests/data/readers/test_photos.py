@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -30,9 +32,11 @@ def test_poses_are_those_of_the_ground_truth(
     for frame in truth:
         with Image.open(shared_data / "strecha_fountain/images" / frame.name) as image:
             image.resize((384, 256), Image.Resampling.LANCZOS).save(folder / frame.name, quality=97)
+    Image.new("RGB", (384, 256), (90, 90, 90)).save(folder / "z_flat.png")
     capture = photos.read(folder, tmp_path / "cache", threads=1)
     assert [frame.name for frame in capture.frames] == [frame.name for frame in truth]
-    assert "estimated by pycolmap from all 5 photos, 5 could be placed" in capture.notes["poses"]
+    assert "estimated by pycolmap from all 6 photos, 5 could be placed" in capture.notes["poses"]
+    assert capture.unplaced == {"z_flat.png": "0 features: blurred, dark, or without texture"}
     assert capture.points is not None
     assert len(capture.points.means) > 100
 
@@ -51,7 +55,8 @@ def test_poses_are_those_of_the_ground_truth(
     again = photos.read(folder, tmp_path / "cache", threads=1)
     for one, other in zip(capture.frames, again.frames, strict=True):
         assert torch.equal(one.camera.world_to_camera, other.camera.world_to_camera)
-    assert sorted(p.name for p in folder.iterdir()) == [frame.name for frame in truth]
+    assert again.unplaced == capture.unplaced
+    assert sorted(p.name for p in folder.iterdir()) == [*(frame.name for frame in truth), "z_flat.png"]
     assert len(list((tmp_path / "cache").iterdir())) == 1
 
 
@@ -92,6 +97,24 @@ def test_a_run_that_is_terminated_while_it_reads_photos_ends_without_a_stack_tra
     command = [sys.executable, "-c", f"{program}os.kill(os.getpid(), signal.SIGTERM)"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (ended.returncode, ended.stderr) == (-signal.SIGTERM, "")
+
+
+def test_a_photo_without_a_pose_is_told_with_the_placed_photo_that_it_has_most_in_common_with(tmp_path: Path) -> None:
+    database, first = tmp_path / "database.db", 2147483647
+    with contextlib.closing(sqlite3.connect(database)) as connection, connection:
+        connection.execute("CREATE TABLE images (image_id, name)")
+        connection.executemany("INSERT INTO images VALUES (?, ?)", [(i, f"{i}.jpg") for i in (1, 2, 3, 4)])
+        connection.execute("CREATE TABLE keypoints (image_id, rows)")
+        connection.executemany("INSERT INTO keypoints VALUES (?, ?)", [(i, 1000) for i in (1, 2, 3, 4)])
+        connection.execute("CREATE TABLE two_view_geometries (pair_id, rows)")
+        pairs = [(1 * first + 2, 300), (1 * first + 3, 9), (2 * first + 3, 14), (3 * first + 4, 80)]
+        connection.executemany("INSERT INTO two_view_geometries VALUES (?, ?)", pairs)
+    found = photos.sfm._unplaced(database, {"1.jpg", "2.jpg"})
+    told = {name: photos.sfm.why_unplaced(facts, {"2.jpg": "b.png"}) for name, facts in found.items()}
+    assert told == {
+        "3.jpg": "14 features in common with b.png, less with every other photo: more overlap",
+        "4.jpg": "shares nothing with the placed photos: overlap by two thirds",
+    }
 
 
 def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_takes_them() -> None:

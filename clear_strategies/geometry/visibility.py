@@ -1,0 +1,54 @@
+"""Which cameras see a surface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from clear_strategies.geometry.projection import back_project, inside_of, project
+from rasterizers.interface import Camera
+
+_TOLERANCE: Final = 0.03  # a camera sees a point whose depth there exceeds the camera's own by at most this share of it
+
+
+def seen_by(
+    camera: Camera, depth: Float[Tensor, "H W"], others: Sequence[tuple[Camera, Float[Tensor, "h w"]]]
+) -> Int[Tensor, "H W"]:
+    """In how many other cameras the surface behind each pixel is inside the image and not hidden.
+
+    Args:
+        depth: z in world units, nan where there is no surface, which nobody sees.
+        others: cameras, each with its own depth.
+    """
+    rows, columns = torch.nonzero(depth.isfinite(), as_tuple=True)
+    surface = back_project(camera, torch.stack((columns, rows), dim=1) + 0.5, depth[rows, columns])
+    seen = torch.zeros(depth.shape, dtype=torch.long)
+    seen[rows, columns] = times_seen(surface, others)
+    return seen
+
+
+def times_seen(
+    points: Float[Tensor, "N 3"], cameras: Sequence[tuple[Camera, Float[Tensor, "h w"]]]
+) -> Int[Tensor, " N"]:
+    """In how many cameras each point is inside the image and not hidden; `sees` for several cameras."""
+    count = torch.zeros(len(points), dtype=torch.long)
+    for camera, depth in cameras:
+        count += sees(camera, depth, points).long()
+    return count
+
+
+def sees(camera: Camera, depth: Float[Tensor, "h w"], points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+    """Whether each point is inside the camera's image and not hidden.
+
+    Args:
+        depth: of the camera, nan where there is no surface, so that no point is seen there.
+    """
+    pixels, z = project(camera, points)
+    seen = inside_of(camera, pixels, z)
+    column, row = pixels[seen].long().unbind(1)
+    seen[seen.clone()] = z[seen] <= depth[row, column] * (1 + _TOLERANCE)  # False where it has none
+    return seen

@@ -1,0 +1,157 @@
+"""From where the next photos would help most.
+
+A photo shows a surface as far as it looks at it from the same side. Two photos give a surface its depth, so a further photo is
+worth most where one photo shows what it shows; half as much where none does or two do, and nothing where `ENOUGH` do.
+`bench next_photo` measures what photos from there bring.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.geometry.cameras import moved
+from clear_strategies.geometry.projection import back_project
+from clear_strategies.geometry.visibility import sees
+from clear_strategies.outputs.figures import spaced
+from clear_strategies.viewing import paths
+from clear_strategies.viewing.cameras import at_most
+from clear_strategies.viewing.look import Painter
+from rasterizers.interface import Camera
+
+ENOUGH: Final = 3
+"""Photos that see a surface; more of them change little."""
+_SIDE: Final = 4  # a photo from θ aside shows cos(θ) to this power of what a pixel shows: 78 % at 20°, 25 % at 45°
+COMPARED: Final = 64
+"""Photos that are asked what they see, at most."""
+
+_OVERLAP: Final = 0.5  # of a next photo's pixels, those that photos see: with less its pose could not be estimated
+_NEAREST: Final = 0.3  # of the depth at the photo it is moved from, its own depth: closer it stands before one thing
+_LONGEST: Final = 0.5  # of that depth, the longest step
+_BESIDE: Final = 16  # photos that a next one may stand beside, at most
+_LONGER_SIDE: Final = 96  # px at which candidates are drawn
+
+_MOVES: Final = {
+    name: torch.tensor(direction, dtype=torch.float64)
+    for name, direction in {
+        "to the right of": (1, 0, 0), "to the left of": (-1, 0, 0), "above": (0, -1, 0), "below": (0, 1, 0),
+    }.items()
+}  # fmt: skip
+_BETWEEN: Final = 4  # places on a path through the photos, for each of them
+_STEPS: Final = (1, 2)
+
+Seeing = tuple[Camera, Float[Tensor, "h w"]]
+"""A camera and its depth."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NextPhoto:
+    """A camera from which a photo would help.
+
+    Args:
+        camera: as large as the photos.
+        where: in words; a step is the usual distance of neighbouring photos.
+        worth: of each pixel of a small picture, in [0, 1].
+    """
+
+    camera: Camera
+    where: str
+    worth: Float[Tensor, "h w"]
+
+    @property
+    def gain(self) -> float:
+        """The mean of `worth`."""
+        return float(self.worth.mean())
+
+
+def with_depth(cameras: Sequence[Camera], painter: Painter) -> list[Seeing]:
+    """Some of the cameras, at most `COMPARED`, small, with the depth of what they see."""
+    small = [at_most(camera, _LONGER_SIDE) for camera in spaced(cameras, COMPARED)]
+    return [(camera, painter.depth(camera)) for camera in small]
+
+
+def next_photos(photos: Mapping[str, Camera], painter: Painter, count: int = 2) -> list[NextPhoto]:
+    """The places where photos would help most, the best first; fewer than `count` where no other place helps.
+
+    Each is chosen as if the photos before it had been taken.
+
+    Args:
+        photos: the cameras by the photos' names.
+        painter: of the field that was trained on them.
+    """
+    seeing, candidates = with_depth(list(photos.values()), painter), list(_candidates(photos, painter))
+    chosen: list[NextPhoto] = []
+    while len(chosen) < count:
+        best, its_own = None, None
+        for place in candidates:
+            shown = _shown(*place.seeing, seeing)
+            if float((shown > 0).float().mean()) < _OVERLAP:
+                continue
+            worth = 1 - (shown.clamp(max=ENOUGH) - 1).abs() / (ENOUGH - 1)
+            if best is None or float(worth.mean()) > best.gain:
+                best, its_own = NextPhoto(place.camera, place.where, worth), place.seeing
+        if best is None or its_own is None or best.gain == 0:
+            break
+        chosen.append(best)
+        seeing.append(its_own)
+    return chosen
+
+
+def _shown(camera: Camera, depth: Float[Tensor, "h w"], seeing: Sequence[Seeing]) -> Float[Tensor, "h w"]:
+    """How many photos show what each pixel shows, those from the same side as a whole; 0 where nothing is."""
+    rows, columns = torch.nonzero(depth.isfinite(), as_tuple=True)
+    surface = back_project(camera, torch.stack((columns, rows), dim=1) + 0.5, depth[rows, columns])
+    mine = torch.nn.functional.normalize(camera.center.float() - surface, dim=1)
+    total = torch.zeros(len(surface))
+    for other, its_depth in seeing:
+        theirs = torch.nn.functional.normalize(other.center.float() - surface, dim=1)
+        total += sees(other, its_depth, surface) * (mine * theirs).sum(dim=1).clamp(min=0) ** _SIDE
+    shown = torch.zeros(depth.shape)
+    shown[rows, columns] = total
+    return shown
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """See `NextPhoto`; `seeing` is the camera small, with its depth."""
+
+    camera: Camera
+    where: str
+    seeing: Seeing
+
+
+def _candidates(photos: Mapping[str, Camera], painter: Painter) -> Iterator[_Candidate]:
+    """The places from which something is seen that is not right before the camera."""
+    cameras = list(photos.values())
+    centers = torch.stack([camera.center.double() for camera in cameras])
+    apart = torch.cdist(centers, centers).fill_diagonal_(torch.inf)
+    usual = float(apart.amin(dim=1).median())  # inf of a single photo
+    places: list[tuple[str, Camera, float]] = []
+    depths = []
+    for name, camera in spaced(list(photos.items()), _BESIDE):
+        depth = float(painter.depth(at_most(camera, _LONGER_SIDE)).nanmedian())
+        if not depth > 0:  # nan: nothing is there
+            continue
+        depths.append(depth)
+        step = min(usual, _LONGEST * depth)
+        for (where, direction), times in itertools.product(_MOVES.items(), _STEPS):
+            told = f"{times} step{'s' * (times > 1)} {where} {name}"
+            places.append((told, moved(camera, times * step * direction, aim=depth), depth))
+    if len(cameras) > 1 and depths:
+        for camera in paths.through(cameras, _BETWEEN * min(len(cameras), _BESIDE)):
+            distance = (centers - camera.center.double()).norm(dim=1)
+            # The two photos between which it lies: the way from one to the other through it is hardly longer.
+            detour = (distance[:, None] + distance - apart).fill_diagonal_(torch.inf)
+            first, second = (list(photos)[i] for i in divmod(int(detour.argmin()), len(cameras)))
+            places.append((f"between {first} and {second}", camera, min(depths)))
+    for where, camera, depth in places:
+        small = at_most(camera, _LONGER_SIDE)
+        its_depth = painter.depth(small)
+        if float(its_depth.nanmedian()) >= _NEAREST * depth:  # False where nothing is there
+            yield _Candidate(camera, where, (small, its_depth))

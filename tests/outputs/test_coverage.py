@@ -1,0 +1,56 @@
+"""coverage.png and coverage.html: shares that add up, photos without a pose, and advice where the photos are the user's own."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from clear_strategies.outputs import coverage
+from tests.helpers import wall
+
+SCENE = wall.scene(-1.0, 0.0, 1.0)
+
+
+def test_what_a_photo_shows_is_seen_by_it_at_least() -> None:
+    found = coverage.coverage_of(SCENE, wall.painter())
+    assert list(found.shares) == [view.name for view in SCENE.train]
+    assert all(sum(share) == pytest.approx(1) for share in found.shares.values())
+    assert int(found.times.max()) <= len(SCENE.train)
+    assert len(found.says()) == len(found.advice) == 2
+    assert found.shares["photo1"][2] > 0.5
+
+
+def test_many_points_are_thinned_and_a_hidden_one_is_seen_by_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(coverage, "_MOST_POINTS", 5)
+    found = coverage.coverage_of(SCENE, wall.painter())
+    assert 0 < len(found.points) <= 5
+    assert found.times.shape == found.points.shape[:1]
+
+
+def test_the_picture_names_photos_without_a_pose_and_the_page_is_whole(tmp_path: Path) -> None:
+    scene = replace(SCENE, unplaced={"dark.jpg": "12 features: blurred, dark, or without texture"})
+    text = "\n".join(coverage._lines(coverage.coverage_of(scene, wall.painter()), scene))
+    assert "dark.jpg: 12 features" in text
+    assert all(view.name in text for view in scene.train)
+    coverage.write_coverage(tmp_path, scene, wall.painter(), "toy")
+    assert (tmp_path / coverage.PICTURE).stat().st_size > 10_000
+    pytest.importorskip("viser")
+    assert "__VISER_EMBED_DATA__" in (tmp_path / coverage.PAGE).read_text()
+
+
+def test_advice_is_told_where_all_photos_train(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "clear_strategies")
+    coverage.write_coverage(tmp_path, replace(SCENE, test=SCENE.train[:1]), wall.painter(), "toy")
+    assert "two more photos" not in caplog.text
+    coverage.write_coverage(tmp_path, SCENE, wall.painter(), "toy")
+    assert "two more photos would help most from here (coverage.png): 1. " in caplog.text
+
+
+def test_points_have_the_colour_of_their_number_of_photos() -> None:
+    colors = coverage._colored(torch.tensor([0, 1, 2, 3, 9]))
+    assert (colors[3] == colors[4]).all()
+    assert len({tuple(color) for color in colors}) == 4
