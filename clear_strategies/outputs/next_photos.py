@@ -1,8 +1,8 @@
 """From where the next photos would help most.
 
 A photo shows a surface as far as it looks at it from the same side. Two photos give a surface its depth, so a further photo is
-worth most where one photo shows what it shows; half as much where none does or two do, and nothing where `ENOUGH` do.
-`bench next_photo` measures what photos from there bring.
+worth most where one photo shows what it shows; half as much where none does or two do, and nothing where `ENOUGH` do. It also
+has to share two thirds of its picture with two photos, or neither its pose nor its depth would be sound. `bench next_photo` measures what photos from there bring.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 
 from clear_strategies.geometry.cameras import moved
 from clear_strategies.geometry.projection import back_project
-from clear_strategies.geometry.visibility import sees
+from clear_strategies.geometry.visibility import seen_by, sees
 from clear_strategies.outputs.figures import spaced
 from clear_strategies.viewing import paths
 from clear_strategies.viewing.cameras import at_most
@@ -31,7 +31,10 @@ _SIDE: Final = 4  # a photo from θ aside shows cos(θ) to this power of what a 
 COMPARED: Final = 64
 """Photos that are asked what they see, at most."""
 
-_OVERLAP: Final = 0.5  # of a next photo's pixels, those that photos see: with less its pose could not be estimated
+_RELATED: Final = 2
+_OVERLAP: Final = (
+    2 / 3
+)  # of a next photo's pixels, those that `_RELATED` photos see: with less neither pose nor depth holds
 _NEAREST: Final = 0.3  # of the depth at the photo it is moved from, its own depth: closer it stands before one thing
 _LONGEST: Final = 0.5  # of that depth, the longest step
 _BESIDE: Final = 16  # photos that a next one may stand beside, at most
@@ -87,19 +90,20 @@ def next_photos(photos: Mapping[str, Camera], painter: Painter, count: int = 2) 
     """
     seeing, candidates = with_depth(list(photos.values()), painter), list(_candidates(photos, painter))
     chosen: list[NextPhoto] = []
-    while len(chosen) < count:
-        best, its_own = None, None
-        for place in candidates:
-            shown = _shown(*place.seeing, seeing)
-            if float((shown > 0).float().mean()) < _OVERLAP:
-                continue
-            worth = 1 - (shown.clamp(max=ENOUGH) - 1).abs() / (ENOUGH - 1)
-            if best is None or float(worth.mean()) > best.gain:
-                best, its_own = NextPhoto(place.camera, place.where, worth), place.seeing
-        if best is None or its_own is None or best.gain == 0:
+    while len(chosen) < count and candidates:
+        overlaps = [float((seen_by(*place.seeing, seeing) >= _RELATED).float().mean()) for place in candidates]
+        least = min(_OVERLAP, max(overlaps))
+        worths = {
+            i: 1 - (_shown(*candidates[i].seeing, seeing).clamp(max=ENOUGH) - 1).abs() / (ENOUGH - 1)
+            for i, overlap in enumerate(overlaps)
+            if overlap >= least
+        }
+        best = max(worths, key=lambda i: float(worths[i].mean()))
+        if not worths[best].any():
             break
-        chosen.append(best)
-        seeing.append(its_own)
+        place = candidates.pop(best)
+        chosen.append(NextPhoto(place.camera, place.where, worths[best]))
+        seeing.append(place.seeing)
     return chosen
 
 
