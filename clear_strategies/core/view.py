@@ -15,10 +15,15 @@ from rasterizers.interface import Camera
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photo:
-    """An image, float32 in [0, 1], and the camera on its pixel grid."""
+    """An image, float32 in [0, 1], and the camera on its pixel grid.
+
+    Args:
+        shown: False at hidden pixels (a mask): no loss compares them, and they have no depth. None: every pixel is shown.
+    """
 
     camera: Camera
     image: Float[Tensor, "H W 3"]
+    shown: Bool[Tensor, "H W"] | None = None
 
     def __post_init__(self) -> None:
         found = tuple(self.image.shape)
@@ -27,22 +32,29 @@ class Photo:
                 f"an image of {self.camera.width}x{self.camera.height} pixels has shape "
                 f"({self.camera.height}, {self.camera.width}, 3), got {found}."
             )
+        if self.shown is not None and self.shown.shape != found[:2]:
+            raise ValueError(f"shown must be {found[:2]}, a boolean for each pixel, got {tuple(self.shown.shape)}.")
 
     def to(self, device: torch.device | str) -> Photo:
         """The same photo with its image on `device`. The camera stays on the CPU, where kernels read its numbers."""
-        return replace(self, image=self.image.to(device))
+        return replace(self, image=self.image.to(device), shown=None if self.shown is None else self.shown.to(device))
 
     def factor_to(self, max_pixels: int) -> int:
         """The smallest whole factor that reduces it to at most `max_pixels`."""
         return max(1, math.ceil(math.sqrt(self.camera.width * self.camera.height / max_pixels)))
 
     def reduced(self, factor: int) -> Photo:
-        """The mean of each block of `factor` × `factor` pixels. What is left over at the right and at the bottom is cut off."""
+        """The mean of each block of `factor` × `factor` pixels, hidden where one of them is. What is left over at the right and
+        at the bottom is cut off.
+        """
         if factor == 1:
             return self
         image = images.area_mean(images.crop_to_multiple(self.image, factor), factor)
         camera = replace(self.camera, width=image.shape[1] * factor, height=image.shape[0] * factor)
-        return Photo(camera.scaled(1 / factor), image)
+        if self.shown is None:
+            return Photo(camera.scaled(1 / factor), image)
+        whole = images.area_mean(images.crop_to_multiple(self.shown[..., None].float(), factor), factor)[..., 0] == 1
+        return Photo(camera.scaled(1 / factor), image, whole)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,6 +125,17 @@ class View:
         if self.depth is None or self.depth.depth.shape == self.lr.image.shape[:2]:
             return self.lr
         return self.hr.reduced(self.hr.camera.width // self.depth.depth.shape[1])
+
+    def hiding(self, shown: Bool[Tensor, "h w"]) -> View:
+        """The same view, at both scales without the LR pixels where `shown` is False."""
+        fine = shown.repeat_interleave(self.factor, 0).repeat_interleave(self.factor, 1)
+        return replace(self, lr=replace(self.lr, shown=shown), hr=replace(self.hr, shown=fine))
+
+    def brightened(self, gain: Float[Tensor, " 3"]) -> View:
+        """The same view with its images times a gain for each channel, in [0, 1]."""
+        hr = replace(self.hr, image=(self.hr.image * gain).clamp(0, 1))
+        truth = hr.image if self.hr_is_photo else None if self.truth is None else (self.truth * gain).clamp(0, 1)
+        return replace(self, lr=replace(self.lr, image=(self.lr.image * gain).clamp(0, 1)), hr=hr, truth=truth)
 
     def to(self, device: torch.device | str) -> View:
         """The same view with its images on `device`."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.data.cameras import Lens
@@ -34,6 +34,7 @@ class Frame:
         load: decodes the image, float32 [H, W, 3] in [0, 1]. Readers never call it; the size is in `camera`.
         split: "train" or "test" where the data set itself defines the split (Blender), else None.
         sfm_id: the frame's id in `SfmPoints.track_image`, or None.
+        shown: decodes the photo's mask at the photo's own size, False at hidden pixels; None: there is no mask.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Frame:
     load: Callable[[], Float[Tensor, "H W 3"]]
     split: str | None = None
     sfm_id: int | None = None
+    shown: Callable[[], Bool[Tensor, "H W"]] | None = None
 
     @staticmethod
     def of_photo(
@@ -53,6 +55,7 @@ class Frame:
         background: Color | None = None,
         split: str | None = None,
         sfm_id: int | None = None,
+        mask: Path | None = None,
     ) -> Frame:
         """The frame of a file, with the lens fitted to the photo's real size. Reads the file's header only.
 
@@ -62,6 +65,8 @@ class Frame:
             upright: the lens is that of the photo as its EXIF block turns it; None: the shape of a photo on its side tells
                 whether its lens is, and other turned photos are refused.
             background: behind transparent pixels; None: black, logged.
+            mask: an image of the photo's size, black where it hides; None: masks/STEM.png or masks/NAME.png (COLMAP's way) beside
+                the photo's folder, if one is there.
 
         Raises:
             DataError: the photo is not there, or has another aspect ratio than the lens.
@@ -71,7 +76,10 @@ class Frame:
         fitted = lens.resized(width, height, path)
         pinhole = fitted.undistorted(path)
         camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
-        return Frame(name, camera, partial(_load, path, fitted, pinhole, background, turn), split=split, sfm_id=sfm_id)
+        load = partial(_load, path, fitted, pinhole, background, turn)
+        mask = mask or _mask_of(path)
+        shown = None if mask is None else partial(_load_mask, mask, fitted, pinhole, turn)
+        return Frame(name, camera, load, split=split, sfm_id=sfm_id, shown=shown)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,3 +164,12 @@ def _turned_as(path: Path, lens: Lens) -> bool | None:
 def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None, turn: bool | None) -> Float[Tensor, "H W 3"]:
     image = read_image(path, background=background, expect=(lens.width, lens.height), turn=turn)
     return lens.undistort(image, pinhole) if lens.distorts else image
+
+
+def _mask_of(path: Path) -> Path | None:
+    folder = path.parent.parent / "masks"
+    return next((m for m in (folder / f"{path.stem}.png", folder / f"{path.name}.png") if m.is_file()), None)
+
+
+def _load_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[Tensor, "H W"]:
+    return _load(path, lens, pinhole, None, turn).mean(dim=2) > 0.5

@@ -29,11 +29,14 @@ from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError
+from clear_strategies.geometry.exposure import exposure_gains
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
 _READERS: Final = 4  # photos read at once, at most: each is held at its full size meanwhile
+_WHOLE: Final = 0.99  # of a pixel's mask, for the pixel to be shown
+_SAME_EXPOSURE: Final = 0.01  # photos whose gains are closer to 1 stay as they are
 _ROUNDING: Final = 0.5  # grey levels: the largest difference that rounding to 8 bits makes
 
 
@@ -53,7 +56,9 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     progress = Progress("photos and their SR images", "photos", len(train_frames) + len(test_frames))
     frames, found = (*train_frames, *test_frames), list[View]()
     for frame, reduced in zip(frames, photos_of(frames, views), strict=True):
-        found.append(_view(frame, reduced, capture, views, prior, lr_files, required=len(found) < len(train_frames)))
+        view = _view(frame, reduced, capture, views, prior, lr_files, required=len(found) < len(train_frames))
+        shown = reduced.reduced(reduced.camera.width // view.lr.camera.width).shown
+        found.append(view if shown is None else view.hiding(shown))
         progress(len(found))
     train, test = tuple(found[: len(train_frames)]), tuple(found[len(train_frames) :])
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
@@ -64,6 +69,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     points = initial.cloud
     if initial.depths:
         train = tuple(replace(v, depth=depth) for v, depth in zip(train, initial.depths, strict=True))
+    train, exposure = _equalized(train) if views.equalize else (train, {})
     sample, photo, sr = train[0], train_frames[0].camera, views.photos_are != "both"
     network = network_of(prior) if sr else None
     made = {
@@ -84,6 +90,8 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         "sizes": f"photos of {_size(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
         "LR": f"{_size(sample.lr.camera)}, {made}",
         "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), {'SR images: ' if sr else ''}{sample.sr_source}",
+        **_hidden(train),
+        **exposure,
         **_moved(train, views.downsample),
         **({} if network is None else {"SR network": f"{fingerprint(network)} (SHA-256)"}),
         **({"the SR images add": f"{_added_detail(train):.1f} grey levels to bicubic, on average"} if sr else {}),
@@ -208,14 +216,50 @@ def _moved(views: Sequence[View], down: DownKernel) -> dict[str, str]:
     return {"back-projection": text}
 
 
+def _hidden(views: Sequence[View]) -> dict[str, str]:
+    """What masks hide of the views, a line for the plan; empty without masks."""
+    hidden = [float((~view.lr.shown).float().mean()) for view in views if view.lr.shown is not None]
+    if not hidden:
+        return {}
+    return {
+        "masks": f"{len(hidden)} of {len(views)} training photos have one, which hides {sum(hidden) / len(hidden):.1%} of it"
+    }
+
+
+def _equalized(train: Sequence[View]) -> tuple[tuple[View, ...], dict[str, str]]:
+    """The views at their common exposure, and a line for the plan."""
+    depths = [view.depth for view in train if view.depth is not None]
+    if len(depths) < len(train):
+        _log.warning(
+            "data.views.equalize has no effect: there is no depth that tells what the photos share. Set data.cloud.init=stereo."
+        )
+        return tuple(train), {}
+    gains = exposure_gains([view.depth_photo for view in train], depths)
+    span = f"photos times {float(gains.min()):.3f} to {float(gains.max()):.3f}"
+    if float((gains - 1).abs().max()) < _SAME_EXPOSURE:
+        return tuple(train), {"exposure of the photos": f"the same ({span})"}
+    equal = tuple(view.brightened(gain) for view, gain in zip(train, gains, strict=True))
+    return equal, {"equalized": f"{span} (data.views.equalize)"}
+
+
 def _grey_levels(differences: Sequence[Tensor]) -> float:
     """The mean over images of their mean difference, in grey levels of 255."""
     return 255 * sum(float(difference.mean()) for difference in differences) / len(differences)
 
 
 def _reduced(frame: Frame, views: ViewSettings) -> Photo:
+    """The photo at the size that `views` asks for, and its mask: a pixel is shown if all that it covers is."""
+    image = frame.load()
+    photo = _sized(image, frame.camera, views)
+    if frame.shown is None:
+        return photo
+    shown = frame.shown().float()[..., None].expand(-1, -1, 3)
+    shown = images.resize(shown, (image.shape[1], image.shape[0]), "area")  # within_limit reduces photos alone
+    return replace(photo, shown=_sized(shown, frame.camera, views).image[..., 0] > _WHOLE)
+
+
+def _sized(image: Tensor, camera: Camera, views: ViewSettings) -> Photo:
     """The photo reduced by `shrink`, with sizes that are whole at both scales; see `ViewSettings.sizes`."""
-    image, camera = frame.load(), frame.camera
     multiple = 1 if views.photos_are == "lr" else views.sr_scale
     if views.sizes == "round":
         width, height = (multiple * size for size in lr_size(camera, views))

@@ -41,6 +41,9 @@ class ViewSettings:
             SR images, and LR is made from them.
         downsample: D, the operator that makes LR.
         lr_folder: ready-made LR images by the photos' names, instead of making them.
+        equalize: bring the training photos to their common exposure and white balance, by a gain for each photo and channel
+            (`clear_strategies.geometry.exposure_gains`); needs the depth of data.cloud.init=stereo or auto. Test photos stay as
+            they are.
 
     Raises:
         SettingError: a value is outside its range, or contradicts another.
@@ -58,6 +61,7 @@ class ViewSettings:
     photos_are: PhotosAre = "lr"
     downsample: DownKernel = "bicubic"
     lr_folder: str | None = None
+    equalize: bool = False
 
     def __post_init__(self) -> None:
         if self.train_names is not None:

@@ -119,7 +119,7 @@ def _widened(photo: Photo, field: float) -> PseudoView:
     wide = replace(c, cx=c.cx + x, cy=c.cy + y, width=c.width + 2 * x, height=c.height + 2 * y)
     image = torch.nn.functional.pad(photo.image, (0, 0, x, x, y, y))
     known = torch.zeros(wide.height, wide.width, dtype=torch.bool)
-    known[y : y + c.height, x : x + c.width] = True
+    known[y : y + c.height, x : x + c.width] = True if photo.shown is None else photo.shown
     return PseudoView(Photo(wide, image), known)
 
 

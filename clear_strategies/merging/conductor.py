@@ -163,7 +163,7 @@ class Conductor:
         self.forget_logs()
         with stage("losses LR"):
             low = rendered.image.detach()
-            l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, view.lr.image)  # Eq. 4
+            l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, view.lr.image, view.lr.shown)  # Eq. 4
         where = f"t={t}, view {view.name}"
         require_finite_losses(where, l_lr.values, {"the LR photo": view.lr.image, "the LR render": low})
         g_lr: Any = None
@@ -313,7 +313,7 @@ class Conductor:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage, view = self.work_log.stage, step.view
         with stage("losses HR"):
-            losses = self.objective.hr(hr.image.detach(), view.hr.image)  # Eq. 5
+            losses = self.objective.hr(hr.image.detach(), view.hr.image, view.hr.shown)  # Eq. 5
         require_finite_losses(where, losses.values, {"the SR image": view.hr.image, "the HR render": hr.image})
         with stage("backward HR"):  # one pass for all cotangents
             both = losses.cotangents if lr_cotangents is None else torch.cat((lr_cotangents, losses.cotangents))

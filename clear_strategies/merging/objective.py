@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, get_args
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
@@ -79,24 +80,34 @@ class Objective:
         """Whether Î_LR is rendered; else it is the area mean of Î_HR, which is then needed at every iteration."""
         return self.lr_from == "lr" and self.lambda_lr > 0
 
-    def lr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:
-        """L_LR, and the cotangent of λ_LR L_LR."""
+    def lr(
+        self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None = None
+    ) -> Losses:
+        """L_LR, and the cotangent of λ_LR L_LR.
+
+        Args:
+            shown: where False the target counts as equal to the image, and the cotangent is 0.
+        """
         compared = self._clamped(image)
+        target = _beside_hidden(target, compared, shown)
         cotangents = compared.new_empty(1, *compared.shape)
         loss = kernels.photometric(compared, target, self.lambda_ssim, kernels=self.kernels, out=cotangents[0])  # Eq. 4
         if self.lambda_lr != 1:
             cotangents *= self.lambda_lr
-        return self._losses({"lr": loss}, image, cotangents)
+        return self._losses({"lr": loss}, image, cotangents, shown)
 
-    def hr(self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"]) -> Losses:
-        """L_base and L_HF, two cotangents; L_base alone where λ_HF = 0."""
+    def hr(
+        self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None = None
+    ) -> Losses:
+        """L_base and L_HF, two cotangents; L_base alone where λ_HF = 0. `shown` as for `lr`."""
         compared, use = self._clamped(image), self.kernels
+        target = _beside_hidden(target, compared, shown)
         cotangents = compared.new_empty(2 if self.lambda_hf > 0 else 1, *compared.shape)
         base = kernels.photometric(compared, target, self.lambda_ssim_hr, kernels=use, out=cotangents[0])  # Eq. 5
         losses = {"base": base}
         if self.lambda_hf > 0:
             losses["hf"] = kernels.haar_l1(compared, target, self.haar_levels, kernels=use, out=cotangents[1])  # Eq. 5
-        return self._losses(losses, image, cotangents)
+        return self._losses(losses, image, cotangents, shown)
 
     def _clamped(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
         return image.clamp(0, 1) if self.clamp_render else image
@@ -106,7 +117,16 @@ class Objective:
         losses: Mapping[str, LossAndGradient],
         image: Float[Tensor, "H W 3"],
         cotangents: Float[Tensor, "K H W 3"],
+        shown: Bool[Tensor, "H W"] | None,
     ) -> Losses:
+        if shown is not None:
+            cotangents *= shown[..., None]
         if self.clamp_render:
             cotangents *= (image >= 0) & (image <= 1)
         return Losses({name: deferred.scalar(loss.value) for name, loss in losses.items()}, cotangents)
+
+
+def _beside_hidden(
+    target: Float[Tensor, "H W 3"], image: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None
+) -> Float[Tensor, "H W 3"]:
+    return target if shown is None else torch.where(shown[..., None], target, image)

@@ -144,7 +144,7 @@ def _gradients(
     objective = replace(conductor.objective, lambda_hr=_ALWAYS_ON)
     aside = Conductor(*copy.deepcopy(conductor.strategies), objective=objective)
     lr, hr = (cast(FieldShot, shot) for shot in field.render_scales(rasterizer, view))  # both scales are asked for
-    (g_lr,) = lr.vjp(objective.lr(lr.image.detach(), view.lr.image).cotangents)
+    (g_lr,) = lr.vjp(objective.lr(lr.image.detach(), view.lr.image, view.lr.shown).cotangents)
     merged = aside.merge(field.raw(), g_lr, aside.hr_gradients(hr, view, t=1), t=1)
     corrects = aside.owner("correct") is not None
     return g_lr, cast(Grads, merged.hr), merged.corrected if corrects else None

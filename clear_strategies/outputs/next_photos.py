@@ -2,7 +2,8 @@
 
 A photo shows a surface as far as it looks at it from the same side. Two photos give a surface its depth, so a further photo is
 worth most where one photo shows what it shows; half as much where none does or two do, and nothing where `ENOUGH` do. It also
-has to share two thirds of its picture with two photos, or neither its pose nor its depth would be sound. `bench next_photo` measures what photos from there bring.
+has to share two thirds of its picture with two photos, or neither its pose nor its depth would be sound.
+`bench next_photo` measures what photos from there bring.
 """
 
 from __future__ import annotations

@@ -49,9 +49,11 @@ def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> Number:
     for view in state.views[:_VIEWS_OF_LOSS]:
         if objective.lambda_hr(state.t) > 0:
             shown = state.skip_policy.view(view, state.t).hr
-            loss = objective.hr(state.field.render(rasterizer, shown.camera), shown.image).values["base"]
+            loss = objective.hr(state.field.render(rasterizer, shown.camera), shown.image, shown.shown).values["base"]
         else:
-            loss = objective.lr(state.field.render(rasterizer, view.lr.camera), view.lr.image).values["lr"]
+            loss = objective.lr(state.field.render(rasterizer, view.lr.camera), view.lr.image, view.lr.shown).values[
+                "lr"
+            ]
         losses.append(loss)
     return sum(losses) / len(losses)
 

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from clear_strategies.core import deferred, images
+from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.view import Photo, View
+from clear_strategies.core.view import View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import SettingError
 from clear_strategies.schedules import milestone
@@ -88,7 +88,7 @@ class SkipPolicy:
         if t > self.skips.coarse_until or view.factor % _REDUCED:
             return view
         if view.name not in self._coarse:
-            hr = Photo(view.hr.camera.scaled(1 / _REDUCED), images.downsample(view.hr.image, _REDUCED, "area"))
+            hr = view.hr.reduced(_REDUCED)
             self._coarse[view.name] = replace(view, hr=hr, truth=None)
         return self._coarse[view.name]
 

@@ -291,3 +291,27 @@ def test_stereo_compares_the_hr_side_where_it_is_photos_and_no_sr_images(photos_
         assert (shown.camera.width, shown.camera.fx) == (compared[0], view.hr.camera.fx / factor)
         of = view.lr.image if compared[0] == 16 else images.area_mean(view.hr.image, factor)
         assert torch.equal(shown.image, of)
+
+
+@pytest.mark.slow
+def test_equalized_photos_lose_their_casts_at_both_scales_and_test_photos_keep_theirs():
+    known = demo.read(width=160, height=120)
+    names = [f.name for f in known.frames if f.split == "train"]
+    casts = dict(zip(names, torch.tensor([[0.9, 1.0, 1.0], [1.0, 1.0, 0.92], [1.0, 1.05, 1.0]]), strict=True))
+    shown = {f.name: (f.load() * casts.get(f.name, 0.8)).clamp(0, 1) for f in known.frames}
+    frames = tuple(replace(f, load=lambda name=f.name: shown[name]) for f in known.frames)
+    wanted = ViewSettings(photos_are="hr", sr_scale=2, equalize=True)
+    made = prepare(Capture("cast", frames), wanted, Bicubic(), CloudSettings(init="stereo"))
+    common = torch.stack(list(casts.values())).log().mean(0).exp()
+    for view in made.train:
+        before = images.downsample(shown[view.name], 2).mean((0, 1))
+        assert torch.allclose(casts[view.name] * view.lr.image.mean((0, 1)) / before, common, atol=0.01)
+        assert torch.allclose(view.hr.image.mean((0, 1)), view.lr.image.mean((0, 1)), atol=2e-3)
+    assert made.notes["equalized"].startswith("photos times 0.9")
+    assert all(torch.equal(view.truth, shown[view.name]) for view in made.test)
+
+
+def test_without_depth_equalize_says_that_it_has_no_effect(caplog):
+    made = prepare(capture(), ViewSettings(sr_scale=2, equalize=True), Bicubic(), POINTS)
+    assert "data.views.equalize has no effect" in caplog.text
+    assert "equalized" not in made.notes

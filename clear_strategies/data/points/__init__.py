@@ -11,6 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import DepthMap, Photo
@@ -202,6 +206,7 @@ def _from_photos(
         known: SfM points of the training views alone; with them nothing is triangulated.
     """
     auto = settings.init == "auto"
+    photos = [_blackened(photo) for photo in photos]
     if auto and sfm is not None and known is None:
         _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
     features = triangulate(photos, settings.triangulation) if known is None else known
@@ -211,14 +216,20 @@ def _from_photos(
             finer = [photo.reduced(photo.factor_to(stereo.max_pixels)) for photo in sharper]
             if (ratio := finer[0].camera.width / photos[0].camera.width) > 1:
                 # The points between them, whose depth is guessed, stay as few as at LR.
-                photos, stereo, stride = finer, stereo.finer(ratio), round(ratio * stride)
-        maps = depth_maps(photos, features.means, stereo, background)
+                photos, stereo, stride = (
+                    [_blackened(photo) for photo in finer],
+                    stereo.finer(ratio),
+                    round(ratio * stride),
+                )
+        masks = None if all(p.shown is None for p in photos) else [_shown(photo) for photo in photos]
+        maps = depth_maps(photos, features.means, stereo, background, masks)
         cloud = stereo_cloud(
             features,
             photos,
             maps,
             stereo,
             background=background,
+            masks=masks,
             fill=settings.densify is not False,
             stride=stride,
             outlier_neighbours=settings.outlier_neighbours,
@@ -242,6 +253,15 @@ def _from_photos(
     if auto:
         _log.debug("init: auto chose %s.", features.source)
     return _cleaned(settings, features, photos, background), ()
+
+
+def _blackened(photo: Photo) -> Photo:
+    """The photo with black in place of what is hidden: it has no features."""
+    return photo if photo.shown is None else replace(photo, image=photo.image * photo.shown[..., None])
+
+
+def _shown(photo: Photo) -> Bool[Tensor, "h w"]:
+    return torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown
 
 
 def _cleaned(

@@ -77,14 +77,14 @@ def read(
         pose = pose_from_opengl(file, f"{where}.transform_matrix", entry.get("transform_matrix"))
         lens = _lens(file, where, {**shared, **entry}, path)
         lenses.append(lens)
-        frames.append(Frame.of_photo(short[i], path, lens, pose, background=background, split=splits.get(name)))
+        mask_path = entry.get("mask_path")
+        hides = None if mask_path is None else inside(folder, str(mask_path), file=file, allow_outside=allow_outside)
+        frames.append(
+            Frame.of_photo(short[i], path, lens, pose, background=background, split=splits.get(name), mask=hides)
+        )
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(lenses, frames)}
     if splits:
         notes["split"] = _split_note(file, names, [names[i] for i in kept], splits)
-    masked = sum("mask_path" in entries[i] for i in kept)
-    if masked:
-        _log.warning("%s: masks (of %d frames) are not used.", file, masked)
-        notes["masks"] = f"not used ({masked} frames have one)"
     points = _points(folder, file, content, allow_outside)
     return Capture(folder.resolve().name, sorted_by_name(frames, file), points, background or (0.0, 0.0, 0.0), notes)
 

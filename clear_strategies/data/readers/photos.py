@@ -133,7 +133,7 @@ def _once_each(paths: Sequence[Path]) -> list[Path]:
 
 
 def _exposure(photos: Mapping[Path, Exif]) -> dict[str, str]:
-    """A note where EXIF says that exposures differ: nothing here corrects that."""
+    """A note where EXIF says that exposures differ; `ViewSettings.equalize` corrects that."""
     known = {path.name: exif.exposure for path, exif in photos.items() if exif.exposure is not None}
     if len(known) < 2:
         return {}
@@ -142,7 +142,10 @@ def _exposure(photos: Mapping[Path, Exif]) -> dict[str, str]:
     if stops <= _STOPS:
         return {}
     text = f"differs by {stops:.1f} stops between {low} and {high} (EXIF)"
-    _log.warning("the photos' exposure %s: brightness that jumps between views costs detail. Lock it next time.", text)
+    _log.warning(
+        "the photos' exposure %s. data.views.equalize=true, the default here, evens it out, except where light is clipped. "
+        "Lock it next time.", text,
+    )  # fmt: skip
     return {"exposure": text}
 
 

@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.readers import nerfstudio
 from tests.helpers import captures as tiny
 
@@ -71,10 +73,18 @@ def test_the_files_lists_split_the_frames_and_the_rest_is_logged(
     assert "1 frames are in none" in caplog.text
 
 
-def test_masks_are_ignored_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    capture = nerfstudio.read(changed(tmp_path, lambda v: v["frames"][0].update(mask_path="m.png")))
-    assert "masks" in caplog.text
-    assert capture.notes["masks"].startswith("not used (1")
+def test_the_masks_it_names_hide_their_black_pixels_and_are_undistorted_with_their_photos(tmp_path: Path) -> None:
+    mask = torch.ones(12, 16, 3)
+    mask[:, :4] = 0
+    write_png(tmp_path / "m.png", mask)
+    for lens in ({}, {"camera_model": "OPENCV", "k1": 0.05}):
+        named = changed(tmp_path, lambda v, lens=lens: v["frames"][0].update(mask_path="m.png", **lens))
+        shown = [frame.shown for frame in nerfstudio.read(named).frames]
+        assert sum(s is not None for s in shown) == 1
+        found = next(s for s in shown if s is not None)()
+        assert found.shape == (12, 16)
+        assert not found[:, :3].any()
+        assert found[:, 6:].all()
 
 
 def test_points_of_a_ply_have_no_tracks(tmp_path: Path) -> None:

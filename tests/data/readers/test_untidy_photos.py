@@ -36,6 +36,7 @@ def of_photos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Re
         for path in found:  # it makes copies of all of them
             read_image(path, turn=True)
         shutil.copytree(model, folder)
+        (folder / photos.sfm.UNPLACED).write_text("{}")
 
     monkeypatch.setattr(photos.sfm, "reconstruct", reconstruct)
     captures.write_photos(tmp_path / "photos")

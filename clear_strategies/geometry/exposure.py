@@ -1,0 +1,71 @@
+"""Photos at one exposure and white balance: a gain for each photo and channel, from the colours of surfaces that photos share.
+
+A camera that chooses its exposure for each photo multiplies linear light, and so does white balance. Where the sRGB curve is
+close to a power, the photo is multiplied by a power of the same number: one gain per channel describes both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.core.view import DepthMap, Photo
+from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
+
+_TOLERANCE: Final = 0.02  # relative difference of depth up to which two photos show the same surface
+_UNCLIPPED: Final = (0.05, 0.92)  # darker, a ratio is that of noise; lighter, the photo may have been clipped
+_FEWEST: Final = 100  # shared pixels of a pair, per channel
+
+
+def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float[Tensor, "V 3"]:
+    """The gains that bring the photos to their common exposure: photo × gain.
+
+    Each pair of photos gives the median ratio of the colours of the surfaces that both show; least squares over all pairs make
+    one gain of each photo of them. Over photos that are connected by pairs, the gains of a channel have the geometric mean 1.
+    A photo that shares nothing with another has the gain 1.
+
+    Args:
+        depths: of the photos, on their pixels.
+    """
+    ratios, weights, pairs = [], [], []
+    for a, (photo, depth) in enumerate(zip(photos, depths, strict=True)):
+        for b, (other, its_depth) in enumerate(zip(photos, depths, strict=True)):
+            if a != b:
+                ratio, weight = _ratio(photo, depth, other, its_depth)
+                pairs.append((a, b))
+                ratios.append(ratio)
+                weights.append(weight)
+    if not pairs:
+        return torch.ones(len(photos), 3)
+    difference = torch.zeros(len(pairs), len(photos), dtype=torch.float64)
+    for row, (a, b) in enumerate(pairs):
+        difference[row, a], difference[row, b] = 1, -1
+    root = torch.stack(weights).sqrt()  # [pairs, 3]
+    # The pseudo-inverse has the least norm: of what no pair tells, the mean of the logarithms, it says 0.
+    logs = [
+        torch.linalg.pinv(root[:, c, None] * difference) @ (root[:, c] * torch.stack(ratios)[:, c]) for c in range(3)
+    ]
+    return torch.exp(-torch.stack(logs, dim=1)).float()
+
+
+def _ratio(photo: Photo, depth: DepthMap, other: Photo, its_depth: DepthMap) -> tuple[Tensor, Tensor]:
+    """The median of log(photo / other) over the surfaces that both show, and how many pixels show one, by channel."""
+    rows, columns = torch.nonzero(depth.known, as_tuple=True)
+    surface = back_project(photo.camera, torch.stack((columns, rows), dim=1) + 0.5, depth.depth[rows, columns])
+    pixels, z = project(other.camera, surface)
+    shared = inside_of(other.camera, pixels, z)
+    column, row = torch.where(shared[:, None], pixels, 0.0).long().unbind(dim=1)
+    shared &= (its_depth.depth[row, column] / z - 1).abs() <= _TOLERANCE  # False where it is unknown
+    mine, theirs = photo.image[rows[shared], columns[shared]], sample_colors(other.image, pixels[shared])
+    low, high = _UNCLIPPED
+    usable = (mine > low) & (mine < high) & (theirs > low) & (theirs < high)
+    found, counts = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    for channel in range(3):
+        log = (mine / theirs).double().log()[usable[:, channel], channel]
+        if len(log) >= _FEWEST:
+            found[channel], counts[channel] = log.median(), len(log)
+    return found, counts

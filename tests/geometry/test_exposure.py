@@ -1,0 +1,68 @@
+"""Photos whose exposure differs come back to the common one; photos that do not differ stay as they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from clear_strategies.core.view import DepthMap, Photo, View
+from clear_strategies.geometry import exposure_gains
+from tests.helpers import planes
+
+DEPTH = 4.0
+CASTS = torch.tensor([[1.1, 1.0, 0.95], [0.92, 1.0, 1.08], [1.0, 1.04, 1.0]])
+
+
+def photos(casts: Tensor) -> list[Photo]:
+    """A plane between the brightnesses 0.25 and 0.75, each photo with its cast."""
+    shown = planes.plane_photos(3)
+    return [replace(p, image=((0.25 + p.image / 2) * cast).clamp(0, 1)) for p, cast in zip(shown, casts, strict=True)]
+
+
+def depths(count: int = 3) -> list[DepthMap]:
+    whole = torch.full((90, 120), DEPTH)
+    return [DepthMap(whole, torch.ones_like(whole))] * count
+
+
+def test_casts_are_found_up_to_their_geometric_mean():
+    gains = exposure_gains(photos(CASTS), depths())
+    assert torch.allclose(gains * CASTS, CASTS.log().mean(0).exp().expand(3, 3), atol=1e-3)
+    assert torch.allclose(gains.log().mean(0), torch.zeros(3), atol=1e-5)
+
+
+def test_photos_that_do_not_differ_keep_their_colours():
+    assert torch.allclose(exposure_gains(photos(torch.ones(3, 3)), depths()), torch.ones(3, 3), atol=1e-5)
+
+
+def test_clipped_pixels_tell_nothing():
+    casts = torch.tensor([[1.9, 1.9, 1.9], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    assert float((photos(casts)[0].image == 1).float().mean()) > 0.1
+    gains = exposure_gains(photos(casts), depths())
+    assert torch.allclose(gains[1] / gains[0], torch.full((3,), 1.9), atol=2e-3)
+
+
+def test_a_photo_that_shares_no_surface_keeps_its_colours_and_does_not_change_the_others():
+    unknown = DepthMap(torch.full((90, 120), torch.nan), torch.zeros(90, 120))
+    gains = exposure_gains(photos(CASTS), [*depths(2), unknown])
+    assert gains[2].tolist() == pytest.approx([1, 1, 1])
+    assert torch.allclose(gains[:2], exposure_gains(photos(CASTS)[:2], depths(2)), atol=1e-6)
+    assert exposure_gains(photos(CASTS)[:1], depths(1)).tolist() == [[1, 1, 1]]
+
+
+def test_a_surface_that_another_photo_does_not_show_tells_nothing():
+    behind = DepthMap(torch.full((90, 120), 1.5 * DEPTH), torch.ones(90, 120))
+    assert exposure_gains(photos(CASTS)[:2], [depths()[0], behind]).tolist() == [[1, 1, 1]] * 2
+
+
+def test_a_view_is_brightened_at_both_scales_and_its_photo_stays_its_truth():
+    lr, hr = planes.photo(), Photo(planes.camera(0, 80, 80), torch.full((80, 80, 3), 0.6))
+    gain = torch.tensor([1.5, 2.0, 0.5])
+    made = View("v", lr, hr, truth=torch.full((80, 80, 3), 0.5)).brightened(gain)
+    assert torch.equal(made.lr.image, (lr.image * gain).clamp(0, 1))
+    assert made.hr.image[0, 0].tolist() == pytest.approx([0.9, 1.0, 0.3])
+    assert made.truth is not None
+    assert made.truth[0, 0].tolist() == pytest.approx([0.75, 1.0, 0.25])
+    assert View("v", lr, hr, truth=hr.image).brightened(gain).hr_is_photo
