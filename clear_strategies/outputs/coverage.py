@@ -152,7 +152,9 @@ def _draw_next(axes: Axes, number: int, photo: NextPhoto, painter: Painter) -> N
     """What would be seen from there as far as it is known, redder where a photo is worth more."""
     image = painter.color(photo.camera)
     red = torch.tensor(_rgb(figures.RED)) / 255
-    weight = torch.nn.functional.interpolate(photo.worth[None, None], image.shape[:2], mode="nearest")[0, 0, ..., None]
+    weight = torch.nn.functional.interpolate(photo.worth.nan_to_num(0)[None, None], image.shape[:2], mode="nearest")[
+        0, 0, ..., None
+    ]
     axes.imshow((image * (1 - 0.6 * weight) + 0.6 * weight * red).numpy())
     axes.set_axis_off()
     told = f"next photo {number}: {photo.where}"
@@ -164,7 +166,7 @@ def _lines(found: Coverage, scene: Scene) -> list[str]:
     lines = ["WHERE TO STAND NEXT, aiming at the same spot"]
     lines += found.says() or ["nowhere: enough photos see all of what is seen at all"]
     lines += ["a step: the usual distance between neighbouring photos"]
-    lines += ["worth: of its pixels, those that one photo alone shows from there", ""]
+    lines += ["worth 100%: one photo alone shows all that it would show", ""]
     lines += [f"{'SURFACE SEEN BY':<24}  one   two   {ENOUGH} or more photos"]
     for name, (one, two, more) in list(found.shares.items())[:_MOST_LINES]:
         lines.append(f"{_short(name):<24} {one:4.0%}  {two:4.0%}  {more:4.0%}")

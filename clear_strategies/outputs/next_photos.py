@@ -2,7 +2,7 @@
 
 A photo shows a surface as far as it looks at it from the same side. Two photos give a surface its depth, so a further photo is
 worth most where one photo shows what it shows; half as much where none does or two do, and nothing where `ENOUGH` do. It also
-has to share two thirds of its picture with two photos, or neither its pose nor its depth would be sound.
+has to share half of what it shows with two photos, or its pose would not be sound. Background does not count.
 `bench next_photo` measures what photos from there bring.
 """
 
@@ -61,7 +61,7 @@ class NextPhoto:
     Args:
         camera: as large as the photos.
         where: in words; a step is the usual distance of neighbouring photos.
-        worth: of each pixel of a small picture, in [0, 1].
+        worth: of each pixel of a small picture, in [0, 1]; nan where there is no surface.
     """
 
     camera: Camera
@@ -71,7 +71,7 @@ class NextPhoto:
     @property
     def gain(self) -> float:
         """The mean of `worth`."""
-        return float(self.worth.mean())
+        return float(self.worth.nanmean())
 
 
 def with_depth(cameras: Sequence[Camera], painter: Painter) -> list[Seeing]:
@@ -92,15 +92,15 @@ def next_photos(photos: Mapping[str, Camera], painter: Painter, count: int = 2) 
     seeing, candidates = with_depth(list(photos.values()), painter), list(_candidates(photos, painter))
     chosen: list[NextPhoto] = []
     while len(chosen) < count and candidates:
-        overlaps = [float((seen_by(*place.seeing, seeing) >= _RELATED).float().mean()) for place in candidates]
+        overlaps = [_overlap(*place.seeing, seeing) for place in candidates]
         least = min(_OVERLAP, max(overlaps))
         worths = {
             i: 1 - (_shown(*candidates[i].seeing, seeing).clamp(max=ENOUGH) - 1).abs() / (ENOUGH - 1)
             for i, overlap in enumerate(overlaps)
             if overlap >= least
         }
-        best = max(worths, key=lambda i: float(worths[i].mean()))
-        if not worths[best].any():
+        best = max(worths, key=lambda i: float(worths[i].nanmean()))
+        if float(worths[best].nanmean()) == 0:
             break
         place = candidates.pop(best)
         chosen.append(NextPhoto(place.camera, place.where, worths[best]))
@@ -108,8 +108,13 @@ def next_photos(photos: Mapping[str, Camera], painter: Painter, count: int = 2) 
     return chosen
 
 
+def _overlap(camera: Camera, depth: Float[Tensor, "h w"], seeing: Sequence[Seeing]) -> float:
+    """The share of what is seen from there that photos enough see, to relate a photo to them."""
+    return float((seen_by(camera, depth, seeing)[depth.isfinite()] >= _RELATED).float().mean())
+
+
 def _shown(camera: Camera, depth: Float[Tensor, "h w"], seeing: Sequence[Seeing]) -> Float[Tensor, "h w"]:
-    """How many photos show what each pixel shows, those from the same side as a whole; 0 where nothing is."""
+    """How many photos show what each pixel shows, those from the same side as a whole; nan where nothing is."""
     rows, columns = torch.nonzero(depth.isfinite(), as_tuple=True)
     surface = back_project(camera, torch.stack((columns, rows), dim=1) + 0.5, depth[rows, columns])
     mine = torch.nn.functional.normalize(camera.center.float() - surface, dim=1)
@@ -117,7 +122,7 @@ def _shown(camera: Camera, depth: Float[Tensor, "h w"], seeing: Sequence[Seeing]
     for other, its_depth in seeing:
         theirs = torch.nn.functional.normalize(other.center.float() - surface, dim=1)
         total += sees(other, its_depth, surface) * (mine * theirs).sum(dim=1).clamp(min=0) ** _SIDE
-    shown = torch.zeros(depth.shape)
+    shown = torch.full(depth.shape, torch.nan)
     shown[rows, columns] = total
     return shown
 
