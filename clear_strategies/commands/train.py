@@ -23,6 +23,7 @@ or a Blender scene in the folder.
 It trains what we use ourselves (+strategy=best) on all photos for fit.iterations={_ITERATIONS}; settings change that, e.g.
 
   clear-strategies train photos/ fit.iterations=3000
+  clear-strategies train photos/ --minutes 4                      as good as it gets in four minutes
   clear-strategies train photos/ data.views.test_every=8          every 8th photo is kept for testing
   clear-strategies train photos/ data.views.max_hr_megapixels=8   sharper, slower, more memory
   clear-strategies train clip.mp4 data.reader.frames=24           so many of its sharpest frames
@@ -35,7 +36,7 @@ It trains what we use ourselves (+strategy=best) on all photos for fit.iteration
 CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
 _PLAIN: Final = re.compile(r"(/|\./|(\.\./)+)?[A-Za-z_][\w./-]*", re.ASCII)  # needs no quotes, for Hydra or a shell
 _NO_TEXT: Final = ("null", "true", "false", "nan", "inf")
-_CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "+protocol=", "+scene=")
+_CHOOSE_ITERATIONS: Final = ("fit.iterations=", "fit.minutes=", "experiment=", "+experiment=", "+protocol=", "+scene=")
 
 
 def main(arguments: list[str]) -> None:
@@ -64,7 +65,7 @@ def overrides(arguments: Sequence[str]) -> list[str]:
         raise SettingError(
             "train needs a folder of photos or a video first: clear-strategies train PHOTOS [setting=value …]."
         )
-    path, rest = Path(arguments[0]), list(arguments[1:])
+    path, rest = Path(arguments[0]), _settings(arguments[1:])
     if path.name == "transforms.json":
         path = path.parent
     if not path.is_dir() and not path.is_file():
@@ -75,6 +76,12 @@ def overrides(arguments: Sequence[str]) -> list[str]:
     )
     reader, root = detect(path) if path.is_dir() else ("photos", path)
     return [*chosen, f"data={reader}", f"data.path={_quoted(str(root))}", *rest]
+
+
+def _settings(arguments: Sequence[str]) -> list[str]:
+    """Hydra's overrides, with `--minutes M` or `--minutes=M` as one of them."""
+    joined = re.sub(r"(^|\0)--minutes[=\0]([^\0]*)", r"\1fit.minutes=\2", "\0".join(arguments))
+    return joined.split("\0") if joined else []
 
 
 def detect(folder: Path) -> tuple[str, Path]:

@@ -20,6 +20,8 @@ from clear_strategies.compose import tree
 from clear_strategies.data.prepare import save_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.jobs import device, resume, scene
+from clear_strategies.jobs.budget import Budget
+from clear_strategies.jobs.budget import Plan as TimePlan
 from clear_strategies.jobs.lock import hold
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.merging.conductor import Conductor
@@ -49,6 +51,7 @@ class _Training:
         compared: the configuration from `resume.comparable`, which a resumed run must have in common.
         folder: where its files go.
         pictures: what shows it there; None for a baseline, which the run's own pictures show.
+        timed: how it keeps to its minutes; None: it has no limit.
     """
 
     settings: JobSettings
@@ -56,6 +59,7 @@ class _Training:
     compared: Mapping[str, Any]
     folder: Path
     pictures: results.Pictures | None
+    timed: TimePlan | None = None
 
     @classmethod
     def of(cls, settings: JobSettings, values: Mapping[str, Any], folder: Path) -> _Training:
@@ -69,6 +73,19 @@ class _Training:
         without = replace(self.settings, strategies={})
         alone = _Training.of(without, {**values, "strategies": {}}, self.folder / BASELINE)
         return replace(alone, pictures=None)
+
+    def lasting(self, iterations: int) -> _Training:
+        """The same training with this number of iterations, whatever time it takes."""
+        settings = replace(self.settings, fit=replace(self.settings.fit, iterations=iterations, minutes=None))
+        compared = {**self.compared, "fit.iterations": iterations, "fit.minutes": None}
+        return replace(self, settings=settings, conductor=settings.conductor(settings.fit.stretch), compared=compared)
+
+    def timed_by(self, budget: Budget, place: _Place, trainings: int) -> _Training:
+        """The same training with as many iterations as fit into the time that is left for it and the others."""
+        fit = self.settings.fit
+        pilot, rasterizer = self.lasting(fit.iterations).start(place, None), place.drawing.rasterizer
+        plan = budget.iterations(pilot, rasterizer, trainings=trainings, maps=fit.map_views, frames=fit.video)
+        return replace(self.lasting(plan.iterations), timed=plan)
 
     @property
     def chosen(self) -> plan.Chosen:
@@ -136,6 +153,7 @@ def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = Non
     """
     values = tree(config)
     settings = settings_of(values)
+    budget = None if settings.fit.minutes is None else Budget.of(settings.fit.minutes)
     if settings.fit.viewer:
         live.require_viewer()
     if settings.fit.log == "tensorboard":
@@ -146,7 +164,7 @@ def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = Non
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
     with hold(folder):
         files.sweep(folder)
-        return _run(ours, baseline, drawing, watch)
+        return _run(ours, baseline, drawing, watch, budget)
 
 
 def _why_without_baseline(settings: JobSettings) -> str | None:
@@ -164,20 +182,27 @@ def _in_sweep() -> bool:
 
 
 def _run(
-    ours: _Training, baseline: _Training | None, drawing: device.Drawing, watch: Callable[[], None] | None
+    ours: _Training,
+    baseline: _Training | None,
+    drawing: device.Drawing,
+    watch: Callable[[], None] | None,
+    budget: Budget | None,
 ) -> float | None:
     settings = ours.settings
     if settings.fit.resume == resume.AUTO and (finished := resume.finished(ours.folder, ours.compared)) is not None:
         return finished[0]
     threads, why = device.threads(settings.fit.threads)
     torch.set_num_threads(threads)
-    loaded = scene.load(settings.data, settings.prior, settings.fit.seed, ours.conductor.prior)
+    loaded = scene.load(settings.data, settings.prior, settings.fit.seed, ours.conductor.prior, budget)
     if settings.data.save_lr is not None:
         save_lr(loaded, Path(settings.data.save_lr))
         return None
     device.log_choice(settings.rasterizer, drawing)
     drawing = drawing.over(loaded.background)
     place = _Place(loaded, loaded.to(drawing.device), drawing, watch)
+    if budget is not None:
+        ours = ours.timed_by(budget, place, 1 if baseline is None else 2)
+        baseline = None if baseline is None else baseline.lasting(ours.settings.fit.iterations)
     # Run and baseline are set up before either trains, so that an error does not come after the first has trained.
     source, first = settings.fit.resume, None
     if baseline is not None:
@@ -193,6 +218,7 @@ def _run(
         "rasterizer": f"{drawing.name}, kernel {drawing.kernel} px²",
         "threads": f"{threads} ({why})",
         "memory": memory.says(found, most),
+        **({} if ours.timed is None else {"time": ours.timed.says()}),
     }
     said = plan.describe(loaded, state, ours.chosen, machine)
     _log.log(level, "%s", said.short)
@@ -238,6 +264,8 @@ def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[
     """
     fit_settings, painter = training.settings.fit, Painter(state.field, place.drawing.make)
     calls = [] if place.watch is None else [place.watch]
+    if training.timed is not None:
+        calls.append(training.timed.hurry(state))
     with ExitStack() as open_:
         if fit_settings.viewer:
             saved, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, cast
 
 from clear_strategies.data.capture import Capture
@@ -16,8 +16,9 @@ from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_o
 from clear_strategies.data.priors.ncnn import factors, missing_packages
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.usable import Fault, require_faults
-from clear_strategies.data.view_settings import ViewSettings
+from clear_strategies.data.view_settings import ViewSettings, split
 from clear_strategies.errors import SettingError
+from clear_strategies.jobs.budget import Budget
 from clear_strategies.settings import LISTED
 
 _log = logging.getLogger(__name__)
@@ -92,15 +93,20 @@ def _photos(capture: Capture) -> dict[str, Callable[[], Any]]:
 
 
 def load(
-    data: DataSettings, prior: PriorSettings, seed: int, decorated: Callable[[Prior], Prior] = lambda prior: prior
+    data: DataSettings,
+    prior: PriorSettings,
+    seed: int,
+    decorated: Callable[[Prior], Prior] = lambda prior: prior,
+    budget: Budget | None = None,
 ) -> Scene:
     """Read the data set and prepare its views and its initial points.
 
     Args:
         decorated: what becomes of the chosen prior, see `Conductor.prior`.
+        budget: of the run; SR images get no larger than its time allows.
     """
     auto = isinstance(prior, AutoPrior) and data.save_lr is None
-    capture, views = read(data, prior)
+    capture, views = read(data, prior, budget)
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
     elif isinstance(prior, AutoPrior):
@@ -118,10 +124,16 @@ def load(
     return scene
 
 
-def read(data: DataSettings, prior: PriorSettings) -> tuple[Capture, ViewSettings]:
+def read(data: DataSettings, prior: PriorSettings, budget: Budget | None = None) -> tuple[Capture, ViewSettings]:
     """The capture as the data set has it, and the settings of its views, both within the limit of the HR images."""
     auto = isinstance(prior, AutoPrior) and data.save_lr is None
-    return within_limit(data.reader(), data.views, reaches=_reach(prior, auto), super_resolve=not auto)
+    capture, views = data.reader(), data.views
+    if budget is not None and views.photos_are == "lr" and not isinstance(prior, functools.partial):
+        network = prior.of(capture, views.sr_scale) if isinstance(prior, AutoPrior) else cast("Prior", prior)
+        found, limit = budget.megapixels(split(capture, views)[0], network), views.max_hr_megapixels
+        if found is not None and (limit is None or found < limit):
+            views = replace(views, max_hr_megapixels=found)
+    return within_limit(capture, views, reaches=_reach(prior, auto), super_resolve=not auto)
 
 
 def _reach(prior: PriorSettings, auto: bool) -> Callable[[int], bool]:

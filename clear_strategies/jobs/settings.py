@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -38,6 +39,8 @@ class RunSettings(FitSettings):
         resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: look into the run's own
             folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
             from the beginning. Both apply to the baseline, too.
+        minutes: of wall time that the whole run should take: the size of HR is reduced and the number of iterations is chosen for
+            it, `iterations` at most, by a measurement of some seconds. None: it takes as long as it takes.
         device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
             there, else cpu. A run may be resumed on another device; its bits then differ.
         threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib,
@@ -52,6 +55,7 @@ class RunSettings(FitSettings):
     viewer: bool = False
     baseline: bool = False
     resume: str | None = None
+    minutes: float | None = None
     device: Device | None = None
     threads: int | None = None
 
@@ -63,6 +67,13 @@ class RunSettings(FitSettings):
             raise SettingError(f"video must be at least 0 frames, got {self.video}. 0 writes no video.")
         if self.page < 0:
             raise SettingError(f"page must be at least 0 Gaussians, got {self.page}. 0 writes no page.")
+        if self.minutes is not None and not 0 < self.minutes < math.inf:
+            raise SettingError(f"minutes must be above 0, got {self.minutes}. null sets no limit.")
+        if self.minutes is not None and self.resume is not None:
+            raise SettingError(
+                "minutes and resume exclude each other: a resumed run has the iterations that it began with. "
+                "Leave minutes out, and name fit.iterations as the run's metrics.json or run.log has it."
+            )
         if self.threads is not None and self.threads < 1:
             raise SettingError(f"threads must be at least 1, got {self.threads}. null takes all cores.")
 

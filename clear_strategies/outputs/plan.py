@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 # What a user decides on, or wants to know before waiting for the result. The rest is for `-v` and run.log.
 _SHORT: Final[Sequence[str]] = (
     "scene", "poses", "HR side", "train views", "test views", "not used", "LR", "HR", "the SR images add", "initial points",
-    "method", "strategies", "rasterizer", "memory", "iterations", "skipped",
+    "method", "strategies", "rasterizer", "memory", "time", "iterations", "skipped",
 )  # fmt: skip
 
 

@@ -124,16 +124,19 @@ class TrainState:
         done, self.t = self.t, self.t + 1
         if not self.skip_policy.settled(self.history, done):
             return
-        to, skips = min(self.skip_policy.skips.plateau_to, self.settings.iterations), self.skip_policy.skips
-        left_out, self.t = to + 1 - self.t, to + 1
-        self.optimizer.steps += left_out  # the learning rates follow the iteration
-        self.conductor.work_log.skip(
-            "iterations", "the training views stopped improving (skips.plateau_gain)", left_out
+        skips = self.skip_policy.skips
+        gained = (
+            f"the training views' loss fell by less than {skips.plateau_gain:.1%} in {skips.plateau_window} iterations"
         )
-        _log.info(
-            "t=%d: the training views' loss fell by less than %.1f %% in %d iterations; training goes on at t=%d.",
-            done, 100 * skips.plateau_gain, skips.plateau_window, self.t,
-        )  # fmt: skip
+        self.go_on_after(min(skips.plateau_to, self.settings.iterations), gained)
+
+    def go_on_after(self, last: int, why: str) -> None:
+        """Leave out the iterations from the next one to `last`."""
+        left_out, before = last + 1 - self.t, self.t - 1
+        self.t = last + 1
+        self.optimizer.steps += left_out  # the learning rates follow the iteration
+        self.conductor.work_log.skip("iterations", why, left_out)
+        _log.info("t=%d: %s; training goes on at t=%d.", before, why, self.t)
 
     def refilter(self) -> None:
         """Recompute the 3D filter from the present means."""
