@@ -79,6 +79,8 @@ def _of_scene(results: Results, request: Request, scene: str, trainer: Trainer) 
     splat = open_splat(_folder(request, scene, first))
     poses = dict(zip((frame.name for frame in first), splat.poses(), strict=True))
     places = [(p.camera, float(splat.painter.depth(p.camera).nanmedian())) for p in next_photos(poses, splat.painter)]
+    if not places:
+        raise DataError(scene, "next photos", "the field shows nothing", "train longer: fit.iterations")
     advised = min(left, key=lambda frame: min(_apart(frame.camera, camera, focus) for camera, focus in places))
     gained = psnr(advised) - before
     drawn = np.random.default_rng(request.seed).permutation(len(left))[: request.others]
