@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 FILE: Final = "splat.html"
 _DISTANCE: Final = 20.0  # of the first camera from the scene in the page: covariances are float16 there
 _SEEN_FROM: Final = 16  # cameras whose colours are averaged, at most
-_POINT: Final = 0.03  # size of a point, in lengths of a camera
+_SHARE: Final = 0.6  # of the length of a camera in the viewer, where one is shown at a time
+_POINT: Final = 0.05  # size of a point, in lengths of a camera
 _DARK: Final = 0.5  # mean of the background's RGB below which the page is dark
 
 
@@ -78,7 +79,7 @@ def write_page(
 def write_points_page(
     path: Path, means: Float[Tensor, "N 3"], rgb: Float[Tensor, "N 3"], shown: Sequence[ShownCamera], title: str
 ) -> None:
-    """Write a page of points and cameras; it begins at the first camera. viser must be installed, see `missing`.
+    """Write a page of points and cameras; it begins behind and above them. viser must be installed, see `missing`.
 
     Args:
         rgb: colours of the points, in [0, 1].
@@ -90,8 +91,8 @@ def write_points_page(
     from clear_strategies.viewing.aim import add_camera, drawn_length
 
     cameras = [marked.camera for marked in shown]
-    with _page(path, cameras, title, dark=False) as (server, times):
-        length = times * drawn_length(cameras)
+    with _page(path, [paths.overview(cameras), *cameras], title, dark=False) as (server, times):
+        length = _SHARE * times * drawn_length(cameras)
         points = (means * times).cpu().numpy()
         server.scene.add_point_cloud("/points", points, rgb.cpu().numpy(), point_size=_POINT * length)
         for i, marked in enumerate(shown):

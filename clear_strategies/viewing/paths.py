@@ -16,6 +16,7 @@ from rasterizers.interface import Camera
 _MOST_KEYS: Final = 24  # a path through more cameras passes these, as far apart as possible
 _WRAP: Final = 3  # keys repeated at both ends, so that the rotation's spline has no seam
 _SURROUNDED: Final = 0.5  # mean direction from the scene to the cameras: shorter than this, they stand around it
+_BEHIND, _ABOVE = 1.6, 0.9  # of the distance of the farthest camera from the scene: where an overview stands
 _SWAY: Final = 0.1  # of the distance to the scene: the radii of the ellipse for a single camera
 
 
@@ -82,6 +83,16 @@ def ellipse(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     angles = np.linspace(0, 2 * np.pi, frames, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1) * radii
     return [_placed(cameras[0], center, _looking(center, focus, up)) for center in middle + circle @ plane]
+
+
+def overview(cameras: Sequence[Camera]) -> Camera:
+    """A camera behind and above all of them that looks at what they look at, with the first one's lens and size."""
+    centers, focus, up = _centers(cameras), look_at(cameras), _unit(-_axes(cameras)[:, :, 1].mean(0))
+    offsets = centers - focus
+    facing = (offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)).mean(0)
+    behind = _unit(facing if np.linalg.norm(facing) >= _SURROUNDED else offsets[0])
+    center = focus + np.linalg.norm(offsets, axis=1).max() * (_BEHIND * behind + _ABOVE * up)
+    return _placed(cameras[0], center, _looking(center, focus, up))
 
 
 def look_at(cameras: Sequence[Camera]) -> Float[np.ndarray, " 3"]:

@@ -33,6 +33,17 @@ def centers(cameras: list[Camera]) -> np.ndarray:
     return np.stack([camera.center.numpy() for camera in cameras])
 
 
+@pytest.mark.parametrize("cameras", [RING, RING[:3], [at((0, 0, -3))]], ids=["around", "in front", "one"])
+def test_an_overview_stands_above_the_cameras_and_farther_away_and_looks_at_the_scene(cameras):
+    above = paths.overview(cameras)
+    place, focus = above.center.numpy(), paths.look_at(cameras)
+    assert place[1] < min(camera.center[1] for camera in cameras)  # y points down
+    farthest = max(np.linalg.norm(camera.center.numpy() - focus) for camera in cameras)
+    assert np.linalg.norm(place - focus) > 1.5 * farthest
+    forward = above.world_to_camera[2, :3].numpy()
+    assert forward @ (focus - place) / np.linalg.norm(focus - place) == pytest.approx(1, abs=1e-6)
+
+
 def test_a_path_passes_its_cameras_and_is_even_and_closed():
     path = centers(paths.through(SHUFFLED, 120))
     for camera in RING:
