@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from clear_strategies.strategies.gco import GCO
     from clear_strategies.strategies.p2g import P2G
     from clear_strategies.strategies.pseudo_views import PseudoViews
+    from clear_strategies.strategies.random_background import RandomBackground
     from clear_strategies.strategies.splatsure import SplatSuRe
     from clear_strategies.strategies.svs import SVS
 
@@ -46,6 +47,7 @@ __all__ = [
     "Objective",
     "Photo",
     "PseudoViews",
+    "RandomBackground",
     "Run",
     "ScreenGradients",
     "Shot",
@@ -73,6 +75,7 @@ _NAMES: Final = {  # by the module of this package that they are defined in
     "strategies.gco": ("GCO",),
     "strategies.p2g": ("P2G",),
     "strategies.pseudo_views": ("PseudoViews",),
+    "strategies.random_background": ("RandomBackground",),
     "strategies.splatsure": ("SplatSuRe",),
     "strategies.svs": ("SVS",),
 }

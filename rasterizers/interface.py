@@ -303,6 +303,21 @@ class RasterSettings:
             raise ValueError(f"background must be three numbers in [0, 1], got {self.background}.")
 
 
+def over(rasterizer: Rasterizer, background: tuple[float, float, float] | None) -> Rasterizer:
+    """The rasterizer with another background, RGB in [0, 1]; itself for None.
+
+    Raises:
+        TypeError: it does not have the settings of `RasterSettings`.
+    """
+    if background is None:
+        return rasterizer
+    if not isinstance(rasterizer, RasterSettings):
+        raise TypeError(
+            f"{type(rasterizer).__name__} has no background that could change; derive it from RasterSettings."
+        )
+    return replace(rasterizer, background=background)
+
+
 PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(
     {
         "fast": MappingProxyType({"alpha_min": 1 / 255, "transmittance_min": 1e-4}),

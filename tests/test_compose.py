@@ -275,7 +275,14 @@ def test_a_host_gets_the_strategies_and_the_decorators_of_best():
     run = settings_of(tree(composed("+strategy=best")))
     best = conductor("best")
     assert [type(s) for s in best.strategies] == [type(s) for s in run.conductor(1.0).strategies]
-    assert [type(s).__name__ for s in best.strategies] == ["GCO", "P2G", "SVS", "PseudoViews", "FadingOpacity"]
+    assert [type(s).__name__ for s in best.strategies] == [
+        "GCO",
+        "P2G",
+        "SVS",
+        "PseudoViews",
+        "FadingOpacity",
+        "RandomBackground",
+    ]
     assert best.prior(Bicubic()) == run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic())
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,6 +12,8 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from rasterizers.interface import Camera
+
+_KNOWN_SHARE: Final = 0.3  # of a block's pixels, for its depth to be known
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +81,26 @@ class DepthMap:
     def coverage(self) -> float:
         """The share of pixels with depth."""
         return float(self.known.float().mean())
+
+    def reduced(self, factor: int) -> DepthMap:
+        """The median depth of each block of `factor` × `factor` pixels, and their mean confidence; unknown where less than
+        `_KNOWN_SHARE` of them are known.
+        """
+        if factor == 1:
+            return self
+        depth, confidence = (
+            images.crop_to_multiple(x[..., None], factor)[..., 0].unfold(0, factor, factor).unfold(1, factor, factor)
+            .flatten(2) for x in (self.depth, self.confidence)
+        )  # fmt: skip
+        known = (confidence > 0).float().mean(dim=-1)
+        enough = known >= _KNOWN_SHARE
+        mean = confidence.mean(dim=-1) / known.clamp_min(torch.finfo(known.dtype).tiny)
+        return DepthMap(torch.where(enough, depth.nanmedian(dim=-1).values, torch.nan), torch.where(enough, mean, 0.0))
+
+    def completed_by(self, other: DepthMap) -> DepthMap:
+        """This map, and where it knows nothing, `other`, a map of the same photo."""
+        depth = torch.where(self.known, self.depth, other.depth)
+        return DepthMap(depth, torch.where(self.known, self.confidence, other.confidence))
 
     def to(self, device: torch.device | str) -> DepthMap:
         """The same map on `device`."""

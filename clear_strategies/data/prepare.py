@@ -63,7 +63,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     train, test = tuple(found[: len(train_frames)]), tuple(found[len(train_frames) :])
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
     initial = initial_points(
-        cloud, [v.lr for v in train], sharper=[v.hr for v in train] if views.photos_are == "both" else (),
+        cloud, [v.lr for v in train], hr=[v.hr for v in train], hr_is_photo=views.photos_are == "both",
         sfm=capture.points, train_ids=ids, sfm_is_train=not held_out, background=capture.background, seed=seed,
     )  # fmt: skip
     points = initial.cloud

@@ -24,13 +24,13 @@ from clear_strategies.errors import StrategyConflict
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.iteration import HrGradients, Merged, Stepper, Update, require_finite_parts
 from clear_strategies.merging.objective import Losses, Objective
-from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
+from clear_strategies.strategies.base import Color, ScreenGradients, Strategy, by_class, overrides
 
 _log = logging.getLogger(__name__)
 
 P = TypeVar("P")
 
-_ONE_ANSWER: Final = ("gate", "observe", "route", "correct", "score")
+_ONE_ANSWER: Final = ("background", "gate", "observe", "route", "correct", "score")
 
 
 class Conductor:
@@ -115,6 +115,10 @@ class Conductor:
         if z is None:
             self.work_log.skip("gate", "no Gaussian is dropped at this rate")
         return z
+
+    def background(self, t: int) -> Color | None:
+        """The colour behind every rendering of iteration t; None: the scene's own."""
+        return self._one["background"].background(t) if "background" in self._one else None
 
     def wants_hr(self, t: int) -> bool:
         """Whether the HR render has any use at t: λ_HR > 0, Î_LR is made of it, or a densification score needs it."""

@@ -1,7 +1,8 @@
 """The contract of a strategy. A strategy answers questions about one training iteration; it knows no rasterizer.
 
 The hooks are phases of an iteration, so their order needs no configuration. A hook that no strategy overrides is never
-called. At most one strategy may override each of the hooks with a single answer: gate, observe, route, correct, score.
+called. At most one strategy may override each of the hooks with a single answer: background, gate, observe, route, correct,
+score.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import Grads, Shot
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
+
+Color = tuple[float, float, float]
+"""RGB in [0, 1]."""
 
 _DEVICE = "device"
 
@@ -74,6 +78,10 @@ class Strategy:
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """Before render: which Gaussians take part? z >= 0 multiplies the opacity; None: all of them.  Eq. 15"""
+        raise NotImplementedError
+
+    def background(self, t: int) -> Color | None:
+        """Before render: over which colour are both scales and the extra views rendered? None: the scene's own."""
         raise NotImplementedError
 
     def observe(self, step: Step, hr: Shot) -> Evidence | None:

@@ -83,12 +83,17 @@ def check_gradients_are_left_alone(make: Make) -> None:
 
 
 def check_answers_have_their_shapes(make: Make) -> None:
-    """One number per Gaussian from gate and score, the same attributes and shapes from the merge, all finite."""
+    """One number per Gaussian from gate and score, a colour from background, the merge's attributes and shapes, all finite."""
     conductor = _conductor(make)
     lr, hr, view, params = _situation(1)
     for t in range(1, _STEPS):
         z = conductor.gate(t, _N)
         _require(z is None or (z.shape == (_N,) and bool((z >= 0).all())), "gate() must give [N] numbers >= 0, or None")
+        color = conductor.background(t)
+        _require(
+            color is None or (len(color) == 3 and all(0 <= c <= 1 for c in color)),
+            f"background() must give three numbers in [0, 1], or None, got {color}",
+        )
         update = conductor.update(params, lr, hr, view, t)
         _require(update.score.shape == (_N,), f"score() gave {tuple(update.score.shape)} for {_N} Gaussians")
         for name, gradient in _grads(update).items():
@@ -221,6 +226,7 @@ def _trace(conductor: Conductor, start: int, stop: int) -> Any:
         lr, hr, view, params = _situation(100 + t)
         z = conductor.gate(t, _N)
         yield torch.ones(_N) if z is None else z
+        yield torch.tensor(conductor.background(t) or (0.0, 0.0, 0.0))
         update = conductor.update(params, lr, hr, view, t)
         yield update.score
         grads = _grads(update)

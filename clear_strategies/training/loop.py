@@ -29,7 +29,7 @@ from clear_strategies.training.signals import Interrupted, deferred_signals, for
 from clear_strategies.training.skips import PLATEAU_LOSS
 from clear_strategies.training.state import TrainState
 from rasterizers import native
-from rasterizers.interface import Rasterizer
+from rasterizers.interface import Rasterizer, over
 
 
 def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
@@ -38,16 +38,17 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = s.skip_policy.view(s.view(), t)
     scales = {"lr": ask.wants_lr, "hr": ask.wants_hr(t) and (not ask.wants_lr or s.skip_policy.hr_due(t, ask.work_log))}
+    before_color = over(rasterizer, ask.background(t))
     z = ask.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in scales.items() if wanted)}"):
-        lr, hr = θ.render_scales(rasterizer, view, gate=z, **scales)  # Î_LR, Î_HR     Eq. 2, 3
+        lr, hr = θ.render_scales(before_color, view, gate=z, **scales)  # Î_LR, Î_HR     Eq. 2, 3
     drawn = [shot for shot in (lr, hr) if shot is not None]
     u = ask.update(θ.raw(), lr, hr, view, t, s.compiled_step)
     if u.grads is not None:  # else the compiled step has made the step
         with stage("optimizer"):
             s.optimizer.step(θ.raw(), u.grads, torch.stack([shot.visible for shot in drawn]).any(0))
             θ.constrain()
-    extra = extra_steps(s, rasterizer, ask.extra_views(t))
+    extra = extra_steps(s, before_color, ask.extra_views(t))
     ask.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
     s.density.accumulate(u, drawn[-1], t)  # S^dens         Eq. 14
     with stage("density and filter"):

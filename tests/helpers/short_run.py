@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor, FadingOpacity, Objective, PseudoViews, Strategy
+from clear_strategies import GCO, P2G, SVS, Conductor, FadingOpacity, Objective, PseudoViews, RandomBackground, Strategy
 from clear_strategies.core.view import DepthMap
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
@@ -65,6 +65,7 @@ def start(
         ),
         "pseudo_views": lambda: PseudoViews(count=8, reach=0.1),
         "fading_opacity": lambda: FadingOpacity(rate=0.02, until=1_350),
+        "random_background": lambda: RandomBackground(until=ITERATIONS - 2),
     }
     objective = Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
     return TrainState.start(

@@ -17,6 +17,7 @@ from clear_strategies import (
     Grads,
     Objective,
     PseudoViews,
+    RandomBackground,
     SplatSuRe,
     Step,
     Strategy,
@@ -44,8 +45,8 @@ class Halve(Strategy):
 
 @pytest.mark.parametrize(
     "make",
-    [GCO, P2G, SVS, SplatSuRe, PseudoViews, FadingOpacity, Halve, lambda: SVS(anchor_strength=0.01)],
-    ids=["GCO", "P2G", "SVS", "SplatSuRe", "PseudoViews", "FadingOpacity", "own", "loose"],
+    [GCO, P2G, SVS, SplatSuRe, PseudoViews, FadingOpacity, RandomBackground, Halve, lambda: SVS(anchor_strength=0.01)],
+    ids=["GCO", "P2G", "SVS", "SplatSuRe", "PseudoViews", "FadingOpacity", "RandomBackground", "own", "loose"],
 )
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
 def test_contract(make, check):

@@ -32,7 +32,7 @@ STATES = [
     ("p2g",),
     ("svs",),
     ("gco", "p2g", "svs"),
-    ("gco", "p2g", "svs", "pseudo_views", "fading_opacity"),
+    ("gco", "p2g", "svs", "pseudo_views", "fading_opacity", "random_background"),
 ]
 
 

@@ -11,21 +11,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-import torch
-from jaxtyping import Bool
-from torch import Tensor
-
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import SfmPoints
+from clear_strategies.data.points.compared import blackened, compared_at
 from clear_strategies.data.points.files import from_ply, from_sfm, from_tracks
 from clear_strategies.data.points.random import random_cloud
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, voxel_grid, without_outliers
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.filling import STRIDE
-from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.interpolation import densify, pixel_grid
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
@@ -40,6 +36,7 @@ __all__ = [
 _log = logging.getLogger(__name__)
 
 Init = Literal["auto", "stereo", "triangulated", "sfm_train", "sfm", "ply", "random"]
+Compare = Literal["hr", "lr"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +63,9 @@ class CloudSettings:
             points (itself included) exceeds the average by more than `outlier_ratio` standard deviations; 0
             neighbours: no point is removed.
         voxel: points are averaged in cubes of this edge, world units; None: they are not.
+        compare: the images that stereo compares. "hr": those at HR, up to `stereo.max_pixels`. Where these are photos, maps and
+            points are made at their size; where a prior made them, they only sharpen the depth of the LR photos.
+            "lr": the LR photos.
         max_points: a larger cloud is reduced to this many points, chosen at random.
         triangulation: for init=stereo, triangulated and auto.
         stereo: for init=stereo and auto.
@@ -85,6 +85,7 @@ class CloudSettings:
     outlier_neighbours: int = OUTLIER_NEIGHBOURS
     outlier_ratio: float = OUTLIER_RATIO
     voxel: float | None = None
+    compare: Compare = "hr"
     max_points: int = MAX_POINTS
     triangulation: TriangulationSettings = field(default_factory=TriangulationSettings)
     stereo: StereoSettings = field(default_factory=StereoSettings)
@@ -93,6 +94,7 @@ class CloudSettings:
         require_choice("data.cloud.init", self.init, get_args(Init))
         if self.init == "ply" and not self.path:
             refuse("data.cloud.path", "init=ply needs a PLY file", self.path, "add data.cloud.path=…")
+        require_choice("data.cloud.compare", self.compare, get_args(Compare))
         require_choice("data.cloud.densify", self.densify, (True, False, "auto"))
         for name in ("min_views", "enough", "stride", "random_points", "max_points"):
             require_whole(f"data.cloud.{name}", getattr(self, name), least=1)
@@ -137,7 +139,8 @@ def initial_points(
     settings: CloudSettings,
     photos: Sequence[Photo],
     *,
-    sharper: Sequence[Photo] = (),
+    hr: Sequence[Photo] = (),
+    hr_is_photo: bool = False,
     sfm: SfmPoints | None = None,
     train_ids: Sequence[int] = (),
     sfm_is_train: bool = False,
@@ -148,7 +151,8 @@ def initial_points(
 
     Args:
         photos: the training views at LR.
-        sharper: the same at HR, where photos show it: stereo compares these instead. None where HR is made by a prior.
+        hr: the same at HR, see `CloudSettings.compare`; none: stereo compares `photos`.
+        hr_is_photo: these are photos, not SR images.
         sfm: the scene's SfM points, if it has some.
         train_ids: their ids of the training frames.
         sfm_is_train: every photo of the capture trains, so that init=auto may use the SfM points in place of triangulating.
@@ -170,7 +174,7 @@ def initial_points(
             cloud = _cleaned(settings, from_tracks(sfm, train_ids, settings.min_views), photos, background)
         case _:
             known = _of_training_alone(settings, sfm, train_ids) if sfm_is_train else None
-            cloud, depths = _from_photos(settings, photos, sharper, sfm, known, background)
+            cloud, depths = _from_photos(settings, photos, hr, hr_is_photo, sfm, known, background)
     if cloud is None:
         cloud = random_cloud(photos, settings.random_points, seed, settings.box)
     if settings.voxel is not None:
@@ -195,7 +199,8 @@ def _of_training_alone(settings: CloudSettings, sfm: SfmPoints | None, train_ids
 def _from_photos(
     settings: CloudSettings,
     photos: Sequence[Photo],
-    sharper: Sequence[Photo],
+    hr: Sequence[Photo],
+    hr_is_photo: bool,
     sfm: SfmPoints | None,
     known: PointCloud | None,
     background: tuple[float, float, float] | None,
@@ -206,32 +211,22 @@ def _from_photos(
         known: SfM points of the training views alone; with them nothing is triangulated.
     """
     auto = settings.init == "auto"
-    photos = [_blackened(photo) for photo in photos]
+    photos, hr = [blackened(photo) for photo in photos], [blackened(photo) for photo in hr]
     if auto and sfm is not None and known is None:
         _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
     features = triangulate(photos, settings.triangulation) if known is None else known
     if settings.init != "triangulated":
-        stereo, stride = settings.stereo, settings.stride
-        if sharper:
-            finer = [photo.reduced(photo.factor_to(stereo.max_pixels)) for photo in sharper]
-            if (ratio := finer[0].camera.width / photos[0].camera.width) > 1:
-                # The points between them, whose depth is guessed, stay as few as at LR.
-                photos, stereo, stride = (
-                    [_blackened(photo) for photo in finer],
-                    stereo.finer(ratio),
-                    round(ratio * stride),
-                )
-        masks = None if all(p.shown is None for p in photos) else [_shown(photo) for photo in photos]
-        maps = depth_maps(photos, features.means, stereo, background, masks)
+        compared = compared_at(photos, hr if settings.compare == "hr" else (), hr_is_photo, settings.stereo)
+        maps = compared.depth_maps(features.means, background)
         cloud = stereo_cloud(
             features,
-            photos,
+            compared.photos,
             maps,
-            stereo,
+            compared.settings,
             background=background,
-            masks=masks,
+            masks=compared.masks(compared.photos),
             fill=settings.densify is not False,
-            stride=stride,
+            stride=round(compared.finer * settings.stride),  # guessed points stay as few as at LR
             outlier_neighbours=settings.outlier_neighbours,
             outlier_ratio=settings.outlier_ratio,
         )
@@ -253,15 +248,6 @@ def _from_photos(
     if auto:
         _log.debug("init: auto chose %s.", features.source)
     return _cleaned(settings, features, photos, background), ()
-
-
-def _blackened(photo: Photo) -> Photo:
-    """The photo with black in place of what is hidden: it has no features."""
-    return photo if photo.shown is None else replace(photo, image=photo.image * photo.shown[..., None])
-
-
-def _shown(photo: Photo) -> Bool[Tensor, "h w"]:
-    return torch.ones(photo.image.shape[:2], dtype=torch.bool) if photo.shown is None else photo.shown
 
 
 def _cleaned(

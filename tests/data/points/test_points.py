@@ -13,6 +13,7 @@ from clear_strategies.core import images
 from clear_strategies.core.view import Photo
 from clear_strategies.data.ply import write_points
 from clear_strategies.data.points import CloudSettings, initial_points
+from clear_strategies.data.points.compared import compared_at
 from clear_strategies.data.readers import llff
 from clear_strategies.data.view_settings import ViewSettings, split
 from clear_strategies.errors import DataError, SettingError
@@ -45,6 +46,32 @@ def test_auto_takes_stereo_keeps_its_depth_and_says_how_much_is_known(caplog: py
     assert "dense stereo between the 3 photos (depth known at" in found.cloud.source
     assert "init: auto chose" in caplog.text
     assert ((found.cloud.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("compare", "hr_is_photo", "size"), [("hr", True, (96, 128)), ("hr", False, (48, 64)), ("lr", True, (48, 64))]
+)
+def test_stereo_at_hr_keeps_its_size_for_photos_and_that_of_lr_for_sr_images(compare, hr_is_photo, size) -> None:
+    hr = plane_photos(3, 128, 96)
+    lr = [photo.reduced(2) for photo in hr]
+    settings = CloudSettings(init="stereo", compare=compare, stereo=StereoSettings(max_planes=64))
+    found = initial_points(settings, lr, hr=hr, hr_is_photo=hr_is_photo)
+    assert [tuple(depth.depth.shape) for depth in found.depths] == [size] * 3
+    known = torch.cat([depth.depth[depth.known] for depth in found.depths])
+    assert ((known / 4 - 1).abs() < 0.03).float().mean() > 0.95
+
+
+def test_sr_images_beyond_the_limit_are_compared_at_a_whole_part_of_their_size() -> None:
+    hr = plane_photos(3, 128, 96)
+    lr = [photo.reduced(4) for photo in hr]
+
+    def sizes(max_pixels: int) -> tuple[int, int]:
+        compared = compared_at(lr, hr, hr_is_photo=False, settings=StereoSettings(max_pixels=max_pixels))
+        return compared.images[0].camera.width, compared.reduction
+
+    assert sizes(128 * 96) == (128, 4)
+    assert sizes(128 * 96 - 1) == (64, 2)
+    assert sizes(64 * 48 - 1) == (32, 1)
 
 
 def test_other_clouds_have_no_depth() -> None:

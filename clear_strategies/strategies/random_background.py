@@ -1,0 +1,57 @@
+"""RandomBackground: each iteration is rendered over another colour, so that surfaces become opaque.
+
+Over a black background, a dark surface can be thin: the background is as dark as it. From another camera something else shows
+through, and its dark parts are holes. Over a colour that changes at each iteration, only an opaque surface matches its photo.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from clear_strategies.core.view import View
+from clear_strategies.geometry.pseudo_views import cut_out
+from clear_strategies.schedules import milestone
+from clear_strategies.strategies.base import Color, Strategy
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RandomBackground(Strategy):
+    """A background of a random colour at each iteration, for photos that show surfaces everywhere.
+
+    Photos of an object before a plain background keep that background: they do show what is behind the object.
+
+    Args:
+        until: the iteration after which the background is the scene's own, so that the run ends on what it is tested with.
+    """
+
+    until: int = milestone(9_000)
+
+    def on_fit_start(self, n_views: int, seed: int) -> None:
+        super().on_fit_start(n_views, seed)
+        self.cache["seed"], self.cache["plain"] = seed, False
+
+    def wants_views(self) -> bool:
+        return True
+
+    def on_views(self, views: Sequence[View]) -> None:
+        """Whether the photos show an object before a plain background, or hide pixels by masks."""
+        if not views:
+            return
+        plain = cut_out((view.lr.to("cpu") for view in views), views[0].background)
+        self.cache["plain"] = plain or any(view.lr.shown is not None for view in views)
+        if plain:
+            _log.info("the background stays as it is: the photos show an object before it.")
+
+    def background(self, t: int) -> Color | None:
+        """RGB, uniform in [0, 1]: a function of (seed, t)."""
+        if t > self.until or self.cache.get("plain", False):
+            return None
+        generator = torch.Generator().manual_seed(self.cache.get("seed", 0) * 1_000_003 + t)
+        r, g, b = torch.rand(3, generator=generator).tolist()
+        return r, g, b

@@ -1,0 +1,61 @@
+"""RandomBackground: which colours, when, and for which photos none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from clear_strategies import RandomBackground
+from clear_strategies.core.view import Photo
+from clear_strategies.strategies.testing import check_strategy
+from clear_strategies.training.loop import iterate
+from tests.helpers.short_run import SCENE, start
+from tests.helpers.toy import RASTERIZER
+
+
+def prepared(views=SCENE.train, seed=5):
+    strategy = RandomBackground(until=40)
+    strategy.on_fit_start(len(views), seed)
+    strategy.on_views(views)
+    return strategy
+
+
+def test_it_keeps_the_contract():
+    check_strategy(RandomBackground)
+
+
+def test_every_iteration_has_its_own_colour_a_function_of_the_seed():
+    colors = [prepared().background(t) for t in range(1, 41)]
+    assert len(set(colors)) == 40
+    assert colors == [prepared().background(t) for t in range(1, 41)]
+    assert colors[0] != prepared(seed=6).background(1)
+    assert torch.tensor(colors).mean(0).sub(0.5).abs().max() < 0.2
+
+
+def test_the_run_ends_on_the_background_of_the_scene():
+    assert prepared().background(41) is None
+
+
+def test_what_the_photos_show_behind_an_object_or_hide_stays_as_it_is():
+    white = [
+        replace(view, lr=Photo(view.lr.camera, torch.ones_like(view.lr.image)), background=(1.0, 1.0, 1.0))
+        for view in SCENE.train
+    ]
+    assert prepared(white).background(1) is None
+    hiding = [
+        view.hiding(torch.arange(view.lr.camera.width).expand(view.lr.image.shape[:2]) > 3) for view in SCENE.train
+    ]
+    assert prepared(hiding).background(1) is None
+
+
+def test_the_trainer_renders_over_it_and_evaluates_over_the_background_of_the_scene():
+    state = start(("random_background",))
+    state.field.opacities.data.fill_(-15.0)  # the background is all that is seen
+    view = state.view()
+    iterate(state, RASTERIZER)
+    color = torch.tensor(state.conductor.background(1))
+    psnr = -10 * float((color - view.lr.image).square().mean().log10())
+    assert state.history_as_floats()[0]["psnr_train_lr"] == pytest.approx(psnr, abs=1e-3)
+    assert float(state.field.render(RASTERIZER, view.lr.camera).max()) < 1e-4
