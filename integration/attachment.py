@@ -85,6 +85,7 @@ class Attachment:
         threshold: the host's densification threshold on the mean ‖∇_u‖ in NDC units; None: the score is not scaled.
         loss_scale: returns the factor of the host's loss (`scaler.get_scale` of an AMP gradient scaler).
         accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
+        own_background: the host chooses the colour behind its renderings; `background` then counts for nothing.
 
     Attributes:
         t: the current iteration, from 1.
@@ -103,6 +104,7 @@ class Attachment:
         threshold: float | None = None,
         loss_scale: Callable[[], float] | None = None,
         accumulation: int = 1,
+        own_background: bool = True,
     ) -> None:
         if accumulation < 1:
             raise SettingError(f"accumulation: must be at least 1 backward pass per step, got {accumulation}.")
@@ -134,6 +136,9 @@ class Attachment:
                 "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
                 ", ".join(_named(decorate) for decorate in conductor.decorators),
             )
+        chooser = conductor.owner("background")
+        if chooser is not None and own_background:
+            _log.info("%s has no effect here: the host chooses its background itself.", type(chooser).__name__)
         if not conductor.strategies:
             _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
 
@@ -165,6 +170,11 @@ class Attachment:
             rendering.output.register_hook(self._on_backward)  # type: ignore[no-untyped-call]
         self.counts["LR renders"] += 1
         return rendering.returned
+
+    @property
+    def background(self) -> tuple[float, float, float] | None:
+        """The colour behind every rendering of this iteration, for hosts that let the strategies choose it; None: their own."""
+        return None if self.removed else self.conductor.background(self.t)
 
     def before_step(self) -> None:
         """For a hook before the host's optimizer step: count the steps in which no strategy took part.

@@ -47,6 +47,8 @@ class Attached:
         names: gsplat's parameter name -> the host's, where they differ (nerfstudio: sh0 is features_dc).
         loss_scale, accumulation: see `Attachment`.
         masks: [h, w] by the name of a view, what the host multiplies the LR image by after rendering.
+        own_background: the loop adds a background to its renderings itself; else the strategies may choose the `backgrounds` of
+            calls that name none.
 
     Raises:
         ValueError: there is no view, or a parameter is missing.
@@ -68,6 +70,7 @@ class Attached:
         loss_scale: Callable[[], float] | None = None,
         accumulation: int = 1,
         masks: Mapping[str, Tensor] | None = None,
+        own_background: bool = False,
     ) -> None:
         if not views:
             raise ValueError(
@@ -87,13 +90,14 @@ class Attached:
             as_parameter=state is None,
         )
         self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).to(means)
-        self._masks = dict(masks or {})
+        self._masks, self._own_background = dict(masks or {}), own_background
         self._named: View | None = None  # by `rendering`
         self._replaced: list[Replaced] = []
         require_end(conductor, _refine_stop(strategy), "refine_stop_iter", first=0)
         self.attachment = Attachment(
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=self._poll_parents, threshold=_threshold(strategy, conductor),
+            own_background=own_background,
         )  # fmt: skip
         self._hooks = [
             optimizers[self._host_name("means")].register_step_pre_hook(lambda *_: self.attachment.before_step()),
@@ -201,7 +205,7 @@ class Attached:
     def _render(
         self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, resolution: Resolution, gate: Tensor | None
     ) -> HostRendering:  # fmt: skip
-        call = dict(arguments)
+        call = {**arguments, **self._background(arguments)}
         if gate is not None:
             call["opacities"] = call["opacities"] * gate.to(call["opacities"])
         if resolution == "hr":
@@ -247,7 +251,7 @@ class Attached:
         self, rasterization: Rasterization, arguments: Mapping[str, Any], camera: Camera
     ) -> AutogradShot:
         """The Gaussians of a call, drawn by another camera."""
-        call = dict(arguments)
+        call = {**arguments, **self._background(arguments)}
         call |= {
             "viewmats": camera.world_to_camera.to(call["viewmats"]).reshape(call["viewmats"].shape),
             "Ks": intrinsics(camera).to(call["Ks"]).reshape(call["Ks"].shape),
@@ -263,6 +267,13 @@ class Attached:
         rows = info["gaussian_ids"] if info["means2d"].dim() == 2 else None
         nothing = image.new_zeros(n, 2), torch.ones(n, dtype=torch.bool, device=image.device)
         return AutogradShot(image, *nothing, params, ScreenGradientSlot(info["means2d"], size, rows=rows))
+
+    def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:
+        """The `backgrounds` that the strategies choose for a call; none where it names its own."""
+        color = self.attachment.background
+        if color is None or self._own_background or call.get("backgrounds") is not None:
+            return {}
+        return {"backgrounds": call["means"].new_tensor(color)[None]}
 
     def _with_detail(self, arguments: Mapping[str, Any], *, trained: bool) -> dict[str, Any]:
         """The same call with colours f_base + f_det; f_det gets a gradient only if it is trained by the rendering."""
