@@ -64,7 +64,8 @@ class CloudSettings:
             neighbours: no point is removed.
         voxel: points are averaged in cubes of this edge, world units; None: they are not.
         compare: the images that stereo compares. "hr": those at HR, up to `stereo.max_pixels`. Where these are photos, maps and
-            points are made at their size; where a prior made them, they only sharpen the depth of the LR photos.
+            points are made at their size; where a prior made them, their depth completes that of the LR photos, except before a
+            plain background.
             "lr": the LR photos.
         max_points: a larger cloud is reduced to this many points, chosen at random.
         triangulation: for init=stereo, triangulated and auto.
@@ -216,7 +217,13 @@ def _from_photos(
         _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
     features = triangulate(photos, settings.triangulation) if known is None else known
     if settings.init != "triangulated":
-        compared = compared_at(photos, hr if settings.compare == "hr" else (), hr_is_photo, settings.stereo)
+        compared = compared_at(
+            photos,
+            hr if settings.compare == "hr" else (),
+            hr_is_photo=hr_is_photo,
+            settings=settings.stereo,
+            background=background,
+        )
         maps = compared.depth_maps(features.means, background)
         cloud = stereo_cloud(
             features,

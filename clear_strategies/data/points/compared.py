@@ -1,8 +1,9 @@
 """At which size the photos are compared, and what becomes of the depth that is found there.
 
 HR shows more than LR, so stereo at HR finds more depth, and more precisely. Where HR is photos, everything is made at their size.
-An SR image holds what a network made up, too: its depth only sharpens that of the LR photo. A pixel of LR has the median depth of
-its block, or where SR images do not agree on one, the depth that the LR photos themselves tell.
+An SR image holds what a network made up, too: its depth only completes that of the LR photos. Where these do not agree on one, a
+pixel of LR has the median depth of its block of SR pixels. Not so for an object before a plain background: along its outline SR
+images mix both, and their depth there is wrong (lego loses 0.18 dB by it).
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Compared:
         finest = self._maps(self.images, points, background, self.settings.finer(self.reduction))
         of_photos = self._maps(self.photos, points, background, self.settings)
         return tuple(
-            fine.reduced(self.reduction).completed_by(own) for fine, own in zip(finest, of_photos, strict=True)
+            own.completed_by(fine.reduced(self.reduction)) for own, fine in zip(of_photos, finest, strict=True)
         )
 
     def _maps(
@@ -62,12 +63,20 @@ class Compared:
         return None if all(photo.shown is None for photo in photos) else [_shown(photo) for photo in photos]
 
 
-def compared_at(lr: Sequence[Photo], hr: Sequence[Photo], hr_is_photo: bool, settings: StereoSettings) -> Compared:
+def compared_at(
+    lr: Sequence[Photo],
+    hr: Sequence[Photo],
+    *,
+    hr_is_photo: bool,
+    settings: StereoSettings,
+    background: tuple[float, float, float] | None = None,
+) -> Compared:
     """The choice for these photos: HR, reduced to at most `settings.max_pixels`, where that is larger than LR, else LR.
 
     Args:
         hr: the same views at HR; none: LR is compared.
         hr_is_photo: HR is photos, not SR images.
+        background: the colour of pixels without a surface; None: every pixel shows one.
     """
     whole = Compared(lr, lr, 1, 1.0, settings)
     if not hr:
@@ -76,6 +85,8 @@ def compared_at(lr: Sequence[Photo], hr: Sequence[Photo], hr_is_photo: bool, set
         photos = [photo.reduced(photo.factor_to(settings.max_pixels)) for photo in hr]
         finer = photos[0].camera.width / lr[0].camera.width
         return Compared(photos, photos, 1, finer, settings.finer(finer)) if finer > 1 else whole
+    if background is not None:
+        return whole
     factor = hr[0].camera.width // lr[0].camera.width
     least = max(photo.factor_to(settings.max_pixels) for photo in hr)
     reduced = next((k for k in range(least, factor) if factor % k == 0), factor)
