@@ -10,6 +10,7 @@ takes a picture of each.
 from __future__ import annotations
 
 import base64
+import contextlib
 import csv
 import os
 import re
@@ -233,6 +234,7 @@ def pages(folder: Path, run: Path) -> None:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM)
         for name, address in addresses.items():
             page = browser.new_page(viewport=WINDOW)
+            page.set_default_timeout(600_000)
             page.goto(address)
             (folder / f"{name}.jpg").write_bytes(settled(page))
             page.close()
@@ -241,14 +243,16 @@ def pages(folder: Path, run: Path) -> None:
 
 
 def settled(page: Any) -> bytes:
-    """The picture of a page that shows something and has not changed for five seconds."""
-    session, before = page.context.new_cdp_session(page), b""
+    """The picture of a page that shows something and no longer changes."""
+    with contextlib.suppress(Exception):  # viser's warning that the browser draws without a GPU
+        page.locator(".mantine-Notification-closeButton").first.click(timeout=60_000)
+    session, before = page.context.new_cdp_session(page), 0
     while True:
-        now = session.send("Page.captureScreenshot", {"format": "jpeg", "quality": 85})["data"]
-        if now == before and len(now) > 40_000:  # an empty page has one colour
-            return base64.b64decode(now)
-        before = now
         time.sleep(5)
+        shot = session.send("Page.captureScreenshot", {"format": "jpeg", "quality": 85})["data"]
+        if before == len(shot) > 40_000:  # an empty page has one colour
+            return base64.b64decode(shot)
+        before = len(shot)
 
 
 if __name__ == "__main__":
