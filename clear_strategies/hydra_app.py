@@ -31,6 +31,10 @@ from clear_strategies.jobs.sweep import Sweep
 _log = logging.getLogger(__name__)
 
 _VERBOSE: Final = "fit.verbose=true"
+_FLAGS: Final = (
+    "--help", "--hydra-help", "--version", "--cfg", "--resolve", "--package", "--run", "--multirun", "--shell-completion",
+    "--config-path", "--config-name", "--config-dir", "--experimental-rerun", "--info",
+)  # fmt: skip
 
 
 def main(overrides: Sequence[str] | None = None) -> None:
@@ -40,10 +44,11 @@ def main(overrides: Sequence[str] | None = None) -> None:
         overrides: in place of the program's arguments.
 
     Raises:
-        SettingError: an override names no setting; or a library of the trainer is not installed.
+        SettingError: an override names no setting, a flag is unknown, or a library of the trainer is not installed.
     """
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra passes errors on instead of printing them its own way
     arguments = sys.argv[1:] if overrides is None else overrides
+    _require_known_flags(arguments)
     sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else a for a in arguments]  # Hydra reads them there
     exit_codes.require_train()
     try:
@@ -52,6 +57,15 @@ def main(overrides: Sequence[str] | None = None) -> None:
         if (unknown := re.match(r"Could not override '([^']+)'", str(error))) is None:
             raise
         raise SettingError(_no_such_setting(unknown[1])) from error
+
+
+def _require_known_flags(arguments: Sequence[str]) -> None:
+    """Hydra would answer an unknown flag with its own usage, which names none of our commands."""
+    for word in arguments:
+        flag = word.partition("=")[0]
+        if flag.startswith("--") and flag != "--verbose" and not any(known.startswith(flag) for known in _FLAGS):
+            remedy = "A setting is written name=value, and clear-strategies settings lists all of them."
+            raise SettingError(f"{flag}: there is no such flag. {remedy}")
 
 
 def _no_such_setting(key: str) -> str:

@@ -3,19 +3,23 @@
 `python docs/figures.py` draws those of docs/explanation/evidence-sparse.md from its CSV files. `python docs/figures.py demo`
 trains the demo, as the README's first command does, and draws the README's picture of it, docs/images/demo.png; further
 words are overrides of the run. `python docs/figures.py notebook` runs docs/tutorial/notebook.ipynb and keeps what its
-cells show.
+cells show. `python docs/figures.py pages RUN` opens a run's splat.html and coverage.html and the viewer in Chromium, and
+takes a picture of each.
 """
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import csv
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
 import textwrap
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -208,10 +212,55 @@ def notebook(path: Path) -> None:
     nbformat.write(content, path)
 
 
+CHROMIUM: Final = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+WINDOW: Final = {"width": 900, "height": 560}
+
+
+def pages(folder: Path, run: Path) -> None:
+    """A run as Chromium shows it: the page of the splat, that of the coverage, and the viewer."""
+    from playwright.sync_api import sync_playwright
+
+    from clear_strategies.jobs.saved import open_splat
+    from clear_strategies.viewing.server import Screen, SplatViewer
+
+    splat = open_splat(run)
+    viewer = SplatViewer(Screen(splat.painter, splat.cameras), title=splat.name, port=8437, out=run)
+    addresses = {
+        "splat_page": (run / "splat.html").resolve().as_uri(),
+        "coverage_page": (run / "coverage.html").resolve().as_uri(),
+        "viewer": viewer.address,
+    }
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM)
+        for name, address in addresses.items():
+            page = browser.new_page(viewport=WINDOW)
+            page.set_default_timeout(600_000)
+            page.goto(address)
+            (folder / f"{name}.jpg").write_bytes(settled(page))
+            page.close()
+        browser.close()
+    viewer.close()
+
+
+def settled(page: Any) -> bytes:
+    """The picture of a page that shows something and no longer changes."""
+    with contextlib.suppress(Exception):  # viser's warning that the browser draws without a GPU
+        page.locator(".mantine-Notification-closeButton").first.click(timeout=60_000)
+    session, before = page.context.new_cdp_session(page), 0
+    while True:
+        time.sleep(5)
+        shot = session.send("Page.captureScreenshot", {"format": "jpeg", "quality": 85})["data"]
+        if before == len(shot) > 40_000:  # an empty page has one colour
+            return base64.b64decode(shot)
+        before = len(shot)
+
+
 if __name__ == "__main__":
     if sys.argv[1:2] == ["demo"]:
         demo(DOCS / "images", *sys.argv[2:])
     elif sys.argv[1:2] == ["notebook"]:
         notebook(DOCS / "tutorial" / "notebook.ipynb")
+    elif sys.argv[1:2] == ["pages"]:
+        pages(DOCS / "images", Path(sys.argv[2]))
     else:
         main(DOCS / "images")

@@ -28,6 +28,7 @@ EXTRAS: Final = {
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
     "heic": (("pillow_heif",), "photos as iPhones save them (HEIC)"),
     "view": (("viser", "nerfview"), "clear-strategies view, and the splat in a page"),
+    "export": (("gaussforge",), "export --to spz and --to sog"),
     "log": (("tensorboard",), "fit.log=tensorboard: curves and pictures while a run trains"),
     "gsplat": (("gsplat",), "gsplat's densifiers, and its rasterizer on CUDA"),
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
@@ -126,7 +127,7 @@ def _is_installed(module: str) -> bool:
 def _programs() -> Iterator[tuple[str, str]]:
     yield "compiler", shutil.which("c++") or "none: the C++ kernels are compiled at install only where there is one"
     node = shutil.which("splat-transform") or shutil.which("npx")
-    yield "splat-transform", node or "neither it nor npx: export --to spz and --to sog need Node.js 20 or later"
+    yield "splat-transform", node or "neither it nor npx: export --to html needs Node.js 20 or later"
     brought = _is_installed("imageio_ffmpeg")
     yield "ffmpeg", "imageio-ffmpeg brings it" if brought else "none: videos need it: pip install imageio-ffmpeg"
 

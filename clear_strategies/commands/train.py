@@ -20,13 +20,13 @@ _USAGE: Final = f"""clear-strategies train PHOTOS [setting=value …]
 
 PHOTOS is a folder of photos, a video of a still scene, or a capture: COLMAP's sparse/, a transforms.json, a poses_bounds.npy
 or a Blender scene in the folder.
-It trains what we use ourselves (+strategy=best) on all photos for fit.iterations={_ITERATIONS}; settings change that, e.g.
+The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}. Settings change that:
 
   clear-strategies train photos/ fit.iterations=3000
-  clear-strategies train photos/ --minutes 4                      as good as it gets in four minutes
+  clear-strategies train photos/ --minutes 4                      done in about four minutes
   clear-strategies train photos/ data.views.test_every=8          every 8th photo is kept for testing
   clear-strategies train photos/ data.views.max_hr_megapixels=8   sharper, slower, more memory
-  clear-strategies train clip.mp4 data.reader.frames=24           so many of its sharpest frames
+  clear-strategies train clip.mp4 --frames 24                     24 of its sharpest frames
   clear-strategies train photos/ data.missing=skip data.broken=skip
   clear-strategies train photos/ fit.log=tensorboard -v           curves while it trains; every detail on the console
 
@@ -36,6 +36,7 @@ It trains what we use ourselves (+strategy=best) on all photos for fit.iteration
 CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
 _PLAIN: Final = re.compile(r"(/|\./|(\.\./)+)?[A-Za-z_][\w./-]*", re.ASCII)  # needs no quotes, for Hydra or a shell
 _NO_TEXT: Final = ("null", "true", "false", "nan", "inf")
+_FLAGS: Final = {"--minutes": "fit.minutes", "--frames": "data.reader.frames"}
 _CHOOSE_ITERATIONS: Final = ("fit.iterations=", "fit.minutes=", "experiment=", "+experiment=", "+protocol=", "+scene=")
 
 
@@ -43,7 +44,7 @@ def main(arguments: list[str]) -> None:
     """Train on what the first argument names.
 
     Raises:
-        SettingError: there is no first argument, or it is neither a folder nor a video.
+        SettingError: there is no first argument, it is neither a folder nor a video, or a flag has no value.
     """
     if "--help" in arguments or "-h" in arguments:
         sys.stdout.write(_USAGE)
@@ -79,9 +80,18 @@ def overrides(arguments: Sequence[str]) -> list[str]:
 
 
 def _settings(arguments: Sequence[str]) -> list[str]:
-    """Hydra's overrides, with `--minutes M` or `--minutes=M` as one of them."""
-    joined = re.sub(r"(^|\0)--minutes[=\0]([^\0]*)", r"\1fit.minutes=\2", "\0".join(arguments))
-    return joined.split("\0") if joined else []
+    """Hydra's overrides: `--minutes M` and `--minutes=M` are one of them."""
+    found, rest = list[str](), iter(arguments)
+    for word in rest:
+        name, equals, value = word.partition("=")
+        if name not in _FLAGS:
+            found.append(word)
+            continue
+        value = value if equals else next(rest, "")
+        if not value or value.startswith("-"):
+            raise SettingError(f"{name} needs a number: {name} 4.")
+        found.append(f"{_FLAGS[name]}={value}")
+    return found
 
 
 def detect(folder: Path) -> tuple[str, Path]:

@@ -33,7 +33,7 @@ PAGE: Final = "coverage.html"
 _SOLID: Final = 0.3  # opacity of the Gaussians that are counted as surface
 _MOST_POINTS: Final = 60_000  # of them in the page and on the map
 _COLORS: Final = (figures.RED, figures.YELLOW, figures.CYAN, figures.BLUE)
-_SEEN: Final = ("no photo", "one", "two", f"{ENOUGH} or more")
+_SEEN: Final = ("no photo", "one photo", "two photos", f"{ENOUGH} or more")
 _CAMERA, _NEXT = figures.INK, figures.GREEN
 _MOST_LINES: Final = 18  # of the text beside the map
 _CROP: Final = 0.03  # of the points, on each side of the map, that lie outside of it
@@ -88,13 +88,16 @@ def write_coverage(folder: Path, scene: Scene, painter: Painter, title: str) -> 
             for view in scene.train
         ]
         shown += [page.ShownCamera(p.camera, f"next photo {i}", _rgb(_NEXT)) for i, p in enumerate(found.advice, 1)]
-        page.write_points_page(folder / PAGE, found.points, torch.from_numpy(_colored(found.times)), shown, title)
+        legend = {f"seen by {name}": _rgb(color) for name, color in zip(_SEEN, _COLORS, strict=True)}
+        legend |= {"the photos": _rgb(_CAMERA), "where to take the next": _rgb(_NEXT)}
+        colors = torch.from_numpy(_colored(found.times))
+        page.write_points_page(folder / PAGE, found.points, colors, shown, f"{title}: what the photos see", legend)
     if found.advice:
         level = logging.DEBUG if scene.test else logging.INFO
         _log.log(level, "two more photos would help most from here (%s): %s", PICTURE, "; ".join(found.says()))
 
 
-def _rgb(color: str) -> tuple[int, int, int]:
+def _rgb(color: str) -> page.RGB:
     r, g, b = bytes.fromhex(color.removeprefix("#"))
     return r, g, b
 

@@ -1,4 +1,4 @@
-"""A splat in the formats of viewers: .ply, .glb and .splat by this package, the others by PlayCanvas's splat-transform.
+"""A splat in the formats of viewers: all by Python, but the page, which PlayCanvas's splat-transform writes.
 
 splat-transform is a program of npm (MIT). One that is on the PATH is taken; else `npx` downloads it once.
 """
@@ -25,13 +25,13 @@ from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.errors import SettingError
 from clear_strategies.outputs.format_names import FORMATS
 from clear_strategies.outputs.gltf import glb_bytes
+from clear_strategies.outputs.packed import PACKED, packed_bytes
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
 _CONVERTER: Final = "@playcanvas/splat-transform@2"
-_SPZ_VERSION: Final = "3"  # 4, the converter's default, is too new for most readers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,8 +78,10 @@ def write_format(path: Path, g: GaussianPly, form: str, start: Start) -> None:
         files.write_bytes(path, splat_bytes(g))
     elif form == "glb":
         files.write_bytes(path, glb_bytes(g))
+    elif form in PACKED:
+        files.write_bytes(path, packed_bytes(g, form))
     else:
-        _convert(path, g, form, start)
+        _write_page(path, g, start)
 
 
 def splat_bytes(g: GaussianPly) -> bytes:
@@ -111,29 +113,25 @@ def converter() -> list[str]:
         _log.info("npx runs %s; the first time it downloads about 70 MB.", _CONVERTER)
         return [npx, "--yes", _CONVERTER]
     raise SettingError(
-        "spz, sog and html are written by PlayCanvas's splat-transform, which needs Node.js 20 or later: install it from "
-        "nodejs.org, or choose --to ply, --to glb or --to splat."
+        "--to html needs PlayCanvas's splat-transform and Node.js 20 or later: install Node.js from nodejs.org, or take the "
+        "run's own splat.html, whose colours are the same from all sides."
     )
 
 
-def _convert(path: Path, g: GaussianPly, form: str, start: Start) -> None:
-    command = converter()
-    if form != "spz" and not torch.cuda.is_available():
+def _write_page(path: Path, g: GaussianPly, start: Start) -> None:
+    command, on_gpu = converter(), torch.cuda.is_available()
+    if not on_gpu:
         _log.info(
-            "sog and html sort colours into clusters; without a GPU this takes minutes for large splats (--sh 0 is fast)."
+            "the page clusters view-dependent colours; without a GPU this takes minutes for large splats (--sh 0 is fast)."
         )
-    options = ["--spz-version", _SPZ_VERSION] if form == "spz" else ["--gpu", "cpu"]
-    options = options if form == "spz" or not torch.cuda.is_available() else []
-    with files.replacing(path.with_suffix(f".{form}")) as target, tempfile.TemporaryDirectory() as folder:
-        source = Path(folder) / "splat.ply"
+    with files.replacing(path.with_suffix(".html")) as target, tempfile.TemporaryDirectory() as folder:
+        source, viewer = Path(folder) / "splat.ply", Path(folder) / "viewer.json"
         write_gaussians(source, g)
-        if form == "html":
-            viewer = Path(folder) / "viewer.json"
-            viewer.write_text(json.dumps(start.settings()))
-            options += ["--viewer-settings", str(viewer)]
-        _run([*command, "--quiet", "--overwrite", *options, str(source), str(target)])
+        viewer.write_text(json.dumps(start.settings()))
+        options = ["--quiet", "--overwrite", *([] if on_gpu else ["--gpu", "cpu"]), "--viewer-settings", str(viewer)]
+        _run([*command, *options, str(source), str(target)])
         if not target.is_file():
-            raise SettingError(f"{command[0]} wrote no {form} file. Choose another format, or install it anew.")
+            raise SettingError(f"{command[0]} wrote no page. Choose another format, or install it anew.")
 
 
 def _run(command: Sequence[str]) -> None:

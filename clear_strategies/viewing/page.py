@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import html
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -34,19 +34,20 @@ _SHARE: Final = 0.6  # of the length of a camera in the viewer, where one is sho
 _POINT: Final = 0.05  # size of a point, in lengths of a camera
 _DARK: Final = 0.5  # mean of the background's RGB below which the page is dark
 
+RGB = tuple[int, int, int]  # 0 to 255
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownCamera:
     """A camera in a page of points.
 
     Args:
-        rgb: 0 to 255.
         image: in its frustum, uint8 [h, w, 3]; None: the frustum is empty.
     """
 
     camera: Camera
     label: str
-    rgb: tuple[int, int, int]
+    rgb: RGB
     image: np.ndarray | None = None
 
 
@@ -77,13 +78,19 @@ def write_page(
 
 
 def write_points_page(
-    path: Path, means: Float[Tensor, "N 3"], rgb: Float[Tensor, "N 3"], shown: Sequence[ShownCamera], title: str
+    path: Path,
+    means: Float[Tensor, "N 3"],
+    rgb: Float[Tensor, "N 3"],
+    shown: Sequence[ShownCamera],
+    title: str,
+    legend: Mapping[str, RGB],
 ) -> None:
     """Write a page of points and cameras; it begins behind and above them. viser must be installed, see `missing`.
 
     Args:
         rgb: colours of the points, in [0, 1].
         shown: at least one.
+        legend: what each colour means.
 
     Raises:
         OSError: as `write_page`.
@@ -91,7 +98,8 @@ def write_points_page(
     from clear_strategies.viewing.aim import add_camera, drawn_length
 
     cameras = [marked.camera for marked in shown]
-    with _page(path, [paths.overview(cameras), *cameras], title, dark=False) as (server, times):
+    above = _legend(title, legend)
+    with _page(path, [paths.overview(cameras), *cameras], title, dark=False, above=above) as (server, times):
         length = _SHARE * times * drawn_length(cameras)
         points = (means * times).cpu().numpy()
         server.scene.add_point_cloud("/points", points, rgb.cpu().numpy(), point_size=_POINT * length)
@@ -103,9 +111,13 @@ def write_points_page(
 
 @contextlib.contextmanager
 def _page(
-    path: Path, cameras: Sequence[Camera], title: str, *, dark: bool
+    path: Path, cameras: Sequence[Camera], title: str, *, dark: bool, above: str = ""
 ) -> Iterator[tuple[viser.ViserServer, float]]:
-    """A server whose scene becomes the page, and how many times larger than the world it is."""
+    """A server whose scene becomes the page, and how many times larger than the world it is.
+
+    Args:
+        above: HTML over the scene.
+    """
     import viser
 
     from clear_strategies.viewing.aim import aim
@@ -122,7 +134,17 @@ def _page(
             text = serializer.as_html(dark_mode=dark)
         finally:
             server.stop()
-    files.write_text(path, text.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1))
+    text = text.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>", 1)
+    files.write_text(path, text.replace("<body>", f"<body>{above}", 1))
+
+
+def _legend(title: str, rows: Mapping[str, RGB]) -> str:
+    """A list of colours in the lower left corner, through which the mouse reaches the scene."""
+    listed = "".join(
+        f'<div><span style="color:rgb{rgb}">&#9632;</span> {html.escape(label)}</div>' for label, rgb in rows.items()
+    )
+    style = "position:fixed;left:12px;bottom:12px;z-index:1;pointer-events:none;font:13px/1.5 sans-serif"
+    return f'<div style="{style}"><b>{html.escape(title)}</b>{listed}</div>'
 
 
 def covariances(splats: Splats) -> Float[Tensor, "N 3 3"]:

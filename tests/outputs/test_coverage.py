@@ -39,7 +39,9 @@ def test_the_picture_names_photos_without_a_pose_and_the_page_is_whole(tmp_path:
     coverage.write_coverage(tmp_path, scene, wall.painter(), "toy")
     assert (tmp_path / coverage.PICTURE).stat().st_size > 10_000
     pytest.importorskip("viser")
-    assert "__VISER_EMBED_DATA__" in (tmp_path / coverage.PAGE).read_text()
+    written = (tmp_path / coverage.PAGE).read_text()
+    assert "__VISER_EMBED_DATA__" in written
+    assert all(f"</span> {label}</div>" in written for label in ("seen by no photo", "where to take the next"))
 
 
 def test_advice_is_told_where_all_photos_train(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -7,6 +7,7 @@ known, and no byte may be left over.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,33 +37,49 @@ class Model:
 
 
 def find_model(root: Path) -> Path:
-    """The folder of the sparse model.
+    """The folder of the sparse model; of the several that COLMAP's mapper may leave in `sparse`, the one with most photos.
 
     Raises:
-        DataError: there is none.
+        DataError: there is none, or one of several cannot be read.
     """
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     for candidate in (root / "sparse" / "0", root / "sparse", root / "colmap" / "sparse" / "0", root):
         if _is_model(candidate):
-            others = [p.name for p in sorted(candidate.parent.glob("[1-9]*")) if candidate.name == "0" and _is_model(p)]
-            if others:
-                _log.warning("%s: model 0 is used; COLMAP's other models (%s) are not.", root, ", ".join(others))
-            return candidate
+            numbered = sorted(candidate.parent.glob("[1-9]*")) if candidate.name == "0" else []
+            return _largest(root, [candidate, *filter(_is_model, numbered)])
     raise DataError(
         root, "sparse model", "no cameras.bin or cameras.txt in sparse/0, sparse, colmap/sparse/0 or here",
         "run COLMAP first, or use data=photos for photos without poses",
     )  # fmt: skip
 
 
+def _largest(root: Path, models: Sequence[Path]) -> Path:
+    if len(models) == 1:
+        return models[0]
+    photos = {model: len(read_images(model / f"images{_ending(model)}")) for model in models}
+    largest = max(models, key=lambda model: photos[model])
+    others = ", ".join(f"{model.name} with {photos[model]}" for model in models if model != largest)
+    _log.warning(
+        "%s: COLMAP left %d models. The largest, %s with %d photos, is used; the others are not: %s.",
+        root, len(models), largest.name, photos[largest], others,
+    )  # fmt: skip
+    return largest
+
+
+def _ending(folder: Path) -> str:
+    """Of a model's files. If there is any binary file, text files are ignored."""
+    binary = any((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D"))
+    return ".bin" if binary else ".txt"
+
+
 def read_model(folder: Path) -> Model:
-    """Cameras, images and points of a model folder. If there is any binary file, text files are ignored.
+    """Cameras, images and points of a model folder.
 
     Raises:
         DataError: a file is missing or not what it should be.
     """
-    binary = any((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D"))
-    ending = ".bin" if binary else ".txt"
+    ending = _ending(folder)
     lenses = read_cameras(folder / f"cameras{ending}")
     registered = read_images(folder / f"images{ending}")
     if not registered:

@@ -66,13 +66,21 @@ def test_photos_may_differ_from_the_model_in_their_ending(tmp_path: Path) -> Non
     assert [frame.name for frame in colmap.read(tmp_path).frames] == ["a.png", "b.jpg", "c.png"]
 
 
-def test_photos_without_a_pose_and_further_models_are_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_photos_without_a_pose_are_noted(tmp_path: Path) -> None:
     shutil.copy(tiny.colmap_bin(tmp_path) / "images/a.png", tmp_path / "images/d.png")
-    shutil.copytree(tmp_path / "sparse/0", tmp_path / "sparse/1")
-    with caplog.at_level("DEBUG"):
-        capture = colmap.read(tmp_path)
-    assert capture.notes["without pose"] == "1 photos, not used: d.png"
-    assert "other models (1) are not" in caplog.text
+    assert colmap.read(tmp_path).notes["without pose"] == "1 photos, not used: d.png"
+
+
+def test_of_several_models_the_one_with_most_photos_is_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    tiny.colmap_txt(tmp_path)
+    small = tmp_path / "sparse/0"
+    shutil.copytree(small, tmp_path / "sparse/1")
+    lines = (small / "images.txt").read_text().splitlines(keepends=True)
+    (small / "images.txt").write_text("".join(lines[:-2]))  # an image has two lines
+    (small / "points3D.txt").unlink()
+    with caplog.at_level("WARNING"):
+        assert len(colmap.read(tmp_path).frames) == 3
+    assert "The largest, 1 with 3 photos, is used; the others are not: 0 with 2." in caplog.text
 
 
 def test_a_model_without_points_is_a_capture_without_points(tmp_path: Path) -> None:

@@ -9,12 +9,14 @@ import sqlite3
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
+from clear_strategies.data.exif import Exif
 from clear_strategies.data.readers import colmap, photos, sfm
 from clear_strategies.data.readers.sfm import SfmSettings
 from clear_strategies.errors import DataError
@@ -121,6 +123,31 @@ def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_take
     with pytest.raises(DataError, match=r"only 4 of the 10 photos .*overlap.* data\.reader\.least_placed=0\.4"):
         photos.sfm._require_placed(Path("mine"), [4, 2], 10, 0.5)
     photos.sfm._require_placed(Path("mine"), [6, 3], 10, 0.5)
+
+
+class FakeModel:
+    """What `sfm` asks of a pycolmap.Reconstruction."""
+
+    def __init__(self, *names: str) -> None:
+        self.images = {i: SimpleNamespace(name=name) for i, name in enumerate(names)}
+
+    def num_reg_images(self) -> int:
+        return len(self.images)
+
+    def write_binary(self, folder: str) -> None:
+        (Path(folder) / "images.bin").write_text(",".join(image.name for image in self.images.values()))
+
+
+def test_of_several_models_the_largest_is_kept_and_the_others_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    models = [FakeModel("0", "1", "2"), FakeModel("3", "4", "5", "6", "7"), FakeModel("8", "9")]
+    monkeypatch.setattr(sfm, "_map", lambda *_: models)
+    monkeypatch.setattr(sfm, "_unplaced", lambda _, placed: {"all": sorted(placed)})
+    listed = {tmp_path / f"{i}.jpg": Exif() for i in range(10)}
+    sfm.reconstruct(tmp_path, listed, tmp_path / "poses", SfmSettings(1600, 8192, False, 0.5, threads=1, seed=0))
+    assert (tmp_path / "poses/images.bin").read_text() == "3,4,5,6,7"
+    assert "groups that nothing connects (5, 3, 2 photos); the largest is used" in caplog.text
 
 
 @pytest.mark.parametrize("precise", [True, False])
