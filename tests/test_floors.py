@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -14,21 +16,36 @@ from tests.helpers.floors import DOORS, FLOORS
 ROOT = Path(__file__).resolve().parents[1]
 
 HEAVY = {"cv2", "kornia", "open3d", "PIL", "warp", "gsplat", "hydra", "omegaconf"}
+PACKAGES = ("clear_strategies", "rasterizers", "integration")
 
 
 def modules(package: str) -> list[Path]:
     return sorted((ROOT / package).rglob("*.py"))
 
 
-def imports(path: Path) -> set[str]:
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+def dotted(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+@cache
+def statements(path: Path) -> list[set[str]]:
+    """What each import of a file may mean, those inside functions too, but for those that only type checkers read.
+
+    `from a import b` is the module a.b, or a name that the module a defines.
+    """
+    tree, found = ast.parse(path.read_text()), []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            node.body = []
+        elif isinstance(node, ast.Import):
+            found += [{alias.name} for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found.add(node.module)
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+            found += [{node.module, f"{node.module}.{alias.name}"} for alias in node.names]
     return found
+
+
+def imports(path: Path) -> set[str]:
+    return set().union(*statements(path))
 
 
 def unit(path: Path) -> str:
@@ -50,6 +67,33 @@ def test_imports_point_down(path):
         assert parts[1] == me or parts[1] in FLOORS[me][0], f"{me} imports {name}"
         if me == parts[1] == "strategies" and path.stem not in ("__init__", "testing"):
             assert parts[2] in (path.stem, "base"), f"strategies are mutually blind, but {path.stem} imports {name}"
+
+
+def test_a_floor_imports_lower_floors_only():
+    """So there is no circle between folders."""
+    below: set[str] = set()
+    for folder, (allowed, _) in FLOORS.items():
+        assert allowed <= below, f"{folder} stands below {allowed - below}"
+        below.add(folder)
+
+
+def require_no_circle(graph: dict[str, set[str]]) -> None:
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" imports ".join(reversed(error.args[1])))
+
+
+def test_no_files_import_each_other():
+    files = {dotted(path): path for package in PACKAGES for path in modules(package)}
+    # Of a package and a module in it, the longer name is what is imported.
+    found = {
+        name: {max(known, key=len) for one in statements(path) if (known := one & files.keys())}
+        for name, path in files.items()
+    }
+    require_no_circle({name: imported - {name} for name, imported in found.items()})
+    with pytest.raises(pytest.fail.Exception, match="imports"):
+        require_no_circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
 
 
 @pytest.mark.parametrize("path", modules("clear_strategies"), ids=lambda p: str(p.relative_to(ROOT)))

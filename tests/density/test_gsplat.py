@@ -17,13 +17,14 @@ from clear_strategies.compose import CONF
 from clear_strategies.core.gradients import Grads
 from clear_strategies.density import lent
 from clear_strategies.density.adaptive import Density, DensitySettings
-from clear_strategies.density.base import Densifier, DensifierSettings, DensityError
+from clear_strategies.density.base import DensityError
 from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings
 from clear_strategies.density.threshold import topk_threshold
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, scaled
 from clear_strategies.settings import build
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training import checkpoint
+from clear_strategies.training.densifier import Densifier, DensifierSettings
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
