@@ -22,7 +22,7 @@ from clear_strategies import (
     Strategy,
     StrategyConflict,
 )
-from clear_strategies.kernels import losses
+from clear_strategies.kernels.losses import reference
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.testing import CHECKS, ContractError, check_strategy
 from clear_strategies.training.field import GaussianField
@@ -119,7 +119,7 @@ def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective
             return None, cotangent * ctx.gradient, None
 
     def photometric(x: Tensor, y: Tensor) -> Tensor:
-        return 0.8 * Loss.apply(losses.l1, x, y) + 0.2 * (1 - Loss.apply(losses.ssim, x, y))
+        return 0.8 * Loss.apply(reference.l1, x, y) + 0.2 * (1 - Loss.apply(reference.ssim, x, y))
 
     common = (raw["means"], raw["quats"], scales, opacities, raw["sh0"], raw["shN"][:, :bands])
     zero = torch.zeros_like(raw["detail"])
@@ -130,7 +130,7 @@ def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective
         lr = draw(view.lr.camera, *common, zero)
     loss = objective.lambda_lr * photometric(lr, view.lr.image.double()) + λ * (
         photometric(hr, view.hr.image.double())
-        + objective.lambda_hf * Loss.apply(losses.haar_l1, hr, view.hr.image.double())
+        + objective.lambda_hf * Loss.apply(reference.haar_l1, hr, view.hr.image.double())
     )
     gradients = torch.autograd.grad(loss, list(raw.values()))
     return Grads(dict(zip(raw, gradients, strict=True)))
