@@ -131,11 +131,7 @@ def rasterization(
     Raises:
         ValueError: a mode that only gsplat supports.
     """
-    if render_mode not in ("RGB", "RGB+ED") or rasterize_mode not in ("classic", "antialiased") or absgrad:
-        raise ValueError(
-            "this stand-in for gsplat's rasterization draws render_mode='RGB' or 'RGB+ED', rasterize_mode='classic' or "
-            f"'antialiased', absgrad=False; got {render_mode!r}, {rasterize_mode!r}, {absgrad}. gsplat's own needs CUDA."
-        )
+    _require_supported(render_mode, rasterize_mode, absgrad)
     n = len(means)
     if sh_degree is None:
         base, bands = (colors[:, None] - 0.5) / SH_C0, colors.new_zeros(n, 0, 3)
@@ -158,6 +154,14 @@ def rasterization(
     }  # fmt: skip
     images = [s.image if s.depth is None else torch.cat((s.image, s.depth[..., None]), -1) for s in shots]
     return torch.stack(images), torch.stack([s.alpha for s in shots])[..., None], info
+
+
+def _require_supported(render_mode: str, rasterize_mode: str, absgrad: bool) -> None:
+    if render_mode not in ("RGB", "RGB+ED") or rasterize_mode not in ("classic", "antialiased") or absgrad:
+        raise ValueError(
+            "this stand-in for gsplat's rasterization draws render_mode='RGB' or 'RGB+ED', rasterize_mode='classic' or "
+            f"'antialiased', absgrad=False; got {render_mode!r}, {rasterize_mode!r}, {absgrad}. gsplat's own needs CUDA."
+        )
 
 
 @lru_cache(maxsize=8)

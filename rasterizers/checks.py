@@ -1,7 +1,8 @@
-"""Checks and helpers that several backends share, so that all refuse bad input with the same messages."""
+"""What the backends of this package share: what they draw together, and how they refuse bad input."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import Final
 
@@ -9,12 +10,41 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from rasterizers.interface import Camera, Rasterizer, Splats, Traits
+from rasterizers.interface import Camera, Rasterizer, RasterSettings, Rendering, Splats, Traits
 
 _SHAPES: Final = {
     "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (None, 3), "rgb_offset": (3,),
 }  # fmt: skip
 _BANDS: Final = (0, 3, 8, 15)
+
+
+class Backend(RasterSettings):
+    """A rasterizer that implements `draw`."""
+
+    __slots__ = ()
+
+    def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
+        """Draw jobs with the same pose and tensor objects, which may share work; opacities and offsets may differ."""
+        raise NotImplementedError
+
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
+        return self.draw([(splats, camera)], [depth])[0]
+
+    def render_scales(
+        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
+    ) -> list[Rendering]:
+        """See `Rasterizer.render_scales`. Jobs that share nothing are drawn one by one."""
+        depths = depth or [False] * len(jobs)
+        if all(_same_gaussians_and_pose(jobs[0], job) for job in jobs[1:]):
+            return self.draw(jobs, depths)
+        return [self(*job, depth=z) for job, z in zip(jobs, depths, strict=True)]
+
+
+def _same_gaussians_and_pose(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
+    """Whether two jobs draw the same tensor objects from the same pose; opacities and offsets may differ."""
+    (a, from_a), (b, from_b) = first, other
+    same = all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
+    return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
 
 
 def require_splats(splats: Splats, traits: Traits) -> None:
@@ -86,13 +116,6 @@ def require_depth(rasterizer: Rasterizer) -> None:
         raise ValueError(
             f"{type(rasterizer).__name__} draws no depth (its traits.depth is False); cpp, torch, warp and gsplat do."
         )
-
-
-def same_gaussians_and_pose(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
-    """Whether two jobs draw the same tensor objects from the same pose; opacities and offsets may differ."""
-    (a, from_a), (b, from_b) = first, other
-    same = all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
-    return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
 
 
 def packed_rows(shN: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:

@@ -15,17 +15,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import require_cotangents, require_finite, require_splats
+from rasterizers.checks import Backend, require_cotangents, require_finite, require_splats
 from rasterizers.geometry import SH_C0, spherical_harmonics
-from rasterizers.interface import (
-    BackendUnavailable,
-    Camera,
-    RasterSettings,
-    Rendering,
-    SplatGradients,
-    Splats,
-    Traits,
-)
+from rasterizers.interface import BackendUnavailable, Camera, Rendering, SplatGradients, Splats, Traits
 
 _FIXED: Final = {"alpha_min": 1 / 255, "alpha_max": 0.99, "transmittance_min": 1e-4}  # the defaults of RasterSettings
 
@@ -46,7 +38,7 @@ def _gsplat_rasterization() -> Callable[..., Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class GsplatRasterizer(RasterSettings):
+class GsplatRasterizer(Backend):
     """gsplat's `rasterization` as a rasterizer.
 
     Args:
@@ -62,7 +54,7 @@ class GsplatRasterizer(RasterSettings):
     rasterization: Callable[..., Any] | None = None
 
     def __post_init__(self) -> None:
-        RasterSettings.__post_init__(self)
+        Backend.__post_init__(self)
         for name, fixed in _FIXED.items():
             if getattr(self, name) != fixed:
                 raise ValueError(
@@ -75,13 +67,11 @@ class GsplatRasterizer(RasterSettings):
     def traits(self) -> Traits:
         return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}), depth=True)
 
-    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> GsplatRendering:
-        """Draw; depth by gsplat's render mode "RGB+ED".
+    def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
+        """Jobs share nothing; depth is drawn by gsplat's render mode "RGB+ED"."""
+        return [self._drawn(*job, z) for job, z in zip(jobs, depth, strict=True)]
 
-        Raises:
-            TypeError: the splats are on another device, or not float32.
-            ValueError: they are not finite, or a tensor has a wrong shape.
-        """
+    def _drawn(self, splats: Splats, camera: Camera, depth: bool) -> GsplatRendering:
         require_splats(splats, self.traits)
         require_finite(splats)
         names = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -113,12 +103,6 @@ class GsplatRasterizer(RasterSettings):
             info["means2d"].detach()[0], visible,
             drawn, {**leaves, "screen": info["means2d"]}, basis,
         )  # fmt: skip
-
-    def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
-    ) -> list[Rendering]:
-        """Draws the jobs one after the other; nothing is shared."""
-        return [self(*job, depth=z) for job, z in zip(jobs, depth or [False] * len(jobs), strict=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -14,21 +16,36 @@ from tests.helpers.floors import DOORS, FLOORS
 ROOT = Path(__file__).resolve().parents[1]
 
 HEAVY = {"cv2", "kornia", "open3d", "PIL", "warp", "gsplat", "hydra", "omegaconf"}
+PACKAGES = ("clear_strategies", "rasterizers", "integration")
 
 
 def modules(package: str) -> list[Path]:
     return sorted((ROOT / package).rglob("*.py"))
 
 
-def imports(path: Path) -> set[str]:
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+def dotted(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+@cache
+def statements(path: Path) -> list[set[str]]:
+    """What each import of a file may mean, those inside functions too, but for those that only type checkers read.
+
+    `from a import b` is the module a.b, or a name that the module a defines.
+    """
+    tree, found = ast.parse(path.read_text()), []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            node.body = []
+        elif isinstance(node, ast.Import):
+            found += [{alias.name} for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found.add(node.module)
-            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+            found += [{node.module, f"{node.module}.{alias.name}"} for alias in node.names]
     return found
+
+
+def imports(path: Path) -> set[str]:
+    return set().union(*statements(path))
 
 
 def unit(path: Path) -> str:
@@ -37,41 +54,65 @@ def unit(path: Path) -> str:
     return parts[0].removesuffix(".py")
 
 
-@pytest.mark.parametrize("path", modules("clear_strategies"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_imports_point_down(path):
-    me = unit(path)
-    if me == "__init__" or me in DOORS or path.name == "testing.py":  # contracts may look at everything
-        return
-    assert me in FLOORS, f"{me} stands on no floor; add it to FLOORS"
-    for name in imports(path):
-        if not name.startswith("clear_strategies."):
+def test_imports_point_down():
+    for path in modules("clear_strategies"):
+        me = unit(path)
+        if me == "__init__" or me in DOORS or path.name == "testing.py":  # contracts may look at everything
             continue
-        parts = name.split(".")
-        assert parts[1] == me or parts[1] in FLOORS[me][0], f"{me} imports {name}"
-        if me == parts[1] == "strategies" and path.stem not in ("__init__", "testing"):
-            assert parts[2] in (path.stem, "base"), f"strategies are mutually blind, but {path.stem} imports {name}"
+        assert me in FLOORS, f"{me} stands on no floor; add it to FLOORS"
+        for name in imports(path):
+            parts = name.split(".")
+            if parts[0] != "clear_strategies" or len(parts) == 1:
+                continue
+            assert parts[1] == me or parts[1] in FLOORS[me][0], f"{path} imports {name}"
+            if me == parts[1] == "strategies" and path.stem not in ("__init__", "testing"):
+                assert parts[2] in (path.stem, "base"), f"strategies are mutually blind, but {path.stem} imports {name}"
 
 
-@pytest.mark.parametrize("path", modules("clear_strategies"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_heavy_libraries_stay_in_their_rooms(path):
-    me = unit(path)
-    allowed = DOORS[me] if me in DOORS else FLOORS[me][1] if me in FLOORS else set()
-    for name in imports(path):
-        library = name.split(".")[0]
-        assert library not in HEAVY or library in allowed, f"{me} imports {name}"
+def test_a_floor_imports_lower_floors_only():
+    """So there is no circle between folders."""
+    below: set[str] = set()
+    for folder, (allowed, _) in FLOORS.items():
+        assert allowed <= below, f"{folder} stands below {allowed - below}"
+        below.add(folder)
 
 
-@pytest.mark.parametrize("path", modules("clear_strategies"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_no_concrete_rasterizer_is_imported(path):
-    allowed = ("rasterizers.interface", "rasterizers.geometry", "rasterizers.native", "rasterizers.warp_runtime")
-    for name in imports(path):
-        if name.startswith("rasterizers.") and path.name != "testing.py":
-            assert name.startswith(allowed), f"{path.name} imports {name}"
+def require_no_circle(graph: dict[str, set[str]]) -> None:
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" imports ".join(reversed(error.args[1])))
 
 
-@pytest.mark.parametrize("path", modules("rasterizers"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_rasterizers_stand_alone(path):
-    assert not any(name.startswith("clear_strategies") for name in imports(path))
+def test_no_files_import_each_other():
+    files = {dotted(path): path for package in PACKAGES for path in modules(package)}
+    # Of a package and a module in it, the longer name is what is imported.
+    found = {
+        name: {max(known, key=len) for one in statements(path) if (known := one & files.keys())}
+        for name, path in files.items()
+    }
+    require_no_circle({name: imported - {name} for name, imported in found.items()})
+    with pytest.raises(pytest.fail.Exception, match="imports"):
+        require_no_circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
+
+
+def test_heavy_libraries_stay_in_their_rooms():
+    for path in modules("clear_strategies"):
+        me = unit(path)
+        allowed = DOORS[me] if me in DOORS else FLOORS[me][1] if me in FLOORS else set()
+        wrong = {name.split(".")[0] for name in imports(path)} & HEAVY - allowed
+        assert not wrong, f"{path} imports {wrong}"
+
+
+def test_packages_import_what_lies_below_them():
+    """No concrete rasterizer in clear_strategies, nothing of clear_strategies in rasterizers, and hosts at the top."""
+    shared = ("rasterizers.interface", "rasterizers.geometry", "rasterizers.native", "rasterizers.warp_runtime")
+    for path in modules("clear_strategies"):
+        found = {name for name in imports(path) if name.startswith(("rasterizers.", "integration"))}
+        wrong = {name for name in found if not name.startswith(shared) and path.name != "testing.py"}
+        assert not wrong, f"{path} imports {wrong}"
+    for path in modules("rasterizers"):
+        assert not any(name.startswith(("clear_strategies", "integration")) for name in imports(path)), path
 
 
 def test_importing_the_library_is_light():
@@ -83,16 +124,12 @@ def test_importing_the_library_is_light():
     assert result.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize(
-    "path", [*modules("clear_strategies"), *modules("rasterizers")], ids=lambda p: str(p.relative_to(ROOT))
-)
-def test_nothing_dangerous_is_called(path):
+def test_nothing_dangerous_is_called():
     """No pickles, no eval, no assert as a check."""
-    tree = ast.parse(path.read_text())
-    if path.name != "testing.py":
-        assert "pickle" not in imports(path)
-    calls = {n.func.id for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)}
-    assert not calls & {"eval", "exec", "print"}
-    assert not any(isinstance(n, ast.Assert) for n in ast.walk(tree))
-    keywords = {k.arg for n in ast.walk(tree) if isinstance(n, ast.Call) for k in n.keywords}
-    assert "allow_pickle" not in keywords
+    for path in (*modules("clear_strategies"), *modules("rasterizers")):
+        tree = ast.parse(path.read_text())
+        assert path.name == "testing.py" or "pickle" not in imports(path), path
+        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        assert not {n.func.id for n in calls if isinstance(n.func, ast.Name)} & {"eval", "exec", "print"}, path
+        assert not any(isinstance(node, ast.Assert) for node in ast.walk(tree)), path
+        assert not any(keyword.arg == "allow_pickle" for call in calls for keyword in call.keywords), path

@@ -1,87 +1,20 @@
-"""Density control: the contract of a densifier, which clones, splits, prunes and resets Gaussians while training."""
+"""What both densifiers share: the error, the marks, and the ranges of their settings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
-import torch
-from jaxtyping import Float, Int
-from torch import Tensor
-
-from clear_strategies.core.gradients import Shot
 from clear_strategies.errors import ClearError, SettingError
-from clear_strategies.merging.iteration import Update
-from clear_strategies.training.field import GaussianField
-from clear_strategies.training.optim import Adam
 
 
 class DensityError(ClearError, RuntimeError):
     """Pruning would leave too few Gaussians to go on."""
 
 
-@runtime_checkable
-class Densifier(Protocol):
-    """Changes the structure of the field while it trains."""
-
-    @property
-    def name(self) -> str:
-        """Its name in the printed plan."""
-        ...
-
-    @property
-    def settings(self) -> Any:
-        """A dataclass; its milestones are printed."""
-        ...
-
-    @property
-    def marks(self) -> Mapping[str, int]:
-        """The iterations worth a mark on a curve."""
-        ...
-
-    def accumulate(self, update: Update, shot: Shot, t: int) -> None:
-        """Accumulate the scores of iteration t; `shot` is the rendering that they belong to."""
-        ...
-
-    def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
-        """Do what is due at t, after the optimizer's step; returns whether the structure changed.
-
-        Args:
-            resized: called with parents[M] once field and optimizer have been gathered; row i of everything else per
-                Gaussian now comes from row parents[i].
-        """
-        ...
-
-    def reset_due(self, t: int) -> bool:
-        """Whether opacities are lowered at t; renders right after that say nothing about the field."""
-        ...
-
-    def state_dict(self) -> dict[str, Tensor]: ...
-
-    def load_state_dict(self, tensors: dict[str, Tensor]) -> None: ...
-
-
-@runtime_checkable
-class DensifierSettings(Protocol):
-    """Settings of a densifier: a frozen dataclass that makes the densifier once the scene is known."""
-
-    def densifier(
-        self, n: int, *, extent: float, seed: int, white_background: bool, device: torch.device | str = "cpu"
-    ) -> Densifier:
-        """For a field of n Gaussians on `device`; `extent` is 3DGS's cameras_extent, world units."""
-        ...
-
-
 def structure_marks(stop: int, reset_every: int) -> dict[str, int]:
     """The marks that both densifiers have: the end of densification, and the first opacity reset before it."""
     reset = {"opacity reset": reset_every} if 0 < reset_every < stop else {}
     return {"densify until": stop, **reset}
-
-
-def cameras_extent(centers: Float[Tensor, "V 3"]) -> float:
-    """3DGS's scene size: 1.1 times the largest distance of a training camera from their mean, at least a little."""
-    radius = torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()
-    return max(1.1 * float(radius), 1e-6)
 
 
 def require_in_range(settings: Any) -> None:

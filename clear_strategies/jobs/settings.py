@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 from clear_strategies.compose import ConductorSettings
 from clear_strategies.data.priors import Bicubic
-from clear_strategies.density.base import DensifierSettings
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device, scene
 from clear_strategies.jobs.device import Device, RasterizerSettings
 from clear_strategies.settings import build
+from clear_strategies.training.densifier import DensifierSettings
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings

@@ -16,11 +16,11 @@ from clear_strategies.core import deferred
 from clear_strategies.core.finite import is_finite, rows_not_finite
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
-from clear_strategies.density.base import Densifier, DensifierSettings, cameras_extent
 from clear_strategies.errors import DataError, DivergedError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
+from clear_strategies.training.densifier import Densifier, DensifierSettings, cameras_extent
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.history import History
 from clear_strategies.training.mip import MipFilter

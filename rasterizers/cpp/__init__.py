@@ -18,14 +18,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import (
-    packed_rows,
-    require_cotangents,
-    require_finite,
-    require_splats,
-    same_gaussians_and_pose,
-)
-from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
+from rasterizers.checks import Backend, packed_rows, require_cotangents, require_finite, require_splats
+from rasterizers.interface import Camera, Rendering, SplatGradients, Splats, Traits
 from rasterizers.native import load_kernels, threads
 
 _TRAITS: Final = Traits(
@@ -38,7 +32,7 @@ _LONGEST_SIDE: Final = 32 << 15  # px: bins of 32 px are numbered in 16 bits
 
 
 @dataclass(frozen=True, slots=True)
-class CppRasterizer(RasterSettings):
+class CppRasterizer(Backend):
     """Compiled kernels for the CPU.
 
     Args:
@@ -57,7 +51,7 @@ class CppRasterizer(RasterSettings):
     isa: str | None = None
 
     def __post_init__(self) -> None:
-        RasterSettings.__post_init__(self)
+        Backend.__post_init__(self)
         if self.memory < 1:
             raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
         if self.threads is not None and self.threads < 1:
@@ -73,23 +67,15 @@ class CppRasterizer(RasterSettings):
     def traits(self) -> Traits:
         return _TRAITS
 
-    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
-        return CppRendering(_Frame(self, [(splats, camera)]), 0, depth=depth)
-
     def list_bytes(self, splats: Splats, camera: Camera) -> int:
         """See `interface.CountsLists`; projects the Gaussians and draws nothing."""
         pairs: int = _Frame(self, [(splats, camera)]).native.pairs(0)
         return pairs * (_PAIR_BYTES + _SUMS_BYTES)
 
-    def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
-    ) -> list[Rendering]:
-        """Jobs with the same pose and tensor objects share projection, colour and depth order."""
-        depths = depth or [False] * len(jobs)
-        if len(jobs) > 1 and all(same_gaussians_and_pose(jobs[0], job) for job in jobs[1:]):
-            frame = _Frame(self, jobs)
-            return [CppRendering(frame, i, depth=depths[i]) for i in range(len(jobs))]
-        return [self(*job, depth=z) for job, z in zip(jobs, depths, strict=True)]
+    def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
+        """Jobs of one pose share projection, colour and depth order."""
+        frame = _Frame(self, jobs)
+        return [CppRendering(frame, i, depth=z) for i, z in enumerate(depth)]
 
 
 _PAIR_BYTES: Final = 16  # its Gaussian, its place, and the blocks of its bin that the ellipse reaches

@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import require_cotangents, require_finite, require_splats
-from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
+from rasterizers.checks import Backend, require_cotangents, require_finite, require_splats
+from rasterizers.interface import Camera, Rendering, SplatGradients, Splats, Traits
 from rasterizers.reference.blend import blend, blend_vjp
 from rasterizers.reference.projection import Projection, project
 from rasterizers.reference.tiles import TileGrid, TileLists, list_tiles
@@ -32,7 +32,7 @@ _TILE: Final = 8  # px; takes half the time of 16 in torch
 
 
 @dataclass(frozen=True, slots=True)
-class ReferenceRasterizer(RasterSettings):
+class ReferenceRasterizer(Backend):
     """Pure torch. Deterministic on the CPU only, because index_add_ on CUDA is not.
 
     Args:
@@ -42,7 +42,7 @@ class ReferenceRasterizer(RasterSettings):
     lanes: int = 1 << 19
 
     def __post_init__(self) -> None:
-        RasterSettings.__post_init__(self)
+        Backend.__post_init__(self)
         if self.lanes < 1:
             raise ValueError(f"lanes must be at least 1 pair, got {self.lanes}.")
 
@@ -50,18 +50,16 @@ class ReferenceRasterizer(RasterSettings):
     def traits(self) -> Traits:
         return _TRAITS
 
-    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
+    def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
+        """Jobs share nothing."""
+        return [self._drawn(*job, z) for job, z in zip(jobs, depth, strict=True)]
+
+    def _drawn(self, splats: Splats, camera: Camera, depth: bool) -> Rendering:
         require_splats(splats, _TRAITS)
         require_finite(splats)
         grid = TileGrid(camera.width, camera.height, _TILE)
         projection = project(splats, camera, self, depth=depth)
-        lists = list_tiles(projection, grid)
-        return ReferenceRendering(self, grid, projection, lists)
-
-    def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
-    ) -> list[Rendering]:
-        return [self(*job, depth=z) for job, z in zip(jobs, depth or [False] * len(jobs), strict=True)]
+        return ReferenceRendering(self, grid, projection, list_tiles(projection, grid))
 
 
 class ReferenceRendering:

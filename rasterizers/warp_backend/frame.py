@@ -33,7 +33,7 @@ from rasterizers.warp_backend.bins import find_tiles, list_pairs
 from rasterizers.warp_backend.blend import blend, blend_vjp
 from rasterizers.warp_backend.colour import basis
 from rasterizers.warp_backend.project import project, project_vjp
-from rasterizers.warp_backend.rasterizer import PAIR_BYTES, SUMS_BYTES, TILE, WarpRasterizer, mebibytes, padded
+from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
 from rasterizers.warp_runtime import array, on_stream
 
 _ROW: Final = 14
@@ -79,7 +79,7 @@ class Frame:
 
     def __init__(
         self,
-        settings: WarpRasterizer,
+        settings: WarpSettings,
         jobs: Sequence[tuple[Splats, Camera]],
         depth: Sequence[bool],
     ) -> None:
@@ -338,7 +338,7 @@ def _grid_struct(camera: Camera, columns: int, rows: int) -> Any:
     return grid
 
 
-def _cuts_struct(settings: WarpRasterizer) -> Any:
+def _cuts_struct(settings: WarpSettings) -> Any:
     cuts = types.Cuts()
     cuts.kernel, cuts.near, cuts.antialiased = settings.kernel, settings.near, settings.antialiased
     cuts.near_bits = int.from_bytes(struct.pack("<d", settings.near), "little")

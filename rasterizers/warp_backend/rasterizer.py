@@ -1,92 +1,20 @@
-"""The settings of the Warp backend, and its memory budget. Warp is imported by the first construction."""
+"""The class of the Warp backend. Warp is imported by the first construction."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Final
+from dataclasses import dataclass
 
-import torch
-
-from rasterizers.checks import same_gaussians_and_pose
-from rasterizers.interface import Camera, RasterSettings, Rendering, Splats, Traits
-from rasterizers.warp_runtime import require_warp
-
-TILE: Final = 8
-"""Edge of the tiles that Gaussians are listed for, px."""
-PAIR_BYTES: Final = 24  # tile and place, twice for the sort, and the Gaussian, before and after it
-SUMS_BYTES: Final = 36  # a pair's nine sums for one cotangent
-
-
-def _default_device() -> str:
-    return "cuda" if torch.cuda.is_available() else "cpu"
+from rasterizers.interface import Camera, Rendering, Splats
+from rasterizers.warp_backend.settings import WarpSettings
 
 
 @dataclass(frozen=True, slots=True)
-class WarpRasterizer(RasterSettings):
-    """Warp kernels for CUDA; the same kernels run on a CPU, slowly, to check them.
+class WarpRasterizer(WarpSettings):
+    """Warp kernels for CUDA; the same kernels run on a CPU, slowly, to check them."""
 
-    Args:
-        memory: MiB that one image's lists may take, together with the sums that their pairs send back.
-        device: "cuda" or "cpu", where the splats' tensors are; by default "cuda" where there is one.
-        capacities: the number of pairs to allocate for the next image of each size, from the images before it.
-
-    Raises:
-        BackendUnavailable: Warp is not installed, or there is no CUDA device.
-        ValueError: a setting is out of range.
-    """
-
-    memory: int = 4096
-    device: str = field(default_factory=_default_device)
-    capacities: dict[tuple[int, int], int] = field(default_factory=dict, init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        RasterSettings.__post_init__(self)
-        if self.memory < 1:
-            raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
-        if self.device not in ("cpu", "cuda"):
-            raise ValueError(f"device must be cpu or cuda, got {self.device!r}.")
-        require_warp("the warp rasterizer", self.device, "device=cpu runs here, slowly")
-
-    @property
-    def traits(self) -> Traits:
-        return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}), depth=True)
-
-    def capacity(self, camera: Camera) -> int:
-        """The number of pairs to allocate for an image of this size before they are counted; -1: it is the first one."""
-        return self.capacities.get((camera.width, camera.height), -1)
-
-    def remember(self, camera: Camera, pairs: int) -> None:
-        """Set the capacity to a quarter more than an image needed; the capacity shrinks slowly if later ones need less."""
-        capacity = max(pairs + pairs // 4, self.capacity(camera) * 63 // 64)
-        self.capacities[camera.width, camera.height] = capacity if self.allows(capacity) else pairs
-
-    def allows(self, pairs: int) -> bool:
-        """Whether the lists of this many pairs, which are counted in 32 bits, fit the budget."""
-        return mebibytes(pairs) <= self.memory and pairs < 2**31
-
-    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
+    def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
+        """Jobs of one pose share colour and depth order."""
         from rasterizers.warp_backend.frame import Frame
 
-        return Frame(self, [(splats, camera)], [depth]).draw()[0]
-
-    def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
-    ) -> list[Rendering]:
-        """Jobs with the same pose and tensor objects share colour and depth order."""
-        from rasterizers.warp_backend.frame import Frame
-
-        depths = depth or [False] * len(jobs)
-        if len(jobs) > 1 and all(same_gaussians_and_pose(jobs[0], job) for job in jobs[1:]):
-            return [*Frame(self, jobs, depths).draw()]
-        return [self(*job, depth=z) for job, z in zip(jobs, depths, strict=True)]
-
-
-def padded(count: int) -> int:
-    """The next power of two, so that torch's allocator reuses memory from the last image."""
-    return 1 << max(0, count - 1).bit_length()
-
-
-def mebibytes(pairs: int) -> int:
-    """Memory of the pairs' lists and of their sums for one cotangent."""
-    return padded(pairs) * (PAIR_BYTES + SUMS_BYTES) >> 20
+        return [*Frame(self, jobs, depth).draw()]

@@ -6,12 +6,12 @@ from typing import Any, Final
 
 import warp as wp
 
-from rasterizers.warp_backend import rasterizer
+from rasterizers.warp_backend import settings
 
 wp.set_module_options({"enable_backward": False})
 
-TILE: Final = wp.constant(rasterizer.TILE)
-PIXELS: Final = wp.constant(rasterizer.TILE**2)
+TILE: Final = wp.constant(settings.TILE)
+PIXELS: Final = wp.constant(settings.TILE**2)
 """Pixels of a tile."""
 SUMS: Final = wp.constant(6)
 """Sums of a pair for one cotangent before those of the colour: q = ∂L/∂(log alpha) and its moments."""

@@ -16,7 +16,7 @@ FLOORS: dict[str, tuple[set[str], set[str]]] = {
     "strategies": (GROUND | {"core", "geometry"}, set()),
     "merging": (GROUND | {"core", "kernels", "strategies"}, set()),
     "data": (GROUND | {"core", "geometry"}, {"cv2", "PIL"}),
-    "training": (GROUND | {"core", "kernels", "geometry", "strategies", "merging", "data", "density"}, set()),
+    "training": (GROUND | {"core", "kernels", "geometry", "strategies", "merging", "data"}, set()),
     "density": (GROUND | {"core", "strategies", "merging", "data", "training"}, {"gsplat"}),
     "viewing": (GROUND | {"core", "data", "training"}, set()),
     "outputs": (

@@ -32,9 +32,11 @@ def photo(height, width, seed=5):
     return (0.2 * grown[0] + 0.1 * grown[1] + 0.3 * grown[2] + 0.4 * grown[3]).contiguous()
 
 
-TRAINING_LOSSES = {
-    "photometric": lambda x, y, name: losses.photometric(x, y, 0.2, kernels=name),
-    "l1": lambda x, y, name: losses.l1(x, y, kernels=name),
-    "ssim": lambda x, y, name: losses.ssim(x, y, kernels=name),
-    "haar": lambda x, y, name: losses.haar_l1(x, y, 3, kernels=name),
+LOSSES = {
+    "photometric": lambda x, y, name="auto": losses.photometric(x, y, 0.2, kernels=name),
+    "l1": lambda x, y, name="auto": losses.photometric(x, y, 0.0, kernels=name),
+    "1 - ssim": lambda x, y, name="auto": losses.photometric(x, y, 1.0, kernels=name),
+    "haar": lambda x, y, name="auto": losses.haar_l1(x, y, 1, kernels=name),
+    "haar of three levels": lambda x, y, name="auto": losses.haar_l1(x, y, 3, kernels=name),
 }
+"""The losses that training uses, at their ends too. All are 0 for equal images, with gradient 0."""

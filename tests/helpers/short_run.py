@@ -16,9 +16,9 @@ from clear_strategies import GCO, P2G, SVS, Conductor, FadingOpacity, Objective,
 from clear_strategies.core.view import DepthMap
 from clear_strategies.data.scene import Scene
 from clear_strategies.density.adaptive import DensitySettings
-from clear_strategies.density.base import cameras_extent
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 from clear_strategies.training.compiled_step import FusedMode
+from clear_strategies.training.densifier import cameras_extent
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates

@@ -20,14 +20,7 @@ from clear_strategies.kernels.losses.images import image_pair
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, milestones, scaled
 from rasterizers.interface import BackendUnavailable
-from tests.helpers.loss_cases import TRAINING_LOSSES, image, needs_cpp, needs_warp, photo, rough
-
-LOSSES = {
-    "l1": kernels.l1,
-    "ssim": kernels.ssim,
-    "haar": kernels.haar_l1,
-    "haar of two levels": lambda x, y: kernels.haar_l1(x, y, 2),
-}
+from tests.helpers.loss_cases import LOSSES, image, needs_cpp, needs_warp, photo, rough
 
 
 @pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
@@ -45,20 +38,13 @@ def test_gradients_are_finite_differences(loss, size):
 def test_ssim_is_the_mean_that_scikit_image_computes_inside():
     from skimage.metrics import structural_similarity
 
-    x, y = image(40, 50, 1), image(40, 50, 2)
-    options = {
-        "gaussian_weights": True,
-        "sigma": 1.5,
-        "use_sample_covariance": False,
-        "data_range": 1.0,
-        "channel_axis": 2,
-    }
-    _, their_map = structural_similarity(x.numpy(), y.numpy(), full=True, **options)
     # Only the border differs (they reflect, 3DGS pads with zeros), so the images get a black frame.
-    framed = [torch.nn.functional.pad(z, (0, 0, 20, 20, 20, 20)) for z in (x, y)]
-    _, theirs = structural_similarity(*(z.numpy() for z in framed), full=True, **options)
-    assert float(kernels.ssim(*framed).value) == pytest.approx(float(theirs.mean()), abs=1e-9)
-    assert their_map.shape == (40, 50, 3)
+    framed = [torch.nn.functional.pad(image(40, 50, seed), (0, 0, 20, 20, 20, 20)) for seed in (1, 2)]
+    _, theirs = structural_similarity(
+        *(z.numpy() for z in framed), full=True, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+        data_range=1.0, channel_axis=2,
+    )  # fmt: skip
+    assert float(reference.ssim(*framed).value) == pytest.approx(float(theirs.mean()), abs=1e-9)
 
 
 def sky(height=96, width=90):
@@ -109,20 +95,11 @@ every_implementation = pytest.mark.parametrize("name", [*COMPILED, "torch"])
 
 @every_implementation
 @pytest.mark.parametrize(("x", "y"), PAIRS.values(), ids=PAIRS)
-def test_ssim_agrees_with_float64(name, x, y):
-    value, gradient = kernels.ssim(x, y, kernels=name)
-    exact = reference.ssim(x.double(), y.double())
-    assert -1 - 1e-6 <= float(value) <= 1 + 1e-6
-    assert float(value) == pytest.approx(float(exact.value), abs=1e-6)
-    assert_close(gradient, exact.gradient, 1e-5)
-
-
-@every_implementation
-@pytest.mark.parametrize(("x", "y"), PAIRS.values(), ids=PAIRS)
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
 def test_photometric_agrees_with_float64(name, x, y, share):
     value, gradient = kernels.photometric(x, y, share, kernels=name)
     exact = reference.photometric(x.double(), y.double(), share)
+    assert float(value) >= -1e-6
     assert float(value) == pytest.approx(float(exact.value), abs=1e-6)
     assert_close(gradient, exact.gradient, 1e-5)
 
@@ -143,16 +120,7 @@ def assert_close(gradient, exact, relative):
 
 
 @every_compiled
-def test_equal_images_have_zero_gradient(name):
-    x = photo(60, 70)
-    for loss, perfect in (("photometric", 0.0), ("l1", 0.0), ("ssim", 1.0), ("haar", 0.0)):
-        value, gradient = TRAINING_LOSSES[loss](x, x.clone(), name)
-        assert float(value) == perfect
-        assert not gradient.any()
-
-
-@every_compiled
-@pytest.mark.parametrize("loss", TRAINING_LOSSES.values(), ids=TRAINING_LOSSES)
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
 def test_a_loss_is_a_float32_scalar_outside_of_autograd(name, loss):
     value, gradient = loss(photo(20, 30), photo(20, 30, 6), name)
     assert value.shape == ()
@@ -169,7 +137,7 @@ def threads():
 
 
 @needs_cpp
-@pytest.mark.parametrize("loss", TRAINING_LOSSES.values(), ids=TRAINING_LOSSES)
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
 def test_the_bits_do_not_depend_on_threads(loss, threads):
     x, y = rough(photo(261, 350), 0.1)
     results = []
@@ -188,9 +156,9 @@ ISA_SCRIPT = """
 import sys, torch
 sys.path.insert(0, {tests!r})
 from clear_strategies.kernels.losses import cpp
-from tests.helpers.loss_cases import TRAINING_LOSSES, photo, rough
+from tests.helpers.loss_cases import LOSSES, photo, rough
 x, y = rough(photo(141, 353), 0.1)
-torch.save([cpp.native().isa, *(tuple(loss(x, y, "cpp")) for loss in TRAINING_LOSSES.values())], {out!r})
+torch.save([cpp.native().isa, *(tuple(loss(x, y, "cpp")) for loss in LOSSES.values())], {out!r})
 """
 
 
@@ -207,7 +175,7 @@ def test_every_instruction_set_agrees(isa, tmp_path):
     found, *theirs = torch.load(out)
     assert found == isa
     x, y = rough(photo(141, 353), 0.1)
-    for loss, (value, gradient) in zip(TRAINING_LOSSES.values(), theirs, strict=True):
+    for loss, (value, gradient) in zip(LOSSES.values(), theirs, strict=True):
         mine = loss(x, y, "cpp")
         assert float(value) == pytest.approx(float(mine.value), rel=1e-6)
         assert_close(gradient, mine.gradient, 2e-6)
@@ -264,7 +232,7 @@ def test_images_on_different_devices_are_refused():
 
 def test_auto_uses_torch_for_images_that_the_compiled_kernels_refuse():
     x, y = image(6, 7, 1), image(6, 7, 2)
-    assert kernels.ssim(x, y).value.dtype == torch.float64
+    assert kernels.photometric(x, y, 0.2).value.dtype == torch.float64
     assert torch.equal(kernels.haar_l1(x, y).gradient, reference.haar_l1(x, y).gradient)
 
 
@@ -295,14 +263,14 @@ def test_the_objective_is_the_same_with_cpp_and_torch(caplog):
             assert_close(ours, theirs, 1e-5)
 
 
-def test_identical_images_are_perfect():
-    x = image(16, 16)
-    assert float(kernels.ssim(x, x).value) == pytest.approx(1.0)
-    assert float(kernels.photometric(x, x, 0.2).value) == pytest.approx(0.0, abs=1e-12)
-    for loss in (kernels.l1, kernels.haar_l1):
-        value, gradient = loss(x, x)
-        assert float(value) == 0
-        assert not gradient.any()
+@every_implementation
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
+def test_equal_images_have_no_loss_and_no_gradient(name, loss):
+    x = photo(60, 70)
+    value, gradient = loss(x, x.clone(), name)
+    bound = 1e-15 if name == "torch" else 0.0
+    assert abs(float(value)) <= bound
+    assert float(gradient.abs().max()) <= bound
 
 
 @given(seed=st.integers(0, 1000), shift=st.floats(-1, 1))

@@ -16,7 +16,7 @@ from clear_strategies import Objective
 from clear_strategies.kernels import losses
 from clear_strategies.kernels.losses import cpp, warp
 from rasterizers.interface import BackendUnavailable
-from tests.helpers.loss_cases import TRAINING_LOSSES, needs_warp, photo, rough
+from tests.helpers.loss_cases import LOSSES, needs_warp, photo, rough
 
 
 @pytest.fixture
@@ -82,7 +82,7 @@ def test_images_on_a_cpu_do_not_import_warp(monkeypatch):
     monkeypatch.setattr(warp, "require", lambda device: pytest.fail("required Warp"))
     x, y = photo(20, 30), photo(20, 30, 6)
     assert losses.implementations()
-    for loss in TRAINING_LOSSES.values():
+    for loss in LOSSES.values():
         loss(x, y, "auto")
     Objective().hr(x, y)
 
@@ -96,7 +96,7 @@ def test_the_objective_is_the_same_with_warp_and_torch():
 
 
 @needs_warp
-@pytest.mark.parametrize("loss", TRAINING_LOSSES.values(), ids=TRAINING_LOSSES)
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
 def test_repeated_losses_have_the_same_bits(loss):
     x, y = rough(photo(61, 150), 0.1)
     value, gradient = loss(x, y, "warp")
@@ -109,7 +109,7 @@ def test_repeated_losses_have_the_same_bits(loss):
 
 @pytest.mark.slow
 @needs_warp
-@pytest.mark.parametrize("loss", TRAINING_LOSSES.values(), ids=TRAINING_LOSSES)
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
 def test_blocks_of_many_threads_agree_with_one_thread(monkeypatch, loss):
     """As on CUDA, with 256 threads per block; Warp can emulate this on a CPU."""
     import warp as wp

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
@@ -23,7 +23,8 @@ from clear_strategies import (
     Strategy,
     StrategyConflict,
 )
-from clear_strategies.kernels import losses
+from clear_strategies.core.view import Photo
+from clear_strategies.kernels.losses import reference
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.testing import CHECKS, ContractError, check_strategy
 from clear_strategies.training.field import GaussianField
@@ -96,7 +97,9 @@ def field_and_view(dtype=torch.float64, degree=1):
         value.add_(torch.randn(value.shape, generator=g), alpha=0.05)
     field.degree = degree
     field.update_filter([v.hr.camera for v in scene.train], 0.2)
-    return field.to(dtype), scene.train[1]
+    view = scene.train[1]
+    lr, hr = (Photo(photo.camera, photo.image.to(dtype)) for photo in (view.lr, view.hr))
+    return field.to(dtype), replace(view, lr=lr, hr=hr)
 
 
 def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective, λ: float) -> Grads:
@@ -120,7 +123,7 @@ def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective
             return None, cotangent * ctx.gradient, None
 
     def photometric(x: Tensor, y: Tensor) -> Tensor:
-        return 0.8 * Loss.apply(losses.l1, x, y) + 0.2 * (1 - Loss.apply(losses.ssim, x, y))
+        return 0.8 * Loss.apply(reference.l1, x, y) + 0.2 * (1 - Loss.apply(reference.ssim, x, y))
 
     common = (raw["means"], raw["quats"], scales, opacities, raw["sh0"], raw["shN"][:, :bands])
     zero = torch.zeros_like(raw["detail"])
@@ -131,7 +134,7 @@ def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective
         lr = draw(view.lr.camera, *common, zero)
     loss = objective.lambda_lr * photometric(lr, view.lr.image.double()) + λ * (
         photometric(hr, view.hr.image.double())
-        + objective.lambda_hf * Loss.apply(losses.haar_l1, hr, view.hr.image.double())
+        + objective.lambda_hf * Loss.apply(reference.haar_l1, hr, view.hr.image.double())
     )
     gradients = torch.autograd.grad(loss, list(raw.values()))
     return Grads(dict(zip(raw, gradients, strict=True)))
@@ -145,7 +148,6 @@ def test_without_strategies_it_is_autograd_of_the_summed_loss(hf, lambda_lr, lr_
     conductor = Conductor(objective=objective)
     lr, hr = field.render_scales(toy.RASTERIZER, view, lr=conductor.wants_lr, hr=conductor.wants_hr(5))
     assert (lr is None) == (lr_from == "hr" or lambda_lr == 0)
-    view = _double(view)
     found = conductor.update(field.raw(), lr, hr, view, 5).grads
     expected = autograd_of_the_summed_loss(field, view, objective, 1.0)
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
@@ -156,7 +158,6 @@ def test_without_strategies_it_is_autograd_of_the_summed_loss(hf, lambda_lr, lr_
 def test_a_reduced_lr_image_counts_for_densification_in_ndc_as_a_drawn_one_does():
     """∇_u in NDC does not depend on the pixels that it was pulled through: two routes to one blurred picture agree."""
     field, view = field_and_view()
-    view = _double(view)
     seen = {}
     for lr_from in ("lr", "hr"):
         conductor = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0), lr_from=lr_from))
@@ -168,7 +169,6 @@ def test_a_reduced_lr_image_counts_for_densification_in_ndc_as_a_drawn_one_does(
 
 def test_without_lr_photos_only_the_reference_moves_gaussians():
     field, view = field_and_view()
-    view = _double(view)
     conductor = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0, lambda_lr=0.0))
     _, hr = field.render_scales(toy.RASTERIZER, view, lr=False)
     update = conductor.update(field.raw(), None, hr, view, 5)
@@ -198,7 +198,6 @@ def test_a_weight_without_warm_up_is_constant_from_the_first_iteration():
 
 def test_the_detail_feature_moves_by_routed_high_frequencies_alone():
     field, view = field_and_view()
-    view = _double(view)
     objective = Objective(lambda_hr=ALWAYS)
     lr, hr = field.render_scales(toy.RASTERIZER, view)
     p2g = P2G()
@@ -213,7 +212,6 @@ def test_the_detail_feature_moves_by_routed_high_frequencies_alone():
 
 def test_routing_weighs_the_high_frequency_gradient_only():
     field, view = field_and_view()
-    view = _double(view)
     objective = Objective(lambda_hr=ALWAYS)
     lr, hr = field.render_scales(toy.RASTERIZER, view)
     p2g = P2G()
@@ -232,7 +230,6 @@ def test_two_owners_of_one_question_are_refused():
 
 def test_the_order_of_strategies_does_not_matter():
     field, view = field_and_view()
-    view = _double(view)
     grads = []
     for strategies in ((GCO(), P2G(), SVS()), (SVS(), P2G(), GCO())):
         lr, hr = field.render_scales(toy.RASTERIZER, view)
@@ -254,7 +251,6 @@ def test_hr_is_wanted_only_while_it_has_a_use():
 
 def test_conflict_is_measured_before_correction_and_for_the_baseline_too():
     field, view = field_and_view()
-    view = _double(view)
     ratios = []
     for strategies in ((), (GCO(),)):
         lr, hr = field.render_scales(toy.RASTERIZER, view)
@@ -272,16 +268,6 @@ def test_a_strategy_without_hooks_is_warned_of(caplog):
 
     Conductor(Idle())
     assert "Idle implements no hook" in caplog.text
-
-
-def _double(view):
-    from dataclasses import replace
-
-    from clear_strategies.core.view import Photo
-
-    return replace(
-        view, lr=Photo(view.lr.camera, view.lr.image.double()), hr=Photo(view.hr.camera, view.hr.image.double())
-    )
 
 
 def test_two_strategies_of_one_class_keep_their_states_apart():
@@ -304,7 +290,6 @@ def test_two_strategies_of_one_class_keep_their_states_apart():
 
 def test_what_a_strategy_logged_belongs_to_its_iteration():
     field, view = field_and_view()
-    view = _double(view)
     conductor = Conductor(P2G(), objective=Objective(lambda_hr=ALWAYS))
     lr, hr = field.render_scales(toy.RASTERIZER, view)
     assert "mean_q" in conductor.update(field.raw(), lr, hr, view, 5).logs

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 import rasterizers
+from clear_strategies.core.projection import intrinsics
 from rasterizers import Splats, autograd
 from rasterizers.reference import ReferenceRasterizer
-from rasterizers.testing import scene
+from rasterizers.testing import pixels_of, scene
 from tests.helpers.backends import camera
 
 
@@ -42,17 +43,23 @@ def test_depth_that_was_not_asked_for_is_not_drawn():
     assert autograd.draw(ReferenceRasterizer(), scene(5), camera(40, 30)).depth is None
 
 
-def test_gsplats_render_mode_with_depth_has_it_as_the_fourth_channel():
-    splats, view = scene(60, dtype=torch.float64), camera(40, 30)
-    K = torch.tensor([[view.fx, 0, view.cx], [0, view.fy, view.cy], [0, 0, 1]], dtype=torch.float64)
-    means = splats.means.clone().requires_grad_()
-    images, _, _ = autograd.rasterization(
-        means, splats.quats, splats.scales, splats.opacities, torch.cat((splats.sh0, splats.shN), 1),
-        view.world_to_camera.double()[None], K[None], 40, 30, sh_degree=1, render_mode="RGB+ED", backend="torch",
+def test_the_stand_in_for_gsplats_rasterization_has_our_rasterizers_gradients():
+    """The expected depth is the fourth channel of its images."""
+    view, names = camera(40, 30), [f.name for f in fields(Splats)[:6]]
+    splats = Splats(**{name: getattr(leaves(scene(60, dtype=torch.float64)), name) for name in names})
+    geometry = (
+        splats.means, splats.quats, splats.scales, splats.opacities, torch.cat((splats.sh0, splats.shN), 1),
+        view.world_to_camera.double()[None], intrinsics(view)[None], 40, 30,
     )  # fmt: skip
-    plain = Splats(*(getattr(splats, f.name) for f in fields(Splats)[:6]))
-    expected = rasterizers.load("torch", kernel=0.3, antialiased=False)(plain, view, depth=True)
-    assert torch.allclose(images[0, ..., 3], expected.depth)
-    assert torch.allclose(images[0, ..., :3], expected.image)
-    images[..., :3].sum().backward()
-    assert means.grad.abs().sum() > 0
+    settings = {"sh_degree": 1, "backend": "torch"}
+    images, _, info = autograd.rasterization(*geometry, render_mode="RGB+ED", **settings)
+    expected = rasterizers.load("torch", kernel=0.3, antialiased=False)(splats, view, depth=True)
+    assert torch.allclose(images[0], pixels_of(expected))
+    v = torch.randn(1, 30, 40, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    (images[..., :3] * v).sum().backward()
+    gradients = expected.vjp(v)
+    for name in names:
+        assert torch.allclose(getattr(splats, name).grad, getattr(gradients, name)[0], rtol=1e-9, atol=1e-12), name
+    assert torch.allclose(info["means2d"].grad[0], gradients.screen[0])
+    with pytest.raises(ValueError, match="needs CUDA"):
+        autograd.rasterization(*geometry, render_mode="D", **settings)

@@ -1,4 +1,4 @@
-"""Expected depth: values worked out by hand, agreement with float64, and what it shares with the image."""
+"""Expected depth: values worked out by hand, and what it shares with the image. test_compiled.py compares backends."""
 
 from __future__ import annotations
 
@@ -11,18 +11,9 @@ import rasterizers
 from rasterizers import Splats
 from rasterizers.checks import require_cotangents
 from rasterizers.reference import ReferenceRasterizer
-from rasterizers.testing import magnitude, pixels_of, scene, to
-from tests.helpers.agreement import require_image, require_same_bits
-from tests.helpers.backends import (
-    CLEAN,
-    backends,
-    camera,
-    cotangents,
-    dense_scene,
-    everything,
-    exact,
-    why_not,
-)
+from rasterizers.testing import scene, to
+from tests.helpers.agreement import require_same_bits
+from tests.helpers.backends import CLEAN, backends, camera, cotangents, dense_scene, everything, exact
 
 
 def balls(*depths: float, opacity=0.6, scale=0.4) -> Splats:
@@ -77,25 +68,6 @@ def test_moving_everything_back_moves_the_depth_by_as_much():
 
 
 @backends(dtype=torch.float32)
-def test_float32_agrees_with_float64_at_the_same_cut_offs(backend):
-    splats, view = dense_scene()
-    found, expected = backend()(splats, view, depth=True), exact(splats, view, depth=True)
-    scale = magnitude(expected)
-    require_image(pixels_of(found) / scale, pixels_of(expected) / scale)
-
-
-@backends()
-def test_the_highest_precision_agrees_with_the_reference(backend):
-    splats, view = scene(400), camera(97, 66)
-    narrow = backend.widest == torch.float32
-    settings = {"background": (0.2, 0.4, 0.6), **(CLEAN if narrow else {})}
-    found = backend(**settings)(to(splats, backend.widest), view, depth=True)
-    expected = ReferenceRasterizer(**settings)(to(splats, torch.float64), view, depth=True)
-    error = (pixels_of(found).double() - pixels_of(expected)).abs() / magnitude(expected)
-    assert float(error.max()) < (5e-6 if narrow else 1e-12)
-
-
-@backends(dtype=torch.float32)
 def test_the_faintest_pixel_has_a_depth(backend):
     # Where alpha is 1e-6, 1 - T has one digit left in float32.
     splats = to(balls(2.0, 6.0, opacity=1e-6, scale=10.0), torch.float32)
@@ -116,50 +88,6 @@ def test_depth_does_not_change_the_image_or_its_gradients(backend, k):
     assert without.depth is None
     assert torch.equal(drawn.image, without.image)
     require_same_bits(everything(drawn, v)[1:], everything(without, v)[1:])
-
-
-@backends()
-def test_bits_with_depth_do_not_depend_on_the_run(backend):
-    splats, view = dense_scene(800)
-    v = cotangents(3, view.height, view.width)
-    expected = everything(backend()(splats, view, depth=True), v)
-    for _ in range(3):
-        require_same_bits(everything(backend()(splats, view, depth=True), v), expected)
-
-
-@pytest.mark.skipif(bool(why_not("cpp")), reason=str(why_not("cpp")))
-def test_bits_with_depth_do_not_depend_on_threads_or_memory():
-    splats, view = scene(2000, bands=3, seed=2), camera(1000, 700)
-    splats = replace(splats, scales=splats.scales * 3)
-    v = cotangents(2, 700, 1000)
-    expected = everything(rasterizers.load("cpp", threads=1)(splats, view, depth=True), v)
-    for settings in ({"threads": 2}, {"threads": 3, "memory": 4}):
-        require_same_bits(everything(rasterizers.load("cpp", **settings)(splats, view, depth=True), v), expected)
-
-
-@backends()
-def test_one_of_two_scales_may_have_depth(backend):
-    splats, hr = scene(300), camera(128, 96)
-    jobs = [(splats, hr.scaled(1 / 4)), (splats, hr)]
-    for asked in ([True, False], [False, True], [True, True]):
-        for rendering, job, depth in zip(backend().render_scales(jobs, depth=asked), jobs, asked, strict=True):
-            v = cotangents(2, job[1].height, job[1].width)
-            alone = backend()(*job, depth=depth)
-            assert (rendering.depth is not None) == depth
-            *found, _ = everything(rendering, v)
-            *expected, _ = everything(alone, v)
-            require_same_bits(found, expected)
-
-
-@pytest.mark.parametrize("n", [0, 1, 15, 17])
-@backends()
-def test_any_number_of_gaussians_has_a_depth(backend, n):
-    splats, view = to(scene(300, bands=0), backend.widest), camera(40, 30)
-    some = Splats(*(getattr(splats, a)[:n] for a in ("means", "quats", "scales", "opacities", "sh0", "shN")))
-    found = backend(**CLEAN)(some, view, depth=True)
-    expected = ReferenceRasterizer(**CLEAN)(to(some, torch.float64), view, depth=True)
-    error = (pixels_of(found).double() - pixels_of(expected)).abs() / magnitude(expected)
-    assert float(error.max()) < 5e-6
 
 
 def test_depth_has_no_cotangent():

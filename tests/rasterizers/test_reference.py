@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import rasterizers
-from rasterizers import Camera, Splats
+from rasterizers import PRESETS, Camera, Splats
 from rasterizers.geometry import SH_C0, rotation_matrix, spherical_harmonics
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import CHECKS, ContractError, check_rasterizer, scene, to
@@ -138,16 +138,6 @@ def test_needles_keep_a_positive_determinant():
     assert all(getattr(gradients, name).isfinite().all() for name in ("means", "quats", "scales", "opacities", "rgb"))
 
 
-@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh0"])
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_number_that_is_not_finite_is_refused(field, value):
-    splats = scene(10)
-    bad = getattr(splats, field).clone()
-    bad[7] = value
-    with pytest.raises(ValueError, match=rf"splats\.{field} must be finite; Gaussian 7"):
-        rasterizers.load("torch")(replace(splats, **{field: bad}), odd_camera())
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -157,6 +147,8 @@ def test_a_number_that_is_not_finite_is_refused(field, value):
         ({"alpha_max": 1.5}, "alpha_max"),
         ({"background": (0, 0, 2)}, "background must be"),
         ({"kernels": 0.1}, "unknown rasterizer setting 'kernels'"),
+        ({"lanes": 0}, "lanes"),
+        ({"preset": "best"}, "unknown preset 'best'; choose one of fast, accurate, exact"),
     ],
 )
 def test_settings_outside_their_range_are_refused(settings, message):
@@ -164,15 +156,21 @@ def test_settings_outside_their_range_are_refused(settings, message):
         rasterizers.load("torch", **settings)
 
 
+def test_a_preset_sets_the_cut_offs_and_settings_override_it():
+    assert rasterizers.load("torch", preset="fast") == rasterizers.load("torch")
+    cuts = []
+    for name, preset in PRESETS.items():
+        rasterizer = rasterizers.load("torch", preset=name)
+        cuts.append((rasterizer.alpha_min, rasterizer.transmittance_min))
+        assert cuts[-1] == (preset["alpha_min"], preset["transmittance_min"])
+        assert rasterizers.load("torch", preset=name, alpha_min=1 / 64) == replace(rasterizer, alpha_min=1 / 64)
+    assert cuts == sorted(cuts, reverse=True)  # coarsest first
+
+
 def test_an_unknown_backend_is_refused():
     with pytest.raises(ValueError, match=r"choose one of auto, .*torch"):
         rasterizers.load("cuda")
     assert rasterizers.available()["torch"] is None
-
-
-def test_lanes_must_be_positive():
-    with pytest.raises(ValueError, match="lanes"):
-        ReferenceRasterizer(lanes=0)
 
 
 @pytest.mark.parametrize("pixels", [1e3, 1e5, 1e7, 1e9])

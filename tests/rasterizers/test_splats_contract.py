@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -64,6 +65,16 @@ def test_a_tensor_on_another_device_is_refused(draw):
 def test_a_dtype_that_no_backend_draws_is_refused(draw, dtype):
     with pytest.raises(TypeError, match=r"draws float32.* got splats.means of "):
         draw(changed("means", lambda x: x.to(dtype)), camera())
+
+
+@pytest.mark.parametrize("name", ["means", *OTHERS])
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_number_that_is_not_finite_is_refused(draw, name, bad):
+    visible = int(draw(scene(20), camera()).visible.nonzero()[3])
+    splats = changed(name, torch.Tensor.clone)
+    getattr(splats, name)[visible].view(-1)[-1] = bad
+    with pytest.raises(ValueError, match=f"splats.{name} must be finite; Gaussian {visible}"):
+        draw(splats, camera())
 
 
 def test_bands_that_no_degree_has_are_refused(draw):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import pytest
 import torch
@@ -25,10 +25,8 @@ class ThirdParty(RasterSettings):
     @property
     def inner(self) -> ReferenceRasterizer:
         return ReferenceRasterizer(
-            kernel=self.kernel, near=self.near, alpha_min=self.alpha_min, alpha_max=self.alpha_max,
-            transmittance_min=self.transmittance_min, background=self.background, antialiased=self.antialiased,
-            lanes=self.lanes_per_pass,
-        )  # fmt: skip
+            lanes=self.lanes_per_pass, **{f.name: getattr(self, f.name) for f in fields(RasterSettings)}
+        )
 
     @property
     def traits(self) -> Traits:
@@ -38,10 +36,7 @@ class ThirdParty(RasterSettings):
         return self.inner(splats, camera, depth=depth)
 
     def render_scales(
-        self,
-        jobs: Sequence[tuple[Splats, Camera]],
-        *,
-        depth: Sequence[bool] | None = None,
+        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
     ) -> list[Rendering]:
         return self.inner.render_scales(jobs, depth=depth)
 

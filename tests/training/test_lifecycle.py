@@ -14,9 +14,10 @@ from clear_strategies import SVS, Conductor, Update
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.points import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
-from clear_strategies.density.base import DensityError, cameras_extent
+from clear_strategies.density.base import DensityError
 from clear_strategies.errors import SettingError
 from clear_strategies.strategies.testing import StubShot
+from clear_strategies.training.densifier import cameras_extent
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.mip import filter_std
 from clear_strategies.training.optim import Adam, LearningRates

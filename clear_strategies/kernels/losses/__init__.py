@@ -24,10 +24,8 @@ __all__ = [
     "LossAndGradient",
     "haar_l1",
     "implementations",
-    "l1",
     "photometric",
     "require",
-    "ssim",
 ]
 
 _log = logging.getLogger(__name__)
@@ -40,10 +38,6 @@ class Implementation(Protocol):
     """The functions of an implementation; `reference` specifies them."""
 
     def photometric(self, x: Tensor, y: Tensor, lambda_ssim: float, out: Tensor | None = None) -> LossAndGradient: ...
-
-    def l1(self, x: Tensor, y: Tensor) -> LossAndGradient: ...
-
-    def ssim(self, x: Tensor, y: Tensor) -> LossAndGradient: ...
 
     def haar_l1(self, x: Tensor, y: Tensor, levels: int = 1, out: Tensor | None = None) -> LossAndGradient: ...
 
@@ -98,16 +92,6 @@ def haar_l1(
 ) -> LossAndGradient:
     """Mean absolute difference of Haar details, averaged over levels, with its gradient, written into `out` if given."""
     return _choose(kernels, x, y).haar_l1(x, y, levels, out)
-
-
-def l1(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], *, kernels: Choice = "auto") -> LossAndGradient:
-    """Mean absolute difference, with its gradient."""
-    return _choose(kernels, x, y).l1(x, y)
-
-
-def ssim(x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], *, kernels: Choice = "auto") -> LossAndGradient:
-    """Mean structural similarity, with its gradient."""
-    return _choose(kernels, x, y).ssim(x, y)
 
 
 def _choose(kernels: Choice, x: Tensor, y: Tensor) -> Implementation:

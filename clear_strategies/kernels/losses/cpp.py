@@ -57,18 +57,6 @@ def photometric(
     return _result((1 - lambda_ssim) * l1_mean + lambda_ssim * dissimilarity, images)
 
 
-def l1(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> LossAndGradient:
-    """Mean absolute difference; where x = y the gradient is 0."""
-    return photometric(x, y, 0.0)
-
-
-def ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> LossAndGradient:
-    """Mean structural similarity as 3DGS trains with it: zero padding, so borders count less."""
-    images = image_pair(_DEVICES, x, y, None)
-    _, dissimilarity = native().photometric(*images, 0.0, -1.0, threads())  # SSIM - 1, and its gradient
-    return _result(1 - dissimilarity, images)
-
-
 def haar_l1(
     x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], levels: int = 1, out: Float[Tensor, "H W 3"] | None = None
 ) -> LossAndGradient:

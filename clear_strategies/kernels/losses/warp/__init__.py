@@ -60,17 +60,6 @@ def photometric(
     return LossAndGradient(_launches(x).photometric(images, 1 - lambda_ssim, lambda_ssim), images.gradient)
 
 
-def l1(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> LossAndGradient:
-    """Mean absolute difference; where x = y the gradient is 0."""
-    return photometric(x, y, 0.0)
-
-
-def ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> LossAndGradient:
-    """Mean structural similarity as 3DGS trains with it: zero padding, so borders count less."""
-    images = image_pair(_DEVICES, x, y, None)
-    return LossAndGradient(_launches(x).photometric(images, 0.0, -1.0, 1.0), images.gradient)  # 1 - (1 - SSIM)
-
-
 def haar_l1(
     x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], levels: int = 1, out: Float[Tensor, "H W 3"] | None = None
 ) -> LossAndGradient:

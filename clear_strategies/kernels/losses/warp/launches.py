@@ -17,8 +17,8 @@ from rasterizers.warp_runtime import array, on_stream
 LANES: Final = {"cuda": 256, "cpu": 1}  # threads per block; on a CPU, Warp's blocks have one
 
 
-def photometric(images: ImagePair, l1: float, dssim: float, start: float = 0.0) -> Float[Tensor, ""]:
-    """The value l1 · mean |x - y| + dssim · (1 - SSIM) + start; with dssim = 0 no SSIM is computed."""
+def photometric(images: ImagePair, l1: float, dssim: float) -> Float[Tensor, ""]:
+    """The value l1 · mean |x - y| + dssim · (1 - SSIM); with dssim = 0 no SSIM is computed."""
     x, y, out = (image.flatten(1) for image in images)
     height, width = x.shape
     l1_share, dssim_share = l1 / x.numel(), dssim / x.numel()
@@ -34,7 +34,7 @@ def photometric(images: ImagePair, l1: float, dssim: float, start: float = 0.0) 
                 similarity.gradient, blocks, x.device, array(x), array(y), array(maps), l1_share, l1_share,
                 -dssim_share, array(out), array(parts),
             )  # fmt: skip
-        return _total(parts, start)
+        return _total(parts)
 
 
 def haar_l1(images: ImagePair, levels: int) -> Float[Tensor, ""]:
@@ -60,16 +60,16 @@ def haar_l1(images: ImagePair, levels: int) -> Float[Tensor, ""]:
                 array(above, wp.vec3), above is None, weight, array(gradient, wp.vec3), array(own),
             )  # fmt: skip
             above = gradient
-        return _total(parts, 0.0)
+        return _total(parts)
 
 
 def _parts(like: Tensor, blocks: int) -> Tensor:
     return like.new_empty(blocks, dtype=torch.float64)
 
 
-def _total(parts: Tensor, start: float) -> Float[Tensor, ""]:
+def _total(parts: Tensor) -> Float[Tensor, ""]:
     value = parts.new_empty((), dtype=torch.float32)
-    _launch(sums.total, [1], parts.device, array(parts), start, array(value.view(1)))
+    _launch(sums.total, [1], parts.device, array(parts), array(value.view(1)))
     return value
 
 

@@ -48,16 +48,14 @@ def absolute(lanes: int) -> Any:
 @cache
 @no_type_check
 def total(lanes: int) -> Any:
-    """The kernel that writes start + Σ parts in float32, with one block of `lanes` threads."""
+    """The kernel that writes Σ parts in float32, with one block of `lanes` threads."""
 
     @wp.kernel(module="unique", enable_backward=False)
-    def total(parts: wp.array[wp.float64], start: wp.float64, value: wp.array[wp.float32]) -> None:
+    def total(parts: wp.array[wp.float64], value: wp.array[wp.float32]) -> None:
         _, lane = wp.tid()
         share = wp.float64(0.0)
         for part in range(lane, parts.shape[0], lanes):
             share += parts[part]
-        if lane == 0:
-            share += start
         wp.tile_store(value, wp.tile_astype(wp.tile_sum(wp.tile(share)), wp.float32))
 
     return total

@@ -1,0 +1,75 @@
+"""The settings of the Warp backend, and its memory budget."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import torch
+
+from rasterizers.checks import Backend
+from rasterizers.interface import Camera, Traits
+from rasterizers.warp_runtime import require_warp
+
+TILE: Final = 8
+"""Edge of the tiles that Gaussians are listed for, px."""
+PAIR_BYTES: Final = 24  # tile and place, twice for the sort, and the Gaussian, before and after it
+SUMS_BYTES: Final = 36  # a pair's nine sums for one cotangent
+
+
+def _default_device() -> str:
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+@dataclass(frozen=True, slots=True)
+class WarpSettings(Backend):
+    """The settings of `WarpRasterizer`.
+
+    Args:
+        memory: MiB that one image's lists may take, together with the sums that their pairs send back.
+        device: "cuda" or "cpu", where the splats' tensors are; by default "cuda" where there is one.
+        capacities: the number of pairs to allocate for the next image of each size, from the images before it.
+
+    Raises:
+        BackendUnavailable: Warp is not installed, or there is no CUDA device.
+        ValueError: a setting is out of range.
+    """
+
+    memory: int = 4096
+    device: str = field(default_factory=_default_device)
+    capacities: dict[tuple[int, int], int] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        Backend.__post_init__(self)
+        if self.memory < 1:
+            raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
+        if self.device not in ("cpu", "cuda"):
+            raise ValueError(f"device must be cpu or cuda, got {self.device!r}.")
+        require_warp("the warp rasterizer", self.device, "device=cpu runs here, slowly")
+
+    @property
+    def traits(self) -> Traits:
+        return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}), depth=True)
+
+    def capacity(self, camera: Camera) -> int:
+        """The number of pairs to allocate for an image of this size before they are counted; -1: it is the first one."""
+        return self.capacities.get((camera.width, camera.height), -1)
+
+    def remember(self, camera: Camera, pairs: int) -> None:
+        """Set the capacity to a quarter more than an image needed; the capacity shrinks slowly if later ones need less."""
+        capacity = max(pairs + pairs // 4, self.capacity(camera) * 63 // 64)
+        self.capacities[camera.width, camera.height] = capacity if self.allows(capacity) else pairs
+
+    def allows(self, pairs: int) -> bool:
+        """Whether the lists of this many pairs, which are counted in 32 bits, fit the budget."""
+        return mebibytes(pairs) <= self.memory and pairs < 2**31
+
+
+def padded(count: int) -> int:
+    """The next power of two, so that torch's allocator reuses memory from the last image."""
+    return 1 << max(0, count - 1).bit_length()
+
+
+def mebibytes(pairs: int) -> int:
+    """Memory of the pairs' lists and of their sums for one cotangent."""
+    return padded(pairs) * (PAIR_BYTES + SUMS_BYTES) >> 20

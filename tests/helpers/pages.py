@@ -1,0 +1,66 @@
+"""The pages of the documentation: their fenced blocks, and the commands in them."""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
+    ROOT / "integration" / "README.md",
+    *sorted(DOCS.rglob("*.md")),
+]
+OURS = ("clear_strategies", "rasterizers", "integration")
+
+
+def name(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def loaded(path: Path) -> ModuleType:
+    """A Python file of docs/, which is no package."""
+    spec = importlib.util.spec_from_file_location(f"docs_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+HOOKS = loaded(DOCS / "hooks.py")
+
+
+def blocks(page: Path, *languages: str) -> list[str]:
+    """The fenced blocks of these languages; those inside lists are dedented."""
+    found = re.findall(rf"^( *)```(?:{'|'.join(languages)})\n(.*?)^ *```", page.read_text(), re.DOTALL | re.MULTILINE)
+    return [re.sub(rf"^{indent}", "", text, flags=re.MULTILINE) for indent, text in found]
+
+
+def commands(block: str) -> Iterator[list[str]]:
+    """The words of every simple command of a shell block, without variables set before it and redirections after it."""
+    for line in block.replace("\\\n", " ").splitlines():
+        lexer = shlex.shlex(line, posix=True, punctuation_chars=True)
+        lexer.whitespace_split = True
+        words: list[str] = []
+        for word in itertools.chain(lexer, [";"]):
+            if set(word) <= set(";&|"):
+                redirected = next((i for i, w in enumerate(words) if set(w) <= set("<>&")), len(words))
+                words = words[:redirected]
+                while words and (words[0] == "do" or re.fullmatch(r"\w+=.*", words[0])):
+                    words = words[1:]
+                if words:
+                    yield words
+                words = []
+            else:
+                words.append(word)

@@ -1,0 +1,262 @@
+"""What the documentation names exists: links, paths, symbols, settings, numbers of its tables."""
+
+from __future__ import annotations
+
+import ast
+import csv
+import importlib
+import inspect
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+import clear_strategies
+from clear_strategies import Strategy
+from clear_strategies.compose import CONF, OPTIONS, composed
+from tests.helpers.floors import DOORS, FLOORS
+from tests.helpers.pages import DOCS, HOOKS, OURS, PAGES, ROOT, loaded, name
+
+
+def test_every_name_of_the_public_api_exists():
+    page = (DOCS / "reference" / "public-api.md").read_text()
+    names = set(re.findall(r"`((?:clear_strategies|rasterizers|integration)\.[\w.]+)`", page)) - {OPTIONS}
+    assert {f"clear_strategies.{name}" for name in clear_strategies.__all__} <= names | {
+        "clear_strategies.ATTRIBUTES", "clear_strategies.CONFLICT_GROUPS",
+    }  # fmt: skip
+    for module, _, attribute in (whole.rpartition(".") for whole in names):
+        assert hasattr(importlib.import_module(module), attribute), f"{module}.{attribute}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
+        if target.startswith("http"):
+            continue
+        path = (page.parent / target).resolve()
+        generated = path.is_relative_to(DOCS) and path.relative_to(DOCS).as_posix() in HOOKS.GENERATED
+        assert path.exists() or generated, target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_paths_that_pages_name_exist(page):
+    text = page.read_text()
+    named = re.findall(r"`((?:clear_strategies|rasterizers|integration|conf|tests|docs)/[\w./-]*)`", text)
+    for folder, rows in re.findall(r"^\| file of `([^`]+)` \|.*\n\|[-|]+\|\n((?:\|.*\n)+)", text, re.MULTILINE):
+        cells = [row.split("|")[1] for row in rows.splitlines()]
+        named += [f"{folder}/{file}" for cell in cells for file in re.findall(r"`([^`]+)`", cell)]
+    assert not [path for path in named if not (ROOT / path).exists()]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_symbols_that_pages_name_are_in_their_files(page):
+    stations = re.findall(r"`([\w./-]+\.(?:py|cpp|hpp|yaml|md)):([\w.]+)`", page.read_text())
+    assert stations or page.name != "CONTRIBUTING.md"
+    assert not [f"{file}:{symbol}" for file, symbol in stations if not holds(ROOT / file, symbol)]
+
+
+def holds(file: Path, symbol: str) -> bool:
+    """Whether a file defines a symbol; one that is not Python, whether it has the word."""
+    if file.suffix != ".py":
+        return file.is_file() and re.search(rf"\b{symbol}\b", file.read_text()) is not None
+    body = ast.parse(file.read_text()).body if file.is_file() else []
+    for part in symbol.split("."):
+        defined = next((node for node in body if part in names_of(node)), None)
+        if defined is None:
+            return False
+        body = getattr(defined, "body", [])
+    return True
+
+
+def names_of(node: ast.stmt) -> set[str]:
+    targets = [*getattr(node, "targets", []), getattr(node, "target", None)]
+    return {getattr(node, "name", ""), *(target.id for target in targets if isinstance(target, ast.Name))}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_names_that_pages_use_exist(page):
+    named = re.findall(rf"`((?:{'|'.join(OURS)})(?:\.\w+)+)", page.read_text())
+    assert not [dotted for dotted in dict.fromkeys(named) if not exists(dotted)]
+
+
+def exists(dotted: str) -> bool:
+    parts = dotted.split(".")
+    for n in range(len(parts), 0, -1):
+        file = ROOT.joinpath(*parts[:n])
+        source = file.with_suffix(".py") if file.with_suffix(".py").is_file() else file / "__init__.py"
+        if not source.is_file():
+            continue
+        try:
+            found: object = importlib.import_module(".".join(parts[:n]))
+            for part in parts[n:]:
+                found = getattr(found, part)
+        except AttributeError:
+            return False
+        except ImportError:  # a host's own module is not installed
+            tree = ast.parse(source.read_text())
+            return {getattr(node, "name", None) for node in tree.body} >= set(parts[n : n + 1])
+        return True
+    return False
+
+
+def test_pages_that_the_code_names_exist():
+    tracked = subprocess.run(["git", "ls-files"], capture_output=True, text=True, cwd=ROOT, check=False).stdout.split()
+    if not tracked:
+        pytest.skip("not a checkout")
+    sources = [ROOT / path for path in tracked if path.endswith((".py", ".yaml", ".toml", ".hpp", ".cpp", ".md"))]
+    named = {
+        (path, source.relative_to(ROOT).as_posix())
+        for source in sources
+        if source.is_file()
+        for path in re.findall(r"\bdocs/[\w/-]+\.md", source.read_text())
+    }
+    assert not sorted(where for where in named if not (ROOT / where[0]).exists())
+
+
+CONFIG = composed(["+strategy=clear"], "config")
+
+
+def test_what_has_not_run_on_a_gpu_is_said_once():
+    claim = re.compile(
+        r"not (?:yet )?(?:been )?(?:run|on)\b[^.]{0,40}\bGPU|not yet run|on a GPU not yet", re.IGNORECASE
+    )
+    elsewhere = [page for page in PAGES if page.name not in ("status.md", "benchmarks.md")]
+    assert not [name(page) for page in elsewhere if claim.search(" ".join(page.read_text().split()))]
+    assert "yet" in (DOCS / "status.md").read_text()
+
+
+def test_every_reading_of_the_method_is_listed():
+    rows = re.findall(r"^\| F(\d+) \|", (DOCS / "explanation" / "paper.md").read_text(), re.MULTILINE)
+    assert [int(row) for row in rows] == list(range(1, 47))
+
+
+def test_every_test_that_the_paper_page_names_exists():
+    equations = (DOCS / "explanation" / "paper.md").read_text().split("## Readings")[0]
+    named = set(re.findall(r"`(test_\w+)`", equations))
+    source = "".join(p.read_text() for p in (ROOT / "tests").rglob("test_*.py"))
+    assert named
+    assert not {test for test in named if f"def {test}(" not in source}
+
+
+def test_config_fields_that_pages_name_exist():
+    groups = "data|strategies|decorators|objective|density|optim|mip|rasterizer|fit|skips"
+    for page in PAGES:
+        today = re.sub(r"\n### Breaking\n.*?\n### ", "", page.read_text(), flags=re.DOTALL)  # it names what is gone
+        # "strategies.svs.anchor_strength=0" and "fit.resume=…" name a field, too
+        for field in re.findall(rf"`((?:{groups})\.[\w.]+)(?:=[^`]*)?`", today):
+            if field.startswith(("density.strategy", "objective.kernels", "skips.hr")) or "mine" in field:
+                continue
+            assert exists_in_config(field), f"{name(page)}: {field}"
+    readings = (DOCS / "explanation" / "paper.md").read_text().split("## Readings")[1]
+    assert len(re.findall(rf"`(?:{groups})\.[\w.]+`", readings)) > 20
+
+
+def exists_in_config(field: str) -> bool:
+    """In the composed configuration, in a file of conf/, or in the class that the configuration names."""
+    return OmegaConf.select(CONFIG, field, default="absent", throw_on_missing=False) != "absent" or field in FIELDS
+
+
+def fields_of_files() -> Iterator[str]:
+    """Every dotted key that a file of conf/ sets."""
+
+    def keys(prefix: str, node: DictConfig) -> Iterator[str]:
+        for key, value in node.items_ex(resolve=False):
+            yield f"{prefix}{key}"
+            if isinstance(value, DictConfig):
+                yield from keys(f"{prefix}{key}.", value)
+
+    for path in CONF.rglob("*.yaml"):
+        package = re.search(r"^# @package (\S+)", path.read_text(), re.MULTILINE)
+        here = package[1] if package else ".".join(path.parent.relative_to(CONF).parts)
+        yield from keys("" if here in ("", "_global_") else f"{here}.", OmegaConf.load(path))
+
+
+GROUPS = HOOKS.groups()
+FIELDS = {
+    *(
+        f"{section.key}.{setting.name}"
+        for group in GROUPS
+        for section in group.sections
+        for setting in section.settings
+    ),
+    *(section.key for group in GROUPS for section in group.sections),
+    *fields_of_files(),
+}
+
+
+def test_every_field_of_the_configuration_is_described():
+    assert HOOKS.undescribed(GROUPS) == []
+
+
+def test_the_configuration_page_lists_every_choice_and_every_setting():
+    page = HOOKS.page(GROUPS)
+    for path in CONF.rglob("*.yaml"):
+        if not path.stem.startswith("_") and path.parent != CONF:
+            assert f"| `{path.stem}` |" in page, path
+    assert len(FIELDS) > 100
+
+
+def test_the_architecture_page_shows_the_floors():
+    def rows(after: str) -> list[list[set[str]]]:
+        text = (DOCS / "explanation" / "architecture.md").read_text().split(after)[1].split("\n\n")[0]
+        return [
+            [set(re.findall(r"`([^`]+)`", cell)) for cell in line.split("|")[1:-1]]
+            for line in text.splitlines()
+            if line.startswith("| `")
+        ]
+
+    floors = {min(folder): (imports, libraries) for folder, _, imports, libraries in rows("| folder or file |")}
+    assert floors == FLOORS
+    assert list(floors) == list(FLOORS)
+    assert {min(door): libraries for door, libraries in rows("| door |")} == DOORS
+
+
+def test_the_table_of_hooks_shows_the_hooks_of_a_strategy():
+    page = (DOCS / "how-to" / "own-strategy.md").read_text()
+    rows = re.findall(r"^\| `(\w+)\(([^)]*)\)`", page, re.MULTILINE)
+    shown = {hook: arguments.split(", ") if arguments else [] for hook, arguments in rows}
+    hooks = {hook: list(inspect.signature(getattr(Strategy, hook)).parameters)[1:] for hook in shown}
+    assert shown == hooks
+    assert len(shown) == 14
+
+
+def test_pictures_are_drawn_from_the_tables(tmp_path):
+    figures = loaded(DOCS / "figures.py")
+    figures.main(tmp_path)
+    page = (DOCS / "explanation" / "evidence-sparse.md").read_text()
+    named = set(re.findall(r"images/(evidence_\w+\.svg)", page))
+    assert named == {path.name for path in tmp_path.iterdir()}
+    assert all((DOCS / "images" / picture).exists() for picture in named)
+
+
+def test_the_gains_that_the_readme_names_are_those_of_the_evidence():
+    text = (ROOT / "README.md").read_text()
+    table = re.search(r"^\| what you add .*\n\|[-|]+\|\n((?:\|.*\n)+)", text, re.MULTILINE)
+    assert table
+    gains = set(re.findall(r"\+\d\.\d+", table[1]))
+    assert len(gains) == 4
+    assert not [gain for gain in gains if f"{gain[1:]}" not in (DOCS / "explanation" / "evidence.md").read_text()]
+
+
+def test_numbers_of_a_summary_are_those_of_its_table():
+    """Every row of a small table on the evidence pages stands in the CSV file that is linked below it."""
+    page = "".join(
+        (DOCS / "explanation" / name).read_text() for name in ("evidence.md", "evidence-sparse.md", "evidence-hosts.md")
+    )
+    checked = 0
+    for section in page.split("\n## ")[1:]:
+        table = re.search(r"^\|.*\n\|[-|]+\|\n((?:\|.*\n)+)", section, re.MULTILINE)
+        linked = re.search(r"\]\(\.\./data/evidence/(\w+\.csv)\)", section)
+        if table is None or linked is None:
+            continue
+        numbers = r"(?<![\w.])[+-]?\d[\d,]*\.?\d*(?![\w.]*[A-Za-z])"
+        with (DOCS / "data" / "evidence" / linked[1]).open(newline="") as file:
+            known = {number for row in csv.reader(file) for cell in row for number in re.findall(numbers, cell)}
+        for row in table[1].splitlines():
+            cells = row.replace("*", "").split("|")[2:]
+            assert not set(re.findall(numbers, " | ".join(cells))) - known, row
+            checked += 1
+    assert checked > 30
