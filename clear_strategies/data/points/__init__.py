@@ -222,7 +222,7 @@ def _from_photos(
             hr if settings.compare == "hr" else (),
             hr_is_photo=hr_is_photo,
             settings=settings.stereo,
-            background=background,
+            background=background or (0.0, 0.0, 0.0),
         )
         maps = compared.depth_maps(features.means, background)
         cloud = stereo_cloud(

@@ -18,6 +18,7 @@ from torch import Tensor
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.pseudo_views import cut_out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,14 +70,14 @@ def compared_at(
     *,
     hr_is_photo: bool,
     settings: StereoSettings,
-    background: tuple[float, float, float] | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Compared:
     """The choice for these photos: HR, reduced to at most `settings.max_pixels`, where that is larger than LR, else LR.
 
     Args:
         hr: the same views at HR; none: LR is compared.
         hr_is_photo: HR is photos, not SR images.
-        background: the colour of pixels without a surface; None: every pixel shows one.
+        background: of the scene, RGB in [0, 1].
     """
     whole = Compared(lr, lr, 1, 1.0, settings)
     if not hr:
@@ -85,7 +86,7 @@ def compared_at(
         photos = [photo.reduced(photo.factor_to(settings.max_pixels)) for photo in hr]
         finer = photos[0].camera.width / lr[0].camera.width
         return Compared(photos, photos, 1, finer, settings.finer(finer)) if finer > 1 else whole
-    if background is not None:
+    if cut_out(lr, background):
         return whole
     factor = hr[0].camera.width // lr[0].camera.width
     least = max(photo.factor_to(settings.max_pixels) for photo in hr)

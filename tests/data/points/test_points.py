@@ -72,9 +72,16 @@ def test_sr_images_beyond_the_limit_are_compared_at_a_whole_part_of_their_size()
     assert sizes(128 * 96) == (128, 4)
     assert sizes(128 * 96 - 1) == (64, 2)
     assert sizes(64 * 48 - 1) == (32, 1)
-    plain = compared_at(lr, hr, hr_is_photo=False, settings=StereoSettings(), background=(1.0, 1.0, 1.0))
-    assert plain.reduction == 1
-    assert plain.images == lr
+
+
+def test_sr_images_of_an_object_before_a_plain_background_are_not_compared() -> None:
+    hr = plane_photos(3, 128, 96)
+    for photo in hr:
+        photo.image[:48] = 1.0
+    lr = [photo.reduced(4) for photo in hr]
+    compared = compared_at(lr, hr, hr_is_photo=False, settings=StereoSettings(), background=(1.0, 1.0, 1.0))
+    assert compared.reduction == 1
+    assert compared.images == lr
 
 
 def test_other_clouds_have_no_depth() -> None:
