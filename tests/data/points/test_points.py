@@ -76,8 +76,8 @@ def test_sr_images_beyond_the_limit_are_compared_at_a_whole_part_of_their_size()
 
 def test_sr_images_of_an_object_before_a_plain_background_are_not_compared() -> None:
     hr = plane_photos(3, 128, 96)
-    for photo in hr:
-        photo.image[:48] = 1.0
+    for one in hr:
+        one.image[:48] = 1.0
     lr = [photo.reduced(4) for photo in hr]
     compared = compared_at(lr, hr, hr_is_photo=False, settings=StereoSettings(), background=(1.0, 1.0, 1.0))
     assert compared.reduction == 1
