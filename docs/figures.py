@@ -10,7 +10,6 @@ takes a picture of each.
 from __future__ import annotations
 
 import base64
-import contextlib
 import csv
 import os
 import re
@@ -213,7 +212,11 @@ def notebook(path: Path) -> None:
 
 
 CHROMIUM: Final = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-WINDOW: Final = {"width": 900, "height": 560}
+WINDOW: Final = {"width": 720, "height": 460}
+# viser's, that the browser draws without a GPU.
+CLOSE_WARNING: Final = (
+    "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
+)
 
 
 def pages(folder: Path, run: Path) -> None:
@@ -244,11 +247,10 @@ def pages(folder: Path, run: Path) -> None:
 
 def settled(page: Any) -> bytes:
     """The picture of a page that shows something and no longer changes."""
-    with contextlib.suppress(Exception):  # viser's warning that the browser draws without a GPU
-        page.locator(".mantine-Notification-closeButton").first.click(timeout=60_000)
     session, before = page.context.new_cdp_session(page), 0
     while True:
         time.sleep(5)
+        page.evaluate(CLOSE_WARNING)
         shot = session.send("Page.captureScreenshot", {"format": "jpeg", "quality": 85})["data"]
         if before == len(shot) > 40_000:  # an empty page has one colour
             return base64.b64decode(shot)

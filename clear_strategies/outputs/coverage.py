@@ -91,7 +91,7 @@ def write_coverage(folder: Path, scene: Scene, painter: Painter, title: str) -> 
         legend = {f"seen by {name}": _rgb(color) for name, color in zip(_SEEN, _COLORS, strict=True)}
         legend |= {"the photos": _rgb(_CAMERA), "where to take the next": _rgb(_NEXT)}
         colors = torch.from_numpy(_colored(found.times))
-        page.write_points_page(folder / PAGE, found.points, colors, shown, f"{title}: what the photos see", legend)
+        page.write_points_page(folder / PAGE, found.points, colors, shown, title, legend)
     if found.advice:
         level = logging.DEBUG if scene.test else logging.INFO
         _log.log(level, "two more photos would help most from here (%s): %s", PICTURE, "; ".join(found.says()))

@@ -98,8 +98,7 @@ def write_points_page(
     from clear_strategies.viewing.aim import add_camera, drawn_length
 
     cameras = [marked.camera for marked in shown]
-    above = _legend(title, legend)
-    with _page(path, [paths.overview(cameras), *cameras], title, dark=False, above=above) as (server, times):
+    with _page(path, [paths.overview(cameras), *cameras], title, dark=False, above=_legend(legend)) as (server, times):
         length = _SHARE * times * drawn_length(cameras)
         points = (means * times).cpu().numpy()
         server.scene.add_point_cloud("/points", points, rgb.cpu().numpy(), point_size=_POINT * length)
@@ -138,13 +137,13 @@ def _page(
     files.write_text(path, text.replace("<body>", f"<body>{above}", 1))
 
 
-def _legend(title: str, rows: Mapping[str, RGB]) -> str:
+def _legend(rows: Mapping[str, RGB]) -> str:
     """A list of colours in the lower left corner, through which the mouse reaches the scene."""
     listed = "".join(
         f'<div><span style="color:rgb{rgb}">&#9632;</span> {html.escape(label)}</div>' for label, rgb in rows.items()
     )
     style = "position:fixed;left:12px;bottom:12px;z-index:1;pointer-events:none;font:13px/1.5 sans-serif"
-    return f'<div style="{style}"><b>{html.escape(title)}</b>{listed}</div>'
+    return f'<div style="{style}">{listed}</div>'
 
 
 def covariances(splats: Splats) -> Float[Tensor, "N 3 3"]:

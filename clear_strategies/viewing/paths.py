@@ -16,7 +16,7 @@ from rasterizers.interface import Camera
 _MOST_KEYS: Final = 24  # a path through more cameras passes these, as far apart as possible
 _WRAP: Final = 3  # keys repeated at both ends, so that the rotation's spline has no seam
 _SURROUNDED: Final = 0.5  # mean direction from the scene to the cameras: shorter than this, they stand around it
-_BEHIND, _ABOVE = 1.6, 0.9  # of the distance of the farthest camera from the scene: where an overview stands
+_BEHIND, _ABOVE = 2.0, 1.1  # of the distance of the farthest camera from the scene: where an overview stands
 _SWAY: Final = 0.1  # of the distance to the scene: the radii of the ellipse for a single camera
 
 
