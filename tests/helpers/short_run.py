@@ -65,7 +65,7 @@ def start(
         ),
         "pseudo_views": lambda: PseudoViews(count=8, reach=0.1),
         "fading_opacity": lambda: FadingOpacity(rate=0.02, until=1_350),
-        "random_background": lambda: RandomBackground(until=ITERATIONS - 2),
+        "random_background": lambda: RandomBackground(until=1_350),
     }
     objective = Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
     return TrainState.start(

@@ -40,6 +40,7 @@ def test_a_gsplat_loop_renders_both_scales_and_extra_views_over_it_unless_it_has
         host.train([scene.train[0].name])
     finally:
         clear.remove()
+    assert conductor.background(1) is not None
     color = None if own_background else tuple(torch.tensor(conductor.background(1)).tolist())
     assert asked == [color] * 3
 

@@ -15,8 +15,8 @@ from tests.helpers.short_run import SCENE, start
 from tests.helpers.toy import RASTERIZER
 
 
-def prepared(views=SCENE.train, seed=5):
-    strategy = RandomBackground(until=40)
+def prepared(views=SCENE.train, seed=5, until=1_350):
+    strategy = RandomBackground(until=until)
     strategy.on_fit_start(len(views), seed)
     strategy.on_views(views)
     return strategy
@@ -35,7 +35,14 @@ def test_every_iteration_has_its_own_colour_a_function_of_the_seed():
 
 
 def test_the_run_ends_on_the_background_of_the_scene():
-    assert prepared().background(41) is None
+    assert prepared().background(1_351) is None
+
+
+def test_a_short_run_keeps_its_background_and_says_so():
+    short = prepared(until=1_349)
+    assert short.background(1) is None
+    assert "stays as it is" in short.summary()
+    assert "1,350" in prepared().summary()
 
 
 def test_what_the_photos_show_behind_an_object_or_hide_stays_as_it_is():
@@ -51,7 +58,7 @@ def test_what_the_photos_show_behind_an_object_or_hide_stays_as_it_is():
 
 
 def test_the_trainer_renders_over_it_and_evaluates_over_the_background_of_the_scene():
-    state = start(("random_background",))
+    state = start((), more=[RandomBackground(until=1_350)])
     state.field.opacities.data.fill_(-15.0)  # the background is all that is seen
     view = state.view()
     iterate(state, RASTERIZER)

@@ -17,7 +17,7 @@ from clear_strategies.data.points.compared import compared_at
 from clear_strategies.data.readers import llff
 from clear_strategies.data.view_settings import ViewSettings, split
 from clear_strategies.errors import DataError, SettingError
-from clear_strategies.geometry import StereoSettings
+from clear_strategies.geometry import StereoSettings, depth_maps
 from clear_strategies.geometry.projection import project
 from tests.helpers.planes import photo, plane_photos, sfm
 
@@ -49,7 +49,7 @@ def test_auto_takes_stereo_keeps_its_depth_and_says_how_much_is_known(caplog: py
 
 
 @pytest.mark.parametrize(
-    ("compare", "hr_is_photo", "size"), [("hr", True, (96, 128)), ("hr", False, (48, 64)), ("lr", True, (48, 64))]
+    ("compare", "hr_is_photo", "size"), [("auto", True, (96, 128)), ("hr", False, (48, 64)), ("lr", True, (48, 64))]
 )
 def test_stereo_at_hr_keeps_its_size_for_photos_and_that_of_lr_for_sr_images(compare, hr_is_photo, size) -> None:
     hr = plane_photos(3, 128, 96)
@@ -59,6 +59,21 @@ def test_stereo_at_hr_keeps_its_size_for_photos_and_that_of_lr_for_sr_images(com
     assert [tuple(depth.depth.shape) for depth in found.depths] == [size] * 3
     known = torch.cat([depth.depth[depth.known] for depth in found.depths])
     assert ((known / 4 - 1).abs() < 0.03).float().mean() > 0.95
+
+
+def test_sr_images_of_few_photos_only_are_compared(monkeypatch) -> None:
+    hr = plane_photos(6, 64, 48)
+    lr = [photo.reduced(2) for photo in hr]
+    compared = []
+
+    def recorded(photos, *arguments):
+        compared.append(photos[0].camera.width)
+        return depth_maps(photos, *arguments)
+
+    monkeypatch.setattr("clear_strategies.data.points.compared.depth_maps", recorded)
+    for n in (5, 6):
+        initial_points(CloudSettings(init="stereo", densify=False), lr[:n], hr=hr[:n])
+    assert compared == [64, 32, 32]
 
 
 def test_sr_images_beyond_the_limit_are_compared_at_a_whole_part_of_their_size() -> None:
