@@ -2,11 +2,12 @@
 
 Over a black background, a dark surface can be thin: the background is as dark as it. From another camera something else shows
 through, and its dark parts are holes. Over a colour that changes at each iteration, only an opaque surface matches its photo.
+
+Many views hold a surface from several sides; there the changing colour is noise, and costs more than it brings.
 """
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -18,15 +19,13 @@ from clear_strategies.geometry.pseudo_views import cut_out
 from clear_strategies.schedules import milestone
 from clear_strategies.strategies.base import Color, Strategy
 
-_log = logging.getLogger(__name__)
-
-
+_FEW_VIEWS: Final = 5  # more views keep the background of the scene
 _LONG_RUN: Final = 1_350  # iterations over other colours; with fewer, surfaces have no time to become opaque
 
 
 @dataclass(frozen=True)
 class RandomBackground(Strategy):
-    """A background of a random colour at each iteration, for photos that show surfaces everywhere.
+    """A background of a random colour at each iteration, for at most five photos that show surfaces everywhere.
 
     Photos of an object before a plain background keep that background: they do show what is behind the object.
 
@@ -40,29 +39,32 @@ class RandomBackground(Strategy):
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
-        self.cache["seed"], self.cache["plain"] = seed, False
+        self.cache["seed"], self.cache["kept"] = seed, self._why_kept(n_views)
 
     def summary(self) -> str | None:
-        if self.until < _LONG_RUN:
-            return f"the background stays as it is: the run has fewer than {_LONG_RUN:,} iterations for another one"
-        return None if self.cache["plain"] else f"another colour in each of the first {self.until:,} iterations"
+        kept: str = self.cache.get("kept", "")
+        return f"none, {kept}" if kept else f"another colour in each of the first {self.until:,} iterations"
 
     def wants_views(self) -> bool:
         return True
 
     def on_views(self, views: Sequence[View]) -> None:
         """Whether the photos show an object before a plain background, or hide pixels by masks."""
-        if not views:
-            return
-        plain = cut_out((view.lr.to("cpu") for view in views), views[0].background)
-        self.cache["plain"] = plain or any(view.lr.shown is not None for view in views)
-        if plain:
-            _log.info("the background stays as it is: the photos show an object before it.")
+        if any(view.lr.shown is not None for view in views):
+            self.cache["kept"] = "because masks hide a part of the photos"
+        elif views and cut_out((view.lr.to("cpu") for view in views), views[0].background):
+            self.cache["kept"] = "because the photos show an object before a plain background"
 
     def background(self, t: int) -> Color | None:
         """RGB, uniform in [0, 1]: a function of (seed, t)."""
-        if self.until < _LONG_RUN or t > self.until or self.cache.get("plain", False):
+        if t > self.until or self.cache.get("kept"):
             return None
         generator = torch.Generator().manual_seed(self.cache.get("seed", 0) * 1_000_003 + t)
         r, g, b = torch.rand(3, generator=generator).tolist()
         return r, g, b
+
+    def _why_kept(self, n_views: int) -> str:
+        """Why the background stays as it is, as far as that is known without the photos; empty: it changes."""
+        if n_views > _FEW_VIEWS:
+            return f"because there are more than {_FEW_VIEWS} training views"
+        return "" if self.until >= _LONG_RUN else f"because the run has fewer than {_LONG_RUN:,} iterations for it"

@@ -38,11 +38,15 @@ def test_the_run_ends_on_the_background_of_the_scene():
     assert prepared().background(1_351) is None
 
 
-def test_a_short_run_keeps_its_background_and_says_so():
-    short = prepared(until=1_349)
-    assert short.background(1) is None
-    assert "stays as it is" in short.summary()
-    assert "1,350" in prepared().summary()
+@pytest.mark.parametrize(
+    ("views", "until", "why"),
+    [(SCENE.train[:1] * 6, 1_350, "more than 5 training views"), (SCENE.train, 1_349, "fewer than 1,350 iterations")],
+)
+def test_many_views_and_short_runs_keep_the_background_and_say_so(views, until, why):
+    kept = prepared(views, until=until)
+    assert kept.background(1) is None
+    assert why in kept.summary()
+    assert "another colour in each of the first 1,350" in prepared().summary()
 
 
 def test_what_the_photos_show_behind_an_object_or_hide_stays_as_it_is():
