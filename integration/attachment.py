@@ -38,7 +38,6 @@ from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients, only
 from integration.autograd_shot import AutogradShot
-from integration.detail import keep_from_drifting
 from integration.errors import HostError
 from integration.extra_steps import ExtraSteps, RenderCamera
 from integration.host_score import ScoreScaler, score_for_host
@@ -287,7 +286,8 @@ class Attachment:
         hr_trained = None if hr_grads is None else only(hr_grads, trained)
         merged = self.conductor.merge(values, g_lr, hr_trained, self.t)
         if "detail" in merged.grads:
-            keep_from_drifting(trained["detail"], self.conductor.detail.decay / self.accumulation)
+            # L_HF does not change with a constant added to the colours, so that nothing else would hold the mean of f_det.
+            trained["detail"].mul_(1 - self.conductor.detail.decay / self.accumulation)
         for name, p in trained.items():
             # Without HR the gradient of f_det is 0 and not None, so that its Adam counts every step.
             g = merged.grads[name] * grad_scale if name in merged.grads else torch.zeros_like(p)

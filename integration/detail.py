@@ -22,16 +22,6 @@ def detail_adam(detail: torch.nn.Parameter, rates: DetailRates) -> torch.optim.A
     return torch.optim.Adam([detail], lr=rates.rate, eps=_EPS)
 
 
-def keep_from_drifting(detail: Float[Tensor, "N 3"], share: float) -> None:
-    """Lose this share of f_det: L_HF does not change with a constant added to the colours, so that nothing else would hold
-    the mean of f_det.
-
-    Args:
-        share: `DetailRates.decay`, over the merges per step of the host.
-    """
-    detail.mul_(1 - share)
-
-
 def sh0_offset(detail: Float[Tensor, "N 3"], sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
     """f_det as an offset of the constant SH band."""
     return (detail / SH_C0).view_as(sh0)

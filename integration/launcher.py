@@ -3,18 +3,44 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import runpy
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from clear_strategies.compose import conductor
-from clear_strategies.errors import DataError
+from clear_strategies.errors import ClearError, DataError
+from integration.log import show_log
 from integration.points import wants_stereo
 from integration.views import sr_images, sr_source
 
+_log = logging.getLogger(__name__)
 
-def parser(module: str, description: str) -> argparse.ArgumentParser:
+
+def main(
+    module: str, script: str, arguments: Sequence[str] | None, train: Callable[[Launch], bool], otherwise: str
+) -> int:
+    """The program `python -m <module>`; returns its exit status.
+
+    Args:
+        script: the host's, in words. train: runs it; returns whether a step of CLEAR was made.
+        otherwise: why none may have been.
+    """
+    show_log()
+    options = _parser(module, f"Run {script} with CLEAR.").parse_args(arguments)
+    try:
+        if train(Launch(options)):
+            return 0
+    except ClearError as error:
+        _log.error("%s", error)
+        return 2
+    _log.error("%s trained without CLEAR: %s.", options.script, otherwise)
+    return 1
+
+
+def _parser(module: str, description: str) -> argparse.ArgumentParser:
     """The arguments of `python -m <module> [options] script [its arguments]`."""
     made = argparse.ArgumentParser(prog=f"python -m {module}", description=description)
     add = made.add_argument

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from typing import Final, Literal
 
 import torch
-from torch import Tensor
 
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.projection import intrinsics
-from clear_strategies.core.view import Photo
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry import stereo
+from integration.views import HostPhoto
 
 _log = logging.getLogger(__name__)
 
@@ -40,13 +39,12 @@ def wants_stereo(points: str) -> bool:
     return points == "stereo"
 
 
-def stereo_points(photos: Sequence[Photo], masks: Sequence[Tensor | None] | None = None) -> PointCloud:
+def stereo_points(photos: Sequence[HostPhoto]) -> PointCloud:
     """Dense stereo between a host's training photos; one line of the log says what was found.
 
     Args:
-        photos: the training photos as the host trains on them, in its world. Stereo runs on their device.
-        masks: one for each photo, [h, w] in [0, 1]: below 0.5 the host hides the pixel, which gets no points. None among
-            them, or in their place: nothing is hidden.
+        photos: in the host's world. Where the mask is below 0.5 the host hides the pixel, which gets no points. Stereo runs on
+            their device.
 
     Returns:
         At most `MAX_POINTS` points on the CPU: world units, RGB in [0, 1]. More are reduced at random, always to the same.
@@ -54,12 +52,12 @@ def stereo_points(photos: Sequence[Photo], masks: Sequence[Tensor | None] | None
     Raises:
         DataError: there are fewer than two photos, or stereo confirms no depth.
     """
-    cameras = [photo.camera for photo in photos]
+    posed = [photo.posed for photo in photos]
     found = stereo(
-        [photo.image.clamp(0, 1) for photo in photos],
-        torch.stack([camera.world_to_camera.cpu() for camera in cameras]) if cameras else torch.zeros(0, 4, 4),
-        torch.stack([intrinsics(camera) for camera in cameras]) if cameras else torch.zeros(0, 3, 3),
-        masks=None if masks is None else [None if mask is None else mask >= 0.5 for mask in masks],
+        [photo.image.clamp(0, 1) for photo in posed],
+        torch.stack([photo.camera.world_to_camera.cpu() for photo in posed]) if posed else torch.zeros(0, 4, 4),
+        torch.stack([intrinsics(photo.camera) for photo in posed]) if posed else torch.zeros(0, 3, 3),
+        masks=[None if photo.mask is None else photo.mask >= 0.5 for photo in photos],
     )
     cloud = PointCloud(found.means.cpu(), found.colors.cpu(), found.summary)
     kept = cloud.at_most(MAX_POINTS)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -10,29 +12,47 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import Photo, View
+from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors.interface import super_resolved
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from rasterizers.interface import Camera
 
+_log = logging.getLogger(__name__)
+
 SuperResolve = Callable[[str, Float[Tensor, "h w 3"], int], Float[Tensor, "H W 3"]]
 """I_HR of a view from its name, its LR image and the factor: a prior of `clear_strategies.data.priors`, or your function."""
 
 
-def posed_photo(image: Float[Tensor, "h w C"], world_to_camera: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"]) -> Photo:
-    """A host's photo and its camera.
+@dataclass(frozen=True, slots=True, eq=False)
+class HostPhoto:
+    """A training photo as its host trains on it.
 
     Args:
+        name: of its file, with the folder where the host has it.
         image: RGB in [0, 1] or 8 bits; further channels are left out.
         world_to_camera: OpenCV axes (x right, y down, z forward).
         K: focal lengths and principal point in pixels of `image`; pixel (0, 0) spans [0, 1)².
+        mask: what the host's loss multiplies its rendering by, in [0, 1]; None: nothing is hidden.
     """
-    if image.dtype == torch.uint8:
-        image = image.float() / 255
-    image = image[..., :3].float()
-    h, w = image.shape[:2]
-    (fx, _, cx), (_, fy, cy), _ = K.tolist()
-    return Photo(Camera(world_to_camera.detach().float(), fx, fy, cx, cy, w, h), image)
+
+    name: str
+    image: Float[Tensor, "h w C"]
+    world_to_camera: Float[Tensor, "4 4"]
+    K: Float[Tensor, "3 3"]
+    mask: Float[Tensor, "h w"] | None = None
+
+    @property
+    def posed(self) -> Photo:
+        """The photo with its camera, RGB in [0, 1]."""
+        image = self.image.float() / 255 if self.image.dtype == torch.uint8 else self.image.float()
+        h, w = image.shape[:2]
+        (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
+        return Photo(Camera(self.world_to_camera.detach().float(), fx, fy, cx, cy, w, h), image[..., :3])
+
+    def view(self, sr: SuperResolve, factor: int) -> View:
+        """See `view`."""
+        return view(self.name, self.image, self.world_to_camera, self.K, sr, factor, self.mask)
 
 
 def view(
@@ -47,7 +67,7 @@ def view(
     """One training view of a host, on the device of its image.
 
     Args:
-        image: the real photo. world_to_camera, K: see `posed_photo`.
+        image, world_to_camera, K: see `HostPhoto`.
         sr: gives the SR image. factor: HR pixels per LR pixel.
         mask: what the host's loss multiplies its rendering by, in [0, 1]. Photo and SR image are multiplied by it, so that
             a pixel that the host hides is hidden at both scales; the HR rendering must be as well, see `enlarged_mask`.
@@ -55,7 +75,7 @@ def view(
     Raises:
         DataError: the SR image is not `factor` times as large as the photo.
     """
-    lr = posed_photo(image, world_to_camera, K)
+    lr = HostPhoto(name, image, world_to_camera, K).posed
     image, camera = lr.image, lr.camera
     w, h = camera.width, camera.height
     made = super_resolved(sr, name, image.cpu(), factor)
@@ -71,6 +91,28 @@ def view(
         name, Photo(camera, image), Photo(camera.scaled(factor), sr_image), sr_source=getattr(sr, "label", "unknown"),
         disagreement=None if made.disagreement is None else made.disagreement.to(image),
     )  # fmt: skip
+
+
+def save_photos(photos: Iterable[HostPhoto], folder: Path | str) -> None:
+    """Write the photos, and black where a mask hides them, as PNG by their names, for an SR tool to enlarge.
+
+    Raises:
+        DataError: two photos would have the same file.
+    """
+    written: set[Path] = set()
+    for photo in photos:
+        file = (Path(folder) / photo.name).with_suffix(".png")
+        if file in written:
+            raise DataError(
+                file, "file name", "is that of two photos",
+                "give every photo its own name; this trainer ignores folders and endings",
+            )  # fmt: skip
+        image = photo.posed.image
+        write_png(file, image if photo.mask is None else image * photo.mask[..., None])
+        written.add(file)
+    _log.info(
+        "%d LR photos written to %s. Enlarge them and pass the folder of the results as sr.", len(written), folder
+    )
 
 
 def enlarged_mask(mask: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "H W"]:

@@ -15,12 +15,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from integration.gsplat.attached import Attached, attach
-from integration.gsplat.data import save_lr, views_from_dataset
+from integration.gsplat.data import views_from_dataset
 
 if TYPE_CHECKING:
     from integration.gsplat.simple_trainer import install
 
-__all__ = ["Attached", "attach", "install", "save_lr", "views_from_dataset"]
+__all__ = ["Attached", "attach", "install", "views_from_dataset"]
 
 
 def __getattr__(name: str) -> Any:

@@ -8,38 +8,29 @@ The script ends with `gsplat.distributed.cli(main, cfg)`; there CLEAR is install
 from __future__ import annotations
 
 import importlib
-import logging
 import sys
 from collections.abc import Sequence
 from typing import Any
 
-from clear_strategies.errors import ClearError
+from integration import launcher
 from integration.errors import HostError
 from integration.gsplat.attached import Attached
-from integration.gsplat.data import save_lr
+from integration.gsplat.data import photos_of
 from integration.gsplat.simple_trainer import install
-from integration.launcher import Launch, parser, run_script
-from integration.log import show_log
-
-_log = logging.getLogger("integration.gsplat")  # __name__ is "__main__" here
+from integration.launcher import Launch, run_script
+from integration.views import save_photos
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run simple_trainer.py with CLEAR; returns the exit status."""
-    show_log()
-    options = parser("integration.gsplat", "Run gsplat's simple_trainer.py with CLEAR.").parse_args(arguments)
+    return launcher.main("integration.gsplat", "gsplat's simple_trainer.py", arguments, _train, "no Runner was trained")
+
+
+def _train(launch: Launch) -> bool:
     attached: list[Attached] = []
-    try:
-        launch = Launch(options)
-        _install_at_the_end(launch, attached)
-        run_script(launch)
-    except ClearError as error:
-        _log.error("%s", error)
-        return 2
-    if not any(a.attachment.counts["merges"] for a in attached):
-        _log.error("%s trained without CLEAR: no Runner was trained.", launch.script)
-        return 1
-    return 0
+    _install_at_the_end(launch, attached)
+    run_script(launch)
+    return any(a.attachment.counts["merges"] for a in attached)
 
 
 def _install_at_the_end(launch: Launch, attached: list[Attached]) -> None:
@@ -62,7 +53,7 @@ def _install_at_the_end(launch: Launch, attached: list[Attached]) -> None:
 
 
 def _save_lr(runner: Any, folder: Any) -> None:
-    save_lr(runner.trainset, folder)
+    save_photos(photos_of(runner.trainset), folder)
     raise SystemExit(0)
 
 

@@ -6,6 +6,7 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, Final
 
 import torch
@@ -223,29 +224,16 @@ class Attached:
                 f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
                 "num_downscales=0)."
             )
-        renders, alphas, info = rasterization(**call)
-        size = call["width"], call["height"]
-        packed = info["means2d"].dim() == 2
-        rows = info["gaussian_ids"] if packed else None
-        visible = _visible(info["radii"], packed)
-        if gate is not None:  # dropped Gaussians are not visible
-            kept = (gate > 0)[rows] if rows is not None else gate > 0
-            visible = visible & kept
-            radii = info["radii"]
-            info["radii"] = radii * kept.view(*kept.shape, *[1] * (radii.dim() - (1 if packed else 2))).to(radii)
-        n = len(self._params[self._host_name("means")])
-        means2d, visible = info["means2d"].detach().reshape(-1, 2), visible.reshape(-1)
-        if rows is not None:
-            means2d = means2d.new_zeros(n, 2).index_copy_(0, rows, means2d)
-            visible = torch.zeros(n, dtype=torch.bool, device=rows.device).index_copy_(0, rows, visible)
         params = self.params()
         if resolution == "lr":
             params.pop("detail", None)
-        image = renders[..., :3].reshape(size[1], size[0], 3)
-        if resolution == "hr" and (mask := self._masks.get(view.name)) is not None:
-            image = image * enlarged_mask(mask.to(image), view.factor)[..., None]
-        shot = AutogradShot(image, means2d, visible, params, ScreenGradientSlot(info["means2d"], size, rows=rows))
-        return HostRendering(shot, renders, (renders, alphas, info))
+        rendering = self._drawn(rasterization, call, params, gate)
+        mask = self._masks.get(view.name)
+        if resolution == "lr" or mask is None:
+            return rendering
+        image = rendering.shot.image
+        masked = image * enlarged_mask(mask.to(image), view.factor)[..., None]
+        return replace(rendering, shot=replace(rendering.shot, image=masked))
 
     def _render_camera(
         self, rasterization: Rasterization, arguments: Mapping[str, Any], camera: Camera
@@ -259,14 +247,30 @@ class Attached:
             "height": camera.height,
             "render_mode": "RGB",
         }
-        renders, _, info = rasterization(**call)
         params = self.params()
         params.pop("detail", None)
-        image = renders[..., :3].reshape(camera.height, camera.width, 3)
-        n, size = len(params["means"]), (camera.width, camera.height)
-        rows = info["gaussian_ids"] if info["means2d"].dim() == 2 else None
-        nothing = image.new_zeros(n, 2), torch.ones(n, dtype=torch.bool, device=image.device)
-        return AutogradShot(image, *nothing, params, ScreenGradientSlot(info["means2d"], size, rows=rows))
+        return self._drawn(rasterization, call, params, None).shot
+
+    def _drawn(
+        self, rasterization: Rasterization, call: Mapping[str, Any], params: Mapping[str, Tensor], gate: Tensor | None
+    ) -> HostRendering:
+        """One rendering. Gaussians that the gate drops are marked as not visible in its `info`."""
+        renders, alphas, info = rasterization(**call)
+        size, n, packed = (call["width"], call["height"]), len(params["means"]), info["means2d"].dim() == 2
+        rows = info["gaussian_ids"] if packed else None
+        visible = _visible(info["radii"], packed)
+        if gate is not None:
+            kept = (gate > 0)[rows] if rows is not None else gate > 0
+            visible = visible & kept
+            radii = info["radii"]
+            info["radii"] = radii * kept.view(*kept.shape, *[1] * (radii.dim() - (1 if packed else 2))).to(radii)
+        means2d, visible = info["means2d"].detach().reshape(-1, 2), visible.reshape(-1)
+        if rows is not None:
+            means2d = means2d.new_zeros(n, 2).index_copy_(0, rows, means2d)
+            visible = torch.zeros(n, dtype=torch.bool, device=rows.device).index_copy_(0, rows, visible)
+        image = renders[..., :3].reshape(size[1], size[0], 3)
+        shot = AutogradShot(image, means2d, visible, params, ScreenGradientSlot(info["means2d"], size, rows=rows))
+        return HostRendering(shot, renders, (renders, alphas, info))
 
     def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:
         """The `backgrounds` that the strategies choose for a call; none where it names its own."""

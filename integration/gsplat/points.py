@@ -8,13 +8,10 @@ import inspect
 import logging
 from typing import Any, Final
 
-import torch
-
 from clear_strategies.core.points import PointCloud
 from integration.errors import HostError
-from integration.gsplat.data import mask_of
+from integration.gsplat.data import photos_of
 from integration.points import ELSEWHERE, stereo_points
-from integration.views import posed_photo
 
 _log = logging.getLogger(__name__)
 
@@ -47,23 +44,12 @@ def start_from_stereo(runner_class: Any) -> None:
         given.apply_defaults()
         init_type = given.arguments.get("init_type", "sfm")
         if init_type == "sfm":
-            parser = _with_points(parser, stereo_cloud(dataset(parser, split="train")))
+            parser = _with_points(parser, stereo_points(photos_of(dataset(parser, split="train"))))
         else:
             _log.warning("points=stereo has no effect with init_type=%s. Set init_type=sfm.", init_type)
         return create(parser, *args, **kwargs)
 
     module[_CREATE] = create_from_stereo
-
-
-def stereo_cloud(dataset: Any) -> PointCloud:
-    """The stereo cloud of all photos of a `Dataset` (`examples/datasets/colmap.py`), in the world of its parser.
-
-    Raises:
-        DataError: there are fewer than two photos, or stereo confirms no depth.
-    """
-    items = [dataset[i] for i in range(len(dataset))]
-    photos = [posed_photo(item["image"] / 255, torch.linalg.inv(item["camtoworld"]), item["K"]) for item in items]
-    return stereo_points(photos, [mask_of(item) for item in items])
 
 
 def _with_points(parser: Any, cloud: PointCloud) -> Any:

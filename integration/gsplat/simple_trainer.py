@@ -18,7 +18,7 @@ from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.errors import HostError
 from integration.gsplat.attached import Attached
-from integration.gsplat.data import masks_from_dataset, views_from_dataset
+from integration.gsplat.data import photos_of
 from integration.gsplat.points import start_from_stereo
 from integration.log import show_log
 from integration.points import Points, wants_stereo
@@ -63,8 +63,7 @@ def install(
     Args:
         runner_class: simple_trainer's `Runner`. Its Config stretches the schedules (`max_steps`), and
             `strategy.refine_stop_iter` is lowered to the step at which a strategy ends densification.
-        strategies: names of conf/strategy: "clear", "gco", "gco,svs" …
-        overrides: settings, e.g. "strategies.gco.tolerance=0.1", "objective=lr_only".
+        strategies: names of conf/strategy, e.g. "gco,svs". overrides: settings, e.g. "strategies.gco.tolerance=0.1".
         sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names.
         factor: HR pixels per LR pixel.
         points: "own": the splats start as the host's `init_type` says; "stereo": from dense stereo between its training
@@ -87,9 +86,9 @@ def install(
         chosen = conductor(strategies, *overrides, iterations=runner.cfg.max_steps)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
         source, scale = sr_source(images, chosen, factor)
-        runner.clear = _Installed(
-            runner, views_from_dataset(runner.trainset, source, scale, runner.device), chosen, seed
-        )
+        photos = photos_of(runner.trainset, runner.device)
+        masks = {photo.name: photo.mask for photo in photos if photo.mask is not None}
+        runner.clear = _Installed(runner, [photo.view(source, scale) for photo in photos], masks, chosen, seed)
         installed(runner.clear.attached)
         result = train(runner)
         _log.info("%s.", runner.clear.attached.attachment.summary())
@@ -125,13 +124,12 @@ def require_supported(config: Any, processes: int = 1) -> None:
 class _Installed:
     """CLEAR in one Runner; its files hold f_base + f_det."""
 
-    def __init__(self, runner: Any, views: Any, chosen: Any, seed: int) -> None:
+    def __init__(self, runner: Any, views: Any, masks: Any, chosen: Any, seed: int) -> None:
         rendering = sys.modules["gsplat.rendering"]
         self.views, self._splats = views, runner.splats
         self.attached = Attached(
-            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=seed,
-            masks=masks_from_dataset(runner.trainset),
-        )  # fmt: skip
+            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=seed, masks=masks
+        )
         self.attached.replace_everywhere(rendering.rasterization)
         export = getattr(sys.modules["gsplat"], "export_splats", None)
         if export is not None:

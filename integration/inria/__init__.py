@@ -14,12 +14,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from integration.inria.attached import THRESHOLD, Attached, Render, attach
-from integration.inria.cameras import save_lr, views_from_cameras
 
 if TYPE_CHECKING:
     from integration.inria.from_options import install
 
-__all__ = ["THRESHOLD", "Attached", "Render", "attach", "install", "save_lr", "views_from_cameras"]
+__all__ = ["THRESHOLD", "Attached", "Render", "attach", "install"]
 
 
 def __getattr__(name: str) -> Any:

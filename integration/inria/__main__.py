@@ -13,31 +13,23 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from clear_strategies.errors import ClearError
+from integration import launcher
 from integration.errors import HostError
-from integration.inria import Attached, save_lr
+from integration.inria import Attached
+from integration.inria.cameras import photo_of
 from integration.inria.from_options import install
-from integration.launcher import Launch, parser, run_script
-from integration.log import show_log
+from integration.launcher import Launch, run_script
+from integration.views import save_photos
 
 _log = logging.getLogger("integration.inria")  # __name__ is "__main__" here
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a train.py with CLEAR; returns the exit status."""
-    show_log()
-    options = parser("integration.inria", "Run the train.py of a 3DGS-style trainer with CLEAR.").parse_args(arguments)
-    try:
-        run = _Run(Launch(options))
-        run.start()
-    except ClearError as error:
-        _log.error("%s", error)
-        return 2
-    if run.attached is None or not run.attached.attachment.counts["merges"]:
-        _log.error("%s trained without CLEAR: it called no GaussianModel.training_setup, or made no step.", run.script)
-        return 1
-    _log.info("%s.", run.attached.attachment.summary())
-    return 0
+    why = "it called no GaussianModel.training_setup, or made no step"
+    return launcher.main(
+        "integration.inria", "the train.py of a 3DGS-style trainer", arguments, lambda launch: _Run(launch).train(), why
+    )
 
 
 class _Run:
@@ -48,18 +40,24 @@ class _Run:
     """
 
     def __init__(self, launch: Launch) -> None:
-        self._launch, self.script = launch, launch.script
+        self._launch = launch
         self._scenes: list[Any] = []
         self._installing = False
         self.attached: Attached | None = None
 
-    def start(self) -> None:
-        sys.path.insert(0, str(self.script.parent.resolve()))  # for the host's modules
+    def train(self) -> bool:
+        """Whether a step of CLEAR was made."""
+        folder = str(self._launch.script.parent.resolve())
+        sys.path.insert(0, folder)  # for the host's modules
         try:
             with self._hooked_host():
                 run_script(self._launch)
         finally:
-            sys.path.remove(str(self.script.parent.resolve()))
+            sys.path.remove(folder)
+        if self.attached is None or not self.attached.attachment.counts["merges"]:
+            return False
+        _log.info("%s.", self.attached.attachment.summary())
+        return True
 
     @contextmanager
     def _hooked_host(self) -> Iterator[None]:
@@ -95,7 +93,7 @@ class _Run:
             )
         scene = self._scenes[-1]
         if self._launch.save_lr is not None:
-            save_lr(scene.getTrainCameras(), self._launch.save_lr)
+            save_photos(map(photo_of, scene.getTrainCameras()), self._launch.save_lr)
             raise SystemExit(0)
         self._installing = True  # points=stereo calls training_setup again
         self.attached = install(gaussians, scene, opt, **self._launch.settings)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import View
-from clear_strategies.data.photo_files import SUFFIXES, write_png
+from clear_strategies.data.photo_files import SUFFIXES
 from clear_strategies.errors import DataError, SettingError
-from integration.views import SuperResolve, view
-
-_log = logging.getLogger(__name__)
+from integration.views import HostPhoto, SuperResolve
 
 _SAME_POSE = 1e-6  # largest difference between the entries of the poses of one camera and its copy
 
@@ -65,7 +62,10 @@ class HostViews:
                 "give every photo its own name; this trainer ignores folders",
             )  # fmt: skip
         self.factor = factor
-        self.all = tuple(_host_view(camera, sr, factor, device) for camera in cameras)
+        photos = [photo_of(camera, device) for camera in cameras]
+        self.all = tuple(
+            HostView(camera, photo.view(sr, factor), photo.mask) for camera, photo in zip(cameras, photos, strict=True)
+        )
         self._by_camera = {id(host_view.camera): host_view for host_view in self.all}
         self._by_name: dict[str | None, HostView] = dict(zip(names, self.all, strict=True))
 
@@ -89,44 +89,17 @@ class HostViews:
         return named if same else None
 
 
-def views_from_cameras(
-    cameras: Sequence[Any], sr: SuperResolve, factor: int = 4, device: torch.device | str = "cpu"
-) -> tuple[View, ...]:
-    """The training views of a 3DGS-style trainer, e.g. of `scene.getTrainCameras()`; see `HostViews`."""
-    return tuple(host_view.view for host_view in HostViews(cameras, sr, factor, device).all)
+def photo_of(camera: Any, device: torch.device | str = "cpu") -> HostPhoto:
+    """The photo of a training camera, in the trainer's world and as it is trained on (its -r).
 
-
-def save_lr(cameras: Sequence[Any], folder: Path | str) -> None:
-    """Write the photos as the trainer uses them (its -r, its masks), as PNG, for an SR tool to enlarge.
-
-    Raises:
-        DataError: two photos would have the same file.
+    `alpha_mask`, which 3DGS multiplies its rendering by, is the photo's alpha, and with --train_test_exp the half of a test photo
+    that stays unseen.
     """
-    written: set[Path] = set()
-    for camera in cameras:
-        file = (Path(folder) / file_name(camera.image_name)).with_suffix(".png")
-        if file in written:
-            raise DataError(
-                file, "file name", "is that of two photos",
-                "give every photo its own name; this trainer ignores folders and endings",
-            )  # fmt: skip
-        image, mask = camera.original_image.permute(1, 2, 0), mask_of(camera)
-        write_png(file, image if mask is None else image * mask[..., None])
-        written.add(file)
-    _log.info(
-        "%d LR photos written to %s. Enlarge them and pass the folder of the results as sr.", len(written), folder
+    image, mask = camera.original_image.permute(1, 2, 0).detach().to(device), getattr(camera, "alpha_mask", None)
+    shown = None if mask is None or bool((mask == 1).all()) else mask[0].to(image)
+    return HostPhoto(
+        _file_name(camera.image_name), image, camera.world_view_transform.T, intrinsics(camera), mask=shown
     )
-
-
-def mask_of(camera: Any) -> Float[Tensor, "h w"] | None:
-    """`alpha_mask`, which 3DGS multiplies its rendering by: the photo's alpha, and with --train_test_exp the half of a
-    test photo that stays unseen. None: it hides nothing.
-    """
-    mask = getattr(camera, "alpha_mask", None)
-    if mask is None or bool((mask == 1).all()):
-        return None
-    found: Tensor = mask[0]
-    return found
 
 
 def intrinsics(camera: Any) -> Float[Tensor, "3 3"]:
@@ -138,14 +111,6 @@ def intrinsics(camera: Any) -> Float[Tensor, "3 3"]:
     return torch.tensor([[fx * w, 0, (cx + 1) * w], [0, fy * h, (cy + 1) * h], [0, 0, 1]], dtype=torch.float64)
 
 
-def file_name(image_name: str) -> str:
+def _file_name(image_name: str) -> str:
     """A name with an image suffix; a suffix is added where the host has dropped it, even if the name contains dots."""
     return image_name if Path(image_name).suffix.lower() in SUFFIXES else f"{image_name}.png"
-
-
-def _host_view(camera: Any, sr: SuperResolve, factor: int, device: torch.device | str) -> HostView:
-    image, pose = camera.original_image.permute(1, 2, 0).to(device), camera.world_view_transform.T
-    mask = mask_of(camera)
-    mask = None if mask is None else mask.to(image)
-    made = view(file_name(camera.image_name), image, pose, intrinsics(camera), sr, factor, mask=mask)
-    return HostView(camera, made, mask)

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Sequence
 from typing import Any, Final
 
 import torch
 
-from clear_strategies.core.points import PointCloud
-from clear_strategies.core.view import Photo
 from integration.errors import HostError
-from integration.inria.cameras import intrinsics, mask_of
+from integration.inria.cameras import photo_of
 from integration.points import ELSEWHERE, stereo_points
-from integration.views import posed_photo
 
 _OPEN: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
@@ -34,29 +30,11 @@ def start_from_stereo(gaussians: Any, scene: Any, opt: Any) -> None:
     create, cloud_type = _host_functions(gaussians)
     given = {"pcd": None, "cam_infos": cameras, "spatial_lr_scale": _extent(gaussians, scene)}
     arguments = _arguments(gaussians, create, given)
-    cloud = stereo_cloud(cameras, gaussians._xyz.device)
+    cloud = stereo_points([photo_of(camera, gaussians._xyz.device) for camera in cameras])
     means, colors = cloud.means.numpy(), cloud.colors.numpy()
     pcd = cloud_type(points=means, colors=colors, normals=torch.zeros_like(cloud.means).numpy())
     create(**arguments | {"pcd": pcd})
     gaussians.training_setup(opt)
-
-
-def stereo_cloud(cameras: Sequence[Any], device: torch.device | str = "cpu") -> PointCloud:
-    """The stereo cloud of a 3DGS-style trainer's cameras, e.g. of `scene.getTrainCameras()`, in its world.
-
-    Args:
-        cameras: with their photos; pixels that `alpha_mask` hides get no points.
-        device: where the photos are compared.
-
-    Raises:
-        DataError: there are fewer than two photos, or stereo confirms no depth.
-    """
-    return stereo_points([_photo(camera, device) for camera in cameras], [mask_of(camera) for camera in cameras])
-
-
-def _photo(camera: Any, device: torch.device | str) -> Photo:
-    image = camera.original_image.permute(1, 2, 0).detach().to(device)
-    return posed_photo(image, camera.world_view_transform.T, intrinsics(camera))
 
 
 def _host_functions(gaussians: Any) -> tuple[Any, Any]:

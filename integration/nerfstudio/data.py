@@ -6,6 +6,7 @@ a folder or a network.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,10 @@ from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import View
-from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors import Bicubic, Images, Onnx, Prior, cached
 from clear_strategies.errors import DataError, SettingError
 from integration.points import stereo_points
-from integration.views import posed_photo, view
+from integration.views import HostPhoto
 
 
 def prior(sr: Path | None) -> Prior:
@@ -41,20 +41,15 @@ def views_from_datamanager(
         DataError: two photos have the same stem, a photo has a mask, or an SR image does not fit.
         SettingError: the photos are not kept in memory.
     """
-    photos = _cached(datamanager)  # read first: it undistorts the photos and corrects the cameras
-    cameras, files = datamanager.train_dataset.cameras, datamanager.train_dataset.image_filenames
-    Ks, poses = cameras.get_intrinsics_matrices(), world_to_camera(cameras.camera_to_worlds)
+    files = datamanager.train_dataset.image_filenames
     _require_unique_stems(files)
-    found = []
-    for i, photo in enumerate(photos):
-        name = Path(files[i]).name
-        if "mask" in photo:
+    for file, item in zip(files, _cached(datamanager), strict=True):
+        if "mask" in item:
             raise DataError(
-                name, "mask", "hides pixels from splatfacto's loss but not from the losses of the SR image",
+                Path(file).name, "mask", "hides pixels from splatfacto's loss but not from the losses of the SR image",
                 "train without masks",
             )  # fmt: skip
-        found.append(view(name, over_black(photo["image"]).to(device), poses[i].to(device), Ks[i], sr, factor))
-    return tuple(found)
+    return tuple(photo.view(sr, factor) for photo in photos_of(datamanager, device))
 
 
 def seed_with_stereo(datamanager: Any) -> None:
@@ -83,19 +78,23 @@ def stereo_cloud(datamanager: Any) -> PointCloud:
         DataError: there are fewer than two photos, or stereo confirms no depth.
         SettingError: the photos are not kept in memory.
     """
-    cached = _cached(datamanager)  # read first: it undistorts the photos and corrects the cameras
-    cameras = datamanager.train_dataset.cameras
+    photos, items = photos_of(datamanager), _cached(datamanager)
+    return stereo_points([replace(photo, mask=_mask(item)) for photo, item in zip(photos, items, strict=True)])
+
+
+def photos_of(datamanager: Any, device: torch.device | str = "cpu") -> list[HostPhoto]:
+    """The photos that splatfacto trains on, undistorted and over black, in the world of the data manager's cameras.
+
+    Raises:
+        SettingError: the photos are not kept in memory.
+    """
+    items = _cached(datamanager)  # read first: it undistorts the photos and corrects the cameras
+    cameras, files = datamanager.train_dataset.cameras, datamanager.train_dataset.image_filenames
     Ks, poses = cameras.get_intrinsics_matrices(), world_to_camera(cameras.camera_to_worlds)
-    photos = [posed_photo(over_black(item["image"]), pose, K) for item, pose, K in zip(cached, poses, Ks, strict=True)]
-    return stereo_points(photos, [_mask(item) for item in cached])
-
-
-def save_lr(datamanager: Any, folder: Path) -> None:
-    """Write the photos as splatfacto trains on them, as PNG, for an SR tool to enlarge."""
-    files = datamanager.train_dataset.image_filenames
-    _require_unique_stems(files)
-    for file, photo in zip(files, _cached(datamanager), strict=True):
-        write_png(folder / f"{Path(file).stem}.png", over_black(photo["image"]))
+    return [
+        HostPhoto(Path(file).name, over_black(item["image"]).to(device), pose.to(device), K)
+        for file, item, pose, K in zip(files, items, poses, Ks, strict=True)
+    ]
 
 
 def world_to_camera(camera_to_world: Float[Tensor, "*C 3 4"]) -> Float[Tensor, "*C 4 4"]:

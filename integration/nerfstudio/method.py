@@ -32,8 +32,9 @@ from clear_strategies.errors import SettingError
 from integration.densification import end_of_densification
 from integration.detail import sh0_offset
 from integration.gsplat import Attached, attach
-from integration.nerfstudio.data import prior, save_lr, views_from_datamanager
+from integration.nerfstudio.data import photos_of, prior, views_from_datamanager
 from integration.nerfstudio.datamanager import ClearDatamanagerConfig
+from integration.views import save_photos
 
 NAMES: Final = {"sh0": "features_dc", "shN": "features_rest"}
 """gsplat's parameter name -> splatfacto's, where they differ."""
@@ -139,7 +140,7 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         if config.random_init and getattr(datamanager.config, "points", "own") == "stereo":
             CONSOLE.log("points=stereo has no effect with random_init. Set pipeline.model.random_init=False.")
         if config.save_lr is not None:
-            save_lr(datamanager, config.save_lr)
+            save_photos(photos_of(datamanager), config.save_lr)
             CONSOLE.log(
                 f"CLEAR: wrote the LR photos to {config.save_lr}; enlarge them x{config.factor} for pipeline.model.sr."
             )

@@ -1,14 +1,18 @@
-"""A trainer like those in gsplat's documentation, on a CPU, with our rasterizer. Contains nothing of CLEAR."""
+"""A trainer like those in gsplat's documentation, on a CPU, with our rasterizer: `Host` contains nothing of CLEAR."""
 
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
 
+from clear_strategies import Conductor
 from clear_strategies.kernels import losses
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import LearningRates
+from integration.gsplat import Attached, attach
 from rasterizers import autograd
 
 
@@ -33,6 +37,14 @@ def intrinsics(camera):
     return torch.tensor([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], dtype=torch.float64)
 
 
+def drawn(function, splats, camera, **settings):
+    """Six tensors of gsplat's names, drawn by a function like gsplat's `rasterization`."""
+    p = splats
+    activated = p["scales"].exp(), p["opacities"].sigmoid(), torch.cat([p["sh0"], p["shN"]], 1)
+    view = camera.world_to_camera[None], intrinsics(camera), camera.width, camera.height
+    return function(p["means"], p["quats"], *activated, *view, **{"sh_degree": 3, **settings})
+
+
 class Host:
     """Parameters, optimizers and LR photos (name -> camera and image) of a gsplat-style trainer."""
 
@@ -51,12 +63,7 @@ class Host:
         self.degree = lambda step: min(3, step)
 
     def render(self, camera, step):
-        p = self.splats
-        return rasterization(
-            p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), torch.cat([p["sh0"], p["shN"]], 1),
-            camera.world_to_camera[None], intrinsics(camera), camera.width, camera.height,
-            sh_degree=self.degree(step), packed=False,
-        )  # fmt: skip
+        return drawn(rasterization, self.splats, camera, sh_degree=self.degree(step), packed=False)
 
     def train(self, names, between=lambda: None):
         """The order of gsplat's simple_trainer: backward, step, densify."""
@@ -77,3 +84,21 @@ class Host:
             if self.strategy is not None:
                 self.strategy.step_post_backward(self.splats, self.optimizers, self.state, step, info, packed=False)
             between()
+
+
+@contextmanager
+def attached(host: Host, scene, conductor: Conductor, function=None, **settings) -> Iterator[Attached]:
+    """The host with CLEAR in its loop."""
+    clear = attach(host.splats, host.optimizers, scene.train, conductor, **settings)
+    clear.replace_everywhere(function or rasterization)
+    try:
+        yield clear
+    finally:
+        clear.remove()
+
+
+def trained(host: Host, scene, conductor: Conductor, names, **settings) -> Attached:
+    """Train on the views of these names with CLEAR."""
+    with attached(host, scene, conductor, **settings) as clear:
+        host.train(names)
+    return clear

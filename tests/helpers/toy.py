@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -105,3 +105,13 @@ class ShowsDark(Strategy):
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         return (self.cache["extra"],)
+
+
+@dataclass(frozen=True)
+class Recorder(Strategy):
+    """Records every change of structure."""
+
+    changes: list[Tensor] = field(default_factory=list)
+
+    def on_resize(self, parents: Tensor) -> None:
+        self.changes.append(parents)

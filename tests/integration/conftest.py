@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from clear_strategies import Conductor
+from integration.inria import attach
 from tests.helpers import inria, toy
 
 
@@ -24,3 +26,18 @@ def inria_capture(inria_host, tmp_path):
     """A folder with the LR photos and SR images of the toy scene."""
     importlib.import_module("scene").write(tmp_path, toy.scene(inria.N))
     return tmp_path
+
+
+@pytest.fixture
+def inria_attached(inria_host, inria_capture):
+    """`made(*strategies)`: CLEAR attached to a fresh model of the host, the model, and its scene."""
+
+    def made(*strategies, objective=inria.HR_FROM_START, sr=inria_capture / "sr", **settings):
+        gaussians, scene = inria_host.setup(inria.options(inria_host, inria_capture))
+        return (
+            attach(gaussians, scene.cameras, Conductor(*strategies, objective=objective), sr=sr, **settings),
+            gaussians,
+            scene,
+        )
+
+    return made

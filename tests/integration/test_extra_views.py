@@ -56,23 +56,13 @@ def test_gsplat_draws_it_and_steps_once_more_on_its_gradient(drawn):
     for each in (with_extra, alone):
         each.splats["scales"].data += torch.tensor([0.0, 0.3, 0.6])
     start = {name: p.detach().clone() for name, p in with_extra.splats.items()}
-    clear = attach(with_extra.splats, with_extra.optimizers, scene.train, dark())
-    clear.replace_everywhere(gsplat_host.rasterization)
-    try:
-        with_extra.train([scene.train[0].name])
-    finally:
-        clear.remove()
+    clear = gsplat_host.trained(with_extra, scene, dark(), [scene.train[0].name])
     image, camera = drawn[0]
     assert torch.allclose(image.double(), reference(start, camera, 0), atol=1e-5)
     assert clear.attachment.counts["extra views"] == 1
 
     gradient = extra_gradient(alone, camera)
-    plain = attach(alone.splats, alone.optimizers, scene.train, Conductor(objective=inria.HR_FROM_START))
-    plain.replace_everywhere(gsplat_host.rasterization)
-    try:
-        alone.train([scene.train[0].name])
-    finally:
-        plain.remove()
+    gsplat_host.trained(alone, scene, Conductor(objective=inria.HR_FROM_START), [scene.train[0].name])
     for name, optimizer in alone.optimizers.items():
         if name in gradient:
             alone.splats[name].grad = gradient[name]
@@ -99,12 +89,8 @@ def extra_gradient(a_host, camera):
 def test_accumulated_passes_are_one_step_with_one_extra_step(drawn):
     scene = toy.scene(20)
     a_host = Host(scene, accumulation=2)
-    clear = attach(a_host.splats, a_host.optimizers, scene.train, dark(), accumulation=2)
-    clear.replace_everywhere(gsplat_host.rasterization)
-    try:
-        a_host.train([view.name for view in scene.train] * 2)
-    finally:
-        clear.remove()
+    names = [view.name for view in scene.train] * 2
+    clear = gsplat_host.trained(a_host, scene, dark(), names, accumulation=2)
     assert len(drawn) == clear.attachment.counts["extra views"] == 3
     assert clear.attachment.counts["steps of the host alone"] == 0
 
@@ -151,14 +137,8 @@ def test_opacities_fade_in_a_gsplat_host():
     scene, after = toy.scene(20), {}
     for strategies in ((), (FadingOpacity(rate=0.5),)):
         a_host = Host(scene)
-        clear = attach(
-            a_host.splats, a_host.optimizers, scene.train, Conductor(*strategies, objective=inria.HR_FROM_START)
-        )
-        clear.replace_everywhere(gsplat_host.rasterization)
-        try:
-            a_host.train([view.name for view in scene.train] + [scene.train[0].name])
-        finally:
-            clear.remove()
+        names = [scene.train[i % 3].name for i in range(4)]
+        gsplat_host.trained(a_host, scene, Conductor(*strategies, objective=inria.HR_FROM_START), names)
         after[len(strategies)] = a_host.splats["opacities"].detach().sigmoid()
     assert after[1].mean() < 0.4 * after[0].mean()  # three steps, and what the optimizer gives back
     assert after[1].min() > 0.005
@@ -181,12 +161,8 @@ def test_splatsure_follows_a_host_that_densifies():
     torch.manual_seed(0)
     a_host = Host(scene, extent=4.0, strategy=densifier)
     conductor = Conductor(SplatSuRe(), objective=inria.HR_FROM_START)
-    clear = attach(a_host.splats, a_host.optimizers, scene.train, conductor, strategy=densifier)
-    clear.replace_everywhere(gsplat_host.rasterization)
-    try:
-        a_host.train([scene.train[i % 3].name for i in range(30)])
-    finally:
-        clear.remove()
+    names = [scene.train[i % 3].name for i in range(30)]
+    gsplat_host.trained(a_host, scene, conductor, names, strategy=densifier)
     n = len(a_host.splats["means"])
     assert n != 40
     assert {rows.shape for rows in conductor.state_dict().values()} == {(n,)}

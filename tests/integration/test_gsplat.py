@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import logging
+from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
@@ -14,9 +14,8 @@ from clear_strategies import GCO, P2G, SVS, Conductor, Objective
 from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.core.view import Photo, View
 from clear_strategies.density.adaptive import DensitySettings
-from clear_strategies.errors import SettingError
 from clear_strategies.merging.detail import DetailRates
-from clear_strategies.schedules import LogLinear, WarmupDecay, scaled
+from clear_strategies.schedules import LogLinear, scaled
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import LearningRates
@@ -24,15 +23,14 @@ from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from integration import HostError
 from integration.gsplat import attach
-from integration.rows import ROWS
-from rasterizers import Splats, autograd
+from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
+from tests.helpers.inria import HR_FROM_START
 
 STEPS = 50
 EPS = 1e-10
 SUBSETS = ("baseline", "gco", "p2g", "svs", "clear")
-HR_FROM_START = WarmupDecay(start=0, full=1, decay_from=100, end=100)
 
 
 def subset(name):
@@ -57,17 +55,8 @@ def double(view):
 @pytest.fixture
 def attached():
     """Attach to a host; the module is restored after the test."""
-    handles = []
-
-    def attach_to(host, scene, *args, **kwargs):
-        handle = attach(host.splats, host.optimizers, scene.train, *args, **kwargs)
-        handle.replace_everywhere(gsplat_host.rasterization)
-        handles.append(handle)
-        return handle
-
-    yield attach_to
-    for handle in handles:
-        handle.remove()
+    with ExitStack() as stack:
+        yield lambda *args, **settings: stack.enter_context(gsplat_host.attached(*args, **settings))
 
 
 @pytest.mark.slow
@@ -108,7 +97,7 @@ def test_fifty_steps_equal_those_of_our_own_trainer(name, attached):
 
 def first_gradient(scene, strategies, attached, steps=1, **host_settings):
     host = Host(scene, **host_settings)
-    clear = attached(host, scene, Conductor(*strategies, objective=Objective(lambda_hr=HR_FROM_START)))
+    clear = attached(host, scene, Conductor(*strategies, objective=HR_FROM_START))
     host.train([scene.train[0].name] * steps)
     clear.remove()
     return host.grads, clear
@@ -147,7 +136,7 @@ def test_without_a_strategy_the_gradient_is_that_of_the_summed_losses(attached):
     renders, _, _ = host.render(view.lr.camera, 0)
     gsplat_host.Photometric.apply(renders[0], view.lr.image).backward()
     alone = {k: p.grad.clone() for k, p in host.splats.items()}
-    o = Objective(lambda_hr=HR_FROM_START)
+    o = HR_FROM_START
     renders, _, _ = host.render(view.hr.camera, 0)
     cotangents = o.hr(renders[0].detach(), view.hr.image).cotangents
     (renders[0] * (cotangents[0] + o.lambda_hf * cotangents[1])).sum().backward()
@@ -182,7 +171,7 @@ def test_gradient_scaling_and_accumulation_do_not_change_the_merge(accumulation,
     host = Host(scene, scaler=Scaler(), accumulation=accumulation)
     host.degree = lambda step: 0
     clear = attached(
-        host, scene, Conductor(GCO(), objective=Objective(lambda_hr=HR_FROM_START)),
+        host, scene, Conductor(GCO(), objective=HR_FROM_START),
         loss_scale=lambda: 1024.0, accumulation=accumulation,
     )  # fmt: skip
     host.train([scene.train[0].name] * accumulation)
@@ -228,9 +217,7 @@ def test_f_det_fades_as_the_readings_of_the_conductor_say(attached):
     scene = toy.scene(20)
     for decay in (0.0, 0.5):
         host = Host(scene)
-        clear = attached(
-            host, scene, Conductor(objective=Objective(lambda_hr=HR_FROM_START), detail=DetailRates(decay=decay))
-        )
+        clear = attached(host, scene, Conductor(objective=HR_FROM_START, detail=DetailRates(decay=decay)))
         host.splats["detail"].data += 1.0
         host.optimizers["detail"].param_groups[0]["lr"] = 0.0
         host.train([scene.train[0].name])
@@ -280,7 +267,7 @@ def test_a_pose_that_two_views_share_is_refused_unless_the_view_is_named(attache
     first, second = scene.train[:2]
     twins = replace(scene, train=(first, replace(second, lr=first.lr, hr=first.hr)))
     host = Host(scene)
-    clear = attached(host, twins, Conductor(objective=Objective(lambda_hr=HR_FROM_START)))
+    clear = attached(host, twins, Conductor(objective=HR_FROM_START))
     with pytest.raises(HostError, match=f"{first.name} and {second.name} have the same pose"):
         host.render(first.lr.camera, 0)
     with clear.rendering(twins.train[1]):
@@ -299,11 +286,10 @@ def test_a_renderer_without_projected_centres_trains_without_a_score(attached, m
     monkeypatch.setattr(gsplat_host, "rasterization", unprojected)
     scene = toy.scene(20)
     host = Host(scene)
-    objective = Objective(lambda_hr=HR_FROM_START)
-    clear = attach(host.splats, host.optimizers, scene.train, Conductor(*subset("clear"), objective=objective))
-    clear.replace_everywhere(unprojected)
-    host.train([v.name for v in scene.train])
-    clear.remove()
+    names = [v.name for v in scene.train]
+    clear = gsplat_host.trained(
+        host, scene, Conductor(*subset("clear"), objective=HR_FROM_START), names, function=unprojected
+    )
     assert clear.attachment.counts["merges"] == 3
     assert float(host.splats["detail"].abs().max()) > 0
 
@@ -332,105 +318,17 @@ def test_missing_parameters_and_views_are_refused():
         attach(host.splats, host.optimizers, scene.train, Conductor())
 
 
-def test_the_stand_in_for_gsplats_rasterization_has_our_rasterizers_gradients():
-    splats, camera = toy.splats(20, dtype=torch.float64), toy.camera(0.1, 48, 32)
-    camera = replace(camera, world_to_camera=camera.world_to_camera.double())
-    leaves = {
-        k: getattr(splats, k).clone().requires_grad_() for k in ("means", "quats", "scales", "opacities", "sh0", "shN")
-    }
-    colors = torch.cat((leaves["sh0"], leaves["shN"]), 1)
-    pose, K = camera.world_to_camera[None], gsplat_host.intrinsics(camera).double()
-    geometry = (leaves["means"], leaves["quats"], leaves["scales"], leaves["opacities"], colors)
-    image, _, info = gsplat_host.rasterization(*geometry, pose, K, 48, 32, sh_degree=1)
-    cotangent = torch.randn(image.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    (image * cotangent).sum().backward()
-    drawn = rasterizers.load("torch", near=0.01, kernel=0.3, antialiased=False)(Splats(**leaves_of(splats)), camera)
-    expected = drawn.vjp(cotangent)
-    assert torch.equal(image[0], drawn.image)
-    for name, leaf in leaves.items():
-        assert torch.allclose(leaf.grad, getattr(expected, name)[0]), name
-    assert torch.allclose(info["means2d"].grad[0], expected.screen[0])
-    with pytest.raises(ValueError, match="needs CUDA"):
-        autograd.rasterization(*geometry, pose, K, 48, 32, sh_degree=1, render_mode="D")
+def test_radii_of_gsplat_1_4_are_supported(attached, monkeypatch):
+    @functools.wraps(autograd.rasterization)
+    def older(*args, **kwargs):
+        renders, alphas, info = autograd.rasterization(*args, backend="torch", **kwargs)
+        return renders, alphas, {**info, "radii": info["radii"][..., 0]}
 
-
-def leaves_of(splats):
-    return {k: getattr(splats, k) for k in ("means", "quats", "scales", "opacities", "sh0", "shN")}
-
-
-class TestWithGsplat:
-    """gsplat's own strategies."""
-
-    @pytest.fixture(autouse=True)
-    def installed(self):
-        pytest.importorskip("gsplat", reason="pip install gsplat")
-
-    def strategy(self, **settings):
-        from gsplat.strategy import DefaultStrategy
-
-        return DefaultStrategy(**{
-            "refine_start_iter": 4, "refine_stop_iter": 24, "refine_every": 5, "grow_grad2d": 2e-4, "prune_opa": 0.02,
-            **settings,
-        })  # fmt: skip
-
-    def run(self, attached, strategies, steps=30, **settings):
-        torch.manual_seed(0)
-        scene = toy.scene(40)
-        strategy = self.strategy(**settings)
-        host = Host(scene, extent=4.0, strategy=strategy)
-        objective = Objective(lambda_hr=HR_FROM_START)
-        clear = attached(host, scene, Conductor(*strategies, objective=objective), strategy=strategy)
-        host.train([scene.train[i % 3].name for i in range(steps)])
-        return host, clear
-
-    def test_all_parameters_and_states_follow_its_densifier(self, attached):
-        host, clear = self.run(attached, subset("clear"))
-        n = len(host.splats["means"])
-        assert n > 40
-        assert {len(p) for p in host.splats.values()} == {n}
-        assert len(host.splats[ROWS]) == n
-        assert clear.attachment.counts["structure changes"] >= 3
-        assert clear.attachment.counts["scores written"] == 30
-        assert clear.attachment.counts["merges"] == 30
-        assert float(host.splats["detail"].abs().max()) > 0
-
-    def test_as_many_densify_by_the_score_as_by_the_ordinary_statistic(self, attached):
-        counts = {}
-        for name in ("baseline", "p2g"):
-            host, clear = self.run(attached, (P2G(patch=4, score_by="evidence"),) if name == "p2g" else (), 6)
-            counts[name] = len(host.splats["means"]) - 40
-            clear.remove()
-        assert counts["baseline"] > 3
-        assert abs(counts["p2g"] - counts["baseline"]) <= max(3, 0.3 * counts["baseline"])
-
-    def test_radii_of_gsplat_1_4_are_supported(self, attached, monkeypatch):
-        @functools.wraps(autograd.rasterization)
-        def older(*args, **kwargs):
-            renders, alphas, info = autograd.rasterization(*args, backend="torch", **kwargs)
-            return renders, alphas, {**info, "radii": info["radii"][..., 0]}
-
-        monkeypatch.setattr(gsplat_host, "rasterization", older)
-        scene = toy.scene(30)
-        new, _ = first_gradient(scene, subset("clear"), attached)
-        host = Host(scene)
-        clear = attach(
-            host.splats,
-            host.optimizers,
-            scene.train,
-            Conductor(*subset("clear"), objective=Objective(lambda_hr=HR_FROM_START)),
-        )
-        clear.replace_everywhere(older)
-        host.train([scene.train[0].name])
-        clear.remove()
-        for name, g in new.items():
-            assert torch.equal(host.grads[name], g), name
-
-    def test_densification_after_the_anchor_is_refused_before_the_first_step(self, attached):
-        early = SVS(anchor_start=5, anchor_strength=0.01)
-        with pytest.raises(SettingError, match=r"must end before the anchor is taken, got 24. Set refine_stop_iter=4"):
-            self.run(attached, (early,))
-
-    def test_densification_beyond_a_strategys_end_is_warned_of_at_the_start(self, attached, caplog):
-        with caplog.at_level(logging.WARNING):
-            self.run(attached, (SVS(anchor_start=10),), steps=1)
-        assert "densifies until refine_stop_iter=24" in caplog.text
+    monkeypatch.setattr(gsplat_host, "rasterization", older)
+    scene = toy.scene(30)
+    new, _ = first_gradient(scene, subset("clear"), attached)
+    host = Host(scene)
+    conductor = Conductor(*subset("clear"), objective=HR_FROM_START)
+    gsplat_host.trained(host, scene, conductor, [scene.train[0].name], function=older)
+    for name, g in new.items():
+        assert torch.equal(host.grads[name], g), name

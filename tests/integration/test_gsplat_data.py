@@ -7,14 +7,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from clear_strategies import Conductor, DataError, Objective
+from clear_strategies import Conductor, DataError
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.priors import Images
-from clear_strategies.schedules import WarmupDecay
 from integration.gsplat import attach
-from integration.gsplat.data import masks_from_dataset, save_lr, views_from_dataset
+from integration.gsplat.data import photos_of, views_from_dataset
+from integration.views import save_photos
 from tests.helpers import gsplat_host, toy
+from tests.helpers.inria import HR_FROM_START
 
 NAMES = ("cam1/0001.png", "cam2/0001.png", "cam2/0002.png")
 HIDDEN = slice(12, None)  # columns of 24
@@ -62,15 +63,16 @@ def test_photos_of_one_name_in_two_folders_have_their_own_sr_images(dataset, tmp
 
 
 def test_photos_are_written_into_their_folders_with_their_masks(dataset, tmp_path):
-    save_lr(dataset, tmp_path / "lr")
+    save_photos(photos_of(dataset), tmp_path / "lr")
     written = [read_image(tmp_path / "lr" / name) for name in NAMES]
     assert float(written[0][:, HIDDEN].max()) == 0
     assert torch.allclose(written[1], dataset.train[1].lr.image, atol=1 / 255)
 
 
 def test_a_masked_pixel_is_hidden_at_both_scales(dataset, tmp_path):
-    views, masks = views_from_dataset(dataset, Images(str(tmp_path / "sr"))), masks_from_dataset(dataset)
-    assert set(masks) == {NAMES[0]}
+    views = views_from_dataset(dataset, Images(str(tmp_path / "sr")))
+    masks = {photo.name: photo.mask for photo in photos_of(dataset)}
+    assert [mask is None for mask in masks.values()] == [False, True, True]
     assert float(views[0].hr.image[:, 4 * 12 :].abs().max()) == 0
     assert hr_gradient(views, dataset.train[0].lr.camera, masks[NAMES[0]]) > 0
     assert hr_gradient(views, dataset.train[0].lr.camera, torch.zeros(16, 24)) == 0
@@ -79,12 +81,7 @@ def test_a_masked_pixel_is_hidden_at_both_scales(dataset, tmp_path):
 def hr_gradient(views, camera, mask):
     """Σ |∂(L_base + L_HF) / ∂ means| of the first view."""
     host = gsplat_host.Host(toy.scene(24))
-    objective = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
-    clear = attach(host.splats, host.optimizers, views, Conductor(objective=objective), masks={NAMES[0]: mask})
-    p = host.splats
-    renders, _, _ = clear.wrap(gsplat_host.rasterization)(
-        p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), torch.cat([p["sh0"], p["shN"]], 1),
-        camera.world_to_camera[None], gsplat_host.intrinsics(camera).float(), 24, 16, sh_degree=3,
-    )  # fmt: skip
+    clear = attach(host.splats, host.optimizers, views, Conductor(objective=HR_FROM_START), masks={NAMES[0]: mask})
+    renders, _, _ = gsplat_host.drawn(clear.wrap(gsplat_host.rasterization), host.splats, camera)
     (renders * 0).sum().backward()  # nothing of the photo
-    return float(p["means"].grad.abs().sum())
+    return float(host.splats["means"].grad.abs().sum())

@@ -50,12 +50,7 @@ def trainer(monkeypatch, tmp_path):
 
 def rendered(splats):
     """The first training view from six tensors of gsplat's names."""
-    photo = toy.scene(24).train[0].lr
-    return gsplat_host.rasterization(
-        splats["means"], splats["quats"], splats["scales"].exp(), splats["opacities"].sigmoid(),
-        torch.cat((splats["sh0"], splats["shN"]), 1), photo.camera.world_to_camera[None],
-        gsplat_host.intrinsics(photo.camera).float(), 24, 16, sh_degree=3,
-    )[0]  # fmt: skip
+    return gsplat_host.drawn(gsplat_host.rasterization, splats, toy.scene(24).train[0].lr.camera)[0]
 
 
 def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(trainer, caplog):

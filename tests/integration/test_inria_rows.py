@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import pytest
 import torch
 
-from clear_strategies import Conductor, Strategy
+from clear_strategies import Conductor
 from integration.inria import attach
 from integration.inria.rows import CarriedRows
 from integration.lineage import MatchedRows
+from tests.helpers import toy
 from tests.helpers.inria import HR_FROM_START, N, loop, options
 
 ROWS = torch.arange(N)
-
-
-@dataclass(frozen=True)
-class Recorder(Strategy):
-    """Records every change of structure."""
-
-    changes: list = field(default_factory=list)
-
-    def on_resize(self, parents):
-        self.changes.append(parents)
 
 
 @pytest.fixture
@@ -115,7 +104,7 @@ def test_a_change_by_another_function_is_found_by_its_values(also_pruned, model,
 def test_the_loop_reports_the_rows_and_gets_its_methods_back(inria_host, inria_capture):
     opt = options(inria_host, inria_capture)
     gaussians, scene = inria_host.setup(opt)
-    recorder = Recorder()
+    recorder = toy.Recorder()
     clear = attach(gaussians, scene.cameras, Conductor(recorder, objective=HR_FROM_START), sr=inria_capture / "sr")
     gaussians.optimizer.param_groups[1]["lr"] = 0.0  # colours stay, so that they identify Gaussians
     colors = gaussians._features_dc.detach().clone()

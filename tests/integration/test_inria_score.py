@@ -12,33 +12,32 @@ from integration.inria import attach
 from tests.helpers.inria import HR_FROM_START, WITHOUT_HR, N, options
 
 
+def screen_gradient(host, render, camera, gaussians, **settings):
+    """What the densifier reads after a step's backward pass."""
+    package = render(camera, gaussians, None, None, **settings)
+    host.Photometric.apply(package["render"], camera.original_image).backward()
+    return package["viewspace_points"].grad
+
+
 @pytest.mark.parametrize("strategies", [(), (GCO(),)], ids=["baseline", "gco"])
-def test_without_a_score_the_densifier_reads_its_own_statistic(strategies, inria_host, inria_capture):
+def test_without_a_score_the_densifier_reads_its_own_statistic(strategies, inria_host, inria_attached):
     """Its threshold is meant for the gradient of the photo; with HR's gradient added, every host would grow more."""
-    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
-    clear = attach(gaussians, scene.cameras, Conductor(*strategies, objective=HR_FROM_START), sr=inria_capture / "sr")
-    read = []
-    for render in (inria_host.render, clear.wrap(inria_host.render)):
-        package = render(scene.cameras[0], gaussians, None, None)
-        inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
-        read.append(package["viewspace_points"].grad)
+    clear, gaussians, scene = inria_attached(*strategies)
+    renders = inria_host.render, clear.wrap(inria_host.render)
+    read = [screen_gradient(inria_host, render, scene.cameras[0], gaussians) for render in renders]
     assert clear.attachment.counts["HR renders"] == 1
     assert torch.equal(*read)
 
 
 def test_with_a_score_as_many_gaussians_pass_the_threshold_as_by_the_hosts_statistic(inria_host, inria_capture):
     gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
-    package = inria_host.render(scene.cameras[0], gaussians, None, None)
-    inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
-    own = package["viewspace_points"].grad[:, :2].norm(dim=1)
+    own = screen_gradient(inria_host, inria_host.render, scene.cameras[0], gaussians)[:, :2].norm(dim=1)
     threshold = float(own.sort(descending=True).values[6:8].mean())  # 7 of 24 pass
     clear = attach(
         gaussians, scene.cameras, Conductor(P2G(patch=4), objective=HR_FROM_START), sr=inria_capture / "sr",
         threshold=threshold,
     )  # fmt: skip
-    package = clear.wrap(inria_host.render)(scene.cameras[0], gaussians, None, None)
-    inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
-    written = package["viewspace_points"].grad[:, :2].norm(dim=1)
+    written = screen_gradient(inria_host, clear.wrap(inria_host.render), scene.cameras[0], gaussians)[:, :2].norm(dim=1)
     assert int((written >= threshold).sum()) == int((own >= threshold).sum()) == 7
     assert not torch.allclose(written, own)
 
@@ -49,9 +48,7 @@ def test_mip_splattings_third_column_holds_the_score_too(inria_host, inria_captu
     gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
     gaussians.xyz_gradient_accum_abs = torch.zeros(N, 1)
     clear = attach(gaussians, scene.cameras, Conductor(P2G(patch=4), objective=HR_FROM_START), sr=inria_capture / "sr")
-    package = clear.wrap(inria_host.render)(scene.cameras[0], gaussians, None, None)
-    inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
-    gradient = package["viewspace_points"].grad
+    gradient = screen_gradient(inria_host, clear.wrap(inria_host.render), scene.cameras[0], gaussians)
     assert torch.equal(gradient[:, 2], gradient[:, 0])
     assert float(gradient[:, 2].max()) > 0
 
@@ -72,14 +69,10 @@ def test_mip_splattings_filter_is_that_of_the_hr_cameras(inria_host, inria_captu
     assert scene.cameras[0].image_width == 24
 
 
-def test_absolute_gradients_stay_the_hosts_own(inria_host, inria_capture, caplog):
-    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
-    clear = attach(gaussians, scene.cameras, Conductor(P2G(patch=4), objective=HR_FROM_START), sr=inria_capture / "sr")
-    grads = []
-    for render in (inria_host.render, clear.wrap(inria_host.render)):
-        package = render(scene.cameras[0], gaussians, None, None, columns=4)
-        inria_host.Photometric.apply(package["render"], scene.cameras[0].original_image).backward()
-        grads.append(package["viewspace_points"].grad)
+def test_absolute_gradients_stay_the_hosts_own(inria_host, caplog, inria_attached):
+    clear, gaussians, scene = inria_attached(P2G(patch=4))
+    renders = inria_host.render, clear.wrap(inria_host.render)
+    grads = [screen_gradient(inria_host, render, scene.cameras[0], gaussians, columns=4) for render in renders]
     assert torch.equal(grads[0][:, 2:], grads[1][:, 2:])
     assert not torch.equal(grads[0][:, :2], grads[1][:, :2])
     assert "4 columns" in caplog.text

@@ -23,13 +23,14 @@ from clear_strategies.schedules import WarmupDecay
 from integration.gsplat import attach
 from integration.nerfstudio.data import (
     over_black,
+    photos_of,
     prior,
-    save_lr,
     seed_with_stereo,
     stereo_cloud,
     views_from_datamanager,
     world_to_camera,
 )
+from integration.views import save_photos
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
 
@@ -96,7 +97,7 @@ def test_sr_images_are_found_by_the_photos_stem(tmp_path):
 
 def test_saved_lr_photos_are_the_training_photos(tmp_path):
     manager = DataManager()
-    save_lr(manager, tmp_path)
+    save_photos(photos_of(manager), tmp_path)
     assert torch.equal((read_image(tmp_path / "two.png") * 255).round().byte(), manager.photos[1]["image"])
 
 
@@ -106,13 +107,14 @@ def test_the_sr_setting_chooses_the_prior(tmp_path):
     assert isinstance(prior(tmp_path / "span.ONNX"), Cached)
 
 
-def test_masks_and_equal_stems_are_refused():
+def test_masks_and_equal_stems_are_refused(tmp_path):
     with pytest.raises(DataError, match="mask"):
         views_from_datamanager(DataManager(mask=torch.ones(16, 24, 1)), Bicubic(), 4)
     twins = DataManager(files=("a/one.jpg", "b/one.png"))
-    for call in (lambda: views_from_datamanager(twins, Bicubic(), 4), lambda: save_lr(twins, None)):
-        with pytest.raises(DataError, match="stem"):
-            call()
+    with pytest.raises(DataError, match="stem"):
+        views_from_datamanager(twins, Bicubic(), 4)
+    with pytest.raises(DataError, match="is that of two photos"):
+        save_photos(photos_of(twins), tmp_path)
 
 
 class ToyManager:
@@ -127,7 +129,8 @@ class ToyManager:
             camera_to_worlds=torch.stack([p.camera.world_to_camera.inverse() * flip for p in photos])[:, :3],
             get_intrinsics_matrices=lambda: self.lens,
         )
-        self.train_dataset, self._corrected = SimpleNamespace(cameras=cameras), Ks
+        names = [f"{i}.png" for i in range(len(photos))]
+        self.train_dataset, self._corrected = SimpleNamespace(cameras=cameras, image_filenames=names), Ks
         self.photos = [{"image": kind(photo.image)} | extra for photo in photos]
         old = {"points3D_xyz": torch.zeros(5, 3), "points3D_rgb": torch.zeros(5, 3), "points3D_error": torch.zeros(5)}
         self.train_dataparser_outputs = SimpleNamespace(metadata={"scale": 1.0} | old)

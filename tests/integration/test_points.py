@@ -18,11 +18,12 @@ from clear_strategies.geometry import stereo
 from integration import HostError
 from integration import points as initial
 from integration.gsplat import points as gsplat_points
+from integration.gsplat.data import photos_of as photos_of_dataset
 from integration.inria.__main__ import main as inria_main
-from integration.inria.cameras import HostViews
+from integration.inria.cameras import photo_of
 from integration.inria.from_options import install as install_in_inria
-from integration.inria.points import stereo_cloud
 from integration.points import stereo_points, wants_stereo
+from integration.views import HostPhoto
 from tests.helpers import toy
 from tests.helpers.inria import FOLDER, N, options
 
@@ -34,9 +35,14 @@ SH_C0 = 0.28209479177387814
 @cache
 def expected():
     """What `stereo` gives for the photos of the toy scene."""
+    photos = host_photos()
+    poses, Ks = (torch.stack([getattr(photo, name) for photo in photos]) for name in ("world_to_camera", "K"))
+    return stereo([photo.image for photo in photos], poses, Ks)
+
+
+def host_photos():
     photos = [view.lr for view in toy.scene(N).train]
-    poses = torch.stack([photo.camera.world_to_camera for photo in photos])
-    return stereo([photo.image for photo in photos], poses, torch.stack([intrinsics(photo.camera) for photo in photos]))
+    return [HostPhoto("", p.image, p.camera.world_to_camera, intrinsics(p.camera)) for p in photos]
 
 
 def assert_starts_there(means, sh0):
@@ -58,7 +64,7 @@ def test_other_words_than_own_and_stereo_are_refused(points):
 
 
 def test_one_line_says_what_was_found_and_a_large_cloud_is_reduced(monkeypatch, caplog):
-    photos = [view.lr for view in toy.scene(N).train]
+    photos = host_photos()
     with caplog.at_level(logging.INFO):
         whole = stereo_points(photos)
     assert [r.message for r in caplog.records if r.name == "integration.points"] == [
@@ -74,7 +80,7 @@ def test_one_line_says_what_was_found_and_a_large_cloud_is_reduced(monkeypatch, 
 
 
 def test_too_few_photos_are_refused():
-    for photos in ([], [toy.scene(N).train[0].lr]):
+    for photos in ([], host_photos()[:1]):
         with pytest.raises(DataError, match="images: must be at least 2 photos"):
             stereo_points(photos)
 
@@ -135,9 +141,9 @@ def test_the_hidden_half_of_a_photo_of_the_dataset_gives_no_points(trainer):
 
     mask = torch.ones(16, 24, dtype=torch.bool)
     dataset = Masked(trainer.Parser(toy.scene(N)))
-    assert len(gsplat_points.stereo_cloud(dataset)) == len(expected().means)
+    assert len(stereo_points(photos_of_dataset(dataset))) == len(expected().means)
     mask[:, 12:] = False
-    cloud = gsplat_points.stereo_cloud(dataset)
+    cloud = stereo_points(photos_of_dataset(dataset))
     seen = torch.zeros(len(cloud), dtype=torch.bool)
     for view in toy.scene(N).train:
         camera = view.lr.camera
@@ -204,11 +210,11 @@ def test_gaussians_stay_the_hosts_own_by_default(inria_host, inria_capture):
 
 def test_pixels_under_an_alpha_mask_give_no_points(inria_host, inria_capture):
     _, scene, _ = own_gaussians(inria_host, inria_capture)
-    whole = stereo_cloud(scene.cameras)
+    whole = stereo_points([photo_of(camera) for camera in scene.cameras])
     for camera in scene.cameras:
         camera.alpha_mask = torch.ones(1, 16, 24)
         camera.alpha_mask[..., 12:] = 0
-    assert 0 < len(stereo_cloud(scene.cameras)) < 0.8 * len(whole)
+    assert 0 < len(stereo_points([photo_of(camera) for camera in scene.cameras])) < 0.8 * len(whole)
 
 
 @pytest.mark.parametrize(
@@ -268,11 +274,3 @@ def test_the_launchers_name_the_flag_and_refuse_other_words_before_the_host_star
         assert "--points own|stereo" in capsys.readouterr().out
         assert main(["--points", "colmap", "--sr", ".", str(SCRIPT)]) == 2
     assert caplog.text.count("points: must be own (the host's) or stereo") == 2
-
-
-def test_views_and_points_have_the_same_cameras(inria_host, inria_capture):
-    """A host's camera is read the same way for its view and for its points."""
-    _, scene, _ = own_gaussians(inria_host, inria_capture)
-    views = HostViews(scene.cameras, lambda name, image, factor: image, 1).all
-    cloud = stereo_points([host_view.view.lr for host_view in views])
-    assert torch.equal(cloud.means, stereo_cloud(scene.cameras).means)
