@@ -12,17 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from clear_strategies.data.cameras import Lens
-from clear_strategies.data.readers.colmap_records import (
-    MODEL_OF_ID,
-    WRITE_AGAIN,
-    Image,
-    Points,
-    checked_points,
-    image_of,
-    lens_of,
-    parameters_of,
-    put,
-)
+from clear_strategies.data.readers import colmap_records as records
 from clear_strategies.errors import DataError
 from clear_strategies.files import require_regular
 
@@ -34,28 +24,28 @@ def cameras(path: Path) -> dict[int, Lens]:
     lenses: dict[int, Lens] = {}
     for i in range(file.count("number of cameras", 24 + 3 * 8)):
         number, kind, width, height = (int(x) for x in file.take("<iiQQ", f"camera {i}"))
-        name = MODEL_OF_ID.get(kind, f"number {kind}")
-        parameters = file.take(f"<{parameters_of(path, name)}d", f"parameters of camera {i}")
-        put(path, lenses, number, lens_of(path, f"camera {number}", name, width, height, parameters))
+        name = records.MODEL_OF_ID.get(kind, f"number {kind}")
+        parameters = file.take(f"<{records.parameters_of(path, name)}d", f"parameters of camera {i}")
+        records.put(path, lenses, number, records.lens_of(path, f"camera {number}", name, width, height, parameters))
     file.finish()
     return lenses
 
 
-def images(path: Path) -> list[Image]:
+def images(path: Path) -> list[records.Image]:
     file = _Bytes(path)
-    found: dict[int, Image] = {}
+    found: dict[int, records.Image] = {}
     for i in range(file.count("number of images", 4 + 7 * 8 + 4 + 1 + 8)):
         field = f"image {i}"
         number, *pose = file.take("<i7d", field)
         (camera,) = file.take("<i", field)
         name = file.text(f"name of image {i}")
         file.skip(24 * file.count(f"2D points of {name!r}", 24))
-        put(path, found, int(number), image_of(path, int(number), tuple(pose), int(camera), name))
+        records.put(path, found, int(number), records.image_of(path, int(number), tuple(pose), int(camera), name))
     file.finish()
     return list(found.values())
 
 
-def points(path: Path) -> Points:
+def points(path: Path) -> records.Points:
     file = _Bytes(path)
     n = file.count("number of points", 8 + 24 + 3 + 8 + 8)
     means, colors, track, ids = [], [], [], set()
@@ -68,7 +58,7 @@ def points(path: Path) -> Points:
         track.append(np.frombuffer(file.data, "<i4", 2 * length, file.at)[::2])
         file.skip(8 * length)
     file.finish()
-    return checked_points(path, ids, means, colors, track)
+    return records.checked_points(path, ids, means, colors, track)
 
 
 class _Bytes:
@@ -89,7 +79,7 @@ class _Bytes:
     def take(self, layout: str, field: str) -> tuple[Any, ...]:
         size = struct.calcsize(layout)
         if size > self.left:
-            raise DataError(self.path, field, f"needs {size} bytes, {self.left} are left: truncated", WRITE_AGAIN)
+            raise records.damaged(self.path, field, f"needs {size} bytes, {self.left} are left: truncated")
         values = struct.unpack_from(layout, self.data, self.at)
         self.at += size
         return values
@@ -98,11 +88,8 @@ class _Bytes:
         """A 64-bit count of records of at least `record` bytes each."""
         (n,) = self.take("<Q", field)
         if n * record > self.left:
-            raise DataError(
-                self.path,
-                field,
-                f"is {n}, of {record} bytes or more each, but {self.left} bytes are left",
-                WRITE_AGAIN,
+            raise records.damaged(
+                self.path, field, f"is {n}, of {record} bytes or more each, but {self.left} bytes are left"
             )
         return int(n)
 
@@ -112,13 +99,13 @@ class _Bytes:
     def text(self, field: str) -> str:
         end = self.data.find(b"\0", self.at, self.at + _LONGEST_NAME)
         if end < 0:
-            raise DataError(self.path, field, "is no text that ends", WRITE_AGAIN)
+            raise records.damaged(self.path, field, "is no text that ends")
         raw, self.at = self.data[self.at : end], end + 1
         try:
             return raw.decode()
         except UnicodeDecodeError as error:
-            raise DataError(self.path, field, "is no UTF-8 text", WRITE_AGAIN) from error
+            raise records.damaged(self.path, field, "is no UTF-8 text") from error
 
     def finish(self) -> None:
         if self.left:
-            raise DataError(self.path, "end", f"{self.left} bytes are left over", WRITE_AGAIN)
+            raise records.damaged(self.path, "end", f"{self.left} bytes are left over")

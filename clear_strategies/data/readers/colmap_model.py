@@ -18,7 +18,7 @@ from torch import Tensor
 
 from clear_strategies.data.cameras import Lens
 from clear_strategies.data.readers import colmap_binary, colmap_text
-from clear_strategies.data.readers.colmap_records import WRITE_AGAIN, Image, Points, checked_points
+from clear_strategies.data.readers.colmap_records import Image, Points, checked_points, damaged
 from clear_strategies.errors import DataError
 from rasterizers.geometry import rotation_matrix
 
@@ -86,9 +86,7 @@ def read_model(folder: Path) -> Model:
         raise DataError(folder / f"images{ending}", "images", "there is none", "run COLMAP's mapper to its end")
     for image in registered:
         if image.camera not in lenses:
-            raise DataError(
-                folder / f"images{ending}", image.name, f"has the unknown camera {image.camera}", WRITE_AGAIN
-            )
+            raise damaged(folder / f"images{ending}", image.name, f"has the unknown camera {image.camera}")
     file = folder / f"points3D{ending}"
     if not file.exists():
         _log.debug("%s has no %s: the capture has no points.", folder, file.name)
@@ -97,34 +95,22 @@ def read_model(folder: Path) -> Model:
         points = read_points(file)
         unknown = np.setdiff1d(points.track[:, 1], [image.id for image in registered])
         if len(unknown):
-            raise DataError(file, "track", f"names the unknown image {unknown[0]}", WRITE_AGAIN)
+            raise damaged(file, "track", f"names the unknown image {unknown[0]}")
     return Model(folder, ending, lenses, registered, points)
 
 
 def read_cameras(file: Path) -> dict[int, Lens]:
-    """cameras.bin or cameras.txt: the lens of each camera by its id.
-
-    Raises:
-        DataError: the file is not what it should be.
-    """
+    """cameras.bin or cameras.txt: the lens of each camera by its id."""
     return colmap_binary.cameras(file) if file.suffix == ".bin" else colmap_text.cameras(file)
 
 
 def read_images(file: Path) -> list[Image]:
-    """images.bin or images.txt.
-
-    Raises:
-        DataError: the file is not what it should be.
-    """
+    """images.bin or images.txt."""
     return colmap_binary.images(file) if file.suffix == ".bin" else colmap_text.images(file)
 
 
 def read_points(file: Path) -> Points:
-    """points3D.bin or points3D.txt.
-
-    Raises:
-        DataError: the file is not what it should be.
-    """
+    """points3D.bin or points3D.txt."""
     return colmap_binary.points(file) if file.suffix == ".bin" else colmap_text.points(file)
 
 

@@ -19,7 +19,11 @@ MODELS: Final = {
     "OPENCV_FISHEYE": (5, 8), "FULL_OPENCV": (6, 12), "SIMPLE_RADIAL_FISHEYE": (8, 4), "RADIAL_FISHEYE": (9, 5),
 }  # fmt: skip
 MODEL_OF_ID: Final = {number: name for name, (number, _) in MODELS.items()}
-WRITE_AGAIN: Final = "export the model again"
+
+
+def damaged(path: Path, where: str, problem: str) -> DataError:
+    """What to raise where a file is not as COLMAP writes it."""
+    return DataError(path, where, problem, "export the model again")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +55,7 @@ def checked_points(
 ) -> Points:
     """`track`: of each point, the ids of the images that observe it."""
     if len(ids) != len(means):
-        raise DataError(path, "point id", "occurs twice", WRITE_AGAIN)
+        raise damaged(path, "point id", "occurs twice")
     if not means:
         return Points(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros((0, 2), np.int64))
     where = np.array(means)
@@ -84,14 +88,14 @@ def lens_of(path: Path, where: str, model: str, width: int, height: int, p: tupl
 
 def image_of(path: Path, number: int, pose: tuple[float, ...], camera: int, name: str) -> Image:
     if not all(abs(x) < FARTHEST for x in pose):
-        raise DataError(path, name or f"image {number}", "has a pose that is not finite", WRITE_AGAIN)
+        raise damaged(path, name or f"image {number}", "has a pose that is not finite")
     norm = math.hypot(*pose[:4])
     if not 0.5 < norm < 2:
-        raise DataError(path, name or f"image {number}", f"has a rotation quaternion of length {norm:.3g}", WRITE_AGAIN)
+        raise damaged(path, name or f"image {number}", f"has a rotation quaternion of length {norm:.3g}")
     return Image(number, pose[:4], pose[4:], camera, name)
 
 
 def put(path: Path, table: dict[int, Any], number: int, value: Any) -> None:
     if number in table:
-        raise DataError(path, f"id {number}", "occurs twice", WRITE_AGAIN)
+        raise damaged(path, f"id {number}", "occurs twice")
     table[number] = value
