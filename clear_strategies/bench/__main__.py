@@ -10,23 +10,14 @@ import argparse
 import logging
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from clear_strategies import console
-from clear_strategies.bench import (
-    device,
-    errors,
-    evidence,
-    iteration,
-    kernels,
-    next_photo,
-    rasterizers,
-    seconds,
-    stereo,
-)
+from clear_strategies.bench import kernels, rasterizers
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
 from clear_strategies.errors import ClearError
@@ -121,7 +112,12 @@ def parser() -> argparse.ArgumentParser:
             "overrides", nargs="*", metavar="OVERRIDE",
             help=f"the data set and its {chosen}, as for a run (default: the demo)",
         )  # fmt: skip
+    _add_checks(questions, common, garden, out)
+    return result
 
+
+def _add_checks(questions: Any, common: Any, garden: Any, out: Any) -> None:
+    """The questions about a finished run, and about a machine with a GPU."""
     ask = questions.add_parser("errors", parents=[common, out], help="where a run's error on its test views lies")
     ask.add_argument("run", type=Path, metavar="RUN", help="the folder of a finished run")
     ask.add_argument("--reference", type=Path, metavar="RUN", help="another run of the same scene, beside it")
@@ -132,7 +128,6 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--quick", action="store_true", help="tiny scenes, to see that the steps run")
     ask.add_argument("--data-root", type=Path, metavar="DIR", help="holds LLFF's fern with images_4 and images_2")
     ask.add_argument("--scene", nargs="+", type=Path, default=[], metavar="PLY", help="more Gaussians to measure")
-    return result
 
 
 def _add_trainings(questions: Any, common: argparse.ArgumentParser) -> None:
@@ -170,15 +165,11 @@ def _add_kept(ask: argparse.ArgumentParser, question: str) -> None:
 
 
 def _measure(question: str, options: dict[str, Any], results: Results) -> None:
-    if question == "seconds":
-        seconds.measure(results, seconds.Request(**options))
-    elif question == "next_photo":
-        next_photo.measure(results, next_photo.Request(**options))
-    elif question == "device":
-        device.measure(results, device.Request(**options))
+    """By the module of the question's name: its `measure` takes a `Request`, if the module has one, or else the options."""
+    module: Any = import_module(f"clear_strategies.bench.{question}")
+    if hasattr(module, "Request"):
+        module.measure(results, module.Request(**options))
     else:
-        asked = {"rasterizers": rasterizers, "kernels": kernels, "iteration": iteration, "stereo": stereo}
-        module: Any = {**asked, "evidence": evidence, "errors": errors}[question]
         module.measure(results, **{name: value for name, value in options.items() if name != "out"})
 
 

@@ -6,7 +6,6 @@ other. With `--device cpu --quick` the same program runs tiny scenes without a G
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -19,10 +18,9 @@ from typing import Any, Final
 import pandas as pd
 
 from clear_strategies.bench.rasterizers import require_device
-from clear_strategies.bench.results import Results
+from clear_strategies.bench.results import ROOT, Results, environment
 from clear_strategies.errors import DataError
 
-ROOT: Final = Path(__file__).resolve().parents[2]
 PASSED, FAILED, SKIPPED = "passed", "failed", "not run"
 
 TINY: Final = (
@@ -34,13 +32,7 @@ _FERN: Final = {"images_4": "HR 1008x756", "images_2": "HR 2016x1512"}  # LLFF's
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """The options of the command line.
-
-    Args:
-        out: a new folder for logs, tables and runs.
-        quick: tiny scenes, to see that the steps run.
-        data_root: holds LLFF's fern. data: the garden's file. scene: more .ply files to measure.
-    """
+    """The options of the command line."""
 
     out: Path
     device: str
@@ -71,9 +63,6 @@ def measure(results: Results, request: Request, plan: Callable[[Request], Sequen
 
     Args:
         plan: the steps of a request; `steps` unless given.
-
-    Raises:
-        DataError: there is no such device, or the folder is not empty.
     """
     require_device(request.device)
     if request.out.exists() and (not request.out.is_dir() or any(request.out.iterdir())):
@@ -98,15 +87,14 @@ def _run(step: Step, request: Request, log: Path) -> dict[str, Any]:
     row = {"step": step.name, "result": SKIPPED, "seconds": 0.0, "reason": step.why_not or "", "log": ""}
     if step.why_not is not None:
         return row
-    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     hidden = {"CUDA_VISIBLE_DEVICES": ""} if request.device == "cpu" else {}
-    environment = {**os.environ, "PYTHONPATH": paths, **hidden, **step.environment}
     began = time.perf_counter()
     with log.open("wb") as output:
         try:
             code = subprocess.run(  # noqa: S603 - our own programs, and NVIDIA's
-                step.command, env=environment, stdout=output, stderr=subprocess.STDOUT, check=False
-            ).returncode
+                step.command, env=environment(**hidden, **step.environment), stdout=output, stderr=subprocess.STDOUT,
+                check=False,
+            ).returncode  # fmt: skip
             last_line = (log.read_text("utf-8", "replace").strip().splitlines() or ["it printed nothing"])[-1]
             problem = step.problem() if code == 0 else f"exit code {code}: {last_line[:200]}"
         except OSError as error:

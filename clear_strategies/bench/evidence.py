@@ -52,11 +52,7 @@ class _Found:
 
 
 def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
-    """Fill `results` with a row for each kind of error, and a picture of the first view's R.
-
-    Raises:
-        SettingError, DataError: the overrides, or the data, cannot be used; or the prior has no seeded errors.
-    """
+    """Fill `results` with a row for each kind of error, and a picture of the first view's R."""
     chosen = list(overrides) or list(_DEMO)
     errors = _errors(tree(composed(chosen, "config"))["prior"])
     settings = settings_of(tree(composed([*chosen, "prior.share=0", "data.views.test_limit=0"], "config")))
@@ -87,11 +83,7 @@ def auc(right: Float[Tensor, " K"], wrong: Float[Tensor, " M"]) -> float:
 
 
 def _errors(prior: Mapping[str, Any]) -> SeededErrors:
-    """The errors of a prior's node.
-
-    Raises:
-        SettingError: it makes none.
-    """
+    """The errors of a prior's node."""
     names = [f.name for f in fields(SeededErrors)]
     if not all(name in prior for name in names):
         raise SettingError(

@@ -73,10 +73,6 @@ def measure(
     Args:
         backend: None: all that run here.
         isa: instruction sets whose compiled modules are compared; None: the fastest of this processor.
-
-    Raises:
-        BackendUnavailable: this processor cannot run one of `isa`.
-        DataError: a name is unknown, or nothing that was asked for runs here.
     """
     require_device(device)
     backends = usable(backend, device, results.note)
@@ -119,19 +115,13 @@ def measure(
 
 
 def require_device(device: str) -> None:
-    """Raises:
-    DataError: torch sees no such device.
-    """
+    """Refuse a device that torch does not see."""
     if device == "cuda" and not torch.cuda.is_available():
         raise DataError("--device", "cuda", "torch sees no such device here", "use --device cpu")
 
 
 def usable(asked: Sequence[str] | None, device: str, note: Callable[[str], None]) -> list[str]:
-    """The backends that run here, of those asked for.
-
-    Raises:
-        DataError: a name is unknown, or none runs.
-    """
+    """The backends that run here, of those asked for."""
     reasons = rasterizers.available()
     for name in asked or ():
         if name not in reasons:

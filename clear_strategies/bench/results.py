@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import pandas as pd
 import torch
@@ -15,6 +16,8 @@ from torch.utils import collect_env
 
 from clear_strategies import files
 from clear_strategies.outputs.provenance import provenance
+
+ROOT: Final = Path(__file__).resolve().parents[2]
 
 
 @dataclass(slots=True, eq=False)
@@ -75,3 +78,9 @@ def machine() -> dict[str, Any]:
         "torch": torch.__version__,
         "torch_threads": torch.get_num_threads(),
     }
+
+
+def environment(**more: str) -> dict[str, str]:
+    """Of a child process that imports this very package."""
+    paths = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    return {**os.environ, "PYTHONPATH": paths, **more}

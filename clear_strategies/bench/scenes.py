@@ -128,11 +128,7 @@ class _Frustum:
 
 
 def garden(path: Path) -> Workload:
-    """The points of gsplat's test_garden.npz as Gaussians: sizes from the distances to three neighbours.
-
-    Raises:
-        DataError: the file is missing or is not the garden.
-    """
+    """The points of gsplat's test_garden.npz as Gaussians: sizes from the distances to three neighbours."""
     from scipy.spatial import cKDTree
 
     try:
@@ -156,11 +152,7 @@ def garden(path: Path) -> Workload:
 
 
 def from_ply(path: Path) -> Workload:
-    """Gaussians as a run exports them.
-
-    Raises:
-        DataError: the file is no such export.
-    """
+    """Gaussians as a run exports them."""
     g = read_gaussians(path)
     splats = Splats(g.means, g.quats, g.scales.exp(), g.opacities.sigmoid(), g.sh0, g.shN)
     return Workload(path.stem, splats, facing_all(splats))
@@ -194,9 +186,6 @@ def load(name: str, data: Path | None = None) -> Workload:
 
     Args:
         data: the garden's file.
-
-    Raises:
-        DataError: no scene or file has that name, or the file cannot be used.
     """
     if name in _GENERATED:
         return _GENERATED[name]()

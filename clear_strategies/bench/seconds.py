@@ -24,7 +24,7 @@ import torch
 
 from clear_strategies import files
 from clear_strategies.bench import plots
-from clear_strategies.bench.results import Results
+from clear_strategies.bench.results import Results, environment
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
 from clear_strategies.report.runs import history
@@ -50,15 +50,7 @@ Trainer = Callable[[Path, Sequence[str]], str | None]
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """The options of the command line.
-
-    Args:
-        overrides: shared by all trainings.
-        variants: the overrides of each, the reference first; they win over the shared ones.
-        scene: values of `+scene=`; none: what `overrides` ask for.
-        probes: how often a run evaluates the test views, evenly spaced over its iterations.
-        out: holds the trainings.
-    """
+    """The options of the command line. A variant's overrides win over those of all trainings."""
 
     overrides: Sequence[str]
     variants: Sequence[Sequence[str]]
@@ -98,20 +90,12 @@ def _without_folders(overrides: Sequence[str]) -> str:
 
 def train(folder: Path, overrides: Sequence[str]) -> str | None:
     """Train in a process of its own; returns the line that says why it failed, or None."""
-    root = Path(__file__).resolve().parents[2]
-    paths = os.pathsep.join(filter(None, (str(root), os.environ.get("PYTHONPATH"))))
     where = str(folder.resolve()).replace("\\", "\\\\").replace("'", "\\'")
-    command = [
-        sys.executable,
-        "-m",
-        "clear_strategies.run",
-        "fit.baseline=false",
-        *overrides,
-        f"hydra.run.dir='{where}'",
-    ]
+    program = [sys.executable, "-m", "clear_strategies.run", "fit.baseline=false"]
     child = subprocess.run(  # noqa: S603 - this interpreter
-        command, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True, errors="replace", check=False
-    )
+        [*program, *overrides, f"hydra.run.dir='{where}'"],
+        env=environment(), capture_output=True, text=True, errors="replace", check=False,
+    )  # fmt: skip
     if child.returncode == 0:
         return None
     lines = [line for line in (child.stdout + child.stderr).splitlines() if line.strip()]
@@ -125,9 +109,6 @@ def measure(results: Results, request: Request, trainer: Trainer = train) -> Non
 
     Args:
         trainer: trains into a folder with overrides.
-
-    Raises:
-        DataError: no reference finished.
     """
     rows: list[dict[str, Any]] = []
     probes: list[dict[str, Any]] = []
@@ -251,10 +232,6 @@ def _clocks() -> dict[str, float]:
 
 
 def _read(folder: Path, facts: Mapping[str, Any]) -> Training:
-    """
-    Raises:
-        DataError: files of the run are missing or damaged, or there was no test view.
-    """
     metrics, command, rows = read_object(folder / "metrics.json"), read_object(folder / _COMMAND), history(folder)
     probes = [row for row in rows if "psnr_test" in row]
     if not probes or any(name not in probes[-1] for name in (WALL, PROCESSOR)):
