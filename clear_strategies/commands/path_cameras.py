@@ -7,6 +7,7 @@ import logging
 from pathlib import Path
 
 from clear_strategies.commands.options import LONGEST, STILLS
+from clear_strategies.data.view_settings import resized
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import SavedSplat
 from clear_strategies.viewing import FPS, cameras, paths
@@ -16,11 +17,7 @@ _log = logging.getLogger(__name__)
 
 
 def cameras_of(splat: SavedSplat, options: argparse.Namespace) -> tuple[list[str], list[Camera], float]:
-    """Names, cameras and frames per second of what `--path` names.
-
-    Raises:
-        DataError, SettingError: it names no cameras, or a file that cannot be read.
-    """
+    """Names, cameras and frames per second of what `--path` names."""
     path, fps = str(options.path), None
     if path in STILLS:
         chosen = [saved for saved in splat.cameras if saved.split == path]
@@ -32,11 +29,11 @@ def cameras_of(splat: SavedSplat, options: argparse.Namespace) -> tuple[list[str
         found, fps = _of_path(splat, path, options.frames)
         names = [f"{i:04d}" for i in range(len(found))]
     if options.width is not None:
-        found = [cameras.resized(c, options.width, max(1, round(c.height * options.width / c.width))) for c in found]
+        found = [resized(c, options.width, max(1, round(c.height * options.width / c.width))) for c in found]
     if path not in STILLS:
         found = [cameras.at_most(c, None if options.width is not None else LONGEST) for c in found]
         if len({(c.width, c.height) for c in found}) > 1:
-            found = [cameras.resized(c, found[0].width, found[0].height) for c in found]
+            found = [resized(c, found[0].width, found[0].height) for c in found]
             _log.warning("the cameras have different sizes; all frames have the first one's.")
     return names, found, float(options.fps or fps or FPS)
 

@@ -1,23 +1,40 @@
-"""JSON files read strictly: NaN, duplicate keys, deep nesting and numbers beyond a float are refused."""
+"""JSON files read strictly, and what they must hold as msgspec types.
+
+class Run(msgspec.Struct):
+iterations: Count
+scores: dict[str, float | None]
+
+run = typed(path, read_object(path), Run, remedy="train the run again")
+"""
 
 from __future__ import annotations
 
 import json
 import math
+import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, TypeVar
+
+import msgspec
+from msgspec import Meta
 
 from clear_strategies.errors import DataError
 from clear_strategies.files import require_regular
 
+Count = Annotated[int, Meta(ge=0, le=10**12)]
+Positive = Annotated[float, Meta(ge=0, lt=1e300)]
+Number = Annotated[float, Meta(gt=-1e18, lt=1e18)]
+
 _LARGEST: Final = 256 << 20
+_T = TypeVar("_T")
 
 
-def read_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a file.
+def read(path: Path) -> Any:
+    """The content of a file. msgspec's own reader would accept a key that occurs twice.
 
     Raises:
-        DataError: it cannot be read, is no strict JSON, or is no object.
+        DataError: it cannot be read, or has NaN, duplicate keys, deep nesting or numbers beyond a float.
     """
 
     def refuse_constant(name: str) -> Any:
@@ -38,7 +55,7 @@ def read_object(path: Path) -> dict[str, Any]:
 
     require_regular(path, most=_LARGEST)
     try:
-        value = json.loads(
+        return json.loads(
             path.read_text("utf-8"),
             parse_constant=refuse_constant,
             parse_float=finite,
@@ -50,44 +67,34 @@ def read_object(path: Path) -> dict[str, Any]:
         raise DataError(path, "json", "is nested too deeply", "write it again") from error
     except ValueError as error:
         raise DataError(path, "json", f"is not valid ({str(error)[:120]})", "write it again") from error
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """The JSON object in a file."""
+    value = read(path)
     if not isinstance(value, dict):
-        raise DataError(path, "json", f"is a {type(value).__name__}, not an object", "give a transforms file")
+        raise DataError(path, "json", f"is a {type(value).__name__}, not an object", "give another file")
     return value
 
 
-def number(path: Path, where: str, value: Any) -> float:
-    """A finite number.
+def typed(
+    path: Path, content: Any, kind: Callable[..., _T], *, where: str = "", remedy: str = "correct the field"
+) -> _T:
+    """The content as `kind`; of an object, keys that a struct lacks are ignored.
+
+    Args:
+        kind: a struct, or a list or dict of such.
+        where: of the content in the file.
 
     Raises:
-        DataError: it is no number, or missing.
+        DataError: it is no such thing. The message has the place, e.g. `frames[1].fl_x`.
     """
-    if value is None:
-        raise DataError(path, where, "is missing", "give a number")
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e18:
-        found = repr(value)[:40] if isinstance(value, str | int | float) else f"a {type(value).__name__}"
-        raise DataError(path, where, f"is {found} where a finite number belongs", "correct the field")
-    return float(value)
-
-
-def frames_of(path: Path, content: dict[str, Any]) -> list[dict[str, Any]]:
-    """The list "frames", each an object.
-
-    Raises:
-        DataError: it is missing, empty, or holds something else.
-    """
-    frames = content.get("frames")
-    if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
-        raise DataError(path, "frames", "is missing, empty or no list of objects", "give a transforms file")
-    return frames
-
-
-def file_path(path: Path, index: int, frame: dict[str, Any]) -> str:
-    """A frame's "file_path".
-
-    Raises:
-        DataError: it is missing or no text.
-    """
-    value = frame.get("file_path")
-    if not isinstance(value, str) or not value:
-        raise DataError(path, f"frames[{index}].file_path", "is missing or no text", "name the frame's image")
-    return value
+    try:
+        made: _T = msgspec.convert(content, kind)
+        return made
+    except msgspec.ValidationError as error:
+        problem, _, place = str(error).partition(" - at `$")
+        missing = re.fullmatch(r"Object missing required field `(.*)`", problem)
+        parts = (where, place.strip("`."), missing[1] if missing else "")
+        told = "is missing" if missing else problem.replace("Expected", "must be")
+        raise DataError(path, ".".join(filter(None, parts)).replace(".[", "[") or "json", told, remedy) from error

@@ -22,7 +22,7 @@ NO_DISK: Final = 3
 SIGNALS: Final = 128
 
 # What the extra [train] brings beside the core, by the names that are imported.
-_TRAIN: Final = ("cv2", "jinja2", "kornia", "matplotlib", "safetensors", "scipy", "skimage", "tqdm")
+TRAIN: Final = ("cv2", "jinja2", "kornia", "matplotlib", "msgspec", "safetensors", "scipy", "skimage", "tqdm")
 
 
 class Ending(NamedTuple):
@@ -63,12 +63,8 @@ def _told_by_libraries() -> tuple[type[Exception], ...]:
 
 
 def require_train() -> None:
-    """Check that the trainer's libraries are installed, without importing them.
-
-    Raises:
-        SettingError: one is not installed.
-    """
-    if missing := [name for name in _TRAIN if find_spec(name) is None]:
+    """Refuse to begin without the trainer's libraries; none is imported."""
+    if missing := [name for name in TRAIN if find_spec(name) is None]:
         raise SettingError(
             f"training needs {', '.join(missing)}, which the core does not install: pip install 'clear-strategies[train]'."
         )

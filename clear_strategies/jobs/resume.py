@@ -42,24 +42,16 @@ def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def finished(folder: Path, config: Mapping[str, Any]) -> tuple[float | None] | None:
-    """What the finished run in this folder returned; None where there is none.
-
-    Raises:
-        DataError: it was another configuration's, or its metrics.json is damaged.
-    """
+    """What the finished run in this folder returned; None where there is none."""
     path = folder / "metrics.json"
     if not path.exists():
         return None
     content = metrics.read(path, _TRAIN_AGAIN)
-    try:
-        _require_same(path, content["config"], config)
-        means = content["test"]["mean"] or content["train"]["mean"]
-        psnr = means["ours"]["psnr"] if means else None
-        date = content["provenance"]["date"]
-    except KeyError as error:
-        raise DataError(path, str(error), "is missing", _TRAIN_AGAIN) from error
+    _require_same(path, content.config, config)
+    ours = content.shown.mean.get("ours")
+    psnr = None if ours is None else ours.psnr
     score = "no PSNR" if psnr is None else f"PSNR {psnr:.2f} dB"
-    _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, date, score)
+    _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, content.provenance.date, score)
     return (psnr,)
 
 
@@ -68,9 +60,6 @@ def resume(state: TrainState, asked: str | None, folder: Path, config: Mapping[s
 
     Args:
         asked: a run's folder or one of its checkpoints; "auto": the newest checkpoint in `folder` that is whole, or none.
-
-    Raises:
-        DataError: the checkpoint is damaged, or another configuration's.
     """
     if asked == AUTO:
         _resume_newest(state, folder / CHECKPOINTS, config)
@@ -87,9 +76,6 @@ def of_both(asked: str | None, run: Mapping[str, Any], baseline: Mapping[str, An
 
     Args:
         run, baseline: the configuration of each.
-
-    Raises:
-        DataError: no checkpoint is there, it is damaged, or it is another configuration's.
     """
     if asked is None or asked == AUTO:
         return asked, asked

@@ -33,23 +33,19 @@ class Baseline:
 
     @classmethod
     def read(cls, folder: Path) -> Baseline:
-        """Read a run's folder.
-
-        Raises:
-            DataError: metrics.json is not there or damaged, or a render of a test view is not there.
-        """
+        """Read a run's folder."""
         path = folder / "metrics.json"
         content = metrics.read(path, _TRAIN_AGAIN)
+        parts = {"test": content.test, "train": content.train}
         try:
-            parts = {part: content[part]["mean"] for part in ("test", "train")}
             found = cls(
                 folder=folder,
-                means={part: _scores(mean["ours"]) for part, mean in parts.items() if mean},
-                views={view: _scores(row["ours"]) for view, row in content["test"]["views"].items()},
-                seconds=float(content["seconds"]),
+                means={name: part.mean["ours"].numbers for name, part in parts.items() if part.mean},
+                views={view: row["ours"].numbers for view, row in content.test.views.items()},
+                seconds=content.seconds,
             )
-        except (KeyError, TypeError) as error:
-            raise DataError(path, str(error), "is missing or damaged", _TRAIN_AGAIN) from error
+        except KeyError as error:
+            raise DataError(path, str(error), "is missing", _TRAIN_AGAIN) from error
         for view in found.views:
             if not found.render_of(view).is_file():
                 raise DataError(found.render_of(view), "file", "is not there", _TRAIN_AGAIN)
@@ -63,8 +59,3 @@ class Baseline:
         """What metrics.json of the run holds of it."""
         means = {part: asdict(mean) for part, mean in self.means.items()}
         return {"folder": self.folder.name, "seconds": self.seconds, **means}
-
-
-def _scores(scores: Mapping[str, Any]) -> ImageScores:
-    """Scores from JSON, where null stands for a number that was not finite."""
-    return ImageScores(**{name: float("nan") if value is None else float(value) for name, value in scores.items()})

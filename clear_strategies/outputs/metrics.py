@@ -17,20 +17,21 @@ metrics.json: {"scene", "method", "strategies", "seed", "iterations", "gaussians
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import msgspec
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import View
-from clear_strategies.data import json_shapes as shapes
 from clear_strategies.data.scene import Scene
-from clear_strategies.data.strict_json import read_object
+from clear_strategies.data.strict_json import Count, Positive, read_object, typed
 from clear_strategies.outputs.figures import spaced
 from clear_strategies.outputs.image_scores import ImageScores, mean_scores, score
 from rasterizers.interface import Camera
@@ -43,34 +44,71 @@ NOTE: Final = (
 )
 
 TRAIN_RENDERS: Final = 4  # training views whose renders are kept where there are no test views
-_TABLE: Final = shapes.table(shapes.number(null=True))
-_PART: Final = shapes.record(against=shapes.text(), views=shapes.table(shapes.table(_TABLE)), mean=shapes.table(_TABLE))
-SHAPE: Final = shapes.record(
-    scene=shapes.text(),
-    strategies=shapes.each(shapes.text()),
-    seed=shapes.whole(-shapes.LARGEST),
-    iterations=shapes.whole(),
-    gaussians=shapes.whole(),
-    seconds=shapes.number(least=0),
-    conflict=_TABLE,
-    synthetic_prior=shapes.flag,
-    test=_PART,
-    train=_PART,
-    provenance=shapes.record({"date": shapes.text(), "plan": shapes.table(shapes.anything)}),
-    optional={"config": shapes.table(shapes.anything), "method": shapes.text(null=True)},
-)
-"""What metrics.json of a finished run holds, for everybody who reads one."""
 
 
-def read(path: Path, remedy: str) -> dict[str, Any]:
+class Scores(msgspec.Struct):
+    """`ImageScores` as the file has them, where null stands for a number that was not finite."""
+
+    psnr: float | None
+    ssim: float | None
+    gmsd: float | None
+    blur: float | None
+
+    @property
+    def numbers(self) -> ImageScores:
+        return ImageScores(*map(as_float, msgspec.structs.astuple(self)))
+
+
+class Part(msgspec.Struct):
+    """TABLE of the test or the training views."""
+
+    against: str
+    views: dict[str, dict[str, Scores]]
+    mean: dict[str, Scores]
+
+
+class Provenance(msgspec.Struct):
+    """Of the facts about where the run was made, those that are read again."""
+
+    date: str = "an unknown date"
+    plan: dict[str, Any] = msgspec.field(default_factory=dict)
+
+
+class Metrics(msgspec.Struct):
+    """What metrics.json of a finished run holds, for everybody who reads one."""
+
+    scene: str
+    strategies: list[str]
+    seed: int
+    iterations: Count
+    gaussians: Count
+    seconds: Positive
+    conflict: dict[str, float | None]
+    synthetic_prior: bool
+    test: Part
+    train: Part
+    provenance: Provenance
+    config: dict[str, Any] = msgspec.field(default_factory=dict)
+    method: str | None = None
+
+    @property
+    def shown(self) -> Part:
+        """The test views; the training views where there are none."""
+        return self.test if self.test.mean else self.train
+
+
+def read(path: Path, remedy: str) -> Metrics:
     """The content of metrics.json.
 
     Raises:
         DataError: it cannot be read, or is not that of a finished run; the message ends with `remedy`.
     """
-    content = read_object(path)
-    shapes.require(path, content, SHAPE, remedy)
-    return content
+    return typed(path, read_object(path), Metrics, remedy=remedy)
+
+
+def as_float(value: float | None) -> float:
+    """A number of the file, where null stands for one that was not finite."""
+    return math.nan if value is None else value
 
 
 Table = dict[str, dict[str, ImageScores]]

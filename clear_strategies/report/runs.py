@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import csv
 import logging
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -62,50 +61,41 @@ class Run:
 
     @classmethod
     def read(cls, folder: Path) -> Run:
-        """Read a run's folder.
-
-        Raises:
-            DataError: metrics.json or .hydra/overrides.yaml is damaged.
-        """
+        """Read a run's folder."""
         path = folder / "metrics.json"
         content, overrides = metrics.read(path, "train the run again"), _overrides(folder)
+        part = content.shown
+        marks = ["synthetic prior"] * content.synthetic_prior
+        marks += [] if part is content.test else ["training views"]
+        marks += [f"against {part.against}"] if "LR" in part.against else []
+        methods = ("ours", *(image for image in BASELINES if image in part.mean))
         try:
-            part = content["test"] if content["test"]["mean"] else content["train"]
-            marks = ["synthetic prior"] * bool(content["synthetic_prior"])
-            marks += [] if content["test"]["mean"] else ["training views"]
-            marks += [f"against {part['against']}"] if "LR" in part.get("against", "HR photos") else []
-            methods = ("ours", *(image for image in BASELINES if image in part["mean"]))
             return cls(
                 folder=folder,
-                scene=str(content["scene"]) + (f" ({', '.join(marks)})" if marks else ""),
+                scene=content.scene + (f" ({', '.join(marks)})" if marks else ""),
                 marks=", ".join(marks),
-                name=_name(overrides, content["strategies"]),
+                name=_name(overrides, content.strategies),
                 settings=tuple(o for o in overrides if _is_setting(o)),
-                seed=int(content["seed"]),
-                iterations=int(content["iterations"]),
-                scores={m: {s: _number(part["mean"][m][s]) for s in SCORES} for m in methods},
-                views={Path(view).stem: _number(of["ours"]["psnr"]) for view, of in part["views"].items()},
+                seed=content.seed,
+                iterations=content.iterations,
+                scores={m: asdict(part.mean[m].numbers) for m in methods},
+                views={Path(view).stem: metrics.as_float(of["ours"].psnr) for view, of in part.views.items()},
                 facts={
-                    "conflict": _number(content["conflict"].get("gaussian")),
-                    "gaussians": _number(content["gaussians"]),
-                    "seconds": _number(content["seconds"]),
+                    "conflict": metrics.as_float(content.conflict.get("gaussian")),
+                    "gaussians": content.gaussians,
+                    "seconds": content.seconds,
                 },
-                plan={str(k): str(v) for k, v in content["provenance"].get("plan", {}).items()},
-                config=dict(content.get("config", {})),
+                plan={label: str(fact) for label, fact in content.provenance.plan.items()},
+                config=content.config,
             )
         except KeyError as error:
             raise DataError(path, str(error), "is missing", "train the run again") from error
-        except (TypeError, ValueError, AttributeError) as error:
-            raise DataError(path, "content", f"is not that of a run ({error})", "train the run again") from error
 
 
 def collect(folders: Iterable[Path]) -> list[Run]:
     """Every finished run at or below the folders: the jobs of a sweep by number, other runs by path. A baseline that
     trained beside a run (`fit.baseline`) comes before it, and once: it is left out, with a message, where another run of
     the same configuration is there. Unfinished and damaged runs are logged and left out.
-
-    Raises:
-        DataError: there is no finished run.
     """
     folders = list(folders)
     found: dict[Path, None] = {}
@@ -226,8 +216,3 @@ def _job(folder: Path) -> int:
         return 0
     number = re.search(r"^    num: (\d+)$", content, re.MULTILINE)
     return int(number[1]) if number else 0
-
-
-def _number(value: Any) -> float:
-    """A number from JSON, where null stands for one that was not finite."""
-    return math.nan if value is None else float(value)

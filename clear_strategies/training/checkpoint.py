@@ -16,11 +16,13 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
+import msgspec
+from msgspec import Meta
 from torch import Tensor
 
-from clear_strategies.data import json_shapes as shapes
+from clear_strategies.data.strict_json import Count, Positive, typed
 from clear_strategies.errors import DataError
 from clear_strategies.files import partial_of
 from clear_strategies.training import tensor_file
@@ -32,19 +34,30 @@ _TENSORS, _HISTORY, _MANIFEST = "tensors.safetensors", "history.json", "manifest
 _PREFIX: Final = "step_"
 _SEAL: Final = "sha256_of_manifest"
 
-_HISTORY_SHAPE: Final = shapes.each(shapes.table(shapes.real))
-_MANIFEST_SHAPE: Final = shapes.record(
-    t=shapes.whole(1, 10**9),
-    config=shapes.table(shapes.anything),
-    facts=shapes.record(optimizer_steps=shapes.whole(0, 10**9), degree=shapes.whole(0, 3)),
-    work_log=shapes.table(
-        shapes.record(
-            runs=shapes.whole(), seconds=shapes.number(least=0), skipped=shapes.table(shapes.whole()),
-        )
-    ),
-    device=shapes.one_of("cpu", "cuda"),
-    sha256=shapes.record({}, **{_TENSORS: shapes.text(), _HISTORY: shapes.text()}),
-)  # fmt: skip
+
+class _Facts(msgspec.Struct):
+    optimizer_steps: Annotated[float, Meta(ge=0, le=10**9, multiple_of=1)]
+    degree: Annotated[float, Meta(ge=0, le=3, multiple_of=1)]
+
+
+class _Stage(msgspec.Struct):
+    runs: Count
+    seconds: Positive
+    skipped: dict[str, Count]
+
+
+class _Hashes(msgspec.Struct):
+    tensors: str = msgspec.field(name=_TENSORS)
+    history: str = msgspec.field(name=_HISTORY)
+
+
+class _Manifest(msgspec.Struct):
+    t: Annotated[int, Meta(ge=1, le=10**9)]
+    config: dict[str, Any]
+    facts: _Facts
+    work_log: dict[str, _Stage]
+    device: Literal["cpu", "cuda"]
+    sha256: _Hashes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,7 +160,7 @@ def load(path: Path) -> Checkpoint:
             raise DataError(path / name, "sha256", "is not what the manifest says: the file was altered", _USE_ANOTHER)
     tensors = tensors_of(path / _TENSORS, files[_TENSORS])
     history = _json(path / _HISTORY, files[_HISTORY])
-    shapes.require(path / _HISTORY, history, _HISTORY_SHAPE, _USE_ANOTHER)
+    typed(path / _HISTORY, history, list[dict[str, float]], remedy=_USE_ANOTHER)
     return Checkpoint(
         t=int(manifest["t"]),
         tensors=tensors,
@@ -189,7 +202,7 @@ def _manifest(path: Path) -> dict[str, Any]:
     content = {key: value for key, value in manifest.items() if key != _SEAL}
     if _sealed(content).encode() != data:
         raise DataError(file, _SEAL, "is not that of the file: it was altered", _USE_ANOTHER)
-    shapes.require(file, content, _MANIFEST_SHAPE, _USE_ANOTHER)
+    typed(file, content, _Manifest, remedy=_USE_ANOTHER)
     return content
 
 

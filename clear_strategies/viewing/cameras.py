@@ -7,16 +7,16 @@ per LR pixel), "split" ("train", "test"), "background" (RGB) and "photo", a smal
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
 from clear_strategies import files
@@ -26,6 +26,9 @@ from clear_strategies.data import strict_json
 from clear_strategies.data.cameras import pose_from_opengl, rigid_inverse
 from clear_strategies.data.photo_files import jpeg
 from clear_strategies.data.scene import Scene
+from clear_strategies.data.strict_json import Number, typed
+from clear_strategies.data.transforms import Transform, transforms_of
+from clear_strategies.data.view_settings import resized
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
 
@@ -69,15 +72,12 @@ def write_cameras(folder: Path, scene: Scene) -> None:
 
 
 def read_cameras(path: Path) -> list[SavedCamera]:
-    """The cameras of a run of ours or of Inria's 3DGS.
-
-    Raises:
-        DataError: it is no such file.
-    """
-    content = _read_json(path)
-    if not isinstance(content, list) or not content or not all(isinstance(entry, dict) for entry in content):
-        raise DataError(path, "json", "is no list of cameras", "give the cameras.json of a run")
-    return [_saved_camera(path, i, entry) for i, entry in enumerate(content)]
+    """The cameras of a run of ours or of Inria's 3DGS."""
+    remedy = "give the cameras.json of a run"
+    entries = typed(path, strict_json.read(path), list[_Entry], remedy=remedy)
+    if not entries:
+        raise DataError(path, "json", "is an empty list", remedy)
+    return [_saved_camera(path, i, entry) for i, entry in enumerate(entries)]
 
 
 def read_path(path: Path, size: tuple[int, int]) -> tuple[list[Camera], float | None]:
@@ -88,11 +88,8 @@ def read_path(path: Path, size: tuple[int, int]) -> tuple[list[Camera], float | 
 
     Returns:
         The cameras, and frames per second where the file names them.
-
-    Raises:
-        DataError: it is no such file.
     """
-    content = _read_json(path)
+    content = strict_json.read(path)
     if isinstance(content, list):
         return [saved.camera for saved in read_cameras(path)], None
     if not isinstance(content, dict) or not ("camera_path" in content or "frames" in content):
@@ -101,23 +98,12 @@ def read_path(path: Path, size: tuple[int, int]) -> tuple[list[Camera], float | 
             'give a cameras.json, a transforms.json ("frames"), or a path of a viewer ("camera_path")',
         )  # fmt: skip
     if "frames" in content:
-        frames = strict_json.frames_of(path, content)
-        return [_of_transforms(path, i, {**content, **frame}, size) for i, frame in enumerate(frames)], None
-    entries = content["camera_path"]
-    if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
-        raise DataError(path, "camera_path", "is empty or no list of objects", "save the path again")
-    width = round(strict_json.number(path, "render_width", content.get("render_width", size[0])))
-    height = round(strict_json.number(path, "render_height", content.get("render_height", size[1])))
-    fps = None if content.get("fps") is None else strict_json.number(path, "fps", content["fps"])
-    return [_of_viewer(path, i, entry, (width, height)) for i, entry in enumerate(entries)], fps
-
-
-def resized(camera: Camera, width: int, height: int) -> Camera:
-    """The camera with another number of pixels, as near to the same picture as these allow."""
-    x, y = width / camera.width, height / camera.height
-    return replace(
-        camera, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y, width=width, height=height
+        return [_of_transforms(path, i, frame, size) for i, frame in enumerate(transforms_of(path, content))], None
+    saved = typed(path, content, _ViewerPath, remedy="save the path again")
+    width, height = (
+        round(own or given) for own, given in zip((saved.render_width, saved.render_height), size, strict=True)
     )
+    return [_of_viewer(path, i, key, (width, height)) for i, key in enumerate(saved.camera_path)], saved.fps
 
 
 def at_most(camera: Camera, longest: int | None) -> Camera:
@@ -151,60 +137,71 @@ def _small(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
     return images.area_mean(image.cpu(), factor) if factor > 1 else image.cpu()
 
 
-def _saved_camera(path: Path, i: int, entry: Mapping[str, Any]) -> SavedCamera:
-    where = f"[{i}]"
-    numbers = {
-        key: strict_json.number(path, f"{where}.{key}", entry.get(key)) for key in ("width", "height", "fx", "fy")
-    }
+class _Entry(msgspec.Struct):
+    width: Number
+    height: Number
+    fx: Number
+    fy: Number
+    rotation: list[Any]
+    position: tuple[Number, Number, Number]
+    cx: Number | None = None
+    cy: Number | None = None
+    img_name: str | None = None
+    split: str = "train"
+    scale: Number = 1
+    photo: str | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class _Key(msgspec.Struct):
+    """Of a viewer's path."""
+
+    camera_to_world: list[Any]  # 4 x 4; nerfstudio writes 16 numbers, row by row
+    fov: Annotated[float, Meta(gt=0, lt=180)]  # vertical, degrees
+
+
+class _ViewerPath(msgspec.Struct):
+    camera_path: Annotated[list[_Key], Meta(min_length=1)]
+    render_width: Number | None = None
+    render_height: Number | None = None
+    fps: Number | None = None
+
+
+def _saved_camera(path: Path, i: int, entry: _Entry) -> SavedCamera:
     try:
-        rotation = np.array(entry["rotation"], float).reshape(3, 3)
-        center = np.array(entry["position"], float).reshape(3)
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(path, f"{where}.rotation, position", f"is no pose ({error})", "write the file again") from error
-    width, height = round(numbers["width"]), round(numbers["height"])
-    pose = rigid_inverse(path, f"{where}.rotation", rotation, center)
-    cx = strict_json.number(path, f"{where}.cx", entry.get("cx", width / 2))
-    cy = strict_json.number(path, f"{where}.cy", entry.get("cy", height / 2))
-    photo, background = entry.get("photo"), entry.get("background", [0.0, 0.0, 0.0])
-    if not (isinstance(background, list) and len(background) == 3):
-        raise DataError(path, f"{where}.background", "is no list of three numbers", "write the file again")
-    r, g, b = (strict_json.number(path, f"{where}.background", c) for c in background)
+        rotation = np.array(entry.rotation, float).reshape(3, 3)
+    except (TypeError, ValueError) as error:
+        raise DataError(path, f"[{i}].rotation", f"is none ({error})", "write the file again") from error
+    width, height = round(entry.width), round(entry.height)
+    pose = rigid_inverse(path, f"[{i}].rotation", rotation, np.array(entry.position))
+    cx = width / 2 if entry.cx is None else entry.cx
+    cy = height / 2 if entry.cy is None else entry.cy
+    photo = None if entry.photo is None else path.parent / entry.photo
     return SavedCamera(
-        name=str(entry.get("img_name", i)),
-        camera=_camera(path, where, pose, numbers["fx"], numbers["fy"], cx, cy, width, height),
-        split="test" if entry.get("split") == "test" else "train",
-        scale=max(1, round(strict_json.number(path, f"{where}.scale", entry.get("scale", 1)))),
-        photo=path.parent / photo if isinstance(photo, str) and (path.parent / photo).is_file() else None,
-        background=(r, g, b),
+        name=str(i) if entry.img_name is None else entry.img_name,
+        camera=_camera(path, f"[{i}]", pose, entry.fx, entry.fy, cx, cy, width, height),
+        split="test" if entry.split == "test" else "train",
+        scale=max(1, round(entry.scale)),
+        photo=photo if photo is not None and photo.is_file() else None,
+        background=entry.background,
     )
 
 
-def _of_transforms(path: Path, i: int, values: Mapping[str, Any], size: tuple[int, int]) -> Camera:
+def _of_transforms(path: Path, i: int, frame: Transform, size: tuple[int, int]) -> Camera:
     """A frame of transforms.json; without distortion, because it is drawn and not read."""
     where = f"frames[{i}]"
-
-    def number(key: str, default: float | None = None) -> float:
-        return strict_json.number(path, f"{where}.{key}", values.get(key, default))
-
-    pose = pose_from_opengl(path, f"{where}.transform_matrix", values.get("transform_matrix"))
-    width, height = number("w", size[0]), number("h", size[1])
-    angle = values.get("camera_angle_x")
-    of_angle = None if angle is None else width / 2 / math.tan(number("camera_angle_x") / 2)
-    fx = number("fl_x", of_angle)
-    fy, cx, cy = number("fl_y", fx), number("cx", width / 2), number("cy", height / 2)
-    return _camera(path, where, pose, fx, fy, cx, cy, round(width), round(height))
+    pose = pose_from_opengl(path, f"{where}.transform_matrix", frame.transform_matrix)
+    width, height = size[0] if frame.w is None else frame.w, size[1] if frame.h is None else frame.h
+    return _camera(path, where, pose, *frame.pinhole(path, where, width, height), round(width), round(height))
 
 
-def _of_viewer(path: Path, i: int, entry: Mapping[str, Any], size: tuple[int, int]) -> Camera:
-    where, matrix = f"camera_path[{i}]", entry.get("camera_to_world")
-    if isinstance(matrix, list) and len(matrix) == 16:  # nerfstudio writes 16 numbers, row by row
+def _of_viewer(path: Path, i: int, key: _Key, size: tuple[int, int]) -> Camera:
+    where, matrix = f"camera_path[{i}]", key.camera_to_world
+    if len(matrix) == 16:
         matrix = [matrix[row : row + 4] for row in range(0, 16, 4)]
     pose = pose_from_opengl(path, f"{where}.camera_to_world", matrix)
-    degrees = strict_json.number(path, f"{where}.fov", entry.get("fov"))
-    if not 0 < degrees < 180:
-        raise DataError(path, f"{where}.fov", f"is {degrees:g}, must lie in (0, 180) degrees", "correct the field")
     width, height = size
-    focal = height / 2 / math.tan(math.radians(degrees) / 2)
+    focal = height / 2 / math.tan(math.radians(key.fov) / 2)
     return _camera(path, where, pose, focal, focal, width / 2, height / 2, width, height)
 
 
@@ -216,17 +213,3 @@ def _camera(
         return Camera(pose.to(torch.float64), fx, fy, cx, cy, width, height)
     except ValueError as error:
         raise DataError(path, where, str(error), "correct the camera") from error
-
-
-def _read_json(path: Path) -> Any:
-    """A list or an object; the strict reader knows objects only."""
-    try:
-        with path.open() as file:
-            first = file.read(64).lstrip()[:1]
-        return json.loads(path.read_text()) if first == "[" else strict_json.read_object(path)
-    except OSError as error:
-        raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(path, "json", f"is not valid ({error})", "write it again") from error

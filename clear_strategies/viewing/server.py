@@ -12,7 +12,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,7 +29,7 @@ from torch import Tensor
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.viewing import video
 from clear_strategies.viewing.aim import add_camera, aim, drawn_length, wxyz
-from clear_strategies.viewing.cameras import SavedCamera
+from clear_strategies.viewing.cameras import SavedCamera, at_most
 from clear_strategies.viewing.film import DepthScale
 from clear_strategies.viewing.look import AS_MEASURED, Look, Painter
 from clear_strategies.viewing.video import Frame
@@ -111,7 +111,7 @@ class Screen:
     def depth_scale(self) -> DepthScale:
         """Chosen once, from the cameras of the run."""
         if self._scale is None:
-            where = [_shrunk(saved.camera) for saved in self.cameras]
+            where = [at_most(saved.camera, _SMALL) for saved in self.cameras]
             self._scale = DepthScale.of(self.painter, where) if where else DepthScale(0.0, 10.0)
         return self._scale
 
@@ -273,12 +273,3 @@ def _go_to(client: Any, camera: Camera) -> None:
         client.camera.wxyz = wxyz(camera)
         client.camera.position = tuple(camera.center.tolist())
         client.camera.fov = 2 * math.atan(camera.height / 2 / camera.fy)
-
-
-def _shrunk(camera: Camera) -> Camera:
-    times = _SMALL / max(camera.width, camera.height)
-    width, height = max(1, round(camera.width * times)), max(1, round(camera.height * times))
-    x, y = width / camera.width, height / camera.height
-    return replace(
-        camera, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y, width=width, height=height
-    )

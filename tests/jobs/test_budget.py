@@ -94,4 +94,4 @@ def test_a_run_of_some_seconds_says_what_was_chosen_and_keeps_the_number(tmp_pat
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "0.001 minutes: " in ended.stdout
     saved = metrics.read(tmp_path / "run" / "metrics.json", "")
-    assert (saved["iterations"], saved["config"]["fit.iterations"], saved["config"]["fit.minutes"]) == (40, 40, None)
+    assert (saved.iterations, saved.config["fit.iterations"], saved.config["fit.minutes"]) == (40, 40, None)

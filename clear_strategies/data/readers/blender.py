@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from clear_strategies.core.checks import as_color
-from clear_strategies.data import strict_json
 from clear_strategies.data.cameras import Lens, pose_from_opengl
 from clear_strategies.data.capture import Capture, Color, Frame, sorted_by_name
 from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
+from clear_strategies.data.strict_json import read_object
+from clear_strategies.data.transforms import focal_of, require_paths, transforms_of
 from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 
@@ -39,10 +39,6 @@ def read(
         allow_outside: follow file names and links that lead out of the folder.
         missing: frames whose photo is not there: "refuse" or "skip".
         broken: photos that cannot be decoded: "refuse" or "skip".
-
-    Raises:
-        SettingError: the background is no colour.
-        DataError: something is missing or not what it should be.
     """
     root, background = Path(root), as_color("data.reader.background", background)
     if not root.is_dir():
@@ -69,19 +65,16 @@ def _frames(
     allow_outside: bool,
     faults: Callable[[Path, list[tuple[Path, int]]], list[tuple[Path, int]]],
 ) -> list[Frame]:
-    content = strict_json.read_object(file)
-    angle = strict_json.number(file, "camera_angle_x", content.get("camera_angle_x"))
-    if not 0 < angle < math.pi:
-        raise DataError(file, "camera_angle_x", f"is {angle:g}; it must lie in (0, pi) radians", "correct the field")
-    frames, entries, photos = [], strict_json.frames_of(file, content), []
-    for i, entry in enumerate(entries):
-        name = strict_json.file_path(file, i, entry)
-        name = name if name.lower().endswith(SUFFIXES) else f"{name}.png"
-        photos.append((inside(root, name, file=file, allow_outside=allow_outside), i))
+    transforms, photos = transforms_of(file, read_object(file)), []
+    require_paths(file, transforms)
+    for i, transform in enumerate(transforms):
+        ending = "" if transform.file_path.lower().endswith(SUFFIXES) else ".png"
+        photos.append((inside(root, transform.file_path + ending, file=file, allow_outside=allow_outside), i))
+    frames = []
     for path, i in faults(file, photos):
-        pose = pose_from_opengl(file, f"frames[{i}].transform_matrix", entries[i].get("transform_matrix"))
+        pose = pose_from_opengl(file, f"frames[{i}].transform_matrix", transforms[i].transform_matrix)
         width, height = image_size(path)
-        focal = width / (2 * math.tan(angle / 2))
+        focal = focal_of(file, "camera_angle_x", transforms[i].camera_angle_x, width)
         lens = Lens(width, height, focal, focal, width / 2, height / 2).check(file, "camera_angle_x")
         label = path.stem if split == "train" else f"{split}/{path.stem}"
         frames.append(Frame.of_photo(label, path, lens, pose, background=background, split=split))

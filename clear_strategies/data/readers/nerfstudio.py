@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
@@ -12,11 +11,12 @@ from typing import Any, Final
 import torch
 
 from clear_strategies.core.checks import as_color
-from clear_strategies.data import strict_json
 from clear_strategies.data.cameras import Lens, pose_from_opengl
 from clear_strategies.data.capture import Capture, Color, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
 from clear_strategies.data.ply import read_points
+from clear_strategies.data.strict_json import read_object
+from clear_strategies.data.transforms import Transform, require_paths, transforms_of
 from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 
@@ -31,10 +31,6 @@ _MODELS: Final = {
     "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
-_INTRINSICS: Final = (
-    "fl_x", "fl_y", "cx", "cy", "w", "h", "k1", "k2", "k3", "k4", "p1", "p2", "camera_angle_x", "camera_angle_y",
-    "camera_model", "is_fisheye",
-)  # fmt: skip
 _SPLITS: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
 
 
@@ -53,35 +49,28 @@ def read(
         allow_outside: follow file names and links that lead out of the folder.
         missing: frames whose photo is not there: "refuse" or "skip".
         broken: photos that cannot be decoded: "refuse" or "skip".
-
-    Raises:
-        SettingError: the background is no colour.
-        DataError: something is missing or not what it should be.
     """
     if background is not None:
         background = as_color("data.reader.background", background)
     given = Path(root)
     file = given if given.suffix == ".json" else given / "transforms.json"
     folder = file.parent
-    content = strict_json.read_object(file)
-    entries = strict_json.frames_of(file, content)
-    splits = _splits(file, content)
-    names = [strict_json.file_path(file, i, entry) for i, entry in enumerate(entries)]
+    content = read_object(file)
+    transforms = transforms_of(file, content)
+    require_paths(file, transforms)
+    splits, names = _splits(file, content), [transform.file_path for transform in transforms]
     short = _short_names(names)
-    shared: dict[str, Any] = {key: content[key] for key in _INTRINSICS if key in content}
     lenses, frames = [], []
     paths = [_photo(folder, name, file, allow_outside) for name in names]
-    kept = usable(file, range(len(entries)), lambda i: paths[i], missing=missing, broken=broken)
+    kept = usable(file, range(len(transforms)), lambda i: paths[i], missing=missing, broken=broken)
     for i in kept:
-        where, name, entry, path = f"frames[{i}]", names[i], entries[i], paths[i]
-        pose = pose_from_opengl(file, f"{where}.transform_matrix", entry.get("transform_matrix"))
-        lens = _lens(file, where, {**shared, **entry}, path)
+        where, transform, path = f"frames[{i}]", transforms[i], paths[i]
+        pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
+        lens = _lens(file, where, transform, path)
         lenses.append(lens)
-        mask_path = entry.get("mask_path")
-        hides = None if mask_path is None else inside(folder, str(mask_path), file=file, allow_outside=allow_outside)
-        frames.append(
-            Frame.of_photo(short[i], path, lens, pose, background=background, split=splits.get(name), mask=hides)
-        )
+        mask = transform.mask_path and inside(folder, transform.mask_path, file=file, allow_outside=allow_outside)
+        split = splits.get(names[i])
+        frames.append(Frame.of_photo(short[i], path, lens, pose, background=background, split=split, mask=mask or None))
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(lenses, frames)}
     if splits:
         notes["split"] = _split_note(file, names, [names[i] for i in kept], splits)
@@ -105,42 +94,24 @@ def _photo(folder: Path, name: str, file: Path, allow_outside: bool) -> Path:
     return inside(folder, f"{name}.png", file=file, allow_outside=allow_outside)
 
 
-def _lens(file: Path, where: str, values: Mapping[str, Any], image: Path) -> Lens:
-    def number(key: str, default: float | None = None) -> float:
-        return strict_json.number(file, f"{where}.{key}", values.get(key, default))
-
-    def focal(key: str, angle_key: str, size: float, default: float | None) -> float:
-        if key in values:
-            return number(key)
-        if angle_key not in values and default is not None:
-            return default
-        if angle_key not in values:
-            raise DataError(file, f"{where}.{key}", "is missing, for the frame and for all", f"give it or {angle_key}")
-        angle = number(angle_key)
-        if not 0 < angle < math.pi:
-            raise DataError(
-                file, f"{where}.{angle_key}", f"is {angle:g}; it must lie in (0, pi) radians", "correct the field"
-            )
-        return size / (2 * math.tan(angle / 2))
-
+def _lens(file: Path, where: str, frame: Transform, image: Path) -> Lens:
     # Of a turned photo only given sizes tell whether they are those of the stored pixels.
-    real_width, real_height = (0, 0) if "w" in values and "h" in values else image_size(image)
-    width, height = number("w", float(real_width)), number("h", float(real_height))
-    fx = focal("fl_x", "camera_angle_x", width, None)
-    fy = focal("fl_y", "camera_angle_y", height, fx)
-    cx, cy = number("cx", width / 2), number("cy", height / 2)
-    model = "OPENCV_FISHEYE" if values.get("is_fisheye") is True else values.get("camera_model", "OPENCV")
-    if not isinstance(model, str) or model not in _MODELS:
-        found = repr(model)[:40] if isinstance(model, str) else f"a {type(model).__name__}"
-        raise DataError(file, f"{where}.camera_model", f"is {found}", f"use one of {', '.join(_MODELS)}")
+    real = (0, 0) if frame.w is not None and frame.h is not None else image_size(image)
+    width, height = (
+        float(size) if given is None else given for given, size in zip((frame.w, frame.h), real, strict=True)
+    )
+    fx, fy, cx, cy = frame.pinhole(file, where, width, height)
+    model = "OPENCV_FISHEYE" if frame.is_fisheye else frame.camera_model
+    if model not in _MODELS:
+        raise DataError(file, f"{where}.camera_model", f"is {model[:40]!r}", f"use one of {', '.join(_MODELS)}")
     keys = _MODELS[model]
-    unused = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if key not in keys and number(key, 0.0) != 0]
+    unused = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if key not in keys and getattr(frame, key) != 0]
     if unused:
         raise DataError(
             file, f"{where}.{unused[0]}", f"is not 0, but {model} has no such term that OpenCV could undistort",
             "set camera_model to what the coefficients belong to, or undistort the images first",
         )  # fmt: skip
-    bend = tuple(number(key, 0.0) for key in keys)
+    bend = tuple(getattr(frame, key) for key in keys)
     distortion = (*bend, *[0.0] * (4 - len(bend))) if bend else ()
     fisheye = model == "OPENCV_FISHEYE"
     return Lens(round(width), round(height), fx, fy, cx, cy, distortion, fisheye).check(file, where)
