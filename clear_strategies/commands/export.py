@@ -17,11 +17,7 @@ _log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Write what the arguments ask for.
-
-    Raises:
-        DataError, SettingError: the run or an argument cannot be used, or a format needs what is not installed.
-    """
+    """Write what the arguments ask for."""
     parser = parser_of(
         "export", "Write a saved run, or a PLY file, in a format of viewers; f_det and the 3D filter included."
     )
@@ -44,8 +40,7 @@ def main(arguments: Sequence[str]) -> None:
 
 def _export(options: argparse.Namespace) -> None:
     from clear_strategies.jobs.saved import open_splat
-    from clear_strategies.outputs.export import gaussians_of
-    from clear_strategies.outputs.formats import Start, write_format
+    from clear_strategies.outputs.formats import Start, gaussians_of, write_format
     from clear_strategies.viewing import paths
 
     splat = open_splat(options.run, options.rasterizer)

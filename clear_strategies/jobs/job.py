@@ -30,7 +30,6 @@ from clear_strategies.outputs.baseline import FOLDER as BASELINE
 from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
-from clear_strategies.outputs.remarks import remarks
 from clear_strategies.schedules import scaled
 from clear_strategies.training import memory
 from clear_strategies.training.loop import fit
@@ -230,7 +229,7 @@ def _run(
     beside = None if baseline is None else _trained_first(baseline, first, place)
     first = None  # its memory is for what trains now
     evaluation, seconds = _train(ours, state, place, beside)
-    for remark in remarks(state):
+    for remark in plan.remarks(state):
         _log.log(level, "%s", remark)
     _log.log(level, "%s", score_table.describe(ours.folder, evaluation, seconds, beside))
     if _in_sweep():

@@ -28,12 +28,7 @@ TRAINED_ON: Final = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetRow:
-    """One view.
-
-    Args:
-        images: column -> image at HR size; "ours" is among them.
-        captions: column -> the line below its image.
-    """
+    """One view: its images at HR size by their column, "ours" among them, and the line below each."""
 
     name: str
     images: Mapping[str, Float[Tensor, "H W 3"]]
@@ -42,11 +37,9 @@ class SheetRow:
 
 
 def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: str = OWN_PHOTO) -> None:
-    """Draw one row per view: its images and, where the truth is known, the truth and the error of ours. Without rows no
-    file is written.
+    """Draw one row per view: its images and, where the truth is known, the truth and the error of ours. `note` stands below.
 
-    Args:
-        note: the line below.
+    Without rows no file is written.
     """
     if not rows:
         return

@@ -26,12 +26,7 @@ _GROUP_COLOURS: Final = {
 
 
 def write_curves(path: Path, history: History, marks: Mapping[str, int], title: str) -> None:
-    """Draw what happened over iterations.
-
-    Args:
-        history: with the column `t`; a column that is missing or NaN is not drawn.
-        marks: name -> iteration, drawn as numbered lines and named below; those after the last row are left out.
-    """
+    """Draw what happened over iterations. A column that is missing or NaN is not drawn; marks, by name, are numbered lines."""
     figure, axes = figures.new_figure(2, 3, 15, 8)
     losses, quality, structure, conflict, correction, detail = axes.flatten()
 

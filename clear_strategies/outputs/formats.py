@@ -1,6 +1,7 @@
 """A splat in the formats of viewers: all by Python, but the page, which PlayCanvas's splat-transform writes.
 
-splat-transform is a program of npm (MIT). One that is on the PATH is taken; else `npx` downloads it once.
+.ply, .glb and .splat are written by this package, the others by PlayCanvas's splat-transform, a program of npm (MIT). One that
+is on the PATH is taken; else `npx` downloads it once.
 """
 
 from __future__ import annotations
@@ -66,9 +67,6 @@ def write_format(path: Path, g: GaussianPly, form: str, start: Start) -> None:
 
     Args:
         start: of the page; the other formats hold no camera.
-
-    Raises:
-        SettingError: there is no such format, or what it needs is not installed or failed.
     """
     if form not in FORMATS:
         raise SettingError(f"--to must be one of {', '.join(FORMATS)}, got {form}.")
@@ -82,6 +80,31 @@ def write_format(path: Path, g: GaussianPly, form: str, start: Start) -> None:
         files.write_bytes(path, packed_bytes(g, form))
     else:
         _write_page(path, g, start)
+
+
+def export_ply(path: Path, field: GaussianField) -> None:
+    """Write the standard 3DGS layout; f_det is folded into the colour, the 3D filter into scales and opacities.
+
+    A viewer that honours the header's `SplatRenderMode: mip` draws the file with opacity compensation, as in training.
+    """
+    write_gaussians(path, gaussians_of(field))
+
+
+def gaussians_of(field: GaussianField) -> GaussianPly:
+    """The Gaussians of `export_ply`."""
+    splats = field.baked()
+    tiny = torch.finfo(torch.float32).eps
+    offset = splats.rgb_offset if splats.rgb_offset is not None else torch.zeros_like(splats.means)
+    higher = torch.zeros_like(field.shN.data)
+    higher[:, : splats.shN.shape[1]] = splats.shN  # bands above the active degree were never rendered
+    return GaussianPly(
+        means=splats.means,
+        sh0=splats.sh0 + offset[:, None] / SH_C0,
+        shN=higher,
+        opacities=torch.logit(splats.opacities.clamp(tiny, 1 - tiny)),
+        scales=splats.scales.log(),
+        quats=torch.nn.functional.normalize(splats.quats, dim=-1),
+    )
 
 
 def splat_bytes(g: GaussianPly) -> bytes:
@@ -102,11 +125,7 @@ def splat_bytes(g: GaussianPly) -> bytes:
 
 
 def converter() -> list[str]:
-    """The command of splat-transform.
-
-    Raises:
-        SettingError: neither it nor npx is installed.
-    """
+    """The command of splat-transform."""
     if (found := shutil.which("splat-transform")) is not None:
         return [found]
     if (npx := shutil.which("npx")) is not None:

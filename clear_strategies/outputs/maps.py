@@ -8,7 +8,7 @@ Five maps per view, in [0, 1] at each HR pixel:
 - `conflict`: 1 where g_LR and g_HR of a Gaussian point apart, else 0.  Eq. 6
 
 `maps.png` shows them side by side with a legend. Where the cloud came from dense stereo, `depth.png` shows the depth of the
-view, see `depth_picture`.
+view, see `maps_picture`.
 
 The last two of the five render the Gaussians over black with that number as their grey. The maps come from copies of the run's
 strategies; the run does not change.
@@ -35,8 +35,7 @@ from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.outputs.depth_picture import write_depth
-from clear_strategies.outputs.maps_picture import write_maps_picture
+from clear_strategies.outputs.maps_picture import write_depth, write_maps_picture
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.strategies.p2g import P2G
@@ -76,11 +75,9 @@ def write_maps(
     *,
     down: DownKernel = "bicubic",
 ) -> None:
-    """Write maps.json and, for each view, a folder of 8-bit grey PNGs (value = 255 × number) with the LR photo and the prior
-    beside them.
+    """Write maps.json and, for each of the views, a folder of 8-bit grey PNGs (value = 255 × number).
 
-    Args:
-        views: at least one; those without depth get no depth.png. The other arguments are those of `view_maps`.
+    The LR photo and the prior lie beside them. The other arguments are those of `view_maps`.
     """
     means: dict[str, Mapping[str, float]] = {}
     for view in views:

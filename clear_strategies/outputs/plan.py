@@ -1,8 +1,10 @@
-"""The plan: what a run prints before it trains."""
+"""The plan: what a run prints before it trains, and what it remarks on its strategies at the end."""
 
 from __future__ import annotations
 
 import logging
+import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -25,12 +27,7 @@ _SHORT: Final[Sequence[str]] = (
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """What the command line chose, by name.
-
-    Args:
-        method: a published baseline (`+method=`), or None.
-        strategies: in the order of the configuration.
-    """
+    """What the command line chose, by name; `method` is a published baseline (`+method=`)."""
 
     method: str | None
     strategies: Sequence[str]
@@ -42,12 +39,7 @@ class Chosen:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A line for each fact.
-
-    Args:
-        short: for the console: what a user decides on, or wants to know before the result is there.
-        details: the other facts.
-    """
+    """A line for each fact; `short` has those that a user decides on, or wants to know before the result is there."""
 
     short: str
     details: str
@@ -135,3 +127,15 @@ def marks(state: TrainState) -> dict[str, int]:
     for s in state.conductor.strategies:
         at |= s.marks()
     return at
+
+
+def remarks(state: TrainState) -> list[str]:
+    """What each strategy says of the means of the run's history; see `Strategy.in_hindsight`."""
+    columns: defaultdict[str, list[float]] = defaultdict(list)
+    for row in state.history_as_floats():
+        for name, value in row.items():
+            if not math.isnan(value):
+                columns[name].append(value)
+    means = {name: sum(values) / len(values) for name, values in columns.items()}
+    said = (strategy.in_hindsight(means) for strategy in state.conductor.strategies)
+    return [remark for remark in said if remark is not None]

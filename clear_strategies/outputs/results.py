@@ -21,14 +21,13 @@ from clear_strategies.outputs import coverage, metrics
 from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.contact_sheet import OWN_PHOTO, TRAINED_ON, SheetRow, write_contact_sheet
 from clear_strategies.outputs.curves import write_curves
-from clear_strategies.outputs.export import export_ply
 from clear_strategies.outputs.figures import spaced
-from clear_strategies.outputs.loop_video import write_depths, write_loop
+from clear_strategies.outputs.fly_through import write_depths, write_loop, write_splat_page
+from clear_strategies.outputs.formats import export_ply
 from clear_strategies.outputs.maps import write_maps
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.plan import Chosen, marks
 from clear_strategies.outputs.provenance import provenance
-from clear_strategies.outputs.splat_page import write_splat_page
 from clear_strategies.training import memory
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.look import Painter
@@ -101,9 +100,7 @@ def write_results(
         down: D, by which the LR images were made.
         painter: of the state's field, for depth and video.
         pictures: None writes none but the renders, which is all that another run's contact sheet needs.
-        seconds: training time.
-        config: the run's configuration, kept in metrics.json.
-        baseline: the one that trained beside it, for the contact sheet and metrics.json.
+        baseline: the one that trained beside it.
     """
     field, work_log, history = state.field, state.conductor.work_log, state.history_as_floats()
     with work_log.stage("evaluate"):
@@ -111,14 +108,13 @@ def write_results(
     for name, image in evaluation.renders.items():
         write_png(folder / "renders" / f"{Path(name).stem}.png", image)
     export_ply(folder / "point_cloud.ply", field)
+    synthetic = " · SYNTHETIC prior" * scene.synthetic_prior
+    title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}{synthetic}"
     if pictures is not None:
         with work_log.stage("maps"):
             if mapped := spaced(state.views, pictures.map_views):
                 write_maps(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
         memory.release()  # the gradients that the maps are made of: several times the field
-        title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}"
-        if scene.synthetic_prior:
-            title += " · SYNTHETIC prior"
         _write_sheet(folder, scene, evaluation, title, baseline)
         _write_views(folder, scene, painter, pictures, work_log, title)
         write_curves(folder / "curves.png", history, marks(state), title)

@@ -31,11 +31,7 @@ _GROUPS: Final = {
 
 
 def require_tensorboard() -> None:
-    """Check that TensorBoard is installed.
-
-    Raises:
-        SettingError: it is not.
-    """
+    """Refuse to begin without TensorBoard."""
     if find_spec("tensorboard") is None:
         raise SettingError("fit.log: tensorboard is not installed: pip install 'clear-strategies[log]'.")
 

@@ -16,7 +16,14 @@ from clear_strategies.core.points import PointCloud
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, Photo, View
 from clear_strategies.data.scene import Scene
+from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.merging.conductor import Conductor
+from clear_strategies.merging.objective import Objective
 from clear_strategies.strategies.base import Strategy
+from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.optim import LearningRates
+from clear_strategies.training.settings import FitSettings
+from clear_strategies.training.state import TrainState
 from rasterizers import Camera, Splats
 
 FACTOR = 4

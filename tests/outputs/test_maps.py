@@ -10,21 +10,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies import GCO, P2G, SVS
 from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads, conflict_ratio
 from clear_strategies.core.view import DepthMap, View
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs.maps import MAPS, view_maps, write_maps
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.strategies.p2g import patch_evidence
 from clear_strategies.training.loop import iterate
-from clear_strategies.training.mip import MipFilter
-from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 
@@ -38,12 +34,7 @@ def trained(*strategies: Strategy, iterations: int = 3) -> TrainState:
     train = tuple(
         replace(v, hr=replace(v.hr, image=torch.where(left, 1 - v.hr.image, v.hr.image))) for v in scene.train
     )
-    settings = FitSettings(iterations=iterations, probe_every=0, max_degree=1, fused="off")
-    conductor = Conductor(*strategies, objective=OBJECTIVE)
-    state = TrainState.start(
-        replace(scene, train=train), conductor, settings=settings, density=DensitySettings(), rates=LearningRates(),
-        mip=MipFilter(),
-    )  # fmt: skip
+    state = toy.started(*strategies, objective=OBJECTIVE, of=replace(scene, train=train), iterations=iterations)
     for _ in range(iterations):
         iterate(state, toy.RASTERIZER)
     return state

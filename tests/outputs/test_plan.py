@@ -7,18 +7,13 @@ from typing import Any
 
 import pytest
 
-from clear_strategies import GCO, P2G, SVS, Conductor, Strategy
+from clear_strategies import GCO, P2G, SVS, Strategy
 from clear_strategies.core.gradients import Grads
-from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs import plan
 from clear_strategies.outputs.progress import progress_bar
-from clear_strategies.outputs.remarks import remarks
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate
-from clear_strategies.training.mip import MipFilter
-from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 
@@ -26,11 +21,7 @@ SCENE = toy.scene()
 
 
 def started(*strategies: Strategy, **objective: Any) -> TrainState:
-    return TrainState.start(
-        SCENE, Conductor(*strategies, objective=Objective(kernels="torch", **objective)),
-        settings=FitSettings(iterations=10, fused="off", probe_every=0), density=DensitySettings(),
-        rates=LearningRates(), mip=MipFilter(),
-    )  # fmt: skip
+    return toy.started(*strategies, objective=Objective(kernels="torch", **objective))
 
 
 def lines(state: TrainState, *names: str, method: str | None = None) -> dict[str, str]:
@@ -79,7 +70,7 @@ def test_any_strategy_states_what_it_skips_marks_and_warns_of(caplog: pytest.Log
 def test_a_run_ends_with_what_its_history_shows_of_a_strategy() -> None:
     state = started(Quiet())
     iterate(state, toy.RASTERIZER)
-    assert remarks(state) == ["40 Gaussians, and not one loud"]
+    assert plan.remarks(state) == ["40 Gaussians, and not one loud"]
 
 
 def test_the_console_gets_what_a_user_decides_on_and_run_log_the_rest() -> None:

@@ -11,11 +11,10 @@ from typing import Any
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, Conductor, files
+from clear_strategies import GCO, P2G, files
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
-from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs import results
 from clear_strategies.outputs.baseline import Baseline
@@ -25,9 +24,6 @@ from clear_strategies.outputs.plan import Chosen
 from clear_strategies.outputs.results import FILES, Pictures, write_results
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate
-from clear_strategies.training.mip import MipFilter
-from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.look import Painter
 from tests.helpers import toy
@@ -41,10 +37,7 @@ PICTURES = Pictures(map_views=1, video_frames=2, page_gaussians=1000)
 
 @pytest.fixture(scope="module")
 def state() -> TrainState:
-    state = TrainState.start(
-        SCENE, Conductor(GCO(), P2G(), objective=OBJECTIVE), settings=FitSettings(iterations=3, fused="off"),
-        density=DensitySettings(), rates=LearningRates(), mip=MipFilter(),
-    )  # fmt: skip
+    state = toy.started(GCO(), P2G(), objective=OBJECTIVE, iterations=3)
     for _ in range(3):
         iterate(state, toy.RASTERIZER)
     return state

@@ -1,4 +1,4 @@
-"""Points that exist already: a PLY file, or the structure-from-motion (SfM) points of the scene."""
+"""Points that exist already, of a PLY file or the scene's structure from motion (SfM), and random ones."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from pathlib import Path
 import torch
 
 from clear_strategies.core.points import PointCloud
+from clear_strategies.core.view import Photo
 from clear_strategies.data.capture import SfmPoints
 from clear_strategies.data.ply import read_points
 from clear_strategies.errors import DataError
+from clear_strategies.geometry.cameras import common_box
 
 
 def from_ply(path: Path) -> PointCloud:
-    """The points of a PLY file.
-
-    Raises:
-        DataError: it cannot be read, or has no points.
-    """
+    """The points of a PLY file."""
     cloud = read_points(path)
     if len(cloud) == 0:
         raise DataError(path, "element vertex", "has no points", "give another file, or use another init")
@@ -48,3 +46,20 @@ def from_tracks(sfm: SfmPoints, train_ids: Sequence[int], min_views: int) -> Poi
         raise DataError("scene", "points", problem, "lower min_views, or use init=triangulated")
     source = f"{len(kept):,} points observed by >= {min_views} training views, of {sfm.source}"
     return PointCloud(sfm.means.float(), sfm.colors.float(), source, uses_test_views="yes")[kept]
+
+
+def random_cloud(photos: Sequence[Photo], count: int, seed: int, box: float | None = None) -> PointCloud:
+    """Uniform points in a box, nearly grey.
+
+    Args:
+        box: half-edge of the box around the origin, world units; None: `common_box`.
+    """
+    if box is None:
+        (low, high), where = common_box(photos), "the cameras' common box"
+    else:
+        low, high, where = torch.full((3,), -box), torch.full((3,), box), f"[-{box:g}, {box:g}]³"
+    g = torch.Generator().manual_seed(seed)
+    means = low + (high - low) * torch.rand(count, 3, generator=g)
+    # Equal colours would give all points equal colour gradients.
+    colors = 0.5 + (torch.rand(count, 3, generator=g) - 0.5) * 0.1
+    return PointCloud(means, colors, f"random: {count:,} points in {where}")

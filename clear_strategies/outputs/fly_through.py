@@ -1,4 +1,4 @@
-"""path.mp4, path.gif and depth/: a run as it looks between and from its cameras."""
+"""path.mp4, path.gif, splat.html and depth/: a run as it looks between its cameras and from them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import torch
 
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.viewing import FPS, cameras, film, paths, video
+from clear_strategies.viewing import FPS, cameras, film, page, paths, video
 from clear_strategies.viewing.film import DepthScale
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera
@@ -47,3 +47,35 @@ def write_depths(folder: Path, views: Sequence[View], painter: Painter) -> None:
     for view, camera in zip(views, where, strict=True):
         picture = scale.picture(painter.depth(camera))
         write_png(folder / f"{Path(view.name).stem}.png", torch.from_numpy(picture) / 255)
+
+
+def write_splat_page(
+    folder: Path,
+    train: Sequence[Camera],
+    painter: Painter,
+    most: int,
+    title: str,
+    background: tuple[float, float, float],
+) -> None:
+    """Write splat.html, unless the field has more Gaussians than `most`, or the page cannot be made: a message then says why.
+
+    Args:
+        most: 0: write no page, without a message.
+    """
+    count = len(painter.field)
+    if most == 0:
+        return
+    if (lack := page.missing()) is not None:
+        _log.info("no %s is written: %s.", page.FILE, lack)
+        return
+    if count > most:
+        _log.info("no %s is written: there are %s Gaussians, fit.page is %s.", page.FILE, f"{count:,}", f"{most:,}")
+        return
+    began, path = time.perf_counter(), folder / page.FILE
+    try:
+        page.write_page(path, painter.field.baked(), train, title, background)
+    except OSError as error:  # the rest of the run is worth more than its page
+        _log.warning("%s could not be written: %s.", page.FILE, error)
+        return
+    size, seconds = path.stat().st_size / 1e6, time.perf_counter() - began
+    _log.debug("%s: %.1f MB in %.1f s (fit.page=0 writes none).", page.FILE, size, seconds)
