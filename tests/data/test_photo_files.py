@@ -83,16 +83,6 @@ def test_the_header_tells_the_size(ending: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize("orientation", [3, 6])
-def test_a_photo_rotated_by_exif_is_refused(ending: str, orientation: int, tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    path = save(tmp_path / f"a{ending}", np.zeros((12, 16, 3), np.uint8), exif=exif)
-    with pytest.raises(DataError, match=f"EXIF orientation: is {orientation}"):
-        photo_files.read_image(path)
-
-
-@pytest.mark.parametrize("ending", ENDINGS)
 def test_every_cut_of_a_file_is_refused(ending: str, tmp_path: Path) -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8)
     path = save(tmp_path / f"a{ending}", pixels)
@@ -101,20 +91,6 @@ def test_every_cut_of_a_file_is_refused(ending: str, tmp_path: Path) -> None:
         path.write_bytes(data[:size])
         with pytest.raises(DataError):
             photo_files.read_image(path)
-
-
-def test_the_limit_of_pixels_is_held_before_decoding(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.png", np.zeros((12, 16, 3), np.uint8))
-    assert photo_files.image_size(path, max_pixels=192) == (16, 12)
-    with pytest.raises(DataError, match="16x12 is more than 191 pixels"):
-        photo_files.image_size(path, max_pixels=191)
-
-
-def test_an_animation_is_refused(tmp_path: Path) -> None:
-    frames = [Image.new("RGB", (8, 8), color) for color in ("red", "blue")]
-    frames[0].save(tmp_path / "a.png", save_all=True, append_images=frames[1:])
-    with pytest.raises(DataError, match="pages"):
-        photo_files.read_image(tmp_path / "a.png")
 
 
 def test_writing_and_reading_is_the_identity_on_eight_bits(tmp_path: Path) -> None:
@@ -155,3 +131,8 @@ def test_names_that_lead_out_are_refused(name: str, tmp_path: Path) -> None:
 def test_names_inside_are_kept_and_outside_ones_can_be_allowed(tmp_path: Path) -> None:
     assert photo_files.inside(tmp_path, "a/../b.png", file=tmp_path) == tmp_path / "a/../b.png"
     assert photo_files.inside(tmp_path, "/x.png", file=tmp_path, allow_outside=True) == Path("/x.png")
+
+
+def test_a_drawing_that_compresses_well_is_no_bomb(tmp_path: Path) -> None:
+    Image.new("L", (3_000, 2_000)).save(tmp_path / "drawing.png")
+    assert photo_files.image_size(tmp_path / "drawing.png") == (3_000, 2_000)

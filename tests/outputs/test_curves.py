@@ -46,9 +46,3 @@ def test_a_measured_column_is_drawn_and_an_unknown_one_is_not(tmp_path: Path) ->
     plain, measured, unknown = (read(tmp_path / f"{name}.png") for name in ("plain", "measured", "unknown"))
     assert not np.array_equal(plain, measured)
     assert np.array_equal(plain, unknown)
-
-
-def test_the_same_input_gives_the_same_file(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        write_curves(tmp_path / f"{name}.png", history(loss_lr=0.1), {"anchor": 50}, "scene")
-    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()

@@ -10,7 +10,6 @@ import torch
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.priors import Images
-from clear_strategies.errors import DataError
 from tests.helpers.networks import photo
 
 
@@ -29,32 +28,6 @@ def test_views_of_two_folders_have_their_images_in_two_folders(tmp_path: Path) -
     found = Images(str(tmp_path))
     for name in seeds:
         assert torch.equal(found(name, lr, 4), read_image(tmp_path / name)), name
-
-
-def test_one_image_for_two_views_is_refused(tmp_path: Path) -> None:
-    write_png(tmp_path / "0001.png", photo(24, 32))
-    found = Images(str(tmp_path))
-    found("cam1/0001.png", photo(6, 8), 4)
-    found("cam1/0001.png", photo(6, 8), 4)
-    with pytest.raises(DataError, match=r"would be that of two views, cam1/0001 and cam2/0001"):
-        found("cam2/0001.png", photo(6, 8), 4)
-
-
-def test_images_of_another_size_are_refused_naming_both(tmp_path: Path) -> None:
-    write_png(tmp_path / "a.png", photo(12, 16))
-    with pytest.raises(DataError, match=r"a\.png: size: is 16x12, but 4 times the LR image is 32x24"):
-        Images(str(tmp_path))("a.jpg", photo(6, 8), 4)
-
-
-def test_images_that_are_missing_or_ambiguous_are_refused(tmp_path: Path) -> None:
-    write_png(tmp_path / "a.png", photo(24, 32))
-    with pytest.raises(DataError, match=r"b: has no SR image b_x4"):
-        Images(str(tmp_path), suffix="_x4")("b.png", photo(6, 8), 4)
-    (tmp_path / "a.jpg").write_bytes(b"a twin")
-    with pytest.raises(DataError, match=r"a: has a\.jpg and a\.png for one view: keep one of them"):
-        Images(str(tmp_path))("a.png", photo(6, 8), 4)
-    with pytest.raises(DataError, match=r"folder: is not there"):
-        Images(str(tmp_path / "absent"))("a.png", photo(6, 8), 4)
 
 
 def test_images_of_another_view_give_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

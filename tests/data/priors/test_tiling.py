@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from clear_strategies.data.priors import Onnx
 from clear_strategies.data.priors.tiling import tiled
 from tests.helpers.networks import photo
 
@@ -46,11 +44,3 @@ def test_tiles_that_differ_are_faded_into_each_other() -> None:
     assert torch.all(row[:128] == 0)
     assert torch.all(row[192:] == 1)
     assert torch.allclose(row[128:192], (torch.arange(64) + 0.5) / 64)
-
-
-@pytest.mark.parametrize(("tile", "overlap"), [(64, 16), (0, 0), (10, -1)])
-def test_tiles_that_are_all_overlap_are_refused(tile: int, overlap: int) -> None:
-    with pytest.raises(ValueError, match=r"0 <= 4 overlap < tile must hold"):
-        Onnx("x.onnx", tile=tile, overlap=overlap)
-    with pytest.raises(ValueError, match=r"0 <= 4 overlap < tile must hold"):
-        tiled(lambda lr: lr, photo(4, 4), 1, tile, overlap)

@@ -14,7 +14,6 @@ from PIL import Image
 from clear_strategies.data import photo_files
 from clear_strategies.data.cameras import Lens
 from clear_strategies.data.readers import colmap
-from clear_strategies.errors import DataError
 from tests.helpers import captures as tiny
 
 LAYOUTS = {"bin": tiny.colmap_bin, "txt": tiny.colmap_txt}
@@ -169,12 +168,6 @@ def test_distorted_models_become_pinholes_and_are_noted(
     assert capture.frames[0].load().shape == raw.shape
     assert not torch.equal(capture.frames[0].load(), raw)
     assert capture.frames[0].camera.fx != 20
-
-
-def test_a_lens_that_opencv_lacks_is_refused_with_what_to_do(tmp_path: Path) -> None:
-    tiny.colmap_bin(tmp_path, "FOV", (20.0, 20.0, 8.0, 6.0, 0.9))
-    with pytest.raises(DataError, match="image_undistorter"):
-        colmap.read(tmp_path)
 
 
 @pytest.mark.parametrize("scene", ["kitchen360", "real_room", "strecha_fountain"])

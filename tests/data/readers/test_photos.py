@@ -77,11 +77,6 @@ def test_photos_that_show_nothing_are_refused_with_what_to_do(tmp_path: Path) ->
     assert list((tmp_path / "cache").iterdir()) == []
 
 
-def test_two_photos_are_too_few(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="there are 2, poses need at least 3"):
-        photos.read(flat_photos(tmp_path / "photos", 2), tmp_path / "cache")
-
-
 def test_the_cache_may_not_lie_among_the_photos(tmp_path: Path) -> None:
     folder = flat_photos(tmp_path / "photos", 3)
     with pytest.raises(DataError, match="lies among the photos"):
