@@ -1,7 +1,6 @@
 """A splat in the formats of viewers: all by Python, but the page, which PlayCanvas's splat-transform writes.
 
-.ply, .glb and .splat are written by this package, the others by PlayCanvas's splat-transform, a program of npm (MIT). One that
-is on the PATH is taken; else `npx` downloads it once.
+splat-transform is a program of npm (MIT). One that is on the PATH is taken; else `npx` downloads it once.
 """
 
 from __future__ import annotations
@@ -27,6 +26,7 @@ from clear_strategies.errors import SettingError
 from clear_strategies.outputs.format_names import FORMATS
 from clear_strategies.outputs.gltf import glb_bytes
 from clear_strategies.outputs.packed import PACKED, packed_bytes
+from clear_strategies.training.field import GaussianField
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 

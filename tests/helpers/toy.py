@@ -122,3 +122,14 @@ class Recorder(Strategy):
 
     def on_resize(self, parents: Tensor) -> None:
         self.changes.append(parents)
+
+
+def started(
+    *strategies: Strategy, objective: Objective | None = None, of: Scene | None = None, **settings: object
+) -> TrainState:
+    """A run on the toy scene, or on another, before its first iteration; the readable path unless `settings` say otherwise."""
+    return TrainState.start(
+        of or scene(), Conductor(*strategies, objective=objective or Objective(kernels="torch")),
+        settings=FitSettings(**{"iterations": 10, "probe_every": 0, "max_degree": 1, "fused": "off", **settings}),
+        density=DensitySettings(), rates=LearningRates(), mip=MipFilter(),
+    )  # fmt: skip

@@ -16,8 +16,7 @@ from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import SfmPoints
 from clear_strategies.data.points.compared import blackened, compared_at
-from clear_strategies.data.points.files import from_ply, from_sfm, from_tracks
-from clear_strategies.data.points.random import random_cloud
+from clear_strategies.data.points.sources import from_ply, from_sfm, from_tracks, random_cloud
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, voxel_grid, without_outliers
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
