@@ -116,8 +116,9 @@ def _ours(loss: str, device: str) -> list[Competitor]:
 def _gradient_of(implementation: Any, loss: str) -> Gradient:
     if loss == PHOTOMETRIC:
         return lambda x, y: implementation.photometric(x, y, _LAMBDA).gradient
-    function = implementation.ssim if loss == SSIM else implementation.haar_l1
-    return lambda x, y: function(x, y).gradient
+    if loss == SSIM:  # photometric at λ = 1 is 1 - SSIM
+        return lambda x, y: -implementation.photometric(x, y, 1.0).gradient
+    return lambda x, y: implementation.haar_l1(x, y).gradient
 
 
 def _peers(device: str, note: Callable[[str], None]) -> Iterator[Competitor]:

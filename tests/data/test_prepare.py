@@ -11,7 +11,6 @@ import torch
 
 from clear_strategies.core import images
 from clear_strategies.core.view import DepthMap
-from clear_strategies.data import points
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.points import CloudSettings
@@ -264,26 +263,28 @@ def test_how_far_a_back_projected_sr_image_was_from_its_photo_is_kept():
 
 
 @pytest.mark.parametrize(
-    ("photos_are", "max_pixels", "compared"),
+    ("photos_are", "max_pixels", "windows", "compared"),
     [
-        ("both", 250_000, (64, 48)),
-        ("both", 1_000, (32, 24)),
-        ("both", 400, (21, 16)),
-        ("both", 200, (16, 12)),
-        ("hr", 250_000, (16, 12)),
+        ("both", 250_000, [7], (64, 48)),
+        ("both", 1_000, [7], (32, 24)),
+        ("both", 400, [7], (21, 16)),
+        ("both", 200, [5], (16, 12)),
+        ("hr", 250_000, [7, 5], (16, 12)),  # SR images, then the LR photos whose depth they complete
     ],
 )
-def test_stereo_compares_the_hr_side_where_it_is_photos_and_no_sr_images(photos_are, max_pixels, compared, monkeypatch):
-    capture, windows = demo.read(width=64, height=48, views=5, train=2), []
+def test_depth_is_that_of_the_hr_side_where_it_is_photos_and_else_of_lr(
+    photos_are, max_pixels, windows, compared, monkeypatch
+):
+    capture, asked = demo.read(width=64, height=48, views=5, train=2), []
 
     def depth_maps(photos, _, stereo, *__):
-        windows.append(stereo.window)
+        asked.append(stereo.window)
         return [DepthMap(torch.full(p.image.shape[:2], 4.0), torch.ones(p.image.shape[:2])) for p in photos]
 
-    monkeypatch.setattr(points, "depth_maps", depth_maps)
+    monkeypatch.setattr("clear_strategies.data.points.compared.depth_maps", depth_maps)
     cloud = CloudSettings(init="stereo", stereo=StereoSettings(max_pixels=max_pixels))
     scene = prepare(capture, ViewSettings(photos_are=photos_are, train=2), Bicubic(), cloud)
-    assert windows == [7 if compared[0] > 16 else 5]
+    assert asked == windows
     for view in scene.train:
         assert tuple(view.depth.depth.shape) == compared[::-1]
         shown = view.depth_photo
