@@ -63,6 +63,9 @@ def measure(results: Results, request: Request, plan: Callable[[Request], Sequen
 
     Args:
         plan: the steps of a request; `steps` unless given.
+
+    Raises:
+        DataError: there is no such device, or the folder is not empty.
     """
     require_device(request.device)
     if request.out.exists() and (not request.out.is_dir() or any(request.out.iterdir())):

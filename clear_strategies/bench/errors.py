@@ -32,6 +32,9 @@ def measure(results: Results, *, run: Path, reference: Path | None = None) -> No
     """Fill `results` with the parts of the error, the views, and a picture of some of them.
 
     `reference` is another run of the same test views; what is seen by how many views is that of `run`.
+
+    Raises:
+        DataError: a folder holds no finished run, it has no test views, or its data are not there.
     """
     splats = {"run": open_splat(run)} | ({} if reference is None else {"reference": open_splat(reference)})
     settings = _settings(run)

@@ -52,7 +52,11 @@ class _Found:
 
 
 def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
-    """Fill `results` with a row for each kind of error, and a picture of the first view's R."""
+    """Fill `results` with a row for each kind of error, and a picture of the first view's R.
+
+    Raises:
+        SettingError, DataError: the overrides, or the data, cannot be used; or the prior has no seeded errors.
+    """
     chosen = list(overrides) or list(_DEMO)
     errors = _errors(tree(composed(chosen, "config"))["prior"])
     settings = settings_of(tree(composed([*chosen, "prior.share=0", "data.views.test_limit=0"], "config")))
@@ -83,7 +87,11 @@ def auc(right: Float[Tensor, " K"], wrong: Float[Tensor, " M"]) -> float:
 
 
 def _errors(prior: Mapping[str, Any]) -> SeededErrors:
-    """The errors of a prior's node."""
+    """The errors of a prior's node.
+
+    Raises:
+        SettingError: it makes none.
+    """
     names = [f.name for f in fields(SeededErrors)]
     if not all(name in prior for name in names):
         raise SettingError(

@@ -98,6 +98,9 @@ def measure(
 
     Args:
         backend: None: the fastest that runs here.
+
+    Raises:
+        DataError: a name is unknown, the scene has no LR grid, or there is no such device.
     """
     require_device(device)
     workload = scenes.load(scene, data).to(device)
@@ -132,7 +135,11 @@ def field_of(splats: Splats) -> GaussianField:
 
 
 def view_of(workload: Workload, rasterizer: Rasterizer) -> View:
-    """One view whose photos are a render plus noise."""
+    """One view whose photos are a render plus noise.
+
+    Raises:
+        DataError: no LR grid divides the image.
+    """
     factor, camera = workload.lr_factor, workload.camera
     if factor is None:
         size = f"{camera.width}x{camera.height} is no multiple of 4, 3 or 2"

@@ -49,7 +49,11 @@ class Competitor:
 def measure(
     results: Results, *, size: Sequence[str], repeats: int, device: str = "cpu", gaussians: Sequence[int] = ()
 ) -> None:
-    """Measure every loss at every size, and the step of each number of Gaussians."""
+    """Measure every loss at every size, and the step of each number of Gaussians.
+
+    Raises:
+        DataError: a size is not WIDTHxHEIGHT, or there is no such device.
+    """
     require_device(device)
     sizes = {text: _parse(text) for text in size}
     competitors = {loss: _ours(loss, device) for loss in (SSIM, PHOTOMETRIC, HAAR)}

@@ -44,7 +44,11 @@ class Request:
 
 
 def measure(results: Results, request: Request, trainer: Trainer = train) -> None:
-    """Fill `results` with the PSNR of the test views before and after each addition."""
+    """Fill `results` with the PSNR of the test views before and after each addition.
+
+    Raises:
+        DataError: a training failed, or a scene has too few photos.
+    """
     rows = [_of_scene(results, request, scene, trainer) for scene in request.scene]
     results.tables["next_photo"] = pd.DataFrame(rows)
     shared = " ".join(override for override in request.overrides if "/" not in override)

@@ -73,6 +73,10 @@ def measure(
     Args:
         backend: None: all that run here.
         isa: instruction sets whose compiled modules are compared; None: the fastest of this processor.
+
+    Raises:
+        BackendUnavailable: this processor cannot run one of `isa`.
+        DataError: a name is unknown, or nothing that was asked for runs here.
     """
     require_device(device)
     backends = usable(backend, device, results.note)
@@ -121,7 +125,11 @@ def require_device(device: str) -> None:
 
 
 def usable(asked: Sequence[str] | None, device: str, note: Callable[[str], None]) -> list[str]:
-    """The backends that run here, of those asked for."""
+    """The backends that run here, of those asked for.
+
+    Raises:
+        DataError: a name is unknown, or none runs.
+    """
     reasons = rasterizers.available()
     for name in asked or ():
         if name not in reasons:

@@ -128,7 +128,11 @@ class _Frustum:
 
 
 def garden(path: Path) -> Workload:
-    """The points of gsplat's test_garden.npz as Gaussians: sizes from the distances to three neighbours."""
+    """The points of gsplat's test_garden.npz as Gaussians: sizes from the distances to three neighbours.
+
+    Raises:
+        DataError: the file is missing or is not the garden.
+    """
     from scipy.spatial import cKDTree
 
     try:
@@ -152,7 +156,11 @@ def garden(path: Path) -> Workload:
 
 
 def from_ply(path: Path) -> Workload:
-    """Gaussians as a run exports them."""
+    """Gaussians as a run exports them.
+
+    Raises:
+        DataError: the file is no such export.
+    """
     g = read_gaussians(path)
     splats = Splats(g.means, g.quats, g.scales.exp(), g.opacities.sigmoid(), g.sh0, g.shN)
     return Workload(path.stem, splats, facing_all(splats))
@@ -186,6 +194,9 @@ def load(name: str, data: Path | None = None) -> Workload:
 
     Args:
         data: the garden's file.
+
+    Raises:
+        DataError: no scene or file has that name, or the file cannot be used.
     """
     if name in _GENERATED:
         return _GENERATED[name]()

@@ -109,6 +109,9 @@ def measure(results: Results, request: Request, trainer: Trainer = train) -> Non
 
     Args:
         trainer: trains into a folder with overrides.
+
+    Raises:
+        DataError: no reference finished.
     """
     rows: list[dict[str, Any]] = []
     probes: list[dict[str, Any]] = []

@@ -32,7 +32,11 @@ _CLOSE: Final = (0.03, 0.10)  # relative errors of depth whose shares the table 
 
 
 def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
-    """Fill `results` with a row for each training photo, and one for all of them together."""
+    """Fill `results` with a row for each training photo, and one for all of them together.
+
+    Raises:
+        SettingError, DataError: the overrides, or the data, cannot be used.
+    """
     data: DataSettings = build(tree(composed(list(overrides), "config"))["data"], "data")
     capture = data.reader()
     frames, _ = split(capture, data.views)

@@ -17,7 +17,11 @@ _log = logging.getLogger(__name__)
 
 
 def cameras_of(splat: SavedSplat, options: argparse.Namespace) -> tuple[list[str], list[Camera], float]:
-    """Names, cameras and frames per second of what `--path` names."""
+    """Names, cameras and frames per second of what `--path` names.
+
+    Raises:
+        DataError, SettingError: it names no cameras, or a file that cannot be read.
+    """
     path, fps = str(options.path), None
     if path in STILLS:
         chosen = [saved for saved in splat.cameras if saved.split == path]

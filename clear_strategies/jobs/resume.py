@@ -42,7 +42,11 @@ def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def finished(folder: Path, config: Mapping[str, Any]) -> tuple[float | None] | None:
-    """What the finished run in this folder returned; None where there is none."""
+    """What the finished run in this folder returned; None where there is none.
+
+    Raises:
+        DataError: it was another configuration's, or its metrics.json is damaged.
+    """
     path = folder / "metrics.json"
     if not path.exists():
         return None
@@ -60,6 +64,9 @@ def resume(state: TrainState, asked: str | None, folder: Path, config: Mapping[s
 
     Args:
         asked: a run's folder or one of its checkpoints; "auto": the newest checkpoint in `folder` that is whole, or none.
+
+    Raises:
+        DataError: the checkpoint is damaged, or another configuration's.
     """
     if asked == AUTO:
         _resume_newest(state, folder / CHECKPOINTS, config)
@@ -76,6 +83,9 @@ def of_both(asked: str | None, run: Mapping[str, Any], baseline: Mapping[str, An
 
     Args:
         run, baseline: the configuration of each.
+
+    Raises:
+        DataError: no checkpoint is there, it is damaged, or it is another configuration's.
     """
     if asked is None or asked == AUTO:
         return asked, asked

@@ -33,7 +33,11 @@ class Baseline:
 
     @classmethod
     def read(cls, folder: Path) -> Baseline:
-        """Read a run's folder."""
+        """Read a run's folder.
+
+        Raises:
+            DataError: metrics.json is not there or damaged, or a render of a test view is not there.
+        """
         path = folder / "metrics.json"
         content = metrics.read(path, _TRAIN_AGAIN)
         parts = {"test": content.test, "train": content.train}

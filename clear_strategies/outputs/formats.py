@@ -67,6 +67,9 @@ def write_format(path: Path, g: GaussianPly, form: str, start: Start) -> None:
 
     Args:
         start: of the page; the other formats hold no camera.
+
+    Raises:
+        SettingError: there is no such format, or what it needs is not installed or failed.
     """
     if form not in FORMATS:
         raise SettingError(f"--to must be one of {', '.join(FORMATS)}, got {form}.")
@@ -125,7 +128,11 @@ def splat_bytes(g: GaussianPly) -> bytes:
 
 
 def converter() -> list[str]:
-    """The command of splat-transform."""
+    """The command of splat-transform.
+
+    Raises:
+        SettingError: neither it nor npx is installed.
+    """
     if (found := shutil.which("splat-transform")) is not None:
         return [found]
     if (npx := shutil.which("npx")) is not None:

@@ -31,7 +31,11 @@ _GROUPS: Final = {
 
 
 def require_tensorboard() -> None:
-    """Refuse to begin without TensorBoard."""
+    """Refuse to begin without TensorBoard.
+
+    Raises:
+        SettingError: it is not.
+    """
     if find_spec("tensorboard") is None:
         raise SettingError("fit.log: tensorboard is not installed: pip install 'clear-strategies[log]'.")
 

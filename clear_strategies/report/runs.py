@@ -61,7 +61,11 @@ class Run:
 
     @classmethod
     def read(cls, folder: Path) -> Run:
-        """Read a run's folder."""
+        """Read a run's folder.
+
+        Raises:
+            DataError: metrics.json or .hydra/overrides.yaml is damaged.
+        """
         path = folder / "metrics.json"
         content, overrides = metrics.read(path, "train the run again"), _overrides(folder)
         part = content.shown
@@ -96,6 +100,9 @@ def collect(folders: Iterable[Path]) -> list[Run]:
     """Every finished run at or below the folders: the jobs of a sweep by number, other runs by path. A baseline that
     trained beside a run (`fit.baseline`) comes before it, and once: it is left out, with a message, where another run of
     the same configuration is there. Unfinished and damaged runs are logged and left out.
+
+    Raises:
+        DataError: there is no finished run.
     """
     folders = list(folders)
     found: dict[Path, None] = {}

@@ -72,7 +72,11 @@ def write_cameras(folder: Path, scene: Scene) -> None:
 
 
 def read_cameras(path: Path) -> list[SavedCamera]:
-    """The cameras of a run of ours or of Inria's 3DGS."""
+    """The cameras of a run of ours or of Inria's 3DGS.
+
+    Raises:
+        DataError: it is no such file.
+    """
     remedy = "give the cameras.json of a run"
     entries = typed(path, strict_json.read(path), list[_Entry], remedy=remedy)
     if not entries:
@@ -88,6 +92,9 @@ def read_path(path: Path, size: tuple[int, int]) -> tuple[list[Camera], float | 
 
     Returns:
         The cameras, and frames per second where the file names them.
+
+    Raises:
+        DataError: it is no such file.
     """
     content = strict_json.read(path)
     if isinstance(content, list):

@@ -71,6 +71,9 @@ class CloudSettings:
         max_points: a larger cloud is reduced to this many points, chosen at random.
         triangulation: for init=stereo, triangulated and auto.
         stereo: for init=stereo and auto.
+
+    Raises:
+        SettingError: a value is outside its range, or init=ply comes without a path.
     """
 
     init: Init = "auto"
@@ -107,7 +110,11 @@ class CloudSettings:
 
 
 def require_source(settings: CloudSettings, sfm: SfmPoints | None) -> None:
-    """Refuse, before any photo is decoded, an `init` whose points do not exist."""
+    """Refuse, before any photo is decoded, an `init` whose points do not exist.
+
+    Raises:
+        DataError: they do not.
+    """
     if settings.init in ("sfm", "sfm_train") and (sfm is None or len(sfm.means) == 0):
         problem = f"there are none, but init={settings.init} asks for them"
         raise DataError("scene", "points", problem, "use init=triangulated or init=random")
@@ -149,6 +156,9 @@ def initial_points(
         train_ids: their ids of the training frames.
         sfm_is_train: every photo of the capture trains, so that init=auto may use the SfM points in place of triangulating.
         background: the colour of pixels without a surface (Blender's white), RGB in [0, 1].
+
+    Raises:
+        DataError: the scene cannot give this cloud.
     """
     require_source(settings, sfm)
     depths: tuple[DepthMap, ...] = ()

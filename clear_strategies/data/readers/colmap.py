@@ -41,6 +41,10 @@ def read(
         allow_outside: follow file names and links that lead out of that folder.
         missing: photos of the model that are not there: "refuse" or "skip".
         broken: photos that cannot be decoded: "refuse" or "skip".
+
+    Raises:
+        SettingError: the background is no colour.
+        DataError: the model or an image cannot be used.
     """
     root = Path(root)
     if background is not None:
@@ -71,6 +75,9 @@ def capture(
 
     Args:
         upright: see `Frame.of_photo`.
+
+    Raises:
+        DataError: an image cannot be used.
     """
     listing = model.folder / f"images{model.ending}"
     kept = usable(listing, model.images, lambda image: paths[image.name], missing=missing, broken=broken)

@@ -100,17 +100,29 @@ def read_model(folder: Path) -> Model:
 
 
 def read_cameras(file: Path) -> dict[int, Lens]:
-    """cameras.bin or cameras.txt: the lens of each camera by its id."""
+    """cameras.bin or cameras.txt: the lens of each camera by its id.
+
+    Raises:
+        DataError: the file is not what it should be.
+    """
     return colmap_binary.cameras(file) if file.suffix == ".bin" else colmap_text.cameras(file)
 
 
 def read_images(file: Path) -> list[Image]:
-    """images.bin or images.txt."""
+    """images.bin or images.txt.
+
+    Raises:
+        DataError: the file is not what it should be.
+    """
     return colmap_binary.images(file) if file.suffix == ".bin" else colmap_text.images(file)
 
 
 def read_points(file: Path) -> Points:
-    """points3D.bin or points3D.txt."""
+    """points3D.bin or points3D.txt.
+
+    Raises:
+        DataError: the file is not what it should be.
+    """
     return colmap_binary.points(file) if file.suffix == ".bin" else colmap_text.points(file)
 
 

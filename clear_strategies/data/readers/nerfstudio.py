@@ -49,6 +49,10 @@ def read(
         allow_outside: follow file names and links that lead out of the folder.
         missing: frames whose photo is not there: "refuse" or "skip".
         broken: photos that cannot be decoded: "refuse" or "skip".
+
+    Raises:
+        SettingError: the background is no colour.
+        DataError: something is missing or not what it should be.
     """
     if background is not None:
         background = as_color("data.reader.background", background)
