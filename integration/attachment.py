@@ -113,6 +113,7 @@ class Attachment:
                 f"lambda_lr={conductor.objective.lambda_lr}, lr_from={conductor.objective.lr_from!r}."
             )
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
+        self._own_background = own_background
         self.t = 1
         self.counts: Counter[str] = Counter()
         self.removed = False
@@ -173,7 +174,7 @@ class Attachment:
     @property
     def background(self) -> tuple[float, float, float] | None:
         """The colour behind every rendering of this iteration, for hosts that let the strategies choose it; None: their own."""
-        return None if self.removed else self.conductor.background(self.t)
+        return None if self.removed or self._own_background else self.conductor.background(self.t)
 
     def before_step(self) -> None:
         """For a hook before the host's optimizer step: count the steps in which no strategy took part.

@@ -109,10 +109,8 @@ class Conductor:
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""
-        if "gate" not in self._one:
-            return None
-        z = self._one["gate"].gate(t, n)
-        if z is None:
+        z: Float[Tensor, " N"] | None = self._ask("gate", None, t, n)
+        if z is None and "gate" in self._one:
             self.work_log.skip("gate", "no Gaussian is dropped at this rate")
         return z
 

@@ -91,7 +91,7 @@ class Attached:
             as_parameter=state is None,
         )
         self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).to(means)
-        self._masks, self._own_background = dict(masks or {}), own_background
+        self._masks = dict(masks or {})
         self._named: View | None = None  # by `rendering`
         self._replaced: list[Replaced] = []
         require_end(conductor, _refine_stop(strategy), "refine_stop_iter", first=0)
@@ -275,7 +275,7 @@ class Attached:
     def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:
         """The `backgrounds` that the strategies choose for a call; none where it names its own."""
         color = self.attachment.background
-        if color is None or self._own_background or call.get("backgrounds") is not None:
+        if color is None or call.get("backgrounds") is not None:
             return {}
         return {"backgrounds": call["means"].new_tensor(color)[None]}
 
