@@ -23,16 +23,16 @@ _FIXED: Final = {"alpha_min": 1 / 255, "alpha_max": 0.99, "transmittance_min": 1
 
 
 def _gsplat_rasterization() -> Callable[..., Any]:
+    if not torch.cuda.is_available():
+        raise BackendUnavailable(
+            "the gsplat rasterizer draws on CUDA only, and torch finds no CUDA device; cpp draws on a CPU."
+        )
     try:
         from gsplat.rendering import rasterization
     except ImportError as error:
         raise BackendUnavailable(
             f"the gsplat rasterizer needs gsplat, which cannot be imported ({error}); pip install 'clear-strategies[gsplat]'."
         ) from error
-    if not torch.cuda.is_available():
-        raise BackendUnavailable(
-            "the gsplat rasterizer draws on CUDA only, and torch finds no CUDA device; cpp draws on a CPU."
-        )
     found: Callable[..., Any] = rasterization
     return found
 
