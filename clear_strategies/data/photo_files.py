@@ -35,6 +35,7 @@ _FOLDERS: Final = ("images", "images_2", "images_4", "images_8")
 _LONGEST_NAME: Final = 1024
 _LARGE: Final = 1 << 24  # pixels; smaller images may be drawings, which compress without limit
 _BOMB: Final = 200
+PNG_LEVEL: Final = 3  # a third of the time of zlib's default, for 5 % more bytes
 _EXIF_ORIENTATION: Final = 0x0112
 _EXIF_PHOTO: Final = 0x8769
 # What makes [H, W, C] pixels upright, by their EXIF orientation.
@@ -190,7 +191,7 @@ def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) 
     """8-bit PNG, written atomically; a [H, W] image is grey. Values outside [0, 1] are clamped."""
     pixels = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
+    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=PNG_LEVEL)
     write_bytes(path, buffer.getvalue())
 
 

@@ -146,7 +146,7 @@ class Conductor:
 
         Args:
             params: raw parameters by attribute. lr, hr: this view rendered at both scales. hr None skips HR; lr None
-                stands for the area mean of hr, and is not used where `wants_lr` is False.
+                stands for the area mean of hr, where `wants_lr` is False or both scales have one size.
             stepper: merges and steps in one pass; None: the readable path below.
 
         Raises:
@@ -155,7 +155,7 @@ class Conductor:
         """
         o, stage = self.objective, self.work_log.stage
         vjp: Callable[..., Sequence[Any]] = _vjp if stepper is None else stepper.vjp
-        reduced = not self.wants_lr
+        reduced = not self.wants_lr or (lr is None and view.factor == 1)
         rendered = hr if reduced else lr
         if rendered is None:
             raise ValueError(

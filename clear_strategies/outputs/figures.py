@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from clear_strategies.data.photo_files import PNG_LEVEL
 from clear_strategies.files import write_bytes
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ def set_title(figure: Figure, title: str) -> None:
 
 def save_png(figure: Figure, path: Path) -> None:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI)
+    figure.savefig(buffer, format="png", dpi=_DPI, pil_kwargs={"compress_level": PNG_LEVEL})
     write_bytes(path, buffer.getvalue())
 
 

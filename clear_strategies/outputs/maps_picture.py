@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core.images import area_mean
 from clear_strategies.core.view import DepthMap, Photo, View
 from clear_strategies.outputs import figures
 
@@ -22,6 +23,7 @@ _MEANINGS: Final = {
 }
 _COLORS: Final = "viridis"
 _COLUMNS: Final = 4
+_PANEL: Final = 400  # px, the width of one image
 _EXTREMES: Final = (0.02, 0.98)  # quantiles of depth at the ends of the colours
 
 
@@ -89,5 +91,8 @@ def _draw_depth(axis: Any, values: Any, colors: str, ends: tuple[float, float]) 
     axis.figure.colorbar(shown, ax=axis, shrink=0.8)
 
 
-def _array(image: Tensor) -> np.ndarray:
-    return np.asarray(image.detach().clamp(0, 1).cpu().numpy())
+def _array(image: Float[Tensor, "H W"] | Float[Tensor, "H W 3"]) -> np.ndarray:
+    """The image at about the size of its panel, because matplotlib would resample each pixel, twice."""
+    factor = max(1, image.shape[1] // _PANEL)
+    shown = area_mean(image[..., None] if image.dim() == 2 else image, factor)
+    return np.asarray(shown.detach().clamp(0, 1).squeeze(-1).cpu().numpy())

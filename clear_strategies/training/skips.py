@@ -32,7 +32,8 @@ class Skips:
     """Which work is skipped. The defaults skip nothing.
 
     Args:
-        coarse_until: until this iteration HR is rendered and compared at half its size; 0: never.
+        coarse_until: until this iteration HR is rendered and compared at half its size, and LR is not rendered where that is
+            LR's size; 0: never.
         hr_every: from `hr_every_from` on, HR is rendered in every n-th iteration only.
         hr_every_from: iteration, see `hr_every`.
         plateau_gain: once the loss of the training views, drawn whole, has not fallen by at least this share within
@@ -98,6 +99,13 @@ class SkipPolicy:
         if t <= s.hr_every_from or t % s.hr_every == 0:
             return True
         work_log.skip("HR scale", f"every {s.hr_every} iterations (skips.hr_every)")
+        return False
+
+    def lr_due(self, view: View, hr_due: bool, work_log: WorkLog) -> bool:
+        """Whether LR is rendered: not where HR at half its size is as large as the photo, for one render then serves both."""
+        if view.factor > 1 or not hr_due:
+            return True
+        work_log.skip("render LR", "HR at half its size is as large (skips.coarse_until)")
         return False
 
     def measured(self, t: int) -> bool:

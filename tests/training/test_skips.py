@@ -107,6 +107,22 @@ def test_every_skip_trains(skips):
     assert all(bool(p.isfinite().all()) for p in state.field.raw().values())
 
 
+def test_one_render_serves_both_scales_while_they_have_one_size():
+    state = start(("gco", "p2g"))
+    state.skip_policy = SkipPolicy(Skips(coarse_until=12))
+    state.views = [replace(view, hr=view.hr.reduced(2), truth=None) for view in state.views]  # SR by two
+    assert not state.field.detail.any()  # so that both scales have one image
+    view, objective = state.skip_policy.view(state.views[0], 5), Objective(lambda_hr=WarmupDecay(start=0, full=1))
+    lr, hr = state.field.render_scales(toy.RASTERIZER, view)
+    of_one, of_two = (Conductor(objective=objective).update(state.field.raw(), low, hr, view, 5) for low in (None, lr))
+    assert of_one.losses == of_two.losses
+    for name, expected in of_two.grads.items():
+        torch.testing.assert_close(of_one.grads[name], expected)
+    fit(state, toy.scene(), toy.RASTERIZER)
+    skipped = state.conductor.work_log.entries["render LR"].skipped
+    assert skipped == {"HR at half its size is as large (skips.coarse_until)": 11}  # not at t = 1, where λ_HR = 0
+
+
 @pytest.mark.parametrize("bad", [{"hr_every": 0}, {"plateau_gain": 1.0}, {"coarse_until": -1}])
 def test_settings_out_of_range_are_refused(bad):
     with pytest.raises(ValueError, match="must"):
