@@ -65,11 +65,13 @@ def resize(
 
 def area_mean(image: Float[Tensor, "H W C"], factor: int) -> Float[Tensor, "h w C"]:
     """The mean of each factor × factor block, whatever the values."""
-    return _hwc(F.avg_pool2d(_nchw(image), factor))
+    return image if factor == 1 else _hwc(F.avg_pool2d(_nchw(image), factor))
 
 
 def area_mean_transposed(cotangents: Float[Tensor, "K h w C"], factor: int) -> Float[Tensor, "K H W C"]:
     """The VJP of `area_mean`: each cotangent, divided equally among the pixels of its block."""
+    if factor == 1:
+        return cotangents
     return cotangents.repeat_interleave(factor, 1).repeat_interleave(factor, 2) / factor**2
 
 
