@@ -15,12 +15,11 @@ import rasterizers
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import sweep
 from clear_strategies.settings import TARGET
-from rasterizers.interface import BackendUnavailable, Rasterizer, RasterSettings
+from rasterizers.interface import BackendUnavailable, Color, Rasterizer, RasterSettings
 
 _log = logging.getLogger(__name__)
 
 _SHARED: Final = RasterSettings()
-Color = tuple[float, float, float]
 Device = Literal["cpu", "cuda"]
 
 

@@ -18,7 +18,8 @@ from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import View
 from clear_strategies.geometry.pseudo_views import cut_out
 from clear_strategies.schedules import milestone
-from clear_strategies.strategies.base import Color, Strategy
+from clear_strategies.strategies.base import Strategy
+from rasterizers.interface import Color
 
 _FEW_VIEWS: Final = 5  # more views keep the background of the scene
 _LONG_RUN: Final = 1_350  # iterations over other colours; with fewer, surfaces have no time to become opaque

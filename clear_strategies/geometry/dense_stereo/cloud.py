@@ -16,6 +16,7 @@ from clear_strategies.geometry.dense_stereo import filling
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.libraries import REMEDY, missing
 from clear_strategies.geometry.projection import back_project, inside_of, project
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
@@ -26,7 +27,7 @@ def stereo_cloud(
     maps: Sequence[DepthMap],
     settings: StereoSettings,
     *,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
     masks: Sequence[Bool[Tensor, "h w"]] | None = None,
     fill: bool = True,
     stride: int = filling.STRIDE,

@@ -12,6 +12,7 @@ from torch import Tensor
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.interpolation import interpolate_depth, pixel_grid
 from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
+from rasterizers.interface import Color
 
 STRIDE: Final = 2
 """LR px between the points of the grid, by default."""
@@ -24,7 +25,7 @@ def fill(
     photos: Sequence[Photo],
     maps: Sequence[DepthMap],
     stride: int,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
     masks: Sequence[Bool[Tensor, "h w"]] | None = None,
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """(positions, colours) of a grid of `stride` px over the unknown parts of each photo.

@@ -19,6 +19,7 @@ from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons
 from clear_strategies.geometry.projection import inside_of, project
 from clear_strategies.geometry.sift import features_of
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
@@ -33,7 +34,7 @@ def depth_maps(
     photos: Sequence[Photo],
     points: Float[Tensor, "N 3"] | None = None,
     settings: StereoSettings | None = None,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
     masks: Sequence[Bool[Tensor, "h w"]] | None = None,
 ) -> list[DepthMap]:
     """The depth of each photo where others confirm it; unknown everywhere for photos whose stereo cannot be trusted.
