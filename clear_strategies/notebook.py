@@ -23,6 +23,7 @@ from torch import Tensor
 from clear_strategies import console
 from clear_strategies.commands import train as train_command
 from clear_strategies.compose import composed
+from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
@@ -33,7 +34,6 @@ from rasterizers.interface import Camera
 _log = logging.getLogger(__name__)
 
 _SHEET_WIDTH: Final = 1200  # px of the contact sheet in a notebook, at most
-_ATTRIBUTES: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Run:
         opacities [N], sh0 [N, 1, 3] and shN [N, K, 3]. f_det and the 3D filter are part of them, as in point_cloud.ply.
         """
         found = read_gaussians(self.folder / "point_cloud.ply")
-        return {name: getattr(found, name) for name in _ATTRIBUTES}
+        return {name: getattr(found, name) for name in PARAMETERS}
 
     @property
     def cameras(self) -> Sequence[Camera]:

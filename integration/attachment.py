@@ -41,6 +41,7 @@ from integration.autograd_shot import AutogradShot
 from integration.errors import HostError
 from integration.extra_steps import ExtraSteps, RenderCamera
 from integration.host_score import ScoreScaler, score_for_host
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
@@ -172,7 +173,7 @@ class Attachment:
         return rendering.returned
 
     @property
-    def background(self) -> tuple[float, float, float] | None:
+    def background(self) -> Color | None:
         """The colour behind every rendering of this iteration, for hosts that let the strategies choose it; None: their own."""
         return None if self.removed or self._own_background else self.conductor.background(self.t)
 

@@ -16,7 +16,7 @@ from torch import Tensor
 import rasterizers
 from rasterizers.checks import require_depth
 from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera, Rasterizer, Splats
+from rasterizers.interface import Camera, Color, Rasterizer, Splats
 
 
 class Drawn(NamedTuple):
@@ -165,8 +165,6 @@ def _require_supported(render_mode: str, rasterize_mode: str, absgrad: bool) -> 
 
 
 @lru_cache(maxsize=8)
-def _loaded(
-    name: str, device: str, near: float, kernel: float, antialiased: bool, background: tuple[float, float, float]
-) -> Rasterizer:
+def _loaded(name: str, device: str, near: float, kernel: float, antialiased: bool, background: Color) -> Rasterizer:
     name = rasterizers.fastest(device) if name == "auto" else name
     return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased, background=background)

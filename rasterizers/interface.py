@@ -29,6 +29,9 @@ class BackendUnavailable(RuntimeError):
     """A backend that cannot run on this machine. The message says why, and what to install."""
 
 
+Color = tuple[float, float, float]
+"""RGB in [0, 1]."""
+
 _RIGID: Final = 1e-3  # files keep few digits
 
 
@@ -284,7 +287,7 @@ class RasterSettings:
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
     transmittance_min: float = 1e-4
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Color = (0.0, 0.0, 0.0)
     antialiased: bool = True
 
     def __post_init__(self) -> None:
@@ -303,7 +306,7 @@ class RasterSettings:
             raise ValueError(f"background must be three numbers in [0, 1], got {self.background}.")
 
 
-def over(rasterizer: Rasterizer, background: tuple[float, float, float] | None) -> Rasterizer:
+def over(rasterizer: Rasterizer, background: Color | None) -> Rasterizer:
     """The rasterizer with another background, RGB in [0, 1]; itself for None.
 
     Raises:

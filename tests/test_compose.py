@@ -23,6 +23,7 @@ from clear_strategies.jobs import device
 from clear_strategies.jobs.settings import RunSettings, settings_of
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.settings import TARGET, with_defaults
+from tests.helpers.configs import composed, options
 
 
 def names(c):
@@ -115,11 +116,6 @@ def test_a_host_of_no_iterations_is_refused():
         conductor("gco", iterations=0)
 
 
-def composed(*overrides: str) -> Any:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", list(overrides))
-
-
 def test_clear_on_the_command_line_is_clear_in_python():
     """The defaults have one owner, the class: strategies, objective and all numbers are the same, field by field."""
     ours = Conductor(GCO(), P2G(), SVS())
@@ -183,10 +179,6 @@ def test_every_option_composes_into_settings(group):
         chosen = f"{'+' if group in ('strategy', 'method') else ''}{group}={name}"
         config = composed(chosen, *([NEEDED[chosen]] if chosen in NEEDED else []))
         assert isinstance(settings_of(tree(config)).conductor(1.0), Conductor), name
-
-
-def options(group: str) -> list[str]:
-    return sorted(p.stem for p in (CONF / group).glob("*.yaml") if not p.stem.startswith("_"))
 
 
 def leaves(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:

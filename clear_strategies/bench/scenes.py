@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import DataError
 from rasterizers.geometry import SH_C0
@@ -81,7 +82,7 @@ def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed:
     colors = texture + random.normal(0, 0.05, (n, 3))
     shuffled = random.permutation(n)  # a trained field has no order
     splats = _splats(random, points, quats, scales, _sigmoid(random.normal(0.8, 2.2, n)), colors)
-    splats = Splats(*(getattr(splats, a)[shuffled] for a in ("means", "quats", "scales", "opacities", "sh0", "shN")))
+    splats = Splats(*(getattr(splats, a)[shuffled] for a in PARAMETERS))
     return Workload(name, splats, Camera(_pose(), focal, focal, width / 2, height / 2, width, height))
 
 

@@ -23,7 +23,7 @@ from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.prepare import lr_photos
 from clear_strategies.data.view_settings import split
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
-from clear_strategies.geometry.projection import inside_of, project
+from clear_strategies.geometry.projection import seen_pixels
 from clear_strategies.geometry.sift import triangulate
 from clear_strategies.jobs.scene import DataSettings
 from clear_strategies.settings import build
@@ -91,6 +91,5 @@ def _reference(capture: Capture, frame: Frame, photo: Photo) -> tuple[Int[Tensor
     if capture.points is None:
         return torch.zeros(0, 2, dtype=torch.long), torch.zeros(0, dtype=torch.float64)
     seen = torch.unique(capture.points.track_point[capture.points.track_image == frame.sfm_id])
-    pixels, depth = project(photo.camera, capture.points.means[seen])
-    inside = inside_of(photo.camera, pixels, depth)
-    return pixels[inside].long(), depth[inside]
+    _, row, column, depth = seen_pixels(photo.camera, capture.points.means[seen])
+    return torch.stack((column, row), dim=1), depth

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 import rasterizers
+from clear_strategies.core.gradients import PARAMETERS
 from rasterizers import native
 from rasterizers.interface import BackendUnavailable, Camera, Splats
 
 _TOLERANCE: Final = 2e-3  # backends differ in rounding, a wrong one by far more
 _GAUSSIANS, _SIZE = 300, 64
-_TENSORS: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _SLOW_TO_COMPILE: Final = ("warp",)  # on a CPU its first picture takes a minute, and its import half a second
 
 
@@ -59,7 +59,7 @@ def _compared(name: str, splats: Splats, camera: Camera, exact: Tensor) -> tuple
     """What to say of the backend's picture, and whether it is the reference's."""
     rasterizer = rasterizers.load(name, preset="accurate")
     device = "cuda" if "cuda" in rasterizer.traits.devices and torch.cuda.is_available() else "cpu"
-    there = Splats(**{tensor: getattr(splats, tensor).to(device) for tensor in _TENSORS})
+    there = Splats(**{tensor: getattr(splats, tensor).to(device) for tensor in PARAMETERS})
     rasterizer(there, camera)
     began = time.perf_counter()
     image = rasterizer(there, camera).image.cpu()

@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection
 
 from clear_strategies.errors import SettingError
+from rasterizers.interface import Color
 
 
 def require_whole(name: str, value: object, *, least: int, most: int | None = None) -> None:
@@ -54,7 +55,7 @@ def require_choice(name: str, value: object, choices: Collection[object]) -> Non
         refuse(name, f"must be one of {listed}", value, f"{name}={next(iter(choices))}")
 
 
-def as_color(name: str, value: object) -> tuple[float, float, float]:
+def as_color(name: str, value: object) -> Color:
     """Three numbers in [0, 1], as a tuple.
 
     Raises:

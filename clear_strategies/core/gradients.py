@@ -12,8 +12,11 @@ from torch import Tensor
 from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
 
-ATTRIBUTES: Final = ("means", "quats", "scales", "opacities", "sh0", "shN", "detail")
-"""gsplat's names for the raw parameters (log scales, logit opacities), and the detail feature f_det."""
+PARAMETERS: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
+"""gsplat's names for the raw parameters (log scales, logit opacities)."""
+
+ATTRIBUTES: Final = (*PARAMETERS, "detail")
+"""The parameters, and the detail feature f_det."""
 
 CONFLICT_GROUPS: Final = ("means", "sh0", "shN", "opacities", "scales", "quats")
 """The paper's six: position, base appearance, higher-order appearance, opacity, scale, rotation."""

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import images
-from rasterizers.interface import Camera
+from rasterizers.interface import Camera, Color
 
 _KNOWN_SHARE: Final = 0.3  # of a block's pixels, for its depth to be known
 
@@ -130,7 +130,7 @@ class View:
     sr_source: str = "unknown"
     depth: DepthMap | None = None
     disagreement: Float[Tensor, "h w 3"] | None = None
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Color = (0.0, 0.0, 0.0)
 
     @property
     def factor(self) -> int:

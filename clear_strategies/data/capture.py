@@ -19,9 +19,7 @@ from clear_strategies.data.cameras import Lens
 from clear_strategies.data.photo_files import image_size, is_turned, read_image
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
-from rasterizers.interface import Camera
-
-Color = tuple[float, float, float]  # RGB in [0, 1]
+from rasterizers.interface import Camera, Color
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from clear_strategies.errors import DataError
 from clear_strategies.files import require_regular, write_bytes
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
@@ -55,7 +56,7 @@ _ON_THE_SIDE: Final = (5, 6, 7, 8)
 def read_image(
     path: Path,
     *,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
     expect: tuple[int, int] | None = None,
     max_pixels: int = _MAX_PIXELS,
     turn: bool | None = None,

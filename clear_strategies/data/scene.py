@@ -9,6 +9,7 @@ import torch
 
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import View
+from rasterizers.interface import Color
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,7 +27,7 @@ class Scene:
     train: tuple[View, ...]
     test: tuple[View, ...]
     cloud: PointCloud
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Color = (0.0, 0.0, 0.0)
     synthetic_prior: bool = False
     notes: dict[str, str] = field(default_factory=dict)
     unplaced: Mapping[str, str] = field(default_factory=dict)

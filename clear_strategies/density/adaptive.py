@@ -14,6 +14,7 @@ from torch import Tensor
 
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Shot
+from clear_strategies.core.seeds import generator_at
 from clear_strategies.density.base import DensityError, require_in_range, structure_marks
 from clear_strategies.density.threshold import count_passing, topk_mask
 from clear_strategies.errors import SettingError
@@ -215,7 +216,7 @@ class Density:
     def _place_children(self, field: GaussianField, children: slice, t: int) -> None:
         """Place split children at random inside their parent, and make them smaller."""
         scales = field.scales.data[children]
-        generator = torch.Generator(scales.device).manual_seed(self.seed * 1_000_003 + t)
+        generator = generator_at(self.seed, t, scales.device)
         offset = torch.randn(scales.shape, generator=generator, device=scales.device) * scales.exp()
         rotation = rotation_matrix(field.quats.data[children])
         field.means.data[children] += (rotation @ offset[..., None])[..., 0]

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Shot
+from clear_strategies.core.seeds import seed_at
 from clear_strategies.density.base import DensityError, require_in_range, structure_marks
 from clear_strategies.density.lent import (
     ROWS,
@@ -195,7 +196,7 @@ class GsplatDensifier:
         accepted = inspect.signature(self.strategy.step_post_backward).parameters
         rest = {"lr": rates["means"]} if "lr" in accepted else {}
         lent = RowNumbers(params[ROWS])
-        with torch.no_grad(), _seeded(self.seed * 1_000_003 + t, lent.rows.device), self._threshold(t):
+        with torch.no_grad(), _seeded(seed_at(self.seed, t), lent.rows.device), self._threshold(t):
             self.strategy.step_pre_backward(params, optimizers, self.state, t, info)
             self.strategy.step_post_backward(params, optimizers, self.state, t, info, **rest)
         moved = not lent.unchanged(params[ROWS])

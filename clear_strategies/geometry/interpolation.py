@@ -14,16 +14,15 @@ from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo
-from clear_strategies.geometry.projection import back_project, project, sample_colors
+from clear_strategies.geometry.projection import back_project, is_background, project, sample_colors
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
 _FEWEST_SAMPLES: Final = 4  # projected points from which a view's depth is interpolated
 
 
-def densify(
-    cloud: PointCloud, photos: Sequence[Photo], stride: int, background: tuple[float, float, float] | None = None
-) -> PointCloud:
+def densify(cloud: PointCloud, photos: Sequence[Photo], stride: int, background: Color | None = None) -> PointCloud:
     """Add, per view, a point every `stride` pixels at the interpolated inverse depth of the cloud.
 
     Inverse depth is linear on planes. It is interpolated linearly between the projected points; outside their convex
@@ -34,7 +33,7 @@ def densify(
         grid = pixel_grid(photo, stride)
         grid_colors = sample_colors(photo.image, grid)
         if background is not None:
-            surface = ((grid_colors - torch.tensor(background)).abs() > 2 / 255).any(dim=1)
+            surface = ~is_background(grid_colors, background)
             grid, grid_colors = grid[surface], grid_colors[surface]
         inverse_depth = interpolate_depth(cloud.means, photo, grid, 2 * stride)
         if inverse_depth is None:

@@ -1,13 +1,17 @@
-"""From points to pixels and back, and an image's colours between pixel centres. Pixel (0, 0) spans [0, 1)²."""
+"""From points to pixels and back, and an image's colours there. Pixel (0, 0) spans [0, 1)²."""
 
 from __future__ import annotations
 
+from typing import Final
+
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.projection import intrinsics
-from rasterizers.interface import Camera
+from rasterizers.interface import Camera, Color
+
+_SAME_COLOR: Final = 2 / 255  # largest difference of a background pixel from the background's colour
 
 
 def projection_matrix(camera: Camera) -> Float[Tensor, "3 4"]:
@@ -28,6 +32,16 @@ def inside_of(camera: Camera, pixels: Float[Tensor, "N 2"], depth: Float[Tensor,
     return (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
 
 
+def seen_pixels(
+    camera: Camera, points: Float[Tensor, "N 3"]
+) -> tuple[Bool[Tensor, " N"], Int[Tensor, " M"], Int[Tensor, " M"], Float[Tensor, " M"]]:
+    """Which points project into the image, and the rows, columns and depths of these M points."""
+    pixels, depth = project(camera, points)
+    inside = inside_of(camera, pixels, depth)
+    column, row = pixels[inside].long().unbind(dim=1)
+    return inside, row, column, depth[inside]
+
+
 def back_project(camera: Camera, pixels: Float[Tensor, "G 2"], depth: Float[Tensor, " G"]) -> Float[Tensor, "G 3"]:
     """The points at these depths (z, world units) behind these pixels."""
     pose = camera.world_to_camera.double().cpu()
@@ -43,3 +57,8 @@ def sample_colors(image: Float[Tensor, "H W 3"], pixels: Float[Tensor, "N 2"]) -
     batch = image.permute(2, 0, 1)[None]
     samples = torch.nn.functional.grid_sample(batch, grid, padding_mode="border", align_corners=False)
     return samples[0, :, 0].T.cpu()
+
+
+def is_background(colors: Float[Tensor, "*shape 3"], background: Color) -> Bool[Tensor, "*shape"]:
+    """Whether colours are that of the background, up to rounding, so that no surface is there."""
+    return ((colors - torch.tensor(background).to(colors)).abs() <= _SAME_COLOR).all(dim=-1)

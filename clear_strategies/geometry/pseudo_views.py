@@ -18,12 +18,11 @@ from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cameras import moved
-from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
-from rasterizers.interface import Camera
+from clear_strategies.geometry.projection import back_project, inside_of, is_background, project, sample_colors
+from rasterizers.interface import Camera, Color
 
 _SOURCES: Final = 4  # the nearest photos that a pseudo view is made of
 _ALONG: Final = 0.3  # movements along the viewing direction are this much shorter: going close leaves holes
-_SEAM: Final = 2 / 255  # largest difference of a background pixel from the background's colour
 _CUT_OUT: Final = 0.25  # share of background pixels from which the photos show an object cut out of its surroundings
 _NEIGHBOURS: Final = 3  # of a pixel and the eight around it, those that must be known, or it is an outlier
 
@@ -59,7 +58,7 @@ def pseudo_views(
     reach: float,
     tolerance: float,
     max_pixels: int,
-    background: tuple[float, float, float],
+    background: Color,
     seed: int,
 ) -> list[PseudoView]:
     """`count` pseudo views, the training cameras taken in turn; none where fewer than two photos have depth.
@@ -97,9 +96,9 @@ def border_views(photos: Iterable[Photo], *, field: float, max_pixels: int) -> l
     return [_widened(photo.reduced(photo.factor_to(max_pixels)), field) for photo in photos]
 
 
-def cut_out(photos: Iterable[Photo], background: tuple[float, float, float]) -> bool:
+def cut_out(photos: Iterable[Photo], background: Color) -> bool:
     """Whether the photos show an object cut out of its surroundings: a good part of them is the background's colour."""
-    shares = [float(_blank(photo, background).float().mean()) for photo in photos]
+    shares = [float(is_background(photo.image, background).float().mean()) for photo in photos]
     return bool(shares) and sum(shares) / len(shares) >= _CUT_OUT
 
 
@@ -135,16 +134,14 @@ def _reduced(photo: Photo, found: DepthMap, max_pixels: int) -> tuple[Photo, Dep
     return smaller, DepthMap(depth, confidence)
 
 
-def _source(photo: Photo, found: DepthMap, background: tuple[float, float, float]) -> _Source:
+def _source(photo: Photo, found: DepthMap, background: Color) -> _Source:
     """Pixels beside the background are mixed with it: they give points but no colour."""
     known, depth = found.known, torch.nan_to_num(found.depth)
     points = back_project(photo.camera, _centres(photo.camera)[known], depth[known].double())
-    beside = torch.nn.functional.max_pool2d(_blank(photo, background)[None, None].float(), 3, 1, 1)[0, 0] > 0
+    beside = (
+        torch.nn.functional.max_pool2d(is_background(photo.image, background)[None, None].float(), 3, 1, 1)[0, 0] > 0
+    )
     return _Source(photo, points, torch.where(known & ~beside, depth, 0.0), float(depth[known].median()))
-
-
-def _blank(photo: Photo, background: tuple[float, float, float]) -> Bool[Tensor, "h w"]:
-    return ((photo.image - torch.tensor(background)).abs() <= _SEAM).all(dim=-1)
 
 
 def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> PseudoView:

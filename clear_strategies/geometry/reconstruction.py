@@ -17,7 +17,7 @@ from clear_strategies.errors import DataError
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.projection import inside_of, project
+from clear_strategies.geometry.projection import seen_pixels
 from clear_strategies.geometry.sift import features_of
 from rasterizers.interface import Camera
 
@@ -158,10 +158,8 @@ def _unhidden(
     """False for points that lie only at hidden pixels of the photos."""
     shown, hidden = torch.zeros(len(points), dtype=torch.bool), torch.zeros(len(points), dtype=torch.bool)
     for photo, mask in zip(photos, masks, strict=True):
-        pixels, depth = project(photo.camera, points)
-        inside = inside_of(photo.camera, pixels, depth)
-        x, y = pixels[inside].long().unbind(dim=1)
-        visible = mask.cpu()[y, x]
+        inside, row, column, _ = seen_pixels(photo.camera, points)
+        visible = mask.cpu()[row, column]
         shown[inside] |= visible
         hidden[inside] |= ~visible
     return shown | ~hidden

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.geometry.projection import back_project, inside_of, project
+from clear_strategies.geometry.projection import back_project, seen_pixels
 from rasterizers.interface import Camera
 
 _TOLERANCE: Final = 0.03  # a camera sees a point whose depth there exceeds the camera's own by at most this share of it
@@ -47,8 +47,6 @@ def sees(camera: Camera, depth: Float[Tensor, "h w"], points: Float[Tensor, "N 3
     Args:
         depth: of the camera, nan where there is no surface, so that no point is seen there.
     """
-    pixels, z = project(camera, points)
-    seen = inside_of(camera, pixels, z)
-    column, row = pixels[seen].long().unbind(1)
-    seen[seen.clone()] = z[seen] <= depth[row, column] * (1 + _TOLERANCE)  # False where it has none
+    seen, row, column, z = seen_pixels(camera, points)
+    seen[seen.clone()] = z <= depth[row, column] * (1 + _TOLERANCE)  # False where it has none
     return seen

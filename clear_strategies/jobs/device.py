@@ -15,13 +15,11 @@ import rasterizers
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import sweep
 from clear_strategies.settings import TARGET
-from rasterizers.interface import BackendUnavailable, Rasterizer, RasterSettings
+from rasterizers.interface import BackendUnavailable, Color, Rasterizer, RasterSettings
 
 _log = logging.getLogger(__name__)
 
 _SHARED: Final = RasterSettings()
-_SLOWEST: Final = "torch"
-Color = tuple[float, float, float]
 Device = Literal["cpu", "cuda"]
 
 
@@ -139,9 +137,10 @@ def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked:
 
 
 def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer], chosen: Drawing) -> None:
-    """For `auto`: log why the other backends were not chosen; on the console where that leaves the slowest."""
+    """For `auto`: log why the other backends were not chosen; on the console where neither CUDA nor compiled kernels draw."""
     if isinstance(settings, RasterizerSettings) and settings.name == "auto":
-        level = logging.INFO if chosen.name == _SLOWEST else logging.DEBUG
+        slow = chosen.device == "cpu" and not chosen.rasterizer.traits.native_threads
+        level = logging.INFO if slow else logging.DEBUG
         for name, reason in rasterizers.available().items():
             if reason is not None:
                 _log.log(level, "rasterizer %s is not available: %s", name, reason)

@@ -1,6 +1,4 @@
-"""The conductor asks the strategies in the paper's order and merges the gradients. Every host uses this one object.
-Eq. 8, 13
-"""
+"""The conductor asks the strategies in the paper's order and merges the gradients, in every host.  Eq. 8, 13"""
 
 from __future__ import annotations
 
@@ -24,7 +22,8 @@ from clear_strategies.errors import StrategyConflict
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.iteration import HrGradients, Merged, Stepper, Update, require_finite_parts
 from clear_strategies.merging.objective import Losses, Objective
-from clear_strategies.strategies.base import Color, ScreenGradients, Strategy, by_class, overrides
+from clear_strategies.strategies.base import ScreenGradients, Strategy, by_class, overrides
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 

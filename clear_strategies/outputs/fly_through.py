@@ -15,7 +15,7 @@ from clear_strategies.data.photo_files import write_png
 from clear_strategies.viewing import FPS, cameras, film, page, paths, video
 from clear_strategies.viewing.film import DepthScale
 from clear_strategies.viewing.look import Painter
-from rasterizers.interface import Camera
+from rasterizers.interface import Camera, Color
 
 _log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ def write_splat_page(
     painter: Painter,
     most: int,
     title: str,
-    background: tuple[float, float, float],
+    background: Color,
 ) -> None:
     """Write splat.html, unless the field has more Gaussians than `most`, or the page cannot be made: a message then says why.
 

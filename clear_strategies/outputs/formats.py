@@ -28,7 +28,7 @@ from clear_strategies.outputs.gltf import glb_bytes
 from clear_strategies.outputs.packed import PACKED, packed_bytes
 from clear_strategies.training.field import GaussianField
 from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera
+from rasterizers.interface import Camera, Color
 
 _log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class Start:
 
     camera: Camera
     focus: Float[np.ndarray, " 3"]
-    background: tuple[float, float, float]
+    background: Color
 
     def settings(self) -> dict[str, Any]:
         """For PlayCanvas's viewer, which turns 3DGS files by 180° around z: y then points up."""

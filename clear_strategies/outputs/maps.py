@@ -45,7 +45,6 @@ from rasterizers.interface import Camera, Rasterizer
 
 _log = logging.getLogger(__name__)
 
-MAPS: Final = ("reliability", "demand", "weight", "corrected", "conflict")
 _NOTE: Final = (
     "reliability, demand, weight: means over pixels; corrected, conflict: means over the Gaussians that the view moves "
     "at both scales"
@@ -58,7 +57,7 @@ class ViewMaps:
     """The maps of one training view.
 
     Args:
-        maps: by the names in `MAPS`, at HR, in [0, 1]; "corrected" only where a strategy corrects.
+        maps: by the names in `viewing.points.MAPS`, at HR, in [0, 1]; "corrected" only where a strategy corrects.
         means: by the same names, over pixels for the patch maps and over Gaussians for the others.
     """
 

@@ -22,9 +22,7 @@ from clear_strategies.core.evidence import Evidence, PatchMaps
 from clear_strategies.core.gradients import Grads, Shot
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
-
-Color = tuple[float, float, float]
-"""RGB in [0, 1]."""
+from rasterizers.interface import Color
 
 _DEVICE = "device"
 

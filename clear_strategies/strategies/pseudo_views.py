@@ -16,6 +16,7 @@ from typing import Final
 
 import torch
 
+from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry.continuation import continued
@@ -136,7 +137,7 @@ class PseudoViews(Strategy):
         borders: Sequence[ExtraView] = self.cache.get(_BORDERS, ())
         if not (made or borders) or t % self.every:
             return ()
-        generator = torch.Generator().manual_seed(self.cache[_SEED] * 1_000_003 + t)
+        generator = generator_at(self.cache[_SEED], t)
 
         def drawn(n: int) -> int:
             return int(torch.randint(n, (), generator=generator))

@@ -14,10 +14,12 @@ from typing import Final
 
 import torch
 
+from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import View
 from clear_strategies.geometry.pseudo_views import cut_out
 from clear_strategies.schedules import milestone
-from clear_strategies.strategies.base import Color, Strategy
+from clear_strategies.strategies.base import Strategy
+from rasterizers.interface import Color
 
 _FEW_VIEWS: Final = 5  # more views keep the background of the scene
 _LONG_RUN: Final = 1_350  # iterations over other colours; with fewer, surfaces have no time to become opaque
@@ -59,8 +61,7 @@ class RandomBackground(Strategy):
         """RGB, uniform in [0, 1]: a function of (seed, t)."""
         if t > self.until or self.cache.get("kept"):
             return None
-        generator = torch.Generator().manual_seed(self.cache.get("seed", 0) * 1_000_003 + t)
-        r, g, b = torch.rand(3, generator=generator).tolist()
+        r, g, b = torch.rand(3, generator=generator_at(self.cache.get("seed", 0), t)).tolist()
         return r, g, b
 
     def _why_kept(self, n_views: int) -> str:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from clear_strategies.core.compiled_rules import Anchor
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
+from clear_strategies.core.seeds import hashed_seed_at
 from clear_strategies.core.step import Step
 from clear_strategies.errors import AnchorError, SettingError
 from clear_strategies.schedules import Ramp, milestone
@@ -164,13 +165,6 @@ class SVS(Strategy):
 
 def dropout_mask(n: int, p: float, seed: int, t: int, device: torch.device | str = "cpu") -> Float[Tensor, " N"]:
     """Bernoulli(1 - p) / (1 - p) for n Gaussians, drawn on `device` and reproducible there from (seed, t).  Eq. 15"""
-    generator = torch.Generator(device).manual_seed(_mix(seed, t))
+    generator = torch.Generator(device).manual_seed(hashed_seed_at(seed, t))
     kept = torch.rand(n, generator=generator, device=device) >= p
     return kept.to(torch.get_default_dtype()) / (1 - p)
-
-
-def _mix(seed: int, t: int) -> int:
-    """Hash (seed, t) to 63 bits, so that neighbouring iterations get unrelated generators."""
-    x = (seed * 0x9E3779B97F4A7C15 + t * 0xBF58476D1CE4E5B9) & (2**64 - 1)
-    x = (x ^ (x >> 31)) * 0x94D049BB133111EB & (2**64 - 1)
-    return (x ^ (x >> 29)) >> 1

@@ -40,7 +40,7 @@ _GRADIENT: Final = 3 + 4 + 3 + 1 + 2 + 3  # of one cotangent
 _COTANGENTS: Final = 3  # L_LR, L_base, L_HF
 _EVIDENCE: Final = 8  # q, a, w, m, the scores and their sums
 # Floats per pixel of the largest HR image: the render with alpha and the ends of its blocks, two cotangents and their copy,
-# and what the losses hold, or P2G when it compares the SR image with the photo.
+# and what the losses hold, or a strategy that compares the SR image with the photo.
 _PER_PIXEL: Final = (3 + 1 + 2) + 2 * (2 * 3) + max(4 * 3, 8 * 3)
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.finite import is_finite, rows_not_finite
+from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError, DivergedError
@@ -96,7 +97,7 @@ class TrainState:
     def view(self) -> View:
         """The view of this iteration: every view once, in random order, then again in another."""
         epoch, position = divmod(self.t - 1, len(self.views))
-        generator = torch.Generator().manual_seed(self.settings.seed * 1_000_003 + epoch)
+        generator = generator_at(self.settings.seed, epoch)
         order = torch.randperm(len(self.views), generator=generator, device=generator.device)
         return self.views[int(order[position])]
 

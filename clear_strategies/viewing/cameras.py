@@ -30,7 +30,7 @@ from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.data.transforms import Transform, transforms_of
 from clear_strategies.data.view_settings import resized
 from clear_strategies.errors import DataError
-from rasterizers.interface import Camera
+from rasterizers.interface import Camera, Color
 
 FILE: Final = "cameras.json"
 PHOTOS: Final = "cameras"
@@ -55,7 +55,7 @@ class SavedCamera:
     split: Split = "train"
     scale: int = 1
     photo: Path | None = None
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Color = (0.0, 0.0, 0.0)
 
 
 def write_cameras(folder: Path, scene: Scene) -> None:
@@ -157,7 +157,7 @@ class _Entry(msgspec.Struct):
     split: str = "train"
     scale: Number = 1
     photo: str | None = None
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: Color = (0.0, 0.0, 0.0)
 
 
 class _Key(msgspec.Struct):

@@ -22,7 +22,7 @@ from torch import Tensor
 from clear_strategies import files
 from clear_strategies.viewing import paths
 from rasterizers.geometry import rotation_matrix, spherical_harmonics
-from rasterizers.interface import Camera, Splats
+from rasterizers.interface import Camera, Color, Splats
 
 if TYPE_CHECKING:
     import viser
@@ -56,9 +56,7 @@ def missing() -> str | None:
     return None if find_spec("viser") is not None else "viser is not installed: pip install 'clear-strategies[view]'"
 
 
-def write_page(
-    path: Path, splats: Splats, cameras: Sequence[Camera], title: str, background: tuple[float, float, float]
-) -> None:
+def write_page(path: Path, splats: Splats, cameras: Sequence[Camera], title: str, background: Color) -> None:
     """Write the page; it begins at the first camera. viser must be installed, see `missing`.
 
     Args:

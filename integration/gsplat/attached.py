@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.projection import intrinsics
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
@@ -28,7 +29,6 @@ from integration.views import enlarged_mask
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
-_PARAMETERS: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _ATTACHED: Final = "clear_attached"  # attribute of a wrapped function: its Attached
 _SAME_POSE: Final = 1e-3  # largest difference between the entries of two poses of one camera
 
@@ -77,8 +77,8 @@ class Attached:
             raise ValueError(
                 "at least one view is needed; integration.views.view(...) makes one from an image and a camera."
             )
-        self._params, self._names, self._views = params, {**dict.fromkeys(_PARAMETERS), **(names or {})}, tuple(views)
-        host_names = [self._host_name(name) for name in _PARAMETERS]
+        self._params, self._names, self._views = params, {**dict.fromkeys(PARAMETERS), **(names or {})}, tuple(views)
+        host_names = [self._host_name(name) for name in PARAMETERS]
         if missing := [name for name in host_names if name not in params]:
             raise ValueError(f"params must hold {', '.join(host_names)}; {missing[0]} is missing.")
         means = params[self._host_name("means")]
@@ -110,7 +110,7 @@ class Attached:
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
-        found = {name: self._params[self._host_name(name)] for name in _PARAMETERS}
+        found = {name: self._params[self._host_name(name)] for name in PARAMETERS}
         return found | ({"detail": self._params["detail"]} if "detail" in self._params else {})
 
     def wrap(self, rasterization: Rasterization) -> Rasterization:

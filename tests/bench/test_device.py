@@ -7,14 +7,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 
 from clear_strategies.bench import device
 from clear_strategies.bench.__main__ import main, parser
 from clear_strategies.bench.device import Step
 from clear_strategies.bench.results import Results
-from clear_strategies.compose import CONF
 from clear_strategies.errors import DataError
+from tests.helpers.configs import composed
 
 
 def request(tmp_path: Path, **options) -> device.Request:
@@ -105,8 +104,7 @@ def test_every_command_is_understood_by_its_program(tmp_path, quick):
             assert parser().parse_args(arguments).device == "cuda"
         elif module == "clear_strategies.run":
             overrides = [argument for argument in arguments if not argument.startswith("hydra.")]
-            with initialize_config_dir(str(CONF), version_base="1.3"):
-                config = compose("config", overrides)
+            config = composed(*overrides)
             assert config.fit.device == "cuda"
             assert set(config.strategies) == {"gco", "p2g", "svs"}
         else:

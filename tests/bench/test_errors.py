@@ -7,13 +7,12 @@ import math
 import pandas as pd
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 
 from clear_strategies.bench.__main__ import main
 from clear_strategies.bench.error_budget import HeldOut, budget, by_view, distance_from_hull, waves
-from clear_strategies.compose import CONF
 from clear_strategies.jobs import job
 from rasterizers.interface import Camera
+from tests.helpers.configs import composed
 
 TRIANGLE = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 2, 0]])
 
@@ -83,8 +82,7 @@ def test_of_a_single_camera_everything_else_is_outside():
 @pytest.mark.slow
 def test_the_command_reads_a_run_and_finds_its_own_psnr(tmp_path, capsys):
     small = ["data.reader.width=96", "data.reader.height=64", "fit.iterations=4", "fit.baseline=false", "fit.video=0"]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        psnr = job.run(compose("config", ["+strategy=gco", *small]), tmp_path / "run")
+    psnr = job.run(composed("+strategy=gco", *small), tmp_path / "run")
     asked = ["errors", str(tmp_path / "run"), "--reference", str(tmp_path / "run"), "--out", str(tmp_path / "out")]
     assert main(asked) == 0
     views = pd.read_csv(tmp_path / "out" / "errors_views.csv")

@@ -8,11 +8,9 @@ from importlib.util import find_spec
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from clear_strategies import DataError, Update
-from clear_strategies.compose import CONF
 from clear_strategies.core.gradients import Grads
 from clear_strategies.density.base import DensityError
 from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings
@@ -23,6 +21,7 @@ from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam, LearningRates
 from tests.helpers import toy
 from tests.helpers.command_line import TINY, run
+from tests.helpers.configs import composed
 from tests.helpers.gsplat_densifier import DEFAULT, MCMC, TINY_ONE, N, look, need, settings, tagged
 
 
@@ -155,10 +154,7 @@ def test_our_mcmc_is_gsplats_but_for_its_cuda_kernels(monkeypatch):
 
 
 def test_any_class_of_that_shape_is_chosen_by_its_name():
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose(
-            "config", ["density=gsplat", f"density.strategy._target_={TINY_ONE}", "+density.strategy.wander=3"]
-        )
+    config = composed("density=gsplat", f"density.strategy._target_={TINY_ONE}", "+density.strategy.wander=3")
     made = build(OmegaConf.to_container(config.density)).densifier(N, extent=1.0, seed=0, white_background=False)
     assert (type(made.strategy).__name__, made.strategy.wander) == ("Tiny", 3)
     assert made.strategy.refine_start_iter == 500

@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 
-from clear_strategies.compose import CONF
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import job, scene
@@ -23,6 +21,7 @@ from clear_strategies.outputs.score_table import OURS_MINUS_BASELINE
 from clear_strategies.training.signals import Interrupted
 from tests.helpers import pictures
 from tests.helpers.command_line import TINY
+from tests.helpers.configs import composed
 
 ITERATIONS = 12
 SLOW = pytest.mark.slow
@@ -56,9 +55,7 @@ def logged(caplog: pytest.LogCaptureFixture) -> None:
 def train(
     folder: Path, *overrides: str, strategy: str = "gco", watch: Callable[[], None] | None = None
 ) -> float | None:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", [f"+strategy={strategy}", "fit.baseline=true", *SMALL, *overrides])
-    return job.run(config, folder, watch)
+    return job.run(composed(f"+strategy={strategy}", "fit.baseline=true", *SMALL, *overrides), folder, watch)
 
 
 class Iterations:
@@ -212,8 +209,7 @@ def test_what_is_a_baseline_itself_trains_none(tmp_path, overrides, why, caplog)
 
 
 def test_the_jobs_of_a_sweep_train_none(tmp_path, monkeypatch, caplog):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", ["hydra.mode=MULTIRUN", "hydra.job.num=0"], return_hydra_config=True)
+    config = composed("hydra.mode=MULTIRUN", "hydra.job.num=0", hydra=True)
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
     HydraConfig.instance().set_config(config)
     with caplog.at_level("DEBUG"):
@@ -223,8 +219,5 @@ def test_the_jobs_of_a_sweep_train_none(tmp_path, monkeypatch, caplog):
 
 
 def test_the_demo_trains_it_and_other_data_do_not():
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        trained = {
-            data: compose("config", [f"data={data}"]).fit.baseline for data in ("demo", "llff", "colmap", "photos")
-        }
+    trained = {data: composed(f"data={data}").fit.baseline for data in ("demo", "llff", "colmap", "photos")}
     assert trained == {"demo": True, "llff": False, "colmap": False, "photos": False}

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 
-from clear_strategies.compose import CONF, tree
+from clear_strategies.compose import tree
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device
 from clear_strategies.jobs.device import RasterizerSettings, drawn_on
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from rasterizers.interface import RasterSettings, Traits
 from rasterizers.reference import ReferenceRasterizer
+from tests.helpers.configs import composed
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,7 @@ class Blank:
 
 
 def settings(*overrides: str) -> JobSettings:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return settings_of(tree(compose("config", list(overrides))))
+    return settings_of(tree(composed(*overrides)))
 
 
 def test_a_device_that_is_not_there_is_refused_in_one_sentence(monkeypatch):

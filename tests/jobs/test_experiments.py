@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra._internal.utils import create_config_search_path
@@ -29,15 +28,7 @@ from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 from tests.helpers.command_line import TINY, run
-
-
-def names(group: str) -> list[str]:
-    return sorted(p.stem for p in (CONF / group).glob("*.yaml") if not p.stem.startswith("_"))
-
-
-def composed(*overrides: str) -> DictConfig:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", list(overrides))
+from tests.helpers.configs import composed, options
 
 
 def jobs(*arguments: str) -> tuple[list[dict[str, str]], Callable[[dict[str, str]], DictConfig]]:
@@ -65,7 +56,7 @@ def pieces(config: DictConfig, stretch: float = 1.0):
     return [scaled(s, stretch) for s in strategies.values()], *(scaled(thing, stretch) for thing in built)
 
 
-@pytest.mark.parametrize("name", names("method"))
+@pytest.mark.parametrize("name", options("method"))
 @pytest.mark.parametrize("fused", [pytest.param("off", marks=pytest.mark.slow), "auto"])
 def test_every_method_trains(name, fused):
     """Few iterations of a toy, through every phase; the loss that it is about falls."""
@@ -119,7 +110,7 @@ def test_the_compiled_pass_sees_the_same_gradients(lambda_lr, lr_from):
 def test_what_the_methods_are():
     """Weights, filters and dropout, row by row of docs/how-to/baselines.md."""
     found = {}
-    for name in names("method"):
+    for name in options("method"):
         c = composed(f"+method={name}")
         hr = c.objective.lambda_hr
         assert hr.peak == hr.final
@@ -214,7 +205,7 @@ def test_the_evidence_differs_in_what_it_sweeps_alone(experiment):
 
 
 def test_every_experiment_has_a_test():
-    assert {*SCENES, *ROWS, *EVIDENCE, "smoke"} == set(names("experiment"))
+    assert {*SCENES, *ROWS, *EVIDENCE, "smoke"} == set(options("experiment"))
 
 
 def test_the_protocols_are_the_papers():

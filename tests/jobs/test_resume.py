@@ -6,19 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 
-from clear_strategies.compose import CONF, tree
+from clear_strategies.compose import tree
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import resume
 from clear_strategies.training.loop import iterate
 from tests.helpers import toy
+from tests.helpers.configs import composed
 from tests.helpers.short_run import start
 
 
 def compared(*overrides: str):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return resume.comparable(tree(compose("config", list(overrides))))
+    return resume.comparable(tree(composed(*overrides)))
 
 
 def test_resuming_on_another_device_is_logged(caplog):

@@ -6,9 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
 
-from clear_strategies.compose import CONF, tree
+from clear_strategies.compose import tree
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.priors import Bicubic, Corrupted, Ncnn, ncnn
 from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio
@@ -18,6 +17,7 @@ from clear_strategies.errors import SettingError
 from clear_strategies.jobs.scene import AutoPrior, DataSettings, load, require_factor
 from clear_strategies.jobs.settings import settings_of
 from tests.helpers import captures, fake_ncnn
+from tests.helpers.configs import composed
 
 
 def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
@@ -103,8 +103,7 @@ def test_auto_says_why_a_factor_is_left_to_bicubic(tmp_path, monkeypatch, caplog
 @pytest.mark.parametrize("prior", ["realesrgan", "waifu2x"])
 def test_a_factor_that_the_network_has_not_is_refused_before_data_is_read(prior: str, tmp_path: Path, monkeypatch):
     fake_ncnn.install(tmp_path, monkeypatch)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        values = tree(compose("config", [f"prior={prior}", "data.views.sr_scale=3"]))
+    values = tree(composed(f"prior={prior}", "data.views.sr_scale=3"))
     with pytest.raises(SettingError, match=rf"^data\.views\.sr_scale: must be (2 or )?4 with {prior}, got 3: "):
         settings_of(values)
 

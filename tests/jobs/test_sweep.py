@@ -15,6 +15,7 @@ from clear_strategies.jobs import sweep
 from clear_strategies.jobs.sweep import Sweep, Watch
 from clear_strategies.training import checkpoint
 from tests.helpers.command_line import TINY, run, started, stopped_by, trains, wait_for
+from tests.helpers.configs import composed
 
 AUTO = ["fit.resume=auto", *TINY]
 SWEEP = ["-m", "hydra.sweep.dir=all", *AUTO]
@@ -201,14 +202,10 @@ def test_the_threads_of_one_job_are_not_those_of_the_next():
 @pytest.mark.skipif(find_spec("submitit") is None, reason="submitit is not installed: pip install -e '.[sweeps]'")
 def test_the_slurm_configuration_is_one_that_submitit_takes(tmp_path):
     """hydra/launcher=slurm, composed and turned into the head of a batch file."""
-    from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf
     from submitit.slurm.slurm import _make_sbatch_string
 
-    from clear_strategies.compose import CONF
-
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        launcher = compose("config", ["hydra/launcher=slurm"], return_hydra_config=True).hydra.launcher
+    launcher = composed("hydra/launcher=slurm", hydra=True).hydra.launcher
     fields = {k: v for k, v in launcher.items() if k not in ("_target_", "submitit_folder", "max_num_timeout")}
     names = {"name": "job_name", "timeout_min": "time", "mem_gb": "mem", "tasks_per_node": "ntasks_per_node"}
     plain = {names.get(k, k): OmegaConf.to_container(v) if OmegaConf.is_config(v) else v for k, v in fields.items()}

@@ -16,12 +16,13 @@ from clear_strategies.core.gradients import Grads, conflict_ratio
 from clear_strategies.core.view import DepthMap, View
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.merging.objective import Objective
-from clear_strategies.outputs.maps import MAPS, view_maps, write_maps
+from clear_strategies.outputs.maps import view_maps, write_maps
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.strategies.p2g import patch_evidence
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import TrainState
+from clear_strategies.viewing.points import MAPS
 from tests.helpers import toy
 
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")

@@ -14,16 +14,15 @@ import traceback
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from clear_strategies.compose import CONF
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import job
 from clear_strategies.jobs.resume import CHECKPOINTS
 from clear_strategies.training import checkpoint
 from tests.helpers import pictures
 from tests.helpers.command_line import TINY
+from tests.helpers.configs import composed
 from tests.stress.rows import Row, Worst
 
 # Every event of a run and a checkpoint every third iteration.
@@ -42,8 +41,7 @@ def measure(folder: Path, kills: int, *, seed: int = 0) -> Row:
 
 
 def _measure(folder: Path, kills: int, seed: int) -> Row:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", _RUN)
+    config = composed(*_RUN)
     job.run(config, folder / "warm")  # in this process, so that its children need not import anything
     began = time.monotonic()
     _require_done(_started(config, folder / "whole"))

@@ -12,13 +12,12 @@ from pathlib import Path
 from unittest import mock
 
 import torch
-from hydra import compose, initialize_config_dir
 
-from clear_strategies.compose import CONF
 from clear_strategies.jobs import job
 from clear_strategies.training import memory
 from clear_strategies.training.state import TrainState
 from tests.helpers.command_line import TINY
+from tests.helpers.configs import composed
 from tests.stress.rows import Row
 
 _BOUND = 0.15
@@ -49,7 +48,7 @@ def run(overrides: Sequence[str]) -> tuple[float, float, float, int]:
     """
     torch.set_num_threads(1)
     folder = Path(tempfile.mkdtemp())
-    job.run(_config([*TINY, "+strategy=clear", "fit.video=0"]), folder / "imports")
+    job.run(composed(*TINY, "+strategy=clear", "fit.video=0"), folder / "imports")
     gc.collect()
     ctypes.CDLL("libc.so.6").malloc_trim(0)
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
@@ -72,11 +71,6 @@ def run(overrides: Sequence[str]) -> tuple[float, float, float, int]:
         return ended
 
     with mock.patch.object(memory, "needs", noted), mock.patch.object(job, "fit", watched):
-        job.run(_config(overrides), folder / "run")
+        job.run(composed(*overrides), folder / "run")
     one = found[0]
     return (one.peak(most[0]) - base) / 2**20, (reached[0] - base) / 2**20, (one.reached - base) / 2**20, most[0]
-
-
-def _config(overrides: Sequence[str]):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", list(overrides))

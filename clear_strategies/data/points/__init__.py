@@ -24,6 +24,7 @@ from clear_strategies.geometry.dense_stereo.filling import STRIDE
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.interpolation import densify, pixel_grid
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
+from rasterizers.interface import Color
 
 __all__ = [
     "CloudSettings",
@@ -143,7 +144,7 @@ def initial_points(
     sfm: SfmPoints | None = None,
     train_ids: Sequence[int] = (),
     sfm_is_train: bool = False,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
     seed: int = 0,
 ) -> InitialPoints:
     """The cloud a run starts from.
@@ -202,7 +203,7 @@ def _from_photos(
     hr_is_photo: bool,
     sfm: SfmPoints | None,
     known: PointCloud | None,
-    background: tuple[float, float, float] | None,
+    background: Color | None,
 ) -> tuple[PointCloud | None, tuple[DepthMap, ...]]:
     """Points from the training LR images, and their depth maps; None where init=auto finds too few.
 
@@ -263,7 +264,7 @@ def _cleaned(
     settings: CloudSettings,
     cloud: PointCloud,
     photos: Sequence[Photo],
-    background: tuple[float, float, float] | None,
+    background: Color | None,
 ) -> PointCloud:
     cloud = without_outliers(cloud, settings.outlier_neighbours, settings.outlier_ratio)
     return _densified(settings, cloud, photos, background)
@@ -273,7 +274,7 @@ def _densified(
     settings: CloudSettings,
     cloud: PointCloud,
     photos: Sequence[Photo],
-    background: tuple[float, float, float] | None,
+    background: Color | None,
 ) -> PointCloud:
     grid = sum(len(pixel_grid(photo, settings.stride)) for photo in photos)
     if settings.densify == "auto" and len(cloud) >= grid:

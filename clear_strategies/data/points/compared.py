@@ -19,6 +19,7 @@ from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.pseudo_views import cut_out
+from rasterizers.interface import Color
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,9 +39,7 @@ class Compared:
     finer: float
     settings: StereoSettings
 
-    def depth_maps(
-        self, points: Float[Tensor, "N 3"], background: tuple[float, float, float] | None
-    ) -> tuple[DepthMap, ...]:
+    def depth_maps(self, points: Float[Tensor, "N 3"], background: Color | None) -> tuple[DepthMap, ...]:
         """A map for each of `photos`. `points` and `background` as in `depth_maps` of the package geometry."""
         if self.reduction == 1:
             return self._maps(self.images, points, background, self.settings)
@@ -54,7 +53,7 @@ class Compared:
         self,
         photos: Sequence[Photo],
         points: Float[Tensor, "N 3"],
-        background: tuple[float, float, float] | None,
+        background: Color | None,
         settings: StereoSettings,
     ) -> tuple[DepthMap, ...]:
         return tuple(depth_maps(photos, points, settings, background, self.masks(photos)))
@@ -70,7 +69,7 @@ def compared_at(
     *,
     hr_is_photo: bool,
     settings: StereoSettings,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Color = (0.0, 0.0, 0.0),
 ) -> Compared:
     """The choice for these photos: HR, reduced to at most `settings.max_pixels`, where that is larger than LR, else LR.
 

@@ -15,7 +15,8 @@ from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO
 from clear_strategies.geometry.dense_stereo import filling
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.libraries import REMEDY, missing
-from clear_strategies.geometry.projection import back_project, inside_of, project
+from clear_strategies.geometry.projection import back_project, seen_pixels
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
@@ -26,7 +27,7 @@ def stereo_cloud(
     maps: Sequence[DepthMap],
     settings: StereoSettings,
     *,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
     masks: Sequence[Bool[Tensor, "h w"]] | None = None,
     fill: bool = True,
     stride: int = filling.STRIDE,
@@ -104,11 +105,9 @@ def covered_squares(
     """Which squares hold the projection of a point that lies on the surface."""
     square = squares_of(found, spacing)
     covered = torch.zeros(int(square.max()) + 1, dtype=torch.bool)
-    pixels, depth = project(photo.camera, points)
-    inside = inside_of(photo.camera, pixels, depth)
-    x, y = pixels[inside].long().unbind(dim=1)
-    same = (found.depth.cpu()[y, x] / depth[inside] - 1).abs() <= tolerance
-    covered[square[y[same], x[same]]] = True
+    _, row, column, depth = seen_pixels(photo.camera, points)
+    same = (found.depth.cpu()[row, column] / depth - 1).abs() <= tolerance
+    covered[square[row[same], column[same]]] = True
     return covered
 
 
@@ -126,9 +125,6 @@ def best_per_square(found: DepthMap, spacing: float, covered: Bool[Tensor, " S"]
 
 def shows(photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
     """Whether the photo has depth at the pixel of each point."""
-    pixels, depth = project(photo.camera, points)
-    inside = inside_of(photo.camera, pixels, depth)
-    result = torch.zeros(len(points), dtype=torch.bool)
-    x, y = pixels[inside].long().unbind(dim=1)
-    result[inside] = found.known.cpu()[y, x]
-    return result
+    inside, row, column, _ = seen_pixels(photo.camera, points)
+    inside[inside.clone()] = found.known.cpu()[row, column]
+    return inside

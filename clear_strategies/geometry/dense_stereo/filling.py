@@ -11,7 +11,8 @@ from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.interpolation import interpolate_depth, pixel_grid
-from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
+from clear_strategies.geometry.projection import back_project, is_background, sample_colors, seen_pixels
+from rasterizers.interface import Color
 
 STRIDE: Final = 2
 """LR px between the points of the grid, by default."""
@@ -24,7 +25,7 @@ def fill(
     photos: Sequence[Photo],
     maps: Sequence[DepthMap],
     stride: int,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
     masks: Sequence[Bool[Tensor, "h w"]] | None = None,
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """(positions, colours) of a grid of `stride` px over the unknown parts of each photo.
@@ -46,7 +47,7 @@ def fill(
         grid = grid[unknown[y, x]]
         shade = sample_colors(photo.image, grid)
         if background is not None:
-            surface = ((shade - torch.tensor(background)).abs() > 2 / 255).any(dim=1)
+            surface = ~is_background(shade, background)
             grid, shade = grid[surface], shade[surface]
         inverse_depth = interpolate_depth(means, photo, grid, 2 * stride) if len(grid) else None
         if inverse_depth is None:
@@ -63,9 +64,6 @@ def fill(
 
 def floats(points: Float[Tensor, "N 3"], photo: Photo, found: DepthMap) -> Bool[Tensor, " N"]:
     """Whether the photo looks through the point at a surface behind it."""
-    pixels, depth = project(photo.camera, points)
-    inside = inside_of(photo.camera, pixels, depth)
-    result = torch.zeros(len(points), dtype=torch.bool)
-    x, y = pixels[inside].long().unbind(dim=1)
-    result[inside] = depth[inside] < _NEARER * found.depth.cpu()[y, x].double()
-    return result
+    inside, row, column, depth = seen_pixels(photo.camera, points)
+    inside[inside.clone()] = depth < _NEARER * found.depth.cpu()[row, column].double()
+    return inside

@@ -17,14 +17,14 @@ from clear_strategies.geometry.dense_stereo.depth import Estimate, estimate
 from clear_strategies.geometry.dense_stereo.image import Grey, grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons
-from clear_strategies.geometry.projection import inside_of, project
+from clear_strategies.geometry.projection import is_background, seen_pixels
 from clear_strategies.geometry.sift import features_of
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
 _MANY_PHOTOS = 12  # from here on, two others must agree
 _ASKED = 8  # the most photos that are asked to confirm one
-_BACKGROUND = 2 / 255  # largest difference of a background pixel from the background's colour
 _FEW_POINTS = 10  # triangulated points in a photo below which they do not judge its depth
 _CLOSE = 0.1  # relative error up to which depth agrees with a triangulated point
 
@@ -33,7 +33,7 @@ def depth_maps(
     photos: Sequence[Photo],
     points: Float[Tensor, "N 3"] | None = None,
     settings: StereoSettings | None = None,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
     masks: Sequence[Bool[Tensor, "h w"]] | None = None,
 ) -> list[DepthMap]:
     """The depth of each photo where others confirm it; unknown everywhere for photos whose stereo cannot be trusted.
@@ -65,8 +65,7 @@ def depth_maps(
         good = confirmed.agreeing >= min(needed, len(others))
         good &= (mine.correlation >= settings.min_correlation) & (confirmed.agreeing > 0)
         if background is not None:
-            color = torch.tensor(background).to(photo.image)
-            good &= ((photo.image - color).abs() > _BACKGROUND).any(dim=-1)
+            good &= ~is_background(photo.image, background)
         if masks is not None:
             good &= masks[i].to(good.device)
         confidence = mine.correlation.clamp(0, 1) * (confirmed.agreeing.float() / 2).clamp(max=1)
@@ -117,11 +116,9 @@ def _judged(photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"], setting
     """The depth map, or an unknown one where it covers too little or contradicts the triangulated points."""
     if found.coverage < settings.trust:
         return _unknown(photo, f"its depth is confirmed at only {found.coverage:.1%} of the pixels")
-    pixels, depth = project(photo.camera, points)
-    inside = inside_of(photo.camera, pixels, depth)
-    x, y = pixels[inside].long().unbind(dim=1)
+    _, row, column, depth = seen_pixels(photo.camera, points)
     # An occluded point says nothing, so only points in front of the surface contradict it.
-    ratio = found.depth.cpu()[y, x] / depth[inside]
+    ratio = found.depth.cpu()[row, column] / depth
     ratio = ratio[ratio.isfinite()]
     contradictions = float((ratio > 1 + _CLOSE).float().mean()) if len(ratio) >= _FEW_POINTS else 0.0
     if contradictions > 0.5:

@@ -8,18 +8,17 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from torch import Tensor
 
-from clear_strategies.compose import CONF
 from clear_strategies.core import images
 from clear_strategies.data.priors import Bicubic, Cached, Corrupted, DemoPrior
 from clear_strategies.data.readers import demo
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.settings import build
+from tests.helpers.configs import composed
 
 
 class Sharp:
@@ -63,8 +62,7 @@ def test_its_label_names_the_prior_and_says_synthetic():
 
 
 def test_a_network_inside_is_cached_and_the_config_builds_it(tmp_path):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose("config", ["prior=corrupted", "prior.prior.path=net.onnx", "prior.share=0.5"])
+    config = composed("prior=corrupted", "prior.prior.path=net.onnx", "prior.share=0.5")
     prior = build(OmegaConf.to_container(config.prior))
     assert isinstance(prior.prior, Cached)
     assert (prior.prior.prior.path, prior.share) == ("net.onnx", 0.5)

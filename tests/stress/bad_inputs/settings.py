@@ -7,12 +7,12 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from clear_strategies.compose import CONF, tree
+from clear_strategies.compose import tree
 from clear_strategies.jobs import device
 from clear_strategies.jobs.settings import settings_of
+from tests.helpers.configs import composed
 from tests.stress.bad_inputs import BadInput
 
 # An override, and what the message says beside the setting's name.
@@ -116,8 +116,7 @@ _REFUSED: dict[str, str] = {
 
 @cache
 def _sound() -> DictConfig:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", ["+strategy=best"])
+    return composed("+strategy=best")
 
 
 def _given(override: str) -> Callable[[Path], object]:
