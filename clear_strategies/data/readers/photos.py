@@ -70,7 +70,7 @@ def read(
     require_number("data.reader.least_placed", least_placed, above=0, most=1)
     require_whole("data.reader.threads", threads, least=-1)
     require_whole("data.reader.seed", seed, least=0)
-    root, notes = Path(root), {}
+    root, name, notes = Path(root), Path(root).resolve().name, {}
     if frames is not None:
         require_whole("data.reader.frames", frames, least=sfm.FEWEST)
     if root.is_file():
@@ -97,7 +97,7 @@ def read(
         settings = sfm.SfmSettings(max_side, max_features, careful, least_placed, threads, seed)
         sfm.reconstruct(root, photos, folder, settings)
     found = _capture(root, paths, photos, folder)
-    return replace(found, notes={**found.notes, **notes})
+    return replace(found, name=name, notes={**found.notes, **notes})
 
 
 def _capture(root: Path, paths: Sequence[Path], photos: Mapping[Path, Exif], folder: Path) -> Capture:

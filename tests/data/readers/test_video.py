@@ -10,6 +10,7 @@ import pytest
 import skimage.data
 
 from clear_strategies.commands.train import overrides
+from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import photos, video
 from clear_strategies.data.readers.video import choose, frames_of
 from clear_strategies.errors import DataError, SettingError
@@ -77,6 +78,12 @@ def test_photos_of_a_video_are_its_frames(clip, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         photos.read(clip, frames=6)
     assert [path.name for path in seen] == [f"around the room_{k:03d}.jpg" for k in range(1, 7)]
+
+
+def test_the_scene_has_the_name_of_its_video(clip, monkeypatch):
+    monkeypatch.setattr(photos.sfm, "reconstruct", lambda *_: None)
+    monkeypatch.setattr(photos, "_capture", lambda root, *_: Capture(root.name, (), None))
+    assert photos.read(clip, frames=6).name == clip.name
 
 
 def test_train_takes_a_video(clip):
