@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -42,12 +44,13 @@ def time_against_quality(probes: pd.DataFrame) -> Figure:
         probes: the table `seconds_probes`.
     """
     scenes = list(probes["scene"].unique())
-    figure = Figure(figsize=(1.2 + 3 * len(scenes), 3.6), layout="constrained")
+    figure = Figure(figsize=(1.2 + 3 * len(scenes), 4.2), layout="constrained")
     axes = figure.subplots(1, len(scenes), squeeze=False)[0]
     colours = {variant: f"C{i}" for i, variant in enumerate(probes["variant"].unique())}
     for axis, scene in zip(axes, scenes, strict=True):
         for (variant, seed), rows in probes[probes["scene"] == scene].groupby(["variant", "seed"], sort=False):
-            label = None if variant in axis.get_legend_handles_labels()[1] else variant
+            name = textwrap.fill(variant, 48 * len(scenes))
+            label = None if name in axis.get_legend_handles_labels()[1] else name
             axis.plot(rows["training_s"], rows["psnr"], "o-", markersize=3, color=colours[variant], label=label)
             axis.annotate(
                 f"{seed}", tuple(rows[["training_s", "psnr"]].iloc[-1]), (4, 0), textcoords="offset points", fontsize=7
@@ -55,5 +58,5 @@ def time_against_quality(probes: pd.DataFrame) -> Figure:
         axis.set(title=scene, xlabel="seconds of training")
         axis.grid(alpha=0.25)
     axes[0].set_ylabel("PSNR of the test views, dB")
-    axes[0].legend()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", fontsize=8)
     return figure
