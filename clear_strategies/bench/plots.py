@@ -58,5 +58,7 @@ def time_against_quality(probes: pd.DataFrame) -> Figure:
         axis.set(title=scene, xlabel="seconds of training")
         axis.grid(alpha=0.25)
     axes[0].set_ylabel("PSNR of the test views, dB")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", fontsize=8)
+    handles, names = axes[0].get_legend_handles_labels()
+    beside = max(1, 40 * len(scenes) // max(map(len, names)))  # columns that the width holds
+    figure.legend(handles, names, loc="outside lower left", fontsize=8, ncols=min(beside, len(names)))
     return figure
