@@ -103,6 +103,7 @@ def test_v_shows_what_run_log_has(demo):
     assert fields[0] == fields[1]
 
 
+@pytest.mark.slow
 def test_of_many_jobs_the_console_has_a_line_each(tmp_path):
     result = run("-m", "+strategy=gco,svs", *TINY, "fit.iterations=3", "hydra.sweep.dir=all", cwd=tmp_path)
     assert result.returncode == 0, result.stderr

@@ -88,6 +88,7 @@ def test_report_of_a_run(finished):
     assert "Traceback" not in nothing.stderr
 
 
+@pytest.mark.slow
 def test_resuming_through_the_door_gives_the_same_field(finished):
     """A run cut by SIGTERM and resumed ends where the uninterrupted one did."""
     overrides, said = ["+strategy=clear", *TINY], finished / "said_before_the_cut"
@@ -134,6 +135,7 @@ def test_a_strategy_of_another_package(tmp_path):
     assert "GCO and Mine both implement correct()" in clash.stdout + clash.stderr
 
 
+@pytest.mark.slow
 def test_lr_images_are_written_for_an_external_model_whose_results_come_back(tmp_path):
     """data.save_lr writes and stops; whatever enlarges those files is then a prior."""
     from PIL import Image

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.helpers.command_line import started
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -28,6 +30,7 @@ def test_importing_is_light():
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.slow
 def test_messages_are_shown_where_the_host_has_not_configured_logging(tmp_path):
     alone = "import logging; from integration.log import show_log; show_log(); logging.getLogger('integration.x').info('said')"
     configured = alone.replace(

@@ -104,6 +104,7 @@ def cut(tmp_path_factory: pytest.TempPathFactory) -> Callable[[int, Path], Inter
     return copy
 
 
+@pytest.mark.slow
 def test_the_baseline_is_the_run_without_strategies_on_the_same_scene(whole, tmp_path, monkeypatch, caplog):
     loads = []
     prepare = scene.load

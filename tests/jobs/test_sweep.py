@@ -84,6 +84,7 @@ def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same
     assert json.loads((tmp_path / "here" / "metrics.json").read_text())["seconds"] >= seconds[-1]
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on_by_itself_and_ends_the_same(whole, tmp_path):
     every = [*AUTO, "fit.iterations=40", "+strategy=clear", "hydra.run.dir=here"]
     process = started("-c", stopped_by(signal.SIGTERM, after=20), *every, cwd=tmp_path, said=tmp_path / "said")
@@ -109,6 +110,7 @@ def test_torch_and_kernels_divide_the_cores_among_the_jobs(monkeypatch):
     assert sweep.threads(1) == 2
 
 
+@pytest.mark.slow
 def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, monkeypatch):
     """So the same command, started several times, shares the work."""
     from clear_strategies.jobs.lock import hold

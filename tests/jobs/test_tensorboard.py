@@ -15,6 +15,7 @@ SMALL = [*TINY, "fit.map_views=0", "fit.video=0", "fit.probe_every=5000", "fit.t
          "prior=bicubic", "+strategy=gco"]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_numbers_and_pictures_are_there_and_a_resumed_run_goes_on_in_the_same_log(tmp_path):
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator

@@ -19,6 +19,7 @@ SMALL = [
 ]
 
 
+@pytest.mark.slow
 def test_a_run_that_is_watched_has_the_bits_of_one_that_is_not(tmp_path):
     pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
     fields = []

@@ -62,6 +62,7 @@ def names(folder: Path) -> set[str]:
     return {path.name + "/" * path.is_dir() for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 def test_every_file_of_a_run_is_listed(tmp_path: Path, state: TrainState) -> None:
     evaluation = write(tmp_path, state)
     assert names(tmp_path) == set(FILES) - WRITTEN_BY_OTHERS
@@ -76,6 +77,7 @@ def test_every_file_of_a_run_is_listed(tmp_path: Path, state: TrainState) -> Non
     assert names(tmp_path / "renders") == {f"{view.name}.png"}
 
 
+@pytest.mark.slow
 def test_the_baseline_beside_a_run_is_shown_and_its_means_are_kept(tmp_path: Path, state: TrainState) -> None:
     write(tmp_path / "run" / "baseline", state, pictures=None)
     scores = {"renders/", "point_cloud.ply", "history.csv", "conflict.csv", "timing.csv", "metrics.json"}

@@ -24,6 +24,7 @@ from clear_strategies.errors import DataError
 pycolmap = pytest.importorskip("pycolmap")
 
 
+@pytest.mark.slow
 def test_poses_are_those_of_the_ground_truth(
     shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
