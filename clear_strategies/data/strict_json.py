@@ -1,10 +1,12 @@
-"""JSON files read strictly, and what they must hold as msgspec types.
+"""JSON files read strictly, and what they must hold as msgspec types, which ignore keys that they lack:
 
-class Run(msgspec.Struct):
-iterations: Count
-scores: dict[str, float | None]
+    class Run(msgspec.Struct):
+        iterations: Count
+        scores: dict[str, float | None]
 
-run = typed(path, read_object(path), Run, remedy="train the run again")
+    run = typed(path, read_object(path), Run, remedy="train the run again")
+
+A value that does not fit is refused with its place in the file.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -47,8 +48,7 @@ class PaperTable:
     @property
     def lines(self) -> dict[str, dict[str, str]]:
         """The table's lines of published.csv, by the paper's name of the method."""
-        with (Path(__file__).parent / "published.csv").open(newline="", encoding="utf-8") as file:
-            return {line["method"]: line for line in csv.DictReader(file) if line["table"] == self.key}
+        return {line["method"]: line for line in _published() if line["table"] == self.key}
 
     def columns(self, rows: Sequence[Row]) -> dict[str, Columns]:
         """The paper's numbers, each right of ours; LPIPS, which we do not measure, right of SSIM."""
@@ -113,6 +113,12 @@ class PaperTable:
         if clouds := planned("initial points"):
             found.append(f"initial points {' | '.join(clouds)} (the paper does not say where its own come from)")
         return found
+
+
+@cache
+def _published() -> list[dict[str, str]]:
+    with (Path(__file__).parent / "published.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 _LLFF_PIXELS: Final = ("2016x1512", "1008x756")

@@ -103,7 +103,7 @@ class SkipPolicy:
 
     def lr_due(self, view: View, hr_due: bool, work_log: WorkLog) -> bool:
         """Whether LR is rendered: not where HR at half its size is as large as the photo, for one render then serves both."""
-        if view.factor > 1 or not hr_due:
+        if view.factor > 1 or not hr_due or view is not self._coarse.get(view.name):
             return True
         work_log.skip("render LR", "HR at half its size is as large (skips.coarse_until)")
         return False

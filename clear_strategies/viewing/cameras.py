@@ -141,7 +141,7 @@ def _entry(number: int, view: View) -> dict[str, Any]:
 def _small(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
     """The image, reduced by a whole number to at most `_PHOTO_WIDTH` where it is wider."""
     factor = math.ceil(image.shape[1] / _PHOTO_WIDTH)
-    return images.area_mean(image.cpu(), factor) if factor > 1 else image.cpu()
+    return images.area_mean(image.cpu(), factor)
 
 
 class _Entry(msgspec.Struct):

@@ -123,6 +123,13 @@ def test_one_render_serves_both_scales_while_they_have_one_size():
     assert skipped == {"HR at half its size is as large (skips.coarse_until)": 11}  # not at t = 1, where λ_HR = 0
 
 
+def test_photos_that_sr_does_not_enlarge_are_rendered_at_both_scales():
+    view, work_log = toy.scene().train[0], WorkLog()
+    same, skip_policy = replace(view, hr=view.lr), SkipPolicy(Skips(coarse_until=10))
+    assert skip_policy.lr_due(skip_policy.view(same, 1), True, work_log)
+    assert not work_log.entries
+
+
 @pytest.mark.parametrize("bad", [{"hr_every": 0}, {"plateau_gain": 1.0}, {"coarse_until": -1}])
 def test_settings_out_of_range_are_refused(bad):
     with pytest.raises(ValueError, match="must"):
