@@ -9,12 +9,10 @@ import torch
 
 from clear_strategies.core.finite import is_finite
 from clear_strategies.density.adaptive import Density
-from clear_strategies.errors import DivergedError, SettingError
-from clear_strategies.schedules import LogLinear
+from clear_strategies.errors import DivergedError
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import FieldShot
 from clear_strategies.training.loop import fit, iterate
-from clear_strategies.training.optim import LearningRates
 from tests.helpers import toy
 from tests.helpers.short_run import SCENE, start, tensors
 
@@ -128,11 +126,3 @@ def test_gaussians_that_are_not_finite_do_not_vanish_as_faint():
     state.field.opacities.data[3] = float("nan")
     with pytest.raises(DivergedError, match=r"before densification, the parameter of opacities .* first Gaussian 3"):
         state.density.restructure(state.field, state.optimizer, 5)
-
-
-@pytest.mark.parametrize("rate", [1e30, float("inf"), float("nan"), -1.0])
-def test_learning_rates_beyond_use_are_refused(rate):
-    with pytest.raises(SettingError, match=r"scales must lie in \[0, 100\]"):
-        LearningRates(scales=rate)
-    with pytest.raises(SettingError, match=r"must lie in \(0, 100\]"):
-        LogLinear(initial=rate)

@@ -144,14 +144,6 @@ def test_opacities_fade_in_a_gsplat_host():
     assert after[1].min() > 0.005
 
 
-def test_opacities_fade_in_an_inria_style_host(inria_host, inria_capture):
-    opacities = [
-        trained_inria(inria_host, inria_capture, strategies, iterations=4)[0]._opacity.detach().sigmoid()
-        for strategies in ([], [FadingOpacity(rate=0.5)])
-    ]
-    assert opacities[1].mean() < 0.4 * opacities[0].mean()
-
-
 def test_splatsure_follows_a_host_that_densifies():
     strategies = pytest.importorskip("gsplat.strategy", reason="pip install gsplat")
     scene = toy.scene(40)

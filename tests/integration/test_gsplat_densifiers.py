@@ -42,15 +42,6 @@ def test_all_parameters_and_states_follow_the_densifier():
     assert float(host.splats["detail"].abs().max()) > 0
 
 
-def test_as_many_densify_by_the_score_as_by_the_ordinary_statistic():
-    grown = {}
-    for name, chosen in {"baseline": (), "p2g": (P2G(patch=4, score_by="evidence"),)}.items():
-        host, _ = run(*chosen, steps=6)
-        grown[name] = len(host.splats["means"]) - 40
-    assert grown["baseline"] > 3
-    assert abs(grown["p2g"] - grown["baseline"]) <= max(3, 0.3 * grown["baseline"])
-
-
 def test_densification_after_the_anchor_is_refused_before_the_first_step():
     with pytest.raises(SettingError, match=r"must end before the anchor is taken, got 24. Set refine_stop_iter=4"):
         run(SVS(anchor_start=5, anchor_strength=0.01))

@@ -66,13 +66,6 @@ def test_a_lock_that_says_nothing_is_respected(tmp_path, text):
     assert (tmp_path / NAME).read_text() == text
 
 
-def test_of_another_host_nothing_is_known(tmp_path):
-    leave(tmp_path, host="elsewhere")
-    with pytest.raises(DataError, match="cannot be known from") as caught, hold(tmp_path):
-        pass
-    assert not isinstance(caught.value, HeldError)
-
-
 @pytest.mark.parametrize(("job", "restarts", "taken"), [("7", "1", True), ("7", "0", False), ("8", "1", False)])
 def test_a_job_that_slurm_starts_again_elsewhere_takes_over_from_itself(tmp_path, monkeypatch, job, restarts, taken):
     leave(tmp_path, host="elsewhere", slurm_job="7", slurm_restarts=0)

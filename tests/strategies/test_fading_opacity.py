@@ -9,9 +9,7 @@ import torch
 
 from clear_strategies import FadingOpacity
 from clear_strategies.core.step import Step
-from clear_strategies.errors import SettingError
 from clear_strategies.schedules import scaled
-from clear_strategies.strategies.testing import check_strategy
 from clear_strategies.training.loop import iterate
 from tests.helpers.short_run import SCENE, start, tensors
 from tests.helpers.toy import RASTERIZER
@@ -25,10 +23,6 @@ def faded(settings, t=1, views=3, opacities=LOGITS):
     params = {"opacities": opacities.clone(), "means": torch.ones(len(opacities), 3)}
     strategy.after_step(params, Step(t, SCENE.train[0], None, None))
     return params
-
-
-def test_it_keeps_the_contract():
-    check_strategy(FadingOpacity)
 
 
 def test_every_opacity_loses_the_same_share_and_nothing_else_changes():
@@ -72,12 +66,6 @@ def test_without_a_rate_it_has_no_effect_and_says_so():
     assert torch.equal(faded(off)["opacities"], LOGITS)
     assert "rate is 0" in (off.without_effect(lambda_lr=1.0, lambda_hr=1.0) or "")
     assert FadingOpacity().without_effect(lambda_lr=1.0, lambda_hr=1.0) is None
-
-
-@pytest.mark.parametrize("bad", [-0.1, 1.0, float("nan")])
-def test_a_rate_outside_its_range_is_refused(bad):
-    with pytest.raises(SettingError, match="rate"):
-        FadingOpacity(rate=bad)
 
 
 def test_a_run_fades_and_every_row_has_the_bits_of_the_pass_that_skips_some():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from hypothesis import given, settings
@@ -81,12 +79,6 @@ def test_rows_without_conflict_are_bitwise_untouched_and_lr_always_is(seed):
         assert torch.equal(lr[group], before[group])
 
 
-def test_weight_zero_changes_nothing():
-    lr, hr = random_pair(1)
-    found = GCO(weight_min=0.0, weight_max=0.0).correct(lr, hr, None)
-    assert all(torch.equal(found[group], hr[group]) for group in CONFLICT_GROUPS)
-
-
 @given(seed=st.integers(0, 1_000))
 @settings(max_examples=20, deadline=None)
 def test_correction_helps_lr_and_never_lengthens_more_than_the_gradient(seed):
@@ -105,31 +97,6 @@ def test_decisions_do_not_change_when_a_loss_is_scaled_by_a_power_of_two(seed, i
     scaled = GCO().correct(lr * 2.0**i, hr * 2.0**j, None)
     for group in CONFLICT_GROUPS:
         assert torch.equal(scaled[group], found[group] * 2.0**j), group
-
-
-@pytest.mark.parametrize("factor", [1e-3, 1e-6, 1e-12, 1e3])
-def test_decisions_do_not_change_with_the_unit_of_the_losses(factor):
-    lr, hr = random_pair(3)
-    found, scaled = GCO().correct(lr, hr, None), GCO().correct(lr * factor, hr * factor, None)
-    for group in CONFLICT_GROUPS:
-        moved = (found[group] != hr[group]).flatten(1).any(1) if hr[group].dim() > 1 else found[group] != hr[group]
-        after = scaled[group] != (hr * factor)[group]
-        assert torch.equal(after.flatten(1).any(1) if after.dim() > 1 else after, moved)
-
-
-@pytest.mark.parametrize("norm", [1e-38, 1e-30, 1e-20, 1e-6, 1.0, 1e6, 1e15])
-def test_accurate_at_every_scale_of_gradients(norm):
-    lr, hr = random_pair(4, norm_lr=norm, norm_hr=norm)
-    found = GCO().correct(lr, hr, None)
-    for group in CONFLICT_GROUPS:
-        l, h = lr[group].double().reshape(200, -1), hr[group].double().reshape(200, -1)
-        n = l.norm(dim=1) * h.norm(dim=1)
-        c = (l * h).sum(1) / n
-        omega = ((-c - 0.05) / 0.95).clamp(0, 1).clamp(0.05, 0.75) * (c < -0.05)
-        expected = h - (omega * ((l * h).sum(1) + 0.05 * n) / (l * l).sum(1))[:, None] * l
-        error = (found[group].double().reshape(200, -1) - expected).norm(dim=1) / h.norm(dim=1)
-        if norm > 1e-37:  # below, float32 itself is subnormal
-            assert float(error.max()) < 1.2e-7
 
 
 def test_zero_gradients_are_no_conflict():
@@ -166,31 +133,6 @@ def test_a_prior_that_agrees_with_lr_makes_it_inactive_and_the_end_of_the_run_sa
     gco.correct(lr, hr, toy.step(evidence=Evidence(torch.zeros(200), torch.ones(200))))
     assert gco.in_hindsight(gco.logs) is None
     assert gco.in_hindsight({}) is None
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"tolerance": 1.2}, r"tolerance must lie in \[0, 1\), got 1.2"),
-        ({"tolerance": math.nan}, "tolerance"),
-        ({"weight_min": 0.8}, "weight_min <= weight_max"),
-        ({"groups": ("means", "colour")}, "groups must be among"),
-    ],
-)
-def test_settings_outside_their_range_are_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        GCO(**setting)
-
-
-@pytest.mark.parametrize("huge", [1e10, 1e20, 1e30])
-def test_one_huge_gradient_hides_no_conflict_of_the_others(huge):
-    """Every other Gaussian is in full conflict, whatever one of them does."""
-    g_lr = torch.randn(100, 3, generator=torch.Generator().manual_seed(0)) * 1e-5
-    g_hr = -g_lr
-    g_lr[0] = g_hr[0] = huge
-    corrected = GCO().correct(Grads({"means": g_lr}), Grads({"means": g_hr}), None)["means"]
-    assert bool((corrected[1:] != g_hr[1:]).any(1).all())
-    assert torch.equal(corrected[0], g_hr[0])
 
 
 def test_no_conflict_is_missed_where_norms_spread_over_ten_decades():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-import pytest
 import torch
 
 from clear_strategies import PseudoViews
@@ -14,8 +13,6 @@ from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.readers import demo
 from clear_strategies.data.view_settings import ViewSettings
-from clear_strategies.errors import SettingError
-from clear_strategies.strategies.testing import check_strategy
 from tests.helpers.short_run import SCENE, with_depth
 
 FEW = PseudoViews(count=8, reach=0.1)
@@ -26,10 +23,6 @@ def prepared(views, settings=FEW, seed=5):
     made.on_fit_start(len(views), seed)
     made.on_views(views)
     return made
-
-
-def test_it_keeps_the_contract():
-    check_strategy(PseudoViews)
 
 
 def test_large_photos_get_fewer_views_so_that_all_of_them_fit_into_memory(monkeypatch):
@@ -131,23 +124,3 @@ def test_an_object_cut_out_of_its_surroundings_needs_none(caplog):
 def test_without_an_lr_loss_it_has_no_effect():
     assert "lambda_lr is 0" in (FEW.without_effect(lambda_lr=0.0, lambda_hr=1.0) or "")
     assert FEW.without_effect(lambda_lr=1.0, lambda_hr=0.0) is None
-
-
-@pytest.mark.parametrize(
-    "bad",
-    [
-        {"every": 0},
-        {"count": 0},
-        {"reach": 0.0},
-        {"weight": 0.0},
-        {"tolerance": -1.0},
-        {"max_pixels": 0},
-        {"continued": -0.1},
-        {"continued": 1.5},
-        {"border": 0.9},
-        {"border": float("inf")},
-    ],
-)
-def test_a_setting_outside_its_range_is_refused(bad):
-    with pytest.raises(SettingError, match=next(iter(bad))):
-        PseudoViews(**bad)

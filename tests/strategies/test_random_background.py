@@ -9,7 +9,6 @@ import torch
 
 from clear_strategies import RandomBackground
 from clear_strategies.core.view import Photo
-from clear_strategies.strategies.testing import check_strategy
 from clear_strategies.training.loop import iterate
 from tests.helpers.short_run import SCENE, start
 from tests.helpers.toy import RASTERIZER
@@ -20,10 +19,6 @@ def prepared(views=SCENE.train, seed=5, until=1_350):
     strategy.on_fit_start(len(views), seed)
     strategy.on_views(views)
     return strategy
-
-
-def test_it_keeps_the_contract():
-    check_strategy(RandomBackground)
 
 
 def test_every_iteration_has_its_own_colour_a_function_of_the_seed():

@@ -123,21 +123,3 @@ def test_a_changed_number_of_gaussians_under_an_anchor_is_an_error():
         svs.regularize(params(21), 6)
     with pytest.raises(AnchorError, match="Stop densification at t_a"):
         svs.on_resize(torch.arange(19))
-
-
-@pytest.mark.parametrize(
-    ("setting", "message"),
-    [
-        ({"anchor_strength": -1}, "anchor_strength"),
-        ({"anchor_weights": {"mean": 1}}, "anchor_weights"),
-        ({"anchor_weights": {"means": -1}}, "anchor_weights"),
-    ],
-)
-def test_settings_outside_their_range_are_refused(setting, message):
-    with pytest.raises(ValueError, match=message):
-        SVS(**setting)
-
-
-def test_a_dropout_rate_of_one_is_refused():
-    with pytest.raises(ValueError, match=r"\[0, 1\)"):
-        Ramp(maximum=1.0)

@@ -98,16 +98,6 @@ def test_the_anchor_does_not_pull_a_second_time(fused):
     assert all(torch.equal(value, before[name]) for name, value in state.field.raw().items())
 
 
-def test_a_dark_view_darkens_the_field():
-    state = start(())
-    losses = []
-    for _ in range(30):
-        state.optimizer.steps += 1
-        losses.append(extra_steps(state, toy.RASTERIZER, [black()]))
-    read = deferred.resolve(losses)
-    assert read[-1][LOSS] < 0.8 * read[0][LOSS]
-
-
 def test_without_an_lr_loss_no_strategy_is_asked():
     state = start((), more=[Dark()])
     object.__setattr__(state.conductor.objective, "lambda_lr", 0.0)

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
-from clear_strategies.data.priors import Cached, Onnx, cache_folder
-from clear_strategies.errors import DataError
+from clear_strategies.data.priors import Cached, cache_folder
 from tests.helpers.networks import photo
 
 
@@ -99,11 +98,6 @@ def test_a_cache_that_cannot_be_written_costs_time_but_no_result(
     lr = photo(5, 6)
     assert Cached(Counting(str(model)), tmp_path / "file" / "cache")("view", lr, 2).shape == (10, 12, 3)
     assert "cannot be cached" in caplog.text
-
-
-def test_a_cached_model_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"absent\.onnx: file: is not there"):
-        Cached(Onnx(str(tmp_path / "absent.onnx")), tmp_path)("view", photo(4, 4), 4)
 
 
 def test_the_cache_is_where_the_environment_says(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
