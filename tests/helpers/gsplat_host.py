@@ -9,26 +9,11 @@ from contextlib import contextmanager
 import torch
 
 from clear_strategies import Conductor
-from clear_strategies.kernels import losses
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import LearningRates
 from integration.gsplat import Attached, attach
 from rasterizers import autograd
-
-
-class Photometric(torch.autograd.Function):
-    """0.8 L1 + 0.2 (1 - SSIM), the host's loss."""
-
-    @staticmethod
-    def forward(ctx, image, target):
-        loss = losses.photometric(image.detach().contiguous(), target, 0.2, kernels="torch")
-        ctx.gradient = loss.gradient
-        return image.new_tensor(float(loss.value))
-
-    @staticmethod
-    def backward(ctx, scale):
-        return ctx.gradient * scale, None
-
+from tests.helpers.host_parts import photometric
 
 rasterization = functools.partial(autograd.rasterization, backend="torch")
 
@@ -72,7 +57,7 @@ class Host:
             renders, _, info = self.render(camera, step)
             if self.strategy is not None:
                 self.strategy.step_pre_backward(self.splats, self.optimizers, self.state, step, info)
-            loss = Photometric.apply(renders[0], target) / self.accumulation
+            loss = photometric(renders[0], target) / self.accumulation
             (self.scaler.scale(loss) if self.scaler else loss).backward()
             if (step + 1) % self.accumulation == 0:
                 self.grads = {k: p.grad.clone() for k, p in self.splats.items() if p.grad is not None}

@@ -17,7 +17,8 @@ from gsplat.strategy import DefaultStrategy
 from clear_strategies.core.points import PointCloud
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
-from tests.helpers.gsplat_host import Photometric, intrinsics
+from tests.helpers.gsplat_host import intrinsics
+from tests.helpers.host_parts import photometric
 
 
 @dataclass
@@ -101,7 +102,7 @@ class Runner:
                 image_ids=torch.tensor([data["image_id"]]),
             )  # fmt: skip
             cfg.strategy.step_pre_backward(self.splats, self.optimizers, self.strategy_state, step, info)
-            Photometric.apply(renders[0], pixels[0]).backward()
+            photometric(renders[0], pixels[0]).backward()
             for optimizer in self.optimizers.values():
                 optimizer.step()
                 optimizer.zero_grad(set_to_none=True)

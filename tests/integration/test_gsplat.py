@@ -134,7 +134,7 @@ def test_without_a_strategy_the_gradient_is_that_of_the_summed_losses(attached):
     merged, _ = first_gradient(scene, (), attached)
     host = Host(scene)
     renders, _, _ = host.render(view.lr.camera, 0)
-    gsplat_host.Photometric.apply(renders[0], view.lr.image).backward()
+    gsplat_host.photometric(renders[0], view.lr.image).backward()
     alone = {k: p.grad.clone() for k, p in host.splats.items()}
     o = HR_FROM_START
     renders, _, _ = host.render(view.hr.camera, 0)

@@ -173,7 +173,7 @@ def test_without_a_strategy_the_gradient_is_that_of_the_summed_losses(inria_host
     camera = scene.cameras[1]
     view = clear.views[camera.image_name]
     drawn = inria_host.render(camera, gaussians, None, None)["render"]
-    inria_host.Photometric.apply(drawn, camera.original_image).backward()
+    inria_host.photometric(drawn, camera.original_image).backward()
     image = inria_host.render(enlarged_camera(camera, 4), gaussians, None, None)["render"].permute(1, 2, 0)
     cotangents = HR_FROM_START.hr(image.detach(), view.hr.image).cotangents
     (image * (cotangents[0] + 0.2 * cotangents[1])).sum().backward()
@@ -260,7 +260,7 @@ def test_without_the_detail_feature_the_other_gradients_are_the_same(inria_host,
     with_detail, _ = run_once(inria_host, inria_capture, GCO())
     clear, gaussians, scene = inria_attached(GCO(), detail=False)
     package = clear.wrap(inria_host.render)(scene.cameras[1], gaussians, None, None)
-    inria_host.Photometric.apply(package["render"], scene.cameras[1].original_image).backward()
+    inria_host.photometric(package["render"], scene.cameras[1].original_image).backward()
     assert "detail" not in clear.params()
     assert torch.equal(with_detail["means"], gaussians._xyz.grad)
 

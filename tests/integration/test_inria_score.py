@@ -15,7 +15,7 @@ from tests.helpers.inria import HR_FROM_START, WITHOUT_HR, N, options
 def screen_gradient(host, render, camera, gaussians, **settings):
     """What the densifier reads after a step's backward pass."""
     package = render(camera, gaussians, None, None, **settings)
-    host.Photometric.apply(package["render"], camera.original_image).backward()
+    host.photometric(package["render"], camera.original_image).backward()
     return package["viewspace_points"].grad
 
 

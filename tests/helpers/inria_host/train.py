@@ -6,22 +6,12 @@ import torch
 from gaussian_renderer import render
 from scene import GaussianModel, Scene
 
-from clear_strategies.kernels import losses
+from tests.helpers import host_parts
 
 
-class Photometric(torch.autograd.Function):
-    """0.8 L1 + 0.2 (1 - SSIM)."""
-
-    @staticmethod
-    def forward(ctx, image, target):
-        x, y = (i.detach().permute(1, 2, 0).contiguous() for i in (image, target))
-        loss = losses.photometric(x, y, 0.2, kernels="torch")
-        ctx.gradient = loss.gradient.permute(2, 0, 1)
-        return image.new_tensor(float(loss.value))
-
-    @staticmethod
-    def backward(ctx, scale):
-        return ctx.gradient * scale, None
+def photometric(image, target):
+    """Of images [3, H, W]."""
+    return host_parts.photometric(image.permute(1, 2, 0), target.permute(1, 2, 0))
 
 
 def densify(gaussians, opt, iteration, package):
@@ -62,7 +52,7 @@ def loop(opt, gaussians, scene, names=None, between=lambda iteration: None, firs
         image = package["render"]
         if camera.alpha_mask is not None:
             image *= camera.alpha_mask
-        loss = Photometric.apply(image, camera.original_image)
+        loss = photometric(image, camera.original_image)
         loss.backward()
         between(iteration)
         if not opt.step_first:

@@ -3,28 +3,10 @@
 import torch
 
 from rasterizers import Camera, Splats, autograd, load
+from tests.helpers.host_parts import InNdc
 
 ABSOLUTE = False
 RASTERIZER = load("torch", near=0.01, kernel=0.3, antialiased=False)
-
-
-class _InNdc(torch.autograd.Function):
-    """Zero offsets of the projected centres; their gradient goes to a tensor of zeros, in NDC."""
-
-    @staticmethod
-    def forward(ctx, dummy, width, height):
-        ctx.size, ctx.columns = (width, height), dummy.shape[1]
-        return dummy.new_zeros(len(dummy), 2)
-
-    @staticmethod
-    def backward(ctx, g):
-        ndc = torch.zeros(len(g), ctx.columns, dtype=g.dtype)
-        ndc[:, :2] = g * g.new_tensor(ctx.size) / 2
-        if ctx.columns == 4:  # some forks keep absolute gradients here
-            ndc[:, 2:] = 3 * ndc[:, :2].abs()
-        elif ABSOLUTE:  # and Mip-Splatting keeps their norm in the third column
-            ndc[:, 2] = 3 * ndc[:, :2].norm(dim=1)
-        return ndc, None, None
 
 
 def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3, indices=False, dropout=0.0):
@@ -45,7 +27,7 @@ def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3
     scales = pc.get_scaling * scaling_modifier
     opacity = torch.nn.functional.dropout(pc.get_opacity[:, 0], dropout)  # DropGaussian's render does this itself
     splats = Splats(xyz, pc.get_rotation, scales, opacity, features[:, :1], features[:, 1:bands])
-    drawn = autograd.draw(RASTERIZER, splats, camera, _InNdc.apply(dummy, w, h))
+    drawn = autograd.draw(RASTERIZER, splats, camera, InNdc.apply(dummy, w, h, ABSOLUTE))
     return {
         "render": drawn.image.permute(2, 0, 1),
         "viewspace_points": dummy,

@@ -7,25 +7,9 @@ import torch
 import rasterizers
 from rasterizers import Camera, Splats, autograd
 from rasterizers.geometry import SH_C0
+from tests.helpers.host_parts import InNdc
 
 HOST = os.environ["HOST"]
-
-
-class _InNdc(torch.autograd.Function):
-    """Zero offsets of the projected centres; their gradient goes to a tensor of zeros, in NDC."""
-
-    @staticmethod
-    def forward(ctx, dummy, width, height):
-        ctx.size, ctx.columns = (width, height), dummy.shape[1]
-        return dummy.new_zeros(len(dummy), 2)
-
-    @staticmethod
-    def backward(ctx, g):
-        ndc = g.new_zeros(len(g), ctx.columns)
-        ndc[:, :2] = g * g.new_tensor(ctx.size) / 2
-        if HOST == "mip-splatting":  # which keeps an absolute gradient in the third column
-            ndc[:, 2] = 3 * ndc[:, :2].norm(dim=1)
-        return ndc, None, None
 
 
 class GaussianRasterizationSettings:
@@ -54,7 +38,7 @@ class GaussianRasterizer(torch.nn.Module):
             splats = Splats(means3D, rotations, scales, opacities[:, 0], sh0, rest)
             return autograd.draw(rasterizer, splats, camera, offset)
 
-        drawn = draw(shs[:, :1], shs[:, 1:bands], background, _InNdc.apply(means2D, w, h))
+        drawn = draw(shs[:, :1], shs[:, 1:bands], background, InNdc.apply(means2D, w, h, HOST == "mip-splatting"))
         image, radii = drawn.image.permute(2, 0, 1).contiguous(), 3 * drawn.visible.int()
         if HOST in ("mip-splatting", "dropgaussian", "lightning"):
             return image, radii
