@@ -41,6 +41,7 @@ __all__ = [
     "Traits",
     "available",
     "fastest",
+    "for_device",
     "load",
     "names",
 ]
@@ -53,6 +54,7 @@ _BACKENDS: Final[dict[str, tuple[str, str]]] = {
     "gsplat": ("rasterizers.gsplat_backend", "GsplatRasterizer"),
 }
 _ON_CUDA: Final = ("warp", "gsplat")
+_ON_EITHER: Final = ("warp",)  # draws on a CPU or on CUDA; which of them is said when it is made
 
 
 def load(name: str = "auto", *, preset: str | None = None, **settings: Any) -> Rasterizer:
@@ -92,6 +94,11 @@ def fastest(device: str | None = None) -> str:
         device: "cpu" or "cuda", where the splats' tensors are; None: any.
     """
     return next(name for name, backend in _runnable() if device is None or device in backend.traits.devices)
+
+
+def for_device(name: str, device: str) -> dict[str, str]:
+    """The settings by which a backend is made for tensors on this device; none where nothing has to be said."""
+    return {"device": device} if name in _ON_EITHER else {}
 
 
 def _runnable() -> Iterator[tuple[str, Rasterizer]]:

@@ -56,14 +56,11 @@ class RasterizerSettings:
 
     def load(self, device: Device | None) -> tuple[str, Callable[..., Rasterizer]]:
         """The name of the backend, and a function that makes the rasterizer."""
-        name = self.name
-        settings = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
-        settings = {key: value for key, value in settings.items() if value is not None}
-        if name == "auto":
-            name = rasterizers.fastest(device)
-        elif name == "warp" and device is not None:
-            settings.setdefault("device", device)
-        return name, functools.partial(rasterizers.load, name, **settings)
+        name = rasterizers.fastest(device) if self.name == "auto" else self.name
+        chosen = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
+        settings = {key: value for key, value in chosen.items() if value is not None}
+        of_device = {} if device is None else rasterizers.for_device(name, device)
+        return name, functools.partial(rasterizers.load, name, **{**of_device, **settings})
 
 
 _OWN: Final = f"{RasterizerSettings.__module__}.{RasterizerSettings.__qualname__}"

@@ -2,7 +2,7 @@
 
 Five maps per view, in [0, 1] at each HR pixel:
 
-- `reliability` R, `demand` A and `weight` R·A: the patch evidence, enlarged.  Eq. 9, 10
+- `reliability` R, `demand` A and `weight` R·A: the patch evidence of a strategy that has it, enlarged.  Eq. 9, 10
 - `corrected`: the share of its HR gradient that a Gaussian lost by correction, ‖g̃_HR - g_HR‖ / ‖g_HR‖ over all groups
   together.  Eq. 7, 11
 - `conflict`: 1 where g_LR and g_HR of a Gaussian point apart, else 0.  Eq. 6
@@ -29,16 +29,13 @@ from torch import Tensor
 
 from clear_strategies import files
 from clear_strategies.core import images
-from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot
-from clear_strategies.core.images import DownKernel
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs.maps_picture import write_depth, write_maps_picture
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
-from clear_strategies.strategies.p2g import P2G
 from clear_strategies.training.field import FieldShot, GaussianField
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer
@@ -57,7 +54,8 @@ class ViewMaps:
     """The maps of one training view.
 
     Args:
-        maps: by the names in `viewing.points.MAPS`, at HR, in [0, 1]; "corrected" only where a strategy corrects.
+        maps: by the names in `viewing.points.MAPS`, at HR, in [0, 1]; "corrected" only where a strategy corrects, those of
+            patch evidence only where a strategy has it.
         means: by the same names, over pixels for the patch maps and over Gaussians for the others.
     """
 
@@ -66,13 +64,7 @@ class ViewMaps:
 
 
 def write_maps(
-    folder: Path,
-    views: Sequence[View],
-    field: GaussianField,
-    conductor: Conductor,
-    rasterizer: Rasterizer,
-    *,
-    down: DownKernel = "bicubic",
+    folder: Path, views: Sequence[View], field: GaussianField, conductor: Conductor, rasterizer: Rasterizer
 ) -> None:
     """Write maps.json and, for each of the views, a folder of 8-bit grey PNGs (value = 255 × number).
 
@@ -80,7 +72,7 @@ def write_maps(
     """
     means: dict[str, Mapping[str, float]] = {}
     for view in views:
-        found = view_maps(field, conductor, rasterizer, view, down=down)
+        found = view_maps(field, conductor, rasterizer, view)
         means[view.name] = found.means
         own = folder / Path(view.name).stem
         for name, values in {**found.maps, "lr": view.lr.image, "prior": view.hr.image}.items():
@@ -91,26 +83,19 @@ def write_maps(
     corrector = conductor.owner("correct")
     if corrector is None:
         _log.debug("maps: no strategy of this run corrects, so there is no corrected.png.")
-    observer = next((s for s in conductor.strategies if s.patch_maps(views[0]) is not None), None)
+    observer = _observer(conductor, views[0])
     content = {
         "note": _NOTE,
         "corrector": None if corrector is None else type(corrector).__name__,
-        "evidence": "P2G's defaults" if observer is None else f"this run's {type(observer).__name__}",
+        "evidence": None if observer is None else type(observer).__name__,
         "views": means,
     }
     files.write_json(folder / "maps.json", content)
 
 
-def view_maps(
-    field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View, *, down: DownKernel = "bicubic"
-) -> ViewMaps:
-    """The maps of one view, without dropout.
-
-    Args:
-        conductor: of the run; where none of its strategies has patch evidence, that of P2G's defaults is shown.
-        down: D of these defaults.
-    """
-    patches = _enlarged(_patch_maps(conductor.strategies, view, down), view)
+def view_maps(field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View) -> ViewMaps:
+    """The maps of one view by the strategies of the run, without dropout."""
+    patches = _patch_maps(_observer(conductor, view), view)
     numbers, compared = _compare(*_gradients(field, conductor, rasterizer, view))
     drawn = _draw(field, rasterizer, view.hr.camera, torch.stack(list(numbers.values()), dim=1))
     maps = {**patches, **{name: drawn[..., k].clamp(0, 1) for k, name in enumerate(numbers)}}
@@ -119,12 +104,15 @@ def view_maps(
     return ViewMaps(maps, means)
 
 
-def _patch_maps(strategies: Sequence[Strategy], view: View, down: DownKernel) -> PatchMaps:
-    known = (found for s in strategies if (found := s.patch_maps(view)) is not None)
-    return next(known, None) or P2G(down=down).patch_maps(view)
+def _observer(conductor: Conductor, view: View) -> Strategy | None:
+    """The strategy that has patch evidence of the view."""
+    return next((s for s in conductor.strategies if s.patch_maps(view) is not None), None)
 
 
-def _enlarged(patches: PatchMaps, view: View) -> dict[str, Tensor]:
+def _patch_maps(observer: Strategy | None, view: View) -> dict[str, Tensor]:
+    """R, A and R·A, enlarged to HR."""
+    if observer is None or (patches := observer.patch_maps(view)) is None:
+        return {}
     edge, camera, R, A = patches.patch * view.factor, view.hr.camera, patches.reliability, patches.demand
 
     def enlarged(values: Tensor) -> Tensor:

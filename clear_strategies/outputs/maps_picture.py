@@ -13,6 +13,7 @@ from torch import Tensor
 from clear_strategies.core.images import area_mean
 from clear_strategies.core.view import DepthMap, Photo, View
 from clear_strategies.outputs import figures
+from clear_strategies.viewing.film import DepthScale
 
 _MEANINGS: Final = {
     "reliability": "reliability R\nhow far the SR image agrees with the LR photo",
@@ -24,7 +25,6 @@ _MEANINGS: Final = {
 _COLORS: Final = "viridis"
 _COLUMNS: Final = 4
 _PANEL: Final = 400  # px, the width of one image
-_EXTREMES: Final = (0.02, 0.98)  # quantiles of depth at the ends of the colours
 
 
 def write_maps_picture(
@@ -66,9 +66,10 @@ def write_depth(path: Path, photo: Photo, found: DepthMap, title: str) -> None:
     left, middle, right = axes.flatten()
     left.imshow(photo.image.cpu().clamp(0, 1).numpy())
     left.set_title("LR photo")
-    _draw_depth(middle, found.depth.where(found.known, float("nan")), "viridis_r", _depth_ends(found))
+    depth = found.depth.where(found.known, float("nan"))
+    _draw(middle, depth, "viridis_r", DepthScale.spanning(depth))
     middle.set_title(f"depth, world units; known at {found.coverage:.0%}, grey elsewhere")
-    _draw_depth(right, found.confidence.where(found.known, float("nan")), "viridis", (0.0, 1.0))
+    _draw(right, found.confidence.where(found.known, float("nan")), "viridis", DepthScale(0.0, 1.0))
     right.set_title("confidence, 0 to 1")
     for axis in (left, middle, right):
         axis.set_xticks([])
@@ -77,17 +78,9 @@ def write_depth(path: Path, photo: Photo, found: DepthMap, title: str) -> None:
     figures.save_png(figure, path)
 
 
-def _depth_ends(found: DepthMap) -> tuple[float, float]:
-    known = found.depth[found.known]
-    if len(known) == 0:
-        return 0.0, 1.0
-    low, high = (float(known.quantile(q)) for q in _EXTREMES)
-    return low, max(high, low * (1 + 1e-6))
-
-
-def _draw_depth(axis: Any, values: Any, colors: str, ends: tuple[float, float]) -> None:
+def _draw(axis: Any, values: Float[Tensor, "H W"], colors: str, scale: DepthScale) -> None:
     axis.set_facecolor(figures.RULE)
-    shown = axis.imshow(values.cpu().numpy(), cmap=colors, vmin=ends[0], vmax=ends[1], interpolation="nearest")
+    shown = axis.imshow(values.cpu().numpy(), cmap=colors, vmin=scale.near, vmax=scale.far, interpolation="nearest")
     axis.figure.colorbar(shown, ax=axis, shrink=0.8)
 
 

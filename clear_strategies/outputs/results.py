@@ -113,7 +113,7 @@ def write_results(
     if pictures is not None:
         with work_log.stage("maps"):
             if mapped := spaced(state.views, pictures.map_views):
-                write_maps(folder / "maps", mapped, field, state.conductor, rasterizer, down=down)
+                write_maps(folder / "maps", mapped, field, state.conductor, rasterizer)
         memory.release()  # the gradients that the maps are made of: several times the field
         _write_sheet(folder, scene, evaluation, title, baseline)
         _write_views(folder, scene, painter, pictures, work_log, title)

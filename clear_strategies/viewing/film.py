@@ -38,11 +38,15 @@ class DepthScale:
     def of(cls, painter: Painter, cameras: Sequence[Camera], look: Look = AS_MEASURED) -> DepthScale:
         """From a few of the cameras."""
         some = cameras[:: math.ceil(len(cameras) / _SAMPLED)]
-        known = torch.cat([depth[depth.isfinite()] for depth in (painter.depth(camera, look) for camera in some)])
+        return cls.spanning(torch.cat([painter.depth(camera, look).flatten() for camera in some]))
+
+    @classmethod
+    def spanning(cls, depth: Float[Tensor, ...]) -> DepthScale:
+        """From depths, of which those that are not finite are unknown; 0 to 1 where none is known."""
+        known = depth[depth.isfinite()].cpu().numpy()  # torch's own quantile takes 16 million numbers at most
         if not len(known):
             return cls(0.0, 1.0)
-        values = known.numpy()
-        near, far = (float(np.quantile(values, q)) for q in _EXTREMES)
+        near, far = (float(np.quantile(known, q)) for q in _EXTREMES)
         return cls(near, max(far, near * (1 + 1e-6) + 1e-6))
 
     def picture(self, depth: Float[Tensor, "H W"], *, legend: bool = True) -> Frame:
