@@ -10,6 +10,7 @@ from torch import Tensor
 
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.gradients import CONFLICT_GROUPS
 
 # A Gaussian whose axes are equally long does not change when it is rotated: in exact arithmetic its
 # rotation gradient is 0, in floating point it is noise that would "conflict" one time in five.
@@ -47,6 +48,11 @@ class CorrectionRule:
     weight_min: float
     weight_max: float
     report: Callable[[Sequence[GroupReport], Evidence | None], None]
+
+    @property
+    def corrects(self) -> list[bool]:
+        """Whether each of the conflict groups is corrected."""
+        return [group in self.groups for group in CONFLICT_GROUPS]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

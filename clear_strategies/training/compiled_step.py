@@ -22,9 +22,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.compiled_rules import ROTATION_NOISE, Anchor, CorrectionRule, GroupReport
+from clear_strategies.core.compiled_rules import Anchor, CorrectionRule, GroupReport
 from clear_strategies.core.deferred import Number
-from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels import gaussian_step as kernel
 from clear_strategies.kernels.gaussian_step import cpp
@@ -200,13 +199,11 @@ class CompiledStep:
         )
         λ = o.lambda_hr(t)
         conflict: dict[str, Number] = {}
-        correction, compared = None, None
+        rule, compared = None, None
         if hr is not None and λ > 0:
-            compared = gaussians.compare()  # before correction
+            rule, compared = self._rule, gaussians.compare()  # before correction
             shares = zip((*CONFLICT_GROUPS, "gaussian"), compared.opposed, compared.comparable, strict=True)
             conflict = {group: deferred.defer(deferred.ratio, opposed, n) for group, opposed, n in shares}
-            if self._rule is not None:
-                correction = _correction(self._rule, e)
         anchor = self._anchor(len(a.sigmoid)) if anchor is None else anchor
         decays = (hr is not None and hr.hf is not None) or "detail" in anchor.targets
         keep = 1 - self.optimizer.rates.detail_decay if decays else 1.0
@@ -222,14 +219,14 @@ class CompiledStep:
         shN, active = params["shN"], g_lr.gradients.basis.shape[1] - 1
         bands = active if skips and self._above_is_quiet(shN, active, anchor.targets.get("shN")) else shN.shape[1]
         stepped = gaussians.step(
-            attributes, correction,
+            attributes, rule, None if e is None else e.reliability.float().contiguous(),
             kernel.StepSettings(
                 BETA1, BETA2, bias2, self.optimizer.rates.eps, λ,
                 None if visible is None else visible.contiguous().view(torch.uint8), skips, 3 * bands,
             ),
         )  # fmt: skip
-        if self._rule is not None and compared is not None:
-            self._rule.report(_reports(self._rule, compared, stepped), e)
+        if rule is not None and compared is not None:
+            rule.report(_reports(rule, compared, stepped), e)
         if merged is None:
             self._note_skips(stepped, bands, shN.shape[1])
         return conflict
@@ -270,17 +267,6 @@ class CompiledStep:
                 skip("optimizer rows", reason, rows)
         if bands < all_bands:
             skip("SH bands in the optimizer", "above the active degree", all_bands - bands)
-
-
-def _correction(rule: CorrectionRule, e: Evidence | None) -> kernel.Correction:
-    return kernel.Correction(
-        [group in rule.groups for group in CONFLICT_GROUPS],
-        rule.tolerance,
-        rule.weight_min,
-        rule.weight_max,
-        ROTATION_NOISE,
-        None if e is None else e.reliability.float().contiguous(),
-    )
 
 
 def _reports(rule: CorrectionRule, compared: kernel.Comparison, stepped: kernel.StepCounts) -> list[GroupReport]:

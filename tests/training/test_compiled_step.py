@@ -82,12 +82,12 @@ class Elsewhere:
         self.fetch(products)
         return found
 
-    def step(self, attributes, correction, step):
+    def step(self, attributes, rule, q, step):
         def brought(thing):
             return thing and replace(thing, **{f.name: self.bring(getattr(thing, f.name)) for f in fields(thing)})
 
         found = self.passes.step(
-            {name: brought(a) for name, a in attributes.items()}, brought(correction), brought(step)
+            {name: brought(a) for name, a in attributes.items()}, rule, self.bring(q), brought(step)
         )
         self.fetch(*(x for a in attributes.values() for x in (a.p, a.m, a.v, a.merged)))
         return found

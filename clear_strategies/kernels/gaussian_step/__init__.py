@@ -17,6 +17,8 @@ from typing import Protocol
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from clear_strategies.core.compiled_rules import CorrectionRule
+
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
@@ -29,23 +31,6 @@ class Comparison:
 
     comparable: Sequence[int] | Int[Tensor, " 7"]
     opposed: Sequence[int] | Int[Tensor, " 7"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Correction:
-    """GCO's settings as numbers.
-
-    Args:
-        groups: whether each group is corrected.
-        reliability: q [N], None: 0.
-    """
-
-    groups: Sequence[bool]
-    tolerance: float
-    weight_min: float
-    weight_max: float
-    rotation_noise: float
-    reliability: Tensor | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +102,11 @@ class GaussianStep(Protocol):
         ...
 
     def step(
-        self, attributes: Mapping[str, Attribute], correction: Correction | None, settings: StepSettings
+        self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
     ) -> StepCounts:
-        """Merge, correct, add the anchor's gradient and apply Adam, in place."""
+        """Merge, correct, add the anchor's gradient and apply Adam, in place.
+
+        Args:
+            rule: None: nothing is corrected. q: reliability [N], None: 0.
+        """
         ...

@@ -8,7 +8,8 @@ from typing import Any
 
 from torch import Tensor
 
-from clear_strategies.kernels.gaussian_step import Attribute, Comparison, Correction, StepCounts, StepSettings
+from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
+from clear_strategies.kernels.gaussian_step import Attribute, Comparison, StepCounts, StepSettings
 from rasterizers.native import load_kernels, threads
 
 
@@ -40,12 +41,15 @@ class CppGaussianStep:
         return Comparison(*self._step.compare(threads()))
 
     def step(
-        self, attributes: Mapping[str, Attribute], correction: Correction | None, settings: StepSettings
+        self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
     ) -> StepCounts:
         tables = {
             name: {slot: getattr(a, slot) for slot in Attribute.__slots__} | {"width": math.prod(a.p.shape[1:])}
             for name, a in attributes.items()
         }
-        rule = None if correction is None else {slot: getattr(correction, slot) for slot in Correction.__slots__}
+        correction = None if rule is None else {
+            "groups": rule.corrects, "tolerance": rule.tolerance, "weight_min": rule.weight_min,
+            "weight_max": rule.weight_max, "rotation_noise": ROTATION_NOISE, "reliability": q,
+        }  # fmt: skip
         numbers = {slot: getattr(settings, slot) for slot in StepSettings.__slots__}
-        return StepCounts(*self._step.step(tables, rule, numbers, threads()))
+        return StepCounts(*self._step.step(tables, correction, numbers, threads()))

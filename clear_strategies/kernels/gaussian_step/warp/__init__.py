@@ -15,7 +15,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from clear_strategies.kernels.gaussian_step import Attribute, Comparison, Correction, StepCounts, StepSettings
+from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
+from clear_strategies.kernels.gaussian_step import Attribute, Comparison, StepCounts, StepSettings
 from clear_strategies.kernels.gaussian_step.warp import adam, conflict, passes, raw_gradients
 from rasterizers.warp_runtime import array, on_stream
 
@@ -77,9 +78,9 @@ class WarpGaussianStep:
         return Comparison(*counts.sum(0).view(2, -1))
 
     def step(
-        self, attributes: Mapping[str, Attribute], correction: Correction | None, settings: StepSettings
+        self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
     ) -> StepCounts:
-        if self._n and correction is not None and not self._has_base:
+        if self._n and rule is not None and not self._has_base:
             raise ValueError("there is no HR gradient to correct.")
         parameters = {name: self._attribute(name, attributes[name], width) for name, width in _WIDTHS.items()}
         bands = self._attribute("shN", attributes["shN"], math.prod(attributes["shN"].p.shape[1:]))
@@ -93,11 +94,10 @@ class WarpGaussianStep:
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
         counts, omegas = self._blocks(passes.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
-        rule, adam_step = self._rule(correction), _adam(settings)
-        reliability = None if correction is None else correction.reliability
+        adam_step = _adam(settings)
         with on_stream(self._like.device):
             self._launch_tiled(
-                passes.step, *self._gradients, rule, array(reliability), self._options(correction, settings),
+                passes.step, *self._gradients, self._rule(rule, q), array(q), _options(rule is not None, settings),
                 adam_step, *parameters.values(), bands, array(settings.visible), array(colours), array(moving),
                 array(counts, passes.Counts), array(omegas, conflict.Six),
             )  # fmt: skip
@@ -141,25 +141,16 @@ class WarpGaussianStep:
         out.stiffness, out.rate, out.keep, out.limit = a.stiffness, -a.rate, a.keep, a.limit
         return out
 
-    def _options(self, correction: Correction | None, settings: StepSettings) -> Any:
-        out = passes.StepOptions()
-        out.lambda_hr, out.skips, out.width = settings.lambda_hr, settings.skips, settings.width
-        out.corrects, out.has_visible = correction is not None, settings.visible is not None
+    def _rule(self, rule: CorrectionRule | None, q: Tensor | None) -> Any:
+        out = conflict.Rule()
+        if rule is None:
+            return out
+        out.groups = sum(on << k for k, on in enumerate(rule.corrects))
+        out.tolerance, out.weight_min, out.weight_max = rule.tolerance, rule.weight_min, rule.weight_max
+        out.rotation_noise, out.has_reliability = ROTATION_NOISE, q is not None
+        if q is not None:
+            self._required("reliability", q, (self._n,), torch.float32)
         return out
-
-    def _rule(self, c: Correction | None) -> Any:
-        rule = conflict.Rule()
-        if c is None:
-            return rule
-        if len(c.groups) != _GROUPS:
-            raise ValueError(f"groups must have one entry for each of {_GROUPS} conflict groups.")
-        rule.groups = sum(on << k for k, on in enumerate(c.groups))
-        rule.tolerance, rule.weight_min, rule.weight_max = c.tolerance, c.weight_min, c.weight_max
-        rule.rotation_noise = c.rotation_noise
-        rule.has_reliability = c.reliability is not None
-        if c.reliability is not None:
-            self._required("reliability", c.reliability, (self._n,), torch.float32)
-        return rule
 
     def _structure(
         self,
@@ -195,6 +186,13 @@ def _structure(owner: str, kind: Any, fields: tuple[tuple[str, int, int], ...], 
     out = kind()
     for name, address, length in fields:
         setattr(out, name, wp.array(ptr=address, dtype=wp.float32, shape=(length,), device=device))
+    return out
+
+
+def _options(corrects: bool, settings: StepSettings) -> Any:
+    out = passes.StepOptions()
+    out.lambda_hr, out.skips, out.width = settings.lambda_hr, settings.skips, settings.width
+    out.corrects, out.has_visible = corrects, settings.visible is not None
     return out
 
 
