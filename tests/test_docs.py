@@ -13,16 +13,9 @@ import signal
 import subprocess
 import sys
 import tomllib
-from functools import cache
 from pathlib import Path
 
 import pytest
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra._internal.utils import create_config_search_path
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.plugins import Plugins
-from hydra.core.utils import setup_globals
 from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig
@@ -32,6 +25,7 @@ from clear_strategies import Conductor
 from clear_strategies.commands import train
 from clear_strategies.compose import CONF
 from tests.helpers import command_line, documented
+from tests.helpers.configs import jobs_of, loader
 from tests.helpers.pages import DOCS, OURS, PAGES, ROOT, blocks, commands, loaded, name
 
 # Each command once, by the first page that has it.
@@ -90,22 +84,12 @@ def require_composable(arguments: list[str]) -> None:
     if "-m" not in flags and whole.hydra.mode != RunMode.MULTIRUN:
         require_conductor(loader().load_configuration("config", overrides, run_mode=RunMode.RUN))
         return
-    swept = [f"{key}={value}" for key, value in (whole.hydra.sweeper.params or {}).items()]
-    parsed = OverridesParser.create(loader()).parse_overrides([*swept, *overrides])
-    (jobs,) = BasicSweeper.split_arguments(parsed, None)
     chosen: set[str] = set()
-    for job in jobs:
+    for job in jobs_of(whole, overrides):
         files = {word for word in job if (CONF / word.lstrip("+").split("=")[0]).is_dir()}
         if not chosen or files - chosen:  # the first job, and each that takes a file that no job before it took
             chosen |= {*files, ""}
             require_conductor(loader().load_sweep_config(whole, list(job)))
-
-
-@cache
-def loader() -> ConfigLoaderImpl:
-    setup_globals()
-    Plugins.instance()
-    return ConfigLoaderImpl(create_config_search_path(str(CONF)))
 
 
 def require_conductor(config: DictConfig) -> None:

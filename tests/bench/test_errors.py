@@ -11,17 +11,9 @@ import torch
 from clear_strategies.bench.__main__ import main
 from clear_strategies.bench.error_budget import HeldOut, budget, by_view, distance_from_hull, waves
 from clear_strategies.jobs import job
-from rasterizers.interface import Camera
 from tests.helpers.configs import composed
 
 TRIANGLE = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 2, 0]])
-
-
-def camera(x: float = 0.0) -> Camera:
-    """At (x, 0, 0), looking along z; a pixel is 0.1 wide at a depth of 1."""
-    pose = torch.eye(4)
-    pose[0, 3] = -x
-    return Camera(pose, 10.0, 10.0, 5.0, 5.0, 10, 10)
 
 
 def view(error: torch.Tensor, **facts) -> HeldOut:

@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import cache
+
 from hydra import compose, initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra._internal.utils import create_config_search_path
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.plugins import Plugins
+from hydra.core.utils import setup_globals
 from omegaconf import DictConfig
 
 from clear_strategies.compose import CONF
@@ -17,3 +26,18 @@ def composed(*overrides: str, hydra: bool = False) -> DictConfig:
 def options(group: str) -> list[str]:
     """The choices of a group, without those that others build on."""
     return sorted(p.stem for p in (CONF / group).glob("*.yaml") if not p.stem.startswith("_"))
+
+
+@cache
+def loader() -> ConfigLoaderImpl:
+    """Hydra's, of conf/."""
+    setup_globals()
+    Plugins.instance()
+    return ConfigLoaderImpl(create_config_search_path(str(CONF)))
+
+
+def jobs_of(whole: DictConfig, overrides: Sequence[str]) -> Sequence[Sequence[str]]:
+    """The overrides of each job that Hydra's sweeper makes of these; `whole` is the configuration of the sweep."""
+    swept = [f"{key}={value}" for key, value in (whole.hydra.sweeper.params or {}).items()]
+    (jobs,) = BasicSweeper.split_arguments(OverridesParser.create(loader()).parse_overrides([*swept, *overrides]), None)
+    return jobs

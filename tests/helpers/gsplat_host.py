@@ -13,6 +13,7 @@ from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import LearningRates
 from integration.gsplat import Attached, attach
 from rasterizers import autograd
+from tests.helpers import toy
 from tests.helpers.host_parts import photometric
 
 rasterization = functools.partial(autograd.rasterization, backend="torch")
@@ -87,3 +88,25 @@ def trained(host: Host, scene, conductor: Conductor, names, **settings) -> Attac
     with attached(host, scene, conductor, **settings) as clear:
         host.train(names)
     return clear
+
+
+def densified(
+    conductor: Conductor, strategy=None, steps: int = 30, *, colors_stay: bool = False
+) -> tuple[Host, Attached]:
+    """A host on the toy scene of 40 Gaussians, trained with CLEAR while gsplat's default strategy, or another, densifies.
+
+    Args:
+        colors_stay: they identify Gaussians then.
+    """
+    from gsplat.strategy import DefaultStrategy
+
+    strategy = strategy or DefaultStrategy(
+        refine_start_iter=4, refine_stop_iter=24, refine_every=5, grow_grad2d=2e-4, prune_opa=0.02
+    )
+    torch.manual_seed(0)
+    scene = toy.scene(40)
+    host = Host(scene, extent=4.0, strategy=strategy)
+    if colors_stay:
+        host.optimizers["sh0"].param_groups[0]["lr"] = 0.0
+    names = [scene.train[i % 3].name for i in range(steps)]
+    return host, trained(host, scene, conductor, names, strategy=strategy)

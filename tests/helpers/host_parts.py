@@ -7,6 +7,9 @@ from torch import Tensor
 
 from clear_strategies.kernels import losses
 
+FROM_START = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
+"""Settings of a run that is too short for the warm-up, and photos that are too small for P2G's patches."""
+
 
 def photometric(image: Tensor, target: Tensor) -> Tensor:
     """A number whose gradient is that of 0.8 L1 + 0.2 (1 - SSIM), the hosts' loss; images [H, W, 3]."""

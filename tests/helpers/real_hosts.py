@@ -17,8 +17,6 @@ from tests.helpers import toy
 
 ROOT = Path(__file__).resolve().parents[2]
 CPU = ROOT / "tests" / "hosts" / "cpu"
-FROM_START = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
-"""Settings of a run that is too short for the warm-up, and photos that are too small for P2G's patches."""
 
 
 def checkout(name: str, script: str) -> Path:

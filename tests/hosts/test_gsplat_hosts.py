@@ -15,7 +15,8 @@ import pytest
 import torch
 
 from clear_strategies.data.ply import read_gaussians
-from tests.helpers.real_hosts import CPU, FROM_START, checkout, run
+from tests.helpers.host_parts import FROM_START
+from tests.helpers.real_hosts import CPU, checkout, run
 
 STEPS = 30
 END = "    cli(main, cfg, verbose=True)\n"

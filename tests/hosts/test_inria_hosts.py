@@ -17,7 +17,8 @@ import torch
 from PIL import Image
 
 from clear_strategies.data.ply import read_gaussians
-from tests.helpers.real_hosts import FROM_START, checkout, hide_half, run, spoil_half
+from tests.helpers.host_parts import FROM_START
+from tests.helpers.real_hosts import checkout, hide_half, run, spoil_half
 
 HOSTS = {
     "3dgs": ["--disable_viewer"],

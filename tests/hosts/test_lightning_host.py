@@ -18,7 +18,8 @@ import torch
 from PIL import Image
 
 from clear_strategies.data.ply import read_gaussians
-from tests.helpers.real_hosts import FROM_START, checkout, run, spoil_half
+from tests.helpers.host_parts import FROM_START
+from tests.helpers.real_hosts import checkout, run, spoil_half
 
 STEPS = 30
 

@@ -18,8 +18,9 @@ from integration.inria.attached import _ATTRIBUTES
 from rasterizers import Splats
 from tests.helpers import gsplat_host, inria, toy
 from tests.helpers.gsplat_host import Host
+from tests.helpers.host_parts import FROM_START
 from tests.integration.test_inria import trained as trained_inria
-from tests.integration.test_lightning import HR_FROM_START, attachment_of, fitted, host  # noqa: F401 - a fixture
+from tests.integration.test_lightning import attachment_of, fitted, host  # noqa: F401 - a fixture
 
 
 @pytest.fixture
@@ -127,7 +128,7 @@ def test_an_inria_style_host_draws_any_camera(inria_host, inria_capture, drawn):
 def test_a_lightning_host_draws_it_and_steps_on_it(host, tmp_path, drawn):  # noqa: F811 - the fixture
     for view in host.scene.train:
         write_png(tmp_path / f"{view.name}_x4.png", images.quantize(view.hr.image))
-    shown = [*HR_FROM_START[:2], "+strategies.dark._target_=tests.helpers.toy.ShowsDark"]
+    shown = [*FROM_START[:2], "+strategies.dark._target_=tests.helpers.toy.ShowsDark"]
     module = fitted(host, host.controller(strategies="baseline", sr=str(tmp_path), suffix="_x4", overrides=shown), 4)
     assert len(drawn) == 4
     assert attachment_of(module).counts["extra views"] == 4
@@ -145,16 +146,9 @@ def test_opacities_fade_in_a_gsplat_host():
 
 
 def test_splatsure_follows_a_host_that_densifies():
-    strategies = pytest.importorskip("gsplat.strategy", reason="pip install gsplat")
-    scene = toy.scene(40)
-    densifier = strategies.DefaultStrategy(
-        refine_start_iter=4, refine_stop_iter=24, refine_every=5, grow_grad2d=2e-4, prune_opa=0.02
-    )
-    torch.manual_seed(0)
-    a_host = Host(scene, extent=4.0, strategy=densifier)
+    pytest.importorskip("gsplat.strategy", reason="pip install gsplat")
     conductor = Conductor(SplatSuRe(), objective=inria.HR_FROM_START)
-    names = [scene.train[i % 3].name for i in range(30)]
-    gsplat_host.trained(a_host, scene, conductor, names, strategy=densifier)
+    a_host, _ = gsplat_host.densified(conductor)
     n = len(a_host.splats["means"])
     assert n != 40
     assert {rows.shape for rows in conductor.state_dict().values()} == {(n,)}

@@ -5,29 +5,20 @@ from __future__ import annotations
 import logging
 
 import pytest
-import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies.errors import SettingError
 from clear_strategies.schedules import Ramp
 from integration.rows import ROWS
-from tests.helpers import gsplat_host, toy
-from tests.helpers.gsplat_host import Host
+from tests.helpers import gsplat_host
 from tests.helpers.inria import HR_FROM_START
 
-strategies = pytest.importorskip("gsplat.strategy", reason="pip install gsplat")
+pytest.importorskip("gsplat.strategy", reason="pip install gsplat")
 
 
 def run(*chosen, steps=30):
     """Gsplat's DefaultStrategy for so many steps: the host, and CLEAR in it."""
-    torch.manual_seed(0)
-    scene = toy.scene(40)
-    strategy = strategies.DefaultStrategy(
-        refine_start_iter=4, refine_stop_iter=24, refine_every=5, grow_grad2d=2e-4, prune_opa=0.02
-    )
-    host = Host(scene, extent=4.0, strategy=strategy)
-    names = [scene.train[i % 3].name for i in range(steps)]
-    return host, gsplat_host.trained(host, scene, Conductor(*chosen, objective=HR_FROM_START), names, strategy=strategy)
+    return gsplat_host.densified(Conductor(*chosen, objective=HR_FROM_START), steps=steps)
 
 
 def test_all_parameters_and_states_follow_the_densifier():

@@ -16,12 +16,11 @@ from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import SettingError
 from tests.helpers import gsplat_host, toy
+from tests.helpers.host_parts import FROM_START
 
 gsplat = pytest.importorskip("gsplat", reason="pip install gsplat")
 SCRIPT = Path(__file__).parents[1] / "helpers" / "simple_trainer.py"
-FROM_START = [
-    f"--overrides={x}" for x in ("objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4")
-]
+OVERRIDES = [f"--overrides={override}" for override in FROM_START]
 
 
 @pytest.fixture
@@ -55,7 +54,7 @@ def rendered(splats):
 
 def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(trainer, caplog):
     with caplog.at_level(logging.INFO):
-        assert trainer.run([*trainer.sr, *FROM_START]) == 0
+        assert trainer.run([*trainer.sr, *OVERRIDES]) == 0
     assert "8 merges" in caplog.text
     assert "refine_stop_iter=3 instead of 7" in caplog.text  # SVS ends densification at half of the steps
     evaluated = torch.load(trainer.folder / "image.pt")
@@ -68,7 +67,7 @@ def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(trainer, ca
 
 def test_views_are_recognised_by_their_index_when_poses_are_noisy(trainer, caplog):
     with caplog.at_level(logging.INFO):
-        assert trainer.run([*trainer.sr, *FROM_START], "--pose_noise", "0.01") == 0
+        assert trainer.run([*trainer.sr, *OVERRIDES], "--pose_noise", "0.01") == 0
     assert "8 merges" in caplog.text
 
 

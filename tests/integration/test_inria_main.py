@@ -14,11 +14,11 @@ from safetensors.torch import load_file
 from integration import HostError
 from integration.inria.__main__ import main
 from integration.inria.from_options import install
+from tests.helpers.host_parts import FROM_START
 from tests.helpers.inria import FOLDER, N, options
 
 SETUP = "    gaussians.training_setup(opt)\n"
-ROWS = ["strategies.p2g.patch=4", "objective.lambda_hr.start=0", "objective.lambda_hr.full=0"]
-ROWS_SET = [f"--overrides={row}" for row in ROWS]
+OVERRIDES = [f"--overrides={override}" for override in FROM_START]
 
 
 def edited_train(folder, line, monkeypatch):
@@ -27,22 +27,13 @@ def edited_train(folder, line, monkeypatch):
     assert source.count(SETUP) == 2  # in `training`, and in `setup` for the tests
     text = "from integration.inria import install\n" + source.replace(SETUP, f"{SETUP}    {line}\n", 1)
     (folder / "edited.py").write_text(text)
-    arguments = [
-        "-s",
-        str(folder),
-        "--save",
-        str(folder / "edited.ply"),
-        "--iterations",
-        "12",
-        "--densify_until_iter",
-        "9",
-    ]
+    arguments = ["-s", str(folder), "--save", str(folder / "edited.ply"), "--iterations=12", "--densify_until_iter=9"]
     monkeypatch.setattr(sys, "argv", ["edited.py", *arguments])
     return runpy.run_path(str(folder / "edited.py"), run_name="__main__")
 
 
 def test_one_line_and_none_give_the_same_file(inria_host, inria_capture, caplog, monkeypatch):
-    settings = [*ROWS, "strategies.svs.anchor_start=7500"]
+    settings = [*FROM_START, "strategies.svs.anchor_start=7500"]
     sr = str(inria_capture / "sr")
     command = [
         "--sr", sr, *(f"--overrides={s}" for s in settings),
@@ -64,7 +55,7 @@ def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture)
     """Its defaults are not on the command line: 30 iterations, densification until 24."""
     opt = options(inria_host, inria_capture)
     gaussians, scene = inria_host.setup(opt)
-    clear = install(gaussians, scene, opt, strategies="clear_paper", overrides=ROWS[:1], sr=inria_capture / "sr")
+    clear = install(gaussians, scene, opt, strategies="clear_paper", overrides=FROM_START[2:], sr=inria_capture / "sr")
     conductor = clear.attachment.conductor
     assert opt.densify_until_iter == 15  # clear_paper takes its anchor at half of the iterations
     assert conductor.may_densify(14)
@@ -78,7 +69,7 @@ def test_a_run_continues_from_the_hosts_checkpoint_as_if_it_had_not_stopped(inri
     def run(name, *arguments):
         script = [str(FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(inria_capture / name)]
         common = ["--iterations", "8", "--densify_until_iter", "0", "--sh_interval", "1"]
-        assert main(["--sr", str(inria_capture / "sr"), *ROWS_SET, *script, *common, *arguments]) == 0
+        assert main(["--sr", str(inria_capture / "sr"), *OVERRIDES, *script, *common, *arguments]) == 0
 
     run("whole.ply", "--checkpoint", str(inria_capture / "5.pth"), "--checkpoint_iteration", "5")
     run("resumed.ply", "--start_checkpoint", str(inria_capture / "5.pth"))

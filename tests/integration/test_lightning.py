@@ -17,9 +17,9 @@ from clear_strategies.errors import SettingError
 from integration import HostError
 from rasterizers.geometry import SH_C0
 from tests.helpers import toy
+from tests.helpers.host_parts import FROM_START
 
 N = 24
-HR_FROM_START = ["objective.lambda_hr.start=0", "objective.lambda_hr.full=0", "strategies.p2g.patch=4"]
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def attachment_of(module):
 
 
 def test_it_trains_with_the_hosts_density_controller(host, sr):
-    to_the_end = [*HR_FROM_START, "strategies.svs.anchor_start=10000"]  # the strategies let the host densify
+    to_the_end = [*FROM_START, "strategies.svs.anchor_start=10000"]  # the strategies let the host densify
     module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=to_the_end), 16)
     n = module.gaussian_model.n_gaussians
     attachment = attachment_of(module)
@@ -96,7 +96,7 @@ def test_it_trains_with_the_hosts_density_controller(host, sr):
 def test_centres_in_pixels_and_in_ndc_give_the_same_densification(host, sr):
     norms = []
     for pixels in (True, False):
-        settings = {"sr": sr, "suffix": "_x4", "strategies": "p2g", "overrides": HR_FROM_START}
+        settings = {"sr": sr, "suffix": "_x4", "strategies": "p2g", "overrides": FROM_START}
         module = fitted(host, host.controller(**settings), 1, pixels)
         size = torch.tensor([[12.0, 8.0]]) if pixels else 1.0
         norms.append((module.points.grad[:, :2] * size).norm(dim=-1))
@@ -115,7 +115,7 @@ def test_dropped_gaussians_have_no_gradient(host):
 
 
 def test_the_hosts_exposure_is_applied_at_both_scales(host, sr):
-    module = fitted(host, host.controller(strategies="baseline", sr=sr, suffix="_x4", overrides=HR_FROM_START[:2]), 1)
+    module = fitted(host, host.controller(strategies="baseline", sr=sr, suffix="_x4", overrides=FROM_START[:2]), 1)
     assert module.output_processor.sizes == [96, 24]
 
 
@@ -145,7 +145,7 @@ def test_max_steps_must_be_set(host, sr):
 
 def test_a_run_saves_its_checkpoint_and_continues_from_it_as_if_it_had_not_stopped(host, sr):
     """The host pickles its live renderer with every checkpoint, so nothing may hang on it."""
-    settings = {"sr": sr, "suffix": "_x4", "overrides": HR_FROM_START}
+    settings = {"sr": sr, "suffix": "_x4", "overrides": FROM_START}
     quiet = host.vanilla(densify_until_iter=0)
     whole = fitted(host, host.controller(base=quiet, **settings), 8)
     module = fitted(host, host.controller(base=quiet, **settings), 5)
@@ -166,7 +166,7 @@ def test_a_masked_pixel_is_hidden_at_both_scales(host, sr):
     """A gradient of a hidden half would come from the SR image alone."""
     mask = torch.zeros(3, 16, 24)
     module = fitted(
-        host, host.controller(strategies="gco", sr=sr, suffix="_x4", overrides=HR_FROM_START[:2]), 1, mask=mask
+        host, host.controller(strategies="gco", sr=sr, suffix="_x4", overrides=FROM_START[:2]), 1, mask=mask
     )
     assert all(float(g.abs().max()) == 0 for g in module.grads.values())
     assert attachment_of(module).log["base"] == 0
@@ -185,7 +185,7 @@ def test_mip_splattings_filter_is_that_of_the_hr_cameras(host, sr):
 
 
 def test_losses_of_hr_are_in_the_hosts_log(host, sr):
-    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=HR_FROM_START), 3)
+    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=FROM_START), 3)
     assert float(module.logged["clear_base"]) > 0
 
 
@@ -231,6 +231,6 @@ def test_models_whose_colours_are_not_those_of_the_gaussians_are_refused(host, s
 
 
 def test_a_resumed_run_without_our_state_continues_at_its_step_and_warns(host, sr, caplog):
-    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=HR_FROM_START), 4, start=3)
+    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=FROM_START), 4, start=3)
     assert attachment_of(module).t == 4
     assert "resumed at step 3 from a checkpoint without CLEAR" in caplog.text

@@ -24,12 +24,12 @@ from integration.inria.cameras import photo_of
 from integration.inria.from_options import install as install_in_inria
 from integration.points import stereo_points, wants_stereo
 from integration.views import HostPhoto
+from rasterizers.geometry import SH_C0
 from tests.helpers import toy
+from tests.helpers.host_parts import FROM_START
 from tests.helpers.inria import FOLDER, N, options
 
 SCRIPT = Path(__file__).parents[1] / "helpers" / "simple_trainer.py"
-ROWS = ["strategies.p2g.patch=4", "objective.lambda_hr.start=0", "objective.lambda_hr.full=0"]
-SH_C0 = 0.28209479177387814
 
 
 @cache
@@ -178,7 +178,7 @@ def own_gaussians(host, folder, **settings):
 
 
 def install_stereo(gaussians, scene, opt, folder, **settings):
-    return install_in_inria(gaussians, scene, opt, points="stereo", sr=folder / "sr", overrides=ROWS, **settings)
+    return install_in_inria(gaussians, scene, opt, points="stereo", sr=folder / "sr", overrides=FROM_START, **settings)
 
 
 @pytest.mark.parametrize("newer", [False, True])
@@ -203,7 +203,7 @@ def test_gaussians_are_made_again_at_the_stereo_cloud(newer, inria_host, inria_c
 def test_gaussians_stay_the_hosts_own_by_default(inria_host, inria_capture):
     gaussians, scene, opt = own_gaussians(inria_host, inria_capture)
     optimizer, xyz = gaussians.optimizer, gaussians._xyz
-    install_in_inria(gaussians, scene, opt, sr=inria_capture / "sr", overrides=ROWS).remove()
+    install_in_inria(gaussians, scene, opt, sr=inria_capture / "sr", overrides=FROM_START).remove()
     assert gaussians.optimizer is optimizer
     assert gaussians._xyz is xyz
 
@@ -250,7 +250,7 @@ def test_the_launcher_trains_from_stereo_and_continues_from_its_checkpoint(inria
 
     def run(name, *arguments):
         script = [str(FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(inria_capture / name)]
-        clear = ["--points", "stereo", "--sr", str(inria_capture / "sr"), *(f"--overrides={row}" for row in ROWS)]
+        clear = ["--points", "stereo", "--sr", str(inria_capture / "sr"), *(f"--overrides={row}" for row in FROM_START)]
         assert inria_main([*clear, *script, "--iterations", "6", "--densify_until_iter", "0", *arguments]) == 0
         return load_file(inria_capture / name)
 

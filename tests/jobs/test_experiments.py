@@ -9,17 +9,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra._internal.utils import create_config_search_path
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.plugins import Plugins
-from hydra.core.utils import setup_globals
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import Conductor
-from clear_strategies.compose import CONF
 from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import CHANGES_NO_RESULT, build
@@ -28,24 +21,18 @@ from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 from tests.helpers.command_line import TINY, run
-from tests.helpers.configs import composed, options
+from tests.helpers.configs import composed, jobs_of, loader, options
 
 
 def jobs(*arguments: str) -> tuple[list[dict[str, str]], Callable[[dict[str, str]], DictConfig]]:
     """The jobs that Hydra's sweeper makes of a command line, and what composes one."""
-    setup_globals()
-    Plugins.instance()
-    loader = ConfigLoaderImpl(create_config_search_path(str(CONF)))
-    whole = loader.load_configuration("config", list(arguments), run_mode=RunMode.MULTIRUN)
+    whole = loader().load_configuration("config", list(arguments), run_mode=RunMode.MULTIRUN)
     assert whole.hydra.mode == RunMode.MULTIRUN
-    swept = [f"{key}={value}" for key, value in whole.hydra.sweeper.params.items()]
-    overrides = OverridesParser.create(loader).parse_overrides([*swept, *arguments])
-    (batch,) = BasicSweeper.split_arguments(overrides, None)
 
     def composed_job(job: dict[str, str]) -> DictConfig:
-        return loader.load_sweep_config(whole, [f"{key}={value}" for key, value in job.items()])
+        return loader().load_sweep_config(whole, [f"{key}={value}" for key, value in job.items()])
 
-    return [dict(override.split("=", 1) for override in job) for job in batch], composed_job
+    return [dict(override.split("=", 1) for override in job) for job in jobs_of(whole, arguments)], composed_job
 
 
 def pieces(config: DictConfig, stretch: float = 1.0):

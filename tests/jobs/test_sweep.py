@@ -84,18 +84,6 @@ def test_a_killed_run_goes_on_from_the_newest_whole_checkpoint_and_ends_the_same
     assert json.loads((tmp_path / "here" / "metrics.json").read_text())["seconds"] >= seconds[-1]
 
 
-@pytest.mark.slow
-def test_a_stopped_run_goes_on_by_itself_and_ends_the_same(whole, tmp_path):
-    every = [*AUTO, "fit.iterations=40", "+strategy=clear", "hydra.run.dir=here"]
-    process = started("-c", stopped_by(signal.SIGTERM, after=20), *every, cwd=tmp_path, said=tmp_path / "said")
-    assert process.wait() == 143, (tmp_path / "said").read_text()
-    assert not (tmp_path / "here" / "metrics.json").exists()
-    result = run(*every, cwd=tmp_path)
-    assert result.returncode == 0, result.stderr
-    assert "resumed from" in result.stdout + result.stderr
-    assert (tmp_path / "here" / "point_cloud.ply").read_bytes() == (whole / "point_cloud.ply").read_bytes()
-
-
 def test_torch_and_kernels_divide_the_cores_among_the_jobs(monkeypatch):
     monkeypatch.setattr(sweep, "_threads_of_torch", lambda: 16)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _pid: set(range(12)), raising=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import builtins
 import dataclasses
 import sys
 from pathlib import Path
@@ -30,14 +29,7 @@ def test_without_cuda_the_error_says_what_to_install():
 
 
 def test_without_warp_the_error_says_what_to_install(monkeypatch):
-    real = builtins.__import__
-
-    def missing(name, *arguments, **options):
-        if name == "warp":
-            raise ModuleNotFoundError("No module named 'warp'", name="warp")
-        return real(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", missing)
+    monkeypatch.setitem(sys.modules, "warp", None)  # makes its import fail
     with pytest.raises(BackendUnavailable, match=r"not installed .*pip install 'clear-strategies\[warp\]'"):
         rasterizers.load("warp")
 

@@ -43,16 +43,13 @@ def test_an_opacity_that_no_renderer_draws_stays_as_it_is_so_that_logits_stay_fi
     assert -13 < params["opacities"][2] <= -11.5
 
 
-def test_the_more_views_there_are_the_slower_it_fades():
-    for views, rate in ((1, 0.02), (3, 0.02), (6, 0.01), (12, 0.005)):
-        lost = 1 - faded(FadingOpacity(rate=0.02), views=views)["opacities"][4].sigmoid() / 0.5
-        assert float(lost) == pytest.approx(rate, rel=1e-4)
-
-
-def test_a_short_run_fades_more_slowly():
-    for until, rate in ((9_000, 0.02), (1_350, 0.02), (270, 0.004)):
-        lost = 1 - faded(FadingOpacity(rate=0.02, until=until))["opacities"][4].sigmoid() / 0.5
-        assert float(lost) == pytest.approx(rate, rel=1e-4)
+@pytest.mark.parametrize(
+    ("views", "until", "rate"),
+    [(1, 9_000, 0.02), (3, 9_000, 0.02), (6, 9_000, 0.01), (12, 9_000, 0.005), (3, 1_350, 0.02), (3, 270, 0.004)],
+)
+def test_the_more_views_and_the_shorter_the_run_the_slower_it_fades(views, until, rate):
+    lost = 1 - faded(FadingOpacity(rate=0.02, until=until), views=views)["opacities"][4].sigmoid() / 0.5
+    assert float(lost) == pytest.approx(rate, rel=1e-4)
 
 
 def test_after_nine_tenths_of_the_run_opacities_are_left_alone():

@@ -46,20 +46,13 @@ def one_line(refusal: pytest.ExceptionInfo[DataError], *parts: str) -> None:
 
 
 @pytest.mark.parametrize("reader", SKIPPING)
-def test_a_missing_photo_is_counted_and_named_with_its_cure(tmp_path, reader):
+def test_a_missing_photo_is_counted_and_named_with_its_cure_and_skipped_on_request(tmp_path, reader, caplog):
     root, folder, read = built(tmp_path, reader)
     (folder / "b.png").unlink()
     with pytest.raises(DataError) as refusal:
         read(root)
     one_line(refusal, "1 of ", "b.png", "data.missing=skip")
-
-
-@pytest.mark.parametrize("reader", SKIPPING)
-def test_missing_photos_are_skipped_on_request(tmp_path, reader, caplog):
-    root, folder, read = built(tmp_path, reader)
-    (folder / "b.png").unlink()
-    capture = read(root, missing="skip")
-    assert names(capture) == ["a", "c"]
+    assert names(read(root, missing="skip")) == ["a", "c"]
     assert "b.png. They are skipped." in caplog.text
 
 

@@ -110,8 +110,6 @@ def sixteen_bits(folder: Path) -> None:
 
 # What the folder holds, and the photos that are then used.
 READ: dict[str, tuple[Callable[[Path], object], list[str]]] = {
-    "a photo on its side, by EXIF": (lambda f: turn(f / "b.png", 6), ["a.png", "b.png", "c.png"]),
-    "a photo upside down, by EXIF": (lambda f: turn(f / "b.png", 3), ["a.png", "b.png", "c.png"]),
     "HEIC among others": (lambda f: as_heic(f, "b.heic"), ["a.png", "b.heic", "c.png"]),
     "HEIC that calls itself JPEG": (lambda f: as_heic(f, "b.jpg"), ["a.png", "b.jpg", "c.png"]),
     "a photo saved as HEIC and as JPEG": (lambda f: beside(f, "b.HEIC"), ["a.png", "b.png", "c.png"]),
