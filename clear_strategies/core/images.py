@@ -58,8 +58,7 @@ def resize(
         return image.clone()
     if kernel == "area":
         return _hwc(F.adaptive_avg_pool2d(_nchw(image), (height, width))).clamp(0, 1)
-    pixels = (image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    small = Image.fromarray(pixels).resize((width, height), _PIL_FILTERS[kernel])
+    small = Image.fromarray(to_bytes(image)).resize((width, height), _PIL_FILTERS[kernel])
     return torch.from_numpy(np.array(small)).to(image) / 255
 
 
@@ -116,6 +115,11 @@ def patch_means(values: Float[Tensor, "H W C"], patch: int) -> Float[Tensor, "ph
     """
     mean = values.mean(dim=2)[None, None]
     return F.avg_pool2d(mean, patch, ceil_mode=True, count_include_pad=False)[0, 0]
+
+
+def to_bytes(image: Float[Tensor, "H W *C"]) -> np.ndarray:
+    """The image as 8-bit levels, uint8 in main memory; values outside [0, 1] are clamped."""
+    return np.asarray((image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy())
 
 
 def quantize(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:

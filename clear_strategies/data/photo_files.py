@@ -22,6 +22,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from clear_strategies.core.images import to_bytes
 from clear_strategies.errors import DataError
 from clear_strategies.files import require_regular, write_bytes
 from rasterizers.interface import Color
@@ -190,17 +191,15 @@ def list_images(folder: Path) -> list[Path]:
 
 def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> None:
     """8-bit PNG, written atomically; a [H, W] image is grey. Values outside [0, 1] are clamped."""
-    pixels = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=PNG_LEVEL)
+    Image.fromarray(to_bytes(image)).save(buffer, format="PNG", compress_level=PNG_LEVEL)
     write_bytes(path, buffer.getvalue())
 
 
 def jpeg(image: Float[Tensor, "H W 3"], quality: int = 90) -> bytes:
     """A small file of an image in [0, 1], for display and not for measurements."""
-    pixels = (image.detach().clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="JPEG", quality=quality, subsampling=0)
+    Image.fromarray(to_bytes(image)).save(buffer, format="JPEG", quality=quality, subsampling=0)
     return buffer.getvalue()
 
 
@@ -208,8 +207,7 @@ def write_jpeg(
     path: Path, image: Float[Tensor, "H W 3"], size: tuple[int, int], kernel: Image.Resampling, quality: int = 95
 ) -> None:
     """A JPEG of another size, (width, height)."""
-    pixels = Image.fromarray((image.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
-    pixels.resize(size, kernel).save(path, quality=quality, subsampling=0)
+    Image.fromarray(to_bytes(image)).resize(size, kernel).save(path, quality=quality, subsampling=0)
 
 
 def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) -> Path:

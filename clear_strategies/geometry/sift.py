@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.checks import require_number, require_whole
+from clear_strategies.core.images import to_bytes
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry.libraries import REMEDY, missing
@@ -117,8 +118,7 @@ def find_features(photo: Photo, settings: TriangulationSettings) -> Features:
     """SIFT keypoints of the enlarged image, with the square roots of their descriptors (RootSIFT)."""
     import cv2
 
-    pixels = (photo.image.clamp(0, 1) * 255).round().to(torch.uint8).cpu().numpy()
-    grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(to_bytes(photo.image), cv2.COLOR_RGB2GRAY)
     size = (grey.shape[1] * settings.enlarge, grey.shape[0] * settings.enlarge)
     large = cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)
     # Without the precise upscale every keypoint is a quarter of a pixel too far right and down.

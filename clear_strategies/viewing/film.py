@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core.images import to_bytes
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.viewing import video
 from clear_strategies.viewing.look import AS_MEASURED, Look, Painter
 from clear_strategies.viewing.video import Frame
 from rasterizers.interface import Camera
@@ -79,7 +79,7 @@ class DepthScale:
 
 def color_frames(painter: Painter, cameras: Sequence[Camera], look: Look = AS_MEASURED) -> Iterator[Frame]:
     """The pictures, 8 bits."""
-    return (video.to_bytes(painter.color(camera, look)) for camera in cameras)
+    return (to_bytes(painter.color(camera, look)) for camera in cameras)
 
 
 def depth_frames(painter: Painter, cameras: Sequence[Camera], look: Look = AS_MEASURED) -> Iterator[Frame]:

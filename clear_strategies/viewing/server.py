@@ -26,8 +26,8 @@ from nerfview._renderer import RenderTask
 from nerfview.render_panel import populate_general_render_tab
 from torch import Tensor
 
+from clear_strategies.core.images import to_bytes
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.viewing import video
 from clear_strategies.viewing.aim import add_camera, aim, drawn_length, wxyz
 from clear_strategies.viewing.cameras import SavedCamera, at_most
 from clear_strategies.viewing.film import DepthScale
@@ -103,10 +103,10 @@ class Screen:
             return self.depth_scale().picture(self.painter.depth(camera, view.look), legend=False)
         if view.show == _COVERAGE:
             ones = torch.ones(len(self.painter.field))
-            return video.to_bytes(self.painter.numbers(camera, ones, view.look)[..., None].expand(-1, -1, 3))
+            return to_bytes(self.painter.numbers(camera, ones, view.look)[..., None].expand(-1, -1, 3))
         if view.show != _COLOR and (rgb := self.points().get(view.show)) is not None:
-            return video.to_bytes(self.painter.points(camera, rgb, view.look))
-        return video.to_bytes(self.painter.color(camera, view.look))
+            return to_bytes(self.painter.points(camera, rgb, view.look))
+        return to_bytes(self.painter.color(camera, view.look))
 
     def depth_scale(self) -> DepthScale:
         """Chosen once, from the cameras of the run."""
@@ -260,7 +260,7 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
 
     def _add_frustum(self, saved: SavedCamera, size: float) -> Any:
         camera = saved.camera
-        image = None if saved.photo is None else video.to_bytes(read_image(saved.photo))
+        image = None if saved.photo is None else to_bytes(read_image(saved.photo))
         frustum = add_camera(
             self.server, f"/cameras/{saved.name}", camera, size, color=(255, 180, 60), image=image, visible=False
         )

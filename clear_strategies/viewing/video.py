@@ -10,7 +10,6 @@ from typing import Any, Final
 
 import numpy as np
 from jaxtyping import UInt8
-from torch import Tensor
 
 from clear_strategies import files
 from clear_strategies.errors import SettingError
@@ -49,11 +48,6 @@ def write_videos(paths: Iterable[Path], frames: Iterable[Frame], *, fps: float) 
                 send(np.ascontiguousarray(frame))
         if not sends:
             raise SettingError("a video needs at least 1 frame.")
-
-
-def to_bytes(image: Tensor) -> Frame:
-    """A picture in [0, 1] as 8 bits."""
-    return np.asarray((image.clamp(0, 1) * 255).round().byte().cpu().numpy())
 
 
 def _opened(stack: ExitStack, path: Path, width: int, height: int, fps: float) -> Callable[[Any], Any]:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from clear_strategies.core.images import to_bytes
 from clear_strategies.jobs.saved import open_splat
-from clear_strategies.viewing import points, video
+from clear_strategies.viewing import points
 from clear_strategies.viewing.look import Look
 from tests.helpers import saved_run, toy
 
@@ -40,20 +41,20 @@ def close(found, exact):
 
 
 def test_the_window_shows_what_is_measured(screen, splat):
-    close(screen.draw(server.View(), POSE, FOV, (96, 64)), video.to_bytes(splat.painter.color(CAMERA)))
+    close(screen.draw(server.View(), POSE, FOV, (96, 64)), to_bytes(splat.painter.color(CAMERA)))
 
 
 def test_switches_reach_the_picture(screen, splat):
     look = Look(detail=False, sh=False)
     found = screen.draw(server.View(look=look), POSE, FOV, (96, 64))
-    close(found, video.to_bytes(splat.painter.color(CAMERA, look)))
+    close(found, to_bytes(splat.painter.color(CAMERA, look)))
 
 
 def test_the_grid_of_lr_has_the_pixels_of_an_lr_camera_each_a_square(screen, splat):
     found = screen.draw(server.View(grid="LR pixels"), POSE, FOV, (960, 640))
     times = math.ceil(1024 / 24)
     assert found.shape == (16 * times, 24 * times, 3)
-    close(found[::times, ::times], video.to_bytes(splat.painter.color(CAMERA.scaled(1 / 4))))
+    close(found[::times, ::times], to_bytes(splat.painter.color(CAMERA.scaled(1 / 4))))
     assert (found[:times, :times] == found[0, 0]).all()
 
 
@@ -65,7 +66,7 @@ def test_depth_and_coverage_are_pictures(screen):
 def test_points_are_coloured_by_what_is_known_of_them(screen, splat):
     found = screen.draw(server.View(show="opacity"), POSE, FOV, (96, 64))
     colors = points.colors(splat.painter, None, ())["opacity"]
-    close(found, video.to_bytes(splat.painter.points(CAMERA, colors)))
+    close(found, to_bytes(splat.painter.points(CAMERA, colors)))
 
 
 def test_a_map_is_carried_over_to_the_gaussians_that_it_shows(splat):
