@@ -50,12 +50,7 @@ def write_depths(folder: Path, views: Sequence[View], painter: Painter) -> None:
 
 
 def write_splat_page(
-    folder: Path,
-    train: Sequence[Camera],
-    painter: Painter,
-    most: int,
-    title: str,
-    background: Color,
+    folder: Path, train: Sequence[Camera], painter: Painter, most: int, title: str, background: Color
 ) -> None:
     """Write splat.html, unless the field has more Gaussians than `most`, or the page cannot be made: a message then says why.
 

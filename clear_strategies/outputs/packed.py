@@ -48,8 +48,5 @@ def turned(g: GaussianPly) -> GaussianPly:
     bands = g.shN.shape[1]
     signs = (spherical_harmonics(direction * turn, bands) / spherical_harmonics(direction, bands))[0, 1:].round()
     return replace(
-        g,
-        means=g.means * turn,
-        quats=g.quats * g.quats.new_tensor([1.0, 1.0, -1.0, -1.0]),
-        shN=g.shN * signs[:, None],
+        g, means=g.means * turn, quats=g.quats * g.quats.new_tensor([1.0, 1.0, -1.0, -1.0]), shN=g.shN * signs[:, None]
     )

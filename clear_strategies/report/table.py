@@ -46,10 +46,7 @@ def layout(rows: Sequence[Row], *, beside: Mapping[str, Columns] | None = None, 
         beside: quantity -> columns that stand right of it.
         notes: added to the table's own.
     """
-    cells: Columns = {
-        "scene": [row.scene for row in rows],
-        "method": [row.method for row in rows],
-    }
+    cells: Columns = {"scene": [row.scene for row in rows], "method": [row.method for row in rows]}
     for quantity, (header, form) in QUANTITIES.items():
         cells[header] = [_number(row, quantity, form) for row in rows]
         if beside is not None:

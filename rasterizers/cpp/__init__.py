@@ -23,10 +23,7 @@ from rasterizers.interface import Camera, Rendering, SplatGradients, Splats, Tra
 from rasterizers.native import load_kernels, threads
 
 _TRAITS: Final = Traits(
-    devices=frozenset({"cpu"}),
-    dtypes=frozenset({torch.float32, torch.float64}),
-    native_threads=True,
-    depth=True,
+    devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32, torch.float64}), native_threads=True, depth=True
 )
 _LONGEST_SIDE: Final = 32 << 15  # px: bins of 32 px are numbered in 16 bits
 

@@ -24,9 +24,7 @@ from rasterizers.reference.projection import Projection, project
 from rasterizers.reference.tiles import TileGrid, TileLists, list_tiles
 
 _TRAITS: Final = Traits(
-    devices=frozenset({"cpu", "cuda"}),
-    dtypes=frozenset({torch.float32, torch.float64}),
-    depth=True,
+    devices=frozenset({"cpu", "cuda"}), dtypes=frozenset({torch.float32, torch.float64}), depth=True
 )
 _TILE: Final = 8  # px; takes half the time of 16 in torch
 

@@ -129,19 +129,7 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: 
         power_max = (opacities / settings.alpha_min).log() * (1 + 1e-3) + 1e-3
         half = torch.sqrt(2 * power_max.clamp_min(0)[:, None] * torch.stack((a + k, c + k), dim=-1)) * unit[:, None]
     return Projection(
-        len(splats),
-        rows,
-        means2d,
-        conics,
-        opacities,
-        rgb,
-        z,
-        half,
-        power_max,
-        leaves,
-        raw_rgb,
-        basis.detach(),
-        depth,
+        len(splats), rows, means2d, conics, opacities, rgb, z, half, power_max, leaves, raw_rgb, basis.detach(), depth
     )
 
 

@@ -137,10 +137,7 @@ def _ellipse_reaches(
     near_x, near_y = _nearest_to_zero(left, right), _nearest_to_zero(top, bottom)
     on_side_x = torch.clamp(-B * near_x / C, top, bottom)
     on_side_y = torch.clamp(-B * near_y / A, left, right)
-    power = torch.minimum(
-        _power(A, B, C, near_x, on_side_x),
-        _power(A, B, C, on_side_y, near_y),
-    )
+    power = torch.minimum(_power(A, B, C, near_x, on_side_x), _power(A, B, C, on_side_y, near_y))
     return power <= projection.power_max[row]
 
 

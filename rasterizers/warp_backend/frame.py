@@ -21,12 +21,7 @@ import warp as wp
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import (
-    packed_rows,
-    require_cotangents,
-    require_finite,
-    require_splats,
-)
+from rasterizers.checks import packed_rows, require_cotangents, require_finite, require_splats
 from rasterizers.interface import Camera, SplatGradients, Splats
 from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
@@ -77,12 +72,7 @@ class _Lists:
 class Frame:
     """One depth order for several pixel grids, and the tensors that the VJP reads again."""
 
-    def __init__(
-        self,
-        settings: WarpSettings,
-        jobs: Sequence[tuple[Splats, Camera]],
-        depth: Sequence[bool],
-    ) -> None:
+    def __init__(self, settings: WarpSettings, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> None:
         splats, camera = jobs[0]
         for job, _ in jobs:
             require_splats(job, settings.traits)

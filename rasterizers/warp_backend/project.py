@@ -9,14 +9,7 @@ import warp as wp
 
 from rasterizers.warp_backend.bins import count_tiles, depth_key, reaches_image
 from rasterizers.warp_backend.colour import colour_of
-from rasterizers.warp_backend.geometry import (
-    Footprint,
-    Sums,
-    centre_of,
-    footprint_of,
-    geometry_of,
-    geometry_vjp,
-)
+from rasterizers.warp_backend.geometry import Footprint, Sums, centre_of, footprint_of, geometry_of, geometry_vjp
 from rasterizers.warp_backend.types import FAR, SUMS, Cuts, Ellipse, Grid, Pose, Row, ellipse_of, row_of
 
 wp.set_module_options({"enable_backward": False})

@@ -26,12 +26,7 @@ from clear_strategies.geometry.interpolation import densify, pixel_grid
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
 from rasterizers.interface import Color
 
-__all__ = [
-    "CloudSettings",
-    "InitialPoints",
-    "initial_points",
-    "require_source",
-]
+__all__ = ["CloudSettings", "InitialPoints", "initial_points", "require_source"]
 
 _log = logging.getLogger(__name__)
 
@@ -261,20 +256,14 @@ def _compares_hr(compare: Compare, hr_is_photo: bool, n_photos: int) -> bool:
 
 
 def _cleaned(
-    settings: CloudSettings,
-    cloud: PointCloud,
-    photos: Sequence[Photo],
-    background: Color | None,
+    settings: CloudSettings, cloud: PointCloud, photos: Sequence[Photo], background: Color | None
 ) -> PointCloud:
     cloud = without_outliers(cloud, settings.outlier_neighbours, settings.outlier_ratio)
     return _densified(settings, cloud, photos, background)
 
 
 def _densified(
-    settings: CloudSettings,
-    cloud: PointCloud,
-    photos: Sequence[Photo],
-    background: Color | None,
+    settings: CloudSettings, cloud: PointCloud, photos: Sequence[Photo], background: Color | None
 ) -> PointCloud:
     grid = sum(len(pixel_grid(photo, settings.stride)) for photo in photos)
     if settings.densify == "auto" and len(cloud) >= grid:

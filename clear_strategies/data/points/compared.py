@@ -50,11 +50,7 @@ class Compared:
         )
 
     def _maps(
-        self,
-        photos: Sequence[Photo],
-        points: Float[Tensor, "N 3"],
-        background: Color | None,
-        settings: StereoSettings,
+        self, photos: Sequence[Photo], points: Float[Tensor, "N 3"], background: Color | None, settings: StereoSettings
     ) -> tuple[DepthMap, ...]:
         return tuple(depth_maps(photos, points, settings, background, self.masks(photos)))
 

@@ -18,15 +18,7 @@ from clear_strategies.kernels.losses import cpp, warp
 from clear_strategies.kernels.losses import reference as reference
 from clear_strategies.kernels.losses.reference import LossAndGradient
 
-__all__ = [
-    "Choice",
-    "Implementation",
-    "LossAndGradient",
-    "haar_l1",
-    "implementations",
-    "photometric",
-    "require",
-]
+__all__ = ["Choice", "Implementation", "LossAndGradient", "haar_l1", "implementations", "photometric", "require"]
 
 _log = logging.getLogger(__name__)
 

@@ -46,10 +46,7 @@ def accepts(*images: Tensor) -> bool:
 
 
 def photometric(
-    x: Float[Tensor, "H W 3"],
-    y: Float[Tensor, "H W 3"],
-    lambda_ssim: float,
-    out: Float[Tensor, "H W 3"] | None = None,
+    x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], lambda_ssim: float, out: Float[Tensor, "H W 3"] | None = None
 ) -> LossAndGradient:
     """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient, in one pass; with λ = 0 no SSIM is computed."""
     images = image_pair(_DEVICES, x, y, out)

@@ -27,10 +27,7 @@ class LossAndGradient(NamedTuple):
 
 
 def photometric(
-    x: Float[Tensor, "H W C"],
-    y: Float[Tensor, "H W C"],
-    lambda_ssim: float,
-    out: Float[Tensor, "H W C"] | None = None,
+    x: Float[Tensor, "H W C"], y: Float[Tensor, "H W C"], lambda_ssim: float, out: Float[Tensor, "H W C"] | None = None
 ) -> LossAndGradient:
     """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient; with λ = 0 no SSIM is computed."""
     value, gradient = l1(x, y)

@@ -106,12 +106,7 @@ def turns_something(p: Products, rotation_noise: wp.float64) -> wp.bool:
 
 @wp.func
 @no_type_check
-def correct(
-    p: Products,
-    rule: Rule,
-    reliability: wp.array[wp.float32],
-    i: wp.int32,
-) -> Corrected:
+def correct(p: Products, rule: Rule, reliability: wp.array[wp.float32], i: wp.int32) -> Corrected:
     """The corrections of a Gaussian by group (Eq. 6, 7, 11)."""
     multiple, omegas, rows, at_bound = Six(), Six(), wp.int32(0), wp.int32(0)
     one, tolerance, q = wp.float64(1.0), rule.tolerance, wp.float64(0.0)

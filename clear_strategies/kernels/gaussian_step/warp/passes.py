@@ -59,12 +59,7 @@ class StepOptions:
 @wp.kernel
 @no_type_check
 def compare(
-    activation: Activation,
-    lr: Gradient,
-    base: Gradient,
-    hf: Gradient,
-    view: View,
-    counts: wp.array[Counts],
+    activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View, counts: wp.array[Counts]
 ) -> None:
     """One thread per Gaussian: whether its gradients are comparable and opposed."""
     block, lane = wp.tid()
