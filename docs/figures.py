@@ -17,9 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import textwrap
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -89,22 +87,6 @@ def ablation(folder: Path) -> None:
     write(figure, folder, "ablation")
 
 
-def dots(folder: Path, name: str, column: str, label: str) -> None:
-    """One line a method, with the error where the cell has one."""
-    rows = [row for row in table(name) if row[column]]
-    figure, axes = plt.subplots(figsize=(7, 0.28 * len(rows) + 0.9))
-    for y, row in enumerate(rows):
-        ours = row["method"].lower() == "clear"
-        (x,), colour = numbers(row[column]), "C0" if ours else "0.4"
-        axes.errorbar(x, y, xerr=error(row[column]), fmt="o", color=colour)
-        axes.annotate(row[column], (x, y), (0, 6), textcoords="offset points", ha="center", fontsize=7, color=colour)
-    axes.set_yticks(range(len(rows)), [row["method"] for row in rows])
-    axes.set_ylim(len(rows) - 0.5, -0.8)
-    axes.grid(axis="y", linewidth=0.3)
-    axes.set_xlabel(label)
-    write(figure, folder, name)
-
-
 def skips(folder: Path) -> None:
     rows = [row for row in table("skips") if row["scene"] != "average"]
     figure, axes = plt.subplots(figsize=(7, 2.6))
@@ -120,29 +102,9 @@ def skips(folder: Path) -> None:
     write(figure, folder, "skips")
 
 
-def changes(folder: Path, name: str, first: str, drop: int = 0) -> None:
-    """Δ of each change on the scenes that it was tried on; several values are several seeds."""
-    rows = table(name)[drop:]
-    scenes: Sequence[str] = ("fern", "fountain", "demo")
-    figure, axes = plt.subplots(figsize=(8, 0.42 * len(rows) + 0.9))
-    for k, (scene, marker) in enumerate(zip(scenes, "os^", strict=True)):
-        points = [(x, y + 0.15 * (k - 1)) for y, row in enumerate(rows) for x in numbers(row[scene])]
-        axes.plot([x for x, _ in points], [y for _, y in points], marker, label=scene, markersize=4)
-    axes.axvline(0, color=GREY, linewidth=1)
-    axes.set_yticks(range(len(rows)), [textwrap.fill(row[first], 46) for row in rows], fontsize=8)
-    axes.invert_yaxis()
-    axes.set_xlabel("Δ PSNR, dB")
-    axes.legend(fontsize=7, frameon=False)
-    write(figure, folder, name)
-
-
 def main(folder: Path) -> None:
     ablation(folder)
-    dots(folder, "baselines", "average", "PSNR of the test views, dB, average of five scenes")
-    dots(folder, "corrupted", "Δ", "Δ PSNR over the baseline, dB, average of five scenes")
     skips(folder)
-    changes(folder, "readings", "change", drop=1)
-    changes(folder, "skips_chosen", "left out")
 
 
 # The test view of the README's picture, and the part of it that is magnified: left, top, right, bottom, px.
