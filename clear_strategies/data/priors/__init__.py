@@ -16,8 +16,9 @@ from clear_strategies.data.priors.interface import (
 )
 from clear_strategies.data.priors.ncnn import Ncnn
 from clear_strategies.data.priors.onnx import Onnx
+from clear_strategies.data.priors.self_ensembled import SelfEnsembled
 
 __all__ = [
     "BackProjected", "Bicubic", "Cached", "Corrupted", "DemoPrior", "DnnSuperres", "Images", "Ncnn", "Network", "Onnx",
-    "Prior", "SuperResolved", "cache_folder", "cached", "fingerprint", "network_of", "super_resolved",
+    "Prior", "SelfEnsembled", "SuperResolved", "cache_folder", "cached", "fingerprint", "network_of", "super_resolved",
 ]  # fmt: skip
