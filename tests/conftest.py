@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,13 @@ import torch
 
 # Small tensors: a second thread costs more than it brings, above all beside other test processes.
 torch.set_num_threads(1)
+
+
+def pytest_collection_finish() -> None:
+    """From here on no bytecode is written. While two threads import, jaxtyping's import hook may write its own code where Python
+    looks for plain code, and every later process that imports it without the hook fails.
+    """
+    sys.dont_write_bytecode = True
 
 
 @pytest.fixture(scope="session")
