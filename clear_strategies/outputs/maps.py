@@ -29,6 +29,7 @@ from torch import Tensor
 
 from clear_strategies import files
 from clear_strategies.core import images
+from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
@@ -83,11 +84,11 @@ def write_maps(
     corrector = conductor.owner("correct")
     if corrector is None:
         _log.debug("maps: no strategy of this run corrects, so there is no corrected.png.")
-    observer = _observer(conductor, views[0])
+    evidence = _evidence(conductor, views[0])
     content = {
         "note": _NOTE,
         "corrector": None if corrector is None else type(corrector).__name__,
-        "evidence": None if observer is None else type(observer).__name__,
+        "evidence": None if evidence is None else type(evidence[0]).__name__,
         "views": means,
     }
     files.write_json(folder / "maps.json", content)
@@ -95,7 +96,8 @@ def write_maps(
 
 def view_maps(field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View) -> ViewMaps:
     """The maps of one view by the strategies of the run, without dropout."""
-    patches = _patch_maps(_observer(conductor, view), view)
+    evidence = _evidence(conductor, view)
+    patches = {} if evidence is None else _enlarged(evidence[1], view)
     numbers, compared = _compare(*_gradients(field, conductor, rasterizer, view))
     drawn = _draw(field, rasterizer, view.hr.camera, torch.stack(list(numbers.values()), dim=1))
     maps = {**patches, **{name: drawn[..., k].clamp(0, 1) for k, name in enumerate(numbers)}}
@@ -104,15 +106,14 @@ def view_maps(field: GaussianField, conductor: Conductor, rasterizer: Rasterizer
     return ViewMaps(maps, means)
 
 
-def _observer(conductor: Conductor, view: View) -> Strategy | None:
-    """The strategy that has patch evidence of the view."""
-    return next((s for s in conductor.strategies if s.patch_maps(view) is not None), None)
+def _evidence(conductor: Conductor, view: View) -> tuple[Strategy, PatchMaps] | None:
+    """The strategy that has patch evidence of the view, and that evidence."""
+    known = ((s, patches) for s in conductor.strategies if (patches := s.patch_maps(view)) is not None)
+    return next(known, None)
 
 
-def _patch_maps(observer: Strategy | None, view: View) -> dict[str, Tensor]:
-    """R, A and R·A, enlarged to HR."""
-    if observer is None or (patches := observer.patch_maps(view)) is None:
-        return {}
+def _enlarged(patches: PatchMaps, view: View) -> dict[str, Tensor]:
+    """R, A and R·A at HR."""
     edge, camera, R, A = patches.patch * view.factor, view.hr.camera, patches.reliability, patches.demand
 
     def enlarged(values: Tensor) -> Tensor:
