@@ -11,8 +11,8 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.checks import refuse
-from clear_strategies.data.priors.cache import cached
-from clear_strategies.data.priors.interface import Network, Prior
+from clear_strategies.data.priors.cache import Cached, cached
+from clear_strategies.data.priors.interface import Prior
 
 _ORIENTATIONS: Final = tuple((turns, mirrored) for turns in range(4) for mirrored in (False, True))
 """Quarter turns, and whether the photo is mirrored first."""
@@ -35,11 +35,10 @@ class SelfEnsembled:
     prior: Prior
 
     def __post_init__(self) -> None:
-        if not isinstance(getattr(self.prior, "prior", self.prior), Network):
-            refuse(
-                "prior.prior", "must be a network", type(self.prior).__name__, "use that prior without SelfEnsembled"
-            )
-        object.__setattr__(self, "prior", cached(self.prior))
+        network = cached(self.prior)
+        if not isinstance(network, Cached):
+            refuse("prior.prior", "must be a network", type(network).__name__, "use that prior without SelfEnsembled")
+        object.__setattr__(self, "prior", network)
 
     @property
     def label(self) -> str:

@@ -37,7 +37,7 @@ def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_turns_with_the_photo_stays_and_what_does_not_is_averaged() -> None:
     lr = photo(6, 10)
     same = SelfEnsembled(Shaded(0.0))("view", lr, 4)
-    assert torch.equal(same, Shaded(0.0)("view", lr, 4).mul(255).round() / 255)
+    assert torch.equal(same, images.quantize(Shaded(0.0)("view", lr, 4)))
     added = SelfEnsembled(Shaded(0.25))("view", lr, 4) - same
     # Half of the orientations have each pixel in their right half.
     assert added.shape == (24, 40, 3)
