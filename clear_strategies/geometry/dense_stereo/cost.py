@@ -13,7 +13,7 @@ from clear_strategies.geometry.dense_stereo.image import Grey
 
 _VARIANCE_FLOOR: Final = 1e-5  # of grey in [0, 1]: windows with less contrast than noise correlate with nothing
 _UNSEEN: Final = 0.5  # cost of a plane that a photo does not see: that of unrelated windows
-_BLOCK: Final = 1 << 21  # pixels times planes that are compared at once
+_BLOCK: Final = 1 << 19  # pixels times planes that are compared at once: they stay in a processor's cache
 
 
 def cost_volume(
@@ -27,8 +27,9 @@ def cost_volume(
     height, width = photo.image.shape
     volume = photo.image.new_empty(height, width, len(inverse_depths))
     reference = _Windows(photo.image[None], window)
+    swept = [_Swept(photo, other) for other in others]
     for planes in _blocks(len(inverse_depths), max(1, _BLOCK // (height * width))):
-        costs = (_cost(reference, photo, other, inverse_depths[planes], window) for other in others)
+        costs = (_cost(reference, other, inverse_depths[planes], window) for other in swept)
         volume[:, :, planes] = mean_of_lowest(costs, (len(others) + 1) // 2).permute(1, 2, 0)
     return volume
 
@@ -62,33 +63,38 @@ class _Windows:
         self.deviation = (variance.clamp_min(0) + _VARIANCE_FLOOR).sqrt()
 
 
+class _Swept:
+    """Another photo, drawn onto the pixels of the photo through planes."""
+
+    def __init__(self, photo: Grey, other: Grey) -> None:
+        rotated, self.shift = photo.towards(other)
+        self.rotated = rotated.permute(2, 0, 1).contiguous()
+        self.image = other.image
+
+    def through(self, inverse_depths: Float[Tensor, " P"]) -> tuple[Float[Tensor, "P H W"], Bool[Tensor, "P H W"]]:
+        """(the other photo drawn through each plane, whether the pixel lies inside it).
+
+        A pixel's point at inverse depth d projects to K' (R K⁻¹ x + d t), up to its third coordinate.
+        """
+        x, y, z = (self.rotated[k] + self.shift[k] * inverse_depths[:, None, None] for k in range(3))
+        height, width = self.image.shape
+        # grid_sample's coordinates: -1 and 1 are the outer borders of the image.
+        u, v = x.div_(z * (width / 2)).sub_(1), y.div_(z * (height / 2)).sub_(1)
+        seen = (z > 0) & (torch.maximum(u.abs(), v.abs()) < 1)
+        grid = torch.view_as_real(torch.complex(u, v))  # a stack in a tenth of the time
+        images = self.image.expand(len(inverse_depths), 1, height, width)
+        drawn = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+        return drawn[:, 0], seen
+
+
 def _cost(
-    reference: _Windows, photo: Grey, other: Grey, inverse_depths: Float[Tensor, " P"], window: int
+    reference: _Windows, other: _Swept, inverse_depths: Float[Tensor, " P"], window: int
 ) -> Float[Tensor, "P H W"]:
-    drawn, seen = through_planes(photo, other, inverse_depths)
+    drawn, seen = other.through(inverse_depths)
     windows = _Windows(drawn, window)
     covariance = box_mean(reference.images * drawn, window) - reference.mean * windows.mean
     correlation = covariance / (reference.deviation * windows.deviation)
     return torch.where(seen, (1 - correlation) / 2, _UNSEEN)
-
-
-def through_planes(
-    photo: Grey, other: Grey, inverse_depths: Float[Tensor, " P"]
-) -> tuple[Float[Tensor, "P H W"], Bool[Tensor, "P H W"]]:
-    """(the other photo drawn onto the photo's pixels through each plane, whether the pixel lies inside it).
-
-    A pixel's point at inverse depth d projects to K' (R K⁻¹ x + d t), up to its third coordinate.
-    """
-    rotated, shift = photo.towards(other)
-    x, y, z = (rotated[..., k] + shift[k] * inverse_depths[:, None, None] for k in range(3))
-    height, width = other.image.shape
-    # grid_sample's coordinates: -1 and 1 are the outer borders of the image.
-    u, v = x / (z * (width / 2)) - 1, y / (z * (height / 2)) - 1
-    seen = (z > 0) & (u > -1) & (u < 1) & (v > -1) & (v < 1)
-    grid = torch.stack((u, v), dim=-1).nan_to_num(2, 2, -2).clamp(-2, 2)
-    images = other.image.expand(len(inverse_depths), 1, height, width)
-    drawn = torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
-    return drawn[:, 0], seen
 
 
 def box_mean(images: Float[Tensor, "P H W"], window: int) -> Float[Tensor, "P H W"]:
