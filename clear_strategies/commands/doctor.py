@@ -30,7 +30,7 @@ EXTRAS: Final = {
     "log": (("tensorboard",), "fit.log=tensorboard: curves and pictures while a run trains"),
     "gsplat": (("gsplat",), "gsplat's densifiers, and its rasterizer on CUDA"),
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
-    "open3d": (("open3d",), "a second way of removing outliers from point clouds"),
+    "open3d": (("open3d",), "a second way of averaging points in voxels"),
     "sweeps": (("hydra_plugins.hydra_joblib_launcher",), "many runs at once, on one machine or a cluster"),
     "bench": (("pandas",), "python -m clear_strategies.bench"),
 }

@@ -1,6 +1,7 @@
-"""Cleaning a cloud: outliers are removed, voxels averaged. By Open3D where it is installed, else by SciPy and numpy.
+"""Cleaning a cloud: outliers are removed, voxels averaged, both as Open3D defines it.
 
-Both paths follow Open3D's definitions exactly, so a cloud does not depend on which of them ran.
+Outliers are SciPy's work, because most runs remove them and importing Open3D takes two seconds. Voxels are Open3D's where it
+is installed, else numpy's; the points are the same.
 """
 
 from __future__ import annotations
@@ -61,12 +62,6 @@ def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) 
     points = means.detach().double().cpu().numpy()
     if len(points) < 2:
         return torch.arange(len(points))
-    open3d = _open3d("outlier removal")
-    if open3d is not None:
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-        _, kept = cloud.remove_statistical_outlier(nb_neighbors=neighbours, std_ratio=ratio)
-        return torch.tensor(sorted(kept), dtype=torch.long)
-
     from scipy.spatial import cKDTree
 
     distances, _ = cKDTree(points).query(points, k=min(neighbours, len(points)))
@@ -99,7 +94,7 @@ def voxel_grid(
     if float(np.ptp(points, axis=0).max()) >= edge * _LARGEST_CELL:
         raise ValueError(f"edge must be at least the cloud's extent / {_LARGEST_CELL}, got {edge}. Enlarge the voxel.")
     shades = colors.detach().double().cpu().numpy()
-    open3d = _open3d("voxel grid")
+    open3d = _open3d()
     if open3d is not None:
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
         cloud.colors = open3d.utility.Vector3dVector(shades)
@@ -116,12 +111,12 @@ def voxel_grid(
     return averages[:, :3].to(means), averages[:, 3:].to(colors)
 
 
-def _open3d(task: str) -> Any:
+def _open3d() -> Any:
     """The module, or None where it is not installed or its system libraries are missing."""
     try:
         import open3d
     except (ImportError, OSError) as reason:
-        _log.debug("%s by SciPy: open3d (extra [open3d]) cannot be imported (%s).", task, " ".join(str(reason).split()))
+        _log.debug("voxels by numpy: open3d (extra [open3d]) cannot be imported (%s).", " ".join(str(reason).split()))
         return None
-    _log.debug("%s by open3d %s.", task, open3d.__version__)
+    _log.debug("voxels by open3d %s.", open3d.__version__)
     return open3d

@@ -15,11 +15,6 @@ from torch import Tensor
 from clear_strategies.geometry.cleaning import remove_outliers, voxel_grid
 
 
-@pytest.fixture
-def scipy_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_open3d(monkeypatch)
-
-
 def without_open3d(patch: pytest.MonkeyPatch) -> None:
     patch.setitem(sys.modules, "open3d", None)  # makes its import fail
 
@@ -34,15 +29,6 @@ def require_open3d() -> None:
         pytest.skip(f"open3d cannot be imported: {reason}")
 
 
-def both_ways(monkeypatch: pytest.MonkeyPatch, function: object, *arguments: object) -> tuple[object, object]:
-    """(with open3d, with scipy)."""
-    require_open3d()
-    one = function(*arguments)  # type: ignore[operator]
-    with monkeypatch.context() as patch:
-        without_open3d(patch)
-        return one, function(*arguments)  # type: ignore[operator]
-
-
 def room(n: int = 3000) -> Tensor:
     """Two walls of uneven density with noise, strays around them, and points that coincide."""
     rng = np.random.default_rng(0)
@@ -53,24 +39,29 @@ def room(n: int = 3000) -> Tensor:
 
 
 @pytest.mark.parametrize(("count", "ratio"), [(16, 3.0), (16, 0.5), (8, 1.0), (2, 0.1), (400, 1.0)])
-def test_open3d_and_scipy_keep_the_same_points(monkeypatch: pytest.MonkeyPatch, count: int, ratio: float) -> None:
-    with_open3d, with_scipy = both_ways(monkeypatch, remove_outliers, room(300), count, ratio)
-    assert isinstance(with_scipy, Tensor)
-    assert torch.equal(with_open3d, with_scipy)
-    assert 0 < len(with_scipy) < len(room(300))
+def test_outliers_are_those_of_open3d(count: int, ratio: float) -> None:
+    require_open3d()
+    import open3d
+
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(room(300).numpy()))
+    _, expected = cloud.remove_statistical_outlier(nb_neighbors=count, std_ratio=ratio)
+    kept = remove_outliers(room(300), count, ratio)
+    assert kept.tolist() == sorted(expected)
+    assert 0 < len(kept) < len(room(300))
 
 
 @pytest.mark.parametrize("edge", [0.003, 0.1, 1.0, 100.0])
-def test_open3d_and_scipy_average_the_same_voxels(monkeypatch: pytest.MonkeyPatch, edge: float) -> None:
+def test_open3d_and_numpy_average_the_same_voxels(monkeypatch: pytest.MonkeyPatch, edge: float) -> None:
+    require_open3d()
     points = room()
     colors = torch.rand(len(points), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    with_open3d, with_scipy = both_ways(monkeypatch, voxel_grid, points, colors, edge)
-    for one, other in zip(with_open3d, with_scipy, strict=True):
+    with_open3d = voxel_grid(points, colors, edge)
+    without_open3d(monkeypatch)
+    for one, other in zip(with_open3d, voxel_grid(points, colors, edge), strict=True):
         assert one.shape == other.shape
         assert torch.allclose(one, other, rtol=0, atol=1e-9)
 
 
-@pytest.mark.usefixtures("scipy_only")
 def test_a_stray_point_is_removed() -> None:
     # Mean distance to the 2 nearest, itself included: 1/2 four times and 96/2 once. Average 10, deviation 21.2.
     line = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [99, 0, 0]])
@@ -78,14 +69,13 @@ def test_a_stray_point_is_removed() -> None:
     assert remove_outliers(line, 2, 1.8).tolist() == [0, 1, 2, 3, 4]  # 48.3
 
 
-@pytest.mark.usefixtures("scipy_only")
 def test_a_point_on_its_nearest_one_is_removed() -> None:
     line = torch.tensor([[0.0, 0, 0], [0, 0, 0], [1, 0, 0], [2, 0, 0]])
     assert remove_outliers(line, 2, 3.0).tolist() == [2, 3]
 
 
-@pytest.mark.usefixtures("scipy_only")
-def test_voxels_begin_half_an_edge_below_the_smallest_corner() -> None:
+def test_voxels_begin_half_an_edge_below_the_smallest_corner(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_open3d(monkeypatch)
     # Cubes of edge 2 from -1: [-1, 1), [1, 3).
     means = torch.tensor([[0.0, 0, 0], [0.9, 0, 0], [1.1, 0, 0], [2.9, 0, 0]])
     colors = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1, 0], [0.0, 0, 1]])
@@ -117,8 +107,8 @@ def test_tiny_clouds_are_left_alone() -> None:
 def test_the_log_says_which_library_ran(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("DEBUG")
     without_open3d(monkeypatch)
-    remove_outliers(room(100), 16, 3.0)
-    assert "outlier removal by SciPy: open3d (extra [open3d]) cannot be imported" in caplog.text
+    voxel_grid(room(100), room(100), 1.0)
+    assert "voxels by numpy: open3d (extra [open3d]) cannot be imported" in caplog.text
 
 
 def test_bad_arguments_name_the_rule_and_the_value() -> None:
