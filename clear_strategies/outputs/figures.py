@@ -36,6 +36,7 @@ BLUE, RED, GREEN, YELLOW, CYAN, PURPLE, GREY = (
 
 
 Item = TypeVar("Item")
+Span = tuple[float, float]
 
 
 def spaced(items: Sequence[Item], count: int) -> Sequence[Item]:
@@ -118,20 +119,35 @@ class PixelPage:
         self.figure = NewFigure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
         self.text(GAP, 1.5 * LINE, title, size=12)
 
-    def image(self, x: int, y: int, pixels: np.ndarray, times: float) -> tuple[Axes, AxesImage]:
-        """Draw RGB, or an error map in its colours, `times` larger, with the top left corner at (x, y)."""
+    def image(
+        self, x: int, y: int, pixels: np.ndarray, times: float, *, colors: str = "magma", span: Span = (0, ERROR_MAX)
+    ) -> tuple[Axes, AxesImage]:
+        """Draw RGB, or numbers in colours, `times` larger, with the top left corner at (x, y).
+
+        Args:
+            colors: matplotlib's name of the colours of numbers; by default those of an error map.
+            span: the numbers at which the colours begin and end. Grey shows nan.
+        """
+        from matplotlib import colormaps
+
         height, width = (round(size * times) for size in pixels.shape[:2])
         axis = self._axes(x, y, width, height)
         axis.set_axis_off()
         drawn = axis.imshow(
-            pixels, aspect="auto", cmap="magma", vmin=0, vmax=ERROR_MAX,
+            pixels, aspect="auto", cmap=colormaps[colors].with_extremes(bad=RULE), vmin=span[0], vmax=span[1],
             interpolation="nearest" if times >= 1 else "antialiased", interpolation_stage="rgba",
         )  # fmt: skip
         return axis, drawn
 
-    def colour_bar(self, x: int, y: int, height: int, error: AxesImage, label: str) -> None:
-        """The colours of an error map, 12 px wide, with its numbers to the right."""
-        bar = self.figure.colorbar(error, cax=self._axes(x, y, 12, height), extend="max", extendfrac=0.03)
+    def colour_bar(
+        self, x: int, y: int, height: int, drawn: AxesImage, label: str, *, extend: Literal["max", "neither"] = "max"
+    ) -> None:
+        """The colours of an image of numbers, 12 px wide, with its numbers to the right.
+
+        Args:
+            extend: "max": an arrow says that larger numbers have the last colour.
+        """
+        bar = self.figure.colorbar(drawn, cax=self._axes(x, y, 12, height), extend=extend, extendfrac=0.03)
         bar.set_label(label, fontsize=8, color=INK)
         bar.ax.tick_params(labelsize=8, colors=INK)
         bar.outline.set_visible(False)

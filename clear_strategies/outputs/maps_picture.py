@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.images import area_mean
 from clear_strategies.core.view import DepthMap, Photo, View
-from clear_strategies.outputs import figures
+from clear_strategies.outputs.figures import GAP, LINE, PixelPage, Span, magnification, save_png
 from clear_strategies.viewing.film import DepthScale
 
 _MEANINGS: Final = {
@@ -22,9 +24,18 @@ _MEANINGS: Final = {
     "conflict": "conflict\n1 where LR and HR gradients point apart",
     "corrected": "corrected\nthe share of the HR gradient that was taken away",
 }
-_COLORS: Final = "viridis"
 _COLUMNS: Final = 4
-_PANEL: Final = 400  # px, the width of one image
+_TITLE, _BAR = 3 * LINE, 5 * LINE  # px: the height above an image, the width beside it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Panel:
+    """An image under its title; numbers have a colour bar from `span[0]` to `span[1]`."""
+
+    title: str
+    image: Float[Tensor, "H W"] | Float[Tensor, "H W 3"]
+    colors: str = "viridis"
+    span: Span = (0.0, 1.0)
 
 
 def write_maps_picture(
@@ -35,25 +46,15 @@ def write_maps_picture(
     Args:
         maps, means: those of `maps.ViewMaps`, by the same names.
     """
-    shown = {name: maps[name] for name in _MEANINGS if name in maps}
-    rows = -(-(2 + len(shown)) // _COLUMNS)
-    camera = view.hr.camera
-    figure, grid = figures.new_figure(rows, _COLUMNS, 16, rows * (1.0 + 3.6 * camera.height / camera.width))
-    axes: list[Any] = list(grid.flatten())
-    photos = {"LR photo\nwhat the camera saw": view.lr.image, "SR image\nwhat the prior made of it": view.hr.image}
-    for axis, (title, image) in zip(axes, photos.items(), strict=False):
-        axis.imshow(_array(image))
-        axis.set_title(title, fontsize=9, color=figures.INK)
-    drawn = None
-    for axis, (name, values) in zip(axes[2:], shown.items(), strict=False):
-        drawn = axis.imshow(_array(values), cmap=_COLORS, vmin=0, vmax=1, interpolation="nearest")
-        axis.set_title(f"{_MEANINGS[name]} (mean {means[name]:.2f})", fontsize=9, color=figures.INK)
-    for axis in axes:
-        axis.set_axis_off()
-    if drawn is not None:
-        figure.colorbar(drawn, ax=axes, shrink=0.6, label="0: none or never, 1: all or always")
-    figures.set_title(figure, f"{view.name}: where the SR image is believed, and where the photo overrules it")
-    figures.save_png(figure, path)
+    panels = [
+        _Panel("LR photo\nwhat the camera saw", view.lr.image),
+        _Panel("SR image\nwhat the prior made of it", view.hr.image),
+    ]
+    panels += [
+        _Panel(f"{meaning} (mean {means[name]:.2f})", maps[name]) for name, meaning in _MEANINGS.items() if name in maps
+    ]
+    title = f"{view.name}: where the SR image is believed, and where the photo overrules it"
+    _write(path, title, panels, view.hr.camera.width, last_bar="0: none or never, 1: all or always")
 
 
 def write_depth(path: Path, photo: Photo, found: DepthMap, title: str) -> None:
@@ -62,30 +63,42 @@ def write_depth(path: Path, photo: Photo, found: DepthMap, title: str) -> None:
     Args:
         photo: the view at LR. found: on its pixel grid.
     """
-    figure, axes = figures.new_figure(1, 3, 15, 1.5 + 4.2 * photo.camera.height / photo.camera.width)
-    left, middle, right = axes.flatten()
-    left.imshow(photo.image.cpu().clamp(0, 1).numpy())
-    left.set_title("LR photo")
-    depth = found.depth.where(found.known, float("nan"))
-    _draw(middle, depth, "viridis_r", DepthScale.spanning(depth))
-    middle.set_title(f"depth, world units; known at {found.coverage:.0%}, grey elsewhere")
-    _draw(right, found.confidence.where(found.known, float("nan")), "viridis", DepthScale(0.0, 1.0))
-    right.set_title("confidence, 0 to 1")
-    for axis in (left, middle, right):
-        axis.set_xticks([])
-        axis.set_yticks([])
-    figures.set_title(figure, title)
-    figures.save_png(figure, path)
+    depth, confidence = (x.where(found.known, torch.nan) for x in (found.depth, found.confidence))
+    scale = DepthScale.spanning(depth)
+    panels = [
+        _Panel("LR photo", photo.image),
+        _Panel(
+            f"depth, world units; known at {found.coverage:.0%}, grey elsewhere",
+            depth,
+            "viridis_r",
+            (scale.near, scale.far),
+        ),
+        _Panel("confidence, 0 to 1", confidence),
+    ]
+    _write(path, title, panels, photo.camera.width)
 
 
-def _draw(axis: Any, values: Float[Tensor, "H W"], colors: str, scale: DepthScale) -> None:
-    axis.set_facecolor(figures.RULE)
-    shown = axis.imshow(values.cpu().numpy(), cmap=colors, vmin=scale.near, vmax=scale.far, interpolation="nearest")
-    axis.figure.colorbar(shown, ax=axis, shrink=0.8)
+def _write(path: Path, title: str, panels: Sequence[_Panel], width: int, *, last_bar: str | None = None) -> None:
+    """Lay the panels out in rows, all as wide as an image of `width` px is shown.
 
-
-def _array(image: Float[Tensor, "H W"] | Float[Tensor, "H W 3"]) -> np.ndarray:
-    """The image at about the size of its panel, because matplotlib would resample each pixel, twice."""
-    factor = max(1, image.shape[1] // _PANEL)
-    shown = area_mean(image[..., None] if image.dim() == 2 else image, factor)
-    return np.asarray(shown.detach().clamp(0, 1).squeeze(-1).cpu().numpy())
+    Args:
+        last_bar: the label of one colour bar for all, beside the last; None: each panel of numbers has its own.
+    """
+    height, columns = panels[0].image.shape[0] / panels[0].image.shape[1], min(_COLUMNS, len(panels))
+    across = round(width * magnification(width))
+    down, bar = round(across * height), 0 if last_bar else _BAR
+    step_x, step_y = across + bar + GAP, _TITLE + down + GAP
+    rows = -(-len(panels) // columns)
+    page = PixelPage(GAP + columns * step_x + (_BAR if last_bar else 0), 2 * LINE + rows * step_y, title)
+    for i, panel in enumerate(panels):
+        x, y = GAP + i % columns * step_x, 2 * LINE + i // columns * step_y
+        page.text(x + across / 2, y + _TITLE / 2, panel.title, ha="center")
+        # Reduced here as far as it is shown smaller: matplotlib would resample each pixel, twice.
+        image = panel.image if panel.image.dim() == 3 else panel.image[..., None]
+        image = area_mean(image, max(1, image.shape[1] // across)).squeeze(-1).detach().cpu()
+        numbers = panel.image.dim() == 2
+        pixels = np.asarray((image if numbers else image.clamp(0, 1)).numpy())
+        _, drawn = page.image(x, y + _TITLE, pixels, across / pixels.shape[1], colors=panel.colors, span=panel.span)
+        if numbers and (last_bar is None or i == len(panels) - 1):
+            page.colour_bar(x + across + GAP, y + _TITLE, down, drawn, last_bar or "", extend="neither")
+    save_png(page.figure, path)
