@@ -134,13 +134,13 @@ def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked:
 
 
 def log_choice(settings: RasterizerSettings | functools.partial[Rasterizer], chosen: Drawing) -> None:
-    """For `auto`: log why the other backends were not chosen; on the console where neither CUDA nor compiled kernels draw."""
+    """Log why the other backends were not chosen, where `auto` found neither CUDA nor compiled kernels."""
     if isinstance(settings, RasterizerSettings) and settings.name == "auto":
-        slow = chosen.device == "cpu" and not chosen.rasterizer.traits.native_threads
-        level = logging.INFO if slow else logging.DEBUG
+        if chosen.device == "cuda" or chosen.rasterizer.traits.native_threads:
+            return  # nothing faster is missing, and asking the others would import their libraries
         for name, reason in rasterizers.available().items():
             if reason is not None:
-                _log.log(level, "rasterizer %s is not available: %s", name, reason)
+                _log.info("rasterizer %s is not available: %s", name, reason)
 
 
 def drawn_on(devices: frozenset[str], name: str, asked: Device | None) -> Device:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from clear_strategies.geometry.cameras import moved
 from clear_strategies.geometry.projection import back_project
-from clear_strategies.geometry.visibility import seen_by, sees
+from clear_strategies.geometry.visibility import sees
 from clear_strategies.outputs.figures import spaced
 from clear_strategies.viewing import paths
 from clear_strategies.viewing.cameras import at_most
@@ -89,51 +89,62 @@ def next_photos(photos: Mapping[str, Camera], painter: Painter, count: int = 2) 
         photos: the cameras by the photos' names.
         painter: of the field that was trained on them.
     """
-    seeing, candidates = with_depth(list(photos.values()), painter), list(_candidates(photos, painter))
+    candidates = list(_candidates(photos, painter))
+    for camera, depth in with_depth(list(photos.values()), painter):
+        for place in candidates:
+            place.add(camera, depth)
     chosen: list[NextPhoto] = []
     while len(chosen) < count and candidates:
-        overlaps = [_overlap(*place.seeing, seeing) for place in candidates]
-        least = min(_OVERLAP, max(overlaps))
-        worths = {
-            i: 1 - (_shown(*candidates[i].seeing, seeing).clamp(max=ENOUGH) - 1).abs() / (ENOUGH - 1)
-            for i, overlap in enumerate(overlaps)
-            if overlap >= least
-        }
-        best = max(worths, key=lambda i: float(worths[i].nanmean()))
-        if float(worths[best].nanmean()) == 0:
+        least = min(_OVERLAP, max(place.overlap() for place in candidates))
+        related = [place for place in candidates if place.overlap() >= least]
+        worths = [1 - (place.shown.clamp(max=ENOUGH) - 1).abs() / (ENOUGH - 1) for place in related]
+        best = max(range(len(related)), key=lambda i: float(worths[i].mean()))
+        if float(worths[best].mean()) == 0:
             break
-        place = candidates.pop(best)
-        chosen.append(NextPhoto(place.camera, place.where, worths[best]))
-        seeing.append(place.seeing)
+        place = related[best]
+        chosen.append(NextPhoto(place.camera, place.where, place.picture(worths[best])))
+        candidates.remove(place)
+        for other in candidates:
+            other.add(*place.seeing)
     return chosen
 
 
-def _overlap(camera: Camera, depth: Float[Tensor, "h w"], seeing: Sequence[Seeing]) -> float:
-    """The share of what is seen from there that photos enough see, to relate a photo to them."""
-    return float((seen_by(camera, depth, seeing)[depth.isfinite()] >= _RELATED).float().mean())
-
-
-def _shown(camera: Camera, depth: Float[Tensor, "h w"], seeing: Sequence[Seeing]) -> Float[Tensor, "h w"]:
-    """How many photos show what each pixel shows, those from the same side as a whole; nan where nothing is."""
-    rows, columns = torch.nonzero(depth.isfinite(), as_tuple=True)
-    surface = back_project(camera, torch.stack((columns, rows), dim=1) + 0.5, depth[rows, columns])
-    mine = torch.nn.functional.normalize(camera.center.float() - surface, dim=1)
-    total = torch.zeros(len(surface))
-    for other, its_depth in seeing:
-        theirs = torch.nn.functional.normalize(other.center.float() - surface, dim=1)
-        total += sees(other, its_depth, surface) * (mine * theirs).sum(dim=1).clamp(min=0) ** _SIDE
-    shown = torch.full(depth.shape, torch.nan)
-    shown[rows, columns] = total
-    return shown
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """See `NextPhoto`; `seeing` is the camera small, with its depth."""
+    """See `NextPhoto`.
 
-    camera: Camera
-    where: str
-    seeing: Seeing
+    Args:
+        seeing: the camera small, with the depth of what it sees, which is something.
+    """
+
+    def __init__(self, camera: Camera, where: str, seeing: Seeing) -> None:
+        self.camera, self.where, self.seeing = camera, where, seeing
+        small, depth = seeing
+        self._rows, self._columns = torch.nonzero(depth.isfinite(), as_tuple=True)
+        pixels = torch.stack((self._columns, self._rows), dim=1) + 0.5
+        self._surface = back_project(small, pixels, depth[self._rows, self._columns])
+        self._from_here = self._sight(small)
+        self._seen = torch.zeros(len(self._surface), dtype=torch.long)
+        self.shown = torch.zeros(len(self._surface))
+        """How many photos show what each pixel shows, those from the same side as a whole."""
+
+    def _sight(self, camera: Camera) -> Float[Tensor, "M 3"]:
+        return torch.nn.functional.normalize(camera.center.float() - self._surface, dim=1)
+
+    def add(self, camera: Camera, depth: Float[Tensor, "h w"]) -> None:
+        """Count a photo."""
+        seen = sees(camera, depth, self._surface)
+        self._seen += seen
+        self.shown += seen * (self._from_here * self._sight(camera)).sum(dim=1).clamp(min=0) ** _SIDE
+
+    def overlap(self) -> float:
+        """The share of what is seen from here that photos enough see, to relate a photo to them."""
+        return float((self._seen >= _RELATED).float().mean())
+
+    def picture(self, values: Float[Tensor, " M"]) -> Float[Tensor, "h w"]:
+        """The values at their pixels; nan where no surface is."""
+        found = torch.full(self.seeing[1].shape, torch.nan)
+        found[self._rows, self._columns] = values
+        return found
 
 
 def _candidates(photos: Mapping[str, Camera], painter: Painter) -> Iterator[_Candidate]:
