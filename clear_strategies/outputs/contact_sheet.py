@@ -18,7 +18,7 @@ from torch import Tensor
 from clear_strategies.outputs.figures import FAINT, GAP, LINE, PixelPage, error_map, magnification, save_png
 
 if TYPE_CHECKING:
-    from matplotlib.image import AxesImage
+    from matplotlib.image import FigureImage
 
 OWN_PHOTO: Final = "LR, SR prior (and bicubic in the tables) show the test view's own photo, which training never sees."
 TRAINED_ON: Final = (
@@ -57,7 +57,7 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
     for i, column in enumerate(columns):
         page.text(left + i * (cell_w + GAP) + cell_w / 2, top - LINE / 2, column, size=10, ha="center")
 
-    error: AxesImage | None = None
+    error: FigureImage | None = None
     for j, row in enumerate(rows):
         y = top + j * (cell_h + 2 * LINE + GAP)
         page.text(LINE, y + cell_h / 2, row.name, rotation=90, ha="center", va="center", color=FAINT)
@@ -68,7 +68,7 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
         for i, column in enumerate(columns):
             x = left + i * (cell_w + GAP)
             if column in shown:
-                _, drawn = page.image(x, y, shown[column], times)
+                drawn = page.image(x, y, shown[column], times)
                 error = drawn if column == "error of ours" else error
             if column in row.captions:
                 page.text(x + cell_w / 2, y + cell_h + LINE, row.captions[column], ha="center")

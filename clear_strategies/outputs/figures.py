@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from clear_strategies.data.photo_files import PNG_LEVEL
@@ -17,7 +18,7 @@ from clear_strategies.files import write_bytes
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
+    from matplotlib.image import FigureImage
 
 History = Sequence[Mapping[str, float]]
 """One row per iteration, as in history.csv. A cell may be missing or NaN."""
@@ -121,7 +122,7 @@ class PixelPage:
 
     def image(
         self, x: int, y: int, pixels: np.ndarray, times: float, *, colors: str = "magma", span: Span = (0, ERROR_MAX)
-    ) -> tuple[Axes, AxesImage]:
+    ) -> FigureImage:
         """Draw RGB, or numbers in colours, `times` larger, with the top left corner at (x, y).
 
         Args:
@@ -131,23 +132,28 @@ class PixelPage:
         from matplotlib import colormaps
 
         height, width = (round(size * times) for size in pixels.shape[:2])
-        axis = self._axes(x, y, width, height)
-        axis.set_axis_off()
-        drawn = axis.imshow(
-            pixels, aspect="auto", cmap=colormaps[colors].with_extremes(bad=RULE), vmin=span[0], vmax=span[1],
-            interpolation="nearest" if times >= 1 else "antialiased", interpolation_stage="rgba",
-        )  # fmt: skip
-        return axis, drawn
+        shown = colormaps[colors].with_extremes(bad=RULE)
+        return self.figure.figimage(
+            _resized(pixels, height, width), x, self.height - y - height, cmap=shown, vmin=span[0], vmax=span[1]
+        )
+
+    def frame(self, x: float, y: float, width: float, height: float, color: str) -> None:
+        """Draw the outline of a rectangle whose top left corner is at (x, y)."""
+        from matplotlib.patches import Rectangle
+
+        corner, size = (x / self.width, 1 - (y + height) / self.height), (width / self.width, height / self.height)
+        self.figure.add_artist(Rectangle(corner, *size, fill=False, color=color, linewidth=1))
 
     def colour_bar(
-        self, x: int, y: int, height: int, drawn: AxesImage, label: str, *, extend: Literal["max", "neither"] = "max"
+        self, x: int, y: int, height: int, drawn: FigureImage, label: str, *, extend: Literal["max", "neither"] = "max"
     ) -> None:
         """The colours of an image of numbers, 12 px wide, with its numbers to the right.
 
         Args:
             extend: "max": an arrow says that larger numbers have the last colour.
         """
-        bar = self.figure.colorbar(drawn, cax=self._axes(x, y, 12, height), extend=extend, extendfrac=0.03)
+        place = (x / self.width, 1 - (y + height) / self.height, 12 / self.width, height / self.height)
+        bar = self.figure.colorbar(drawn, cax=self.figure.add_axes(place), extend=extend, extendfrac=0.03)
         bar.set_label(label, fontsize=8, color=INK)
         bar.ax.tick_params(labelsize=8, colors=INK)
         bar.outline.set_visible(False)
@@ -157,7 +163,12 @@ class PixelPage:
         place = {"ha": "left", "va": "center", "color": INK, **style}
         self.figure.text(x / self.width, 1 - y / self.height, words, fontsize=size, **place)
 
-    def _axes(self, x: int, y: int, width: int, height: int) -> Axes:
-        return self.figure.add_axes(
-            (x / self.width, 1 - (y + height) / self.height, width / self.width, height / self.height)
-        )
+
+def _resized(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Each pixel repeated where the image is shown larger, means where it is shown smaller."""
+    if width < pixels.shape[1]:
+        channels = torch.from_numpy(pixels.reshape(1, *pixels.shape[:2], -1)).permute(0, 3, 1, 2)
+        reduced = torch.nn.functional.interpolate(channels, (height, width), mode="area")
+        return np.asarray(reduced[0].permute(1, 2, 0).reshape(height, width, *pixels.shape[2:]).numpy())
+    row, column = (np.arange(size) * full // size for size, full in zip((height, width), pixels.shape, strict=False))
+    return pixels[row[:, None], column]

@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core.images import area_mean
 from clear_strategies.core.view import DepthMap, Photo, View
 from clear_strategies.outputs.figures import GAP, LINE, PixelPage, Span, magnification, save_png
 from clear_strategies.viewing.film import DepthScale
@@ -93,12 +92,9 @@ def _write(path: Path, title: str, panels: Sequence[_Panel], width: int, *, last
     for i, panel in enumerate(panels):
         x, y = GAP + i % columns * step_x, 2 * LINE + i // columns * step_y
         page.text(x + across / 2, y + _TITLE / 2, panel.title, ha="center")
-        # Reduced here as far as it is shown smaller: matplotlib would resample each pixel, twice.
-        image = panel.image if panel.image.dim() == 3 else panel.image[..., None]
-        image = area_mean(image, max(1, image.shape[1] // across)).squeeze(-1).detach().cpu()
         numbers = panel.image.dim() == 2
-        pixels = np.asarray((image if numbers else image.clamp(0, 1)).numpy())
-        _, drawn = page.image(x, y + _TITLE, pixels, across / pixels.shape[1], colors=panel.colors, span=panel.span)
+        pixels = np.asarray((panel.image if numbers else panel.image.clamp(0, 1)).detach().cpu().numpy())
+        drawn = page.image(x, y + _TITLE, pixels, across / pixels.shape[1], colors=panel.colors, span=panel.span)
         if numbers and (last_bar is None or i == len(panels) - 1):
             page.colour_bar(x + across + GAP, y + _TITLE, down, drawn, last_bar or "", extend="neither")
     save_png(page.figure, path)

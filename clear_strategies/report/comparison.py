@@ -28,8 +28,6 @@ def write_comparison(
     """
     if not tiles:
         return
-    from matplotlib.patches import Rectangle
-
     height, width = next(iter(tiles.values())).shape[:2]
     times = magnification(width)
     cell_w, cell_h = round(width * times), round(height * times)
@@ -47,9 +45,8 @@ def write_comparison(
         y = 3 * LINE + i // abreast * block + head
         for j, words in enumerate(reversed(names[name])):
             page.text(x + cell_w / 2, y - LINE * (j + 0.5), words, size=10, ha="center")
-        axis, _ = page.image(x, y, pixels, times)
-        corner = (columns.start - 0.5, rows.start - 0.5)
-        axis.add_patch(Rectangle(corner, window_w, window_h, fill=False, color="white", linewidth=1))
+        page.image(x, y, pixels, times)
+        page.frame(x + times * columns.start, y + times * rows.start, times * window_w, times * window_h, "white")
         page.image(x, y + cell_h + GAP, pixels[window], enlarged)
         page.text(x + cell_w / 2, y + cell_h + GAP + enlarged_h + LINE, captions.get(name, ""), ha="center")
     save_png(page.figure, path)
