@@ -171,4 +171,4 @@ def _resized(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
         reduced = torch.nn.functional.interpolate(channels, (height, width), mode="area")
         return np.asarray(reduced[0].permute(1, 2, 0).reshape(height, width, *pixels.shape[2:]).numpy())
     row, column = (np.arange(size) * full // size for size, full in zip((height, width), pixels.shape, strict=False))
-    return pixels[row[:, None], column]
+    return np.asarray(pixels[row[:, None], column])
