@@ -22,6 +22,7 @@ from clear_strategies.core.checks import refuse
 from clear_strategies.core.images import DownKernel
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import Photo, View
+from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import image_size, inside, list_images, read_image, write_png
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
@@ -54,18 +55,20 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     held_out = len(train_frames) < len(capture.frames)  # so the capture's points may know what training must not
     require_source(cloud, capture.points)
     progress = Progress("photos and their SR images", "photos", len(train_frames) + len(test_frames))
-    frames, found = (*train_frames, *test_frames), list[View]()
-    for frame, reduced in zip(frames, photos_of(frames, views), strict=True):
-        view = _view(frame, reduced, capture, views, prior, lr_files, required=len(found) < len(train_frames))
-        shown = reduced.reduced(reduced.camera.width // view.lr.camera.width).shown
-        found.append(view if shown is None else view.hiding(shown))
-        progress(len(found))
+    frames, found, work_log = (*train_frames, *test_frames), list[View](), WorkLog()
+    with work_log.stage("photos and SR images"):
+        for frame, reduced in zip(frames, photos_of(frames, views), strict=True):
+            view = _view(frame, reduced, capture, views, prior, lr_files, required=len(found) < len(train_frames))
+            shown = reduced.reduced(reduced.camera.width // view.lr.camera.width).shown
+            found.append(view if shown is None else view.hiding(shown))
+            progress(len(found))
     train, test = tuple(found[: len(train_frames)]), tuple(found[len(train_frames) :])
     ids = [frame.sfm_id for frame in train_frames if frame.sfm_id is not None]
-    initial = initial_points(
-        cloud, [v.lr for v in train], hr=[v.hr for v in train], hr_is_photo=views.photos_are == "both",
-        sfm=capture.points, train_ids=ids, sfm_is_train=not held_out, background=capture.background, seed=seed,
-    )  # fmt: skip
+    with work_log.stage("initial points"):
+        initial = initial_points(
+            cloud, [v.lr for v in train], hr=[v.hr for v in train], hr_is_photo=views.photos_are == "both",
+            sfm=capture.points, train_ids=ids, sfm_is_train=not held_out, background=capture.background, seed=seed,
+        )  # fmt: skip
     points = initial.cloud
     if initial.depths:
         train = tuple(replace(v, depth=depth) for v, depth in zip(train, initial.depths, strict=True))
@@ -99,7 +102,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         "points use test views": points.uses_test_views,
     }
     synthetic = "synthetic" in sample.sr_source
-    return Scene(capture.name, train, test, points, capture.background, synthetic, notes, capture.unplaced)
+    return Scene(capture.name, train, test, points, capture.background, synthetic, notes, capture.unplaced, work_log)
 
 
 def lr_photos(frames: Sequence[Frame], capture: Capture, views: ViewSettings) -> list[Photo]:

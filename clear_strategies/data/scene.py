@@ -9,6 +9,7 @@ import torch
 
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import View
+from clear_strategies.core.work_log import WorkLog
 from rasterizers.interface import Color
 
 
@@ -21,6 +22,7 @@ class Scene:
         synthetic_prior: the SR images contain errors made on purpose, or the truth (the demo); reports say so.
         notes: label -> fact, in the order in which the plan prints them and the provenance keeps them.
         unplaced: photos without a pose, which train nothing, and why.
+        work_log: how long the views and the initial points took.
     """
 
     name: str
@@ -31,6 +33,7 @@ class Scene:
     synthetic_prior: bool = False
     notes: dict[str, str] = field(default_factory=dict)
     unplaced: Mapping[str, str] = field(default_factory=dict)
+    work_log: WorkLog = field(default_factory=WorkLog)
 
     @property
     def device(self) -> torch.device:

@@ -115,10 +115,11 @@ def write_results(
             if mapped := spaced(state.views, pictures.map_views):
                 write_maps(folder / "maps", mapped, field, state.conductor, rasterizer)
         memory.release()  # the gradients that the maps are made of: several times the field
-        _write_sheet(folder, scene, evaluation, title, baseline)
+        with work_log.stage("contact sheet and curves"):
+            _write_sheet(folder, scene, evaluation, title, baseline)
+            write_curves(folder / "curves.png", history, marks(state), title)
         _write_views(folder, scene, painter, pictures, work_log, title)
-        write_curves(folder / "curves.png", history, marks(state), title)
-    _write_tables(folder, history, work_log)
+    _write_tables(folder, history, [*scene.work_log.rows(), *work_log.rows()])
     files.write_json(
         folder / "metrics.json",
         metrics.to_json(
@@ -182,14 +183,15 @@ def _shown(scene: Scene) -> Sequence[View]:
     return spaced(scene.test, _SHEET_VIEWS) if scene.test else spaced(scene.train, metrics.TRAIN_RENDERS)
 
 
-def _write_tables(folder: Path, history: Sequence[Mapping[str, float]], work_log: WorkLog) -> None:
+def _write_tables(
+    folder: Path, history: Sequence[Mapping[str, float]], stages: Sequence[Mapping[str, str | int | float]]
+) -> None:
     columns = list(dict.fromkeys(key for row in history for key in row))
     files.write_csv(folder / "history.csv", history, columns)
     shares = [c for prefix in ("conflict_", "corrected") for c in columns if c.startswith(prefix)]
     means = [c for c in ("mean_q", "mean_w", "mean_omega") if c in columns]
     compared = [row for row in history if "conflict" in row]
     files.write_csv(folder / "conflict.csv", compared, ["t", "conflict", *shares, *means])
-    stages = work_log.rows()
     files.write_csv(
         folder / "timing.csv", stages, ["stage", "runs", "ms_each", "seconds", "skipped", "seconds_saved", "why"]
     )
