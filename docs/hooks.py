@@ -11,13 +11,13 @@ import importlib
 import inspect
 import re
 import sys
-import typing
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
+import signatures  # beside this file; mkdocs puts its folder on the path
+from omegaconf import DictConfig, OmegaConf
 
 ROOT: Final = Path(__file__).resolve().parents[1]
 CONF: Final = ROOT / "conf"
@@ -200,14 +200,16 @@ def _walk(
     nodes = {k: v for k, v in values.items() if isinstance(v, DictConfig)}
     target = values.get("_target_")
     dotted = {name: f"{path}.{name}" if path else name for name in values}
-    leaves = {name: _shown(v) for name, v in values.items() if name not in nodes and not name.startswith("_")}
+    leaves = {name: signatures.shown(v) for name, v in values.items() if name not in nodes and not name.startswith("_")}
     notes = {name: comments.get(dotted[name], "") for name in values}
     inner: dict[str, Any] = {}
     if target:
         section, inner = _built(key, str(target), leaves, notes)
         yield section
     elif plain and leaves:
-        yield Section("", key, None, "", tuple(Setting(n, "", v, _described(v, notes[n])) for n, v in leaves.items()))
+        yield Section(
+            "", key, None, "", tuple(Setting(n, "", v, signatures.described(v, notes[n])) for n, v in leaves.items())
+        )
     for name in dict.fromkeys([*inner, *nodes]):
         under = {str(k): v for k, v in nodes[name].items_ex(resolve=False)} if name in nodes else {}
         if name in inner and "_target_" not in under:
@@ -236,12 +238,14 @@ def _built(
     """The fields of the class or function that a node is built from; and the defaults that are dataclasses themselves."""
     module, _, name = target.rpartition(".")
     built = getattr(importlib.import_module(module), name)
-    summary, described = _docstring(built) if _is_ours(built) else (f"A class of {built.__module__.split('.')[0]}.", {})
-    hints = _hints(built)
+    summary, described = (
+        signatures.docstring(built) if _is_ours(built) else (f"A class of {built.__module__.split('.')[0]}.", {})
+    )
+    hints = signatures.hints(built)
     metadata = {f.name: f.metadata for f in dataclasses.fields(built)} if dataclasses.is_dataclass(built) else {}
     settings: dict[str, Setting] = {}
     inner: dict[str, Any] = {}
-    for parameter in _parameters(built):
+    for parameter in signatures.parameters(built):
         default = parameter.default
         if dataclasses.is_dataclass(default) and not isinstance(default, type):
             inner[parameter.name] = default
@@ -253,115 +257,20 @@ def _built(
         kind = hints.get(parameter.name, "")
         if "milestone" in metadata.get(parameter.name, {}):
             kind = f"{kind}, milestone"
-        own = "???" if default is inspect.Parameter.empty else _shown(default)
+        own = "???" if default is inspect.Parameter.empty else signatures.shown(default)
         value = leaves.get(parameter.name, own)
         text = described.get(parameter.name) or notes.get(parameter.name, "")
-        settings[parameter.name] = Setting(parameter.name, kind, value, _described(value, text))
+        settings[parameter.name] = Setting(parameter.name, kind, value, signatures.described(value, text))
     for name, value in leaves.items():
         if name not in settings and name not in inner:
-            settings[name] = Setting(name, "", value, _described(value, notes.get(name, "")))
+            settings[name] = Setting(name, "", value, signatures.described(value, notes.get(name, "")))
     return Section("", key, target, summary, tuple(settings.values())), inner
 
 
 def _values(instance: Any) -> dict[str, str]:
     """The fields of a dataclass as they are shown; without those that are dataclasses themselves."""
     values = {f.name: getattr(instance, f.name) for f in dataclasses.fields(instance) if f.init}
-    return {name: _shown(v) for name, v in values.items() if not dataclasses.is_dataclass(v)}
-
-
-def _parameters(built: Any) -> Iterator[inspect.Parameter]:
-    """The parameters; a dataclass's default factories are called, so that their result is shown."""
-    factories = {}
-    if dataclasses.is_dataclass(built):
-        factories = {
-            f.name: f.default_factory for f in dataclasses.fields(built) if f.default_factory is not dataclasses.MISSING
-        }
-    for parameter in inspect.signature(built).parameters.values():
-        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
-            continue
-        made = factories.get(parameter.name)
-        yield parameter.replace(default=made()) if made is not None else parameter
-
-
-def _hints(built: Any) -> dict[str, str]:
-    function = built.__init__ if inspect.isclass(built) else built
-    annotations: dict[str, Any] = dict(getattr(function, "__annotations__", {}))
-    try:
-        resolved: Mapping[str, Any] = typing.get_type_hints(function)
-    except (NameError, TypeError):
-        resolved = {}
-    return {name: _type(resolved.get(name, annotation)) for name, annotation in annotations.items()}
-
-
-def _type(annotation: Any) -> str:
-    if isinstance(annotation, type):
-        return annotation.__name__
-    text = annotation if isinstance(annotation, str) else repr(annotation)
-    return re.sub(r"\b(?:[A-Za-z_]\w*\.)+(?=\w)", "", text)
-
-
-def _shown(value: Any) -> str:
-    """A value as it is written in YAML."""
-    if isinstance(value, ListConfig | DictConfig):
-        value = OmegaConf.to_container(value, resolve=False)
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(_shown(v) for v in value)}]"
-    if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{k}: {_shown(v)}' for k, v in value.items())}}}"
-    return '""' if value == "" else str(value)
-
-
-def _docstring(built: Any) -> tuple[str, dict[str, str]]:
-    """The first paragraph, and the description of each argument."""
-    summary = " ".join((inspect.getdoc(built) or "").split("\n\n")[0].split())
-    if summary.startswith(f"{built.__name__}("):  # a dataclass without a docstring
-        summary = ""
-    described: dict[str, str] = {}
-    for owner in reversed(inspect.getmro(built)[:-1] if inspect.isclass(built) else (built,)):
-        described |= _arguments(inspect.cleandoc(owner.__doc__ or ""))
-    return summary, described
-
-
-def _arguments(text: str) -> dict[str, str]:
-    """What the `Args:` of a docstring say, by argument."""
-    block = re.search(r"^Args:\n((?:[ \t]+.*\n?|\n)+)", text, re.MULTILINE)
-    described: dict[str, str] = {}
-    if block:
-        lines = block[1].splitlines()
-        margin = min(len(line) - len(line.lstrip()) for line in lines if line.strip())
-        entries: list[str] = []
-        for line in lines:
-            if not line.strip():
-                continue
-            if len(line) - len(line.lstrip()) == margin:
-                entries.append(line.strip())
-            else:
-                entries[-1] += " " + line.strip()
-        for entry in entries:
-            # "a, b: …" describes both; "a: …. b: …" in one entry describes each.
-            for part in re.split(r"(?<=[.;])\s+(?=[a-z_]\w*: )", entry):
-                names, colon, description = part.partition(":")
-                if colon:
-                    described |= {n.strip().lstrip("*"): description.strip() for n in names.split(",")}
-    return described
-
-
-def _described(value: str, text: str) -> str:
-    """The description, which says where the value must or does come from."""
-    if value == "???":
-        text = f"Required. {_sentence(text)}".strip()
-    elif not text and value.startswith("${"):
-        text = "Follows the field that its default names."
-    return _sentence(text)
-
-
-def _sentence(text: str) -> str:
-    text = " ".join(text.replace("(10k)", "").split())  # the type says that it is a milestone
-    return text[:1].upper() + text[1:] if re.match(r"[a-z]+ [a-z(]", text) else text
+    return {name: signatures.shown(v) for name, v in values.items() if not dataclasses.is_dataclass(v)}
 
 
 def _comments(text: str) -> dict[str, str]:

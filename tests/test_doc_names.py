@@ -58,6 +58,16 @@ def test_symbols_that_pages_name_are_in_their_files(page):
     assert not [f"{file}:{symbol}" for file, symbol in stations if not holds(ROOT / file, symbol)]
 
 
+def test_the_walks_are_as_long_as_they_say():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    walks = re.findall(r"(\d+) stations in (\d+) files\.\*\*\n\n((?:\d+\. .*\n(?: .*\n)*)+)", text)
+    assert len(walks) == 2
+    for stations, files, walk in walks:
+        first = [re.match(r"\d+\. `([\w./-]+):", line) for line in walk.splitlines() if line[0].isdigit()]
+        assert int(stations) == len(first)
+        assert int(files) == len({match[1] for match in first if match})
+
+
 def holds(file: Path, symbol: str) -> bool:
     """Whether a file defines a symbol; one that is not Python, whether it has the word."""
     if file.suffix != ".py":

@@ -34,7 +34,9 @@ def loaded(path: Path) -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
+    sys.path.insert(0, str(path.parent))  # as mkdocs does
     spec.loader.exec_module(module)
+    sys.path.remove(str(path.parent))
     return module
 
 

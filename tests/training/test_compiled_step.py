@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, fields, replace
-from functools import partial
+from dataclasses import replace
 
 import pytest
 import torch
@@ -18,16 +17,12 @@ from clear_strategies.core import deferred
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
 from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
-from clear_strategies.strategies.base import describes
-from clear_strategies.training.compiled_step import CompiledStep, compiled_step_for
+from clear_strategies.training.compiled_step import CompiledStep
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
-from rasterizers.interface import BackendUnavailable
-from rasterizers.native import load_kernels
-from rasterizers.warp_runtime import require_warp
 from tests.helpers import toy
 from tests.helpers.compiled_step_cases import (
     ANCHORING,
@@ -41,56 +36,6 @@ from tests.helpers.compiled_step_cases import (
 )
 
 EPS = torch.finfo(torch.float32).eps
-
-
-@pytest.fixture(params=["cpp", "warp", "warp-cuda"])
-def passes(request):
-    """The pass in C++ or in Warp, for tensors in the CPU's memory."""
-    try:
-        if request.param == "cpp":
-            load_kernels("clear_strategies.kernels")
-            return CppGaussianStep
-        require_warp("the compiled pass", "cuda" if request.param == "warp-cuda" else "cpu", "")
-    except BackendUnavailable as reason:
-        pytest.skip(str(reason))
-    from clear_strategies.kernels.gaussian_step import warp
-
-    return warp.WarpGaussianStep if request.param == "warp" else partial(Elsewhere, warp.WarpGaussianStep, "cuda")
-
-
-class Elsewhere:
-    """A pass on another device; what it writes comes back to the tests' tensors."""
-
-    def __init__(self, passes, device, activation, lr, base, hf, lambda_hf) -> None:
-        self.device = device
-        self.there: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}  # the same tensor stays the same tensor
-        tables = ({name: self.bring(x) for name, x in t.items()} if t else None for t in (activation, lr, base, hf))
-        self.passes = passes(*tables, lambda_hf)
-
-    def bring(self, x):
-        if not isinstance(x, torch.Tensor):
-            return x
-        return self.there.setdefault(id(x), (x, x.to(self.device, copy=True)))[1]
-
-    def fetch(self, *written) -> None:
-        for x in written:
-            if x is not None:
-                x.copy_(self.there.pop(id(x))[1])
-
-    def compare(self, products=None):
-        found = self.passes.compare(self.bring(products))
-        self.fetch(products)
-        return found
-
-    def step(self, attributes, rule, q, step):
-        def brought(thing):
-            return thing and replace(thing, **{f.name: self.bring(getattr(thing, f.name)) for f in fields(thing)})
-
-        found = self.passes.step(
-            {name: brought(a) for name, a in attributes.items()}, rule, self.bring(q), brought(step)
-        )
-        self.fetch(*(x for a in attributes.values() for x in (a.p, a.m, a.v, a.merged)))
-        return found
 
 
 def assert_same_gradient(c: Case, expected, found, λ=1.0, hr="both"):
@@ -337,79 +282,6 @@ def test_wrong_tensors_are_refused_at_the_border(passes):
         passes(drawn, lr, None, lr, 0.2)
     with pytest.raises(ValueError, match="no HR gradient"):
         passes(drawn, lr, None, None, 0.2).compare()
-
-
-# --- who gets it -------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Tuned(GCO):
-    """Other defaults, the same arithmetic."""
-
-    tolerance: float = 0.2
-
-
-@dataclass(frozen=True)
-class Bolder(GCO):
-    def correct(self, lr, hr, step=None):
-        return super().correct(lr, hr, step) * 2.0
-
-
-class Doubling:
-    def correct(self, lr, hr, step=None):
-        return hr * 2.0
-
-
-@dataclass(frozen=True)
-class Mixed(Doubling, GCO):
-    pass
-
-
-@dataclass(frozen=True)
-class Known(GCO):
-    """States anew that its correction is that of the rule."""
-
-    def correct(self, lr, hr, step=None):
-        return super().correct(lr, hr, step)
-
-    def correction_rule(self):
-        return super().correction_rule()
-
-
-def test_a_class_that_changes_what_a_strategy_does_loses_its_kernel():
-    assert all(describes(c(), "correction_rule") for c in (GCO, Tuned, Known))
-    assert not any(describes(c(), "correction_rule") for c in (Bolder, Mixed, P2G))
-    assert describes(SVS(), "anchor")
-
-
-class OwnAdam(Adam):
-    pass
-
-
-def test_the_readable_path_is_taken_where_it_must_be_and_that_is_said_once(caplog, monkeypatch):
-    field = case(4).fields[0]
-    adam = Adam(field.raw(), LearningRates(), 1.0)
-    double = Adam(field.double().raw(), LearningRates(), 1.0)
-    cases = [
-        ((Conductor(GCO(), P2G()), adam, "off"), "fit.fused=off"),
-        ((Conductor(Bolder()), adam), "Bolder does not state its arithmetic as data"),
-        ((Conductor(), OwnAdam(field.raw(), LearningRates(), 1.0)), "OwnAdam may compute something else than Adam"),
-        ((Conductor(), double), "means is torch.float64 on cpu, not float32"),
-    ]
-    for arguments, reason in cases:
-        caplog.clear()
-        with caplog.at_level("DEBUG"):
-            assert compiled_step_for(*arguments) is None
-        assert [reason in message for message in caplog.messages] == [True]
-
-    def missing(_):
-        raise BackendUnavailable("the compiled kernels are not installed.")
-
-    monkeypatch.setattr("clear_strategies.training.compiled_step.load_kernels", missing)
-    caplog.clear()
-    with caplog.at_level("DEBUG"):
-        assert compiled_step_for(Conductor(), adam) is None
-    assert caplog.messages == ["The per-Gaussian step takes the readable path: the compiled kernels are not installed."]
 
 
 def test_thirty_iterations_are_those_of_the_readable_path(passes):

@@ -1,0 +1,64 @@
+"""The passes of the compiled per-Gaussian step."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from functools import partial
+
+import pytest
+import torch
+
+from clear_strategies.kernels.gaussian_step.cpp import CppGaussianStep
+from rasterizers.interface import BackendUnavailable
+from rasterizers.native import load_kernels
+from rasterizers.warp_runtime import require_warp
+
+
+@pytest.fixture(params=["cpp", "warp", "warp-cuda"])
+def passes(request):
+    """The pass in C++ or in Warp, for tensors in the CPU's memory."""
+    try:
+        if request.param == "cpp":
+            load_kernels("clear_strategies.kernels")
+            return CppGaussianStep
+        require_warp("the compiled pass", "cuda" if request.param == "warp-cuda" else "cpu", "")
+    except BackendUnavailable as reason:
+        pytest.skip(str(reason))
+    from clear_strategies.kernels.gaussian_step import warp
+
+    return warp.WarpGaussianStep if request.param == "warp" else partial(Elsewhere, warp.WarpGaussianStep, "cuda")
+
+
+class Elsewhere:
+    """A pass on another device; what it writes comes back to the tests' tensors."""
+
+    def __init__(self, passes, device, activation, lr, base, hf, lambda_hf) -> None:
+        self.device = device
+        self.there: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}  # the same tensor stays the same tensor
+        tables = ({name: self.bring(x) for name, x in t.items()} if t else None for t in (activation, lr, base, hf))
+        self.passes = passes(*tables, lambda_hf)
+
+    def bring(self, x):
+        if not isinstance(x, torch.Tensor):
+            return x
+        return self.there.setdefault(id(x), (x, x.to(self.device, copy=True)))[1]
+
+    def fetch(self, *written) -> None:
+        for x in written:
+            if x is not None:
+                x.copy_(self.there.pop(id(x))[1])
+
+    def compare(self, products=None):
+        found = self.passes.compare(self.bring(products))
+        self.fetch(products)
+        return found
+
+    def step(self, attributes, rule, q, step):
+        def brought(thing):
+            return thing and replace(thing, **{f.name: self.bring(getattr(thing, f.name)) for f in fields(thing)})
+
+        found = self.passes.step(
+            {name: brought(a) for name, a in attributes.items()}, rule, self.bring(q), brought(step)
+        )
+        self.fetch(*(x for a in attributes.values() for x in (a.p, a.m, a.v, a.merged)))
+        return found
