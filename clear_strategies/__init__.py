@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from clear_strategies.core.gradients import ATTRIBUTES, CONFLICT_GROUPS, Grads, Shot
     from clear_strategies.core.step import Step
     from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
+    from clear_strategies.density.mcmc import MCMC
     from clear_strategies.errors import AnchorError, ClearError, DataError, StrategyConflict
     from clear_strategies.merging.conductor import Conductor
     from clear_strategies.merging.iteration import Update
@@ -33,6 +34,7 @@ __all__ = [
     "ATTRIBUTES",
     "CONFLICT_GROUPS",
     "GCO",
+    "MCMC",
     "P2G",
     "SVS",
     "AnchorError",
@@ -65,6 +67,7 @@ _NAMES: Final = {  # by the module of this package that they are defined in
     "core.gradients": ("ATTRIBUTES", "CONFLICT_GROUPS", "Grads", "Shot"),
     "core.step": ("Step",),
     "core.view": ("DepthMap", "ExtraView", "Photo", "View"),
+    "density.mcmc": ("MCMC",),
     "errors": ("AnchorError", "ClearError", "DataError", "StrategyConflict"),
     "merging.conductor": ("Conductor",),
     "merging.iteration": ("Update",),

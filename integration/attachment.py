@@ -137,9 +137,10 @@ class Attachment:
                 "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
                 ", ".join(_named(decorate) for decorate in conductor.decorators),
             )
-        chooser = conductor.owner("background")
-        if chooser is not None and own_background:
-            _log.info("%s has no effect here: the host chooses its background itself.", type(chooser).__name__)
+        itself = {"densifier": "densifies by"} | ({"background": "chooses its background"} if own_background else {})
+        for hook, does in itself.items():
+            if (owner := conductor.owner(hook)) is not None:
+                _log.info("%s has no effect here: the host %s itself.", type(owner).__name__, does)
         if not conductor.strategies:
             _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
 

@@ -263,6 +263,7 @@ def test_a_host_gets_the_strategies_and_the_decorators_of_best():
         "SVS",
         "PseudoViews",
         "FadingOpacity",
+        "MCMC",
         "RandomBackground",
     ]
     assert best.prior(Bicubic()) == run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic())

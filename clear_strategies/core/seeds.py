@@ -24,3 +24,8 @@ def hashed_seed_at(seed: int, t: int) -> int:
 def generator_at(seed: int, t: int, device: torch.device | str = "cpu") -> torch.Generator:
     """A new generator with the seed of `seed_at`."""
     return torch.Generator(device).manual_seed(seed_at(seed, t))
+
+
+def hashed_generator_at(seed: int, t: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """A new generator with the seed of `hashed_seed_at`."""
+    return torch.Generator(device).manual_seed(hashed_seed_at(seed, t))

@@ -1,63 +1,203 @@
-"""gsplat's MCMCStrategy without CUDA (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
+"""Density control as Markov chain Monte Carlo (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
 
-Settings, schedule and state are gsplat's. The computations that gsplat has as CUDA kernels only, and the operations around
-them, are written here in torch. conf/density/gsplat_mcmc.yaml names this class.
+Gaussians that have become invisible move to where visible ones are, the field grows by copies of visible ones, and noise moves
+those that are faint. Nothing is split by a threshold and no opacity is reset: what a photo holds stays, and what no photo
+holds looks for another place.
 """
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
 
 import torch
-from gsplat.strategy import MCMCStrategy
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
+from clear_strategies.core.finite import require_finite
+from clear_strategies.core.gradients import Shot
+from clear_strategies.core.seeds import hashed_generator_at
+from clear_strategies.core.view import View
+from clear_strategies.density.base import DensityError, structure_marks
+from clear_strategies.errors import SettingError
+from clear_strategies.merging.iteration import Update
+from clear_strategies.schedules import LogLinear, milestone
+from clear_strategies.strategies.base import Strategy
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.optim import Adam
 from rasterizers.geometry import rotation_matrix
+from rasterizers.interface import Camera
 
-_MOST_COPIES: Final = 51  # gsplat's bound on how many Gaussians one becomes in a round
-_GROWTH: Final = 1.05  # per round
+_log = logging.getLogger(__name__)
+
+_MOST_COPIES: Final = 51  # the paper's bound on how many Gaussians one becomes in a round
 _BINOMIALS: Final = torch.tensor(
     [[math.comb(n, j) for j in range(_MOST_COPIES + 1)] for n in range(_MOST_COPIES + 1)], dtype=torch.float64
 )
-# The noise is weighted by σ(100 ((1 - o) - 0.995)): only Gaussians of low opacity move.
-_NOISE_SLOPE: Final = 100.0
-_NOISE_FROM: Final = 0.995
-
-Params = dict[str, nn.Parameter]
+_DENSE: Final = 4.0  # LR px between initial points, up to which their number tells how much surface there is
+_GATE: Final = 100.0  # slope of the noise's gate σ(100 (dead_opacity - o))
+_STILL: Final = 1e-4  # of the gate: below it, at opacities above 0.1, a Gaussian stays where it is
 
 
-class MCMC(MCMCStrategy):  # type: ignore[misc, unused-ignore]  # gsplat has no types
-    """gsplat's MCMCStrategy in torch: dead Gaussians move to live ones, new ones are added, and noise moves all.
+@dataclass(frozen=True)
+class MCMC(Strategy):
+    """Gaussians move and are added by sampling, in iterations start < t < stop; faint ones wander. In place of `density`.
 
     Args:
-        noise_lr: strength of the noise, times the learning rate of the positions.
-        min_opacity: Gaussians below it are dead.
+        start, stop: iterations between which the structure changes.
+        every: iterations between rounds.
+        growth: the share of Gaussians that a round adds, up to the cap.
+        per_point: the cap, as a multiple of the Gaussians at the start, which are one for each initial point.
+        max_gaussians: the cap, whatever `per_point` says.
+        min_gaussians: fewer visible ones are an error.
+        dead_opacity: Gaussians of at most this opacity are moved.
+        noise: strength of the noise. A Gaussian of covariance Σ moves by noise(t) σ(100 (dead_opacity - opacity)) Σ η / s̃ after
+            each iteration, with η ~ N(0, I) and s̃ the median of the Gaussians' largest scales; 0: none moves.
+        cooling: noise(t) / noise, which falls as the learning rate of the positions does.
+
+    Raises:
+        SettingError: a setting is outside its range.
     """
 
-    def step_post_backward(
-        self,
-        params: Params,
-        optimizers: dict[str, Any],
-        state: dict[str, Any],
-        step: int,
-        info: dict[str, Any],
-        lr: float,
-    ) -> None:
-        """As gsplat's; `lr` is the positions' learning rate, world units."""
-        with torch.no_grad():
-            if self.refine_start_iter < step < self.refine_stop_iter and step % self.refine_every == 0:
-                relocate(params, optimizers, self.min_opacity)
-                add(params, optimizers, self.cap_max, self.min_opacity)
-            params["means"].add_(noise(params, lr * self.noise_lr))
+    start: int = milestone(500)
+    stop: int = milestone(8_000)
+    every: int = milestone(100, least=1)
+    growth: float = 0.05
+    per_point: float = 5.0
+    max_gaussians: int = 1_000_000
+    min_gaussians: int = 10
+    dead_opacity: float = 0.005
+    noise: float = 500.0
+    cooling: LogLinear = field(default_factory=lambda: LogLinear(initial=1.0, final=0.01))
+
+    def __post_init__(self) -> None:
+        if min(self.every, self.max_gaussians, self.min_gaussians) < 1:
+            raise SettingError("every, max_gaussians and min_gaussians must be at least 1.")
+        for name, least in (("growth", 0), ("per_point", 1), ("noise", 0)):
+            if not least <= getattr(self, name) < math.inf:
+                raise SettingError(f"{name} must be at least {least} and finite, got {getattr(self, name)}.")
+        if not 0 < self.dead_opacity < 1:
+            raise SettingError(f"dead_opacity must lie in (0, 1), got {self.dead_opacity}.")
+
+    def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Sampler | None:
+        """None, which a message says, where the initial points are too far apart to tell how many Gaussians a surface needs."""
+        spacing = _spacing(field, [view.lr.camera for view in views])
+        if spacing > _DENSE:
+            _log.info(
+                "MCMC has no effect: the initial points lie %.1f LR px apart, more than %g. Dense ones come from stereo "
+                "(data.cloud.init=stereo).", spacing, _DENSE,
+            )  # fmt: skip
+            return None
+        return Sampler(self, len(field), seed=seed)
+
+
+class Sampler:
+    """Changes the structure by sampling; what it does at t is a function of the field, (seed, t) and the cap.
+
+    Args:
+        n: Gaussians at the start.
+    """
+
+    name: Final = "MCMC"
+
+    def __init__(self, settings: MCMC, n: int, *, seed: int) -> None:
+        self.settings, self.seed = settings, seed
+        self.cap = min(settings.max_gaussians, math.ceil(settings.per_point * n))
+
+    @property
+    def marks(self) -> Mapping[str, int]:
+        return structure_marks(self.settings.stop, 0)
+
+    def accumulate(self, update: Update, shot: Shot, t: int) -> None:
+        """Nothing: opacity alone tells which Gaussians are needed."""
+
+    def due(self, t: int) -> bool:
+        """Whether a round falls on t."""
+        s = self.settings
+        return s.start < t < s.stop and t % s.every == 0
+
+    def reset_due(self, t: int) -> bool:
+        return False
+
+    def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
+        generator = hashed_generator_at(self.seed, t, field.means.device)
+        parents = self._round(field, optimizer, t, generator) if self.due(t) else None
+        if parents is not None:
+            resized(parents)
+        if self.settings.noise > 0:
+            self._wander(field, t, generator)
+        return parents is not None
+
+    def _round(
+        self, field: GaussianField, optimizer: Adam, t: int, generator: torch.Generator
+    ) -> Int[Tensor, " M"] | None:
+        """Move the dead and add copies: returns parents[M], or None where nothing changes.
+
+        Raises:
+            DensityError: fewer than min_gaussians are visible.
+            DivergedError: a parameter is not finite.
+        """
+        s, n = self.settings, len(field)
+        require_finite(f"t={t}: before densification, the parameter", field.raw())
+        opacities = field.opacities.data.sigmoid()
+        live = opacities > s.dead_opacity
+        dead = torch.nonzero(~live)[:, 0]
+        if n - len(dead) < s.min_gaussians:
+            raise DensityError(
+                f"t={t}: {n - len(dead)} of {n:,} Gaussians have an opacity above {s.dead_opacity}, fewer than "
+                f"min_gaussians={s.min_gaussians}. Lower density.dead_opacity, or start from a denser cloud."
+            )
+        added = max(0, min(self.cap, math.floor((1 + s.growth) * n)) - n)
+        if len(dead) + added == 0:
+            return None
+        sources = torch.multinomial(opacities * live, len(dead) + added, replacement=True, generator=generator)
+        parents = torch.cat((torch.arange(n, device=sources.device), sources[len(dead) :]))
+        parents[dead] = sources[: len(dead)]
+        copies = torch.bincount(parents, minlength=n)[parents]
+        shared = copies > 1  # sources and their copies, all of which start without momentum
+        field.take(parents, shared)
+        optimizer.take(parents, shared)
+        o, scales = relocation(field.opacities.data[shared].sigmoid(), field.scales.data[shared].exp(), copies[shared])
+        field.opacities.data[shared] = torch.logit(o.clamp(s.dead_opacity, 1 - torch.finfo(o.dtype).eps))
+        field.scales.data[shared] = scales.log()
+        _log.debug("t=%d: %d moved, %d added: %d -> %d Gaussians.", t, len(dead), added, n, len(parents))
+        return parents
+
+    def _wander(self, field: GaussianField, t: int, generator: torch.Generator) -> None:
+        """Add the noise."""
+        s, scales = self.settings, field.scales.data.exp()
+        gate = torch.sigmoid(_GATE * (s.dead_opacity - field.opacities.data.sigmoid()))
+        rows = torch.arange(len(field), device=gate.device)
+        if gate.device.type == "cpu":  # elsewhere the count would have to be waited for
+            rows = rows[gate > _STILL]
+        eta = torch.randn(len(rows), 3, generator=generator, device=gate.device)
+        R = rotation_matrix(field.quats.data[rows])
+        along = scales[rows].square() * (R * eta[:, :, None]).sum(1)  # S² Rᵀ η
+        strength = s.noise * s.cooling(t) / scales.amax(-1).median()
+        field.means.data.index_add_(0, rows, (strength * gate[rows])[:, None] * (R * along[:, None]).sum(2))
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return {"cap": torch.tensor(self.cap)}
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        self.cap = int(tensors["cap"])
+
+
+def _spacing(field: GaussianField, cameras: Sequence[Camera]) -> float:
+    """The median distance of initial points, in pixels of the camera that is nearest to each."""
+    centers = torch.stack([camera.center.to(field.means.data) for camera in cameras])
+    focal = field.means.data.new_tensor([camera.fx for camera in cameras])
+    finest = (focal / torch.cdist(field.means.data, centers)).amax(dim=1)
+    return float((field.scales.data[:, 0].exp() * finest).median())
 
 
 def relocation(
     opacities: Float[Tensor, " N"], scales: Float[Tensor, "N 3"], copies: Int[Tensor, " N"]
 ) -> tuple[Float[Tensor, " N"], Float[Tensor, "N 3"]]:
-    """Opacity and scale of each of `copies` Gaussians that together replace one.  Eq. 9 of that paper
+    """Opacity and scale of each of `copies` Gaussians that together look as the one that they replace.  Eq. 9 of that paper
 
     o' = 1 - (1 - o)^(1/n), s' = s · o / Σ_j C(n, j) (-1)^(j-1) o'^j / √j: the paper's double sum, its inner binomials
     added up.
@@ -69,75 +209,3 @@ def relocation(
     signs = 1 - 2 * ((j - 1) % 2)
     total = (_BINOMIALS.to(o.device)[n, 1:] * signs * shared[:, None] ** j / j.sqrt()).sum(-1)
     return shared.to(opacities), scales * (o / total).to(scales)[:, None]
-
-
-def relocate(params: Params, optimizers: dict[str, Any], min_opacity: float) -> None:
-    """Replace dead Gaussians by copies of live ones, sampled by opacity."""
-    opacities = params["opacities"].sigmoid()
-    dead = opacities <= min_opacity
-    if not bool(dead.any()) or bool(dead.all()):
-        return
-    places, live = dead.nonzero()[:, 0], (~dead).nonzero()[:, 0]
-    sources = live[torch.multinomial(opacities[live], len(places), replacement=True)]
-    share(params, sources, min_opacity)
-
-    def moved(p: Tensor) -> Tensor:
-        return p.index_copy(0, places, p[sources])
-
-    def rested(moments: Tensor) -> Tensor:
-        return moments.index_fill(0, sources, 0)
-
-    _rewrite(params, optimizers, moved, rested)
-
-
-def add(params: Params, optimizers: dict[str, Any], cap: int, min_opacity: float) -> None:
-    """Add a twentieth more Gaussians, up to the cap: copies of Gaussians sampled by opacity."""
-    n = len(params["means"])
-    more = min(cap, int(_GROWTH * n)) - n
-    if more <= 0:
-        return
-    sources = torch.multinomial(params["opacities"].sigmoid(), more, replacement=True)
-    share(params, sources, min_opacity)
-
-    def grown(p: Tensor) -> Tensor:
-        return torch.cat((p, p[sources]))
-
-    def rested(moments: Tensor) -> Tensor:
-        return torch.cat((moments, moments.new_zeros(more, *moments.shape[1:])))
-
-    _rewrite(params, optimizers, grown, rested)
-
-
-def share(params: Params, sources: Int[Tensor, " K"], min_opacity: float) -> None:
-    """Lower each source's opacity and scale to those of its copies to come."""
-    opacities, scales = relocation(
-        params["opacities"].sigmoid()[sources], params["scales"].exp()[sources], torch.bincount(sources)[sources] + 1
-    )
-    params["opacities"][sources] = torch.logit(opacities.clamp(min_opacity, 1 - torch.finfo(torch.float32).eps))
-    params["scales"][sources] = scales.log()
-
-
-def noise(params: Params, strength: float) -> Float[Tensor, "N 3"]:
-    """A random offset within each Gaussian's covariance, larger for lower opacity."""
-    faint = torch.sigmoid(_NOISE_SLOPE * (1 - params["opacities"].sigmoid() - _NOISE_FROM))
-    offset = torch.randn_like(params["means"]) * (faint * strength)[:, None]
-    R = rotation_matrix(params["quats"])
-    along = (R.mT @ offset[..., None]) * params["scales"].exp().square()[..., None]
-    return (R @ along)[..., 0]
-
-
-def _rewrite(
-    params: Params,
-    optimizers: dict[str, Any],
-    of_parameter: Callable[[Tensor], Tensor],
-    of_moments: Callable[[Tensor], Tensor],
-) -> None:
-    """Replace every parameter and its moments."""
-    for name, old in list(params.items()):
-        new = nn.Parameter(of_parameter(old), requires_grad=old.requires_grad)
-        moments = optimizers[name].state.pop(old, {})
-        optimizers[name].state[new] = {
-            key: value if key == "step" else of_moments(value) for key, value in moments.items()
-        }
-        optimizers[name].param_groups[0]["params"] = [new]
-        params[name] = new

@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 P = TypeVar("P")
 
-_ONE_ANSWER: Final = ("background", "gate", "observe", "route", "correct", "score")
+_ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "correct", "score")
 
 
 class Conductor:

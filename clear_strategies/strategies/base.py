@@ -1,8 +1,8 @@
 """The contract of a strategy. A strategy answers questions about one training iteration; it knows no rasterizer.
 
 The hooks are phases of an iteration, so their order needs no configuration. A hook that no strategy overrides is never
-called. At most one strategy may override each of the hooks with a single answer: background, gate, observe, route, correct,
-score.
+called. At most one strategy may override each of the hooks with a single answer: densifier, background, gate, observe, route,
+correct, score.
 """
 
 from __future__ import annotations
@@ -71,6 +71,16 @@ class Strategy:
 
         Args:
             views: on the device of the field; empty where the training loop does not have them all at the start.
+        """
+        raise NotImplementedError
+
+    def densifier(self, field: Any, views: Sequence[View], seed: int) -> Any:
+        """Once, before the first iteration of this package's trainer: what clones, moves and prunes Gaussians in place of
+        `density`, a `clear_strategies.training.densifier.Densifier`; None: `density` does. Other trainers densify by themselves.
+
+        Args:
+            field: the initial `clear_strategies.training.field.GaussianField`.
+            views: all training views.
         """
         raise NotImplementedError
 

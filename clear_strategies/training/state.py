@@ -69,14 +69,18 @@ class TrainState:
 
         Args:
             settings, density, rates, mip, skips: with milestones already scaled to this run.
+            density: replaced where a strategy brings a densifier.
         """
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
         extent = cameras_extent(torch.stack([view.hr.camera.center.float() for view in scene.train]))
         white = all(c == 1.0 for c in scene.background)
-        control = density.densifier(
-            len(theta), extent=extent, seed=settings.seed, white_background=white, device=device
-        )
+        bringer = conductor.owner("densifier")
+        control = None if bringer is None else bringer.densifier(theta, scene.train, settings.seed)
+        if control is None:
+            control = density.densifier(
+                len(theta), extent=extent, seed=settings.seed, white_background=white, device=device
+            )
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
         step = compiled_step_for(conductor, optimizer, settings.fused)

@@ -56,7 +56,15 @@ def test_a_folder_of_any_name_becomes_data_path(tmp_path, name):
     config = composed(train.overrides([str(folder), "fit.iterations=7"]), "config")
     assert tree(config)["data"]["path"] == str(folder)
     assert config.fit.iterations == 7
-    assert set(config.strategies) == {"gco", "p2g", "svs", "pseudo_views", "fading_opacity", "random_background"}
+    assert set(config.strategies) == {
+        "gco",
+        "p2g",
+        "svs",
+        "pseudo_views",
+        "fading_opacity",
+        "mcmc",
+        "random_background",
+    }
 
 
 @pytest.mark.parametrize(

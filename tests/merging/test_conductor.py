@@ -10,6 +10,7 @@ from torch import Tensor
 
 from clear_strategies import (
     GCO,
+    MCMC,
     P2G,
     SVS,
     Conductor,
@@ -46,8 +47,19 @@ class Halve(Strategy):
 
 @pytest.mark.parametrize(
     "make",
-    [GCO, P2G, SVS, SplatSuRe, PseudoViews, FadingOpacity, RandomBackground, Halve, lambda: SVS(anchor_strength=0.01)],
-    ids=["GCO", "P2G", "SVS", "SplatSuRe", "PseudoViews", "FadingOpacity", "RandomBackground", "own", "loose"],
+    [
+        GCO,
+        P2G,
+        SVS,
+        SplatSuRe,
+        PseudoViews,
+        FadingOpacity,
+        MCMC,
+        RandomBackground,
+        Halve,
+        lambda: SVS(anchor_strength=0.01),
+    ],
+    ids=["GCO", "P2G", "SVS", "SplatSuRe", "PseudoViews", "FadingOpacity", "MCMC", "RandomBackground", "own", "loose"],
 )
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
 def test_contract(make, check):

@@ -20,7 +20,7 @@ from torch.utils._pytree import tree_leaves
 from clear_strategies import P2G, SVS, Conductor, SplatSuRe
 from clear_strategies.core import deferred
 from clear_strategies.core.gradients import Grads
-from clear_strategies.density.gsplat import GsplatDensifier, GsplatSettings
+from clear_strategies.density.mcmc import MCMC, Sampler
 from clear_strategies.training import checkpoint
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.skips import SkipPolicy, Skips
@@ -94,20 +94,6 @@ class Written(TorchFunctionMode):
         if function in (torch.tensor, torch.as_tensor, Tensor.new_tensor) and answer.device.type != "cpu":
             self.found.append(function.__name__)
         return answer
-
-
-class Quiet:
-    """A densifier of gsplat's shape that leaves the structure as it is."""
-
-    def check_sanity(self, params, optimizers): ...
-
-    def initialize_state(self, scene_scale=1.0):
-        return {"count": None}
-
-    def step_pre_backward(self, params, optimizers, state, step, info): ...
-
-    def step_post_backward(self, params, optimizers, state, step, info):
-        state["count"] = torch.ones_like(info["radii"])
 
 
 class Generator(torch.Generator):
@@ -203,10 +189,9 @@ def test_other_settings_read_nothing_either(change, no_data, monkeypatch):
     steadily(state)
 
 
-def test_somebody_elses_densifier_is_asked_without_reading_what_it_did(no_data, monkeypatch):
+def test_noise_between_two_rounds_of_sampling_reads_nothing(no_data, monkeypatch):
     state = on_meta(monkeypatch, ("p2g",))
-    settings = GsplatSettings({}, start=1, stop=13, every=5)
-    state.density = GsplatDensifier(settings, Quiet(), len(state.field), extent=1.0, seed=0, device="meta")
+    state.density = Sampler(MCMC(stop=0), len(state.field), seed=0)
     steadily(state)
 
 

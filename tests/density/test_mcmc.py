@@ -1,0 +1,227 @@
+"""Density control by sampling: what moves, what is added, what the noise leaves alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from clear_strategies import MCMC, Update
+from clear_strategies.core.gradients import Grads
+from clear_strategies.density.base import DensityError
+from clear_strategies.density.mcmc import Sampler, relocation
+from clear_strategies.errors import DivergedError, SettingError
+from clear_strategies.strategies.testing import StubShot
+from clear_strategies.training import checkpoint
+from clear_strategies.training.densifier import Densifier
+from clear_strategies.training.field import GaussianField
+from clear_strategies.training.loop import iterate
+from clear_strategies.training.optim import Adam, LearningRates
+from rasterizers import Camera, load
+from tests.helpers import toy
+from tests.helpers.short_run import start, tensors
+
+N = 60
+EVERY = MCMC(start=0, stop=100, every=1, noise=0.0)
+DEAD = -8.0  # logit of an opacity of 3e-4
+
+
+def made(settings: MCMC = EVERY, opacity: float = 0.0, **changes):
+    """(field, optimizer, densifier); every moment is 1."""
+    theta = GaussianField.from_cloud(toy.cloud(N))
+    theta.opacities.data[:] = opacity
+    optimizer = Adam(theta.raw(), LearningRates(), extent=1.0)
+    for moments in (*optimizer.first.values(), *optimizer.second.values()):
+        moments[:] = 1
+    return theta, optimizer, Sampler(replace(settings, **changes), N, seed=3)
+
+
+def step(theta, optimizer, densifier, t: int = 1):
+    """The parents of one step; None: the structure did not change."""
+    parents = []
+    changed = densifier.step(theta, optimizer, t, parents.append)
+    assert changed == bool(parents)
+    return parents[0] if parents else None
+
+
+def test_it_is_a_densifier():
+    assert isinstance(made()[2], Densifier)
+
+
+def test_a_sparse_cloud_keeps_density_control_and_that_is_said(caplog):
+    """The toy's cameras are 5 away: the fewer points, the further they lie apart."""
+    caplog.set_level("INFO")
+    views = toy.scene(8, train=3).train
+    theta = GaussianField.from_cloud(toy.cloud(N))
+    theta.scales.data[:] = -6.0
+    assert EVERY.densifier(theta, views, 0).cap == round(EVERY.per_point * N)
+    theta.scales.data[:] = 2.0
+    assert EVERY.densifier(theta, views, 0) is None
+    assert "MCMC has no effect: the initial points lie" in caplog.text
+
+
+def test_relocation_leaves_what_is_seen():
+    """An opacity of 0.75 as two Gaussians: each has 1 - √0.25 = 0.5, and shrinks by 0.75 / (2 · 0.5 - 0.5² / √2)."""
+    opacities, scales = relocation(torch.tensor([0.75, 0.3]), torch.ones(2, 3), torch.tensor([2, 1]))
+    assert opacities.tolist() == pytest.approx([0.5, 0.3])
+    assert scales[:, 0].tolist() == pytest.approx([0.75 / (1 - 0.25 / 2**0.5), 1.0])
+    many, _ = relocation(torch.tensor([0.999999]), torch.ones(1, 3), torch.tensor([51]))
+    assert 1 - (1 - float(many)) ** 51 == pytest.approx(0.999999)
+
+
+@pytest.mark.parametrize("opacity", [0.2, 0.6, 0.95])
+def test_copies_look_as_the_one_that_they_replace(opacity):
+    """The integral of alpha along a line through the middle is that of the one Gaussian: what the formula holds."""
+    theta = GaussianField.from_cloud(toy.cloud(1))
+    theta.means.data[:] = torch.tensor([0.0, 0, 4])
+    theta.scales.data[:] = -1.0
+    theta.opacities.data[:] = torch.logit(torch.tensor(opacity))
+    camera, rasterizer = Camera(torch.eye(4), 60.0, 60.0, 40.0, 40.0, 80, 80), load("torch", kernel=0.0)
+    before = float(rasterizer(theta.baked(), camera).alpha[40].sum())
+    copies = torch.zeros(4, dtype=torch.long)
+    o, scales = relocation(theta.opacities.data.sigmoid(), theta.scales.data.exp(), torch.tensor([4]))
+    theta.take(copies, copies == 0)
+    theta.opacities.data[:], theta.scales.data[:] = torch.logit(o), scales.log()
+    assert float(rasterizer(theta.baked(), camera).alpha[40].sum()) == pytest.approx(before, rel=0.05)
+
+
+def test_dead_gaussians_move_to_live_ones_and_start_without_momentum():
+    theta, optimizer, densifier = made(growth=0.0)
+    theta.opacities.data[:20] = DEAD
+    means = theta.means.data.clone()
+    parents = step(theta, optimizer, densifier)
+    assert len(theta) == N
+    assert bool((parents[:20] >= 20).all())
+    assert torch.equal(parents[20:], torch.arange(20, N))
+    assert torch.equal(theta.means.data, means[parents])
+    shared = torch.bincount(parents, minlength=N)[parents] > 1
+    for moments in (*optimizer.first.values(), *optimizer.second.values()):
+        assert not bool(moments[shared].any())
+        assert bool((moments[~shared] == 1).all())
+    assert bool((theta.opacities.data[shared] < 0).all())
+    assert bool((theta.opacities.data[~shared] == 0).all())
+
+
+def test_the_field_grows_to_a_multiple_of_its_points():
+    theta, optimizer, densifier = made(growth=0.5, per_point=2.0)
+    sizes = []
+    for t in range(1, 5):
+        step(theta, optimizer, densifier, t)
+        sizes.append(len(theta))
+    assert sizes == [90, 120, 120, 120]
+    assert made(per_point=2.0, max_gaussians=70)[2].cap == 70
+
+
+def test_where_nothing_is_dead_and_the_cap_is_reached_nothing_changes():
+    theta, optimizer, densifier = made(per_point=1.0)
+    before = {name: p.clone() for name, p in theta.raw().items()}
+    assert step(theta, optimizer, densifier) is None
+    assert all(torch.equal(p, before[name]) for name, p in theta.raw().items())
+
+
+def test_rounds_fall_between_start_and_stop():
+    densifier = made(start=10, stop=40, every=10)[2]
+    assert [t for t in range(60) if densifier.due(t)] == [20, 30]
+    assert dict(densifier.marks) == {"densify until": 40}
+    assert not any(densifier.reset_due(t) for t in range(60))
+
+
+def test_the_same_seed_and_iteration_do_the_same():
+    fields = []
+    for _ in range(2):
+        theta, optimizer, densifier = made(noise=5.0, opacity=-4.0)
+        step(theta, optimizer, densifier, 7)
+        fields.append(theta.raw())
+    assert all(torch.equal(fields[0][name], fields[1][name]) for name in fields[0])
+
+
+def test_noise_moves_the_faint_and_leaves_the_opaque():
+    theta, optimizer, densifier = made(noise=100.0, stop=0)
+    theta.opacities.data[:20] = -6.0
+    means = theta.means.data.clone()
+    step(theta, optimizer, densifier)
+    moved = (theta.means.data - means).norm(dim=1)
+    assert float(moved[:20].min()) > 0
+    assert float(moved[20:].max()) < 1e-9
+
+
+def test_noise_is_as_large_as_the_scene():
+    offsets = []
+    for size in (1.0, 8.0):
+        theta, optimizer, densifier = made(noise=100.0, stop=0, opacity=-6.0)
+        theta.means.data *= size
+        theta.scales.data += torch.tensor(size).log()
+        means = theta.means.data.clone()
+        step(theta, optimizer, densifier)
+        offsets.append((theta.means.data - means) / size)
+    assert torch.allclose(*offsets, rtol=1e-3, atol=1e-4)
+
+
+def test_noise_lies_along_the_covariance():
+    theta, optimizer, densifier = made(noise=1e3, stop=0, opacity=-6.0)
+    theta.scales.data[:] = torch.tensor([0.0, -20.0, -20.0])  # needles along their first axis
+    half = 0.5**0.5
+    theta.quats.data[:] = torch.tensor([half, 0, 0, half])  # which a turn about z by 90 degrees lays along y
+    means = theta.means.data.clone()
+    step(theta, optimizer, densifier)
+    offset = (theta.means.data - means).abs()
+    assert float(offset[:, 1].median()) > 0.1
+    assert float(offset[:, [0, 2]].max()) < 1e-4
+
+
+def test_a_run_resumes_to_the_bit_and_to_the_same_cap(tmp_path, monkeypatch):
+    monkeypatch.setattr("clear_strategies.density.mcmc._DENSE", float("inf"))
+
+    def started():
+        return start(("fading_opacity",), more=[MCMC(start=1, stop=13, every=3, per_point=2.0, growth=0.4, noise=20.0)])
+
+    whole = started()
+    n = len(whole.field)
+    for t in range(1, 13):
+        if t == 8:
+            saved = checkpoint.save(tmp_path, whole.checkpoint({}))
+            assert n < len(whole.field) <= 2 * n
+        iterate(whole, toy.RASTERIZER)
+    resumed = started()
+    resumed.restore(checkpoint.load(saved), saved)
+    while resumed.t < 13:
+        iterate(resumed, toy.RASTERIZER)
+    assert resumed.density.cap == whole.density.cap == 2 * n
+    expected, found = tensors(whole), tensors(resumed)
+    assert not [name for name in expected if not torch.equal(found[name], expected[name])]
+
+
+def test_too_few_live_gaussians_are_an_error():
+    theta, optimizer, densifier = made(opacity=DEAD, min_gaussians=5)
+    theta.opacities.data[:3] = 0
+    with pytest.raises(DensityError, match=r"3 of 60 Gaussians .* fewer than min_gaussians=5"):
+        step(theta, optimizer, densifier)
+
+
+def test_a_number_that_is_not_finite_ends_the_run_before_a_round():
+    theta, optimizer, densifier = made()
+    theta.scales.data[4] = torch.nan
+    with pytest.raises(DivergedError, match="before densification, the parameter of scales"):
+        step(theta, optimizer, densifier)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"every": 0}, "must be at least 1"),
+        ({"growth": -0.1}, "growth must be at least 0"),
+        ({"per_point": 0.5}, "per_point must be at least 1"),
+        ({"noise": float("inf")}, "noise must be at least 0 and finite"),
+        ({"dead_opacity": 0.0}, "dead_opacity must lie in"),
+    ],
+)
+def test_settings_outside_their_range_are_refused(changes, message):
+    with pytest.raises(SettingError, match=message):
+        replace(EVERY, **changes)
+
+
+def test_views_change_nothing_by_themselves():
+    densifier = made()[2]
+    shot = StubShot(torch.zeros(48, 64, 3), torch.zeros(N, 2), torch.ones(N, dtype=torch.bool), [])
+    densifier.accumulate(Update(toy.step(), Grads(), torch.ones(N), torch.ones(N)), shot, 1)
