@@ -112,6 +112,10 @@ class Density:
         self._warned_of_cap = False
 
     @property
+    def cap(self) -> int:
+        return self.settings.max_gaussians
+
+    @property
     def marks(self) -> Mapping[str, int]:
         return structure_marks(self.settings.stop, self.settings.reset_every)
 

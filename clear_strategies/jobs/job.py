@@ -212,7 +212,7 @@ def _run(
     memory.release()
     # In a sweep the console shows one line per job; the rest is in run.log.
     level = logging.DEBUG if _in_sweep() else logging.INFO
-    found, most = memory.needs(state, drawing.rasterizer), getattr(state.density.settings, "max_gaussians", None)
+    found, most = memory.needs(state, drawing.rasterizer), state.density.cap
     machine = {
         "rasterizer": f"{drawing.name}, kernel {drawing.kernel} px²",
         "threads": f"{threads} ({why})",

@@ -30,6 +30,11 @@ class Densifier(Protocol):
         ...
 
     @property
+    def cap(self) -> int | None:
+        """The most Gaussians that it lets the field have; None: any number."""
+        ...
+
+    @property
     def marks(self) -> Mapping[str, int]:
         """The iterations worth a mark on a curve."""
         ...

@@ -141,7 +141,7 @@ def require(found: Needs, budget: int | None, most: int | None) -> None:
     fits = found.fits(allowed)
     if most is not None and fits < most:
         _log.warning(
-            "density.max_gaussians=%d need %d MiB, and %d MiB %s: %d Gaussians fit.",
+            "%d Gaussians, the most that there may be, need %d MiB, and %d MiB %s: %d fit.",
             most, mebibytes(found.peak(most)), mebibytes(allowed), whose, fits,
         )  # fmt: skip
 
@@ -151,7 +151,7 @@ def says(found: Needs, most: int | None) -> str:
     more = (found.peak(10 * found.gaussians + 10**6) - found.peak(9 * found.gaussians + 10**6)) / found.gaussians
     line = f"{mebibytes(found.peak(found.gaussians))} MiB at the start ({mebibytes(found.reached)} MiB were taken until now)"
     line += f", {more / 1024:.1f} KiB for each further Gaussian"
-    return line if most is None else f"{line}, {mebibytes(found.peak(most))} MiB with density.max_gaussians={most:,}"
+    return line if most is None else f"{line}, {mebibytes(found.peak(most))} MiB with {most:,}, the most that there may be"
 
 
 def release() -> None:

@@ -45,7 +45,7 @@ def test_a_run_whose_start_is_over_the_budget_is_refused_and_one_that_may_outgro
         memory.require(NEEDS, 4000 * MIB, 100_000)
     assert not caplog.text
     memory.require(NEEDS, 200 * MIB, 100_000)
-    assert f"and 200 MiB fit.memory allows: {NEEDS.fits(200 * MIB)} Gaussians fit" in caplog.text
+    assert f"and 200 MiB fit.memory allows: {NEEDS.fits(200 * MIB)} fit" in caplog.text
 
 
 def test_a_run_holds_parameters_moments_statistics_and_the_anchor():
@@ -75,7 +75,7 @@ def test_cpp_counts_the_pairs_of_its_lists():
 def test_the_plan_says_what_the_start_and_the_cap_need():
     line = memory.says(NEEDS, 100_000)
     assert line.startswith("150 MiB at the start (150 MiB were taken until now), ")
-    assert line.endswith(f"{memory.mebibytes(NEEDS.peak(100_000))} MiB with density.max_gaussians=100,000")
+    assert line.endswith(f"{memory.mebibytes(NEEDS.peak(100_000))} MiB with 100,000, the most that there may be")
 
 
 def test_the_process_knows_what_it_holds():
