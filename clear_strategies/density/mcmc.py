@@ -23,6 +23,7 @@ from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.view import View
 from clear_strategies.density.base import DensityError, structure_marks
 from clear_strategies.errors import SettingError
+from clear_strategies.geometry.pseudo_views import cut_out
 from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import LogLinear, milestone
 from clear_strategies.strategies.base import Strategy
@@ -83,7 +84,12 @@ class MCMC(Strategy):
             raise SettingError(f"dead_opacity must lie in (0, 1), got {self.dead_opacity}.")
 
     def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Sampler | None:
-        """None, which a message says, where the initial points are too far apart to tell how many Gaussians a surface needs."""
+        """None, which a message says, where sampling would be of no use."""
+        if cut_out((view.lr for view in views), views[0].background):
+            _log.info(
+                "MCMC has no effect: the photos show an object before a plain background, so few Gaussians are held by no photo."
+            )
+            return None
         spacing = _spacing(field, [view.lr.camera for view in views])
         if spacing > _DENSE:
             _log.info(

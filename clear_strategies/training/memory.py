@@ -151,7 +151,9 @@ def says(found: Needs, most: int | None) -> str:
     more = (found.peak(10 * found.gaussians + 10**6) - found.peak(9 * found.gaussians + 10**6)) / found.gaussians
     line = f"{mebibytes(found.peak(found.gaussians))} MiB at the start ({mebibytes(found.reached)} MiB were taken until now)"
     line += f", {more / 1024:.1f} KiB for each further Gaussian"
-    return line if most is None else f"{line}, {mebibytes(found.peak(most))} MiB with {most:,}, the most that there may be"
+    return (
+        line if most is None else f"{line}, {mebibytes(found.peak(most))} MiB with {most:,}, the most that there may be"
+    )
 
 
 def release() -> None:

@@ -49,16 +49,25 @@ def test_it_is_a_densifier():
     assert isinstance(made()[2], Densifier)
 
 
-def test_a_sparse_cloud_keeps_density_control_and_that_is_said(caplog):
+def test_where_sampling_is_of_no_use_density_control_stays_and_that_is_said(caplog):
     """The toy's cameras are 5 away: the fewer points, the further they lie apart."""
     caplog.set_level("INFO")
-    views = toy.scene(8, train=3).train
+
+    def shown(grey, background):
+        views = toy.scene(8, train=3).train
+        lit = [replace(v.lr, image=torch.full_like(v.lr.image, grey)) for v in views]
+        return [replace(v, lr=lr, background=background) for v, lr in zip(views, lit, strict=True)]
+
+    views = shown(0.5, (0.0, 0.0, 0.0))
     theta = GaussianField.from_cloud(toy.cloud(N))
     theta.scales.data[:] = -6.0
     assert EVERY.densifier(theta, views, 0).cap == round(EVERY.per_point * N)
     theta.scales.data[:] = 2.0
     assert EVERY.densifier(theta, views, 0) is None
     assert "MCMC has no effect: the initial points lie" in caplog.text
+    theta.scales.data[:] = -6.0
+    assert EVERY.densifier(theta, shown(1.0, (1.0, 1.0, 1.0)), 0) is None
+    assert "an object before a plain background" in caplog.text
 
 
 def test_relocation_leaves_what_is_seen():

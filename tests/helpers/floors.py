@@ -17,7 +17,7 @@ FLOORS: dict[str, tuple[set[str], set[str]]] = {
     "merging": (GROUND | {"core", "kernels", "strategies"}, set()),
     "data": (GROUND | {"core", "geometry"}, {"cv2", "PIL"}),
     "training": (GROUND | {"core", "kernels", "geometry", "strategies", "merging", "data"}, set()),
-    "density": (GROUND | {"core", "strategies", "merging", "data", "training"}, set()),
+    "density": (GROUND | {"core", "geometry", "strategies", "merging", "data", "training"}, set()),
     "viewing": (GROUND | {"core", "data", "training"}, set()),
     "outputs": (
         GROUND | {"core", "geometry", "strategies", "merging", "data", "training", "density", "viewing"},
