@@ -230,7 +230,7 @@ def test_the_table_of_hooks_shows_the_hooks_of_a_strategy():
     shown = {hook: arguments.split(", ") if arguments else [] for hook, arguments in rows}
     hooks = {hook: list(inspect.signature(getattr(Strategy, hook)).parameters)[1:] for hook in shown}
     assert shown == hooks
-    assert len(shown) == 15
+    assert len(shown) == 16
 
 
 def test_pictures_are_drawn_from_the_tables(tmp_path):
