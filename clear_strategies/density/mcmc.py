@@ -39,6 +39,9 @@ _BINOMIALS: Final = torch.tensor(
     [[math.comb(n, j) for j in range(_MOST_COPIES + 1)] for n in range(_MOST_COPIES + 1)], dtype=torch.float64
 )
 _DENSE: Final = 4.0  # LR px between initial points, up to which their number tells how much surface there is
+_SHORT_RUN: Final = (
+    1_200  # the least `stop`, that of 1,500 iterations: in shorter runs density control adds detail sooner
+)
 _GATE: Final = 100.0  # slope of the noise's gate σ(100 (dead_opacity - o))
 _STILL: Final = 1e-4  # of the gate: below it, at opacities above 0.1, a Gaussian stays where it is
 
@@ -85,6 +88,11 @@ class MCMC(Strategy):
 
     def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Sampler | None:
         """None, which a message says, where sampling would be of no use."""
+        if self.stop < _SHORT_RUN:
+            _log.debug(
+                "MCMC has no effect: until t=%d there is less time than sampling needs (%d).", self.stop, _SHORT_RUN
+            )
+            return None
         if cut_out((view.lr for view in views), views[0].background):
             _log.info(
                 "MCMC has no effect: the photos show an object before a plain background, so few Gaussians are held by no photo."

@@ -51,7 +51,7 @@ def test_it_is_a_densifier():
 
 def test_where_sampling_is_of_no_use_density_control_stays_and_that_is_said(caplog):
     """The toy's cameras are 5 away: the fewer points, the further they lie apart."""
-    caplog.set_level("INFO")
+    caplog.set_level("DEBUG")
 
     def shown(grey, background):
         views = toy.scene(8, train=3).train
@@ -61,12 +61,15 @@ def test_where_sampling_is_of_no_use_density_control_stays_and_that_is_said(capl
     views = shown(0.5, (0.0, 0.0, 0.0))
     theta = GaussianField.from_cloud(toy.cloud(N))
     theta.scales.data[:] = -6.0
-    assert EVERY.densifier(theta, views, 0).cap == round(EVERY.per_point * N)
-    theta.scales.data[:] = 2.0
+    long = replace(EVERY, stop=1_200)
+    assert long.densifier(theta, views, 0).cap == round(EVERY.per_point * N)
     assert EVERY.densifier(theta, views, 0) is None
+    assert "there is less time than sampling needs" in caplog.text
+    theta.scales.data[:] = 2.0
+    assert long.densifier(theta, views, 0) is None
     assert "MCMC has no effect: the initial points lie" in caplog.text
     theta.scales.data[:] = -6.0
-    assert EVERY.densifier(theta, shown(1.0, (1.0, 1.0, 1.0)), 0) is None
+    assert long.densifier(theta, shown(1.0, (1.0, 1.0, 1.0)), 0) is None
     assert "an object before a plain background" in caplog.text
 
 
@@ -181,6 +184,7 @@ def test_noise_lies_along_the_covariance():
 
 def test_a_run_resumes_to_the_bit_and_to_the_same_cap(tmp_path, monkeypatch):
     monkeypatch.setattr("clear_strategies.density.mcmc._DENSE", float("inf"))
+    monkeypatch.setattr("clear_strategies.density.mcmc._SHORT_RUN", 0)
 
     def started():
         return start(("fading_opacity",), more=[MCMC(start=1, stop=13, every=3, per_point=2.0, growth=0.4, noise=20.0)])
