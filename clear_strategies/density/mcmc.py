@@ -162,7 +162,7 @@ class Sampler:
         if n - len(dead) < s.min_gaussians:
             raise DensityError(
                 f"t={t}: {n - len(dead)} of {n:,} Gaussians have an opacity above {s.dead_opacity}, fewer than "
-                f"min_gaussians={s.min_gaussians}. Lower density.dead_opacity, or start from a denser cloud."
+                f"min_gaussians={s.min_gaussians}. Lower strategies.mcmc.dead_opacity, or start from a denser cloud."
             )
         added = max(0, min(self.cap, math.floor((1 + s.growth) * n)) - n)
         if len(dead) + added == 0:
