@@ -89,7 +89,7 @@ class MCMC(Strategy):
     def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Sampler | None:
         """None, which a message says, where sampling would be of no use."""
         if self.stop < _SHORT_RUN:
-            _log.debug(
+            _log.info(
                 "MCMC has no effect: until t=%d there is less time than sampling needs (%d).", self.stop, _SHORT_RUN
             )
             return None
