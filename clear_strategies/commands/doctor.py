@@ -28,7 +28,7 @@ EXTRAS: Final = {
     "view": (("viser", "nerfview"), "clear-strategies view, and the splat in a page"),
     "export": (("gaussforge",), "export --to spz and --to sog"),
     "log": (("tensorboard",), "fit.log=tensorboard: curves and pictures while a run trains"),
-    "gsplat": (("gsplat",), "gsplat's densifiers, and its rasterizer on CUDA"),
+    "gsplat": (("gsplat",), "gsplat's rasterizer on CUDA"),
     "warp": (("warp",), "the rasterizer on CUDA without a CUDA toolkit"),
     "open3d": (("open3d",), "a second way of averaging points in voxels"),
     "sweeps": (("hydra_plugins.hydra_joblib_launcher",), "many runs at once, on one machine or a cluster"),

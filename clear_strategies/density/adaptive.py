@@ -15,7 +15,7 @@ from torch import Tensor
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Shot
 from clear_strategies.core.seeds import generator_at
-from clear_strategies.density.base import DensityError, require_in_range, structure_marks
+from clear_strategies.density.base import DensityError
 from clear_strategies.density.threshold import count_passing, topk_mask
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.iteration import Update
@@ -70,7 +70,10 @@ class DensitySettings:
     def __post_init__(self) -> None:
         if not self.threshold > 0:
             raise SettingError(f"threshold must be > 0, got {self.threshold}.")
-        require_in_range(self)
+        if self.mode not in ("quantile", "fixed"):
+            raise SettingError(f"mode must be quantile or fixed, got {self.mode!r}.")
+        if min(self.every, self.max_gaussians, self.min_gaussians) < 1 or self.reset_every < 0:
+            raise SettingError("every, max_gaussians and min_gaussians must be at least 1, reset_every at least 0.")
         if self.reduce not in ("mean", "max"):
             raise SettingError(f"reduce must be mean or max, got {self.reduce!r}.")
         if not 0 <= self.prune_opacity < 1:
@@ -117,7 +120,9 @@ class Density:
 
     @property
     def marks(self) -> Mapping[str, int]:
-        return structure_marks(self.settings.stop, self.settings.reset_every)
+        s = self.settings
+        reset = {"opacity reset": s.reset_every} if 0 < s.reset_every < s.stop else {}
+        return {"densify until": s.stop, **reset}
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
         """Add the scores of this view's visible Gaussians; dropped ones are not visible."""

@@ -21,7 +21,7 @@ from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Shot
 from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.view import View
-from clear_strategies.density.base import DensityError, structure_marks
+from clear_strategies.density.base import DensityError
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry.pseudo_views import cut_out
 from clear_strategies.merging.iteration import Update
@@ -123,7 +123,7 @@ class Sampler:
 
     @property
     def marks(self) -> Mapping[str, int]:
-        return structure_marks(self.settings.stop, 0)
+        return {"densify until": self.settings.stop}
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
         """Nothing: opacity alone tells which Gaussians are needed."""

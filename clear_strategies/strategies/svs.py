@@ -17,7 +17,7 @@ from torch import Tensor
 
 from clear_strategies.core.compiled_rules import Anchor
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
-from clear_strategies.core.seeds import hashed_seed_at
+from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.step import Step
 from clear_strategies.errors import AnchorError, SettingError
 from clear_strategies.schedules import Ramp, milestone
@@ -165,6 +165,6 @@ class SVS(Strategy):
 
 def dropout_mask(n: int, p: float, seed: int, t: int, device: torch.device | str = "cpu") -> Float[Tensor, " N"]:
     """Bernoulli(1 - p) / (1 - p) for n Gaussians, drawn on `device` and reproducible there from (seed, t).  Eq. 15"""
-    generator = torch.Generator(device).manual_seed(hashed_seed_at(seed, t))
+    generator = hashed_generator_at(seed, t, device)
     kept = torch.rand(n, generator=generator, device=device) >= p
     return kept.to(torch.get_default_dtype()) / (1 - p)

@@ -235,6 +235,12 @@ def test_settings_outside_their_range_are_refused(changes, message):
 
 
 def test_views_change_nothing_by_themselves():
-    densifier = made()[2]
     shot = StubShot(torch.zeros(48, 64, 3), torch.zeros(N, 2), torch.ones(N, dtype=torch.bool), [])
-    densifier.accumulate(Update(toy.step(), Grads(), torch.ones(N), torch.ones(N)), shot, 1)
+    fields = []
+    for views in (0, 3):
+        theta, optimizer, densifier = made(growth=0.5)
+        for t in range(1, 1 + views):
+            densifier.accumulate(Update(toy.step(), Grads(), torch.rand(N), torch.rand(N)), shot, t)
+        step(theta, optimizer, densifier, 5)
+        fields.append(theta.raw())
+    assert all(torch.equal(fields[0][name], fields[1][name]) for name in fields[0])
