@@ -61,7 +61,7 @@ def test_milestones_stretch_to_the_hosts_length():
     [
         (("nope",), "strategy=nope: there is no such option"),
         (("gco", "strategies.gco.tau=1"), "strategies.gco.tau"),
-        (("gco", "strategies.gco.tolerance=2"), "tolerance must lie in"),
+        (("gco", "strategies.gco.tolerance=2"), "tolerance: must lie in"),
         (("gco,gco",), "gco twice"),
         (("gco,clear",), "gco twice"),
         (("gco,best",), "gco twice"),

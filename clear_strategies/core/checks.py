@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
+from typing import NoReturn
 
 from clear_strategies.errors import SettingError
 from rasterizers.interface import Color
@@ -22,26 +23,28 @@ def require_whole(name: str, value: object, *, least: int, most: int | None = No
 
 
 def require_number(
-    name: str, value: object, *, above: float | None = None, least: float | None = None, most: float = math.inf
+    name: str,
+    value: object,
+    *,
+    above: float | None = None,
+    least: float = 0,
+    most: float = math.inf,
+    below: float = math.inf,
 ) -> None:
-    """A finite number, greater than `above` or at least `least`, and at most `most`.
+    """A finite number: greater than `above`, or else at least `least`; at most `most` and less than `below`.
 
     Raises:
         SettingError: it is not.
     """
-    low = -math.inf if least is None else least
-    fits = (
-        isinstance(value, int | float)
-        and not isinstance(value, bool)
-        and math.isfinite(value)
-        and low <= value <= most
-        and (above is None or value > above)
-    )
-    if not fits:
-        limits = [f"> {above:g}"] if above is not None else [f">= {low:g}"] if least is not None else []
-        limits += [f"<= {most:g}"] if math.isfinite(most) else []
-        rule = " and ".join(["must be a finite number", *limits])
-        refuse(name, rule, value, f"{name}={most if math.isfinite(most) else max(low, above or 0, 0) + 1:g}")
+    low, opening, sign = (least, "[", ">=") if above is None else (above, "(", ">")
+    number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+    if (number > low or (number == low and above is None)) and number <= most and number < below:
+        return
+    if math.isfinite(most):
+        refuse(name, f"must lie in {opening}{low:g}, {most:g}]", value, f"{name}={most:g}")
+    if math.isfinite(below):
+        refuse(name, f"must lie in {opening}{low:g}, {below:g})", value, f"{name}={(low + below) / 2:g}")
+    refuse(name, f"must be a finite number {sign} {low:g}", value, f"{name}={low + 1:g}")
 
 
 def require_choice(name: str, value: object, choices: Collection[object]) -> None:
@@ -61,13 +64,14 @@ def as_color(name: str, value: object) -> Color:
     Raises:
         SettingError: it is something else.
     """
-    parts = [float(x) for x in value if isinstance(x, int | float)] if isinstance(value, list | tuple) else []
-    if not isinstance(value, list | tuple) or len(value) != 3 or len(parts) != 3 or not all(0 <= x <= 1 for x in parts):
+    parts = value if isinstance(value, list | tuple) else ()
+    if len(parts) != 3 or not all(isinstance(x, int | float) and 0 <= x <= 1 for x in parts):
         refuse(name, "must be three numbers in [0, 1], an RGB colour", value, f"{name}=[1,1,1] is white")
-    return parts[0], parts[1], parts[2]
+    r, g, b = map(float, parts)
+    return r, g, b
 
 
-def refuse(name: str, rule: str, value: object, remedy: str) -> None:
+def refuse(name: str, rule: str, value: object, remedy: str) -> NoReturn:
     """Raise the error.
 
     Raises:

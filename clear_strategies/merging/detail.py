@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 
-from clear_strategies.errors import SettingError
+from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.schedules import LARGEST_RATE
 
 _log = logging.getLogger(__name__)
@@ -31,12 +31,9 @@ class DetailRates:
     decay: float = 0.002
 
     def __post_init__(self) -> None:
-        if not 0 <= self.rate <= LARGEST_RATE:
-            raise SettingError(f"detail must lie in [0, {LARGEST_RATE:g}], got {self.rate}.")
-        if not 0 <= self.decay < 1:
-            raise SettingError(f"detail_decay must lie in [0, 1), got {self.decay}.")
-        if self.steps < 0:
-            raise SettingError(f"detail_steps must be at least 0 iterations, got {self.steps}.")
+        require_number("detail", self.rate, most=LARGEST_RATE)
+        require_number("detail_decay", self.decay, below=1)
+        require_whole("detail_steps", self.steps, least=0)
 
     def of_run(self, iterations: int) -> DetailRates:
         """The rates of a run of this length; see `steps`."""

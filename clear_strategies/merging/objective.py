@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
+from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.core.deferred import Scalar
 from clear_strategies.errors import SettingError
 from clear_strategies.kernels import losses as kernels
@@ -60,20 +61,16 @@ class Objective:
     def __post_init__(self) -> None:
         kernels.require(self.kernels)
         for name in ("lambda_ssim", "lambda_ssim_hr"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise SettingError(f"{name} must lie in [0, 1], got {getattr(self, name)}.")
+            require_number(name, getattr(self, name), most=1)
         for name in ("lambda_lr", "lambda_hf"):
-            if not getattr(self, name) >= 0:
-                raise SettingError(f"{name} must be >= 0, got {getattr(self, name)}.")
-        if self.lr_from not in get_args(LowFrom):
-            raise SettingError(f"lr_from must be lr or hr, got {self.lr_from!r}.")
+            require_number(name, getattr(self, name))
+        require_choice("lr_from", self.lr_from, get_args(LowFrom))
+        require_whole("haar_levels", self.haar_levels, least=1)
         if self.lambda_lr == 0 and not self.lambda_hr(1) > 0:
             raise SettingError(
                 "without L_LR (lambda_lr=0) L_base must act from the first iteration, got "
                 f"lambda_hr.peak={self.lambda_hr.peak}, start={self.lambda_hr.start}. Set lambda_hr.start=0 and full=0."
             )
-        if self.haar_levels < 1:
-            raise SettingError(f"haar_levels must be at least 1, got {self.haar_levels}.")
 
     @property
     def draws_lr(self) -> bool:

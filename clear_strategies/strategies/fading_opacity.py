@@ -15,8 +15,8 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from clear_strategies.core.checks import require_number
 from clear_strategies.core.step import Step
-from clear_strategies.errors import SettingError
 from clear_strategies.schedules import milestone
 from clear_strategies.strategies.base import Strategy
 
@@ -45,8 +45,7 @@ class FadingOpacity(Strategy):
     until: int = milestone(9_000)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.rate < 1:
-            raise SettingError(f"rate must lie in [0, 1), got {self.rate}.")
+        require_number("rate", self.rate, below=1)
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)

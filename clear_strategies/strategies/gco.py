@@ -16,6 +16,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from clear_strategies.core import deferred
+from clear_strategies.core.checks import require_choice, require_number
 from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule, GroupReport
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot, row_norm, scale_rows
@@ -54,15 +55,13 @@ class GCO(Strategy):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", tuple(self.groups))
-        if not 0 <= self.tolerance < 1:
-            raise SettingError(f"tolerance must lie in [0, 1), got {self.tolerance}.")
+        require_number("tolerance", self.tolerance, below=1)
         if not 0 <= self.weight_min <= self.weight_max <= 1:
             raise SettingError(
                 f"0 <= weight_min <= weight_max <= 1 must hold, got {self.weight_min} and {self.weight_max}."
             )
-        unknown = sorted(set(self.groups) - set(CONFLICT_GROUPS))
-        if unknown:
-            raise SettingError(f"groups must be among {', '.join(CONFLICT_GROUPS)}, got {unknown[0]!r}.")
+        for group in self.groups:
+            require_choice("groups", group, CONFLICT_GROUPS)
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
         if lambda_lr == 0:

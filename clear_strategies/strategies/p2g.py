@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
+from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.core.evidence import Evidence, Lookup, Outside, PatchMaps, lift
 from clear_strategies.core.gradients import Shot, screen_norm
 from clear_strategies.core.images import DownKernel, UpKernel, downsample, patch_means, quantize, upsample
@@ -65,16 +66,12 @@ class P2G(Strategy):
 
     def __post_init__(self) -> None:
         _tau_r(self.reliability_scale, 1.0)
-        if not 0 <= self.floor <= 1:
-            raise SettingError(f"floor must lie in [0, 1], got {self.floor}.")
-        if self.patch < 1:
-            raise SettingError(f"patch must be at least 1 LR pixel, got {self.patch}.")
-        if not self.detail_eps > 0:
-            raise SettingError(f"detail_eps must be > 0, got {self.detail_eps}.")
+        require_number("floor", self.floor, most=1)
+        require_whole("patch", self.patch, least=1)
+        require_number("detail_eps", self.detail_eps, above=0)
         for name, kind in (("down", DownKernel), ("up", UpKernel), ("lookup", Lookup),
                            ("outside", Outside), ("score_by", ScoreBy)):  # fmt: skip
-            if getattr(self, name) not in get_args(kind):
-                raise SettingError(f"{name} must be one of {', '.join(get_args(kind))}, got {getattr(self, name)!r}.")
+            require_choice(name, getattr(self, name), get_args(kind))
 
     def observe(self, step: Step, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""

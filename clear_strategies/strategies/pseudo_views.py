@@ -9,16 +9,15 @@ border of a training camera with a wider field: at a small weight, so that what 
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
 
+from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
-from clear_strategies.errors import SettingError
 from clear_strategies.geometry.continuation import continued
 from clear_strategies.geometry.pseudo_views import PseudoView, border_views, cut_out, pseudo_views
 from clear_strategies.strategies.base import Strategy
@@ -68,15 +67,11 @@ class PseudoViews(Strategy):
 
     def __post_init__(self) -> None:
         for name in ("every", "count", "max_pixels"):
-            if getattr(self, name) < 1:
-                raise SettingError(f"{name} must be at least 1, got {getattr(self, name)}.")
+            require_whole(name, getattr(self, name), least=1)
         for name in ("reach", "weight", "tolerance"):
-            if not getattr(self, name) > 0:
-                raise SettingError(f"{name} must be > 0, got {getattr(self, name)}.")
-        if not 0 <= self.continued <= 1:
-            raise SettingError(f"continued must lie in [0, 1], got {self.continued}.")
-        if not 1 <= self.border < math.inf:
-            raise SettingError(f"border must be at least 1 and finite, got {self.border}.")
+            require_number(name, getattr(self, name), above=0)
+        require_number("continued", self.continued, most=1)
+        require_number("border", self.border, least=1)
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)

@@ -20,9 +20,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
+from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
-from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import Strategy
 from rasterizers.interface import Camera
 
@@ -50,12 +50,9 @@ class SplatSuRe(Strategy):
     min_views: int = 3
 
     def __post_init__(self) -> None:
-        if not self.ratio >= 1:
-            raise SettingError(f"ratio must be >= 1 (finest over coarsest), got {self.ratio}.")
-        if not self.softness > 0:
-            raise SettingError(f"softness must be > 0, got {self.softness}.")
-        if self.min_views < 1:
-            raise SettingError(f"min_views must be at least 1, got {self.min_views}.")
+        require_number("ratio", self.ratio, least=1)
+        require_number("softness", self.softness, above=0)
+        require_whole("min_views", self.min_views, least=1)
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)

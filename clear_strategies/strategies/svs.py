@@ -15,11 +15,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.core.compiled_rules import Anchor
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.step import Step
-from clear_strategies.errors import AnchorError, SettingError
+from clear_strategies.errors import AnchorError
 from clear_strategies.schedules import Ramp, milestone
 from clear_strategies.strategies.base import Strategy
 
@@ -58,17 +59,12 @@ class SVS(Strategy):
     reduction: Literal["sum", "mean"] = "sum"
 
     def __post_init__(self) -> None:
-        if self.looks < 0:
-            raise SettingError(f"looks must be at least 0 per view, got {self.looks}.")
-        if not self.anchor_strength >= 0:
-            raise SettingError(f"anchor_strength must be >= 0, got {self.anchor_strength}.")
-        if self.reduction not in ("sum", "mean"):
-            raise SettingError(f"reduction must be sum or mean, got {self.reduction!r}.")
+        require_whole("looks", self.looks, least=0)
+        require_number("anchor_strength", self.anchor_strength)
+        require_choice("reduction", self.reduction, ("sum", "mean"))
         for name, weight in self.anchor_weights.items():
-            if name not in ATTRIBUTES or not weight >= 0:
-                raise SettingError(
-                    f"anchor_weights must give numbers >= 0 for {', '.join(ATTRIBUTES)}, got {name}={weight}."
-                )
+            require_choice("anchor_weights", name, ATTRIBUTES)
+            require_number(f"anchor_weights.{name}", weight)
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)

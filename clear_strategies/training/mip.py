@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.errors import SettingError
+from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.schedules import milestone
 from rasterizers.interface import Camera
 
@@ -39,12 +39,9 @@ class MipFilter:
     last: int = milestone(100)
 
     def __post_init__(self) -> None:
-        if not self.variance >= 0:
-            raise SettingError(f"variance must be >= 0, got {self.variance}.")
-        if self.cameras not in ("hr", "lr"):
-            raise SettingError(f"cameras must be hr or lr, got {self.cameras!r}.")
-        if self.every < 1:
-            raise SettingError(f"every must be at least 1 iteration, got {self.every}.")
+        require_number("variance", self.variance)
+        require_choice("cameras", self.cameras, ("hr", "lr"))
+        require_whole("every", self.every, least=1)
 
 
 @torch.no_grad()

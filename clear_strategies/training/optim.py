@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.core.gradients import ATTRIBUTES
-from clear_strategies.errors import SettingError
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import LARGEST_RATE, LogLinear
 
@@ -56,15 +56,11 @@ class LearningRates:
 
     def __post_init__(self) -> None:
         for name in ("quats", "scales", "opacities", "sh0", "shN"):
-            if not 0 <= getattr(self, name) <= LARGEST_RATE:
-                raise SettingError(f"{name} must lie in [0, {LARGEST_RATE:g}], got {getattr(self, name)}.")
-        if not 0 <= self.eps < 1:
-            raise SettingError(f"eps must lie in [0, 1), got {self.eps}.")
-        if self.geometry_steps < 0:
-            raise SettingError(f"geometry_steps must be at least 0 iterations, got {self.geometry_steps}.")
+            require_number(name, getattr(self, name), most=LARGEST_RATE)
+        require_number("eps", self.eps, below=1)
+        require_whole("geometry_steps", self.geometry_steps, least=0)
         self.of_detail  # noqa: B018 - its ranges are checked here
-        if self.rows not in ("all", "visible"):
-            raise SettingError(f"rows must be all or visible, got {self.rows!r}.")
+        require_choice("rows", self.rows, ("all", "visible"))
 
     @property
     def of_detail(self) -> DetailRates:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import get_args
 
-from clear_strategies.errors import SettingError
+from clear_strategies.core.checks import refuse, require_whole
 from clear_strategies.schedules import REFERENCE_ITERATIONS, milestone
 from clear_strategies.training.compiled_step import FusedMode
 
@@ -46,18 +46,14 @@ class FitSettings:
     fused: FusedMode = "auto"
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise SettingError(f"iterations must be at least 1, got {self.iterations}.")
-        if self.max_degree not in (0, 1, 2, 3):
-            raise SettingError(f"max_degree must be 0, 1, 2 or 3, got {self.max_degree}.")
-        if self.keep < 1:
-            raise SettingError(f"keep must be at least 1 checkpoint, got {self.keep}.")
+        require_whole("iterations", self.iterations, least=1)
+        require_whole("max_degree", self.max_degree, least=0, most=3)
+        require_whole("keep", self.keep, least=1)
         if self.memory is not None and self.memory < 1:
-            raise SettingError(f"memory must be at least 1 MiB, got {self.memory}. null takes what is free.")
+            refuse("memory", "must be at least 1 MiB", self.memory, "null takes what is free")
         if self.fused not in get_args(FusedMode):
-            raise SettingError(
-                f"fused must be one of {', '.join(get_args(FusedMode))}, got {self.fused!r}. In a YAML file, off is quoted."
-            )
+            rule = f"must be one of {', '.join(get_args(FusedMode))}"
+            refuse("fused", rule, self.fused, "in a YAML file, off is quoted")
 
     @property
     def stretch(self) -> float:

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from clear_strategies.core import deferred
+from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.view import View
 from clear_strategies.core.work_log import WorkLog
-from clear_strategies.errors import SettingError
 from clear_strategies.schedules import milestone
 
 _log = logging.getLogger(__name__)
@@ -55,12 +55,9 @@ class Skips:
     plateau_to: int = milestone(8_000)
 
     def __post_init__(self) -> None:
-        if self.hr_every < 1:
-            raise SettingError(f"hr_every must be at least 1 iteration, got {self.hr_every}.")
-        if not 0 <= self.plateau_gain < 1:
-            raise SettingError(f"plateau_gain must lie in [0, 1), got {self.plateau_gain}.")
-        if self.coarse_until < 0:
-            raise SettingError(f"coarse_until must be at least 0 iterations, got {self.coarse_until}.")
+        require_whole("hr_every", self.hr_every, least=1)
+        require_number("plateau_gain", self.plateau_gain, below=1)
+        require_whole("coarse_until", self.coarse_until, least=0)
 
     def says(self) -> list[str]:
         """A phrase for each skip that is on, for the plan."""

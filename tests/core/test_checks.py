@@ -28,7 +28,7 @@ def test_only_whole_numbers_in_range_are_whole_numbers(value: object) -> None:
 def test_numbers_are_finite_and_in_range(value: object) -> None:
     for fine in (0.1, 1):
         require_number("a.b", fine, above=0, most=1)
-    with pytest.raises(SettingError, match=r"^a\.b: must be a finite number and > 0 and <= 1, got .*: a\.b=1$"):
+    with pytest.raises(SettingError, match=r"^a\.b: must lie in \(0, 1\], got .*: a\.b=1$"):
         require_number("a.b", value, above=0, most=1)
 
 

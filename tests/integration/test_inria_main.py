@@ -100,7 +100,7 @@ def test_save_lr_writes_the_photos_as_they_are_trained_on_and_stops(inria_host, 
     ("arguments", "message"),
     [
         (["--strategies", "nobody"], "nobody"),
-        (["--overrides", "strategies.gco.tolerance=2"], "tolerance must lie in"),
+        (["--overrides", "strategies.gco.tolerance=2"], "tolerance: must lie in"),
         ([], "sr: must be the folder of the SR images"),
     ],
 )

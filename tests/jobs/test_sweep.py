@@ -129,7 +129,7 @@ def test_in_other_processes_a_failed_job_stops_no_other_and_is_told(tmp_path):
     )
     said = result.stdout + result.stderr
     assert result.returncode == 2, said
-    assert "1 job(s) failed: job 0: strategies.gco.tolerance must lie in [0, 1), got 7" in said
+    assert "1 job(s) failed: job 0: strategies.gco.tolerance: must lie in [0, 1), got 7" in said
     assert "Traceback" not in said
     assert sorted(p.parent.name for p in tmp_path.glob("all/*/metrics.json")) == ["1", "2"]
     assert "hydra.launcher.n_jobs=2" in (tmp_path / "all" / "1" / "run.log").read_text()

@@ -189,7 +189,7 @@ def test_a_short_run_gives_f_det_a_share_of_its_rate(caplog):
     assert "rate of 0.0005 instead of 0.0025: the run has 300 iterations" in caplog.text
     assert plain.of_run(1_500) == plain
     assert replace(plain, detail_steps=0).of_run(1) == replace(plain, detail_steps=0)
-    with pytest.raises(SettingError, match="detail_steps must be at least 0"):
+    with pytest.raises(SettingError, match="detail_steps: must be a whole number of at least 0"):
         LearningRates(detail_steps=-1)
 
 
@@ -202,7 +202,7 @@ def test_a_short_run_moves_the_geometry_faster_and_nothing_else():
     assert replace(short, means=plain.means, scales=plain.scales, quats=plain.quats) == rates
     assert rates.of_run(30_000) == rates.of_run(60_000) == rates
     assert plain.of_run(1_500) == plain
-    with pytest.raises(SettingError, match="geometry_steps must be at least 0"):
+    with pytest.raises(SettingError, match="geometry_steps: must be a whole number of at least 0"):
         LearningRates(geometry_steps=-1)
 
 

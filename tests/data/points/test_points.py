@@ -170,10 +170,10 @@ def test_outliers_are_removed_before_densification_and_voxels_averaged_after(tmp
         ("stride", 1.5, "must be a whole number of at least 1"),
         ("max_points", -1, "must be a whole number of at least 1"),
         ("outlier_neighbours", 1, "must be 0 or at least 2"),
-        ("outlier_ratio", math.nan, "must be a finite number and > 0"),
-        ("outlier_ratio", None, "must be a finite number and > 0"),
-        ("voxel", 0.0, "must be a finite number and > 0"),
-        ("box", math.inf, "must be a finite number and > 0"),
+        ("outlier_ratio", math.nan, "must be a finite number > 0"),
+        ("outlier_ratio", None, "must be a finite number > 0"),
+        ("voxel", 0.0, "must be a finite number > 0"),
+        ("box", math.inf, "must be a finite number > 0"),
     ],
 )
 def test_settings_out_of_range_are_refused_by_name(wrong: str, value: object, rule: str) -> None:
