@@ -1,4 +1,4 @@
-"""Densification: more points on the same surfaces, at inverse depths interpolated between the points of a cloud."""
+"""More points on the same surfaces, at inverse depths interpolated between points that are known."""
 
 from __future__ import annotations
 
@@ -9,55 +9,86 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.view import Photo
-from clear_strategies.geometry.projection import back_project, is_background, project, sample_colors
+from clear_strategies.core.view import DepthMap, Photo
+from clear_strategies.geometry.projection import (
+    back_project,
+    inside_of,
+    is_background,
+    project,
+    sample_colors,
+    seen_pixels,
+)
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
+STRIDE: Final = 2
+"""LR px between the points of a grid, by default."""
+
 _FEWEST_SAMPLES: Final = 4  # projected points from which a view's depth is interpolated
+_NEARER: Final = 0.95  # a point in front of this share of another photo's depth floats in free space
 
 
 def densify(cloud: PointCloud, photos: Sequence[Photo], stride: int, background: Color | None = None) -> PointCloud:
-    """Add, per view, a point every `stride` pixels at the interpolated inverse depth of the cloud.
-
-    Inverse depth is linear on planes. It is interpolated linearly between the projected points; outside their convex
-    hull it is that of the nearest point. Pixels of the background's colour show no surface and get no point.
-    """
-    means, colors = [cloud.means], [cloud.colors]
-    for i, photo in enumerate(photos):
-        grid = pixel_grid(photo, stride)
-        grid_colors = sample_colors(photo.image, grid)
-        if background is not None:
-            surface = ~is_background(grid_colors, background)
-            grid, grid_colors = grid[surface], grid_colors[surface]
-        inverse_depth = interpolate_depth(cloud.means, photo, grid, 2 * stride)
-        if inverse_depth is None:
-            _log.warning("view %d is not densified.", i)
-            continue
-        means.append(back_project(photo.camera, grid, 1 / inverse_depth))
-        colors.append(grid_colors)
-    added = sum(map(len, means[1:]))
-    if added == 0:
+    """The cloud, with what `grid_points` adds where no depth is known."""
+    means, colors = grid_points(cloud.means, photos, stride, background)
+    if len(means) == 0:
         _log.warning("densify added no point.")
         return cloud
-    source = f"{cloud.source}, densified by {added:,} at interpolated inverse depth"
-    return replace(cloud, means=torch.cat(means), colors=torch.cat(colors), source=source)
+    source = f"{cloud.source}, densified by {len(means):,} at interpolated inverse depth"
+    return replace(
+        cloud, means=torch.cat((cloud.means, means)), colors=torch.cat((cloud.colors, colors)), source=source
+    )
 
 
-def interpolate_depth(
-    means: Float[Tensor, "N 3"], photo: Photo, at: Float[Tensor, "G 2"], cell: int
-) -> Float[Tensor, " G"] | None:
-    """Inverse depth at these pixels, between the nearest points per square of `cell` pixels; None: fewer than 4 points."""
-    pixels, inverse_depth = _samples(means, photo, cell)
-    if len(pixels) < _FEWEST_SAMPLES:
-        _log.warning("depth of a view cannot be interpolated: only %d points project into it.", len(pixels))
-        return None
-    return _interpolate(pixels, inverse_depth, at)
+def grid_points(
+    means: Float[Tensor, "N 3"],
+    photos: Sequence[Photo],
+    stride: int,
+    background: Color | None = None,
+    maps: Sequence[DepthMap] | None = None,
+    masks: Sequence[Bool[Tensor, "h w"]] | None = None,
+) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+    """(positions, colours): in each photo a point every `stride` pixels, at inverse depth interpolated between `means`.
+
+    Inverse depth is linear on planes. It is interpolated linearly between the projected points; outside their convex
+    hull it is that of the nearest point.
+
+    Args:
+        background: pixels of this colour show no surface and get no point.
+        maps: of each photo; only pixels of unknown depth get a point, unless it floats in front of the depth that another
+            photo knows. None: no depth is known.
+        masks: of each photo, False where it hides pixels.
+    """
+    added, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
+    for i, photo in enumerate(photos):
+        grid = pixel_grid(photo, stride)
+        x, y = grid.long().unbind(dim=1)
+        wanted = torch.ones(photo.image.shape[:2], dtype=torch.bool)
+        if maps is not None:
+            wanted &= ~maps[i].known.cpu()
+        if masks is not None:
+            wanted &= masks[i].cpu()
+        grid = grid[wanted[y, x]]
+        shade = sample_colors(photo.image, grid)
+        if background is not None:
+            surface = ~is_background(shade, background)
+            grid, shade = grid[surface], shade[surface]
+        inverse_depth = _interpolated(means, photo, grid, 2 * stride) if len(grid) else None
+        if inverse_depth is None:
+            continue
+        points = back_project(photo.camera, grid, 1 / inverse_depth)
+        kept = torch.ones(len(points), dtype=torch.bool)
+        for j, found in enumerate(maps or ()):
+            if j != i:
+                kept &= ~_floats(points, photos[j], found)
+        added.append(points[kept])
+        colors.append(shade[kept])
+    return torch.cat(added), torch.cat(colors)
 
 
 def pixel_grid(photo: Photo, stride: int) -> Float[Tensor, "G 2"]:
@@ -67,36 +98,37 @@ def pixel_grid(photo: Photo, stride: int) -> Float[Tensor, "G 2"]:
     return torch.cartesian_prod(x, y)
 
 
-def _samples(
-    means: Float[Tensor, "N 3"], photo: Photo, cell: int
-) -> tuple[Float[np.ndarray, "V 2"], Float[np.ndarray, " V"]]:
-    """(pixels, inverse depths) of the points that project into the photo, the nearest one per square of `cell` pixels.
+def _floats(points: Float[Tensor, "N 3"], photo: Photo, found: DepthMap) -> Bool[Tensor, " N"]:
+    """Whether the photo looks through the point at a surface behind it."""
+    inside, row, column, depth = seen_pixels(photo.camera, points)
+    inside[inside.clone()] = depth < _NEARER * found.depth.cpu()[row, column].double()
+    return inside
 
-    Tracks, which list the points that a view observes, are not always known. Occluded points would distort the depth,
-    so only the nearest point in each square is kept.
+
+def _interpolated(
+    means: Float[Tensor, "N 3"], photo: Photo, at: Float[Tensor, "G 2"], cell: int
+) -> Float[Tensor, " G"] | None:
+    """Inverse depth at these pixels; None where fewer than 4 points project into the photo.
+
+    Occluded points would distort the depth, so only the nearest point per square of `cell` pixels counts.
     """
-    camera = photo.camera
-    pixels, depth = project(camera, means)
-    size = torch.tensor([camera.width, camera.height])
-    inside = (depth > 0) & ((pixels >= 0) & (pixels < size)).all(dim=1)
-    pixels, depth = pixels[inside], depth[inside]
-    order = torch.argsort(depth, stable=True)
-    column, row = (pixels[order] / cell).long().unbind(dim=1)
-    _, first = np.unique((row * camera.width + column).numpy(), return_index=True)
-    kept = order[torch.from_numpy(first)]
-    return pixels[kept].numpy(), (1 / depth[kept]).numpy()
-
-
-def _interpolate(
-    pixels: Float[np.ndarray, "V 2"], values: Float[np.ndarray, " V"], at: Float[Tensor, "G 2"]
-) -> Float[Tensor, " G"]:
-    """Linear between the samples, the nearest sample's value outside their convex hull."""
     from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
     from scipy.spatial import QhullError
 
-    result = np.asarray(NearestNDInterpolator(pixels, values)(at.numpy()))
+    pixels, depth = project(photo.camera, means)
+    inside = inside_of(photo.camera, pixels, depth)
+    pixels, depth = pixels[inside], depth[inside]
+    order = torch.argsort(depth, stable=True)
+    column, row = (pixels[order] / cell).long().unbind(dim=1)
+    _, first = np.unique((row * photo.camera.width + column).numpy(), return_index=True)
+    nearest = order[torch.from_numpy(first)]
+    if len(nearest) < _FEWEST_SAMPLES:
+        _log.warning("depth of a view cannot be interpolated: only %d points project into it.", len(nearest))
+        return None
+    samples, values = pixels[nearest].numpy(), (1 / depth[nearest]).numpy()
+    result = np.asarray(NearestNDInterpolator(samples, values)(at.numpy()))
     try:
-        linear = np.asarray(LinearNDInterpolator(pixels, values)(at.numpy()))
+        linear = np.asarray(LinearNDInterpolator(samples, values)(at.numpy()))
     except QhullError:  # all samples lie on one line
         return torch.from_numpy(result)
     return torch.from_numpy(np.where(np.isfinite(linear), linear, result))

@@ -12,12 +12,10 @@ REMEDY: Final = "pip install 'clear-strategies[train]'"
 
 def missing(*modules: str) -> str:
     """The packages of those modules that cannot be imported, joined by commas; empty where all can."""
-    return ", ".join(_PACKAGES[module] for module in modules if not _importable(module))
-
-
-def _importable(module: str) -> bool:
-    try:
-        importlib.import_module(module)
-    except (ImportError, OSError):  # not installed, or its system libraries are missing
-        return False
-    return True
+    lacking = []
+    for module in modules:
+        try:
+            importlib.import_module(module)
+        except (ImportError, OSError):  # not installed, or its system libraries are missing
+            lacking.append(_PACKAGES[module])
+    return ", ".join(lacking)

@@ -20,9 +20,8 @@ from clear_strategies.data.points.sources import from_ply, from_sfm, from_tracks
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, voxel_grid, without_outliers
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
-from clear_strategies.geometry.dense_stereo.filling import STRIDE
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.interpolation import densify, pixel_grid
+from clear_strategies.geometry.interpolation import STRIDE, densify, pixel_grid
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
 from rasterizers.interface import Color
 

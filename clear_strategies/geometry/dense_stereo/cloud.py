@@ -12,8 +12,8 @@ from torch import Tensor
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, without_outliers
-from clear_strategies.geometry.dense_stereo import filling
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.interpolation import STRIDE, grid_points
 from clear_strategies.geometry.libraries import REMEDY, missing
 from clear_strategies.geometry.projection import back_project, seen_pixels
 from rasterizers.interface import Color
@@ -30,7 +30,7 @@ def stereo_cloud(
     background: Color | None = None,
     masks: Sequence[Bool[Tensor, "h w"]] | None = None,
     fill: bool = True,
-    stride: int = filling.STRIDE,
+    stride: int = STRIDE,
     outlier_neighbours: int = OUTLIER_NEIGHBOURS,
     outlier_ratio: float = OUTLIER_RATIO,
 ) -> PointCloud | None:
@@ -64,7 +64,7 @@ def stereo_cloud(
     cloud = without_outliers(PointCloud(means, colors, source), outlier_neighbours, outlier_ratio)
     if not fill:
         return cloud
-    added, shades = filling.fill(cloud.means, photos, maps, stride, background, masks)
+    added, shades = grid_points(cloud.means, photos, stride, background, maps, masks)
     source = f"{source}, filled by {len(added):,} at interpolated inverse depth"
     return PointCloud(torch.cat((cloud.means, added)), torch.cat((cloud.colors, shades)), source)
 

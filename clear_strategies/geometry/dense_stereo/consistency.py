@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -13,17 +12,12 @@ from clear_strategies.geometry.dense_stereo.depth import Estimate
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Confirmed:
-    """How many of the others agree at each pixel, and the mean inverse depth of all that agree, the photo's own included."""
+def confirm(
+    mine: Estimate, others: Sequence[Estimate], settings: StereoSettings
+) -> tuple[Int[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """(how many of the others agree at each pixel, mean inverse depth of all that agree, the photo's own included).
 
-    agreeing: Int[Tensor, "H W"]
-    inverse_depth: Float[Tensor, "H W"]
-
-
-def confirm(mine: Estimate, others: Sequence[Estimate], settings: StereoSettings) -> Confirmed:
-    """Each pixel's point is looked up in the depth of the others, and the point found there is brought back.
-
+    Each pixel's point is looked up in the depth of the others, and the point found there is brought back.
     Another photo agrees if that depth differs by at most `tolerance`, relatively, and if the point comes back to within
     `reprojection` pixels.
     """
@@ -42,7 +36,7 @@ def confirm(mine: Estimate, others: Sequence[Estimate], settings: StereoSettings
         agrees = seen & ahead & same & near
         agreeing += agrees
         total = total + torch.where(agrees, 1 / back.double(), 0.0)
-    return Confirmed(agreeing, (total / (agreeing + 1)).float())
+    return agreeing, (total / (agreeing + 1)).float()
 
 
 def carry(

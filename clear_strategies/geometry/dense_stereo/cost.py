@@ -28,7 +28,9 @@ def cost_volume(
     volume = photo.image.new_empty(height, width, len(inverse_depths))
     reference = _Windows(photo.image[None], window)
     swept = [_Swept(photo, other) for other in others]
-    for planes in _blocks(len(inverse_depths), max(1, _BLOCK // (height * width))):
+    at_once = max(1, _BLOCK // (height * width))
+    for first in range(0, len(inverse_depths), at_once):
+        planes = slice(first, first + at_once)
         costs = (_cost(reference, other, inverse_depths[planes], window) for other in swept)
         volume[:, :, planes] = mean_of_lowest(costs, (len(others) + 1) // 2).permute(1, 2, 0)
     return volume
@@ -47,10 +49,6 @@ def mean_of_lowest(values: Iterator[Tensor], count: int) -> Tensor:
     for value in lowest[1:]:
         total = total + value
     return total / count
-
-
-def _blocks(total: int, size: int) -> Iterator[slice]:
-    return (slice(first, min(first + size, total)) for first in range(0, total, size))
 
 
 class _Windows:

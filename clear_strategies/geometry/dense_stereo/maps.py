@@ -61,15 +61,15 @@ def depth_maps(
             maps.append(_unknown(photo, "no other photo sees the same surfaces from 1 to 45 degrees aside"))
             continue
         others = [e for j in compared[i].others[:_ASKED] if (e := estimates[j]) is not None]
-        confirmed = confirm(mine, others, settings)
-        good = confirmed.agreeing >= min(needed, len(others))
-        good &= (mine.correlation >= settings.min_correlation) & (confirmed.agreeing > 0)
+        agreeing, inverse_depth = confirm(mine, others, settings)
+        good = agreeing >= min(needed, len(others))
+        good &= (mine.correlation >= settings.min_correlation) & (agreeing > 0)
         if background is not None:
             good &= ~is_background(photo.image, background)
         if masks is not None:
             good &= masks[i].to(good.device)
-        confidence = mine.correlation.clamp(0, 1) * (confirmed.agreeing.float() / 2).clamp(max=1)
-        depth = torch.where(good, 1 / confirmed.inverse_depth, torch.nan)
+        confidence = mine.correlation.clamp(0, 1) * (agreeing.float() / 2).clamp(max=1)
+        depth = torch.where(good, 1 / inverse_depth, torch.nan)
         found = DepthMap(depth, torch.where(good, confidence, 0.0))
         maps.append(_judged(photo, found, points, settings))
     return maps

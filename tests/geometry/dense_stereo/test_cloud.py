@@ -8,8 +8,8 @@ import torch
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry.dense_stereo.cloud import points_of
-from clear_strategies.geometry.dense_stereo.filling import fill, floats
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.interpolation import grid_points
 from tests.helpers.planes import photo
 
 
@@ -47,19 +47,15 @@ def test_the_most_confident_pixel_of_a_square_is_taken() -> None:
     assert (points_of([view], [found], 2.0, 0.02)[0][:, 2] == 7).all()
 
 
-def test_a_point_in_front_of_another_photos_depth_floats() -> None:
-    view = photo()
-    points = torch.tensor([[0.0, 0, 3], [0, 0, 4.9], [0, 0, 7], [9, 9, 3]])
-    assert floats(points, view, flat(view, 5.0)).tolist() == [True, False, False, False]
-
-
 def test_only_unknown_pixels_are_filled_and_never_in_known_free_space() -> None:
     views = [photo(), photo(0.1)]
     samples = torch.cat((torch.rand(60, 2) - 0.5, torch.full((60, 1), 3.0)), dim=1)
-    assert len(fill(samples, views, [flat(v, 5.0) for v in views], 2)[0]) == 0
-    assert len(fill(samples, views, [unknown(v) for v in views], 2)[0]) == 800
-    seen = fill(samples, views, [unknown(views[0]), flat(views[1], 5.0)], 2)[0]
-    assert len(seen) < 100
+    assert len(grid_points(samples, views, 2, maps=[flat(v, 5.0) for v in views])[0]) == 0
+    assert len(grid_points(samples, views, 2, maps=[unknown(v) for v in views])[0]) == 800
+    floating = grid_points(samples, views, 2, maps=[unknown(views[0]), flat(views[1], 5.0)])[0]
+    assert len(floating) < 100
+    close = grid_points(samples, views, 2, maps=[unknown(views[0]), flat(views[1], 3.1)])[0]
+    assert len(close) == 400  # within 5 % of what the other photo knows
 
 
 @pytest.mark.parametrize(
