@@ -59,21 +59,16 @@ def lift(
         outside: the value of a visible Gaussian whose centre lies outside the image: that of the border
             patch ("clamp") or 0 ("neutral"). Invisible Gaussians are 0 in any case.
     """
-    grid = centers / patch
+    x, y = (centers / patch).unbind(-1)
+    height, width = patch_maps.shape[1:]
     if lookup == "bilinear":
-        values = _bilinear(patch_maps, grid)
+        grid = torch.stack((2 * x / width - 1, 2 * y / height - 1), dim=-1)[None, None]
+        values = F.grid_sample(patch_maps[None], grid, padding_mode="border", align_corners=False)[0, :, 0]
     else:
-        height, width = patch_maps.shape[1:]
-        column, row = (grid[:, i].clamp(0, edge - 1).long() for i, edge in ((0, width), (1, height)))
+        column, row = x.clamp(0, width - 1).long(), y.clamp(0, height - 1).long()
         values = patch_maps.flatten(1).index_select(1, row * width + column)
     counted = visible
     if outside == "neutral":
         (x, y), (width, height) = centers.unbind(-1), size
         counted = counted & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     return values * counted
-
-
-def _bilinear(patch_maps: Float[Tensor, "C ph pw"], grid: Float[Tensor, "N 2"]) -> Float[Tensor, "C N"]:
-    height, width = patch_maps.shape[1:]
-    points = torch.stack((2 * grid[:, 0] / width - 1, 2 * grid[:, 1] / height - 1), dim=-1)[None, None]
-    return F.grid_sample(patch_maps[None], points, mode="bilinear", padding_mode="border", align_corners=False)[0, :, 0]

@@ -5,27 +5,17 @@ from __future__ import annotations
 import torch
 
 
-def seed_at(seed: int, t: int) -> int:
-    """The seed of a generator at t >= 0: another one for every t < 1,000,003 of every seed.
+def generator_at(seed: int, t: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """A new generator: another one for every t < 1,000,003 of every seed.
 
     Two purposes that ask at the same (seed, t) begin with the same random bits. A purpose that must be independent of the
-    others takes `hashed_seed_at`.
+    others takes `hashed_generator_at`.
     """
-    return seed * 1_000_003 + t
-
-
-def hashed_seed_at(seed: int, t: int) -> int:
-    """(seed, t) hashed to 63 bits, so that the generator is unrelated to those of neighbouring t and of `seed_at`."""
-    x = (seed * 0x9E3779B97F4A7C15 + t * 0xBF58476D1CE4E5B9) & (2**64 - 1)
-    x = (x ^ (x >> 31)) * 0x94D049BB133111EB & (2**64 - 1)
-    return (x ^ (x >> 29)) >> 1
-
-
-def generator_at(seed: int, t: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """A new generator with the seed of `seed_at`."""
-    return torch.Generator(device).manual_seed(seed_at(seed, t))
+    return torch.Generator(device).manual_seed(seed * 1_000_003 + t)
 
 
 def hashed_generator_at(seed: int, t: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """A new generator with the seed of `hashed_seed_at`."""
-    return torch.Generator(device).manual_seed(hashed_seed_at(seed, t))
+    """A new generator, unrelated to those of neighbouring t and of `generator_at`: (seed, t) is hashed to 63 bits."""
+    x = (seed * 0x9E3779B97F4A7C15 + t * 0xBF58476D1CE4E5B9) & (2**64 - 1)
+    x = (x ^ (x >> 31)) * 0x94D049BB133111EB & (2**64 - 1)
+    return torch.Generator(device).manual_seed((x ^ (x >> 29)) >> 1)

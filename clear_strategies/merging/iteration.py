@@ -15,20 +15,10 @@ from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.step import Step
 
-
-@runtime_checkable
-class ScreenGradient(Protocol):
-    """The gradient of one loss in whatever form a `Stepper` takes; dense in the readable path (`Grads`)."""
-
-    @property
-    def screen(self) -> Float[Tensor, "N 2"] | None: ...
-
-    def table(self) -> Mapping[str, Tensor]:
-        """What must be finite before a step, one row per Gaussian, by name."""
-        ...
-
-
-G = TypeVar("G", bound=ScreenGradient)
+G = TypeVar("G")
+"""The gradient of one loss in the form that a `Stepper` takes, with `screen` and `table()` of `Grads`, which it is in the
+readable path.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -87,16 +87,13 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
         OSError: the disk is full or read-only; earlier checkpoints are untouched.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    target = _free_name(folder / f"{_PREFIX}{checkpoint.t:07d}")
+    step = f"{_PREFIX}{checkpoint.t:07d}"
+    # Where the name is taken, by the same step before a resume, another that sorts right after it.
+    names = itertools.chain([step], (f"{step}_{n}" for n in itertools.count(2)))
+    target = next(path for name in names if not (path := folder / name).exists())
     contents = {_TENSORS: tensor_file.parts(checkpoint.tensors), _HISTORY: _rows(checkpoint.history)}
-    manifest: dict[str, Any] = {
-        "format": FORMAT,
-        "t": checkpoint.t,
-        "config": checkpoint.config,
-        "facts": checkpoint.facts,
-        "work_log": checkpoint.work_log,
-        "device": checkpoint.device,
-    }
+    facts = ("t", "config", "facts", "work_log", "device")
+    manifest: dict[str, Any] = {"format": FORMAT, **{name: getattr(checkpoint, name) for name in facts}}
     partial = partial_of(target)
     shutil.rmtree(partial, ignore_errors=True)
     try:
@@ -108,25 +105,12 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
         _flush_folder(folder)
     finally:
         shutil.rmtree(partial, ignore_errors=True)  # exists only after an exception or Ctrl-C above
-    earlier, later = _others(folder, target, checkpoint.t)
-    for old in (*earlier[: max(0, len(earlier) + 1 - keep)], *later):
+    # Those of the same iteration, and of later ones, belong to another run or to a try that this run does not continue.
+    others = [path for path in saved(folder) if path != target]
+    earlier = [path for path in others if path.name < step]
+    for old in (*earlier[: max(0, len(earlier) + 1 - keep)], *others[len(earlier) :]):
         _remove(old)
     return target
-
-
-def _free_name(target: Path) -> Path:
-    """`target`, or where that is taken, by the same step before a resume, another name that sorts right after it."""
-    names = itertools.chain([target], (target.with_name(f"{target.name}_{n}") for n in itertools.count(2)))
-    return next(path for path in names if not path.exists())
-
-
-def _others(folder: Path, target: Path, t: int) -> tuple[list[Path], list[Path]]:
-    """The checkpoints of earlier iterations, and those that `target` takes the place of: of the same iteration, and of
-    later ones, which belong to another run or to a try that this run does not continue.
-    """
-    others = [path for path in saved(folder) if path != target]
-    bound = f"{_PREFIX}{t:07d}"
-    return [path for path in others if path.name < bound], [path for path in others if path.name >= bound]
 
 
 def _remove(old: Path) -> None:

@@ -20,24 +20,19 @@ _VIEWS_OF_LOSS: Final = 4
 
 
 def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int) -> None:
-    """Add the mean PSNR of the test views to the last row of the history."""
+    """Add the mean PSNR of the first few test views, as far as their HR photos are known, to the last row of the history."""
     work_log = state.conductor.work_log
     if state.density.reset_due(done) and not state.ended:
         work_log.skip(PROBING, "opacities were reset in this iteration")
         return
     with work_log.stage(PROBING):
-        psnr = _probe(state, scene, rasterizer)
-    if psnr is not None:
-        state.history[-1]["psnr_test"] = psnr
-
-
-def _probe(state: TrainState, scene: Scene, rasterizer: Rasterizer) -> float | None:
-    """Mean PSNR of the first few test views at HR; None where HR is unknown."""
-    values = []
-    for view in scene.test[: state.settings.probe_views]:
-        if view.truth is not None:
-            values.append(psnr_of(state.field.render(rasterizer, view.hr.camera), view.truth))
-    return sum(deferred.read(values)) / len(values) if values else None
+        values = [
+            psnr_of(state.field.render(rasterizer, view.hr.camera), view.truth)
+            for view in scene.test[: state.settings.probe_views]
+            if view.truth is not None
+        ]
+        if values:
+            state.history[-1]["psnr_test"] = sum(deferred.read(values)) / len(values)
 
 
 def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> Number:
@@ -49,12 +44,11 @@ def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> Number:
     for view in state.views[:_VIEWS_OF_LOSS]:
         if objective.lambda_hr(state.t) > 0:
             shown = state.skip_policy.view(view, state.t).hr
-            loss = objective.hr(state.field.render(rasterizer, shown.camera), shown.image, shown.shown).values["base"]
+            compare, name = objective.hr, "base"
         else:
-            loss = objective.lr(state.field.render(rasterizer, view.lr.camera), view.lr.image, view.lr.shown).values[
-                "lr"
-            ]
-        losses.append(loss)
+            shown, compare, name = view.lr, objective.lr, "lr"
+        image = state.field.render(rasterizer, shown.camera)
+        losses.append(compare(image, shown.image, shown.shown).values[name])
     return sum(losses) / len(losses)
 
 

@@ -22,25 +22,20 @@ def extra_steps(s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[Ext
         DivergedError: a loss or a gradient is not finite; that step was not made.
     """
     row: dict[str, Number] = {}
+    θ, steps, where = s.field, s.optimizer.steps, f"t={s.t}, an extra view: the gradient"
     for extra in extra_views:
         with s.conductor.work_log.stage("extra views"):
-            row[LOSS] = _step(s, rasterizer, extra)
+            shot = θ.shot(rasterizer, extra.photo.camera)
+            losses = s.conductor.extra_loss(shot.image, extra, s.t)
+            if s.compiled_step is not None:
+                (g,) = s.compiled_step.vjp(shot, losses.cotangents)
+                require_finite(where, g.table())
+                s.compiled_step.step_extra(θ.raw(), g, s.t)
+            else:
+                (grads,) = shot.vjp(losses.cotangents)
+                require_finite(where, grads)
+                s.optimizer.step(θ.raw(), grads, shot.visible)
+                θ.constrain()
+            s.optimizer.steps = steps  # the learning rates follow the iteration
+            row[LOSS] = losses.values["lr"]
     return row
-
-
-def _step(s: TrainState, rasterizer: Rasterizer, extra: ExtraView) -> Number:
-    θ, steps = s.field, s.optimizer.steps
-    shot = θ.shot(rasterizer, extra.photo.camera)
-    losses = s.conductor.extra_loss(shot.image, extra, s.t)
-    where = f"t={s.t}, an extra view: the gradient"
-    if s.compiled_step is not None:
-        (g,) = s.compiled_step.vjp(shot, losses.cotangents)
-        require_finite(where, g.table())
-        s.compiled_step.step_extra(θ.raw(), g, s.t)
-    else:
-        (grads,) = shot.vjp(losses.cotangents)
-        require_finite(where, grads)
-        s.optimizer.step(θ.raw(), grads, shot.visible)
-        θ.constrain()
-    s.optimizer.steps = steps  # the learning rates follow the iteration
-    return losses.values["lr"]
