@@ -93,7 +93,15 @@ def border_views(photos: Iterable[Photo], *, field: float, max_pixels: int) -> l
         field: at least 1.
         max_pixels: larger photos are reduced by a whole factor first.
     """
-    return [_widened(photo.reduced(photo.factor_to(max_pixels)), field) for photo in photos]
+    made = []
+    for photo in (photo.reduced(photo.factor_to(max_pixels)) for photo in photos):
+        c = photo.camera
+        x, y = (round(n * (field - 1) / 2) for n in (c.width, c.height))
+        wide = replace(c, cx=c.cx + x, cy=c.cy + y, width=c.width + 2 * x, height=c.height + 2 * y)
+        known = torch.zeros(wide.height, wide.width, dtype=torch.bool)
+        known[y : y + c.height, x : x + c.width] = True if photo.shown is None else photo.shown
+        made.append(PseudoView(Photo(wide, torch.nn.functional.pad(photo.image, (0, 0, x, x, y, y))), known))
+    return made
 
 
 def cut_out(photos: Iterable[Photo], background: Color) -> bool:
@@ -110,16 +118,6 @@ def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.
     )
     direction[2] *= _ALONG
     return moved(camera, direction * reach * distance, aim=distance)
-
-
-def _widened(photo: Photo, field: float) -> PseudoView:
-    c = photo.camera
-    x, y = (round(n * (field - 1) / 2) for n in (c.width, c.height))
-    wide = replace(c, cx=c.cx + x, cy=c.cy + y, width=c.width + 2 * x, height=c.height + 2 * y)
-    image = torch.nn.functional.pad(photo.image, (0, 0, x, x, y, y))
-    known = torch.zeros(wide.height, wide.width, dtype=torch.bool)
-    known[y : y + c.height, x : x + c.width] = True if photo.shown is None else photo.shown
-    return PseudoView(Photo(wide, image), known)
 
 
 def _reduced(photo: Photo, found: DepthMap, max_pixels: int) -> tuple[Photo, DepthMap]:

@@ -155,10 +155,9 @@ def _draw_next(axes: Axes, number: int, photo: NextPhoto, painter: Painter) -> N
     """What would be seen from there as far as it is known, redder where a photo is worth more."""
     image = painter.color(photo.camera)
     red = torch.tensor(_rgb(figures.RED)) / 255
-    weight = torch.nn.functional.interpolate(photo.worth.nan_to_num(0)[None, None], image.shape[:2], mode="nearest")[
-        0, 0, ..., None
-    ]
-    axes.imshow((image * (1 - 0.6 * weight) + 0.6 * weight * red).numpy())
+    worth = photo.worth.nan_to_num(0)[None, None]
+    weight = 0.6 * torch.nn.functional.interpolate(worth, image.shape[:2], mode="nearest")[0, 0, ..., None]
+    axes.imshow((image * (1 - weight) + weight * red).numpy())
     axes.set_axis_off()
     told = f"next photo {number}: {photo.where}"
     axes.set_title("\n".join(textwrap.wrap(told, 60)), fontsize=9, color=_NEXT)
@@ -172,14 +171,11 @@ def _lines(found: Coverage, scene: Scene) -> list[str]:
     lines += ["worth 100%: one photo alone shows all that it would show", ""]
     lines += [f"{'SURFACE SEEN BY':<24}  one   two   {ENOUGH} or more photos"]
     for name, (one, two, more) in list(found.shares.items())[:_MOST_LINES]:
-        lines.append(f"{_short(name):<24} {one:4.0%}  {two:4.0%}  {more:4.0%}")
+        short = name if len(name) <= 24 else f"…{name[-23:]}"
+        lines.append(f"{short:<24} {one:4.0%}  {two:4.0%}  {more:4.0%}")
     if len(found.photos) > _MOST_LINES:
         lines.append(f"and {len(found.photos) - _MOST_LINES} more")
     if scene.unplaced:
         lines += ["", "WITHOUT A POSE, so not used"]
         lines += textwrap.wrap("; ".join(f"{name}: {why}" for name, why in scene.unplaced.items()), 62)[:_MOST_LINES]
     return lines
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= 24 else f"…{name[-23:]}"

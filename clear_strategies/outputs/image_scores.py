@@ -26,6 +26,7 @@ from torch import Tensor
 PSNR_CAP: Final = 100.0  # dB, the PSNR of identical images
 _SMALLEST: Final = 12  # px; GMSD halves the image and SSIM needs room for its window
 _GMSD_C: Final = 170 / 255**2
+_LUMINANCE: Final = np.array([0.299, 0.587, 0.114])
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,7 @@ def score(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> Image
     Raises:
         ValueError: the sizes differ or are too small.
     """
+    from skimage.measure import blur_effect
     from skimage.metrics import structural_similarity
 
     if image.shape != truth.shape:
@@ -57,9 +59,10 @@ def score(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> Image
     ssim = structural_similarity(
         x, y, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2
     )
-    grey_x, grey_y = _luminance(x), _luminance(y)
+    grey_x, grey_y = (np.asarray(rgb @ _LUMINANCE) for rgb in (x, y))
     psnr = min(PSNR_CAP, 10 * math.log10(1 / mse)) if mse > 0 else PSNR_CAP
-    return ImageScores(psnr, float(ssim), _gmsd(grey_x, grey_y), _blur(grey_x) - _blur(grey_y))
+    blur = float(blur_effect(grey_x)) - float(blur_effect(grey_y))
+    return ImageScores(psnr, float(ssim), _gmsd(grey_x, grey_y), blur)
 
 
 def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
@@ -69,29 +72,16 @@ def mean_scores(scores: Sequence[ImageScores]) -> ImageScores | None:
     return ImageScores(*(sum(getattr(s, f.name) for s in scores) / len(scores) for f in fields(ImageScores)))
 
 
-def _luminance(rgb: np.ndarray) -> np.ndarray:
-    return np.asarray(rgb @ np.array([0.299, 0.587, 0.114]))
-
-
 def _gmsd(x: np.ndarray, y: np.ndarray) -> float:
     """Standard deviation of the similarity of Prewitt gradient magnitudes, at half size."""
-    gx, gy = _gradient(_halved(x)), _gradient(_halved(y))
+    gx, gy = _gradient_at_half_size(x), _gradient_at_half_size(y)
     similarity = (2 * gx * gy + _GMSD_C) / (gx**2 + gy**2 + _GMSD_C)
     return float(similarity.std())
 
 
-def _halved(image: np.ndarray) -> np.ndarray:
-    h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
-    return np.asarray(image[:h, :w].reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3)))
-
-
-def _gradient(image: np.ndarray) -> np.ndarray:
+def _gradient_at_half_size(image: np.ndarray) -> np.ndarray:
     from skimage.filters import prewitt_h, prewitt_v
 
-    return np.asarray(np.hypot(prewitt_h(image), prewitt_v(image)))
-
-
-def _blur(image: np.ndarray) -> float:
-    from skimage.measure import blur_effect
-
-    return float(blur_effect(image))
+    h, w = image.shape[0] // 2 * 2, image.shape[1] // 2 * 2
+    half = image[:h, :w].reshape(h // 2, 2, w // 2, 2).mean(axis=(1, 3))
+    return np.asarray(np.hypot(prewitt_h(half), prewitt_v(half)))

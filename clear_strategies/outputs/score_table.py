@@ -69,16 +69,13 @@ def _rows(part: str, evaluation: Evaluation, baseline: Baseline | None) -> Itera
     if ours is not None:
         yield "ours", _numbers(ours)
     if ours is not None and theirs is not None:
-        yield OURS_MINUS_BASELINE, _numbers(_difference(ours, theirs), "+")
+        difference = (getattr(ours, f.name) - getattr(theirs, f.name) for f in fields(ImageScores))
+        yield OURS_MINUS_BASELINE, _numbers(ImageScores(*difference), "+")
     if evaluation.against_lr(part):
         return  # they are made from the very photos that they would be compared with
     for image in ("bicubic", "prior"):
         if (mean := evaluation.mean(part, image)) is not None:
             yield image, _numbers(mean)
-
-
-def _difference(a: ImageScores, b: ImageScores) -> ImageScores:
-    return ImageScores(*(getattr(a, f.name) - getattr(b, f.name) for f in fields(ImageScores)))
 
 
 def _numbers(m: ImageScores, sign: str = "") -> str:

@@ -109,7 +109,10 @@ class PseudoViews(Strategy):
     def _moved_aside(self, views: Sequence[View], photos: dict[str, Photo]) -> list[PseudoView]:
         if len(photos) < 2:
             return []
-        largest = max(_pixels(photo) // photo.factor_to(self.max_pixels) ** 2 for photo in photos.values())
+        largest = max(
+            photo.camera.width * photo.camera.height // photo.factor_to(self.max_pixels) ** 2
+            for photo in photos.values()
+        )
         return pseudo_views(
             photos,
             _depths(views, photos),
@@ -153,10 +156,6 @@ class PseudoViews(Strategy):
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
         return "it is the LR loss that pseudo views are trained by, and lambda_lr is 0" if lambda_lr == 0 else None
-
-
-def _pixels(photo: Photo) -> int:
-    return photo.camera.width * photo.camera.height
 
 
 def _depths(views: Sequence[View], photos: dict[str, Photo]) -> dict[str, DepthMap]:

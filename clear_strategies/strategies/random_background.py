@@ -41,7 +41,11 @@ class RandomBackground(Strategy):
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
-        self.cache["seed"], self.cache["kept"] = seed, self._why_kept(n_views)
+        self.cache["seed"], self.cache["kept"] = seed, ""
+        if n_views > _FEW_VIEWS:
+            self.cache["kept"] = f"because there are more than {_FEW_VIEWS} training views"
+        elif self.until < _LONG_RUN:
+            self.cache["kept"] = f"because the run has fewer than {_LONG_RUN:,} iterations for it"
 
     def summary(self) -> str | None:
         kept: str = self.cache.get("kept", "")
@@ -63,9 +67,3 @@ class RandomBackground(Strategy):
             return None
         r, g, b = torch.rand(3, generator=generator_at(self.cache.get("seed", 0), t)).tolist()
         return r, g, b
-
-    def _why_kept(self, n_views: int) -> str:
-        """Why the background stays as it is, as far as that is known without the photos; empty: it changes."""
-        if n_views > _FEW_VIEWS:
-            return f"because there are more than {_FEW_VIEWS} training views"
-        return "" if self.until >= _LONG_RUN else f"because the run has fewer than {_LONG_RUN:,} iterations for it"

@@ -69,7 +69,8 @@ class SVS(Strategy):
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
         self.cache["seed"] = seed
-        self.cache["share"] = self._share_of_rate(n_views)
+        # How far a run that sees each view `dropout.full` / n_views times needs the rate.
+        self.cache["share"] = min(1.0, self.dropout.full / (self.looks * max(1, n_views))) if self.looks else 1.0
         if self.cache["share"] < 1 and self.dropout.maximum > 0:
             _log.debug(
                 "dropout rises to %.3f instead of %.3f: each of the %d training views is seen %d times (svs.looks: %d).",
@@ -103,7 +104,9 @@ class SVS(Strategy):
             return None
         self._require_same_number(n)
         strength = 2 * self.anchor_strength / (1 if self.reduction == "sum" else n)
-        return Anchor(self.state, {name: strength * self._weight(name) for name in self.state})
+        unit = {"means": self._extent() ** 2} if "means" in self.state else {}
+        weights = {name: self.anchor_weights[name] / unit.get(name, 1.0) for name in self.state}
+        return Anchor(self.state, {name: strength * weight for name, weight in weights.items()})
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
         if self.dropout.maximum == 0 and (self.anchor_strength == 0 or not any(self.anchor_weights.values())):
@@ -132,14 +135,6 @@ class SVS(Strategy):
         if self.state:
             self._require_same_number(len(parents))
         super().on_resize(parents)
-
-    def _share_of_rate(self, n_views: int) -> float:
-        """How far a run that sees each view `dropout.full` / n_views times needs the rate, in [0, 1]."""
-        return min(1.0, self.dropout.full / (self.looks * max(1, n_views))) if self.looks else 1.0
-
-    def _weight(self, name: str) -> float:
-        weight = self.anchor_weights[name]
-        return weight / self._extent() ** 2 if name == "means" else weight
 
     def _extent(self) -> float:
         if "extent" not in self.cache:

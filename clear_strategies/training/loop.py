@@ -110,7 +110,9 @@ def fit(
             try:
                 iterate(state, rasterizer)
             except DivergedError as error:
-                raise DivergedError(f"{error} {_what_to_do(save())}") from error
+                saved = save()
+                where = "" if saved is None else f" The state before that step is {saved}."
+                raise DivergedError(f"{error}{where} Check that view's photos, or lower the learning rates.") from error
             ended = state.ended
             state.history[-1].update(clock.read())
             if settings.probe_every and (done % settings.probe_every == 0 or ended):
@@ -126,11 +128,6 @@ def fit(
     save()
     state.history_as_floats()
     return state
-
-
-def _what_to_do(saved: Path | None) -> str:
-    where = "" if saved is None else f"The state before that step is {saved}. "
-    return f"{where}Check that view's photos, or lower the learning rates."
 
 
 def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Number]:

@@ -13,7 +13,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import logging
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,6 @@ from typing import Final
 
 import torch
 
-from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import CountsLists, Rasterizer
@@ -98,7 +96,9 @@ def needs(state: TrainState, rasterizer: Rasterizer) -> Needs:
     scales = 1 + state.conductor.wants_lr
     floats = _ACTIVATION + _PROJECTION + scales * _GRID + _COTANGENTS * _GRADIENT + scales * basis + _EVIDENCE
     view = max(state.views, key=lambda view: view.hr.image.numel())
-    lists, most = _lists(state, rasterizer, view)
+    lists, most = 0, 0
+    if isinstance(rasterizer, CountsLists):
+        lists, most = rasterizer.list_bytes(state.field.baked(), view.hr.camera) // n, rasterizer.memory * _MIB
     return Needs(
         now=torch.cuda.memory_allocated(state.device) if cuda else resident(),
         reached=torch.cuda.max_memory_allocated(state.device) if cuda else peak(),
@@ -110,14 +110,6 @@ def needs(state: TrainState, rasterizer: Rasterizer) -> Needs:
         pixels=_FLOAT * _PER_PIXEL * (view.hr.image.shape[0] * view.hr.image.shape[1]),
         cuda=cuda,
     )
-
-
-def _lists(state: TrainState, rasterizer: Rasterizer, view: View) -> tuple[int, int]:
-    """Bytes per Gaussian of the lists of the largest image, and the most that the rasterizer takes in all."""
-    if not isinstance(rasterizer, CountsLists):
-        return 0, 0
-    splats = state.field.baked()
-    return rasterizer.list_bytes(splats, view.hr.camera) // len(splats), rasterizer.memory * _MIB
 
 
 def require(found: Needs, budget: int | None, most: int | None) -> None:
@@ -170,28 +162,26 @@ def mebibytes(size: int) -> int:
 
 def resident() -> int:
     """Bytes that the process holds now; 0 where the system does not say."""
-    return _of_status("VmRSS")
+    return _told_by("/proc/self/status", "VmRSS") or 0
 
 
 def peak() -> int:
     """The most bytes that the process has held; 0 where the system does not say."""
-    return _of_status("VmHWM")
+    return _told_by("/proc/self/status", "VmHWM") or 0
 
 
 def available(found: Needs) -> int | None:
     """Bytes that training may take on this machine, with what it holds already; None where the system does not say."""
     if found.cuda:
         return int(torch.cuda.mem_get_info()[0]) + found.now
-    try:
-        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        return int(lines["MemAvailable"].split()[0]) * 1024 + found.now
-    except (OSError, KeyError, ValueError):
-        return None
+    free = _told_by("/proc/meminfo", "MemAvailable")
+    return None if free is None else free + found.now
 
 
-def _of_status(name: str) -> int:
+def _told_by(file: str, name: str) -> int | None:
+    """Bytes; None where the system does not say."""
     try:
-        lines = dict(line.split(":", 1) for line in Path(f"/proc/{os.getpid()}/status").read_text().splitlines())
+        lines = dict(line.split(":", 1) for line in Path(file).read_text().splitlines())
         return int(lines[name].split()[0]) * 1024
     except (OSError, KeyError, ValueError):
-        return 0
+        return None

@@ -50,7 +50,8 @@ def stereo_cloud(
     means, colors = points_of(photos, maps, settings.spacing, settings.tolerance)
     known = torch.zeros(len(features), dtype=torch.bool)
     for photo, found in zip(photos, maps, strict=True):
-        known |= shows(photo, found, features.means)
+        inside, row, column, _ = seen_pixels(photo.camera, features.means)
+        known[inside] |= found.known.cpu()[row, column]
     means = torch.cat((means, features.means[~known]))
     colors = torch.cat((colors, features.colors[~known]))
     shares = ", ".join(f"{found.coverage:.0%}" for found in maps)
@@ -83,8 +84,7 @@ def points_of(
     """
     means, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
     for photo, found in zip(photos, maps, strict=True):
-        covered = covered_squares(photo, found, torch.cat(means), spacing, tolerance)
-        pixel = best_per_square(found, spacing, covered)
+        pixel = _best_per_square(photo, found, torch.cat(means), spacing, tolerance)
         row, column = pixel // photo.camera.width, pixel % photo.camera.width
         centre = torch.stack((column, row), dim=1).double() + 0.5
         means.append(back_project(photo.camera, centre, found.depth.cpu().reshape(-1)[pixel].double()))
@@ -92,39 +92,21 @@ def points_of(
     return torch.cat(means), torch.cat(colors)
 
 
-def squares_of(found: DepthMap, spacing: float) -> Int[Tensor, "h w"]:
-    """The number of each pixel's square."""
-    height, width = found.depth.shape
-    column, row = (((torch.arange(n) + 0.5) / spacing).long() for n in (width, height))
-    return row[:, None] * (int(column[-1]) + 1) + column
-
-
-def covered_squares(
+def _best_per_square(
     photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"], spacing: float, tolerance: float
-) -> Bool[Tensor, " S"]:
-    """Which squares hold the projection of a point that lies on the surface."""
-    square = squares_of(found, spacing)
-    covered = torch.zeros(int(square.max()) + 1, dtype=torch.bool)
+) -> Int[Tensor, " K"]:
+    """The pixel of highest confidence in each square that has depth, unless a point on the surface projects into it."""
+    height, width = found.depth.shape
+    x, y = (((torch.arange(n) + 0.5) / spacing).long() for n in (width, height))
+    squares = y[:, None] * (int(x[-1]) + 1) + x
+    covered = torch.zeros(int(squares.max()) + 1, dtype=torch.bool)
     _, row, column, depth = seen_pixels(photo.camera, points)
     same = (found.depth.cpu()[row, column] / depth - 1).abs() <= tolerance
-    covered[square[row[same], column[same]]] = True
-    return covered
-
-
-def best_per_square(found: DepthMap, spacing: float, covered: Bool[Tensor, " S"]) -> Int[Tensor, " K"]:
-    """The pixel of highest confidence in each square that has depth and is not covered."""
-    square = squares_of(found, spacing).reshape(-1)
-    confidence = found.confidence.cpu().reshape(-1)
+    covered[squares[row[same], column[same]]] = True
+    square, confidence = squares.reshape(-1), found.confidence.cpu().reshape(-1)
     free = torch.nonzero((confidence > 0) & ~covered[square])[:, 0]
     order = free[torch.argsort(confidence[free], descending=True, stable=True)]
     order = order[torch.argsort(square[order], stable=True)]
     first = torch.ones(len(order), dtype=torch.bool)
     first[1:] = square[order[1:]] != square[order[:-1]]
     return order[first]
-
-
-def shows(photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
-    """Whether the photo has depth at the pixel of each point."""
-    inside, row, column, _ = seen_pixels(photo.camera, points)
-    inside[inside.clone()] = found.known.cpu()[row, column]
-    return inside

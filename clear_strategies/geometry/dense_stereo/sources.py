@@ -13,7 +13,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry.cameras import common_box
-from clear_strategies.geometry.projection import back_project, inside_of, project
+from clear_strategies.geometry.projection import back_project, inside_of, project, seen_pixels
 from rasterizers.interface import Camera
 
 _FEW: Final = 20  # points in a photo, below which a grid at guessed depths replaces them
@@ -49,8 +49,9 @@ def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"]) -> list[C
     middle = (low + high)[None] / 2
     found = []
     for i, camera in enumerate(cameras):
-        seen, depth = _visible(camera, points)
-        if len(seen) >= _FEW:
+        inside, _, _, depth = seen_pixels(camera, points)
+        if len(depth) >= _FEW:
+            seen = points[inside].double()
             far, near = torch.quantile(1 / depth, torch.tensor(_QUANTILES, dtype=depth.dtype)).tolist()
             far, near = _FARTHER * far, _NEARER * near
         else:
@@ -73,12 +74,6 @@ def plane_count(camera: Camera, others: Sequence[Camera], far: float, near: floa
         if len(shift):
             paths.append(float(shift.median()))
     return max(8, min(most, math.ceil(max(paths, default=0.0) / step) + 1))
-
-
-def _visible(camera: Camera, points: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "M 3"], Float[Tensor, " M"]]:
-    pixels, depth = project(camera, points)
-    inside = inside_of(camera, pixels, depth)
-    return points[inside].double(), depth[inside]
 
 
 def _grid(camera: Camera, distance: float) -> Float[Tensor, "36 3"]:
