@@ -32,6 +32,16 @@ def without_a_pixel(bad: float, scale: str):
     return replace(SCENE, train=tuple(spoil(view) for view in SCENE.train))
 
 
+def begun(fused: str):
+    """A run at its sixth iteration, in which HR takes part, and what it holds."""
+    state = start(NAMES)
+    if fused == "readable":
+        state.compiled_step = None
+    for _ in range(5):
+        iterate(state, toy.RASTERIZER)
+    return state, {name: value.clone() for name, value in tensors(state).items()}
+
+
 def assert_same(before, after):
     assert before.keys() == after.keys()
     for name, value in before.items():
@@ -48,13 +58,8 @@ def test_a_sum_that_overflows_is_finite_where_its_numbers_are():
 @pytest.mark.parametrize("fused", ["compiled", "readable"])
 @pytest.mark.parametrize("scale", ["lr", "hr"])
 def test_a_pixel_that_is_not_finite_is_named_before_the_step(scale, fused, bad):
-    state = start(NAMES)
-    if fused == "readable":
-        state.compiled_step = None
-    for _ in range(5):  # HR takes part from iteration 4
-        iterate(state, toy.RASTERIZER)
+    state, before = begun(fused)
     state.views = without_a_pixel(bad, scale).train
-    before = {name: value.clone() for name, value in tensors(state).items()}
     photo = {"lr": "the LR photo", "hr": "the SR image"}[scale]
     with pytest.raises(
         DivergedError, match=rf"^t=6, view view\d: the loss .*{photo} is not finite.*first pixel \(5, 3\)"
@@ -68,12 +73,7 @@ def test_a_pixel_that_is_not_finite_is_named_before_the_step(scale, fused, bad):
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "rgb"])
 @pytest.mark.parametrize("fused", ["compiled", "readable"])
 def test_a_gradient_that_is_not_finite_is_named_before_the_step(fused, name, bad, monkeypatch):
-    state = start(NAMES)
-    if fused == "readable":
-        state.compiled_step = None
-    for _ in range(5):
-        iterate(state, toy.RASTERIZER)
-    before = {key: value.clone() for key, value in tensors(state).items()}
+    state, before = begun(fused)
     init = FieldShot.__init__
 
     def spoiled(self, *arguments, **options):
@@ -104,19 +104,19 @@ def test_a_run_that_meets_nan_saves_the_state_before_and_says_where(tmp_path):
     assert_same(dict(saved.tensors), tensors(state))
 
 
-@pytest.mark.parametrize("moments", ["first", "second"])
-def test_moments_that_are_not_finite_are_never_saved(moments):
+@pytest.mark.parametrize(
+    ("table", "named"),
+    [
+        (lambda state: state.field.raw(), ""),
+        (lambda state: state.optimizer.first, "first moment of "),
+        (lambda state: state.optimizer.second, "second moment of "),
+    ],
+)
+@pytest.mark.parametrize("bad", BAD)
+def test_what_is_not_finite_is_never_saved(table, named, bad):
     state = start(())
-    iterate(state, toy.RASTERIZER)
-    getattr(state.optimizer, moments)["scales"][4, 1] = float("inf")
-    with pytest.raises(DivergedError, match=f"before t=2: {moments} moment of scales .* first Gaussian 4"):
-        state.checkpoint({})
-
-
-def test_a_field_that_is_not_finite_is_never_saved():
-    state = start(())
-    state.field.quats.data[2, 0] = float("nan")
-    with pytest.raises(DivergedError, match="before t=1: quats is not finite for 1 Gaussians, first Gaussian 2"):
+    table(state)["scales"][4, 1] = bad
+    with pytest.raises(DivergedError, match=f"t=1: {named}scales is not finite for 1 Gaussians, first Gaussian 4"):
         state.checkpoint({})
 
 

@@ -18,13 +18,6 @@ def row(name: str, seed: int, *, truth: bool = True, size: tuple[int, int] = (40
     return SheetRow(name, shown, random_image(seed + 2, *size) if truth else None, {"ours": "20.00 dB, SSIM 0.500"})
 
 
-def test_small_images_are_shown_at_a_whole_multiple(tmp_path: Path) -> None:
-    shown = row("a", 0)  # 60 pixels wide: four times, to reach 240
-    write_contact_sheet(tmp_path / "sheet.png", [shown], "scene · strategy")
-    sheet = read(tmp_path / "sheet.png")
-    assert all(holds(sheet, image.numpy(), times=4) for image in shown.images.values())
-
-
 def test_huge_images_are_reduced(tmp_path: Path) -> None:
     write_contact_sheet(tmp_path / "sheet.png", [row("a", 0, size=(90, 2000))], "scene")
     assert read(tmp_path / "sheet.png").shape[1] < 4 * 700
@@ -44,13 +37,18 @@ def test_truth_and_error_are_shown_where_they_are_known(tmp_path: Path) -> None:
     assert holds(some, truth.numpy(), times=4)
 
 
-def test_large_images_of_any_size_are_shown_pixel_for_pixel(tmp_path: Path) -> None:
-    rows = [row("wide", 0, size=(30, 250)), row("tall", 10, size=(80, 100))]
+@pytest.mark.parametrize(
+    ("sizes", "times"), [([(30, 250), (80, 100)], 1), ([(40, 60)], 4)], ids=["pixel for pixel", "to reach 240"]
+)
+def test_images_of_any_size_are_shown_at_a_whole_multiple(
+    tmp_path: Path, sizes: list[tuple[int, int]], times: int
+) -> None:
+    rows = [row("a", 10 * i, size=size) for i, size in enumerate(sizes)]
     write_contact_sheet(tmp_path / "sheet.png", rows, "scene")
     sheet = read(tmp_path / "sheet.png")
     for shown in rows:
         assert shown.truth is not None
-        assert all(holds(sheet, image.numpy()) for image in (*shown.images.values(), shown.truth))
+        assert all(holds(sheet, image.numpy(), times=times) for image in (*shown.images.values(), shown.truth))
 
 
 def test_the_columns_are_in_the_order_of_the_row(tmp_path: Path) -> None:

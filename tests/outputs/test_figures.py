@@ -20,7 +20,4 @@ def test_error_is_the_mean_difference_over_rgb() -> None:
 )
 def test_spaced_items_are_at_most_as_many_as_asked_for(count: int, expected: list[int]) -> None:
     assert list(figures.spaced(range(10), count)) == expected
-
-
-def test_no_items_have_no_spaced_items() -> None:
-    assert list(figures.spaced([], 3)) == []
+    assert list(figures.spaced([], count)) == []

@@ -264,11 +264,3 @@ def test_extent_of_cameras():
     centers = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0]])
     assert cameras_extent(centers) == pytest.approx(1.1)
     assert cameras_extent(centers[:1]) > 0
-
-
-def test_parameters_are_kept_where_they_can_move():
-    field, _, _ = tagged()
-    field.opacities.data[0], field.scales.data[0] = 50.0, -90.0
-    field.constrain()
-    assert field.opacities.data[0] == 15
-    assert (field.scales.data[0] == -20).all()

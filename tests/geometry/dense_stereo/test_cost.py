@@ -4,24 +4,18 @@ from __future__ import annotations
 
 import torch
 
-from clear_strategies.geometry.dense_stereo.cost import box_mean, cost_volume, mean_of_lowest
+from clear_strategies.geometry.dense_stereo.cost import cost_volume
 from clear_strategies.geometry.dense_stereo.image import Grey
 from clear_strategies.geometry.dense_stereo.smoothing import smooth
 from tests.helpers.planes import plane_photos
 
 
-def test_the_mean_of_the_lowest_is_that_of_a_sort() -> None:
-    values = torch.rand(5, 4, 7)
-    for count in (1, 2, 3):
-        expected = values.sort(0).values[:count].mean(0)
-        assert torch.allclose(mean_of_lowest(iter(values), count), expected)
-
-
-def test_a_box_mean_repeats_the_border() -> None:
-    image = torch.rand(1, 5, 6)
-    padded = torch.nn.functional.pad(image, (1, 1, 1, 1), mode="replicate")
-    expected = torch.nn.functional.avg_pool2d(padded, 3, 1)
-    assert torch.allclose(box_mean(image, 3), expected, atol=1e-6)
+def test_the_better_half_of_the_other_photos_decides() -> None:
+    first, second, third = (Grey(p.camera, p.image.mean(2)) for p in plane_photos(3))
+    planes = torch.tensor([1 / 8, 1 / 4, 1 / 3])
+    each = torch.stack([cost_volume(first, [other], planes, 5) for other in (second, third, first, third)])
+    found = cost_volume(first, [second, third, first, third], planes, 5)
+    assert torch.allclose(found, each.sort(0).values[:2].mean(0))
 
 
 def test_the_true_plane_costs_next_to_nothing_whatever_the_brightness() -> None:
