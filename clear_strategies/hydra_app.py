@@ -1,7 +1,7 @@
 """`clear-strategies +strategy=clear`: a whole run, or a sweep of runs, by Hydra's command line.
 
 This composes the configuration, checks every setting, prints the plan, trains, and writes its files into Hydra's run folder;
-`clear_strategies.outputs.results.FILES` lists them. metrics.json is written last, so a folder that has it holds a finished run.
+docs/reference/files.md lists them. metrics.json is written last, so a folder that has it holds a finished run.
 `clear_strategies.run` is the program: it calls this for whatever is no subcommand, and turns errors into exit codes.
 """
 

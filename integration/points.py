@@ -9,9 +9,9 @@ from typing import Final, Literal
 import torch
 
 from clear_strategies.core.points import MAX_POINTS, PointCloud
-from clear_strategies.core.projection import intrinsics
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry import stereo
+from clear_strategies.geometry.projection import intrinsics
 from integration.views import HostPhoto
 
 _log = logging.getLogger(__name__)

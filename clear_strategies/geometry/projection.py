@@ -8,10 +8,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.core.projection import intrinsics
 from rasterizers.interface import Camera, Color
 
 _SAME_COLOR: Final = 2 / 255  # largest difference of a background pixel from the background's colour
+
+
+def intrinsics(camera: Camera) -> Float[Tensor, "3 3"]:
+    """K, float64 on the CPU."""
+    return torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float64)
 
 
 def projection_matrix(camera: Camera) -> Float[Tensor, "3 4"]:

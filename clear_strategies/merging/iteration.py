@@ -39,11 +39,6 @@ class HrGradients(Generic[G]):
     m: float | Float[Tensor, " N"] = 1.0
     losses: Mapping[str, Scalar] = field(default_factory=dict)
 
-    @property
-    def evidence(self) -> Evidence | None:
-        """The answer of `observe`."""
-        return self.step.evidence
-
 
 def only(hr: HrGradients[Grads], names: Collection[str]) -> HrGradients[Grads]:
     """The gradients of these attributes, e.g. of those that a host optimizes."""
@@ -125,7 +120,7 @@ def require_finite_parts(where: str, g_lr: Any, hr: HrGradients[Any] | None) -> 
     parts: dict[str, Mapping[str, Tensor]] = {"∇L_LR": g_lr.table()}
     if hr is not None:
         parts |= {"∇L_base": hr.base.table()} | ({} if hr.hf is None else {"∇L_HF": hr.hf.table()})
-        weights = {} if hr.evidence is None else {"reliability": hr.evidence.reliability}
+        weights = {} if hr.step.evidence is None else {"reliability": hr.step.evidence.reliability}
         parts["the evidence"] = weights | ({"m": hr.m} if isinstance(hr.m, Tensor) else {})
     for part, tensors in parts.items():
         # The spherical harmonics of a direction are finite wherever the Gaussian is drawn, and are a third of the numbers.

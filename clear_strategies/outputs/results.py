@@ -33,33 +33,6 @@ from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Rasterizer
 
-# What a run writes into its folder, with Hydra's files; metrics.json comes last.
-FILES: Final[Mapping[str, str]] = {
-    ".hydra/": "the configuration and the overrides that the run was started with",
-    "run.log": "what the run printed, and the details that the console shows with `-v` alone",
-    "checkpoints/": "states to resume from (`fit.resume`), the newest `fit.keep` of them",
-    "baseline/": "the baseline that trained beside the run (`fit.baseline`): its scores, renders, field, checkpoints and tables",
-    "cameras.json": "the cameras, in the layout of Inria's 3DGS, which SuperSplat and SIBR open",
-    "cameras/": "small pictures of the training views, for viewers",
-    "maps/": "where the prior was trusted, and where the photos overruled it, for `fit.map_views` training views",
-    "point_cloud.ply": "the field, for any viewer of 3DGS files",
-    "renders/": "every test view as rendered, at HR; a few training views where there are no test views",
-    "depth/": "the depth of the views on the contact sheet, in colours with a legend",
-    "views/": "LR photo, prior and truth of the views on the contact sheet",
-    "path.mp4": "a loop through the training cameras (`fit.video`)",
-    "path.gif": "the same, smaller",
-    "splat.html": "the splat in a page that turns it, without a server or a network (`fit.page`)",
-    "coverage.png": "from above, how many photos see each part of the scene, and where to take the next two (`fit.page`)",
-    "coverage.html": "the same as a page that turns it",
-    "tensorboard/": "the numbers of history.csv and a few pictures, for TensorBoard (`fit.log`)",
-    "contact_sheet.png": "the same few views: LR photo, prior, baseline (if there is one), render, truth and error side by side",
-    "curves.png": "losses, PSNR, number of Gaussians, conflict and correction over iterations",
-    "history.csv": "one row per iteration: every number that was measured, empty where there was none",
-    "conflict.csv": "of history.csv, the iterations that compared LR with HR gradients, and their columns on conflict",
-    "timing.csv": "one row per stage: how often it ran, how long it took, what was skipped, why, and what that saved",
-    "metrics.json": "scores of every view and their means, configuration and provenance; written last",
-}
-
 _SHEET_VIEWS: Final = 4  # test views on the contact sheet, in views/ and in depth/, at most
 
 

@@ -185,7 +185,7 @@ class CompiledStep:
             anchor: in place of the strategies' own.
         """
         o, a = self.conductor.objective, g_lr.activation
-        m, e = (1.0, None) if hr is None else (hr.m, hr.evidence)
+        m, e = (1.0, None) if hr is None else (hr.m, hr.step.evidence)
         activation = {
             "scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid,
             "factor": a.factor.contiguous(), "route": m.float().contiguous() if isinstance(m, Tensor) else None,

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.projection import intrinsics
 from clear_strategies.data.priors import DemoPrior
 from clear_strategies.data.readers import demo
+from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 
 RATES: Final = {"means": 1.6e-4, "quats": 1e-3, "scales": 5e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}

@@ -18,13 +18,13 @@ from torch import Tensor
 
 from clear_strategies.compose import conductor
 from clear_strategies.core import images
-from clear_strategies.core.projection import intrinsics
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import DemoPrior
 from clear_strategies.data.readers import demo
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_settings import ViewSettings
+from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.kernels import losses
 from integration.examples.demo import splats_with_optimizers
 from integration.gsplat import attach

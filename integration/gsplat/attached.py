@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.gradients import PARAMETERS
-from clear_strategies.core.projection import intrinsics
 from clear_strategies.core.view import View
+from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment, HostRendering, Resolution
 from integration.autograd_shot import AutogradShot, ScreenGradientSlot

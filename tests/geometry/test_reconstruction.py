@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 import torch
 
-from clear_strategies.core.projection import intrinsics
 from clear_strategies.core.view import Photo
 from clear_strategies.data.points import CloudSettings, initial_points
 from clear_strategies.data.readers import demo
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry import Stereo, StereoSettings, depth_maps, stereo
+from clear_strategies.geometry.projection import intrinsics
 from tests.helpers.planes import plane_photos
 
 QUICK = StereoSettings(enlarge=1, max_planes=32)

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from clear_strategies.core.projection import intrinsics
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry import stereo
+from clear_strategies.geometry.projection import intrinsics
 from integration import HostError
 from integration import points as initial
 from integration.gsplat import points as gsplat_points

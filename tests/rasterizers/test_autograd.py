@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import rasterizers
-from clear_strategies.core.projection import intrinsics
+from clear_strategies.geometry.projection import intrinsics
 from rasterizers import Splats, autograd
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import pixels_of, scene

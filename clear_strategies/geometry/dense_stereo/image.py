@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.core.projection import towards
 from clear_strategies.core.view import Photo
+from clear_strategies.geometry.projection import intrinsics
 from rasterizers.interface import Camera
 
 _ENLARGED: Final = 64_000  # the most pixels of an enlarged photo
@@ -24,9 +25,19 @@ class Grey:
     image: Float[Tensor, "H W"]
 
     def towards(self, other: Grey) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, " 3"]]:
-        """(K' R K⁻¹ x of each pixel x, K' t), where (R, t) leads from this camera to the other, K' is the other's."""
-        rotated, shift = towards(self.camera, other.camera)
-        return rotated.to(self.image), shift.to(self.image)
+        """(K' R K⁻¹ x of each pixel x, K' t), where (R, t) leads from this camera to the other, K' is the other's.
+
+        A pixel at inverse depth d lies at (u, v) = (X, Y) / Z of the other image with (X, Y, Z) = K' R K⁻¹ x + d K' t, and
+        Z / d is its depth there.
+        """
+        mine, theirs = (c.world_to_camera.double().cpu() for c in (self.camera, other.camera))
+        R = theirs[:3, :3] @ mine[:3, :3].T
+        t = theirs[:3, 3] - R @ mine[:3, 3]
+        K, K_other = (intrinsics(c) for c in (self.camera, other.camera))
+        H, shift = K_other @ R @ torch.linalg.inv(K), K_other @ t
+        x = (torch.arange(self.camera.width, dtype=torch.float64) + 0.5)[None, :, None]
+        y = (torch.arange(self.camera.height, dtype=torch.float64) + 0.5)[:, None, None]
+        return (x * H[:, 0] + y * H[:, 1] + H[:, 2]).to(self.image), shift.to(self.image)
 
 
 def grey(photo: Photo, enlarge: int, max_pixels: int) -> Grey:
