@@ -16,6 +16,8 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
+from clear_strategies.core.checks import require_choice
+
 DownKernel = Literal["bicubic", "bilinear", "lanczos", "area"]
 UpKernel = Literal["bicubic", "bilinear", "nearest"]
 
@@ -49,7 +51,7 @@ def resize(
     Raises:
         ValueError: unknown kernel, or a size that is not positive.
     """
-    _require_member("downsampling kernel", kernel, get_args(DownKernel))
+    require_choice("kernel", kernel, get_args(DownKernel))
     width, height = size
     if width < 1 or height < 1:
         raise ValueError(f"an image needs at least one pixel a side, got {width}x{height}.")
@@ -127,7 +129,7 @@ def quantize(image: Float[Tensor, "H W C"]) -> Float[Tensor, "H W C"]:
 
 
 def _enlarged(image: Float[Tensor, "h w C"], factor: int, kernel: UpKernel) -> Float[Tensor, "H W C"]:
-    _require_member("upsampling kernel", kernel, get_args(UpKernel))
+    require_choice("kernel", kernel, get_args(UpKernel))
     if factor == 1:
         return image.clone()
     size = (image.shape[0] * factor, image.shape[1] * factor)
@@ -143,8 +145,3 @@ def _nchw(image: Float[Tensor, "H W C"]) -> Float[Tensor, "1 C H W"]:
 
 def _hwc(batch: Float[Tensor, "1 C H W"]) -> Float[Tensor, "H W C"]:
     return batch[0].permute(1, 2, 0).contiguous()
-
-
-def _require_member(what: str, value: str, allowed: tuple[str, ...]) -> None:
-    if value not in allowed:
-        raise ValueError(f"{what} must be one of {', '.join(allowed)}, got {value!r}.")

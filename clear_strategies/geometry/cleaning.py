@@ -52,13 +52,8 @@ def remove_outliers(means: Float[Tensor, "N 3"], neighbours: int, ratio: float) 
     coincide with it, is removed.
 
     Args:
-        neighbours: at least 2, because the first is the point itself.
-
-    Raises:
-        ValueError: neighbours below 2, or a ratio that is not positive.
+        neighbours: at least 2, because the first is the point itself. ratio: > 0.
     """
-    if neighbours < 2 or not ratio > 0:
-        raise ValueError(f"neighbours must be >= 2 and ratio > 0, got {neighbours} and {ratio}.")
     points = means.detach().double().cpu().numpy()
     if len(points) < 2:
         return torch.arange(len(points))
@@ -80,13 +75,11 @@ def voxel_grid(
     """One point per occupied cube: the averages of its positions and colours, ordered by cube.
 
     Args:
-        edge: of a cube, world units. The grid starts half a cube below the smallest coordinates.
+        edge: of a cube, world units, > 0. The grid starts half a cube below the smallest coordinates.
 
     Raises:
-        ValueError: edge is not positive, or so small that the number of cubes overflows.
+        ValueError: edge is so small that the number of cubes overflows.
     """
-    if not edge > 0:
-        raise ValueError(f"edge must be > 0 world units, got {edge}.")
     points = means.detach().double().cpu().numpy()
     if len(points) == 0:
         return means, colors

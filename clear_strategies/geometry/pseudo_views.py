@@ -1,9 +1,8 @@
 """Pseudo views: what cameras beside the training cameras would see, as far as stereo depth and the LR photos tell.
 
-A few photos leave much space that no camera looks through closely, and a Gaussian there costs nothing while it hides
-behind the borders of the photos. Each pseudo view is a training camera moved aside. Its depth is that of the nearest
-photos' surfaces, its colours are those of the photos that see the same surface; where no photo does, nothing is known.
-A border view is a training camera with a wider field: it knows its photo, and nothing around it.
+Each pseudo view is a training camera moved aside. Its depth is that of the nearest photos' surfaces, its colours are those of
+the photos that see the same surface; where no photo does, nothing is known. A border view is a training camera with a wider
+field: it knows its photo, and nothing around it. `clear_strategies.strategies.pseudo_views` says what they are for.
 """
 
 from __future__ import annotations

@@ -7,11 +7,8 @@ Five maps per view, in [0, 1] at each HR pixel:
   together.  Eq. 7, 11
 - `conflict`: 1 where g_LR and g_HR of a Gaussian point apart, else 0.  Eq. 6
 
-`maps.png` shows them side by side with a legend. Where the cloud came from dense stereo, `depth.png` shows the depth of the
-view, see `maps_picture`.
-
-The last two of the five render the Gaussians over black with that number as their grey. The maps come from copies of the run's
-strategies; the run does not change.
+The last two render the Gaussians over black with that number as their grey. The maps come from copies of the run's strategies;
+the run does not change. `maps_picture` draws them side by side, and the depth where it came from dense stereo.
 """
 
 from __future__ import annotations

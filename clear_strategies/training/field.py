@@ -59,13 +59,11 @@ class GaussianField(nn.Module):
         """The initial field of 3DGS: isotropic, as large as the distance to the neighbours, opacity 0.1, the points' colours.
 
         Raises:
-            ValueError: the cloud holds no point, or `max_degree` is not 0 to 3.
+            ValueError: the cloud holds no point.
         """
         n = len(cloud)
         if n == 0:
             raise ValueError(f"an initial cloud needs at least one point, {cloud.source!r} has none.")
-        if max_degree not in (0, 1, 2, 3):
-            raise ValueError(f"max_degree must be 0, 1, 2 or 3, got {max_degree}.")
         means = cloud.means.float()
         quats = torch.zeros(n, 4)
         quats[:, 0] = 1

@@ -43,10 +43,12 @@ def test_the_coarse_reference_is_the_mean_of_blocks_seen_by_the_scaled_camera():
     assert skip_policy.view(view, 9) is coarse
 
 
-def test_a_factor_that_two_does_not_divide_keeps_its_reference():
-    view = toy.scene().train[0]
+def test_photos_that_sr_does_not_enlarge_keep_their_reference_and_are_rendered_at_both_scales():
+    view, work_log, skip_policy = toy.scene().train[0], WorkLog(), SkipPolicy(Skips(coarse_until=10))
     same = replace(view, hr=view.lr)
-    assert SkipPolicy(Skips(coarse_until=10)).view(same, 1) is same
+    assert skip_policy.view(same, 1) is same
+    assert skip_policy.lr_due(same, True, work_log)
+    assert not work_log.entries
 
 
 def test_hr_takes_part_in_every_nth_iteration_and_the_ledger_says_why_not_in_the_others():
@@ -121,10 +123,3 @@ def test_one_render_serves_both_scales_while_they_have_one_size():
     fit(state, toy.scene(), toy.RASTERIZER)
     skipped = state.conductor.work_log.entries["render LR"].skipped
     assert skipped == {"HR at half its size is as large (skips.coarse_until)": 11}  # not at t = 1, where λ_HR = 0
-
-
-def test_photos_that_sr_does_not_enlarge_are_rendered_at_both_scales():
-    view, work_log = toy.scene().train[0], WorkLog()
-    same, skip_policy = replace(view, hr=view.lr), SkipPolicy(Skips(coarse_until=10))
-    assert skip_policy.lr_due(skip_policy.view(same, 1), True, work_log)
-    assert not work_log.entries

@@ -82,30 +82,32 @@ def test_compared_images_may_be_larger_or_smaller_than_the_photos(changed: dict[
         assert (found.depth / exact - 1).abs()[found.known].median() < 0.02
 
 
-def test_a_textureless_photo_has_no_depth_and_the_log_says_so(caplog: pytest.LogCaptureFixture) -> None:
+FLAT = [replace(p, image=torch.full_like(p.image, 0.5)) for p in photos_of(slanted)]
+ONE_PLACE = [cast(slanted, camera(0.0, degrees))[0] for degrees in (-5, 0, 5)]
+FAR_APART = [cast(slanted, camera(side * 2.31, -side * 30.0))[0] for side in (-1, 1)]  # 60 degrees, at (0, 0, 4)
+SEEN_BY_BOTH = torch.rand(50, 3) * 0.2 + torch.tensor([-0.1, -0.1, 3.9])
+
+
+@pytest.mark.parametrize(
+    ("photos", "points", "reason"),
+    [
+        (FLAT, NONE, "confirmed at only 0.0% of the pixels"),
+        (ONE_PLACE, NONE, "no other photo sees the same surfaces"),
+        (FAR_APART, SEEN_BY_BOTH, "no other photo sees the same surfaces"),
+    ],
+    ids=["textureless", "from one place", "too far apart"],
+)
+def test_photos_that_tell_no_depth_have_none_and_the_log_says_why(
+    photos: list[Photo], points: torch.Tensor, reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
     caplog.set_level("DEBUG")
-    flat = [replace(p, image=torch.full_like(p.image, 0.5)) for p in photos_of(slanted)]
-    assert all(found.coverage == 0 for found in depth_maps(flat, NONE, QUICK))
-    assert "confirmed at only 0.0% of the pixels" in caplog.text
-
-
-def test_photos_from_one_place_have_no_depth(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level("DEBUG")
-    photos = [cast(slanted, camera(0.0, degrees))[0] for degrees in (-5, 0, 5)]
-    assert all(found.coverage == 0 for found in depth_maps(photos, NONE, QUICK))
-    assert "no other photo sees the same surfaces" in caplog.text
-
-
-def test_photos_60_degrees_apart_are_not_compared() -> None:
-    # Both look at (0, 0, 4).
-    photos = [cast(slanted, camera(side * 2.31, -side * 30.0))[0] for side in (-1, 1)]
-    points = torch.rand(50, 3) * 0.2 + torch.tensor([-0.1, -0.1, 3.9])
     assert all(found.coverage == 0 for found in depth_maps(photos, points, QUICK))
+    assert reason in caplog.text
 
 
 def test_a_photo_whose_stereo_fails_does_not_spoil_the_others() -> None:
     photos = photos_of(slanted)
-    photos[2] = replace(photos[2], image=torch.full_like(photos[2].image, 0.5))
+    photos[2] = FLAT[2]
     first, second, third = depth_maps(photos, NONE, QUICK)
     assert first.coverage > 0.3
     assert second.coverage > 0.3
