@@ -147,26 +147,18 @@ class CompiledStep:
         self, params: Mapping[str, Tensor], g_lr: Factors, hr: HrGradients[Factors] | None, t: int
     ) -> Mapping[str, Number]:
         """Step `params` and the optimizer's moments in place; returns the conflict ratios by group."""
-        rates, bias2 = self.optimizer.advance()
-        visible = None
-        if self.optimizer.rates.rows == "visible":
-            visible = g_lr.visible if hr is None else g_lr.visible | hr.base.visible
-        return self._run(params, g_lr, hr, t, rates, bias2, visible, None)
+        return self._run(params, g_lr, hr, t, *self.optimizer.advance())
 
     def step_extra(self, params: Mapping[str, Tensor], g_lr: Factors, t: int) -> None:
         """Step on this gradient alone: no anchor pulls."""
-        rates, bias2 = self.optimizer.advance()
-        visible = g_lr.visible if self.optimizer.rates.rows == "visible" else None
-        self._run(params, g_lr, None, t, rates, bias2, visible, None, Anchor({}, {}))
+        self._run(params, g_lr, None, t, *self.optimizer.advance(), anchor=Anchor({}, {}))
 
     def gradient(
         self, params: Mapping[str, Tensor], g_lr: Factors, hr: HrGradients[Factors] | None, t: int
     ) -> tuple[Grads, Mapping[str, Number]]:
         """For tests: the dense gradient that `step` uses, and the conflict ratios; nothing moves."""
         merged = Grads({name: torch.zeros_like(p) for name, p in params.items()})
-        rates = dict.fromkeys(params, 0.0)
-        conflict = self._run(params, g_lr, hr, t, rates, 1.0, None, merged)
-        return merged, conflict
+        return merged, self._run(params, g_lr, hr, t, dict.fromkeys(params, 0.0), 1.0, merged)
 
     def _run(
         self,
@@ -176,13 +168,12 @@ class CompiledStep:
         t: int,
         rates: Mapping[str, float],
         bias2: float,
-        visible: Tensor | None,
-        merged: Grads | None,
+        merged: Grads | None = None,
         anchor: Anchor | None = None,
     ) -> Mapping[str, Number]:
         """
         Args:
-            anchor: in place of the strategies' own.
+            merged: receives the dense gradient; nothing is left out. anchor: in place of the strategies' own.
         """
         o, a = self.conductor.objective, g_lr.activation
         m, e = (1.0, None) if hr is None else (hr.m, hr.step.evidence)
@@ -215,14 +206,16 @@ class CompiledStep:
             )
             for name, p in params.items()
         }  # fmt: skip
+        visible = None
+        if merged is None and self.optimizer.rates.rows == "visible":
+            visible = (g_lr.visible if hr is None else g_lr.visible | hr.base.visible).contiguous().view(torch.uint8)
         skips = self.skips and merged is None and self.optimizer.rates.eps > 0  # 0 / (√0 + 0) moves everything
         shN, active = params["shN"], g_lr.gradients.basis.shape[1] - 1
         bands = active if skips and self._above_is_quiet(shN, active, anchor.targets.get("shN")) else shN.shape[1]
         stepped = gaussians.step(
             attributes, rule, None if e is None else e.reliability.float().contiguous(),
             kernel.StepSettings(
-                BETA1, BETA2, bias2, self.optimizer.rates.eps, λ,
-                None if visible is None else visible.contiguous().view(torch.uint8), skips, 3 * bands,
+                BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, visible, skips, 3 * bands,
             ),
         )  # fmt: skip
         if rule is not None and compared is not None:
