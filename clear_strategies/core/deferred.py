@@ -83,7 +83,6 @@ def ratio(part: float, whole: float) -> float:
 
 
 def added(*numbers: float) -> float:
-    """The sum."""
     return sum(numbers)
 
 

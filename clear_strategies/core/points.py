@@ -31,7 +31,6 @@ class PointCloud:
         return self.means.shape[0]
 
     def __getitem__(self, index: Int[Tensor, " K"]) -> PointCloud:
-        """The points with these indices."""
         return replace(self, means=self.means[index], colors=self.colors[index])
 
     def at_most(self, count: int, seed: int = 0) -> PointCloud:

@@ -103,7 +103,6 @@ class DepthMap:
         return DepthMap(depth, torch.where(self.known, self.confidence, other.confidence))
 
     def to(self, device: torch.device | str) -> DepthMap:
-        """The same map on `device`."""
         return DepthMap(self.depth.to(device), self.confidence.to(device))
 
 
@@ -161,7 +160,6 @@ class View:
         return replace(self, lr=replace(self.lr, image=(self.lr.image * gain).clamp(0, 1)), hr=hr, truth=truth)
 
     def to(self, device: torch.device | str) -> View:
-        """The same view with its images on `device`."""
         hr = self.hr.to(device)
         truth = hr.image if self.hr_is_photo else None if self.truth is None else self.truth.to(device)
         depth = None if self.depth is None else self.depth.to(device)
@@ -182,5 +180,4 @@ class ExtraView:
     weight: Float[Tensor, "h w"]
 
     def to(self, device: torch.device | str) -> ExtraView:
-        """The same view with its tensors on `device`."""
         return ExtraView(self.photo.to(device), self.weight.to(device))

@@ -103,7 +103,6 @@ class WorkLog:
         return {name: asdict(entry) for name, entry in self.entries.items()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a saved log."""
         self._stamped.clear()
         self._counted.clear()
         self._entries = {name: Entry(**entry) for name, entry in state.items()}

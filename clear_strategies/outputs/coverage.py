@@ -164,7 +164,6 @@ def _draw_next(axes: Axes, number: int, photo: NextPhoto, painter: Painter) -> N
 
 
 def _lines(found: Coverage, scene: Scene) -> list[str]:
-    """The text beside the map."""
     lines = ["WHERE TO STAND NEXT, aiming at the same spot"]
     lines += found.says() or ["nowhere: enough photos see all of what is seen at all"]
     lines += ["a step: the usual distance between neighbouring photos"]

@@ -119,7 +119,6 @@ def _named(device: torch.device) -> str:
 
 
 def marks(state: TrainState) -> dict[str, int]:
-    """The iterations worth a mark on a training curve, by name."""
     hr = state.conductor.objective.lambda_hr
     at = {"HR from": hr.start, "HR full": hr.full, **state.density.marks}
     if hr.final != hr.peak:

@@ -35,7 +35,6 @@ def describe(folder: Path, evaluation: Evaluation, seconds: float, baseline: Bas
 
 
 def describe_baseline(baseline: Baseline) -> str:
-    """One line."""
     return f"the baseline: {_in_short(baseline.seconds, baseline.means)}: {_near(baseline.folder)}"
 
 

@@ -125,7 +125,6 @@ class GCO(Strategy):
         return corrected, GroupReport(group, compared, touched, deferred.total(omega, hit), bound)
 
     def report(self, done: Sequence[GroupReport], evidence: Evidence | None) -> None:
-        """Log what was corrected."""
         compared, corrected, omega, at_bound = (
             deferred.defer(deferred.added, *(getattr(c, name) for c in done))
             for name in ("compared", "corrected", "omega", "at_lower_bound")

@@ -58,7 +58,6 @@ def compiled_step_for(conductor: Conductor, optimizer: Adam, mode: FusedMode = "
 
 
 def _why_not(conductor: Conductor, optimizer: Adam, mode: FusedMode) -> Iterator[str]:
-    """The reasons against the compiled step."""
     if mode == "off":
         yield "fit.fused=off"
     for s in conductor.strategies:

@@ -131,7 +131,6 @@ def fit(
 
 
 def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Number]:
-    """One row of the history."""
     row: dict[str, Number] = {
         "t": float(s.t),
         "lambda_hr": s.conductor.objective.lambda_hr(s.t),

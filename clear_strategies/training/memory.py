@@ -139,7 +139,6 @@ def require(found: Needs, budget: int | None, most: int | None) -> None:
 
 
 def says(found: Needs, most: int | None) -> str:
-    """A line of the plan."""
     more = (found.peak(10 * found.gaussians + 10**6) - found.peak(9 * found.gaussians + 10**6)) / found.gaussians
     line = f"{mebibytes(found.peak(found.gaussians))} MiB at the start ({mebibytes(found.reached)} MiB were taken until now)"
     line += f", {more / 1024:.1f} KiB for each further Gaussian"

@@ -121,7 +121,6 @@ class TrainState:
 
     @property
     def ended(self) -> bool:
-        """Whether all iterations are done."""
         return self.t > self.settings.iterations
 
     def advance(self) -> None:
@@ -144,7 +143,6 @@ class TrainState:
         _log.info("t=%d: %s; training goes on at t=%d.", before, why, self.t)
 
     def refilter(self) -> None:
-        """Recompute the 3D filter from the present means."""
         cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]
         self.field.update_filter(cameras, self.mip.variance)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
@@ -48,9 +48,7 @@ def grey(photo: Photo, enlarge: int, max_pixels: int) -> Grey:
         reduce += 1
     if reduce > 1:
         image = images.crop_to_multiple(image, reduce)
-        camera = Camera(
-            camera.world_to_camera, camera.fx, camera.fy, camera.cx, camera.cy, image.shape[1], image.shape[0]
-        )
+        camera = replace(camera, width=image.shape[1], height=image.shape[0])
         image, camera = images.downsample(image, reduce, "area"), camera.scaled(1 / reduce)
     elif enlarge > 1 and camera.width * camera.height * enlarge**2 <= min(_ENLARGED, max_pixels):
         image, camera = images.upsample(image, enlarge), camera.scaled(enlarge)
