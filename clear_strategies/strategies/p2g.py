@@ -109,58 +109,51 @@ class P2G(Strategy):
 
     def patch_maps(self, view: View) -> PatchMaps:
         """R and A of this view."""
-        return PatchMaps(*self._patches(view), self.patch)
+        return PatchMaps(*self.patch_evidence(view.lr.image, view.hr.image, view.factor, view.disagreement), self.patch)
+
+    def patch_evidence(
+        self,
+        lr: Float[Tensor, "h w 3"],
+        hr: Float[Tensor, "H W 3"],
+        factor: int,
+        disagreement: Float[Tensor, "h w 3"] | None = None,
+    ) -> tuple[Float[Tensor, "ph pw"], Float[Tensor, "ph pw"]]:
+        """R_p, agreement with the LR photo, and A_p, share of detail relative to twice the image's mean.  Eq. 9
+
+        A is 0 in a flat image, and 1/2 in a patch with the image's mean detail.
+
+        Args:
+            disagreement: in place of |D(I_HR) - I_LR|, see `View.disagreement`.
+
+        Raises:
+            ValueError: an image lies outside [0, 1] (τ_r and ε are in that unit).
+        """
+        for name, image in (("I_LR", lr), ("I_HR", hr)):
+            low, high = float(image.min()), float(image.max())
+            if not (low >= -1e-3 and high <= 1 + 1e-3):
+                raise ValueError(f"{name} must lie in [0, 1], got {low:.3g}..{high:.3g}. Divide 8-bit values by 255.")
+        reduced = downsample(hr, factor, self.down)
+        if disagreement is None:
+            disagreement = (reduced - lr).abs()
+        tau_r = _tau_r(self.reliability_scale, float(disagreement.mean()))
+        R = torch.exp(-patch_means(disagreement, self.patch) / tau_r)
+        # All kernels of D but "area" round to 8 bits. What that loses of an SR image with more of them is no detail.
+        shown = hr if self.down == "area" else quantize(hr)
+        residual = (shown - upsample(reduced, factor, self.up)).abs()
+        A = (patch_means(residual, self.patch * factor) / (2 * residual.mean() + self.detail_eps)).clamp(0, 1)
+        return R, A
 
     def _cached_patches(self, view: View) -> tuple[Tensor, Tensor]:
         key = (view.name, view.factor)
         if key not in self.cache:
-            R, A = self.cache[key] = self._patches(view)
+            maps = self.patch_maps(view)
+            R, A = self.cache[key] = maps.reliability, maps.demand
             _log.debug(
                 "%s: reliability R %.2f..%.2f (mean %.3f), detail demand A mean %.3f over %dx%d patches.",
                 view.name, float(R.min()), float(R.max()), float(R.mean()), float(A.mean()), R.shape[1], R.shape[0],
             )  # fmt: skip
         R, A = self.cache[key]
         return R, A
-
-    def _patches(self, view: View) -> tuple[Tensor, Tensor]:
-        return patch_evidence(
-            view.lr.image, view.hr.image, view.factor, self.patch, self.reliability_scale, self.detail_eps, self.down,
-            self.up, view.disagreement,
-        )  # fmt: skip
-
-
-def patch_evidence(
-    lr: Float[Tensor, "h w 3"],
-    hr: Float[Tensor, "H W 3"],
-    factor: int,
-    patch: int = 16,
-    reliability_scale: float | str = 0.01,
-    detail_eps: float = 1e-4,
-    down: DownKernel = "bicubic",
-    up: UpKernel = "bicubic",
-    disagreement: Float[Tensor, "h w 3"] | None = None,
-) -> tuple[Float[Tensor, "ph pw"], Float[Tensor, "ph pw"]]:
-    """R_p, agreement with the LR photo, and A_p, share of detail relative to twice the image's mean.  Eq. 9
-
-    R is that of `disagreement`, where it is given, in place of |D(I_HR) - I_LR|: see `View.disagreement`.
-    A is 0 in a flat image, and 1/2 in a patch with the image's mean detail.
-
-    Raises:
-        ValueError: an image lies outside [0, 1] (τ_r and ε are in that unit).
-    """
-    for name, image in (("I_LR", lr), ("I_HR", hr)):
-        low, high = float(image.min()), float(image.max())
-        if not (low >= -1e-3 and high <= 1 + 1e-3):
-            raise ValueError(f"{name} must lie in [0, 1], got {low:.3g}..{high:.3g}. Divide 8-bit values by 255.")
-    reduced = downsample(hr, factor, down)
-    if disagreement is None:
-        disagreement = (reduced - lr).abs()
-    R = torch.exp(-patch_means(disagreement, patch) / _tau_r(reliability_scale, float(disagreement.mean())))
-    # All kernels of D but "area" round to 8 bits. What that loses of an SR image with more of them is no detail.
-    shown = hr if down == "area" else quantize(hr)
-    residual = (shown - upsample(reduced, factor, up)).abs()
-    A = (patch_means(residual, patch * factor) / (2 * residual.mean() + detail_eps)).clamp(0, 1)
-    return R, A
 
 
 # Rounding to 8 bits changes an image by a quarter of a grey level on average; a smaller scale would measure rounding.

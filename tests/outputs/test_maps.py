@@ -19,7 +19,6 @@ from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs.maps import view_maps, write_maps
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
-from clear_strategies.strategies.p2g import patch_evidence
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing.points import MAPS
@@ -65,7 +64,7 @@ def test_patch_maps_are_p2gs_evidence_enlarged_to_hr() -> None:
     state = trained(p2g)
     view = state.views[0]
     maps = view_maps(state.field, state.conductor, toy.RASTERIZER, view).maps
-    R, A = patch_evidence(view.lr.image, view.hr.image, 4, patch=8, reliability_scale=0.02)
+    R, A = p2g.patch_evidence(view.lr.image, view.hr.image, 4)
     assert maps["reliability"].shape == (64, 96)
     assert maps["reliability"][31, 32] == R[0, 1]  # patches of 32 HR pixels
     assert maps["demand"][32, 95] == A[1, 2]

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from clear_strategies import P2G, Evidence, ScreenGradients, Step
 from clear_strategies.core import images
 from clear_strategies.core.evidence import lift
-from clear_strategies.strategies.p2g import patch_evidence
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
 
@@ -21,7 +20,7 @@ from tests.helpers import toy
 @pytest.mark.parametrize("kernel", ["bicubic", "bilinear", "lanczos", "area"])
 def test_reliability_is_one_where_the_reference_agrees_with_lr_up_to_rounding(kernel, scale):
     hr = images.quantize(torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)))
-    R, _ = patch_evidence(images.downsample(hr, 4, kernel), hr, 4, down=kernel, reliability_scale=scale)
+    R, _ = P2G(scale, down=kernel).patch_evidence(images.downsample(hr, 4, kernel), hr, 4)
     assert torch.allclose(R, torch.ones_like(R), atol=1e-6)
 
 
@@ -29,7 +28,7 @@ def test_reliability_worked_out_by_hand():
     # The reference is brighter by 0.01 in the left half: R = exp(-1) there, 1 in the right half.
     lr, hr = torch.full((16, 32, 3), 0.4), torch.full((64, 128, 3), 0.4)
     hr[:, :64] += 0.01
-    R, _ = patch_evidence(lr, hr, 4, down="area")
+    R, _ = P2G(down="area").patch_evidence(lr, hr, 4)
     assert R.shape == (1, 2)
     assert R[0].tolist() == pytest.approx([math.exp(-1), 1.0], rel=1e-5)
 
@@ -38,27 +37,27 @@ def test_a_relative_scale_counts_in_the_views_own_disagreement():
     # 0.05 in the left half, 0 in the right: 0.025 on average; twice that is 0.05 again.
     lr, hr = torch.full((16, 32, 3), 0.4), torch.full((64, 128, 3), 0.4)
     hr[:, :64] += 0.05
-    relative, absolute = (patch_evidence(lr, hr, 4, reliability_scale=r, down="area")[0] for r in ("relative:2", 0.05))
+    relative, absolute = (P2G(r, down="area").patch_evidence(lr, hr, 4)[0] for r in ("relative:2", 0.05))
     assert torch.allclose(relative, absolute, rtol=1e-5)
 
 
 def test_one_textured_patch_of_a_flat_image_demands_everything():
     textured = torch.full((128, 128, 3), 0.6)
     textured[:64, :64] += 0.2 * (torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)) - 0.5)
-    _, A = patch_evidence(images.downsample(textured, 4), textured, 4)
+    _, A = P2G().patch_evidence(images.downsample(textured, 4), textured, 4)
     assert A[0, 0] == 1
     assert float(A[1, 1]) < 1e-3
 
 
 def test_a_patch_with_the_mean_detail_demands_one_half():
     noise = torch.rand(128, 128, 3, generator=torch.Generator().manual_seed(0))
-    _, A = patch_evidence(images.downsample(noise, 4), noise, 4)
+    _, A = P2G().patch_evidence(images.downsample(noise, 4), noise, 4)
     assert torch.allclose(A, torch.full_like(A, 0.5), atol=0.03)
 
 
 def test_images_in_eight_bit_units_are_refused():
     with pytest.raises(ValueError, match=r"I_HR must lie in \[0, 1\]"):
-        patch_evidence(torch.rand(16, 16, 3), 255 * torch.rand(64, 64, 3), 4)
+        P2G().patch_evidence(torch.rand(16, 16, 3), 255 * torch.rand(64, 64, 3), 4)
 
 
 def test_lifting_takes_the_patch_of_the_centre_and_the_border_outside():
@@ -128,5 +127,5 @@ def test_scores():
 @pytest.mark.parametrize("down", ["bicubic", "bilinear", "lanczos", "area"])
 def test_a_flat_image_asks_for_no_detail_on_and_off_the_8_bit_grid(grey, down):
     hr = torch.full((64, 64, 3), grey)
-    _, A = patch_evidence(torch.full((16, 16, 3), grey), hr, 4, down=down)
+    _, A = P2G(down=down).patch_evidence(torch.full((16, 16, 3), grey), hr, 4)
     assert float(A.max()) < 1e-3
