@@ -31,14 +31,7 @@ class Estimate:
 
 def estimate(image: Grey, others: list[Grey], comparison: Comparison, settings: StereoSettings) -> Estimate:
     """Plane sweep: planes uniform in inverse depth, the smoothed cost's minimum, and a parabola through its neighbours."""
-    count = plane_count(
-        image.camera,
-        [o.camera for o in others],
-        comparison.far,
-        comparison.near,
-        settings.plane_step,
-        settings.max_planes,
-    )
+    count = plane_count(image.camera, [other.camera for other in others], comparison, settings)
     planes = torch.linspace(comparison.far, comparison.near, count, dtype=torch.float64)
     cost = cost_volume(image, others, planes.to(image.image), settings.window)
     smoothed = smooth(cost, image.image, settings.small_step, settings.large_step)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry.cameras import common_box
+from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.projection import back_project, inside_of, project, seen_pixels
 from rasterizers.interface import Camera
 
@@ -64,16 +65,16 @@ def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"]) -> list[C
     return found
 
 
-def plane_count(camera: Camera, others: Sequence[Camera], far: float, near: float, step: float, most: int) -> int:
-    """Planes, uniform in inverse depth, of which neighbours lie at most `step` px apart in the other photos."""
+def plane_count(camera: Camera, others: Sequence[Camera], comparison: Comparison, settings: StereoSettings) -> int:
+    """Planes, uniform in inverse depth, of which neighbours lie at most `plane_step` px apart in the other photos."""
     paths = []
     for other in others:
-        ends = [project(other, _grid(camera, 1 / inverse)) for inverse in (far, near)]
+        ends = [project(other, _grid(camera, 1 / inverse)) for inverse in (comparison.far, comparison.near)]
         ahead = (ends[0][1] > 0) & (ends[1][1] > 0)
         shift = torch.linalg.vector_norm(ends[0][0] - ends[1][0], dim=1)[ahead]
         if len(shift):
             paths.append(float(shift.median()))
-    return max(8, min(most, math.ceil(max(paths, default=0.0) / step) + 1))
+    return max(8, min(settings.max_planes, math.ceil(max(paths, default=0.0) / settings.plane_step) + 1))
 
 
 def _grid(camera: Camera, distance: float) -> Float[Tensor, "36 3"]:
