@@ -211,12 +211,9 @@ class CompiledStep:
         skips = self.skips and merged is None and self.optimizer.rates.eps > 0  # 0 / (√0 + 0) moves everything
         shN, active = params["shN"], g_lr.gradients.basis.shape[1] - 1
         bands = active if skips and self._above_is_quiet(shN, active, anchor.targets.get("shN")) else shN.shape[1]
-        stepped = gaussians.step(
-            attributes, rule, None if e is None else e.reliability.float().contiguous(),
-            kernel.StepSettings(
-                BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, visible, skips, 3 * bands,
-            ),
-        )  # fmt: skip
+        q = None if e is None else e.reliability.float().contiguous()
+        settings = kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, visible, skips, 3 * bands)
+        stepped = gaussians.step(attributes, rule, q, settings)
         if rule is not None and compared is not None:
             rule.report(_reports(rule, compared, stepped), e)
         if merged is None:
