@@ -24,12 +24,20 @@ def test_only_whole_numbers_in_range_are_whole_numbers(value: object) -> None:
     assert str(refusal.value) == f"a.b: must be a whole number of at least 1, got {value!r}: a.b=1"
 
 
-@pytest.mark.parametrize("value", [0, 1.5, math.nan, math.inf, True, None, "1"])
-def test_numbers_are_finite_and_in_range(value: object) -> None:
-    for fine in (0.1, 1):
-        require_number("a.b", fine, above=0, most=1)
-    with pytest.raises(SettingError, match=r"^a\.b: must lie in \(0, 1\], got .*: a\.b=1$"):
-        require_number("a.b", value, above=0, most=1)
+@pytest.mark.parametrize("value", [0, 2.5, math.nan, math.inf, -math.inf, True, None, "1"])
+@pytest.mark.parametrize(
+    ("limits", "rule", "remedy"),
+    [
+        ({"above": 0, "most": 1}, r"must lie in \(0, 1\]", 1),
+        ({"above": 0, "below": 2}, r"must lie in \(0, 2\)", 1),
+        ({"least": 3}, "must be a finite number >= 3", 4),
+    ],
+    ids=["most", "below", "least"],
+)
+def test_numbers_are_finite_and_in_range(limits: dict[str, float], rule: str, remedy: float, value: object) -> None:
+    require_number("a.b", remedy, **limits)  # type: ignore[arg-type]
+    with pytest.raises(SettingError, match=rf"^a\.b: {rule}, got .*: a\.b={remedy}$"):
+        require_number("a.b", value, **limits)  # type: ignore[arg-type]
 
 
 def test_choices_are_listed() -> None:
