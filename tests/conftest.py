@@ -3,13 +3,30 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
 
 # Small tensors: a second thread costs more than it brings, above all beside other test processes.
 torch.set_num_threads(1)
+
+
+class _KernelsAsWritten:
+    """Finds modules with Warp's kernels before jaxtyping's import hook does, which would wrap them: Warp reads their source."""
+
+    @staticmethod
+    def find_spec(name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        spec = PathFinder.find_spec(name, path) if ".warp" in name else None
+        written = spec is not None and spec.origin is not None and "\n@wp." in Path(spec.origin).read_text()
+        return spec if written else None
+
+
+def pytest_sessionstart() -> None:
+    sys.meta_path.insert(0, _KernelsAsWritten)
 
 
 def pytest_collection_finish() -> None:

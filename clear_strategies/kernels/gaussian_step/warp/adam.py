@@ -4,13 +4,10 @@ multiplication here.
 
 from __future__ import annotations
 
-from typing import no_type_check
-
 import warp as wp
 
 
 @wp.struct
-@no_type_check
 class AdamStep:
     """The settings that all attributes share."""
 
@@ -23,7 +20,6 @@ class AdamStep:
 
 
 @wp.struct
-@no_type_check
 class Attribute:
     """A parameter tensor with its moments, row-major, its anchor and its limits."""
 
@@ -43,7 +39,6 @@ class Attribute:
 
 
 @wp.func
-@no_type_check
 def step_number(adam: AdamStep, a: Attribute, at: wp.int32, gradient: wp.float32, moves: wp.bool) -> None:
     """Decay, step and clamp one number; with `moves` False only decay and clamp it."""
     if not (moves or a.bounded):
@@ -70,7 +65,6 @@ def step_number(adam: AdamStep, a: Attribute, at: wp.int32, gradient: wp.float32
 
 
 @wp.func
-@no_type_check
 def is_still(a: Attribute, i: wp.int32, width: wp.int32) -> wp.bool:
     """Whether a row with gradient 0 would stay as it is: both moments are 0, and it equals its anchor."""
     for at in range(a.width * i, a.width * i + width):

@@ -6,7 +6,7 @@ core.gradients.CONFLICT_GROUPS, and the whole Gaussian is a seventh.
 
 from __future__ import annotations
 
-from typing import Any, Final, no_type_check
+from typing import Any, Final
 
 import warp as wp
 
@@ -26,7 +26,6 @@ Seven: Final[Any] = wp.types.vector(length=7, dtype=wp.float64)
 
 
 @wp.struct
-@no_type_check
 class Products:
     """⟨l, h⟩, ‖l‖², ‖h‖² by group and of the whole Gaussian."""
 
@@ -36,7 +35,6 @@ class Products:
 
 
 @wp.struct
-@no_type_check
 class Rule:
     """GCO's settings."""
 
@@ -49,7 +47,6 @@ class Rule:
 
 
 @wp.struct
-@no_type_check
 class Corrected:
     """By group, the multiple of g_LR that is subtracted from the HR gradient, and ω. Bit k of `rows` and `at_lower_bound`:
     group k is corrected, and its ω is at the lower bound.
@@ -62,21 +59,18 @@ class Corrected:
 
 
 @wp.func
-@no_type_check
 def products3(low: wp.vec3, high: wp.vec3) -> wp.vec3d:
     a, b = wp.vec3d(low), wp.vec3d(high)
     return wp.vec3d(wp.dot(a, b), wp.dot(a, a), wp.dot(b, b))
 
 
 @wp.func
-@no_type_check
 def products4(low: wp.vec4, high: wp.vec4) -> wp.vec3d:
     a, b = wp.vec4d(low), wp.vec4d(high)
     return wp.vec3d(wp.dot(a, b), wp.dot(a, a), wp.dot(b, b))
 
 
 @wp.func
-@no_type_check
 def group_products(
     low: RawGradient, high: RawGradient, lr: Gradient, base: Gradient, view: View, i: wp.int32
 ) -> Products:
@@ -97,7 +91,6 @@ def group_products(
 
 
 @wp.func
-@no_type_check
 def turns_something(p: Products, rotation_noise: wp.float64) -> wp.bool:
     """Whether the rotation gradient is not noise: a Gaussian with equal axes does not change under rotation."""
     noise2 = rotation_noise * rotation_noise
@@ -105,7 +98,6 @@ def turns_something(p: Products, rotation_noise: wp.float64) -> wp.bool:
 
 
 @wp.func
-@no_type_check
 def correct(p: Products, rule: Rule, reliability: wp.array[wp.float32], i: wp.int32) -> Corrected:
     """The corrections of a Gaussian by group (Eq. 6, 7, 11)."""
     multiple, omegas, rows, at_bound = Six(), Six(), wp.int32(0), wp.int32(0)
@@ -136,7 +128,6 @@ def correct(p: Products, rule: Rule, reliability: wp.array[wp.float32], i: wp.in
 
 
 @wp.func
-@no_type_check
 def corrected3(high: wp.vec3, low: wp.vec3, multiple: wp.float64) -> wp.vec3:
     """ĝ_HR = g_HR - multiple · g_LR (Eq. 7); with multiple 0 it keeps its bits."""
     if multiple == wp.float64(0.0):
@@ -145,14 +136,12 @@ def corrected3(high: wp.vec3, low: wp.vec3, multiple: wp.float64) -> wp.vec3:
 
 
 @wp.func
-@no_type_check
 def merged3(low: wp.vec3, high: wp.vec3, multiple: wp.float64, weight: wp.float32) -> wp.vec3:
     """The sum g_LR + λ ĝ_HR (Eq. 8)."""
     return low + corrected3(high, low, multiple) * weight
 
 
 @wp.func
-@no_type_check
 def merged4(low: wp.vec4, high: wp.vec4, multiple: wp.float64, weight: wp.float32) -> wp.vec4:
     if multiple == wp.float64(0.0):
         return low + high * weight
@@ -160,7 +149,6 @@ def merged4(low: wp.vec4, high: wp.vec4, multiple: wp.float64, weight: wp.float3
 
 
 @wp.func
-@no_type_check
 def merged1(low: wp.float32, high: wp.float32, multiple: wp.float64, weight: wp.float32) -> wp.float32:
     if multiple == wp.float64(0.0):
         return low + high * weight

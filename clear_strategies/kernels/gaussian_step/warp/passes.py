@@ -11,7 +11,7 @@ Blocks sum their counts, and torch sums over the blocks: every sum has a fixed o
 
 from __future__ import annotations
 
-from typing import Any, Final, no_type_check
+from typing import Any, Final
 
 import warp as wp
 
@@ -45,7 +45,6 @@ each; then still and invisible rows.
 
 
 @wp.struct
-@no_type_check
 class StepOptions:
     """The settings of a step other than Adam's."""
 
@@ -57,7 +56,6 @@ class StepOptions:
 
 
 @wp.kernel
-@no_type_check
 def compare(
     activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View, counts: wp.array[Counts]
 ) -> None:
@@ -78,7 +76,6 @@ def compare(
 
 
 @wp.kernel
-@no_type_check
 def step(
     activation: Activation,
     lr: Gradient,
@@ -163,7 +160,6 @@ def step(
 
 
 @wp.kernel
-@no_type_check
 def step_bands(
     view: View,
     lr_basis: wp.array2d[wp.float32],

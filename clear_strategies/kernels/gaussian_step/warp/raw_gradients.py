@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import no_type_check
-
 import warp as wp
 
 
 @wp.struct
-@no_type_check
 class Gradient:
     """One cotangent's rasterizers.interface.SplatGradients, row-major; the colour gradient as its factors rgb and basis."""
 
@@ -21,7 +18,6 @@ class Gradient:
 
 
 @wp.struct
-@no_type_check
 class Activation:
     """The inputs of the activations' VJP (training.field.Activation), and m unless it is 1."""
 
@@ -34,7 +30,6 @@ class Activation:
 
 
 @wp.struct
-@no_type_check
 class View:
     """The sizes, and which gradients are given."""
 
@@ -48,7 +43,6 @@ class View:
 
 
 @wp.struct
-@no_type_check
 class RawGradient:
     """∇θ of one loss for one Gaussian. shN's gradient stays in factors: Y ⊗ rgb."""
 
@@ -61,19 +55,16 @@ class RawGradient:
 
 
 @wp.func
-@no_type_check
 def row3(rows: wp.array[wp.float32], i: wp.int32) -> wp.vec3:
     return wp.vec3(rows[3 * i], rows[3 * i + 1], rows[3 * i + 2])
 
 
 @wp.func
-@no_type_check
 def row4(rows: wp.array[wp.float32], i: wp.int32) -> wp.vec4:
     return wp.vec4(rows[4 * i], rows[4 * i + 1], rows[4 * i + 2], rows[4 * i + 3])
 
 
 @wp.func
-@no_type_check
 def activation_vjp(g: Gradient, a: Activation, bases: wp.int32, i: wp.int32) -> RawGradient:
     """The VJP of the 3D filter, exp and sigmoid. Same operations as training.field.Activation.vjp."""
     out = RawGradient()
@@ -92,7 +83,6 @@ def activation_vjp(g: Gradient, a: Activation, bases: wp.int32, i: wp.int32) -> 
 
 
 @wp.func
-@no_type_check
 def route_of(a: Activation, view: View, i: wp.int32) -> wp.float32:
     """m_i, or 1."""
     m = wp.float32(1.0)
@@ -102,7 +92,6 @@ def route_of(a: Activation, view: View, i: wp.int32) -> wp.float32:
 
 
 @wp.func
-@no_type_check
 def routed(base: RawGradient, hf: RawGradient, m: wp.float32, lambda_hf: wp.float32) -> RawGradient:
     """g^HR = g_base + λ_HF m g_HF (Eq. 13), multiplied in the same order as the conductor does."""
     out = RawGradient()
@@ -116,7 +105,6 @@ def routed(base: RawGradient, hf: RawGradient, m: wp.float32, lambda_hf: wp.floa
 
 
 @wp.func
-@no_type_check
 def load(
     activation: Activation, lr: Gradient, base: Gradient, hf: Gradient, view: View, i: wp.int32
 ) -> tuple[RawGradient, RawGradient, RawGradient]:
@@ -131,7 +119,6 @@ def load(
 
 
 @wp.func
-@no_type_check
 def basis_products(lr: Gradient, base: Gradient, view: View, i: wp.int32) -> wp.vec3d:
     """⟨Y_LR, Y_HR⟩, ‖Y_LR‖², ‖Y_HR‖² over the higher bands, for ⟨Y_a ⊗ a, Y_b ⊗ b⟩ = ⟨Y_a, Y_b⟩ ⟨a, b⟩."""
     out = wp.vec3d()
@@ -145,13 +132,11 @@ def basis_products(lr: Gradient, base: Gradient, view: View, i: wp.int32) -> wp.
 
 
 @wp.func
-@no_type_check
 def size3(v: wp.vec3) -> wp.float32:
     return wp.abs(v[0]) + wp.abs(v[1]) + wp.abs(v[2])
 
 
 @wp.func
-@no_type_check
 def size(g: RawGradient) -> wp.float32:
     """A norm that is 0 only if the gradient is 0; sh0 follows rgb."""
     turn = wp.abs(g.quats[0]) + wp.abs(g.quats[1]) + wp.abs(g.quats[2]) + wp.abs(g.quats[3])

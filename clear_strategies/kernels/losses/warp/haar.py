@@ -7,7 +7,7 @@ A level turns a block (a b; c d) of x - y into its low part (a+b+c+d)/2, the inp
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, no_type_check
+from typing import Any
 
 import warp as wp
 
@@ -17,7 +17,6 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-@no_type_check
 def pixel(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, row: wp.int32, column: wp.int32) -> wp.vec3:
     """A pixel of x - y at the first level, and of the low part x at the others; beyond the edge the last one is repeated."""
     i, j = wp.min(row, x.shape[0] - 1), wp.min(column, x.shape[1] - 1)
@@ -27,19 +26,16 @@ def pixel(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, row: w
 
 
 @wp.func
-@no_type_check
 def signs(v: wp.vec3) -> wp.vec3:
     return wp.vec3(sign(v[0]), sign(v[1]), sign(v[2]))
 
 
 @wp.func
-@no_type_check
 def magnitude(v: wp.vec3) -> wp.float32:
     return wp.abs(v[0]) + wp.abs(v[1]) + wp.abs(v[2])
 
 
 @wp.kernel
-@no_type_check
 def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, low: wp.array2d[wp.vec3]) -> None:
     """One thread per block."""
     i, j = wp.tid()
@@ -49,7 +45,6 @@ def low_part(x: wp.array2d[wp.vec3], y: wp.array2d[wp.vec3], first: wp.bool, low
 
 
 @cache
-@no_type_check
 def details(lanes: int) -> Any:
     """The kernel for weight · Σ |details| + <above, low part>, with `lanes` threads per row of blocks.
 

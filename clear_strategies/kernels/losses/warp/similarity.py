@@ -22,7 +22,7 @@ Warp's blocks have one thread, this thread processes all columns.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, Final, no_type_check
+from typing import Any, Final
 
 import warp as wp
 
@@ -55,7 +55,6 @@ C2: Final = wp.constant(0.03**2)
 
 
 @wp.func
-@no_type_check
 def pair_at(x: wp.array2d[wp.float32], y: wp.array2d[wp.float32], row: wp.int32, column: wp.int32) -> wp.vec2:
     """Image y and the difference d, 0 beyond the image. Always loads, because unconditional loads overlap."""
     i, j = wp.clamp(row, 0, x.shape[0] - 1), wp.clamp(column, 0, x.shape[1] - 1)
@@ -64,7 +63,6 @@ def pair_at(x: wp.array2d[wp.float32], y: wp.array2d[wp.float32], row: wp.int32,
 
 
 @wp.func
-@no_type_check
 def map_at(maps: wp.array3d[wp.float32], nth: wp.int32, row: wp.int32, column: wp.int32) -> wp.float32:
     """A value of a map, 0 beyond the image."""
     i, j = wp.clamp(row, 0, maps.shape[1] - 1), wp.clamp(column, 0, maps.shape[2] - 1)
@@ -72,13 +70,11 @@ def map_at(maps: wp.array3d[wp.float32], nth: wp.int32, row: wp.int32, column: w
 
 
 @wp.func
-@no_type_check
 def blocks_across(width: wp.int32) -> wp.int32:
     return (width + STRIDE - 1) / STRIDE
 
 
 @cache
-@no_type_check
 def similarity(lanes: int) -> Any:
     """The kernel that computes the maps, with `lanes` threads per block; a block's part is weight · Σ (1 - SSIM)."""
     turns = WIDTH // lanes
@@ -147,7 +143,6 @@ def similarity(lanes: int) -> Any:
 
 
 @cache
-@no_type_check
 def gradient(lanes: int) -> Any:
     """The kernel of the gradient of SSIM and L1, with `lanes` threads per block; a block adds L1 to its part."""
     turns = WIDTH // lanes

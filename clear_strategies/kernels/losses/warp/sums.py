@@ -6,7 +6,7 @@ Every block writes its part of the loss to `parts`, in float64, and one block th
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, no_type_check
+from typing import Any
 
 import warp as wp
 
@@ -14,14 +14,12 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-@no_type_check
 def sign(x: wp.float32) -> wp.float32:
     """-1, 0 or 1; 0 for NaN."""
     return wp.where(x > 0.0, 1.0, 0.0) - wp.where(x < 0.0, 1.0, 0.0)
 
 
 @cache
-@no_type_check
 def absolute(lanes: int) -> Any:
     """The kernel of L1, with `lanes` threads per row: writes step · sign(x - y), and the part weight · Σ |x - y|."""
 
@@ -46,7 +44,6 @@ def absolute(lanes: int) -> Any:
 
 
 @cache
-@no_type_check
 def total(lanes: int) -> Any:
     """The kernel that writes Σ parts in float32, with one block of `lanes` threads."""
 
