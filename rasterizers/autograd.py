@@ -70,10 +70,8 @@ class _Draw(torch.autograd.Function):
         offset: Tensor | None,
         *tensors: Tensor,
     ) -> Any:
-        means, quats, scales, opacities, sh0, shN = (x.detach() for x in tensors)
         ctx.offset = offset is not None
-        offset = None if offset is None else offset.detach()
-        detached = Splats(means, quats, scales, opacities, sh0, shN, offset)
+        detached = Splats(*(x.detach() for x in tensors), rgb_offset=None if offset is None else offset.detach())
         ctx.rendering = rasterizer(detached, camera, depth=True) if depth else rasterizer(detached, camera)
         means2d.data.copy_(ctx.rendering.means2d)
         ctx.mark_non_differentiable(ctx.rendering.alpha, ctx.rendering.visible)

@@ -87,10 +87,10 @@ def require_finite(splats: Splats) -> None:
     """
     for field in fields(splats):
         value = getattr(splats, field.name)
-        if value is None or value.numel() == 0:
+        if value is None or bool(torch.isfinite(value.sum())):
             continue
-        if not bool(torch.isfinite(value.sum())) and not bool(torch.isfinite(value).all()):
-            bad = (~torch.isfinite(value)).flatten(1).any(1) if value.dim() > 1 else ~torch.isfinite(value)
+        bad = ~torch.isfinite(value).reshape(len(value), -1).all(1)  # none where the sum alone overflows
+        if bool(bad.any()):
             index = int(bad.nonzero()[0])
             raise ValueError(f"splats.{field.name} must be finite; Gaussian {index} is not ({int(bad.sum())} in all).")
 

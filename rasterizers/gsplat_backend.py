@@ -74,7 +74,7 @@ class GsplatRasterizer(Backend):
     def _drawn(self, splats: Splats, camera: Camera, depth: bool) -> GsplatRendering:
         require_splats(splats, self.traits)
         require_finite(splats)
-        names = ("means", "quats", "scales", "opacities", "sh0", "shN")
+        names = ("means", "quats", "scales", "opacities")
         with torch.enable_grad():
             leaves = {name: getattr(splats, name).detach().requires_grad_() for name in names}
             offset = splats.means.new_zeros(len(splats), 3) if splats.rgb_offset is None else splats.rgb_offset.detach()
@@ -82,10 +82,11 @@ class GsplatRasterizer(Backend):
             identity = torch.zeros_like(leaves["quats"])
             identity[:, 0] = 1  # a zero quaternion is the identity and gets no gradient
             quats = torch.where(leaves["quats"].abs().amax(-1, keepdim=True) > 0, leaves["quats"], identity)
-            base = leaves["sh0"] + leaves["rgb"][:, None] / SH_C0
+            base = splats.sh0.detach() + leaves["rgb"][:, None] / SH_C0
             K = splats.means.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
             images, alphas, info = (self.rasterization or _gsplat_rasterization())(
-                leaves["means"], quats, leaves["scales"], leaves["opacities"], torch.cat((base, leaves["shN"]), 1),
+                leaves["means"], quats, leaves["scales"], leaves["opacities"],
+                torch.cat((base, splats.shN.detach()), 1),
                 camera.world_to_camera.to(splats.means)[None], K[None], camera.width, camera.height,
                 near_plane=self.near, eps2d=self.kernel, sh_degree=math.isqrt(splats.shN.shape[1] + 1) - 1, packed=False,
                 backgrounds=splats.means.new_tensor(self.background)[None],
@@ -124,16 +125,10 @@ class GsplatRendering:
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:
         require_cotangents(cotangents, self.image)
-        gradients = []
-        for cotangent in cotangents:
-            found = torch.autograd.grad(
-                self.drawn, list(self.leaves.values()), cotangent[None], retain_graph=True, materialize_grads=True
-            )
-            gradients.append(dict(zip(self.leaves, found, strict=True)))
-
-        def of(name: str) -> Tensor:
-            return torch.stack([g[name] for g in gradients])
-
-        return SplatGradients(
-            of("means"), of("quats"), of("scales"), of("opacities"), of("screen")[:, 0], of("rgb"), self.basis
-        )
+        leaves = list(self.leaves.values())
+        by_cotangent = [
+            torch.autograd.grad(self.drawn, leaves, cotangent[None], retain_graph=True, materialize_grads=True)
+            for cotangent in cotangents
+        ]
+        g = dict(zip(self.leaves, map(torch.stack, zip(*by_cotangent, strict=True)), strict=True))
+        return SplatGradients(**{**g, "screen": g["screen"][:, 0]}, basis=self.basis)

@@ -16,6 +16,7 @@ from torch import Tensor
 from clear_strategies.errors import SettingError
 from clear_strategies.kernels.losses import cpp, warp
 from clear_strategies.kernels.losses import reference as reference
+from clear_strategies.kernels.losses.images import supported
 from clear_strategies.kernels.losses.reference import LossAndGradient
 
 __all__ = ["Choice", "Implementation", "LossAndGradient", "haar_l1", "implementations", "photometric", "require"]
@@ -96,8 +97,8 @@ def _choose(kernels: Choice, x: Tensor, y: Tensor) -> Implementation:
 
 def _fastest(x: Tensor, y: Tensor) -> Choice:
     if x.device.type == "cpu":
-        return "cpp" if cpp.accepts(x, y) and cpp.available() else "torch"
-    return "warp" if warp.accepts(x, y) and warp.available() else "torch"
+        return "cpp" if supported(cpp.DEVICES, x, y) and cpp.available() else "torch"
+    return "warp" if supported(warp.DEVICES, x, y) and warp.available() else "torch"
 
 
 @cache

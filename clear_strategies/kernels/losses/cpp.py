@@ -17,12 +17,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.kernels.losses.images import ImagePair, image_pair, supported
+from clear_strategies.kernels.losses.images import ImagePair, image_pair
 from clear_strategies.kernels.losses.reference import LossAndGradient
 from rasterizers.interface import BackendUnavailable
 from rasterizers.native import load_kernels, threads
 
-_DEVICES: Final = ("cpu",)
+DEVICES: Final = ("cpu",)
 
 
 def available() -> bool:
@@ -40,16 +40,11 @@ def native() -> ModuleType:
     return load_kernels("clear_strategies.kernels")
 
 
-def accepts(*images: Tensor) -> bool:
-    """Whether the kernels support these images."""
-    return supported(_DEVICES, *images)
-
-
 def photometric(
     x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], lambda_ssim: float, out: Float[Tensor, "H W 3"] | None = None
 ) -> LossAndGradient:
     """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient, in one pass; with λ = 0 no SSIM is computed."""
-    images = image_pair(_DEVICES, x, y, out)
+    images = image_pair(DEVICES, x, y, out)
     l1_mean, dissimilarity = native().photometric(*images, 1 - lambda_ssim, lambda_ssim, threads())
     return _result((1 - lambda_ssim) * l1_mean + lambda_ssim * dissimilarity, images)
 
@@ -60,7 +55,7 @@ def haar_l1(
     """Mean absolute difference of the three detail bands of an orthonormal Haar transform, averaged over levels."""
     if levels < 1:
         raise ValueError(f"levels must be at least 1, got {levels}.")
-    images = image_pair(_DEVICES, x, y, out)
+    images = image_pair(DEVICES, x, y, out)
     return _result(native().haar_l1(*images, levels, threads()), images)
 
 

@@ -16,12 +16,12 @@ from typing import Final
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.kernels.losses.images import image_pair, supported
+from clear_strategies.kernels.losses.images import image_pair
 from clear_strategies.kernels.losses.reference import LossAndGradient
 from rasterizers.interface import BackendUnavailable
 from rasterizers.warp_runtime import require_warp
 
-_DEVICES: Final = ("cuda", "cpu")
+DEVICES: Final = ("cuda", "cpu")
 
 
 @cache
@@ -44,16 +44,11 @@ def require(device: str) -> None:
     require_warp("kernels=warp", device, "kernels=torch runs here")
 
 
-def accepts(*images: Tensor) -> bool:
-    """Whether the kernels support these images."""
-    return supported(_DEVICES, *images)
-
-
 def photometric(
     x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"], lambda_ssim: float, out: Float[Tensor, "H W 3"] | None = None
 ) -> LossAndGradient:
     """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient; with λ = 0 no SSIM is computed."""
-    images = image_pair(_DEVICES, x, y, out)
+    images = image_pair(DEVICES, x, y, out)
     return LossAndGradient(_launches(x).photometric(images, 1 - lambda_ssim, lambda_ssim), images.gradient)
 
 
@@ -63,7 +58,7 @@ def haar_l1(
     """Mean absolute difference of the three detail bands of an orthonormal Haar transform, averaged over levels."""
     if levels < 1:
         raise ValueError(f"levels must be at least 1, got {levels}.")
-    images = image_pair(_DEVICES, x, y, out)
+    images = image_pair(DEVICES, x, y, out)
     return LossAndGradient(_launches(x).haar_l1(images, levels), images.gradient)
 
 
