@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 
 import rasterizers
 from rasterizers import BackendUnavailable, Camera, Rasterizer, Rendering, SplatGradients, Splats
+from rasterizers.geometry import SH_C0
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import gradient_of, pixels_of, scene, to
 
@@ -101,18 +103,25 @@ BACKENDS = {
     "warp": Backend("warp", 100),
     "warp-cuda": Backend("warp", 400, "cuda"),
 }
+EVERY: dict[str, Callable[..., Rasterizer]] = {"torch": ReferenceRasterizer, **BACKENDS}
+"""Those, and the reference that they are compared with."""
 
 
 @cache
 def why_not(name: str) -> str | None:
     """Why a backend does not run on this machine."""
-    return BACKENDS[name].why_not
+    return BACKENDS[name].why_not if name in BACKENDS else None
+
+
+def needs(name: str) -> pytest.MarkDecorator:
+    """Skips a test where the backend does not run, with the reason."""
+    return pytest.mark.skipif(bool(why_not(name)), reason=str(why_not(name)))
 
 
 def backends(*, dtype: torch.dtype | None = None) -> pytest.MarkDecorator:
     """Run a test for every backend, in float32 for every instruction set; skip those that do not run, with the reason."""
     params = [
-        pytest.param(backend, id=name, marks=pytest.mark.skipif(bool(why_not(name)), reason=str(why_not(name))))
+        pytest.param(backend, id=name, marks=needs(name))
         for name, backend in BACKENDS.items()
         if (not backend.isa or dtype == torch.float32)
         and (dtype is None or why_not(name) or dtype in backend().traits.dtypes)
@@ -124,6 +133,19 @@ def exact(splats: Splats, camera: Camera, *, depth: bool = False, **settings: An
     """The rendering in float64, by "cpp" where it was compiled."""
     exact_rasterizer = ReferenceRasterizer(**settings) if why_not("cpp") else rasterizers.load("cpp", **settings)
     return exact_rasterizer(to(splats, torch.float64), camera, depth=depth)
+
+
+def balls(*depths: float, opacity=0.6, scale=0.4, color=0.5, dtype=torch.float64) -> Splats:
+    """Grey balls straight ahead, one behind the other, all as large in the image: with a radius of `scale` at depth 1."""
+    n, z = len(depths), torch.tensor(depths, dtype=dtype)
+    return Splats(
+        means=torch.stack((0 * z, 0 * z, z), 1),
+        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=dtype).repeat(n, 1),
+        scales=(scale * z)[:, None].repeat(1, 3),
+        opacities=torch.full((n,), opacity, dtype=dtype),
+        sh0=torch.full((n, 1, 3), (color - 0.5) / SH_C0, dtype=dtype),
+        shN=torch.zeros(n, 0, 3, dtype=dtype),
+    )
 
 
 def camera(width=65, height=47) -> Camera:

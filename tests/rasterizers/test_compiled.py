@@ -9,7 +9,7 @@ from functools import cache
 import pytest
 import torch
 
-from rasterizers import SplatGradients, Splats
+from rasterizers import SplatGradients
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import CHECKS, gradient_of, magnitude, pixels_of, scene, select, to
 from tests.helpers.agreement import require_gradient, require_image, require_same_bits
@@ -18,6 +18,7 @@ from tests.helpers.backends import (
     CLEAN,
     Backend,
     backends,
+    balls,
     camera,
     cotangents,
     dense_scene,
@@ -91,13 +92,10 @@ def test_transmittance_survives_four_hundred_layers(backend):
     n = 400
     # Near α = 1, an error of α is 1/(1 - α) times as large in T.
     for alpha, tolerance in ((1 / 200, 1e-5), (0.05, 1e-5), (0.5, 1e-5), (0.98, 1e-4)):
-        splats = Splats(
-            means=torch.tensor([[0.0, 0.0, 2.0]]).repeat(n, 1) + torch.arange(n)[:, None] * torch.tensor([0, 0, 1e-3]),
-            quats=torch.tensor([[1.0, 0, 0, 0]]).repeat(n, 1),
+        splats = replace(
+            balls(*(2 + 1e-3 * i for i in range(n)), opacity=alpha, dtype=torch.float32),
             scales=torch.full((n, 3), 2.0),
-            opacities=torch.full((n,), alpha),
             sh0=torch.randn(n, 1, 3, generator=torch.Generator().manual_seed(5)),  # equal colours would cancel
-            shN=torch.zeros(n, 0, 3),
         )
         view, v = camera(8, 8), cotangents(1, 8, 8)
         settings = {"alpha_min": 1e-6, "transmittance_min": 1e-9}
@@ -116,13 +114,11 @@ def test_needles_keep_their_shape(backend, aspect, pixels):
     n, view = 24, camera(64, 64)
     angle = torch.arange(n) * math.pi / n
     size = pixels * 4.0 / view.fx
-    splats = Splats(
+    splats = replace(
+        balls(*[4.0] * n, opacity=0.4, dtype=torch.float32),
         means=torch.tensor([[0.05, -0.02, 4.0]]).repeat(n, 1),
         quats=torch.stack((torch.cos(angle / 2), 0 * angle, 0 * angle, torch.sin(angle / 2)), dim=1),
         scales=torch.tensor([[size, size / aspect, size / aspect]]).repeat(n, 1),
-        opacities=torch.full((n,), 0.4),
-        sh0=torch.full((n, 1, 3), 0.5),
-        shN=torch.zeros(n, 0, 3),
     )
     v = cotangents(1, 64, 64)
     for i in range(0, n, 5):

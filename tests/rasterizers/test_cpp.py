@@ -13,9 +13,9 @@ from rasterizers import Camera, native
 from rasterizers.cpp import CppRasterizer
 from rasterizers.testing import check_rasterizer, scene
 from tests.helpers.agreement import require_same_bits
-from tests.helpers.backends import camera, cotangents, dense_scene, everything, why_not
+from tests.helpers.backends import camera, cotangents, dense_scene, everything, needs
 
-pytestmark = pytest.mark.skipif(bool(why_not("cpp")), reason=str(why_not("cpp")))
+pytestmark = needs("cpp")
 
 
 def cpp(**settings):

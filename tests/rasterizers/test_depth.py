@@ -8,26 +8,11 @@ import pytest
 import torch
 
 import rasterizers
-from rasterizers import Splats
 from rasterizers.checks import require_cotangents
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import scene, to
 from tests.helpers.agreement import require_same_bits
-from tests.helpers.backends import CLEAN, backends, camera, cotangents, dense_scene, everything, exact
-
-
-def balls(*depths: float, opacity=0.6, scale=0.4) -> Splats:
-    """Grey balls straight ahead, one behind the other, all as large in the image."""
-    n, z = len(depths), torch.tensor(depths, dtype=torch.float64)
-    return Splats(
-        means=torch.stack((0 * z, 0 * z, z), 1),
-        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=torch.float64).repeat(n, 1),
-        scales=(scale * z)[:, None].repeat(1, 3),
-        opacities=torch.full((n,), opacity, dtype=torch.float64),
-        sh0=torch.zeros(n, 1, 3, dtype=torch.float64),
-        shN=torch.zeros(n, 0, 3, dtype=torch.float64),
-    )
-
+from tests.helpers.backends import CLEAN, backends, balls, camera, cotangents, dense_scene, everything, exact
 
 # ---- values ------------------------------------------------------------------------------------------------------
 

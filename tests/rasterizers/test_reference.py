@@ -10,9 +10,10 @@ import torch
 
 import rasterizers
 from rasterizers import PRESETS, Camera, Splats
-from rasterizers.geometry import SH_C0, rotation_matrix, spherical_harmonics
+from rasterizers.geometry import rotation_matrix, spherical_harmonics
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import CHECKS, ContractError, check_rasterizer, scene, to
+from tests.helpers.backends import balls
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda c: c.__name__)
@@ -21,34 +22,8 @@ def test_the_reference_passes_every_check(check):
 
 
 def test_a_rasterizer_that_ignores_the_background_fails_the_checks():
-    class Wrong:
-        """Ignores the background."""
-
-        def __init__(self, **settings):
-            settings["background"] = (0.0, 0.0, 0.0)
-            self.inner = rasterizers.load("torch", **settings)
-            self.traits = self.inner.traits
-
-        def __call__(self, *arguments, **options):
-            return self.inner(*arguments, **options)
-
-        def render_scales(self, *arguments, **options):
-            return self.inner.render_scales(*arguments, **options)
-
     with pytest.raises(ContractError, match="background"):
-        check_rasterizer(Wrong)
-
-
-def one(opacity=0.8, scale=0.1, color=0.5, z=2.0, dtype=torch.float64) -> Splats:
-    """A grey ball in the middle of the view."""
-    return Splats(
-        means=torch.tensor([[0.0, 0.0, z]], dtype=dtype),
-        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=dtype),
-        scales=torch.full((1, 3), scale, dtype=dtype),
-        opacities=torch.tensor([opacity], dtype=dtype),
-        sh0=torch.full((1, 1, 3), (color - 0.5) / SH_C0, dtype=dtype),
-        shN=torch.zeros(1, 0, 3, dtype=dtype),
-    )
+        check_rasterizer(lambda **settings: ReferenceRasterizer(**{**settings, "background": (0.0, 0.0, 0.0)}))
 
 
 def odd_camera(focal=40.0) -> Camera:
@@ -57,8 +32,8 @@ def odd_camera(focal=40.0) -> Camera:
 
 
 def test_a_ball_has_the_opacity_that_mip_splatting_gives_it():
-    # σ' = f s / z = 40 · 0.1 / 2 = 2 px; with the kernel σ'² = 4.1; compensation √(16 / 16.81) = 4 / 4.1.
-    rendering = rasterizers.load("torch")(one(), odd_camera())
+    # σ' = 40 · 0.05 = 2 px; with the kernel σ'² = 4.1; compensation √(16 / 16.81) = 4 / 4.1.
+    rendering = rasterizers.load("torch")(balls(2.0, opacity=0.8, scale=0.05), odd_camera())
     assert rendering.alpha[10, 10] == pytest.approx(0.8 * 4 / 4.1, rel=1e-12)
     assert rendering.image[10, 10, 0] == pytest.approx(0.5 * 0.8 * 4 / 4.1, rel=1e-12)
     assert rendering.alpha[10, 12] == pytest.approx(0.8 * 4 / 4.1 * math.exp(-0.5 * 4 / 4.1), rel=1e-12)
@@ -66,7 +41,7 @@ def test_a_ball_has_the_opacity_that_mip_splatting_gives_it():
 
 
 def test_the_nearer_ball_covers_the_farther():
-    near, far = one(opacity=0.5, color=1.0, z=2.0), one(opacity=0.9, color=0.2, z=3.0)
+    near, far = balls(2.0, opacity=0.5, color=1.0), balls(3.0, opacity=0.9, color=0.2)
     both = Splats(*(torch.cat((getattr(far, f), getattr(near, f))) for f in Splats.__slots__[:6]))
     settings = {"kernel": 0.0, "antialiased": False}
     pixel = rasterizers.load("torch", **settings)(both, odd_camera()).image[10, 10, 0]
@@ -74,14 +49,13 @@ def test_the_nearer_ball_covers_the_farther():
 
 
 def test_alpha_is_capped_and_opacity_is_not():
-    rendering = rasterizers.load("torch", kernel=0.0)(one(opacity=1.25), odd_camera())
+    rendering = rasterizers.load("torch", kernel=0.0)(balls(2.0, opacity=1.25, scale=0.05), odd_camera())
     assert rendering.alpha[10, 10] == pytest.approx(0.99)
     assert rendering.alpha[10, 12] == pytest.approx(1.25 * math.exp(-0.5), rel=1e-12)
 
 
 def test_a_pixel_ends_before_its_transmittance_falls_below_the_limit():
-    stack = one(opacity=0.9)
-    five = Splats(*(getattr(stack, f).repeat(5, *[1] * (getattr(stack, f).dim() - 1)) for f in Splats.__slots__[:6]))
+    five = balls(*[2.0] * 5, opacity=0.9)
     # The transmittance goes 0.1, 0.01, 0.001, …: the last one not below the limit stays.
     for limit, left in ((5e-4, 1e-3), (5e-3, 1e-2), (0.5, 1.0)):
         rasterizer = rasterizers.load("torch", kernel=0.0, transmittance_min=limit)
@@ -180,7 +154,7 @@ def test_float32_gradients_of_huge_footprints_agree_with_float64(pixels, shape):
     camera = Camera(torch.eye(4), 100.0, 100.0, 33.0, 24.0, 65, 47)
     v = torch.randn(1, 47, 65, 3, generator=torch.Generator().manual_seed(0))
     splats = replace(
-        one(0.6, z=1.0, dtype=torch.float32),
+        balls(1.0, dtype=torch.float32),
         means=torch.tensor([[0.05, -0.02, 1.0]]),
         quats=torch.tensor([[0.8, -0.3, 0.5, 0.2]]),
         scales=torch.tensor([shape]) * pixels / 100,

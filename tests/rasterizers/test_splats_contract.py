@@ -10,21 +10,16 @@ import torch
 
 from rasterizers.cpp import CppRasterizer
 from rasterizers.interface import Splats
-from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import scene
-from tests.helpers.backends import BACKENDS, camera, why_not
+from tests.helpers.backends import EVERY, camera, needs
 
 OTHERS = ("quats", "scales", "opacities", "sh0", "shN", "rgb_offset")
 ROWS = ("opacities", "rgb_offset", "shN", "quats", "scales", "sh0")
 
 
-@pytest.fixture(params=["torch", *BACKENDS])
+@pytest.fixture(params=[pytest.param(make, id=name, marks=needs(name)) for name, make in EVERY.items()])
 def draw(request):
-    if request.param == "torch":
-        return ReferenceRasterizer()
-    if reason := why_not(request.param):
-        pytest.skip(reason)
-    return BACKENDS[request.param]()
+    return request.param()
 
 
 def changed(name: str, change) -> Splats:
@@ -82,14 +77,18 @@ def test_bands_that_no_degree_has_are_refused(draw):
         draw(changed("shN", lambda x: x.new_zeros(20, 5, 3)), camera())
 
 
-@pytest.mark.skipif(bool(why_not("cpp")), reason=str(why_not("cpp")))
+@needs("cpp")
 def test_the_compiled_module_takes_no_converted_copy():
     """Nanobind's converted copy is freed when the call returns, and the frame would read freed memory later."""
     frame = CppRasterizer()(scene(20), camera())._frame
+    image, grids = torch.empty(47, 65, 3), [[9.0, 9.0, 5.0, 5.0, 65.0, 47.0]]
+
+    def project(opacities):
+        frame.native.project(*frame.shared, grids, opacities, [None], frame.means2d, frame.visible, 1)
+
+    project(frame.opacities)
+    frame.native.draw(0, image, torch.empty(47, 65), None, 1)
     with pytest.raises(TypeError, match="incompatible function arguments"):
-        frame.native.draw(0, torch.empty(47, 65, 3, dtype=torch.float64), torch.empty(47, 65), 1)
-    wide = [opacities.double() for opacities in frame.opacities]
+        frame.native.draw(0, image.double(), torch.empty(47, 65), None, 1)
     with pytest.raises(TypeError, match="incompatible function arguments"):
-        frame.native.project(
-            *frame.shared, [[9.0, 9.0, 5.0, 5.0, 65.0, 47.0]], wide, [None], frame.means2d, frame.visible, [None], 32, 1
-        )
+        project([opacities.double() for opacities in frame.opacities])

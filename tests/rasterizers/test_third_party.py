@@ -13,7 +13,7 @@ import rasterizers
 from rasterizers import Camera, Rasterizer, RasterSettings, Rendering, Splats, Traits, autograd
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import check_rasterizer, scene
-from tests.helpers.backends import BACKENDS, why_not
+from tests.helpers.backends import needs
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +80,10 @@ def test_a_rasterizer_without_depth_passes_the_checks_and_is_refused_by_name_whe
     ("name", "path"),
     [
         ("torch", "rasterizers.reference.ReferenceRasterizer"),
-        ("cpp", "rasterizers.cpp.CppRasterizer"),
-        ("warp", "rasterizers.warp_backend.WarpRasterizer"),
+        pytest.param("cpp", "rasterizers.cpp.CppRasterizer", marks=needs("cpp")),
+        pytest.param("warp", "rasterizers.warp_backend.WarpRasterizer", marks=needs("warp")),
     ],
 )
 def test_the_backends_are_built_by_their_paths(name, path):
-    if name in BACKENDS and why_not(name):
-        pytest.skip(str(why_not(name)))
     settings = {"near": 0.01, "kernel": 0.3, "antialiased": False}
     assert instantiate({"_target_": path, **settings}) == rasterizers.load(name, **settings)

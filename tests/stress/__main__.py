@@ -18,8 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from clear_strategies import files
-from rasterizers.reference import ReferenceRasterizer
-from tests.helpers.backends import BACKENDS, why_not
+from tests.helpers.backends import CLEAN, EVERY, why_not
 from tests.stress import (
     attacks,
     bad_inputs,
@@ -40,22 +39,16 @@ from tests.stress.rows import Row
 _log = logging.getLogger("tests.stress")
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "stability.md"
-_CLEAN = {"alpha_min": 1e-7, "transmittance_min": 1e-9}
 _DAMAGED = {fuzz.binary: 1, fuzz.text: 20, fuzz.scenes: 200}  # of a text file or a scene, that many times fewer mutants
 
 
-def drawing() -> Iterator[tuple[str, Callable]]:
-    """Every backend that runs here, and how to make it."""
-    yield "torch", ReferenceRasterizer
-    for name, backend in BACKENDS.items():
-        if reason := why_not(name):
-            _log.info("%s: left out, %s", name, reason)
-        else:
-            yield name, backend
-
-
 def _projection(options: argparse.Namespace, _: Path) -> Iterator[Row]:
-    return projection.measure({name: make(**_CLEAN) for name, make in drawing()}, every=options.every)
+    reasons = {name: why_not(name) for name in EVERY}
+    for name, reason in reasons.items():
+        if reason:
+            _log.info("%s: left out, %s", name, reason)
+    drawing = {name: make(**CLEAN) for name, make in EVERY.items() if not reasons[name]}
+    return projection.measure(drawing, every=options.every)
 
 
 def _fuzz(options: argparse.Namespace, _: Path) -> Iterator[Row]:

@@ -11,6 +11,7 @@ import torch
 from rasterizers import Camera, Rasterizer, Splats
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import gradient_of, to
+from tests.helpers.backends import CLEAN
 from tests.stress.rows import Row, Worst
 
 SCALES = [10.0**k for k in range(-8, 9)]
@@ -25,7 +26,6 @@ _FLIP = 8e-3  # a pixel at which rounding flips a cut-off
 _SHAPE = torch.tensor([[1.0, 0.7, 0.4]])
 _QUATERNION = torch.tensor([[0.8, -0.3, 0.5, 0.2]])
 _CAMERA = Camera(torch.eye(4), 12.0, 12.0, 4.2, 4.7, 9, 9)
-_CLEAN = {"alpha_min": 1e-7, "transmittance_min": 1e-9}
 
 
 def cases(every: int = 1) -> Iterator[tuple[str, Splats]]:
@@ -51,7 +51,7 @@ def measure(backends: Mapping[str, Rasterizer], *, every: int = 1) -> Iterator[R
 
     The rotation's gradient is measured against the quaternion's own scale: ‖g_quat‖ · ‖q‖, which does not depend on ‖q‖.
     """
-    exact = ReferenceRasterizer(**_CLEAN)
+    exact = ReferenceRasterizer(**CLEAN)
     v = torch.randn(1, 9, 9, 3, generator=torch.Generator().manual_seed(0))
     images, gradients = ({name: Worst() for name in backends} for _ in range(2))
     for where, splats in cases(every):

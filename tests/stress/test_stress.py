@@ -16,22 +16,19 @@ from clear_strategies.training import checkpoint
 from clear_strategies.training.optim import Adam
 from clear_strategies.training.state import TrainState
 from rasterizers.reference import ReferenceRasterizer
-from tests.helpers.backends import BACKENDS, why_not
+from tests.helpers.backends import CLEAN, EVERY, needs
 from tests.stress import attacks, bad_inputs, checkpoints, faults, fuzz, gco, kills, lifecycle, projection, soak
-from tests.stress.__main__ import _CLEAN, main
+from tests.stress.__main__ import main
 from tests.stress.bad_inputs import BadInput
 from tests.stress.rows import Row, Worst, read, table, write
 
-EVERY = {"torch": 97, "warp": 499}
+THINNED = {"torch": 97, "warp": 499}
 MUTANTS = {fuzz.binary: 10_000, fuzz.text: 1_000, fuzz.scenes: 100}  # of each format
 
 
-@pytest.mark.parametrize("name", ["torch", *BACKENDS])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=needs(name)) for name in EVERY])
 def test_single_gaussians_agree_with_float64(name: str) -> None:
-    if name != "torch" and (reason := why_not(name)):
-        pytest.skip(str(reason))
-    make = ReferenceRasterizer if name == "torch" else BACKENDS[name]
-    for row in projection.measure({name: make(**_CLEAN)}, every=EVERY.get(name, 61)):
+    for row in projection.measure({name: EVERY[name](**CLEAN)}, every=THINNED.get(name, 61)):
         row.require()
 
 
@@ -42,7 +39,7 @@ def test_an_image_that_is_off_is_found() -> None:
             rendering.image = rendering.image * 0.99
             return rendering
 
-    image, gradient = projection.measure({"darker": Darker(**_CLEAN)}, every=997)
+    image, gradient = projection.measure({"darker": Darker(**CLEAN)}, every=997)
     assert not image.met
     assert gradient.met
 
