@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,12 @@ def nerfstudio(root: Path) -> Path:
     shared = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": 8.0, "cy": 6.0, "w": WIDTH, "h": HEIGHT, "camera_model": "OPENCV"}
     write_json(root / "transforms.json", {**shared, "frames": frames})
     return root
+
+
+GOOD: dict[str, Callable[[Path], Path]] = {
+    "colmap": colmap_bin, "colmap_txt": colmap_txt, "llff": llff, "blender": blender, "nerfstudio": nerfstudio,
+}  # fmt: skip
+"""What writes each of them."""
 
 
 def write_json(path: Path, value: object) -> None:

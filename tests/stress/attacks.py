@@ -17,9 +17,9 @@ from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.data.readers import colmap
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.settings import build
-from tests.helpers.malformed import GOOD
-from tests.stress.bad_inputs import BadInput, inputs, problem
-from tests.stress.rows import Row, Worst
+from tests.helpers.captures import GOOD
+from tests.stress.bad_inputs import BadInput, a_device, at, count, inputs, problem
+from tests.stress.rows import Row
 
 # Bad inputs that are attacks; the tables say what they hold.
 _AMONG_THE_BAD = (
@@ -71,14 +71,6 @@ def _linked_photo_of_another_ending(folder: Path) -> object:
     return colmap.read(scene)
 
 
-def _endless(read: Callable[[Path], object]) -> Callable[[Path], object]:
-    def give(folder: Path) -> object:
-        (folder / "endless").symlink_to("/dev/zero")
-        return read(folder / "endless")
-
-    return give
-
-
 def _model_in_a_pipe(folder: Path) -> object:
     scene = GOOD["colmap"](folder)
     (scene / "sparse/0/points3D.bin").unlink()
@@ -88,10 +80,10 @@ def _model_in_a_pipe(folder: Path) -> object:
 
 _MORE = {
     "photo of another ending that leads out": (_linked_photo_of_another_ending, "leads out of"),
-    "JSON that is a device": (_endless(read_object), "is a pipe, a device or a socket"),
-    "PLY that is a device": (_endless(ply.read_points), "is a pipe, a device or a socket"),
-    "size of an image that is a device": (_endless(image_size), "is a pipe, a device or a socket"),
-    "image that is a device": (_endless(read_image), "is a pipe, a device or a socket"),
+    "JSON that is a device": (at("endless", read_object, a_device), "is a pipe, a device or a socket"),
+    "PLY that is a device": (at("endless", ply.read_points, a_device), "is a pipe, a device or a socket"),
+    "size of an image that is a device": (at("endless", image_size, a_device), "is a pipe, a device or a socket"),
+    "image that is a device": (at("endless", read_image, a_device), "is a pipe, a device or a socket"),
     "model in a pipe": (_model_in_a_pipe, "is a pipe, a device or a socket"),
 }
 
@@ -164,9 +156,4 @@ def trace(given: BadInput, folder: Path) -> str | None:
 
 def measure(folder: Path) -> Row:
     """How many attacks are not refused, or leave a trace."""
-    bad = Worst()
-    for i, given in enumerate(attacks()):
-        here = folder / str(i)
-        here.mkdir(parents=True)
-        bad.add(float(trace(given, here) is not None), given.name)
-    return bad.row("attacks: not refused, or a trace left", "all", 0, 40)
+    return count(attacks(), trace, folder)["attack"].row("attacks: not refused, or a trace left", "all", 0, 40)

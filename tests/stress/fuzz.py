@@ -32,7 +32,7 @@ from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.readers import colmap, colmap_model, llff, nerfstudio
 from clear_strategies.errors import DataError
 from clear_strategies.training import checkpoint
-from tests.helpers.malformed import GOOD
+from tests.helpers.captures import GOOD
 from tests.stress.faults import small
 from tests.stress.rows import Row
 

@@ -34,19 +34,15 @@ _RUN = [
 _MOST_KILLS = 6  # of one run, before it may end
 
 
-def measure(folder: Path, kills: int, *, seed: int = 0) -> Row:
+@pictures.not_drawn()
+def measure(folder: Path, kills: int) -> Row:
     """Kill runs `kills` times in all; a failure is a checkpoint lost, a rest after the end, or another result."""
-    with pictures.not_drawn():
-        return _measure(folder, kills, seed)
-
-
-def _measure(folder: Path, kills: int, seed: int) -> Row:
     config = composed(*_RUN)
     job.run(config, folder / "warm")  # in this process, so that its children need not import anything
     began = time.monotonic()
     _require_done(_started(config, folder / "whole"))
     seconds = time.monotonic() - began
-    expected, rng, bad, run = _results(folder / "whole"), random.Random(seed), Worst(), 0  # noqa: S311 - no secret
+    expected, rng, bad, run = _results(folder / "whole"), random.Random(0), Worst(), 0  # noqa: S311 - no secret
     while bad.cases < kills:
         here, newest, run = folder / f"run{run}", 0, run + 1
         for _ in range(min(rng.randint(1, _MOST_KILLS), kills - bad.cases)):

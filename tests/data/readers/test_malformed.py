@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from clear_strategies.errors import DataError
-from tests.helpers.malformed import GOOD
+from tests.helpers.captures import GOOD
 from tests.stress.bad_inputs.scenes import READERS
 
 

@@ -5,10 +5,14 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable, Iterator
+import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from clear_strategies.errors import ClearError, DataError
 from clear_strategies.jobs import exit_codes
@@ -33,6 +37,46 @@ class BadInput:
     @property
     def id(self) -> str:
         return f"{self.surface}: {self.name}"
+
+
+def bomb(width: int, height: int) -> bytes:
+    """A PNG of a few bytes whose header promises width x height pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
+
+
+class Canary:
+    """Unpickling it creates a folder, which a test can detect."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, (str(self.path),)
+
+
+def at(
+    name: str, read: Callable[[Path], object], make: bytes | Callable[[Path], object] | None = None
+) -> Callable[[Path], object]:
+    """Reads a path of this name, where `make` has made something, or where there is a file that holds these bytes."""
+
+    def give(folder: Path) -> object:
+        path = folder / name
+        if isinstance(make, bytes):
+            path.write_bytes(make)
+        elif make is not None:
+            make(path)
+        return read(path)
+
+    return give
+
+
+def a_device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
 
 
 def inputs() -> Iterator[BadInput]:
@@ -60,11 +104,17 @@ def problem(given: BadInput, folder: Path) -> str | None:
     return None if re.search(given.pattern, message) else f"the message says something else: {message}"
 
 
-def measure(folder: Path) -> list[Row]:
-    """One row per surface: how many inputs are not refused as they should be."""
+def count(given: Iterable[BadInput], wrong: Callable[[BadInput, Path], str | None], folder: Path) -> dict[str, Worst]:
+    """How many inputs of each surface something is wrong with."""
     found: dict[str, Worst] = {}
-    for i, given in enumerate(inputs()):
+    for i, one in enumerate(given):
         here = folder / str(i)
         here.mkdir(parents=True)
-        found.setdefault(given.surface, Worst()).add(float(problem(given, here) is not None), given.name)
+        found.setdefault(one.surface, Worst()).add(float(wrong(one, here) is not None), one.name)
+    return found
+
+
+def measure(folder: Path) -> list[Row]:
+    """One row per surface: how many inputs are not refused as they should be."""
+    found = count(inputs(), problem, folder)
     return [worst.row(f"bad {surface}: not refused in one line", "all", 0) for surface, worst in found.items()]

@@ -9,52 +9,31 @@ from collections.abc import Callable
 from pathlib import Path
 
 from clear_strategies.data.photo_files import image_folder, inside, list_images
-from clear_strategies.data.readers import blender, colmap, llff, nerfstudio
+from clear_strategies.data.readers import colmap
 from clear_strategies.jobs import resume
 from clear_strategies.jobs.lock import NAME, hold
 from clear_strategies.jobs.saved import open_splat
-from tests.helpers.malformed import GOOD
-from tests.stress.bad_inputs import BadInput
-
-_READERS = {"COLMAP": colmap.read, "LLFF": llff.read, "Blender": blender.read, "nerfstudio": nerfstudio.read}
+from tests.helpers.captures import GOOD
+from tests.stress.bad_inputs import BadInput, at
+from tests.stress.bad_inputs.scenes import READERS
 
 
 def _absent(read: Callable[[Path], object]) -> Callable[[Path], object]:
-    return lambda folder: read(folder / "none")
+    return at("none", read)
 
 
 def _a_file(read: Callable[[Path], object]) -> Callable[[Path], object]:
-    def give(folder: Path) -> object:
-        (folder / "file").write_text("no folder")
-        return read(folder / "file")
-
-    return give
+    return at("file", read, b"no folder")
 
 
-def _made(make: Callable[[Path], object], read: Callable[[Path], object]) -> Callable[[Path], object]:
-    def give(folder: Path) -> object:
-        make(folder)
-        return read(folder)
+def _held(lock: bytes | Callable[[Path], object]) -> Callable[[Path], object]:
+    """Of a folder whose lock is there already."""
 
-    return give
-
-
-def _held(text: str) -> Callable[[Path], object]:
-    def give(folder: Path) -> None:
-        (folder / NAME).write_text(text)
-        with hold(folder):
+    def take(path: Path) -> None:
+        with hold(path.parent):
             pass
 
-    return give
-
-
-def _taken(make: Callable[[Path], object]) -> Callable[[Path], object]:
-    def give(folder: Path) -> None:
-        make(folder / NAME)
-        with hold(folder):
-            pass
-
-    return give
+    return at(NAME, take, lock)
 
 
 def _held_twice(folder: Path) -> None:
@@ -73,12 +52,9 @@ def _photos_gone(folder: Path) -> None:
         photo.unlink()
 
 
-def _finished(content: object) -> Callable[[Path], object]:
-    def give(folder: Path) -> object:
-        (folder / "metrics.json").write_text(content if isinstance(content, str) else json.dumps(content))
-        return resume.finished(folder, {})
-
-    return give
+def _finished(metrics: object) -> Callable[[Path], object]:
+    content = metrics if isinstance(metrics, str) else json.dumps(metrics)
+    return at("metrics.json", lambda path: resume.finished(path.parent, {}), content.encode())
 
 
 def _hidden_photos_only(folder: Path) -> None:
@@ -88,27 +64,27 @@ def _hidden_photos_only(folder: Path) -> None:
 
 _ELSEWHERE = {"host": socket.gethostname() + "-another", "pid": 1, "started": "1", "since": "2026-01-01"}
 _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
-    **{f"{name} at a path that is absent": (_absent(read), "none") for name, read in _READERS.items()},
-    **{f"{name} at a path that is a file": (_a_file(read), "file") for name, read in _READERS.items()},
-    **{f"{name} in an empty folder": (read, ": ") for name, read in _READERS.items()},
-    "photos in a folder of another name": (_made(_photos_renamed, colmap.read), "images: is no folder|has none of"),
-    "no photo of the model is there": (_made(_photos_gone, colmap.read), "is not in .*, and no other photo is"),
+    **{f"{kind} at a path that is absent": (_absent(read), "none") for kind, read in READERS.items()},
+    **{f"{kind} at a path that is a file": (_a_file(read), "file") for kind, read in READERS.items()},
+    **{f"{kind} in an empty folder": (read, ": ") for kind, read in READERS.items()},
+    "photos in a folder of another name": (at("", colmap.read, _photos_renamed), "images: is no folder|has none of"),
+    "no photo of the model is there": (at("", colmap.read, _photos_gone), "is not in .*, and no other photo is"),
     "no folder of photos": (image_folder, "images: has none of the folders images, images_2"),
     "folder of photos by a name that is not there": (lambda folder: image_folder(folder, "images_16"), "is no folder"),
     "photos at a path that is absent": (_absent(list_images), "folder: is not there"),
-    "folder without images": (_made(_hidden_photos_only, list_images), "images: holds no image"),
+    "folder without images": (at("", list_images, _hidden_photos_only), "images: holds no image"),
     "name of a photo that is empty": (lambda folder: inside(folder, "", file=folder), "'' is no file name"),
     "name of a photo with a zero": (lambda folder: inside(folder, "a\0.png", file=folder), "is no file name"),
     "name of a photo with 300 letters": (lambda folder: inside(folder, "x" * 300, file=folder), "is no file name"),
     "name of a photo with 200 accents": (lambda folder: inside(folder, "é" * 200, file=folder), "is no file name"),
     "lock held by this process": (_held_twice, "is at work in this folder"),
-    "lock held on another host": (_held(json.dumps(_ELSEWHERE)), "cannot be known from"),
-    "lock that is no JSON": (_held("{"), "cannot be known from"),
-    "lock that is a list": (_held("[]"), "cannot be known from"),
-    "lock that is a folder": (_taken(Path.mkdir), "lock: is a link or no regular file"),
-    "lock that is a pipe": (_taken(os.mkfifo), "lock: is a link or no regular file"),
+    "lock held on another host": (_held(json.dumps(_ELSEWHERE).encode()), "cannot be known from"),
+    "lock that is no JSON": (_held(b"{"), "cannot be known from"),
+    "lock that is a list": (_held(b"[]"), "cannot be known from"),
+    "lock that is a folder": (_held(Path.mkdir), "lock: is a link or no regular file"),
+    "lock that is a pipe": (_held(os.mkfifo), "lock: is a link or no regular file"),
     "lock that is a link": (
-        _taken(lambda path: path.symlink_to(path.with_name("canary"))),
+        _held(lambda path: path.symlink_to(path.with_name("canary"))),
         "lock: is a link or no regular file",
     ),
     "run that is absent": (_absent(open_splat), "none"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,7 @@ import numpy as np
 from PIL import Image
 
 from clear_strategies.data.photo_files import image_size, read_image
-from tests.helpers.malformed import bomb
-from tests.stress.bad_inputs import BadInput
+from tests.stress.bad_inputs import BadInput, a_device, at, bomb
 
 
 def _encoded(form: str, mode: str = "RGB", size: tuple[int, int] = (40, 30), **options: Any) -> bytes:
@@ -37,11 +37,7 @@ def _pages(form: str) -> bytes:
 
 
 def _read(content: bytes, **options: Any) -> Callable[[Path], object]:
-    def give(folder: Path) -> object:
-        (folder / "a.png").write_bytes(content)
-        return read_image(folder / "a.png", **options)
-
-    return give
+    return at("a.png", partial(read_image, **options), content)
 
 
 def _flipped(content: bytes, at: int) -> bytes:
@@ -52,37 +48,11 @@ def _flipped(content: bytes, at: int) -> bytes:
 
 _PNG, _JPEG, _WEBP, _TIFF = (_encoded(form) for form in ("PNG", "JPEG", "WEBP", "TIFF"))
 _UNREADABLE, _BROKEN = "a.png: file: is no readable image", "a.png: pixels: cannot be decoded"
-
-
-def _absent(folder: Path) -> object:
-    return read_image(folder / "none.png")
-
-
-def _folder(folder: Path) -> object:
-    (folder / "a.png").mkdir()
-    return read_image(folder / "a.png")
-
-
-def _pipe(folder: Path) -> object:
-    os.mkfifo(folder / "a.png")
-    return image_size(folder / "a.png")
-
-
-def _device(folder: Path) -> object:
-    (folder / "a.png").symlink_to("/dev/zero")
-    return read_image(folder / "a.png")
-
-
-def _huge_png_of_one_colour(folder: Path) -> object:
-    Image.new("L", (9_990, 9_990)).save(folder / "a.png")
-    return image_size(folder / "a.png")
-
-
 _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
-    "absent": (_absent, "none.png: file: is not there"),
-    "a folder": (_folder, r"a.png: file: "),
-    "a pipe": (_pipe, "a.png: file: is a pipe, a device or a socket"),
-    "a device": (_device, "a.png: file: is a pipe, a device or a socket"),
+    "absent": (at("none.png", read_image), "none.png: file: is not there"),
+    "a folder": (at("a.png", read_image, Path.mkdir), r"a.png: file: "),
+    "a pipe": (at("a.png", image_size, os.mkfifo), "a.png: file: is a pipe, a device or a socket"),
+    "a device": (at("a.png", read_image, a_device), "a.png: file: is a pipe, a device or a socket"),
     "empty": (_read(b""), _UNREADABLE),
     "one byte": (_read(b"\x89"), _UNREADABLE),
     "text": (_read(b"not a picture\n" * 9), _UNREADABLE),
@@ -118,6 +88,9 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "larger than allowed": (_read(_PNG, max_pixels=1199), "a.png: size: 40x30 is more than 1,199 pixels"),
     "header of 3.6 gigapixels": (_read(bomb(60_000, 60_000)), "a.png: (size|file)"),
     "header of 2^31 pixels a side": (_read(bomb(2**31 - 1, 2**31 - 1)), "a.png: (size|file)"),
-    "100 megapixels of one colour": (_huge_png_of_one_colour, "more than 200 times the file, as in no photo"),
+    "100 megapixels of one colour": (
+        at("a.png", image_size, Image.new("L", (9_990, 9_990)).save),
+        "more than 200 times the file, as in no photo",
+    ),
 }
 INPUTS = [BadInput("image", name, give, pattern) for name, (give, pattern) in _CASES.items()]

@@ -6,23 +6,23 @@ import math
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors import Images, Onnx
-from tests.helpers.malformed import Canary
 from tests.helpers.networks import onnx_bytes, photo, upscaling_weight
-from tests.stress.bad_inputs import BadInput
+from tests.stress.bad_inputs import BadInput, Canary, at
 
 _LR = (8, 12)
 
 
-def _onnx(content: bytes, **options) -> Callable[[Path], object]:
-    def give(folder: Path) -> object:
-        (folder / "net.onnx").write_bytes(content)
-        return Onnx(str(folder / "net.onnx"), **options)("view", photo(*_LR), 4)
+def _onnx(content: bytes, **options: Any) -> Callable[[Path], object]:
+    return at("net.onnx", lambda path: _enlarged(path, **options), content)
 
-    return give
+
+def _enlarged(path: Path, **options: Any) -> object:
+    return Onnx(str(path), **options)("view", photo(*_LR), 4)
 
 
 def _external(location: str) -> Callable[[Path], object]:
@@ -33,7 +33,7 @@ def _external(location: str) -> Callable[[Path], object]:
             there.write_bytes(weight.numpy().astype("<f4").tobytes())
         path = folder / "models" / "external.onnx"
         path.write_bytes(onnx_bytes(weight, external=location.format(folder=folder)))
-        return Onnx(str(path))("view", photo(*_LR), 4)
+        return _enlarged(path)
 
     return give
 
@@ -61,8 +61,8 @@ def _nothing(folder: Path) -> None:
 _GOOD = onnx_bytes(upscaling_weight())
 _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no path": (lambda folder: Onnx(), "prior.path: must be a network in ONNX, got ''"),
-    "path absent": (lambda folder: Onnx(str(folder / "none.onnx"))("view", photo(*_LR), 4), "none.onnx: "),
-    "path is a folder": (lambda folder: Onnx(str(folder))("view", photo(*_LR), 4), ": "),
+    "path absent": (at("none.onnx", _enlarged), "none.onnx: "),
+    "path is a folder": (_enlarged, ": "),
     "tiles all overlap": (_onnx(_GOOD, tile=16, overlap=4), "prior.tile: 0 <= 4 overlap < tile must hold"),
     "tile of 0": (_onnx(_GOOD, tile=0, overlap=0), "prior.tile: "),
     "overlap below 0": (_onnx(_GOOD, overlap=-1), "prior.tile: "),

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 
 from clear_strategies.data.ply import read_gaussians, read_points
-from tests.stress.bad_inputs import BadInput
+from tests.stress.bad_inputs import BadInput, at
 
 NAMES = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
          "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
@@ -31,15 +30,6 @@ def _text(body: str, *properties: str) -> bytes:
     """An ASCII file of one point."""
     xyz = [f"property float {name}" for name in "xyz"]
     return "\n".join(["ply", "format ascii 1.0", "element vertex 1", *xyz, *properties, "end_header", body]).encode()
-
-
-def _given(content: bytes, read: Callable[[Path], object] = read_gaussians) -> Callable[[Path], object]:
-    def give(folder: Path) -> object:
-        path = folder / "a.ply"
-        path.write_bytes(content)
-        return read(path)
-
-    return give
 
 
 _RGB = [f"property uchar {name}" for name in ("red", "green", "blue")]
@@ -102,6 +92,8 @@ _POINTS: dict[str, tuple[bytes, str]] = {
     "colours of two types": (_text("0 0 0 1 0 0", _RGB[0], *_FLOATS[1:]), "red, green, blue: must be all uchar"),
     "colour without blue": (_text("0 0 0 1 0", *_RGB[:2]), "blue: is missing"),
 }
-INPUTS = [BadInput("PLY", name, _given(content), pattern) for name, (content, pattern) in _GAUSSIANS.items()] + [
-    BadInput("PLY", name, _given(content, read_points), pattern) for name, (content, pattern) in _POINTS.items()
+INPUTS = [
+    BadInput("PLY", name, at("a.ply", read, content), pattern)
+    for read, cases in ((read_gaussians, _GAUSSIANS), (read_points, _POINTS))
+    for name, (content, pattern) in cases.items()
 ]

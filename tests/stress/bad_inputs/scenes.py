@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import json
+import pickle
+import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
 
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import blender, colmap, llff, nerfstudio
-from tests.helpers.malformed import CASES, Case
-from tests.stress.bad_inputs import BadInput
+from tests.helpers import captures as tiny
+from tests.stress.bad_inputs import BadInput, Canary, bomb
 
 READERS: dict[str, Callable[[Path], Capture]] = {
     "colmap": colmap.read,
@@ -16,15 +23,270 @@ READERS: dict[str, Callable[[Path], Capture]] = {
     "blender": blender.read,
     "nerfstudio": nerfstudio.read,
 }
+Spoil = Callable[[Path], object]
 
 
-def _read_all(case: Case) -> Callable[[Path], None]:
+def case(name: str, good: str, spoil: Spoil, pattern: str) -> BadInput:
+    """A sound scene by its name in `GOOD`, after a change to its folder."""
+    surface = good.removesuffix("_txt")
+
     def give(folder: Path) -> None:
-        kind, path = case.build(folder)
-        for frame in READERS[kind](path).frames:
+        root = tiny.GOOD[good](folder / "scene")
+        spoil(root)
+        for frame in READERS[surface](root).frames:
             frame.load()
 
-    return give
+    return BadInput(surface, name, give, pattern)
 
 
-INPUTS = [BadInput(case.good.removesuffix("_txt"), case.name, _read_all(case), case.pattern) for case in CASES]
+def remove(name: str) -> Spoil:
+    return lambda root: (root / name).unlink()
+
+
+def write(name: str, data: bytes) -> Spoil:
+    return lambda root: (root / name).write_bytes(data)
+
+
+def cut(name: str, size: int) -> Spoil:
+    """Keep the first `size` bytes, or all but the last -size."""
+    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:size])
+
+
+def append(name: str, data: bytes) -> Spoil:
+    return lambda root: (root / name).write_bytes((root / name).read_bytes() + data)
+
+
+def patch(name: str, at: int, layout: str, *values: float) -> Spoil:
+    """Overwrite packed numbers at a byte offset."""
+
+    def spoil(root: Path) -> None:
+        data = bytearray((root / name).read_bytes())
+        struct.pack_into(layout, data, at, *values)
+        (root / name).write_bytes(bytes(data))
+
+    return spoil
+
+
+def replace(name: str, old: str, new: str) -> Spoil:
+    """Replace the first occurrence of a text, which must be there."""
+
+    def spoil(root: Path) -> None:
+        text = (root / name).read_text()
+        if old not in text:
+            raise LookupError(f"{old!r} is not in {name}: the case would spoil nothing")
+        (root / name).write_text(text.replace(old, new, 1))
+
+    return spoil
+
+
+def edit(name: str, change: Callable[[dict[str, Any]], object]) -> Spoil:
+    """Change a JSON file's object in place."""
+
+    def spoil(root: Path) -> None:
+        value = json.loads((root / name).read_text())
+        change(value)
+        tiny.write_json(root / name, value)
+
+    return spoil
+
+
+def edit_frame(name: str, **values: object) -> Spoil:
+    return edit(name, lambda value: value["frames"][1].update(values))
+
+
+def save_image(name: str, **options: Any) -> Spoil:
+    """Replace a photo by another kind of image."""
+    size = options.pop("size", (tiny.WIDTH, tiny.HEIGHT))
+    mode = options.pop("mode", "RGB")
+    return lambda root: Image.new(mode, size).save(root / name, **options)
+
+
+def save_table(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+    return lambda root: np.save(root / "poses_bounds.npy", change(np.load(root / "poses_bounds.npy")))
+
+
+def npy_header(text: str) -> bytes:
+    body = text.encode().ljust(118 - 1) + b"\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(body)) + body
+
+
+def pickled_table(root: Path) -> None:
+    array = np.array([[Canary(root / "canary")]], dtype=object)
+    np.save(root / "poses_bounds.npy", array, allow_pickle=True)
+
+
+def raw_pickle(root: Path) -> None:
+    (root / "poses_bounds.npy").write_bytes(pickle.dumps(Canary(root / "canary")))
+
+
+def link_outside(name: str) -> Spoil:
+    """Replace a photo by a link to a file outside the scene's folder."""
+
+    def spoil(root: Path) -> None:
+        outside = root.parent / "outside.png"
+        outside.write_bytes((root / name).read_bytes())
+        (root / name).unlink()
+        (root / name).symlink_to(outside)
+
+    return spoil
+
+
+def link_in_circle(name: str) -> Spoil:
+    def spoil(root: Path) -> None:
+        (root / name).unlink()
+        (root / name).symlink_to(root / name)
+
+    return spoil
+
+
+def turned(root: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    Image.new("RGB", (tiny.WIDTH, tiny.HEIGHT)).save(root / "images/b.png", format="JPEG", exif=exif)
+
+
+def truncated_jpeg(root: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (tiny.HEIGHT, tiny.WIDTH, 3), np.uint8)
+    Image.fromarray(pixels).save(root / "images/b.png", format="JPEG", quality=95)
+    cut("images/b.png", -200)(root)
+
+
+def two_images_of_one_name(root: Path) -> None:
+    file = root / "sparse/0/images.bin"
+    file.write_bytes(file.read_bytes().replace(b"b.png\0", b"a.png\0"))
+
+
+def name_without_end(root: Path) -> None:
+    cut(IMAGES, NAME_AT)(root)
+    append(IMAGES, b"x" * 300)(root)
+
+
+CAMERAS, IMAGES, POINTS = (f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D"))
+CAMERAS_TXT, IMAGES_TXT, POINTS_TXT = (f"sparse/0/{name}.txt" for name in ("cameras", "images", "points3D"))
+QUATERNION_AT = 8 + 4  # in images.bin: behind the count and the first id
+NAME_AT = QUATERNION_AT + 7 * 8 + 4
+TRAIN, SHARED = "transforms_train.json", "transforms.json"
+
+INPUTS = [
+    # COLMAP, binary
+    case("no model", "colmap", remove(CAMERAS), r"cameras\.bin: file"),
+    case("no photos", "colmap", lambda root: (root / "images").rename(root / "photos"), r"scene/images: images: is no folder"),
+    case("photo absent", "colmap", remove("images/b.png"), r"images\.bin: photos: 1 of 3 .* b\.png: .*data\.missing=skip"),
+    case("empty file", "colmap", write(IMAGES, b""), r"images\.bin: number of images: .*truncated"),
+    case("cameras truncated", "colmap", cut(CAMERAS, -1), r"cameras\.bin: .*bytes"),
+    case("images truncated", "colmap", cut(IMAGES, -9), r"images\.bin: .*left"),
+    case("points truncated", "colmap", cut(POINTS, -3), r"points3D\.bin: .*left"),
+    case("trailing bytes", "colmap", append(POINTS, b"\0" * 5), r"points3D\.bin: end: 5 bytes"),
+    case("count beyond file", "colmap", patch(IMAGES, 0, "<Q", 2**61), r"images\.bin: number of images: is 23058"),
+    case("2D count beyond file", "colmap", patch(IMAGES, NAME_AT + 6, "<Q", 2**60), r"images\.bin: 2D points of 'a"),
+    case("track beyond file", "colmap", patch(POINTS, 8 + 8 + 24 + 3 + 8, "<Q", 2**59), r"points3D\.bin: track of"),
+    case("zero quaternion", "colmap", patch(IMAGES, QUATERNION_AT, "<4d", 0, 0, 0, 0), r"images\.bin: a\.png: .*leng"),
+    # Its length is 2 by hypot, and less by the root of the sum of squares.
+    case("quaternion of length 2", "colmap",
+         patch(IMAGES, QUATERNION_AT, "<4d", 1.969615506024416, 0, 0.34729635533386066, 0), r"of length 2:"),
+    case("NaN pose", "colmap", patch(IMAGES, QUATERNION_AT, "<d", float("nan")), r"images\.bin: a\.png: .*finite"),
+    case("infinite translation", "colmap", patch(IMAGES, QUATERNION_AT + 32, "<d", float("inf")), r"a\.png: .*finite"),
+    case("NaN point", "colmap", patch(POINTS, 16, "<d", float("nan")), r"points3D\.bin: point 0: .*finite"),
+    case("point beyond float32", "colmap", patch(POINTS, 16, "<d", 1e300), r"points3D\.bin: point 0: .*finite"),
+    case("unknown camera id", "colmap", patch(IMAGES, NAME_AT - 4, "<i", 9), r"images\.bin: a\.png: .*camera 9"),
+    case("duplicate image id", "colmap", patch(IMAGES, 8, "<i", 2), r"images\.bin: id 2: occurs twice"),
+    case("duplicate name", "colmap", two_images_of_one_name, r"file name: 'a\.png' belongs to two"),
+    case("duplicate point id", "colmap", patch(POINTS, 8, "<Q", 2), r"points3D\.bin: .*occurs twice"),
+    case("unknown image in track", "colmap", patch(POINTS, 8 + 8 + 24 + 3 + 8 + 8, "<i", 77), r"unknown image 77"),
+    case("unknown camera model", "colmap", patch(CAMERAS, 12, "<i", 42), r"cameras\.bin: camera model: number 42"),
+    case("no focal length", "colmap", patch(CAMERAS, 32, "<d", 0.0), r"cameras\.bin: camera 1: .*focal"),
+    case("size of zero", "colmap", patch(CAMERAS, 16, "<Q", 0), r"cameras\.bin: camera 1: has size 0x12"),
+    case("principal point far away", "colmap", patch(CAMERAS, 48, "<d", 1e6), r"cameras\.bin: .*principal point"),
+    case("name is no UTF-8", "colmap", patch(IMAGES, NAME_AT, "<B", 0xFF), r"images\.bin: name of image 0: .*UTF-8"),
+    case("name without end", "colmap", name_without_end, r"images\.bin: name of image 0: is no text"),
+    case("images of another shape", "colmap", save_image("images/b.png", size=(16, 9)), r"b\.png: size: is 16x9"),
+    case("symlink leads out", "colmap", link_outside("images/b.png"), r"images\.bin: file name: 'b\.png' leads out"),
+    case("symlink in a circle", "colmap", link_in_circle("images/b.png"), r"images\.bin: .*b\.png"),
+    case("image bomb", "colmap", write("images/b.png", bomb(60000, 60000)), r"b\.png: (size|file): .*(pixels|Bomb)"),
+    case("text named .png", "colmap", write("images/b.png", b"not a picture\n" * 9), r"b\.png: file: is no readable"),
+    case("GIF named .png", "colmap", save_image("images/b.png", format="GIF", mode="L"), r"b\.png: file: is no read"),
+    case("empty photo", "colmap", write("images/b.png", b""), r"b\.png: file: is no readable"),
+    case("photo truncated", "colmap", cut("images/b.png", -60), r"b\.png: pixels: cannot be decoded"),
+    case("JPEG truncated", "colmap", truncated_jpeg, r"b\.png: pixels: cannot be decoded"),
+    case("photo upside down by EXIF", "colmap", turned, r"b\.png: EXIF orientation: is 3"),
+    case("CMYK photo", "colmap", save_image("images/b.png", format="TIFF", mode="CMYK"), r"b\.png: colour mode: is CM"),
+    # COLMAP, text
+    case("txt beside broken bin", "colmap_txt", write(CAMERAS, b"\1"), r"cameras\.bin: number of cameras"),
+    case("txt byte-order mark", "colmap_txt", replace(CAMERAS_TXT, "#", "\ufeff#"), r"cameras\.txt: line 1: .*byte-order"),
+    case("txt decimal comma", "colmap_txt", replace(CAMERAS_TXT, "20.0", "20,0"), r"cameras\.txt: line 2: .*comma"),
+    case("txt NaN", "colmap_txt", replace(POINTS_TXT, "3.0", "nan"), r"points3D\.txt: line 2: has 'nan'"),
+    case("txt 1e999", "colmap_txt", replace(CAMERAS_TXT, "20.0", "1e999"), r"cameras\.txt: line 2: .*finite"),
+    case("txt too few parameters", "colmap_txt", replace(CAMERAS_TXT, " 8 6", " 8"), r"cameras\.txt: line 2: has 3 param"),
+    case("txt column missing", "colmap_txt", replace(IMAGES_TXT, " 1 a.png", " a.png"), r"images\.txt: line 3: has 9"),
+    case("txt second line missing", "colmap_txt", replace(IMAGES_TXT, "a.png\n\n", "a.png\n"), r"images\.txt: line 4"),
+    case("txt last line missing", "colmap_txt", replace(IMAGES_TXT, "c.png\n8.0 6.0 -1\n", "c.png"), r"images\.txt: line 8"),
+    case("txt odd track", "colmap_txt", replace(POINTS_TXT, "0.5 1 0", "0.5 1"), r"points3D\.txt: line 2: has 11 col"),
+    case("txt colour 300", "colmap_txt", replace(POINTS_TXT, "255", "300"), r"points3D\.txt: line 2: has the colour"),
+    case("txt 5000 digits", "colmap_txt", replace(CAMERAS_TXT, "16", "1" * 5000), r"cameras\.txt: line 2: .*whole"),
+    case("txt absolute path", "colmap_txt", replace(IMAGES_TXT, "a.png", "/etc/passwd"), r"images\.txt: .*leads out"),
+    case("txt path traversal", "colmap_txt", replace(IMAGES_TXT, "a.png", "../../x.png"), r"images\.txt: .*leads out"),
+    # LLFF
+    case("npy absent", "llff", remove("poses_bounds.npy"), r"poses_bounds\.npy: file: .*No such file"),
+    case("npy truncated", "llff", cut("poses_bounds.npy", -8), r"poses_bounds\.npy: size: .*asks for 408 bytes, 400"),
+    case("npy trailing bytes", "llff", append("poses_bounds.npy", b"\0"), r"poses_bounds\.npy: size"),
+    case("npy of objects", "llff", pickled_table, r"poses_bounds\.npy: header: .*object"),
+    case("pickle named .npy", "llff", raw_pickle, r"poses_bounds\.npy: header: is no \.npy"),
+    case("npy header asks TiB", "llff",
+         write("poses_bounds.npy", npy_header("{'descr': '<f8', 'fortran_order': False, 'shape': (999999, 17), }")),
+         r"poses_bounds\.npy: size: the header asks for 135999864 bytes"),
+    case("npy header nests", "llff", write("poses_bounds.npy", npy_header("-" * 100)), r"poses_bounds\.npy: header"),
+    case("npy wrong columns", "llff", save_table(lambda t: t[:, :15]), r"header: has the shape \(3, 15\)"),
+    case("npy whole numbers", "llff", save_table(lambda t: t.astype(np.int64)), r"header: has the type int64"),
+    case("npy too few rows", "llff", save_table(lambda t: t[:2]), r"poses_bounds\.npy: rows: there are 2"),
+    case("npy NaN", "llff", save_table(lambda t: np.where(t == t[1, 3], np.nan, t)), r"poses_bounds\.npy: values"),
+    case("npy not rotations", "llff", save_table(lambda t: t * 1.5), r"poses_bounds\.npy: row 0: .*rotation"),
+    case("npy bounds turned round", "llff", save_table(lambda t: t[:, [*range(15), 16, 15]]), r"bounds: are 9 and 1"),
+    case("LLFF images of another shape", "llff", save_image("images_4/b.png", size=(12, 16)), r"b\.png: size: is 12x16"),
+    # Blender
+    case("JSON absent", "blender", remove(TRAIN), r"transforms_train\.json: file"),
+    case("no JSON", "blender", write(TRAIN, b"{'a': 1}"), r"transforms_train\.json: json: is not valid"),
+    case("JSON list", "blender", write(TRAIN, b"[]"), r"transforms_train\.json: json: is a list"),
+    case("deep JSON", "blender", write(TRAIN, b"[" * 100_000), r"transforms_train\.json: json: .*deep"),
+    case("JSON not UTF-8", "blender", write(TRAIN, b'{"a": "\xff"}'), r"transforms_train\.json: json"),
+    case("5000 digits", "blender", write(TRAIN, b'{"camera_angle_x": ' + b"7" * 5000 + b"}"), r"json: is not valid"),
+    case("no frames", "blender", edit(TRAIN, lambda v: v.update(frames=[])), r"transforms_train\.json: frames"),
+    case("no angle", "blender", edit(TRAIN, lambda v: v.pop("camera_angle_x")), r"camera_angle_x: is missing"),
+    case("angle beyond pi", "blender", edit(TRAIN, lambda v: v.update(camera_angle_x=4)), r"camera_angle_x: is 4"),
+    case("two frames of one file", "blender", edit_frame(TRAIN, file_path="./train/a"), r"'a' belongs to two"),
+    case("frame without image", "blender", edit_frame(TRAIN, file_path="./train/x"), r"train\.json: photos: 1 of 2 .* x\.png: "),
+    case("path leads out", "blender", edit_frame(TRAIN, file_path="../../x"), r"train\.json: file name: .*leads out"),
+    case("path with a surrogate", "blender", edit_frame(TRAIN, file_path="\ud800"), r"train\.json: file name"),
+    case("path of 5000 letters", "blender", edit_frame(TRAIN, file_path="x" * 5000), r"file name: 'x+' is no file name"),
+    # nerfstudio
+    case("NaN constant", "nerfstudio", replace(SHARED, '"fl_x": 20.0', '"fl_x": NaN'), r"json: is not valid \(NaN"),
+    case("1e999", "nerfstudio", replace(SHARED, '"fl_x": 20.0', '"fl_x": 1e999'), r"json: is not valid \(1e999"),
+    case("duplicate key", "nerfstudio", replace(SHARED, '"fl_x"', '"h": 12, "fl_x"'), r"the key 'h' occurs twice"),
+    case("number of 100 digits", "nerfstudio", edit(SHARED, lambda v: v.update(fl_x=10**100)), r"fl_x: must be"),
+    case("text for a number", "nerfstudio", edit(SHARED, lambda v: v.update(cx="8")), r"frames\[0\]\.cx: must be"),
+    case("true for a number", "nerfstudio", edit(SHARED, lambda v: v.update(cx=True)), r"frames\[0\]\.cx: must be"),
+    case("no intrinsics", "nerfstudio", edit(SHARED, lambda v: v.pop("fl_x")), r"frames\[0\]\.fl_x: is missing"),
+    case("360 degree camera", "nerfstudio", edit(SHARED, lambda v: v.update(camera_model="EQUIRECTANGULAR")),
+         r"frames\[0\]\.camera_model: is 'EQUIRECTANGULAR'"),
+    case("k4 of a perspective camera", "nerfstudio", edit(SHARED, lambda v: v.update(k4=0.1)), r"frames\[0\]\.k4"),
+    case("lens that folds", "nerfstudio", edit(SHARED, lambda v: v.update(k1=-40.0)), r"a\.png: distortion: .*removed"),
+    case("matrix 2x4", "nerfstudio", edit_frame(SHARED, transform_matrix=[[1, 0, 0, 0], [0, 1, 0, 0]]),
+         r"frames\[1\]\.transform_matrix: is no 3x4"),
+    case("matrix missing", "nerfstudio", edit(SHARED, lambda v: v["frames"][1].pop("transform_matrix")),
+         r"frames\[1\]\.transform_matrix: is no 3x4"),
+    case("matrix mirrors", "nerfstudio", edit_frame(SHARED, transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()),
+         r"frames\[1\]\.transform_matrix: holds no rotation"),
+    case("matrix scales", "nerfstudio", edit_frame(SHARED, transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()),
+         r"frames\[1\]\.transform_matrix: holds no rotation"),
+    case("matrix last row", "nerfstudio", edit_frame(SHARED, transform_matrix=np.diag([1.0, 1, 1, 2]).tolist()),
+         r"frames\[1\]\.transform_matrix: has the last row"),
+    case("file_path missing", "nerfstudio", edit_frame(SHARED, file_path=None), r"frames\[1\]\.file_path: must be"),
+    case("absolute file_path", "nerfstudio", edit_frame(SHARED, file_path="/etc/hostname"), r"file name: .*leads out"),
+    case("w and h of another shape", "nerfstudio", edit(SHARED, lambda v: v.update(w=12, h=16)), r"a\.png: size"),
+    case("split lists overlap", "nerfstudio",
+         edit(SHARED, lambda v: v.update(train_filenames=["images/a.png"], test_filenames=["images/a.png"])),
+         r"test_filenames: 'images/a\.png' is for training"),
+    case("split lists a stranger", "nerfstudio", edit(SHARED, lambda v: v.update(test_filenames=["images/z.png"])),
+         r"split: lists 'images/z\.png'"),
+    case("PLY absent", "nerfstudio", edit(SHARED, lambda v: v.update(ply_file_path="p.ply")), r"p\.ply: file"),
+    case("PLY leads out", "nerfstudio", edit(SHARED, lambda v: v.update(ply_file_path="../p.ply")), r"file name"),
+]  # fmt: skip
