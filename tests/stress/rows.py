@@ -8,6 +8,8 @@ from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+import msgspec
+
 from clear_strategies import files
 
 
@@ -63,11 +65,8 @@ def read(path: Path) -> list[Row]:
     """The rows of earlier measurements; none where there is no file."""
     if not path.exists():
         return []
-    kinds = {"cases": int, "goal": int, "worst": float, "bound": float}
     with path.open(newline="", encoding="utf-8") as file:
-        return [
-            Row(**{name: kinds.get(name, str)(value) for name, value in row.items()}) for row in csv.DictReader(file)
-        ]
+        return msgspec.convert(list(csv.DictReader(file)), list[Row], strict=False)
 
 
 def write(path: Path, rows: Iterable[Row]) -> None:
