@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -43,3 +44,38 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip("real scenes are not here: ../shared/data is absent")
     return folder
+
+
+@pytest.fixture
+def blocks_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, int], int], None]:
+    """Lets the kernels of a table of lanes run with this many threads per block, as on CUDA, where lanes sum together."""
+    import warp as wp
+
+    if not hasattr(wp.config, "enable_cpu_blocks"):
+        pytest.skip("this Warp has no blocks of several threads on a CPU")
+
+    def use(lanes: dict[str, int], threads: int) -> None:
+        monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+        monkeypatch.setitem(lanes, "cpu", threads)
+
+    return use
+
+
+@pytest.fixture
+def ptx_of(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., str]:
+    """Compiles the module of a kernel for CUDA, with `lanes` threads per block or Warp's own number; returns its assembly."""
+    if sys.platform == "darwin":
+        pytest.skip("Warp for macOS brings no compiler for CUDA")
+    import warp as wp
+
+    def compiled(module: Any, lanes: int | None = None) -> str:
+        if lanes is not None:
+            monkeypatch.setitem(module.options, "block_dim", lanes)
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        wp.compile_aot_module(module, arch=90, module_dir=folder, use_ptx=True)
+        (file,) = folder.glob("*.ptx")
+        assembly = file.read_text()
+        assert ".target sm_90" in assembly
+        return assembly
+
+    return compiled

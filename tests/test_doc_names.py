@@ -17,7 +17,6 @@ from omegaconf import DictConfig, OmegaConf
 import clear_strategies
 from clear_strategies import Strategy
 from clear_strategies.compose import CONF, OPTIONS, composed
-from tests.helpers.floors import DOORS, FLOORS
 from tests.helpers.pages import DOCS, HOOKS, OURS, PAGES, ROOT, loaded, name
 
 
@@ -207,21 +206,6 @@ def test_the_configuration_page_lists_every_choice_and_every_setting():
         if not path.stem.startswith("_") and path.parent != CONF:
             assert f"| `{path.stem}` |" in page, path
     assert len(FIELDS) > 100
-
-
-def test_the_architecture_page_shows_the_floors():
-    def rows(after: str) -> list[list[set[str]]]:
-        text = (DOCS / "explanation" / "architecture.md").read_text().split(after)[1].split("\n\n")[0]
-        return [
-            [set(re.findall(r"`([^`]+)`", cell)) for cell in line.split("|")[1:-1]]
-            for line in text.splitlines()
-            if line.startswith("| `")
-        ]
-
-    floors = {min(folder): (imports, libraries) for folder, _, imports, libraries in rows("| folder or file |")}
-    assert floors == FLOORS
-    assert list(floors) == list(FLOORS)
-    assert {min(door): libraries for door, libraries in rows("| door |")} == DOORS
 
 
 def test_the_table_of_hooks_shows_the_hooks_of_a_strategy():

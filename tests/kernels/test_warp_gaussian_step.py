@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from types import SimpleNamespace
 
 import pytest
@@ -47,15 +46,10 @@ def two_steps(warp_step):
 
 
 @pytest.mark.slow
-def test_blocks_of_many_threads_give_the_same_bits(warp_step, monkeypatch):
-    """As on CUDA, where lanes sum together and the last block is not full; Warp can emulate this on a CPU."""
-    import warp as wp
-
-    if not hasattr(wp.config, "enable_cpu_blocks"):
-        pytest.skip("this Warp has no blocks of several threads on a CPU")
+def test_blocks_of_many_threads_give_the_same_bits(warp_step, blocks_of):
+    """The last block is not full."""
     state, conflicts, readings, skipped = two_steps(warp_step)
-    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-    monkeypatch.setitem(warp_step.LANES, "cpu", 128)
+    blocks_of(warp_step.LANES, 128)
     again = two_steps(warp_step)
     assert all(torch.equal(a, b) for a, b in zip(state, again[0], strict=True))
     assert again[1] == conflicts
@@ -121,15 +115,7 @@ def test_cuda_fields_without_warp_use_the_readable_path_and_log_why(adam_on_cuda
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "darwin", reason="Warp for macOS brings no compiler for CUDA")
-def test_the_kernels_compile_for_cuda_on_a_machine_without(warp_step, monkeypatch, tmp_path):
-    import warp as wp
-
-    module = warp_step.passes.step.module  # the module of all three kernels
-    monkeypatch.setitem(module.options, "block_dim", warp_step.LANES["cuda"])
-    wp.compile_aot_module(module, arch=90, module_dir=tmp_path, use_ptx=True)
-    (compiled,) = tmp_path.glob("*.ptx")
-    assembly = compiled.read_text()
-    assert ".target sm_90" in assembly
+def test_the_kernels_compile_for_cuda_on_a_machine_without(warp_step, ptx_of):
+    assembly = ptx_of(warp_step.passes.step.module, warp_step.LANES["cuda"])  # the module of all three kernels
     assert ".local" not in assembly  # no spills: a thread's numbers are in registers
     assert "fma.rn.f32" not in assembly  # products and sums round as in torch

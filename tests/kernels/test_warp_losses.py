@@ -102,18 +102,12 @@ def test_repeated_losses_have_the_same_bits(loss):
 @pytest.mark.slow
 @needs_warp
 @pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
-def test_blocks_of_many_threads_agree_with_one_thread(monkeypatch, loss):
-    """As on CUDA, with 256 threads per block; Warp can emulate this on a CPU."""
-    import warp as wp
-
+def test_blocks_of_many_threads_agree_with_one_thread(blocks_of, loss):
     from clear_strategies.kernels.losses.warp import launches
 
-    if not hasattr(wp.config, "enable_cpu_blocks"):
-        pytest.skip("this Warp has no blocks of several threads on a CPU")
     x, y = rough(photo(15, 90), 0.1)
     alone = loss(x, y, "warp")
-    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-    monkeypatch.setitem(launches.LANES, "cpu", launches.LANES["cuda"])
+    blocks_of(launches.LANES, launches.LANES["cuda"])
     together = loss(x, y, "warp")
     assert float(together.value) == pytest.approx(float(alone.value), rel=1e-6)
     assert torch.allclose(together.gradient, alone.gradient, rtol=1e-5, atol=1e-6 * float(alone.gradient.abs().max()))
@@ -121,18 +115,10 @@ def test_blocks_of_many_threads_agree_with_one_thread(monkeypatch, loss):
 
 @pytest.mark.slow
 @needs_warp
-@pytest.mark.skipif(sys.platform == "darwin", reason="Warp for macOS brings no compiler for CUDA")
-def test_the_kernels_compile_for_cuda_on_a_machine_without(monkeypatch, tmp_path):
-    import warp as wp
-
+def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     from clear_strategies.kernels.losses.warp import haar, launches, similarity, sums
 
     lanes = launches.LANES["cuda"]
     made = (similarity.similarity, similarity.gradient, haar.details, sums.absolute, sums.total)
     for kernel in (haar.low_part, *(make(lanes) for make in made)):
-        monkeypatch.setitem(kernel.module.options, "block_dim", lanes)
-        wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path / kernel.key, use_ptx=True)
-        (compiled,) = (tmp_path / kernel.key).glob("*.ptx")
-        code = compiled.read_text()
-        assert ".target sm_90" in code
-        assert ".local" not in code  # no spills: rows of numbers are in registers
+        assert ".local" not in ptx_of(kernel.module, lanes)  # no spills: rows of numbers are in registers

@@ -14,9 +14,9 @@ import rasterizers
 from rasterizers import BackendUnavailable
 from rasterizers.testing import gradient_of
 from tests.helpers.agreement import require_same_bits
-from tests.helpers.backends import CLEAN, camera, cotangents, dense_scene, everything, why_not
+from tests.helpers.backends import CLEAN, camera, cotangents, dense_scene, everything, needs
 
-installed = pytest.mark.skipif(bool(why_not("warp")), reason=str(why_not("warp")))
+installed = needs("warp")
 no_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA")
 
 
@@ -52,20 +52,14 @@ def test_an_unknown_device_is_refused():
 
 @installed
 @pytest.mark.parametrize("k", [1, 3])
-def test_the_blending_vjp_is_the_same_with_32_threads_per_tile(monkeypatch, k):
-    """As on CUDA, where 32 lanes sum together; Warp can emulate this on a CPU."""
-    import warp as wp
-
+def test_the_blending_vjp_is_the_same_with_32_threads_per_tile(blocks_of, k):
     from rasterizers.warp_backend import frame
 
-    if not hasattr(wp.config, "enable_cpu_blocks"):
-        pytest.skip("this Warp has no blocks of several threads on a CPU")
     splats, view = dense_scene(600)
     v = cotangents(k, view.height, view.width)
     rasterizer = rasterizers.load("warp", device="cpu", **CLEAN)
     alone = rasterizer(splats, view).vjp(v)
-    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
-    monkeypatch.setitem(frame.LANES, "cpu", 32)
+    blocks_of(frame.LANES, 32)
     together, again = (rasterizer(splats, view).vjp(v) for _ in range(2))
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "screen"):
         found, expected = gradient_of(together, name), gradient_of(alone, name)
@@ -73,15 +67,26 @@ def test_the_blending_vjp_is_the_same_with_32_threads_per_tile(monkeypatch, k):
         assert torch.equal(found, gradient_of(again, name))
 
 
+@pytest.fixture
+def sevens(monkeypatch):
+    """Uninitialised memory holds sevens."""
+    from rasterizers.warp_backend import frame
+
+    empty = frame.Frame.empty
+    monkeypatch.setattr(
+        frame.Frame, "empty", lambda self, *s, dtype=torch.float32: empty(self, *s, dtype=dtype).fill_(7)
+    )
+
+
 @installed
-def test_unused_places_do_not_change_the_image(monkeypatch):
+def test_unused_places_do_not_change_the_image(monkeypatch, sevens):
     """A compiler may round the count of tiles and their list differently; a Gaussian then has more places than tiles."""
     from rasterizers.warp_backend import frame
 
     splats, view = dense_scene(200)
     v = cotangents(2, view.height, view.width)
     expected = everything(rasterizers.load("warp", device="cpu")(splats, view), v)
-    project, empty = frame.Frame.project, frame.Frame.empty
+    project = frame.Frame.project
     unused = torch.arange(200) % 3
 
     def counting_too_many(self):
@@ -92,22 +97,15 @@ def test_unused_places_do_not_change_the_image(monkeypatch):
         return keys
 
     monkeypatch.setattr(frame.Frame, "project", counting_too_many)
-    monkeypatch.setattr(
-        frame.Frame, "empty", lambda self, *s, dtype=torch.float32: empty(self, *s, dtype=dtype).fill_(7)
-    )
     require_same_bits(everything(rasterizers.load("warp", device="cpu")(splats, view), v), expected)
 
 
 @pytest.fixture
-def deferred(monkeypatch):
-    """Counts are read when an image is accessed, as on CUDA; uninitialised memory holds sevens."""
+def deferred(monkeypatch, sevens):
+    """Counts are read when an image is accessed, as on CUDA."""
     from rasterizers.warp_backend import frame
 
-    empty = frame.Frame.empty
     monkeypatch.setitem(frame.DEFERRED_COUNTS, "cpu", True)
-    monkeypatch.setattr(
-        frame.Frame, "empty", lambda self, *s, dtype=torch.float32: empty(self, *s, dtype=dtype).fill_(7)
-    )
 
 
 @installed
@@ -192,17 +190,10 @@ def test_no_local_name_hides_a_constant_of_warp():
 
 @pytest.mark.slow
 @installed
-@pytest.mark.skipif(sys.platform == "darwin", reason="Warp for macOS brings no compiler for CUDA")
-def test_the_kernels_compile_for_cuda_on_a_machine_without(monkeypatch, tmp_path):
-    import warp as wp
-
+def test_the_kernels_compile_for_cuda_on_a_machine_without(ptx_of):
     from rasterizers.warp_backend import bins, blend, colour, project
 
-    kernels = [bins.list_pairs, colour.basis, project.project]
-    back = blend.blend_vjp(1, 32)
-    monkeypatch.setitem(back.module.options, "block_dim", 32)
-    kernels += [blend.blend(False), blend.blend(True), back, project.project_vjp(1)]
-    for i, kernel in enumerate(kernels):
-        wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path / str(i), use_ptx=True)
-        (compiled,) = (tmp_path / str(i)).glob("*.ptx")
-        assert ".target sm_90" in compiled.read_text()
+    forward = (bins.list_pairs, colour.basis, project.project, blend.blend(False), blend.blend(True))
+    for kernel in (*forward, project.project_vjp(1)):
+        ptx_of(kernel.module)
+    ptx_of(blend.blend_vjp(1, 32).module, 32)
