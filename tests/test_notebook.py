@@ -15,15 +15,14 @@ from PIL import Image
 import clear_strategies as cs
 from clear_strategies.bench.device import TINY
 from clear_strategies.errors import DataError, SettingError
-
-WITHOUT_PICTURES = ("fit.baseline=false", "fit.page=0", "fit.video=0", "fit.map_views=0", "fit.checkpoint_every=0")
+from tests.helpers.command_line import ALONE
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> cs.Run:
     folder = tmp_path_factory.mktemp("notebook") / "run"
     threads = torch.get_num_threads()
-    made = cs.train(None, *TINY, *WITHOUT_PICTURES, "prior=bicubic", folder=folder)
+    made = cs.train(None, *TINY, *ALONE, "fit.checkpoint_every=0", "prior=bicubic", folder=folder)
     assert torch.get_num_threads() == threads
     return made
 

@@ -97,9 +97,7 @@ def test_resuming_through_the_door_gives_the_same_field(finished):
 
 
 def test_a_sweep_goes_on_after_a_bad_job(tmp_path):
-    result = run(
-        "-m", "strategies.gco.tolerance=0.1,7", "+strategy=gco", "fit.iterations=3", *TINY[:2], *TINY[4:], cwd=tmp_path
-    )
+    result = run("-m", "strategies.gco.tolerance=0.1,7", "+strategy=gco", *TINY, "fit.iterations=3", cwd=tmp_path)
     said = result.stdout + result.stderr
     assert result.returncode == 2
     assert "strategies.gco.tolerance: must lie in [0, 1), got 7" in said
@@ -117,8 +115,8 @@ def test_a_strategy_of_another_package(tmp_path):
         "    def correct(self, lr, hr, evidence):\n"
         "        return hr * self.share\n"
     )
-    result = run("+strategy=p2g", "+strategies.mine._target_=theirs.Mine", "+strategies.mine.share=0.25", "fit.iterations=3",
-                 "hydra.run.dir=out", *TINY[:2], *TINY[4:], cwd=tmp_path)  # fmt: skip
+    result = run("+strategy=p2g", "+strategies.mine._target_=theirs.Mine", "+strategies.mine.share=0.25",
+                 "hydra.run.dir=out", *TINY, "fit.iterations=3", cwd=tmp_path)  # fmt: skip
     # `python -m` puts the current folder on the path, as a user expects.
     assert result.returncode == 0, result.stderr
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["strategies"] == ["p2g", "mine"]

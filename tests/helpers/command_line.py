@@ -9,11 +9,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from clear_strategies.bench import device
 from tests.helpers.forked import ROOT, Forked
 
-TINY = ["data.reader.width=64", "data.reader.height=48", "fit.iterations=12", "fit.max_degree=1", "data.cloud.init=random",
-        "data.cloud.random_points=60", "data.reader.views=5", "data.reader.train=2", "data.views.train=2",
-        "skips=none", "fit.baseline=false", "fit.page=0", "fit.video=0", "fit.map_views=0"]  # fmt: skip
+ALONE = ["fit.baseline=false", "fit.page=0", "fit.video=0", "fit.map_views=0"]
+"""A run that writes little beside its field."""
+TINY = [*device.TINY, "skips=none", *ALONE]
 
 
 def environment(cwd: Path) -> dict[str, str]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
 
 import rasterizers
 from clear_strategies.geometry.projection import intrinsics
-from rasterizers import Splats, autograd
+from rasterizers import SplatGradients, Splats, autograd
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import pixels_of, scene
 from tests.helpers.backends import camera
@@ -17,6 +17,12 @@ from tests.helpers.backends import camera
 
 def leaves(splats: Splats) -> Splats:
     return Splats(**{f.name: getattr(splats, f.name).clone().requires_grad_() for f in fields(Splats)})
+
+
+def require_gradients(splats: Splats, screen: torch.Tensor, expected: SplatGradients) -> None:
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        assert torch.allclose(getattr(splats, name).grad, getattr(expected, name)[0], rtol=1e-9, atol=1e-12), name
+    assert torch.allclose(screen, expected.screen[0])
 
 
 @pytest.mark.parametrize("depth", [False, True])
@@ -27,10 +33,8 @@ def test_a_loss_of_the_image_has_the_gradient_of_the_vjp(depth):
     drawn = autograd.draw(rasterizer, splats, view, depth=depth)
     (drawn.image * v).sum().backward()
     expected = rasterizer(splats, view).vjp(v[None])
-    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-        assert torch.allclose(getattr(splats, name).grad, getattr(expected, name)[0], rtol=1e-9, atol=1e-12), name
+    require_gradients(splats, drawn.means2d.grad, expected)
     assert torch.allclose(splats.rgb_offset.grad, expected.rgb[0])
-    assert torch.allclose(drawn.means2d.grad, expected.screen[0])
 
 
 def test_a_loss_of_depth_is_refused_rather_than_left_out():
@@ -45,8 +49,7 @@ def test_depth_that_was_not_asked_for_is_not_drawn():
 
 def test_the_stand_in_for_gsplats_rasterization_has_our_rasterizers_gradients():
     """The expected depth is the fourth channel of its images."""
-    view, names = camera(40, 30), [f.name for f in fields(Splats)[:6]]
-    splats = Splats(**{name: getattr(leaves(scene(60, dtype=torch.float64)), name) for name in names})
+    view, splats = camera(40, 30), replace(leaves(scene(60, dtype=torch.float64)), rgb_offset=None)
     geometry = (
         splats.means, splats.quats, splats.scales, splats.opacities, torch.cat((splats.sh0, splats.shN), 1),
         view.world_to_camera.double()[None], intrinsics(view)[None], 40, 30,
@@ -57,9 +60,6 @@ def test_the_stand_in_for_gsplats_rasterization_has_our_rasterizers_gradients():
     assert torch.allclose(images[0], pixels_of(expected))
     v = torch.randn(1, 30, 40, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     (images[..., :3] * v).sum().backward()
-    gradients = expected.vjp(v)
-    for name in names:
-        assert torch.allclose(getattr(splats, name).grad, getattr(gradients, name)[0], rtol=1e-9, atol=1e-12), name
-    assert torch.allclose(info["means2d"].grad[0], gradients.screen[0])
+    require_gradients(splats, info["means2d"].grad[0], expected.vjp(v))
     with pytest.raises(ValueError, match="needs CUDA"):
         autograd.rasterization(*geometry, render_mode="D", **settings)

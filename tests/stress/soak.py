@@ -14,6 +14,7 @@ import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective
 from clear_strategies.density.adaptive import DensitySettings
+from clear_strategies.schedules import scaled
 from clear_strategies.training import checkpoint
 from clear_strategies.training.evaluation import evaluate
 from clear_strategies.training.loop import iterate
@@ -44,8 +45,6 @@ def run(iterations: int) -> list[Row]:
         rasterizer, backend = load("cpp"), "cpp"
     except BackendUnavailable:
         rasterizer, backend = toy.RASTERIZER, "torch"
-    from clear_strategies.schedules import scaled
-
     svs = scaled(SVS(anchor_strength=0.01), stretch)
     state = TrainState.start(
         scene,

@@ -37,19 +37,21 @@ def _rewritten(name: str, change: Callable[[bytes], bytes]) -> Callable[[Path], 
 
 
 def _sealed(**changes: Any) -> Callable[[Path], object]:
-    """A manifest that was changed, and then given the hash of its new content."""
+    """A manifest that was changed, and then given the hash of its new content; `...` takes an entry away."""
 
-    def spoil(path: Path) -> None:
-        manifest = json.loads((path / "manifest.json").read_text())
-        manifest.pop("sha256_of_manifest")
-        for name, value in changes.items():
-            if value is ...:
-                manifest.pop(name)
-            else:
-                manifest[name] = value
-        (path / "manifest.json").write_text(checkpoint._sealed(manifest))
+    def change(manifest: dict[str, Any]) -> None:
+        manifest.update(changes)
+        for name in [name for name, value in changes.items() if value is ...]:
+            del manifest[name]
 
-    return _load(spoil)
+    return _load(partial(_seal, change=change))
+
+
+def _seal(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    manifest = json.loads((path / "manifest.json").read_text())
+    manifest.pop("sha256_of_manifest")
+    change(manifest)
+    (path / "manifest.json").write_text(checkpoint._sealed(manifest))
 
 
 def _content(name: str, content: bytes) -> Callable[[Path], object]:
@@ -57,10 +59,7 @@ def _content(name: str, content: bytes) -> Callable[[Path], object]:
 
     def spoil(path: Path) -> None:
         (path / name).write_bytes(content)
-        manifest = json.loads((path / "manifest.json").read_text())
-        manifest.pop("sha256_of_manifest")
-        manifest["sha256"][name] = hashlib.sha256(content).hexdigest()
-        (path / "manifest.json").write_text(checkpoint._sealed(manifest))
+        _seal(path, lambda manifest: manifest["sha256"].update({name: hashlib.sha256(content).hexdigest()}))
 
     return _load(spoil)
 
@@ -80,7 +79,9 @@ def _swapped(name: str) -> Callable[[Path], object]:
     return give
 
 
-def _restored(change: Callable[[dict[str, torch.Tensor]], object], **facts: Any) -> Callable[[Path], object]:
+def _restored(
+    change: Callable[[dict[str, torch.Tensor]], object] = lambda tensors: None, **facts: Any
+) -> Callable[[Path], object]:
     """A sound file whose tensors do not belong to the run that is resumed."""
 
     def give(folder: Path) -> object:
@@ -97,14 +98,6 @@ def _restored(change: Callable[[dict[str, torch.Tensor]], object], **facts: Any)
 
 def _nested(depth: int) -> bytes:
     return b'{"a":' * depth + b"1" + b"}" * depth
-
-
-def _same(tensors: dict[str, torch.Tensor]) -> None:
-    pass
-
-
-def _sparse(tensors: dict[str, torch.Tensor], name: str) -> None:
-    tensors[name] = tensors[name][:-1]
 
 
 _FACTS = {"optimizer_steps": 100.0, "degree": 1.0}
@@ -159,7 +152,8 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no means": (_restored(lambda tensors: tensors.pop("field/means")), "do not fit this run"),
     "no moments": (_restored(lambda tensors: tensors.pop("optimizer/first.means")), "do not fit this run"),
     "no statistics": (_restored(lambda tensors: tensors.pop("density/score")), "do not fit this run"),
-    **{f"{name} with a row too few": (_restored(lambda tensors, name=name: _sparse(tensors, name)), "do not fit this run")
+    **{f"{name} with a row too few": (
+        _restored(lambda tensors, name=name: tensors.update({name: tensors[name][:-1]})), "do not fit this run")
        for name in ("field/quats", "field/filter_3d", "optimizer/second.shN", "density/count")},
     "means in float64": (
         _restored(lambda tensors: tensors.update({"field/means": tensors["field/means"].double()})), "torch.float64",
@@ -170,7 +164,7 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "a strategy's tensors that is not in the run": (
         _restored(lambda tensors: tensors.update({"strategies/Other.rows": torch.zeros(3)})), "belongs to no strategy",
     ),
-    "t beyond the run": (_restored(_same, t=10_000), "t=10000"),
-    "degree beyond the run": (_restored(_same, degree=4.0), "degree=4"),
+    "t beyond the run": (_restored(t=10_000), "t=10000"),
+    "degree beyond the run": (_restored(degree=4.0), "degree=4"),
 }  # fmt: skip
 INPUTS = [BadInput("checkpoint", name, give, pattern) for name, (give, pattern) in _CASES.items()]

@@ -54,10 +54,6 @@ def _two_views_of_one_image(folder: Path) -> object:
     return prior("cam2/0001.png", photo(*_LR), 4)
 
 
-def _nothing(folder: Path) -> None:
-    pass
-
-
 _GOOD = onnx_bytes(upscaling_weight())
 _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no path": (lambda folder: Onnx(), "prior.path: must be a network in ONNX, got ''"),
@@ -84,8 +80,8 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "weights in a file beside": (_external("beside.bin"), "external.onnx: weights: lie in other files"),
     "weights in /etc/passwd": (_external("/etc/passwd"), "external.onnx: weights: lie in other files"),
     "SR folder absent": (lambda folder: Images(str(folder / "none"))("a.png", photo(*_LR), 4), "folder: is not there"),
-    "SR image absent": (_images(_nothing, view="b.png"), "b: has no SR image b"),
-    "SR image without its suffix": (_images(_nothing, suffix="_x4"), "a: has no SR image a_x4"),
+    "SR image absent": (_images(lambda sr: None, view="b.png"), "b: has no SR image b"),
+    "SR image without its suffix": (_images(lambda sr: None, suffix="_x4"), "a: has no SR image a_x4"),
     "two SR images of one view": (_images(lambda sr: (sr / "a.jpg").write_bytes(b"twin")), "for one view: keep one"),
     "one SR image of two views": (_two_views_of_one_image, "would be that of two views"),
     "SR image of the LR size": (_images(lambda sr: write_png(sr / "a.png", photo(*_LR))), "is 12x8, but 4 times"),
