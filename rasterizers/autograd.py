@@ -6,6 +6,7 @@ that a loop written for gsplat runs on a CPU. Each backward pass handles one cot
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -71,7 +72,9 @@ class _Draw(torch.autograd.Function):
         *tensors: Tensor,
     ) -> Any:
         ctx.offset = offset is not None
-        detached = Splats(*(x.detach() for x in tensors), rgb_offset=None if offset is None else offset.detach())
+        detached = Splats(*(x.detach() for x in tensors))
+        if offset is not None:
+            detached = replace(detached, rgb_offset=offset.detach())
         ctx.rendering = rasterizer(detached, camera, depth=True) if depth else rasterizer(detached, camera)
         means2d.data.copy_(ctx.rendering.means2d)
         ctx.mark_non_differentiable(ctx.rendering.alpha, ctx.rendering.visible)

@@ -112,17 +112,16 @@ def batch(image: Image) -> Batch:
 
 def _ours(loss: str, device: str) -> list[Competitor]:
     """The trainer's implementations for images on the device; the torch reference is the truth."""
-    found = losses.implementations(device)
-    gradients = {name: _gradient_of(implementation, loss) for name, implementation in found.items()}
+    gradients = {name: _gradient_of(name, loss) for name in losses.running_on(device)}
     return [Competitor(f"ours, {name}", gradient, gradients["torch"]) for name, gradient in gradients.items()]
 
 
-def _gradient_of(implementation: Any, loss: str) -> Gradient:
+def _gradient_of(kernels: losses.Choice, loss: str) -> Gradient:
     if loss == PHOTOMETRIC:
-        return lambda x, y: implementation.photometric(x, y, _LAMBDA).gradient
+        return lambda x, y: losses.photometric(x, y, _LAMBDA, kernels=kernels).gradient
     if loss == SSIM:  # photometric at λ = 1 is 1 - SSIM
-        return lambda x, y: -implementation.photometric(x, y, 1.0).gradient
-    return lambda x, y: implementation.haar_l1(x, y).gradient
+        return lambda x, y: -losses.photometric(x, y, 1.0, kernels=kernels).gradient
+    return lambda x, y: losses.haar_l1(x, y, kernels=kernels).gradient
 
 
 def _peers(device: str, note: Callable[[str], None]) -> Iterator[Competitor]:

@@ -47,13 +47,13 @@ def test_auto_uses_warp_on_cuda_only(monkeypatch):
     assert losses._fastest(on_cuda(), x) == "torch"
     assert losses._fastest(on_cuda(torch.float64), on_cuda(torch.float64)) == "torch"
     assert losses._fastest(x, x) == ("cpp" if cpp.available() else "torch")
-    assert list(losses.implementations("cuda")) == ["warp", "torch"]
-    assert "warp" not in losses.implementations("cpu")
+    assert losses.running_on("cuda") == ["warp", "torch"]
+    assert "warp" not in losses.running_on("cpu")
 
 
 def test_without_warp_torch_is_used_on_cuda(missing):
     assert losses._fastest(on_cuda(), on_cuda()) == "torch"
-    assert list(losses.implementations("cuda")) == ["torch"]
+    assert losses.running_on("cuda") == ["torch"]
 
 
 def test_without_warp_the_error_says_what_to_install(missing):
@@ -73,7 +73,7 @@ def test_without_cuda_the_error_says_what_to_use(uncached):
 def test_images_on_a_cpu_do_not_import_warp(monkeypatch):
     monkeypatch.setattr(warp, "require", lambda device: pytest.fail("required Warp"))
     x, y = photo(20, 30), photo(20, 30, 6)
-    assert losses.implementations()
+    assert losses.running_on()
     for loss in LOSSES.values():
         loss(x, y, "auto")
     Objective().hr(x, y)

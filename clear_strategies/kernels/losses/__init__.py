@@ -1,14 +1,17 @@
 """Image losses with their gradients, in three implementations.
 
 `reference` specifies the losses in torch, in float64 internally. `cpp` (the CPU) and `warp` (CUDA) compute the same for float32
-images. Every function has an argument `kernels`: "torch", "cpp", "warp", or "auto" for the fastest that supports the images.
+images [H, W, 3]. Every function has an argument `kernels`: "torch", "cpp", "warp", or "auto" for the fastest that supports the
+images. A chosen implementation raises `TypeError` or `ValueError` for images that it does not support, and
+`BackendUnavailable` if it does not run here.
 """
 
 from __future__ import annotations
 
 import logging
 from functools import cache
-from typing import Literal, Protocol, get_args, runtime_checkable
+from types import ModuleType
+from typing import Literal, get_args
 
 from jaxtyping import Float
 from torch import Tensor
@@ -16,36 +19,24 @@ from torch import Tensor
 from clear_strategies.errors import SettingError
 from clear_strategies.kernels.losses import cpp, warp
 from clear_strategies.kernels.losses import reference as reference
-from clear_strategies.kernels.losses.images import supported
+from clear_strategies.kernels.losses.images import DEVICES, image_pair, supported
 from clear_strategies.kernels.losses.reference import LossAndGradient
 
-__all__ = ["Choice", "Implementation", "LossAndGradient", "haar_l1", "implementations", "photometric", "require"]
+__all__ = ["Choice", "LossAndGradient", "haar_l1", "photometric", "require", "running_on"]
 
 _log = logging.getLogger(__name__)
 
 Choice = Literal["auto", "torch", "cpp", "warp"]
 
 
-@runtime_checkable
-class Implementation(Protocol):
-    """The functions of an implementation; `reference` specifies them."""
-
-    def photometric(self, x: Tensor, y: Tensor, lambda_ssim: float, out: Tensor | None = None) -> LossAndGradient: ...
-
-    def haar_l1(self, x: Tensor, y: Tensor, levels: int = 1, out: Tensor | None = None) -> LossAndGradient: ...
-
-
-def implementations(device: str = "cpu") -> dict[str, Implementation]:
-    """The implementations for images on `device`, "cpu" or "cuda", by name, fastest first.
+def running_on(device: str = "cpu") -> list[Choice]:
+    """The implementations that run here for images on "cpu" or "cuda", fastest first.
 
     Warp's kernels on a CPU are for checks, and are not listed.
     """
-    found: dict[str, Implementation] = {}
-    if device == "cpu" and cpp.available():
-        found["cpp"] = cpp
-    if device == "cuda" and warp.available():
-        found["warp"] = warp
-    return found | {"torch": reference}
+    fastest: Choice = "warp" if device == "cuda" else "cpp"
+    runs = warp.available() if device == "cuda" else cpp.available()
+    return [fastest, "torch"] if runs else ["torch"]
 
 
 def require(kernels: Choice) -> None:
@@ -71,8 +62,15 @@ def photometric(
     kernels: Choice = "auto",
     out: Float[Tensor, "H W C"] | None = None,
 ) -> LossAndGradient:
-    """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient with respect to x, written into `out` if given."""
-    return _choose(kernels, x, y).photometric(x, y, lambda_ssim, out)
+    """(1 - λ) ‖x - y‖₁ + λ (1 - SSIM(x, y)), with its gradient with respect to x, written into `out` if given.
+
+    With λ = 0 no SSIM is computed.
+    """
+    kernels = _chosen(kernels, x, y)
+    if kernels == "torch":
+        return reference.photometric(x, y, lambda_ssim, out)
+    images = image_pair(DEVICES[kernels], x, y, out)
+    return LossAndGradient(_compiled(kernels, x).photometric(images, 1 - lambda_ssim, lambda_ssim), images.gradient)
 
 
 def haar_l1(
@@ -84,21 +82,31 @@ def haar_l1(
     out: Float[Tensor, "H W C"] | None = None,
 ) -> LossAndGradient:
     """Mean absolute difference of Haar details, averaged over levels, with its gradient, written into `out` if given."""
-    return _choose(kernels, x, y).haar_l1(x, y, levels, out)
+    if levels < 1:
+        raise ValueError(f"levels must be at least 1, got {levels}.")
+    kernels = _chosen(kernels, x, y)
+    if kernels == "torch":
+        return reference.haar_l1(x, y, levels, out)
+    images = image_pair(DEVICES[kernels], x, y, out)
+    return LossAndGradient(_compiled(kernels, x).haar_l1(images, levels), images.gradient)
 
 
-def _choose(kernels: Choice, x: Tensor, y: Tensor) -> Implementation:
+def _chosen(kernels: Choice, x: Tensor, y: Tensor) -> Choice:
     require(kernels)
     if kernels == "auto":
         kernels = _fastest(x, y)
     _log_once(f"cpp, for {cpp.native().isa}" if kernels == "cpp" else kernels)
-    return {"torch": reference, "cpp": cpp, "warp": warp}[kernels]
+    return kernels
 
 
 def _fastest(x: Tensor, y: Tensor) -> Choice:
     if x.device.type == "cpu":
-        return "cpp" if supported(cpp.DEVICES, x, y) and cpp.available() else "torch"
-    return "warp" if supported(warp.DEVICES, x, y) and warp.available() else "torch"
+        return "cpp" if supported(DEVICES["cpp"], x, y) and cpp.available() else "torch"
+    return "warp" if supported(DEVICES["warp"], x, y) and warp.available() else "torch"
+
+
+def _compiled(kernels: Choice, x: Tensor) -> ModuleType:
+    return cpp if kernels == "cpp" else warp.loaded(x.device.type)
 
 
 @cache

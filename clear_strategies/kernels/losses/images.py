@@ -8,6 +8,8 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor
 
+DEVICES: Final = {"cpp": ("cpu",), "warp": ("cuda", "cpu")}
+"""Where the kernels of each compiled implementation run."""
 _IN_WORDS: Final = {"cpu": "the CPU", "cuda": "CUDA"}
 
 
