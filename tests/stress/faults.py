@@ -9,9 +9,10 @@ import errno
 import io
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -159,53 +160,52 @@ class Scenario:
     act: Callable[[Path], object]
 
 
-def _saves(keep: int, *iterations: int) -> Callable[[Path], None]:
-    def act(folder: Path) -> None:
-        for i, t in enumerate(iterations, 2):
-            checkpoint.save(folder / "checkpoints", small(t, float(i)), keep=keep)
-
-    return act
+def _first(folder: Path, keep: int = 1, *, exported: bool = False) -> None:
+    checkpoint.save(folder / "checkpoints", small(100, 1.0), keep=keep)
+    if exported:
+        _write_all(folder, 0.25)
 
 
-def _first(keep: int, *, exported: bool = False) -> Callable[[Path], None]:
-    def prepare(folder: Path) -> None:
-        checkpoint.save(folder / "checkpoints", small(100, 1.0), keep=keep)
-        if exported:
-            _write_all(folder, 0.25)
-
-    return prepare
-
-
-def _resumed(keep: int) -> Callable[[Path], None]:
-    def act(folder: Path) -> None:
-        files.sweep(folder)
-        found = checkpoint.load(folder)
-        _saves(keep, found.t + 100, found.t + 200)(folder)
-        _write_all(folder, 0.75)
-
-    return act
-
-
-def _died(keep: int) -> Callable[[Path], None]:
+def _died(folder: Path) -> None:
     """A process died while it saved and while it exported."""
+    _first(folder, exported=True)
+    (folder / "checkpoints" / ".step_0000200.7.partial").mkdir()
+    (folder / "checkpoints" / ".step_0000200.7.partial" / "history.json").write_text("[")
+    (folder / ".metrics.json.7.partial").write_text("{")
 
-    def prepare(folder: Path) -> None:
-        _first(keep, exported=True)(folder)
-        (folder / "checkpoints" / ".step_0000200.7.partial").mkdir()
-        (folder / "checkpoints" / ".step_0000200.7.partial" / "history.json").write_text("[")
-        (folder / ".metrics.json.7.partial").write_text("{")
 
-    return prepare
+def _save(folder: Path, keep: int, iterations: Sequence[int]) -> None:
+    for i, t in enumerate(iterations, 2):
+        checkpoint.save(folder / "checkpoints", small(t, float(i)), keep=keep)
+
+
+def _export(folder: Path) -> None:
+    _write_all(folder, 0.75)
+
+
+def _resume(folder: Path, keep: int = 1) -> None:
+    files.sweep(folder)
+    found = checkpoint.load(folder)
+    _save(folder, keep, [found.t + 100, found.t + 200])
+    _export(folder)
+
+
+def _saving(name: str, keep: int, *iterations: int) -> Scenario:
+    act = partial(_save, keep=keep, iterations=iterations)
+    return Scenario(f"{name}, keep={keep}", partial(_first, keep=keep), act)
 
 
 SCENARIOS = [
-    *(Scenario(f"save, keep={k}", _first(k), _saves(k, 200)) for k in (1, 3)),
-    *(Scenario(f"save the same step again, keep={k}", _first(k), _saves(k, 100)) for k in (1, 3)),
-    *(Scenario(f"three saves, keep={k}", _first(k), _saves(k, 200, 300, 400)) for k in (1, 2)),
-    Scenario("first export", _first(1), lambda folder: _write_all(folder, 0.75)),
-    Scenario("export over another", _first(1, exported=True), lambda folder: _write_all(folder, 0.75)),
-    *(Scenario(f"resumed run, keep={k}", _first(k, exported=True), _resumed(k)) for k in (1, 2, 3)),
-    Scenario("resumed after a death", _died(1), _resumed(1)),
+    *(_saving("save", k, 200) for k in (1, 3)),
+    *(_saving("save the same step again", k, 100) for k in (1, 3)),
+    *(_saving("three saves", k, 200, 300, 400) for k in (1, 2)),
+    Scenario("first export", _first, _export),
+    Scenario("export over another", partial(_first, exported=True), _export),
+    *(
+        Scenario(f"resumed run, keep={k}", partial(_first, keep=k, exported=True), partial(_resume, keep=k))
+        for k in (1, 2, 3)
+    ),
+    Scenario("resumed after a death", _died, _resume),
 ]
 
 
