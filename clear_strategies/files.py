@@ -72,6 +72,19 @@ def require_regular(path: Path, *, most: int = _LARGEST) -> None:
         raise DataError(path, "size", f"is more than {most >> 20} MiB", "check the path")
 
 
+def read_bytes(path: Path, *, most: int = _LARGEST) -> bytes:
+    """The content of a regular file.
+
+    Raises:
+        DataError: it cannot be read, or `require_regular` refuses it.
+    """
+    require_regular(path, most=most)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
+
+
 def sweep(folder: Path) -> None:
     """Remove what processes that died left of their writes in a run's folder. Call it while no other process writes there."""
     for depth in ("", "*/", "*/*/"):

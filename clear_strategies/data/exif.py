@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from clear_strategies.data.photo_files import exif_of
-
-_log = logging.getLogger(__name__)
 
 _EXPOSURE_TIME: Final = 0x829A  # s
 _F_NUMBER: Final = 0x829D
@@ -31,15 +28,9 @@ class Exif:
     focal35: float | None = None
     exposure: float | None = None
 
-    def focal_pixels(self, width: int, height: int) -> float:
-        """The focal length of an image of this size, pixels.
-
-        Raises:
-            ValueError: it is not known.
-        """
-        if self.focal35 is None:
-            raise ValueError("the EXIF block has no focal length.")
-        return self.focal35 / _DIAGONAL_35MM * math.hypot(width, height)
+    def focal_pixels(self, width: int, height: int) -> float | None:
+        """The focal length of an image of this size, pixels."""
+        return None if self.focal35 is None else self.focal35 / _DIAGONAL_35MM * math.hypot(width, height)
 
 
 def read_exif(path: Path) -> Exif:

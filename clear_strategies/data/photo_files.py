@@ -203,13 +203,6 @@ def jpeg(image: Float[Tensor, "H W 3"], quality: int = 90) -> bytes:
     return buffer.getvalue()
 
 
-def write_jpeg(
-    path: Path, image: Float[Tensor, "H W 3"], size: tuple[int, int], kernel: Image.Resampling, quality: int = 95
-) -> None:
-    """A JPEG of another size, (width, height)."""
-    Image.fromarray(to_bytes(image)).resize(size, kernel).save(path, quality=quality, subsampling=0)
-
-
 def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) -> Path:
     """`root / name`, if that is inside `root` once symbolic links are resolved.
 

@@ -6,11 +6,10 @@ allocated.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from numpy.lib.recfunctions import structured_to_unstructured
 from torch import Tensor
 
 from clear_strategies.errors import DataError
-from clear_strategies.files import require_regular
+from clear_strategies.files import read_bytes
 
 _TYPES: Final = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -69,24 +68,16 @@ class _Header:
 
 def read_vertices(path: Path) -> np.ndarray:
     """The vertex element as a structured array."""
-    require_regular(path)
-    try:
-        with path.open("rb") as file:
-            header = _parse_header(path, file.read(_LONGEST_HEADER))
-            file.seek(header.body)
-            if header.form == "ascii":
-                return _read_ascii(path, header, file.read())
-            return _read_binary(path, header, file, path.stat().st_size - header.body)
-    except OSError as error:
-        raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
+    data = read_bytes(path)
+    header = _parse_header(path, data[:_LONGEST_HEADER])
+    return (_read_ascii if header.form == "ascii" else _read_binary)(path, header, data[header.body :])
 
 
-def _read_binary(path: Path, header: _Header, file: BinaryIO, left: int) -> np.ndarray:
+def _read_binary(path: Path, header: _Header, body: bytes) -> np.ndarray:
     vertex, skipped = header.vertex, sum(e.bytes for e in header.before)
-    _check_length(path, header, skipped + vertex.bytes, sum(e.bytes for e in header.after), left, "bytes")
-    file.seek(skipped, os.SEEK_CUR)
+    _check_length(path, header, skipped + vertex.bytes, sum(e.bytes for e in header.after), len(body), "bytes")
     row = vertex.dtype.newbyteorder("<" if header.form == "binary_little_endian" else ">")
-    return np.frombuffer(file.read(vertex.bytes), row, vertex.count)
+    return np.frombuffer(body, row, vertex.count, skipped)
 
 
 def _read_ascii(path: Path, header: _Header, body: bytes) -> np.ndarray:

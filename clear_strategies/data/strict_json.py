@@ -22,7 +22,7 @@ import msgspec
 from msgspec import Meta
 
 from clear_strategies.errors import DataError
-from clear_strategies.files import require_regular
+from clear_strategies.files import read_bytes
 
 Count = Annotated[int, Meta(ge=0, le=10**12)]
 Positive = Annotated[float, Meta(ge=0, lt=1e300)]
@@ -55,16 +55,11 @@ def read(path: Path) -> Any:
             raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)!r} occurs twice in one object")
         return value
 
-    require_regular(path, most=_LARGEST)
+    text = read_bytes(path, most=_LARGEST)
     try:
         return json.loads(
-            path.read_text("utf-8"),
-            parse_constant=refuse_constant,
-            parse_float=finite,
-            object_pairs_hook=refuse_duplicates,
+            text.decode(), parse_constant=refuse_constant, parse_float=finite, object_pairs_hook=refuse_duplicates
         )
-    except OSError as error:
-        raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
     except RecursionError as error:
         raise DataError(path, "json", "is nested too deeply", "write it again") from error
     except ValueError as error:

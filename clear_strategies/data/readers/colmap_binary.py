@@ -13,8 +13,7 @@ import numpy as np
 
 from clear_strategies.data.cameras import Lens
 from clear_strategies.data.readers import colmap_records as records
-from clear_strategies.errors import DataError
-from clear_strategies.files import require_regular
+from clear_strategies.files import read_bytes
 
 _LONGEST_NAME: Final = 4096
 
@@ -65,12 +64,7 @@ class _Bytes:
     """A file's bytes, read from front to back; reading past the end is an error."""
 
     def __init__(self, path: Path) -> None:
-        require_regular(path)
-        try:
-            self.data = path.read_bytes()
-        except OSError as error:
-            raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
-        self.path, self.at = path, 0
+        self.data, self.path, self.at = read_bytes(path), path, 0
 
     @property
     def left(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from clear_strategies.data.cameras import Lens
 from clear_strategies.data.readers import colmap_records as records
 from clear_strategies.errors import DataError
-from clear_strategies.files import require_regular
+from clear_strategies.files import read_bytes
 
 _NUMBER: Final = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
 _WHOLE: Final = re.compile(r"-?[0-9]{1,18}")
@@ -69,11 +70,8 @@ def points(path: Path) -> records.Points:
 
 
 def _raw_lines(path: Path) -> list[tuple[int, str]]:
-    require_regular(path)
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
+        text = io.StringIO(read_bytes(path).decode(), newline=None).read()  # with every line break as \n
     except UnicodeDecodeError as error:
         raise records.damaged(path, "file", "is no UTF-8 text") from error
     if text.startswith("\ufeff"):

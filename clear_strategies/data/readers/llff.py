@@ -6,7 +6,6 @@ import io
 import logging
 from dataclasses import replace
 from pathlib import Path
-from tokenize import TokenError
 from typing import Final
 
 import numpy as np
@@ -21,23 +20,12 @@ from clear_strategies.data.readers import colmap
 from clear_strategies.data.readers.colmap_model import Model, find_model, read_model
 from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
-from clear_strategies.files import require_regular
+from clear_strategies.files import read_bytes
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
 _COLUMNS: Final = 17
-# What numpy's parser of the header's Python literal raises on damaged ones.
-_HEADER_ERRORS: Final = (
-    ValueError,
-    KeyError,
-    SyntaxError,
-    TypeError,
-    EOFError,
-    RecursionError,
-    MemoryError,
-    TokenError,
-)
 _REMEDY: Final = "write it with LLFF's img2poses again"
 
 
@@ -163,17 +151,13 @@ def read_bounds(file: Path) -> Float[np.ndarray, "N 17"]:
     Raises:
         DataError: the file is no such table of finite numbers.
     """
-    require_regular(file)
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise DataError(file, "file", f"cannot be read ({error.strerror})", "check the path") from error
+    data = read_bytes(file)
     stream = io.BytesIO(data)
     try:
         version = npy_format.read_magic(stream)
         reader = {(1, 0): npy_format.read_array_header_1_0, (2, 0): npy_format.read_array_header_2_0}[version]
         shape, fortran, dtype = reader(stream)
-    except _HEADER_ERRORS as error:
+    except Exception as error:  # numpy's parser raises many types of error on damaged headers
         raise DataError(file, "header", f"is no .npy header ({str(error)[:80]})", _REMEDY) from error
     if dtype.kind != "f":
         raise DataError(file, "header", f"has the type {dtype}, not floating point", _REMEDY)

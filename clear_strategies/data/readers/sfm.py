@@ -21,9 +21,10 @@ from typing import Any, Final
 from PIL import Image as Picture
 
 from clear_strategies import files
+from clear_strategies.core.images import to_bytes
 from clear_strategies.core.progress import EVERY, Progress
 from clear_strategies.data.exif import Exif
-from clear_strategies.data.photo_files import read_image, write_jpeg
+from clear_strategies.data.photo_files import read_image
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -43,16 +44,7 @@ _MEMORY: Final = 4 << 30  # bytes that all threads together may take in matching
 
 @dataclass(frozen=True, slots=True)
 class SfmSettings:
-    """How poses are estimated.
-
-    Args:
-        max_side: features are extracted from photos reduced to this many pixels.
-        max_features: of a photo, those of the coarsest scales; memory and time of matching grow with its square.
-        precise: features that follow a surface's tilt, matched once more along the epipolar lines; about six times as long.
-        least_placed: the least share of the photos that must be placed, in (0, 1].
-        threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
-        seed: of COLMAP's random samples.
-    """
+    """How poses are estimated: the arguments of `photos.read`, with `precise` decided."""
 
     max_side: int
     max_features: int
@@ -192,9 +184,10 @@ def _write_copies(
         height, width = image.shape[:2]
         scale = min(1.0, max_side / max(width, height))
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        write_jpeg(folder / copy_name(i), image, size, Picture.Resampling.LANCZOS)
-        focal = None if exif.focal35 is None else round(exif.focal_pixels(*size), 2)
-        groups.setdefault((*size, focal), []).append(copy_name(i))
+        copy = Picture.fromarray(to_bytes(image)).resize(size, Picture.Resampling.LANCZOS)
+        copy.save(folder / copy_name(i), quality=95, subsampling=0)
+        focal = exif.focal_pixels(*size)
+        groups.setdefault((*size, focal and round(focal, 2)), []).append(copy_name(i))
     known = sum(len(names) for (_, _, focal), names in groups.items() if focal is not None)
     _log.debug("%d cameras; the focal length of %d of %d photos is in EXIF.", len(groups), known, len(photos))
     return groups

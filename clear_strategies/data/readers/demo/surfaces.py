@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -72,42 +71,13 @@ class Finish:
     gloss: float = 0.0
 
 
-@runtime_checkable
-class Surface(Protocol):
-    """A shape with a chart: coordinates in [0, 1]² for its texture and its light."""
-
-    def __hash__(self) -> int: ...
-
-    @property
-    def finish(self) -> Finish: ...
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """The chart's width and height, world units."""
-        ...
-
-    def depth(self, rays: Rays) -> Float[Array, "h w"]:
-        """Along each ray; infinite if the ray misses the shape."""
-        ...
-
-    def chart(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]: ...
-
-    def points(self, chart: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
-        """The inverse of `chart`."""
-        ...
-
-    def normal(self, points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-        """Unit length, towards the outside."""
-        ...
-
-    def blocks(self, points: Float[Array, "n 3"], lamp: Float[Array, " 3"]) -> Bool[Array, " n"]:
-        """Whether the shape is between the points and the lamp."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """A rectangle: its centre, and half its sides as vectors. Its normal is down × right."""
+    """A rectangle: its centre, and half its sides as vectors.
+
+    Its normal, down × right, has unit length and points outside. Its chart, which `points` inverts, are coordinates in [0, 1]²
+    for its texture and its light.
+    """
 
     finish: Finish
     center: Vector
@@ -116,9 +86,11 @@ class Panel:
 
     @property
     def extent(self) -> tuple[float, float]:
+        """The chart's width and height, world units."""
         return 2 * math.hypot(*self.right), 2 * math.hypot(*self.down)
 
     def depth(self, rays: Rays) -> Float[Array, "h w"]:
+        """Along each ray; infinite if the ray misses the shape."""
         offset = rays.origin - np.asarray(self.center)
         right, down = dual(self.right), dual(self.down)
         normal = self._normal
@@ -142,6 +114,7 @@ class Panel:
         return np.broadcast_to(self._normal, points.shape)
 
     def blocks(self, points: Float[Array, "n 3"], lamp: Float[Array, " 3"]) -> Bool[Array, " n"]:
+        """Whether the shape is between the points and the lamp."""
         normal = self._normal
         here, there = (points - self.center) @ normal, (lamp - self.center) @ normal
         apart = (np.abs(here) > 1e-4) & (here * there < 0)
@@ -155,7 +128,7 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Ball:
-    """A sphere. Its chart is longitude and latitude."""
+    """A sphere, as a `Panel` in all that it answers. Its chart is longitude and latitude."""
 
     finish: Finish
     center: Vector
@@ -190,6 +163,9 @@ class Ball:
         way = lamp - points
         s = np.clip(((self.center - points) * way).sum(-1) / (way * way).sum(-1), 0, 1)[:, None]
         return np.asarray(np.linalg.norm(points + s * way - self.center, axis=-1) < self.radius * (1 - 1e-4))
+
+
+Surface = Panel | Ball
 
 
 def unit(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
