@@ -6,11 +6,13 @@ import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
 from clear_strategies.errors import DataError
@@ -19,6 +21,10 @@ FARTHEST: Final = 1e12
 """The largest coordinate, world units: float32 cannot resolve a scene beyond it."""
 _LARGEST_SIDE: Final = 1 << 20
 _BORDER_SAMPLES: Final = 33
+_Coordinate = Annotated[float, Meta(gt=-FARTHEST, lt=FARTHEST)]
+_Rows = Annotated[
+    list[Annotated[list[_Coordinate], Meta(min_length=4, max_length=4)]], Meta(min_length=3, max_length=4)
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +121,12 @@ def pose_from_opengl(file: Path, where: str, matrix: object) -> Float[Tensor, "4
         DataError: not a rigid 3x4 or 4x4 matrix of finite numbers.
     """
     remedy = "write camera-to-world matrices: a rotation, a translation, last row 0 0 0 1"
-    rows = matrix if isinstance(matrix, list) else []
-    if len(rows) not in (3, 4) or not all(_is_row(row) for row in rows):
-        raise DataError(file, where, "is no 3x4 or 4x4 matrix of finite numbers", remedy)
+    try:
+        rows = msgspec.convert(matrix, _Rows)
+    except msgspec.ValidationError as error:
+        raise DataError(file, where, "is no 3x4 or 4x4 matrix of finite numbers", remedy) from error
     full = np.eye(4)
-    full[: len(rows)] = np.array(rows, float)
+    full[: len(rows)] = rows
     if np.abs(full[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise DataError(file, where, f"has the last row {full[3].tolist()}", remedy)
     rotation = full[:3, :3] * np.array([1.0, -1.0, -1.0])  # OpenGL's y and z axes are opposite
@@ -190,11 +197,3 @@ def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "H W"],
     size, bend = (lens.width, lens.height), np.array(lens.distortion)
     x, y = maps(lens.matrix(), bend, np.eye(3), pinhole.matrix(), size, cv2.CV_32FC1)
     return x, y
-
-
-def _is_row(row: object) -> bool:
-    return isinstance(row, list) and len(row) == 4 and all(_is_number(x) for x in row)
-
-
-def _is_number(x: object) -> bool:
-    return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < FARTHEST

@@ -28,6 +28,7 @@ from clear_strategies.core import images
 from clear_strategies.core.images import DownKernel
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.view_settings import ViewSettings, resized
+from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -49,11 +50,10 @@ def within_limit(
         The capture, with reduced photos where needed, and the settings of its views. Both are unchanged if there is no
         limit, if the HR images fit into it, or if `photos_are` is not "lr".
     """
-    limit, largest = views.max_hr_megapixels, max(f.camera.width * f.camera.height for f in capture.frames)
-    pixels = largest / views.shrink**2 / _MEGA
+    limit, photo = views.max_hr_megapixels, _largest(capture)
+    pixels = photo.width * photo.height / views.shrink**2 / _MEGA
     if views.photos_are != "lr" or limit is None or views.sr_scale**2 * pixels <= limit:
         return capture, views
-    photo = max(capture.frames, key=lambda f: f.camera.width * f.camera.height).camera
     size = f"{photo.width // views.shrink}x{photo.height // views.shrink}"
     why = f"x{views.sr_scale} of {size} is {views.sr_scale**2 * pixels:.3g} megapixels, {_SETTING} is {limit:g}"
     if views.sr_scale > _TWICE and _TWICE**2 * pixels <= limit and reaches(_TWICE):
@@ -63,12 +63,16 @@ def within_limit(
     multiple = 1 if super_resolve else views.sr_scale
     if ratio > 1:
         capture = replace(capture, frames=_reduced(capture.frames, ratio, multiple, views.downsample))
-        now = max(capture.frames, key=lambda f: f.camera.width * f.camera.height).camera
+        now = _largest(capture)
         why += f": photos reduced by {ratio:.3g} to {now.width}x{now.height} (PIL {views.downsample})"
     if super_resolve:
         return _noted(capture, why), replace(views, shrink=1)
     why += "; they are the HR side, no SR image is needed, and LR is made from them"
     return _noted(capture, why), replace(views, shrink=1, photos_are="both")
+
+
+def _largest(capture: Capture) -> Camera:
+    return max((frame.camera for frame in capture.frames), key=lambda camera: camera.width * camera.height)
 
 
 def _noted(capture: Capture, why: str) -> Capture:

@@ -78,12 +78,8 @@ def read_image(
     with _opened(path, max_pixels, turn) as image:
         size = _upright(image.size, orientation_of(image)) if turn else image.size
         if expect is not None and size != expect:
-            raise DataError(
-                path,
-                "size",
-                f"is {size[0]}x{size[1]} where {expect[0]}x{expect[1]} is expected",
-                "use images of the size the cameras were made for",
-            )
+            problem = f"is {size[0]}x{size[1]} where {expect[0]}x{expect[1]} is expected"
+            raise DataError(path, "size", problem, "use images of the size the cameras were made for")
         sixteen_bits = ";16" in str(getattr(image, "tile", ""))  # the layout in the file, unknown after decoding
         try:
             image.load()
@@ -156,7 +152,7 @@ def image_folder(root: Path, name: str | None = None) -> Path:
     """
     present = [folder for folder in _FOLDERS if (root / folder).is_dir()]
     if not root.is_dir():
-        raise DataError(root, "folder", "is not there", "check the path")
+        raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     if name is not None:
         if not (root / name).is_dir():
             there = f"choose one of {', '.join(present)}" if present else "check the path"
@@ -226,12 +222,8 @@ def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) ->
         problem = f"{name[:80]!r} cannot be resolved ({type(error).__name__})"
         raise DataError(file, "file name", problem, "rename the file") from error
     if not within:
-        raise DataError(
-            file,
-            "file name",
-            f"{name!r} leads out of {root}",
-            "keep the images inside the data set's folder, or follow it: data.reader.allow_outside=true",
-        )
+        remedy = "keep the images inside the data set's folder, or follow it: data.reader.allow_outside=true"
+        raise DataError(file, "file name", f"{name!r} leads out of {root}", remedy)
     return root / name
 
 
@@ -250,12 +242,8 @@ def _opened(path: Path, max_pixels: int, turn: bool | None) -> Iterator[Image.Im
         raise DataError(path, "file", f"is no readable image ({type(error).__name__})", remedy) from error
     with image:
         if image.width * image.height > max_pixels:
-            raise DataError(
-                path,
-                "size",
-                f"{image.width}x{image.height} is more than {max_pixels:,} pixels",
-                "downsample the images before training",
-            )
+            problem = f"{image.width}x{image.height} is more than {max_pixels:,} pixels"
+            raise DataError(path, "size", problem, "downsample the images before training")
         if image.width * image.height > _LARGE and image.width * image.height * 3 > _BOMB * path.stat().st_size:
             problem = f"{image.width}x{image.height} pixels are more than {_BOMB} times the file, as in no photo"
             raise DataError(path, "size", problem, "use the camera's own file")
@@ -289,12 +277,9 @@ def _is_heif(path: Path) -> bool:
 
 def _refuse_turned(path: Path, image: Image.Image) -> None:
     if (orientation := orientation_of(image)) != 1:
-        raise DataError(
-            path,
-            "EXIF orientation",
-            f"is {orientation}: the photo is stored turned, and its pose may not include that",
-            "turn the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result",
-        )
+        problem = f"is {orientation}: the photo is stored turned, and its pose may not include that"
+        remedy = "turn the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result"
+        raise DataError(path, "EXIF orientation", problem, remedy)
 
 
 def _upright(size: tuple[int, int], orientation: int) -> tuple[int, int]:

@@ -152,11 +152,8 @@ def save_lr(scene: Scene, folder: Path) -> None:
     """Write the training and test LR images as PNG for an external SR model; prior=images reads its results."""
     for view in (*scene.train, *scene.test):
         write_png((folder / view.name).with_suffix(".png"), view.lr.image)
-    _log.info(
-        "%d LR images written to %s. Super-resolve them, then train with prior=images prior.path=<results>.",
-        len(scene.train) + len(scene.test),
-        folder,
-    )
+    message = "%d LR images written to %s. Super-resolve them, then train with prior=images prior.path=<results>."
+    _log.info(message, len(scene.train) + len(scene.test), folder)
 
 
 def photos_of(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:
@@ -187,13 +184,9 @@ def _view(
         else:
             lr = Photo(lr_camera, images.downsample(truth, views.sr_scale, views.downsample))
     if views.photos_are == "both" and truth is not None:
+        sr_source = "the photos themselves"
         return View(
-            frame.name,
-            lr,
-            Photo(hr_camera, truth),
-            truth=truth,
-            sr_source="the photos themselves",
-            background=capture.background,
+            frame.name, lr, Photo(hr_camera, truth), truth=truth, sr_source=sr_source, background=capture.background
         )
     try:
         made, sr_source = super_resolved(prior, frame.name, lr.image, views.sr_scale), prior.label

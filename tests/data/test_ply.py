@@ -21,8 +21,11 @@ _NUMBERS = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 def gaussians(n: int, bands: int, seed: int = 0) -> GaussianPly:
     g = torch.Generator().manual_seed(seed)
-    shapes = ((n, 3), (n, 1, 3), (n, bands, 3), (n,), (n, 3), (n, 4))
-    return GaussianPly(*(torch.randn(shape, generator=g) for shape in shapes))
+    return GaussianPly(*(torch.randn(shape, generator=g) for shape in shapes(n, bands)))
+
+
+def shapes(n: int, bands: int) -> tuple[tuple[int, ...], ...]:
+    return (n, 3), (n, 1, 3), (n, bands, 3), (n,), (n, 3), (n, 4)
 
 
 def header(*lines: str, form: str = "binary_little_endian") -> bytes:
@@ -83,8 +86,7 @@ def test_points_that_no_file_should_hold_are_refused(
 @_ROUNDTRIP
 @given(n=st.integers(0, 5), bands=st.sampled_from((0, 3, 8, 15)), data=st.data())
 def test_gaussians_survive_a_roundtrip_bitwise(tmp_path: Path, n: int, bands: int, data: st.DataObject) -> None:
-    shapes = ((n, 3), (n, 1, 3), (n, bands, 3), (n,), (n, 3), (n, 4))
-    arrays = [data.draw(hnp.arrays(np.float32, shape, elements=_NUMBERS)) for shape in shapes]
+    arrays = [data.draw(hnp.arrays(np.float32, shape, elements=_NUMBERS)) for shape in shapes(n, bands)]
     g = GaussianPly(*map(torch.from_numpy, arrays))
     write_gaussians(tmp_path / "g.ply", g)
     again = read_gaussians(tmp_path / "g.ply")
@@ -147,6 +149,11 @@ def test_points_without_colours_are_grey_with_a_warning(tmp_path: Path, caplog: 
     (tmp_path / "p.ply").write_bytes(header("element vertex 1", *XYZ) + POINT)
     assert read_points(tmp_path / "p.ply").colors.tolist() == [[0.5, 0.5, 0.5]]
     assert "no colours, so its points are grey" in caplog.text
+
+
+def test_an_ascii_file_without_vertices_is_read(tmp_path: Path) -> None:
+    (tmp_path / "p.ply").write_bytes(header("element vertex 0", *XYZ, form="ascii"))
+    assert len(read_points(tmp_path / "p.ply")) == 0
 
 
 def test_elements_before_and_after_the_vertices_are_skipped(tmp_path: Path) -> None:

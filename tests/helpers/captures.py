@@ -47,6 +47,25 @@ def write_photos(folder: Path, size: tuple[int, int] = (WIDTH, HEIGHT), mode: st
         Image.fromarray(pixels).save(folder / name)
 
 
+def turn(path: Path, orientation: int, *, rotate: bool = True) -> np.ndarray:
+    """Store a photo turned, as its EXIF block then says; its upright pixels. Without `rotate` the block alone changes."""
+    with Image.open(path) as image:
+        upright = image.convert("RGB")
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    stored = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}[orientation]
+    (upright.transpose(stored) if rotate else upright).save(path, exif=exif)
+    return np.array(upright)
+
+
+def link(folder: Path) -> None:
+    """Leave links in place of the photos, which go elsewhere."""
+    elsewhere = folder.rename(folder.parent / "elsewhere")
+    folder.mkdir()
+    for name in NAMES:
+        (folder / name).symlink_to(elsewhere / name)
+
+
 def colmap_bin(root: Path, model: str = "PINHOLE", parameters: tuple[float, ...] = (FOCAL, FOCAL, 8, 6)) -> Path:
     """images/ and sparse/0 in COLMAP's binary layout."""
     write_photos(root / "images")

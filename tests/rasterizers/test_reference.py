@@ -80,6 +80,24 @@ def test_a_scaled_camera_has_the_same_field_of_view():
         camera.scaled(1 / 3)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda p: p.mul_(0),
+        lambda p: p[:3, :3].mul_(2),
+        lambda p: p[0].neg_(),
+        lambda p: p[0, 1].add_(0.1),
+        lambda p: p[3, 3].mul_(2),
+    ],
+    ids=["zero", "scaled", "reflected", "sheared", "last row"],
+)
+def test_a_pose_that_is_not_rigid_is_refused(change):
+    pose = torch.eye(4)
+    change(pose)
+    with pytest.raises(ValueError, match="must be a rotation and a translation"):
+        Camera(pose, 10.0, 10.0, 5.0, 5.0, 10, 10)
+
+
 def test_quaternions_of_any_norm_give_the_same_rotation():
     q = torch.tensor([[0.3, -0.2, 0.8, 0.1]])
     expected = rotation_matrix(q)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import html
 from pathlib import Path
 
 from clear_strategies import report
+from clear_strategies.report.table import Table, aligned
 from tests.helpers.finished_run import cells, make_run
 
 
@@ -22,6 +24,14 @@ def test_settings_that_all_runs_share_are_noted_once(tmp_path: Path) -> None:
     text = report.layout(report.compare(report.collect([tmp_path]))).markdown
     assert "All runs of demo: `data=llff fit.iterations=600`." in text
     assert text.count("data=llff") == 1
+
+
+def test_a_name_is_text_and_no_markup() -> None:
+    rows = "\n".join(aligned({"scene": ["<script>alert(1)</script>"], "method": ["a|b\nc"]}))
+    assert "<script>" not in rows
+    assert html.escape("<script>") in rows
+    assert "a\\|b c" in rows
+    assert "<img" not in Table({"scene": ["x"]}, ["All runs of x: `<img src=y>`."]).markdown
 
 
 def test_a_bar_in_a_name_does_not_break_the_table(tmp_path: Path) -> None:

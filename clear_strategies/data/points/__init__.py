@@ -257,13 +257,8 @@ def _compares_hr(compare: Compare, hr_is_photo: bool, n_photos: int) -> bool:
 def _cleaned(
     settings: CloudSettings, cloud: PointCloud, photos: Sequence[Photo], background: Color | None
 ) -> PointCloud:
+    """Without outliers, and densified where `settings.densify` asks for it."""
     cloud = without_outliers(cloud, settings.outlier_neighbours, settings.outlier_ratio)
-    return _densified(settings, cloud, photos, background)
-
-
-def _densified(
-    settings: CloudSettings, cloud: PointCloud, photos: Sequence[Photo], background: Color | None
-) -> PointCloud:
     grid = sum(len(pixel_grid(photo, settings.stride)) for photo in photos)
     if settings.densify == "auto" and len(cloud) >= grid:
         _log.debug("densify: auto adds nothing: the cloud has %d points, the views' grids %d.", len(cloud), grid)

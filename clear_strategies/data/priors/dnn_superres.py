@@ -16,7 +16,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.core.checks import require_choice
-from clear_strategies.data.priors.interface import log_result, require_file, require_path, warn_if_far_from_lr
+from clear_strategies.data.priors.interface import finished, require_file, require_path
 from clear_strategies.errors import DataError
 
 _MODELS: Final = ("edsr", "espcn", "fsrcnn", "lapsrn")
@@ -84,7 +84,4 @@ class DnnSuperres:
             problem = f"does not enlarge {small.shape[1]}x{small.shape[0]} to {width}x{height}"
             raise DataError(self.path, "network", problem, f"use a x{factor} model")
         large = np.frombuffer(child.stdout, np.uint8).reshape(height, width, 3).copy()
-        result = torch.from_numpy(large).to(lr) / 255
-        log_result(name, self.label, result, began)
-        warn_if_far_from_lr(self.label, result, lr, factor)
-        return result
+        return finished(name, self.label, torch.from_numpy(large).to(lr) / 255, lr, factor, began)

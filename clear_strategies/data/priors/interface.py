@@ -111,7 +111,15 @@ def warn_if_far_from_lr(what: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor,
         )  # fmt: skip
 
 
-def log_result(name: str, label: str, sr: Float[Tensor, "H W 3"], began: float) -> None:
-    """Log the size of an SR image and the seconds since `began` (time.perf_counter)."""
+def finished(
+    name: str, label: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int, began: float
+) -> Float[Tensor, "H W 3"]:
+    """What a network made, on 8-bit steps and the device of its LR image, compared with that one.
+
+    Its size and the seconds since `began` (time.perf_counter) are logged.
+    """
     seconds = time.perf_counter() - began
     _log.debug("%s: %s made %dx%d in %.1f s.", name, label, sr.shape[1], sr.shape[0], seconds)
+    result = images.quantize(sr).to(lr.device)
+    warn_if_far_from_lr(label, result, lr, factor)
+    return result

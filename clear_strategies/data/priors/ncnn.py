@@ -18,9 +18,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core import images
 from clear_strategies.core.checks import refuse, require_choice
-from clear_strategies.data.priors.interface import log_result, warn_if_far_from_lr
+from clear_strategies.data.priors.interface import finished
 from clear_strategies.data.priors.tiling import require_tiles, tiled
 from clear_strategies.errors import DataError, SettingError
 
@@ -123,10 +122,7 @@ class Ncnn:
         model = _MODELS[self.model]
         network = _read_network(model)  # anew for each image: its weights take more memory than the image
         result = tiled(lambda part: _upscale(network, model, part, factor), lr.cpu(), factor, self.tile, self.overlap)
-        log_result(name, self.label, result, began)
-        result = images.quantize(result).to(lr.device)
-        warn_if_far_from_lr(self.label, result, lr, factor)
-        return result
+        return finished(name, self.label, result, lr, factor, began)
 
 
 def factors(model: str) -> tuple[int, ...]:

@@ -13,8 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core import images
-from clear_strategies.data.priors.interface import log_result, require_file, require_path, warn_if_far_from_lr
+from clear_strategies.data.priors.interface import finished, require_file, require_path
 from clear_strategies.data.priors.tiling import require_tiles, tiled
 from clear_strategies.errors import DataError
 
@@ -58,10 +57,7 @@ class Onnx:
         began = time.perf_counter()
         network = _read_network(Path(self.path))
         result = tiled(lambda part: self._run(network, part, factor), lr.cpu(), factor, self.tile, self.overlap)
-        log_result(name, self.label, result, began)
-        result = images.quantize(result).to(lr.device)
-        warn_if_far_from_lr(self.label, result, lr, factor)
-        return result
+        return finished(name, self.label, result, lr, factor, began)
 
     def _run(self, network: Any, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         import cv2

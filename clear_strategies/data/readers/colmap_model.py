@@ -10,6 +10,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -57,7 +58,10 @@ def find_model(root: Path) -> Path:
 def _largest(root: Path, models: Sequence[Path]) -> Path:
     if len(models) == 1:
         return models[0]
-    photos = {model: len(read_images(model / f"images{_ending(model)}")) for model in models}
+    photos = {}
+    for model in models:
+        ending, files = _format(model)
+        photos[model] = len(files.images(model / f"images{ending}"))
     largest = max(models, key=lambda model: photos[model])
     others = ", ".join(f"{model.name} with {photos[model]}" for model in models if model != largest)
     _log.warning(
@@ -67,10 +71,10 @@ def _largest(root: Path, models: Sequence[Path]) -> Path:
     return largest
 
 
-def _ending(folder: Path) -> str:
-    """Of a model's files. If there is any binary file, text files are ignored."""
+def _format(folder: Path) -> tuple[str, ModuleType]:
+    """The ending of a model's files, and what reads them. If there is any binary file, text files are ignored."""
     binary = any((folder / f"{name}.bin").exists() for name in ("cameras", "images", "points3D"))
-    return ".bin" if binary else ".txt"
+    return (".bin", colmap_binary) if binary else (".txt", colmap_text)
 
 
 def read_model(folder: Path) -> Model:
@@ -79,9 +83,9 @@ def read_model(folder: Path) -> Model:
     Raises:
         DataError: a file is missing or not what it should be.
     """
-    ending = _ending(folder)
-    lenses = read_cameras(folder / f"cameras{ending}")
-    registered = read_images(folder / f"images{ending}")
+    ending, files = _format(folder)
+    lenses = files.cameras(folder / f"cameras{ending}")
+    registered = files.images(folder / f"images{ending}")
     if not registered:
         raise DataError(folder / f"images{ending}", "images", "there is none", "run COLMAP's mapper to its end")
     for image in registered:
@@ -92,38 +96,11 @@ def read_model(folder: Path) -> Model:
         _log.debug("%s has no %s: the capture has no points.", folder, file.name)
         points = checked_points(file, set(), [], [], [])
     else:
-        points = read_points(file)
+        points = files.points(file)
         unknown = np.setdiff1d(points.track[:, 1], [image.id for image in registered])
         if len(unknown):
             raise damaged(file, "track", f"names the unknown image {unknown[0]}")
     return Model(folder, ending, lenses, registered, points)
-
-
-def read_cameras(file: Path) -> dict[int, Lens]:
-    """cameras.bin or cameras.txt: the lens of each camera by its id.
-
-    Raises:
-        DataError: the file is not what it should be.
-    """
-    return colmap_binary.cameras(file) if file.suffix == ".bin" else colmap_text.cameras(file)
-
-
-def read_images(file: Path) -> list[Image]:
-    """images.bin or images.txt.
-
-    Raises:
-        DataError: the file is not what it should be.
-    """
-    return colmap_binary.images(file) if file.suffix == ".bin" else colmap_text.images(file)
-
-
-def read_points(file: Path) -> Points:
-    """points3D.bin or points3D.txt.
-
-    Raises:
-        DataError: the file is not what it should be.
-    """
-    return colmap_binary.points(file) if file.suffix == ".bin" else colmap_text.points(file)
 
 
 def pose_of(image: Image) -> Float[Tensor, "4 4"]:

@@ -57,8 +57,6 @@ def read(
     require_choice("data.reader.poses", poses, ("auto", "colmap", "poses_bounds"))
     if background is not None:
         background = as_color("data.reader.background", background)
-    if not root.is_dir():
-        raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     folder = image_folder(root, images)
     has_model = any((root / layout).is_dir() for layout in ("sparse", "colmap/sparse"))
     if poses == "colmap" or (poses == "auto" and has_model):
@@ -94,12 +92,8 @@ def _from_bounds(
     table = read_bounds(file)
     paths = list_images(folder)
     if len(paths) != len(table):
-        raise DataError(
-            file,
-            "rows",
-            f"there are {len(table)}, but {folder.name} holds {len(paths)} images",
-            "give one row an image",
-        )
+        problem = f"there are {len(table)}, but {folder.name} holds {len(paths)} images"
+        raise DataError(file, "rows", problem, "give one row an image")
     model = read_model(find_model(root)) if has_model else None
     ids = _ids_by_order(model, len(paths))
     frames, lenses = [], []
@@ -125,9 +119,7 @@ def _from_bounds(
         **lens_notes(lenses, frames),
     }
     points = None
-    if (
-        model is not None and ids[0] is not None
-    ):  # LLFF's poses are in the coordinates of the COLMAP model they were made from
+    if model is not None and ids[0] is not None:  # LLFF's poses are in the coordinates of this model
         points = colmap.sfm_points(model, model.folder.relative_to(root).as_posix())
     return Capture(root.resolve().name, sorted_by_name(frames, folder), points, background or (0.0, 0.0, 0.0), notes)
 

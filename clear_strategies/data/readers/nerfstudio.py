@@ -6,8 +6,9 @@ import logging
 from collections.abc import Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Final
 
+import msgspec
 import torch
 
 from clear_strategies.core.checks import as_color
@@ -15,7 +16,7 @@ from clear_strategies.data.cameras import Lens, pose_from_opengl
 from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
 from clear_strategies.data.ply import read_points
-from clear_strategies.data.strict_json import read_object
+from clear_strategies.data.strict_json import read_object, typed
 from clear_strategies.data.transforms import Transform, require_paths, transforms_of
 from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
@@ -33,6 +34,15 @@ _MODELS: Final = {
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
 _SPLITS: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
+
+
+class _Listed(msgspec.Struct):
+    """The files that transforms.json names besides its frames."""
+
+    train_filenames: list[str] = []
+    val_filenames: list[str] = []
+    test_filenames: list[str] = []
+    ply_file_path: str | None = None
 
 
 def read(
@@ -63,7 +73,8 @@ def read(
     content = read_object(file)
     transforms = transforms_of(file, content)
     require_paths(file, transforms)
-    splits, names = _splits(file, content), [transform.file_path for transform in transforms]
+    listed, names = typed(file, content, _Listed), [transform.file_path for transform in transforms]
+    splits = _splits(file, listed)
     short = _short_names(names)
     lenses, frames = [], []
     paths = [_photo(folder, name, file, allow_outside) for name in names]
@@ -79,7 +90,10 @@ def read(
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(lenses, frames)}
     if splits:
         notes["split"] = _split_note(file, names, [names[i] for i in kept], splits)
-    points = _points(folder, file, content, allow_outside)
+    points = None
+    if (name := listed.ply_file_path) is not None:
+        cloud, none = read_points(inside(folder, name, file=file, allow_outside=allow_outside)), torch.zeros(0).long()
+        points = SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")
     return Capture(folder.resolve().name, sorted_by_name(frames, file), points, background or (0.0, 0.0, 0.0), notes)
 
 
@@ -122,12 +136,10 @@ def _lens(file: Path, where: str, frame: Transform, image: Path) -> Lens:
     return Lens(round(width), round(height), fx, fy, cx, cy, distortion, fisheye).check(file, where)
 
 
-def _splits(file: Path, content: Mapping[str, Any]) -> dict[str, str]:
+def _splits(file: Path, listed: _Listed) -> dict[str, str]:
     splits: dict[str, str] = {}
     for key, split in _SPLITS.items():
-        names = content.get(key, [])
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise DataError(file, key, "is no list of file names", "correct the field")
+        names = getattr(listed, key)
         both = sorted(name for name in names if splits.get(name, split) != split)
         if both:
             raise DataError(file, key, f"{both[0]!r} is for training, too", "list each photo once")
@@ -146,14 +158,3 @@ def _split_note(file: Path, names: Sequence[str], kept: Sequence[str], splits: M
         message = "%s: %d frames are in none of its split lists and are not used; data.views.own_split=false uses them."
         _log.warning(message, file, neither)
     return f"the file's own: {counts['train']} train, {counts['test']} test, {neither} in neither"
-
-
-def _points(folder: Path, file: Path, content: Mapping[str, Any], allow_outside: bool) -> SfmPoints | None:
-    name = content.get("ply_file_path")
-    if name is None:
-        return None
-    if not isinstance(name, str):
-        raise DataError(file, "ply_file_path", "is no text", "name the point cloud's file")
-    cloud = read_points(inside(folder, name, file=file, allow_outside=allow_outside))
-    none = torch.zeros(0, dtype=torch.long)
-    return SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")

@@ -85,12 +85,8 @@ def choose(sharpness: Float[np.ndarray, " n"], movement: Float[np.ndarray, " n"]
         count = int(np.clip(round(path[-1] / _STEP), _FEWEST, _MOST))
     part = np.minimum((path / max(path[-1], 1e-12) * count).astype(int), count - 1)
     kept = [members[np.argmax(relative[members])] for k in range(count) if len(members := np.flatnonzero(part == k))]
-    return Choice(
-        np.array(kept, dtype=int),
-        total=len(sharpness),
-        blurred=int((relative < _BLURRED).sum()),
-        still=int((movement[1:] < _STILL).sum()),
-    )
+    blurred, still = int((relative < _BLURRED).sum()), int((movement[1:] < _STILL).sum())
+    return Choice(np.array(kept, dtype=int), len(sharpness), blurred, still)
 
 
 def _write_chosen(path: Path, count: int | None, folder: Path) -> None:
@@ -105,24 +101,8 @@ def _write_chosen(path: Path, count: int | None, folder: Path) -> None:
         made.mkdir()
         wanted = "+".join(f"eq(n\\,{i})" for i in choice.frames)
         pattern = str(made / f"{path.stem.replace('%', '_')}_%03d.jpg")
-        subprocess.run(  # noqa: S603 - ffmpeg, by arguments
-            [
-                _ffmpeg(),
-                "-v",
-                "error",
-                "-i",
-                str(path),
-                "-vf",
-                f"select={wanted}",
-                "-fps_mode",
-                "passthrough",
-                "-q:v",
-                "1",
-                pattern,
-            ],
-            check=False,
-            stdin=subprocess.DEVNULL,
-        )
+        command = [*_filtered(path, f"select={wanted}"), "-q:v", "1", pattern]
+        subprocess.run(command, check=False, stdin=subprocess.DEVNULL)  # noqa: S603 - ffmpeg, by arguments
         (made / CHOICE).write_text(choice.summary())
         shutil.rmtree(folder, ignore_errors=True)
         made.rename(folder)
@@ -149,18 +129,7 @@ def _judged(path: Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"
 
 def _small_frames(path: Path) -> Iterator[Grey]:
     """Every frame, upright, grey and `_WIDTH` wide: ffmpeg writes them as PGM, each with its size."""
-    command = [
-        _ffmpeg(),
-        "-v",
-        "error",
-        "-i",
-        str(path),
-        "-vf",
-        f"scale={_WIDTH}:-2,format=gray",
-        "-fps_mode",
-        "passthrough",
-    ]
-    command += ["-f", "image2pipe", "-c:v", "pgm", "-"]
+    command = [*_filtered(path, f"scale={_WIDTH}:-2,format=gray"), "-f", "image2pipe", "-c:v", "pgm", "-"]
     with subprocess.Popen(  # noqa: S603 - ffmpeg, by arguments
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
     ) as process:
@@ -175,8 +144,8 @@ def _small_frames(path: Path) -> Iterator[Grey]:
             yield np.frombuffer(data, np.uint8).reshape(height, width)
 
 
-def _ffmpeg() -> str:
-    """The program that imageio-ffmpeg brings.
+def _filtered(path: Path, filters: str) -> list[str]:
+    """The command that gives a video's frames, filtered, to what follows it: of the ffmpeg that imageio-ffmpeg brings.
 
     Raises:
         DataError: it is not installed.
@@ -185,7 +154,8 @@ def _ffmpeg() -> str:
         import imageio_ffmpeg
     except ImportError as error:
         raise DataError("video", "ffmpeg", "is not installed", "pip install 'clear-strategies[train]'") from error
-    return str(imageio_ffmpeg.get_ffmpeg_exe())
+    ffmpeg = str(imageio_ffmpeg.get_ffmpeg_exe())
+    return [ffmpeg, "-v", "error", "-i", str(path), "-vf", filters, "-fps_mode", "passthrough"]
 
 
 def _key(path: Path, count: int | None) -> str:

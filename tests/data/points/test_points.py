@@ -103,10 +103,16 @@ def test_other_clouds_have_no_depth() -> None:
     assert initial_points(CloudSettings(init="triangulated"), plane_photos(2)).depths == ()
 
 
-def test_stereo_does_not_fall_back_when_asked_for() -> None:
-    views = [photo(0.0), photo(0.0)]
-    with pytest.raises(DataError, match="stereo confirms no depth in any of the 2 training LR images"):
-        initial_points(CloudSettings(init="stereo"), views)
+@pytest.mark.parametrize(
+    ("init", "photos", "problem"),
+    [
+        ("stereo", [photo(0.0), photo(0.0)], "stereo confirms no depth in any of the 2 training LR images"),
+        ("triangulated", flat_photos(), "none could be triangulated from the 2 training LR images"),
+    ],
+)
+def test_what_is_asked_for_does_not_fall_back(init, photos, problem) -> None:
+    with pytest.raises(DataError, match=problem):
+        initial_points(CloudSettings(init=init), photos)
 
 
 def test_auto_falls_back_to_random_and_logs_it(caplog: pytest.LogCaptureFixture) -> None:
@@ -115,11 +121,6 @@ def test_auto_falls_back_to_random_and_logs_it(caplog: pytest.LogCaptureFixture)
     assert cloud.source.startswith("random")
     assert cloud.uses_test_views == "no"
     assert "auto chose random points: the training LR images give only 0 (data.cloud.enough: 50)" in caplog.text
-
-
-def test_triangulated_does_not_fall_back() -> None:
-    with pytest.raises(DataError, match="none could be triangulated from the 2 training LR images"):
-        initial_points(CloudSettings(init="triangulated"), flat_photos())
 
 
 def test_the_same_seed_gives_the_same_cloud() -> None:

@@ -55,10 +55,10 @@ def test_errors_differ_between_views_and_seeds():
     assert not torch.equal(one("a", lr, 4), Corrupted(Sharp(), patch=16, seed=1)("a", lr, 4))
 
 
-def test_its_label_names_the_prior_and_says_synthetic():
-    assert (
-        Corrupted(Bicubic()).label == "bicubic (no detail beyond LR) (synthetic: seeded errors in 30% of the patches)"
-    )
+def test_labels_say_that_it_is_synthetic():
+    errors = "seeded errors in 30% of the patches)"
+    assert Corrupted(Bicubic()).label == f"bicubic (no detail beyond LR) (synthetic: {errors}"
+    assert DemoPrior({}).label == f"demo (synthetic: truth with {errors}"
 
 
 def test_a_network_inside_is_cached_and_the_config_builds_it(tmp_path):
@@ -132,10 +132,6 @@ def test_the_demo_prior_is_better_than_bicubic_and_worse_than_the_truth() -> Non
     assert 0 < 10 * math.log10(bicubic / ours) < 6
 
 
-def test_the_demo_priors_label_says_that_it_is_synthetic() -> None:
-    assert prior().label == "demo (synthetic: truth with seeded errors in 30% of the patches)"
-
-
 def test_the_demo_prior_does_not_change_the_truth_and_crops_it_as_hr_is_cropped() -> None:
     whole = torch.rand(34, 35, 3)
     before = whole.clone()
@@ -159,8 +155,3 @@ def test_hidden_errors_shrink_to_the_same_lr_pixels_and_are_still_wrong():
     assert float(change[mask].min()) > 2 / 255
     apart = [(images.downsample(sr, 4) - images.downsample(right, 4)).abs().mean() for sr in (seen, hidden)]
     assert float(apart[1]) < 0.25 * float(apart[0])
-
-
-def test_the_mask_is_that_of_the_errors():
-    lr, prior = random_lr(), Corrupted(Sharp(), share=0.25, patch=32)
-    assert torch.equal(prior.wrong(96, 128, 4, "a"), wrong_patches(prior, "a", lr))

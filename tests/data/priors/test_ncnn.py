@@ -71,13 +71,6 @@ def test_a_network_that_fails_is_refused_in_one_line(
         Ncnn()("view", photo(4, 4), 2)
 
 
-def test_one_line_of_the_log_per_image(fake: Path, caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level("DEBUG"):
-        Ncnn()("view", photo(8, 12), 4)
-    (line,) = caplog.messages
-    assert line.startswith("view: waifu2x (photo model) made 48x32 in ")
-
-
 def test_the_cache_knows_weights_tiles_and_the_version_of_ncnn(fake: Path, tmp_path: Path) -> None:
     folder, lr = tmp_path / "cache", photo(4, 4)
 

@@ -14,11 +14,10 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import demo
-from clear_strategies.data.readers.demo.room import _FLOOR, _box, room
-from clear_strategies.data.readers.demo.surfaces import Ball, Finish, Panel, Rays
+from clear_strategies.data.readers.demo.room import room
+from clear_strategies.data.readers.demo.surfaces import Ball, Finish, Panel
 from clear_strategies.data.readers.demo.textures import Texture
 from clear_strategies.errors import SettingError
-from rasterizers import Camera
 
 WIDTH, HEIGHT, FACTOR = 128, 96, 4
 
@@ -26,11 +25,6 @@ WIDTH, HEIGHT, FACTOR = 128, 96, 4
 @cache
 def capture() -> Capture:
     return demo.read(width=WIDTH, height=HEIGHT)
-
-
-def frontal(width: int = 40, height: int = 30) -> Camera:
-    """At the origin, looking along z, 90 degrees wide."""
-    return Camera(torch.eye(4).double(), width / 2, width / 2, width / 2, height / 2, width, height)
 
 
 def test_three_of_twelve_views_train_and_lie_inside_the_arc() -> None:
@@ -156,23 +150,6 @@ def test_lr_has_features_that_triangulate_onto_the_surfaces() -> None:
     assert np.median(np.abs(z / true - 1)) < 0.05
 
 
-def test_depth_of_a_panel_is_its_plane() -> None:
-    panel = Panel(Finish("brick"), center=(0.0, 0.0, 4.0), right=(2.0, 0.0, 0.0), down=(0.0, 1.0, 0.0))
-    depth = panel.depth(Rays.through(frontal(), 0, 30, 1))
-    # 90 degrees wide: at z = 4 the picture is 8 wide and 6 high, 5 px a unit; the panel is 4 by 2 units.
-    assert np.isfinite(depth).sum() == 20 * 10
-    assert np.all(depth[10:20, 10:30] == 4)
-
-
-def test_depth_of_a_ball_is_nearest_at_its_centre() -> None:
-    ball = Ball(Finish("moon"), center=(0.0, 0.0, 3.0), radius=1.0)
-    depth = ball.depth(Rays.through(frontal(101, 101), 0, 101, 1))
-    assert depth[50, 50] == pytest.approx(2)
-    assert np.nanmin(depth) == depth[50, 50]
-    # Its outline is seen at sin(angle) = 1/3, tan(angle) = 0.3536: 17.86 px from the middle.
-    assert np.isfinite(depth[50]).sum() == 2 * 17 + 1
-
-
 @pytest.mark.parametrize("k", range(19))
 def test_charts_invert_and_normals_have_unit_length(k: int) -> None:
     surface = room()[k]
@@ -180,16 +157,6 @@ def test_charts_invert_and_normals_have_unit_length(k: int) -> None:
     points = surface.points(at)
     assert np.allclose(surface.chart(points), at, atol=1e-4)
     assert np.allclose(np.linalg.norm(surface.normal(points), axis=-1), 1)
-
-
-def test_a_box_is_closed_and_faces_outwards() -> None:
-    faces = _box("coffee", x=0.0, z=5.0, size=(2.0, 1.0, 1.0), turn=0.3)
-    middle = np.array([0.0, _FLOOR - 0.5, 5.0])
-    for face in faces:
-        outwards = np.asarray([face.center]) - middle
-        normal = face.normal(outwards)
-        assert float((normal * outwards).sum()) == pytest.approx(1.0 if abs(normal[0, 0]) > 0.9 else 0.5)
-        assert np.allclose(np.cross(normal, outwards), 0)
 
 
 def test_shadows_fall_behind_what_stands_in_the_light() -> None:

@@ -12,7 +12,9 @@ import pytest
 import torch
 
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.ply import write_points
 from clear_strategies.data.readers import nerfstudio
+from clear_strategies.errors import DataError
 from tests.helpers import captures as tiny
 
 
@@ -32,6 +34,12 @@ def test_cameras_are_opencv_and_frames_sorted(tmp_path: Path) -> None:
         np.testing.assert_allclose(camera.world_to_camera.numpy(), tiny.world_to_camera(i), atol=1e-12)
         assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 20, 8, 6)
     assert nerfstudio.read(tmp_path / "transforms.json").frames[0].name == "a.png"
+
+
+def test_a_camera_farther_than_float32_resolves_is_refused(tmp_path: Path) -> None:
+    far = [[1.0, 0, 0, 1e17], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
+    with pytest.raises(DataError, match=r"frames\[0\]\.transform_matrix: is no 3x4 or 4x4 matrix of finite numbers"):
+        nerfstudio.read(changed(tmp_path, lambda value: value["frames"][0].update(transform_matrix=far)))
 
 
 def test_a_frames_own_intrinsics_win_over_the_shared_ones(tmp_path: Path) -> None:
@@ -89,10 +97,7 @@ def test_the_masks_it_names_hide_their_black_pixels_and_are_undistorted_with_the
 
 def test_points_of_a_ply_have_no_tracks(tmp_path: Path) -> None:
     changed(tmp_path, lambda value: value.update(ply_file_path="points.ply", applied_transform=[[1, 0, 0, 5]]))
-    properties = "".join(f"property float {axis}\n" for axis in "xyz")
-    colors = "".join(f"property uchar {color}\n" for color in ("red", "green", "blue"))
-    header = f"ply\nformat ascii 1.0\nelement vertex 1\n{properties}{colors}end_header\n"
-    (tmp_path / "points.ply").write_text(f"{header}1 2 3 255 0 51\n")
+    write_points(tmp_path / "points.ply", torch.tensor([[1.0, 2, 3]]), torch.tensor([[1, 0, 0.2]]))
     points = nerfstudio.read(tmp_path).points
     assert points is not None
     assert points.means.tolist() == [[1, 2, 3]]

@@ -5,14 +5,11 @@ Folders of photos without poses are in test_untidy_photos.py.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import blender, colmap, llff, nerfstudio
@@ -81,46 +78,25 @@ def test_a_truncated_photo_is_named_with_its_cure_and_skipped_on_request(tmp_pat
 @pytest.mark.parametrize("reader", READERS)
 def test_linked_photos_are_followed_by_a_switch_that_the_refusal_names(tmp_path, reader):
     root, folder, read = built(tmp_path, reader)
-    elsewhere = tmp_path / "elsewhere"
-    shutil.move(folder, elsewhere)
-    folder.mkdir()
-    for name in NAMES:
-        (folder / name).symlink_to(elsewhere / name)
+    captures.link(folder)
     with pytest.raises(DataError) as refusal:
         read(root)
     one_line(refusal, "leads out of", "data.reader.allow_outside=true")
     assert names(read(root, allow_outside=True)) == ["a", "b", "c"]
 
 
-def turn(path: Path, orientation: int, *, rotate: bool) -> np.ndarray:
-    """Store a photo turned, as its EXIF block then says; its upright pixels. `rotate` keeps the upright view the same."""
-    with Image.open(path) as image:
-        upright = image.convert("RGB")
-    stored = upright.transpose(Image.Transpose.ROTATE_90) if rotate else upright
-    exif = Image.Exif()
-    exif[0x0112] = orientation
-    stored.save(path, exif=exif)
-    return np.asarray(upright)
-
-
-def test_a_photo_on_its_side_is_turned_where_the_camera_is_upright(tmp_path):
+@pytest.mark.parametrize("rotate", [True, False])
+def test_a_photo_on_its_side_is_turned_where_the_camera_is_not_that_of_the_stored_pixels(tmp_path, rotate):
     root, folder, read = built(tmp_path, "colmap")
-    upright = turn(folder / "b.png", 6, rotate=True)
+    expected = captures.turn(folder / "b.png", 6, rotate=rotate)
     frame = read(root).frames[1]
     assert (frame.camera.width, frame.camera.height) == (WIDTH, HEIGHT)
-    assert torch.equal((frame.load() * 255).round().to(torch.uint8), torch.from_numpy(upright.copy()))
-
-
-def test_a_photo_on_its_side_stays_where_the_camera_is_that_of_the_stored_pixels(tmp_path):
-    root, folder, read = built(tmp_path, "colmap")
-    stored = turn(folder / "b.png", 6, rotate=False)
-    frame = read(root).frames[1]
-    assert torch.equal((frame.load() * 255).round().to(torch.uint8), torch.from_numpy(stored.copy()))
+    assert torch.equal((frame.load() * 255).round().to(torch.uint8), torch.from_numpy(expected))
 
 
 def test_a_photo_upside_down_is_refused_because_no_camera_tells(tmp_path):
     root, folder, read = built(tmp_path, "colmap")
-    turn(folder / "b.png", 3, rotate=False)
+    captures.turn(folder / "b.png", 3, rotate=False)
     with pytest.raises(DataError) as refusal:
         read(root)
     one_line(refusal, "b.png", "EXIF orientation", "mogrify -auto-orient")

@@ -48,28 +48,18 @@ def image_of(path: Path) -> Image.Image:
         return image.convert("RGB")
 
 
-def again(folder: Path, name: str = "b.png", **saving) -> None:
+def again(folder: Path, name: str, **saving) -> None:
     """Save b anew, under a name and in a form."""
     image = image_of(folder / "b.png")
     (folder / "b.png").unlink()
     image.save(folder / name, **saving)
 
 
-def turn(path: Path, orientation: int) -> np.ndarray:
-    """Store a photo turned, as its EXIF block then says; its upright pixels."""
-    upright, exif = image_of(path), Image.Exif()
-    exif[0x0112] = orientation
-    stored = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}[orientation]
-    upright.transpose(stored).save(path, exif=exif)
-    return np.asarray(upright)
-
-
 def as_heic(folder: Path, name: str) -> None:
     heif = pytest.importorskip("pillow_heif")
     heif.register_heif_opener()
-    large = image_of(folder / "b.png").resize((64, 48))
-    (folder / "b.png").unlink()
-    large.save(folder / name, format="HEIF")
+    image_of(folder / "b.png").resize((64, 48)).save(folder / "b.png")
+    again(folder, name, format="HEIF")
 
 
 def beside(folder: Path, *names: str) -> None:
@@ -77,28 +67,14 @@ def beside(folder: Path, *names: str) -> None:
         (folder / name).write_bytes(b"never opened")
 
 
-def as_mode(folder: Path, mode: str, name: str = "b.png") -> None:
-    image = image_of(folder / "b.png").convert(mode)
-    (folder / "b.png").unlink()
-    image.save(folder / name)
+def as_mode(folder: Path, mode: str) -> None:
+    image_of(folder / "b.png").convert(mode).save(folder / "b.png")
 
 
 def as_portrait(folder: Path) -> None:
     """Two pictures in one JPEG, the second of them depth: what phones save as a portrait."""
-    image = image_of(folder / "b.png")
-    (folder / "b.png").unlink()
-    image.save(folder / "b.jpg", format="MPO", save_all=True, append_images=[image.convert("L").convert("RGB")])
-
-
-def with_damaged_exif(folder: Path) -> None:
-    again(folder, "b.jpg", exif=b"Exif\0\0MM\0*\xff\xff\xff\xff" + bytes(20))
-
-
-def as_links(folder: Path) -> None:
-    shutil.move(folder, folder.parent / "elsewhere")
-    folder.mkdir()
-    for name in NAMES:
-        (folder / name).symlink_to(folder.parent / "elsewhere" / name)
+    depth = image_of(folder / "b.png").convert("L").convert("RGB")
+    again(folder, "b.jpg", format="MPO", save_all=True, append_images=[depth])
 
 
 def sixteen_bits(folder: Path) -> None:
@@ -123,7 +99,10 @@ READ: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "a grey photo": (lambda f: as_mode(f, "L"), ["a.png", "b.png", "c.png"]),
     "a transparent photo": (lambda f: as_mode(f, "RGBA"), ["a.png", "b.png", "c.png"]),
     "a portrait of two pictures": (as_portrait, ["a.png", "b.jpg", "c.png"]),
-    "a damaged EXIF block": (with_damaged_exif, ["a.png", "b.jpg", "c.png"]),
+    "a damaged EXIF block": (
+        lambda f: again(f, "b.jpg", exif=b"Exif\0\0MM\0*\xff\xff\xff\xff" + bytes(20)),
+        ["a.png", "b.jpg", "c.png"],
+    ),
 }
 
 
@@ -159,7 +138,7 @@ REFUSED = {
         ("d.webp", "several in one file"), SKIP,
     ),
     "links out of the folder": Refusal(
-        as_links, ("leads out of", "data.reader.allow_outside=true"), {"allow_outside": True}
+        captures.link, ("leads out of", "data.reader.allow_outside=true"), {"allow_outside": True}
     ),
     "two files of one name": Refusal(lambda f: image_of(f / "a.png").save(f / "a.jpg"), ("'a' has several files", "keep one")),
     "two photos": Refusal(lambda f: (f / "b.png").unlink(), ("there are 2, poses need at least 3", "take more photos")),
@@ -187,8 +166,8 @@ def test_photos_turned_by_exif_are_upright(of_photos):
     folder, read = of_photos
     for orientation in (3, 6, 8):
         captures.write_photos(folder)
-        upright = turn(folder / "b.png", orientation)
-        assert torch.equal((read().frames[1].load() * 255).round().to(torch.uint8), torch.from_numpy(upright.copy()))
+        upright = captures.turn(folder / "b.png", orientation)
+        assert torch.equal((read().frames[1].load() * 255).round().to(torch.uint8), torch.from_numpy(upright))
 
 
 def test_heic_without_its_library_is_named_with_the_extra(of_photos, monkeypatch):
