@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.data.cameras import Lens
-from clear_strategies.data.photo_files import image_size, is_turned, read_image
+from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
@@ -153,10 +153,10 @@ def lens_notes(lenses: Sequence[Lens], frames: Sequence[Frame]) -> dict[str, str
 
 def _turned_as(path: Path, lens: Lens) -> bool | None:
     """As `read_image` takes it, for a photo whose lens may be that of the stored or of the upright pixels."""
-    if lens.width == lens.height or not is_turned(path):
+    stored = image_size(path, turn=False)
+    if lens.width == lens.height or stored == image_size(path, turn=True):
         return None
-    width, height = image_size(path, turn=False)
-    return (width > height) != (lens.width > lens.height)
+    return (stored[0] > stored[1]) != (lens.width > lens.height)
 
 
 def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None, turn: bool | None) -> Float[Tensor, "H W 3"]:

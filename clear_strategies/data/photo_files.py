@@ -59,7 +59,6 @@ def read_image(
     *,
     background: Color | None = None,
     expect: tuple[int, int] | None = None,
-    max_pixels: int = _MAX_PIXELS,
     turn: bool | None = None,
 ) -> Float[Tensor, "H W 3"]:
     """RGB in [0, 1], float32.
@@ -67,7 +66,6 @@ def read_image(
     Args:
         background: RGB in [0, 1] behind (straight) alpha: rgb · alpha + background · (1 - alpha). None: black, logged.
         expect: (width, height) the image must have.
-        max_pixels: a larger image is refused before it is decoded.
         turn: an image that its EXIF block says is stored turned: True turns it upright, False keeps the stored pixels, None
             refuses it.
 
@@ -75,7 +73,7 @@ def read_image(
         DataError: the file is no PNG, JPEG, WebP, TIFF or HEIC, is damaged or too large, or the image is turned by EXIF, has
             an unknown colour mode, or has another size.
     """
-    with _opened(path, max_pixels, turn) as image:
+    with _opened(path, turn) as image:
         size = _upright(image.size, orientation_of(image)) if turn else image.size
         if expect is not None and size != expect:
             problem = f"is {size[0]}x{size[1]} where {expect[0]}x{expect[1]} is expected"
@@ -99,13 +97,13 @@ def read_image(
     return torch.from_numpy(np.ascontiguousarray(rgb))
 
 
-def image_size(path: Path, *, max_pixels: int = _MAX_PIXELS, turn: bool | None = None) -> tuple[int, int]:
+def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
     """(width, height), from the header only; `turn` as for `read_image`.
 
     Raises:
         DataError: as `read_image`, as far as the header tells.
     """
-    with _opened(path, max_pixels, turn) as image:
+    with _opened(path, turn) as image:
         return _upright(image.size, orientation_of(image)) if turn else image.size
 
 
@@ -125,23 +123,13 @@ def exif_of(path: Path) -> dict[int, Any]:
     Raises:
         DataError: as `image_size`.
     """
-    with _opened(path, _MAX_PIXELS, False) as image:
+    with _opened(path, False) as image:
         try:
             block = image.getexif()
             return {**block, **block.get_ifd(_EXIF_PHOTO)}
         except Exception as error:  # as above
             _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", path.name, error)
             return {}
-
-
-def is_turned(path: Path) -> bool:
-    """Whether the EXIF block says that the image lies on its side: its width and height are swapped when it is upright.
-
-    Raises:
-        DataError: as `image_size`.
-    """
-    with _opened(path, _MAX_PIXELS, False) as image:
-        return orientation_of(image) in _ON_THE_SIDE
 
 
 def image_folder(root: Path, name: str | None = None) -> Path:
@@ -228,7 +216,7 @@ def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) ->
 
 
 @contextmanager
-def _opened(path: Path, max_pixels: int, turn: bool | None) -> Iterator[Image.Image]:
+def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
     require_regular(path)
     formats = (*_FORMATS, "HEIF") if _is_heif(path) else _FORMATS
     try:
@@ -241,8 +229,8 @@ def _opened(path: Path, max_pixels: int, turn: bool | None) -> Iterator[Image.Im
         remedy = f"use one of {', '.join(_FORMATS)}, or go on without the file: data.broken=skip"
         raise DataError(path, "file", f"is no readable image ({type(error).__name__})", remedy) from error
     with image:
-        if image.width * image.height > max_pixels:
-            problem = f"{image.width}x{image.height} is more than {max_pixels:,} pixels"
+        if image.width * image.height > _MAX_PIXELS:
+            problem = f"{image.width}x{image.height} is more than {_MAX_PIXELS:,} pixels"
             raise DataError(path, "size", problem, "downsample the images before training")
         if image.width * image.height > _LARGE and image.width * image.height * 3 > _BOMB * path.stat().st_size:
             problem = f"{image.width}x{image.height} pixels are more than {_BOMB} times the file, as in no photo"

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.lib.recfunctions import unstructured_to_structured
 from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
@@ -85,10 +86,7 @@ def write_gaussians(path: Path, g: GaussianPly, *, comments: Sequence[str] = ("S
     if not finite.all():
         i, k = np.argwhere(~finite)[0]
         raise ValueError(f"Gaussians must be finite, got {names[k]} = {columns[i, k]} in number {i}.")
-    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(c.split())}" for c in comments)]
-    lines += [f"element vertex {len(g)}", *(f"property float {name}" for name in names), "end_header\n"]
-    # Some readers expect ASCII headers.
-    write_bytes(path, "\n".join(lines).encode("ascii", "replace") + columns.astype("<f4").tobytes())
+    _write(path, unstructured_to_structured(columns.astype("<f4"), names=names), comments)
 
 
 def read_gaussians(path: Path) -> GaussianPly:
@@ -141,10 +139,16 @@ def write_points(path: Path | str, means: Float[Tensor, "N 3"], colors: Float[Te
     for k in range(3):
         table[_XYZ[k]] = means[:, k].detach().cpu().numpy()
         table[_RGB[k]] = (colors[:, k].detach().cpu() * 255).round().numpy()
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
-    lines += [f"property float {name}" for name in (*_XYZ, *_NORMAL)]
-    lines += [*(f"property uchar {name}" for name in _RGB), "end_header\n"]
-    write_bytes(Path(path), "\n".join(lines).encode() + table.tobytes())
+    _write(Path(path), table)
+
+
+def _write(path: Path, table: np.ndarray, comments: Sequence[str] = ()) -> None:
+    """A structured array of floats and bytes as the vertices."""
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {' '.join(c.split())}" for c in comments)]
+    kinds = [(name, "float" if table.dtype[name].kind == "f" else "uchar") for name in names_of(table)]
+    lines += [f"element vertex {len(table)}", *(f"property {kind} {name}" for name, kind in kinds), "end_header\n"]
+    # Some readers expect ASCII headers.
+    write_bytes(path, "\n".join(lines).encode("ascii", "replace") + table.tobytes())
 
 
 def read_points(path: Path) -> PointCloud:

@@ -140,11 +140,10 @@ def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Pat
         if stem not in by_stem:
             raise DataError(folder, stem, "has no LR image of this name", "name the LR images like the photos")
         file = found[frame.name] = inside(folder, by_stem[stem].name, file=folder)
-        if image_size(file) != (width, height):
-            found_size = "{}x{}".format(*image_size(file))
-            raise DataError(
-                file, "size", f"is {found_size} where {width}x{height} is expected", "see data.views for the LR size"
-            )
+        size = image_size(file)
+        if size != (width, height):
+            problem = f"is {size[0]}x{size[1]} where {width}x{height} is expected"
+            raise DataError(file, "size", problem, "see data.views for the LR size")
     return found
 
 

@@ -107,17 +107,14 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
         by_name = {Path(f.name).stem: f for f in (pool if own_split else frames)}
         missing = [name for name in views.train_names if name not in by_name]
         if missing:
-            raise DataError(
-                capture.name, "train_names", f"there is no view {missing[0]!r}", f"choose among {', '.join(by_name)}"
-            )
+            remedy = f"choose among {', '.join(by_name)}"
+            raise DataError(capture.name, "train_names", f"there is no view {missing[0]!r}", remedy)
         pool = [by_name[name] for name in views.train_names]
         test = [f for f in test if f not in pool]
     elif views.train is not None:
         if len(pool) < views.train:
-            raise DataError(
-                capture.name, "views", f"{views.train} training views are asked for, there are {len(pool)}",
-                "lower data.views.train",
-            )  # fmt: skip
+            problem = f"{views.train} training views are asked for, there are {len(pool)}"
+            raise DataError(capture.name, "views", problem, "lower data.views.train")
         pool = evenly_spaced(pool, views.train)
     if not pool:
         raise DataError(capture.name, "views", "none is left for training", "give more photos")

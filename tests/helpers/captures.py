@@ -58,9 +58,9 @@ def turn(path: Path, orientation: int, *, rotate: bool = True) -> np.ndarray:
     return np.array(upright)
 
 
-def link(folder: Path) -> None:
-    """Leave links in place of the photos, which go elsewhere."""
-    elsewhere = folder.rename(folder.parent / "elsewhere")
+def link(folder: Path, elsewhere: Path) -> None:
+    """Move a folder of photos, and leave links in its place."""
+    folder.rename(elsewhere)
     folder.mkdir()
     for name in NAMES:
         (folder / name).symlink_to(elsewhere / name)

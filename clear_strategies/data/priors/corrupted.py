@@ -140,15 +140,11 @@ class DemoPrior(SeededErrors):
         return f"demo (synthetic: truth with seeded errors in {self.share:.0%} of the patches)"
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-        return self.corrupt(self._truth(name, lr.shape[1] * factor, lr.shape[0] * factor, factor), lr, factor, name)
-
-    def _truth(self, name: str, width: int, height: int, factor: int) -> Float[Tensor, "H W 3"]:
-        """Cropped at the right and the bottom to a multiple of the factor, as the HR photo is."""
-        truth = self.truth[name]()
+        truth, height, width = self.truth[name](), lr.shape[0] * factor, lr.shape[1] * factor
         spare = (truth.shape[1] - width, truth.shape[0] - height)
         if not all(0 <= pixels < factor for pixels in spare):
             raise DataError(
                 name, "truth", f"is {truth.shape[1]}x{truth.shape[0]} where HR is {width}x{height}",
                 "use the photos at their own size (shrink=1, photos_are=hr), or another prior",
             )  # fmt: skip
-        return truth[:height, :width]
+        return self.corrupt(truth[:height, :width], lr, factor, name)  # cropped as the HR photo is

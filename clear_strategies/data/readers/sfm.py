@@ -7,6 +7,7 @@ photos of one size and one focal length in EXIF, which is where its own starts.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import os
 import signal
@@ -195,14 +196,8 @@ def _write_copies(
 
 def _placing(count: int) -> Callable[[], None]:
     """Counts the photos that COLMAP places. It may begin anew with other photos, so the count is of attempts."""
-    attempts, progress = 0, Progress("placing the photos", "photos", count)
-
-    def note() -> None:
-        nonlocal attempts
-        attempts += 1
-        progress(attempts + 2)  # it starts from a pair
-
-    return note
+    placed, progress = itertools.count(3), Progress("placing the photos", "photos", count)  # it starts from a pair
+    return lambda: progress(next(placed))
 
 
 @contextlib.contextmanager

@@ -78,7 +78,7 @@ def test_a_truncated_photo_is_named_with_its_cure_and_skipped_on_request(tmp_pat
 @pytest.mark.parametrize("reader", READERS)
 def test_linked_photos_are_followed_by_a_switch_that_the_refusal_names(tmp_path, reader):
     root, folder, read = built(tmp_path, reader)
-    captures.link(folder)
+    captures.link(folder, tmp_path / "elsewhere")
     with pytest.raises(DataError) as refusal:
         read(root)
     one_line(refusal, "leads out of", "data.reader.allow_outside=true")

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -67,21 +66,10 @@ def beside(folder: Path, *names: str) -> None:
         (folder / name).write_bytes(b"never opened")
 
 
-def as_mode(folder: Path, mode: str) -> None:
-    image_of(folder / "b.png").convert(mode).save(folder / "b.png")
-
-
 def as_portrait(folder: Path) -> None:
     """Two pictures in one JPEG, the second of them depth: what phones save as a portrait."""
     depth = image_of(folder / "b.png").convert("L").convert("RGB")
     again(folder, "b.jpg", format="MPO", save_all=True, append_images=[depth])
-
-
-def sixteen_bits(folder: Path) -> None:
-    import cv2
-
-    pixels = np.asarray(image_of(folder / "b.png")).astype(np.uint16) * 257
-    cv2.imwrite(str(folder / "b.png"), pixels[..., ::-1])
 
 
 # What the folder holds, and the photos that are then used.
@@ -95,9 +83,10 @@ READ: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     ),
     "a link to nowhere": (lambda f: (f / "d.png").symlink_to(f / "gone.png"), ["a.png", "b.png", "c.png"]),
     "an ending in capitals, a name with spaces": (lambda f: again(f, "b é (1).JPG"), ["a.png", "b é (1).JPG", "c.png"]),
-    "16 bits among 8": (sixteen_bits, ["a.png", "b.png", "c.png"]),
-    "a grey photo": (lambda f: as_mode(f, "L"), ["a.png", "b.png", "c.png"]),
-    "a transparent photo": (lambda f: as_mode(f, "RGBA"), ["a.png", "b.png", "c.png"]),
+    "a grey photo": (
+        lambda f: image_of(f / "b.png").convert("L").save(f / "b.png"),
+        ["a.png", "b.png", "c.png"],
+    ),
     "a portrait of two pictures": (as_portrait, ["a.png", "b.jpg", "c.png"]),
     "a damaged EXIF block": (
         lambda f: again(f, "b.jpg", exif=b"Exif\0\0MM\0*\xff\xff\xff\xff" + bytes(20)),
@@ -128,17 +117,13 @@ class Refusal(NamedTuple):
 SKIP, BROKEN = {"broken": "skip"}, "data.broken=skip"
 REFUSED = {
     "a truncated photo": Refusal(lambda f: (f / "d.png").write_bytes((f / "b.png").read_bytes()[:200]), ("d.png", BROKEN), SKIP),
-    "a web page instead of a photo": Refusal(lambda f: (f / "d.jpg").write_text("404 not found"), ("d.jpg", BROKEN), SKIP),
     "an empty file": Refusal(lambda f: (f / "d.jpg").touch(), ("d.jpg", BROKEN), SKIP),
     "colours for print": Refusal(
         lambda f: image_of(f / "a.png").convert("CMYK").save(f / "d.jpg"), ("d.jpg", "CMYK", "convert the image"), SKIP
     ),
-    "an animation": Refusal(
-        lambda f: image_of(f / "a.png").save(f / "d.webp", save_all=True, append_images=[image_of(f / "b.png")]),
-        ("d.webp", "several in one file"), SKIP,
-    ),
     "links out of the folder": Refusal(
-        captures.link, ("leads out of", "data.reader.allow_outside=true"), {"allow_outside": True}
+        lambda f: captures.link(f, f.parent / "elsewhere"),
+        ("leads out of", "data.reader.allow_outside=true"), {"allow_outside": True},
     ),
     "two files of one name": Refusal(lambda f: image_of(f / "a.png").save(f / "a.jpg"), ("'a' has several files", "keep one")),
     "two photos": Refusal(lambda f: (f / "b.png").unlink(), ("there are 2, poses need at least 3", "take more photos")),
