@@ -47,8 +47,7 @@ def within_limit(
         super_resolve: the HR images must come from the prior, even if the photos are large enough.
 
     Returns:
-        The capture, with reduced photos where needed, and the settings of its views. Both are unchanged if there is no
-        limit, if the HR images fit into it, or if `photos_are` is not "lr".
+        The capture and the settings of its views, unchanged where the HR images fit or `photos_are` is not "lr".
     """
     limit, photo = views.max_hr_megapixels, _largest(capture)
     pixels = photo.width * photo.height / views.shrink**2 / _MEGA

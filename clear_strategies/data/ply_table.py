@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -42,13 +42,9 @@ class _Element:
     def dtype(self) -> np.dtype[np.void]:
         return np.dtype(list((self.row or {}).items()))
 
-    @property
-    def bytes(self) -> int:
-        return self.count * self.dtype.itemsize
-
-    @property
-    def values(self) -> int:
-        return self.count * len(self.row or {})
+    def size(self, ascii_: bool) -> int:
+        """Values in an ASCII file, bytes in a binary one."""
+        return self.count * (len(self.row or {}) if ascii_ else self.dtype.itemsize)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,22 +66,26 @@ def read_vertices(path: Path) -> np.ndarray:
     """The vertex element as a structured array."""
     data = read_bytes(path)
     header = _parse_header(path, data[:_LONGEST_HEADER])
-    return (_read_ascii if header.form == "ascii" else _read_binary)(path, header, data[header.body :])
-
-
-def _read_binary(path: Path, header: _Header, body: bytes) -> np.ndarray:
-    vertex, skipped = header.vertex, sum(e.bytes for e in header.before)
-    _check_length(path, header, skipped + vertex.bytes, sum(e.bytes for e in header.after), len(body), "bytes")
+    vertex, ascii_ = header.vertex, header.form == "ascii"
+    # Line breaks in ASCII files have no meaning, so values are counted.
+    body: Any = data[header.body :].split() if ascii_ else data[header.body :]
+    before, after = (sum(e.size(ascii_) for e in elements) for elements in (header.before, header.after))
+    needed, left, unit = before + vertex.size(ascii_), len(body), "values" if ascii_ else "bytes"
+    if needed > left:
+        problem = f"has a count of {vertex.count}, which needs {needed} {unit}, but {left} are left"
+        raise DataError(path, "element vertex", problem, "the file is truncated; write it again")
+    if all(e.row is not None for e in header.after) and needed + after != left:
+        problem = f"needs {needed + after} {unit} after it, but {left} follow"
+        raise DataError(path, "header", problem, "the file is damaged; write it again")
+    if ascii_:
+        return _of_words(path, vertex, body[before:needed])
     row = vertex.dtype.newbyteorder("<" if header.form == "binary_little_endian" else ">")
-    return np.frombuffer(body, row, vertex.count, skipped)
+    return np.frombuffer(body, row, vertex.count, before)
 
 
-def _read_ascii(path: Path, header: _Header, body: bytes) -> np.ndarray:
-    """By number of values, because line breaks in ASCII PLY files have no meaning."""
-    vertex, skipped, words = header.vertex, sum(e.values for e in header.before), body.split()
-    _check_length(path, header, skipped + vertex.values, sum(e.values for e in header.after), len(words), "values")
+def _of_words(path: Path, vertex: _Element, words: Sequence[bytes]) -> np.ndarray:
     try:
-        numbers = np.array([float(word) for word in words[skipped : skipped + vertex.values]])
+        numbers = np.array([float(word) for word in words])
     except ValueError as error:
         raise DataError(path, "element vertex", f"is not numeric ({error})", "export it again") from error
     table = np.zeros(vertex.count, vertex.dtype)
@@ -97,19 +97,9 @@ def _read_ascii(path: Path, header: _Header, body: bytes) -> np.ndarray:
             if wrong.any():
                 problem = f"must be whole and in [{limits.min}, {limits.max}], is {column[wrong][0]:g}"
                 raise DataError(path, name, problem, "export it again")
-        with np.errstate(over="ignore"):  # overflow gives infinity, which `_columns` refuses
+        with np.errstate(over="ignore"):  # overflow gives infinity, which `columns` refuses
             table[name] = column
     return table
-
-
-def _check_length(path: Path, header: _Header, needed: int, after: int, left: int, unit: str) -> None:
-    """Compare the header's counts with the data that follow it."""
-    if needed > left:
-        problem = f"has a count of {header.vertex.count}, which needs {needed} {unit}, but {left} are left"
-        raise DataError(path, "element vertex", problem, "the file is truncated; write it again")
-    if all(e.row is not None for e in header.after) and needed + after != left:
-        problem = f"needs {needed + after} {unit} after it, but {left} follow"
-        raise DataError(path, "header", problem, "the file is damaged; write it again")
 
 
 def _parse_header(path: Path, head: bytes) -> _Header:

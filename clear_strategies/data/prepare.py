@@ -216,18 +216,16 @@ def _hidden(views: Sequence[View]) -> dict[str, str]:
     hidden = [float((~view.lr.shown).float().mean()) for view in views if view.lr.shown is not None]
     if not hidden:
         return {}
-    return {
-        "masks": f"{len(hidden)} of {len(views)} training photos have one, which hides {sum(hidden) / len(hidden):.1%} of it"
-    }
+    mean = sum(hidden) / len(hidden)
+    return {"masks": f"{len(hidden)} of {len(views)} training photos have one, which hides {mean:.1%} of it"}
 
 
 def _equalized(train: Sequence[View]) -> tuple[tuple[View, ...], dict[str, str]]:
     """The views at their common exposure, and a line for the plan."""
     depths = [view.depth for view in train if view.depth is not None]
     if len(depths) < len(train):
-        _log.warning(
-            "data.views.equalize has no effect: there is no depth that tells what the photos share. Set data.cloud.init=stereo."
-        )
+        why = "there is no depth that tells what the photos share. Set data.cloud.init=stereo."
+        _log.warning("data.views.equalize has no effect: %s", why)
         return tuple(train), {}
     gains = exposure_gains([view.depth_photo for view in train], depths)
     span = f"photos times {float(gains.min()):.3f} to {float(gains.max()):.3f}"

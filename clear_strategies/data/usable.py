@@ -45,8 +45,7 @@ def usable(
     """
     require_faults(missing, broken)
     there = [entry for entry in entries if path_of(entry).is_file()]
-    if len(there) < len(entries):
-        absent = [path_of(entry).name for entry in entries if not path_of(entry).is_file()]
+    if absent := [path_of(entry).name for entry in entries if not path_of(entry).is_file()]:
         told = f"{len(absent)} of {len(entries)} are not there: {some(absent)}"
         if missing == "refuse":
             raise DataError(file, "photos", told, "put them back, or train without them: data.missing=skip")

@@ -210,9 +210,11 @@ def _from_photos(
         _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
     features = triangulate(photos, settings.triangulation) if known is None else known
     if settings.init != "triangulated":
+        few = hr_is_photo or len(photos) <= _FEW_PHOTOS
+        compares_hr = settings.compare == "hr" or (settings.compare == "auto" and few)
         compared = compared_at(
             photos,
-            hr if _compares_hr(settings.compare, hr_is_photo, len(photos)) else (),
+            hr if compares_hr else (),
             hr_is_photo=hr_is_photo,
             settings=settings.stereo,
             background=background or (0.0, 0.0, 0.0),
@@ -248,10 +250,6 @@ def _from_photos(
     if auto:
         _log.debug("init: auto chose %s.", features.source)
     return _cleaned(settings, features, photos, background), ()
-
-
-def _compares_hr(compare: Compare, hr_is_photo: bool, n_photos: int) -> bool:
-    return compare == "hr" or (compare == "auto" and (hr_is_photo or n_photos <= _FEW_PHOTOS))
 
 
 def _cleaned(

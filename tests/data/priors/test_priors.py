@@ -6,7 +6,6 @@ import logging
 from pathlib import Path
 
 import pytest
-import torch
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image
@@ -26,11 +25,6 @@ def test_a_model_that_is_not_there_is_refused(prior: type[Onnx | DnnSuperres], t
     for path in (tmp_path / "absent", tmp_path):
         with pytest.raises(DataError, match=r"file: is not there: set prior\.path"):
             prior(str(path))("view", photo(8, 12), 4)
-
-
-def test_bicubic_is_u_on_eight_bits() -> None:
-    lr = photo(9, 7)
-    assert torch.equal(Bicubic()("view", lr, 3), images.quantize(images.upsample(lr, 3)))
 
 
 def test_real_networks_do_on_fern_what_is_known_of_them(shared_data: Path, caplog: pytest.LogCaptureFixture) -> None:
