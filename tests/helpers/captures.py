@@ -8,11 +8,14 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from PIL import Image
+
+from clear_strategies.data.capture import Frame
 
 WIDTH, HEIGHT = 16, 12
 FOCAL = 20.0
@@ -38,6 +41,14 @@ def world_to_camera(view: int) -> np.ndarray:
 def opengl(view: int) -> list[list[float]]:
     """Camera-to-world with x right, y up, z back."""
     return (np.linalg.inv(world_to_camera(view)) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
+
+
+def largest_turn(a: Sequence[Frame], b: Sequence[Frame]) -> float:
+    """The largest angle, degrees, between two estimates of the cameras' rotations relative to the first camera."""
+    found, real = (torch.stack([frame.camera.world_to_camera[:3, :3] for frame in frames]) for frames in (a, b))
+    relative = (found[1:] @ found[:1].mT) @ (real[1:] @ real[:1].mT).mT
+    cosine = (relative.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
+    return float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max())
 
 
 def write_photos(folder: Path, size: tuple[int, int] = (WIDTH, HEIGHT), mode: str = "RGB") -> None:

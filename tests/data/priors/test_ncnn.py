@@ -87,13 +87,6 @@ def test_the_cache_knows_weights_tiles_and_the_version_of_ncnn(fake: Path, tmp_p
     assert entries(other) == 5
 
 
-def test_a_fresh_image_has_the_bits_and_the_layout_of_a_cached_one(fake: Path, tmp_path: Path) -> None:
-    """Sums over an image have an order, so the same values in another layout have other means."""
-    fresh, again = (Cached(Ncnn(), tmp_path / "cache")("view", photo(9, 7), 4) for _ in range(2))
-    assert torch.equal(fresh, again)
-    assert fresh.stride() == again.stride()
-
-
 def test_the_network_behind_a_prior_is_found_and_named_by_its_weights(fake: Path) -> None:
     network = Ncnn()
     for prior in (network, Cached(network), Corrupted(network), Corrupted(Corrupted(network))):

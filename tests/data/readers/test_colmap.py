@@ -20,15 +20,11 @@ LAYOUTS = {"bin": tiny.colmap_bin, "txt": tiny.colmap_txt}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_cameras_photos_and_points_are_those_of_the_files(layout: str, tmp_path: Path) -> None:
+def test_photos_and_points_are_those_of_the_files(layout: str, tmp_path: Path) -> None:
     capture = colmap.read(LAYOUTS[layout](tmp_path))
     assert [frame.name for frame in capture.frames] == list(tiny.NAMES)
     assert [frame.sfm_id for frame in capture.frames] == [1, 2, 3]
-    for i, frame in enumerate(capture.frames):
-        camera = frame.camera
-        np.testing.assert_allclose(camera.world_to_camera.numpy(), tiny.world_to_camera(i), atol=1e-12)
-        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-        assert intrinsics == (20, 20, 8, 6, 16, 12)
+    for frame in capture.frames:
         assert torch.equal(frame.load(), photo_files.read_image(tmp_path / "images" / frame.name))
     points = capture.points
     assert points is not None

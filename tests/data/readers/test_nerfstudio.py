@@ -26,13 +26,9 @@ def changed(root: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     return root
 
 
-def test_cameras_are_opencv_and_frames_sorted(tmp_path: Path) -> None:
+def test_frames_are_sorted_by_name(tmp_path: Path) -> None:
     capture = nerfstudio.read(changed(tmp_path, lambda value: value["frames"].reverse()))
     assert [frame.name for frame in capture.frames] == list(tiny.NAMES)
-    for i, frame in enumerate(capture.frames):
-        camera = frame.camera
-        np.testing.assert_allclose(camera.world_to_camera.numpy(), tiny.world_to_camera(i), atol=1e-12)
-        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 20, 8, 6)
     assert nerfstudio.read(tmp_path / "transforms.json").frames[0].name == "a.png"
 
 
