@@ -92,7 +92,8 @@ def read(
         notes["split"] = _split_note(file, names, [names[i] for i in kept], splits)
     points = None
     if (name := listed.ply_file_path) is not None:
-        cloud, none = read_points(inside(folder, name, file=file, allow_outside=allow_outside)), torch.zeros(0).long()
+        cloud = read_points(inside(folder, name, file=file, allow_outside=allow_outside))
+        none = torch.zeros(0, dtype=torch.long)
         points = SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")
     return Capture(folder.resolve().name, sorted_by_name(frames, file), points, background or (0.0, 0.0, 0.0), notes)
 
