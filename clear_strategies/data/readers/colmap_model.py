@@ -1,8 +1,4 @@
-"""The files of COLMAP's sparse models, binary and text, read strictly.
-
-Every count is compared with the bytes that are left before anything is allocated. Every number must be finite, every id
-known, and no byte may be left over.
-"""
+"""COLMAP's sparse models, binary and text, read strictly: every number must be finite and every id known."""
 
 from __future__ import annotations
 
