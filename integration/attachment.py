@@ -17,12 +17,11 @@ that densify after it (gsplat).
 
 from __future__ import annotations
 
-import functools
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, Protocol
 
 import torch
@@ -30,7 +29,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import Grads, conflict_columns, to_ndc
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
@@ -39,13 +37,15 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients, only
 from integration.autograd_shot import AutogradShot
 from integration.errors import HostError
-from integration.extra_steps import ExtraSteps, RenderCamera
+from integration.extra_steps import ExtraSteps
 from integration.host_score import ScoreScaler, score_for_host
-from rasterizers.interface import Color
+from integration.views import enlarged_mask
+from rasterizers.interface import Camera, Color
 
 _log = logging.getLogger(__name__)
 
-Resolution = Literal["lr", "hr"]
+Target = Literal["lr", "hr"] | Camera
+"""What a host draws: the view of this iteration at one of its sizes, or what a camera without a photo sees."""
 
 _LOGGED_EVERY: Final = 500  # merges between two lines of the log
 
@@ -65,10 +65,10 @@ class HostRendering:
 
 
 class RenderAt(Protocol):
-    """Renders the view of this iteration at one resolution."""
+    """Renders by the host's own renderer: with f_det at HR, without it at LR and by another camera."""
 
-    def __call__(self, resolution: Resolution, gate: Float[Tensor, " N"] | None) -> HostRendering:
-        """At LR without f_det, or at HR with f_det; opacities are multiplied by `gate`."""
+    def __call__(self, target: Target, gate: Float[Tensor, " N"] | None) -> HostRendering:
+        """The rendering, whose opacities are multiplied by `gate`."""
         ...
 
 
@@ -79,12 +79,12 @@ class Attachment:
         params: returns the leaves that the host optimizes, by gsplat's names (and "detail"). It is called at every
             iteration, since densifiers replace parameters.
         views: all training views. seed: of the strategies.
-        poll_parents: called at every iteration. It returns parents[M] if the structure has changed since its last call
-            (row i of every parameter now comes from row parents[i]), else None. Without this function the host cannot
-            tell, and no strategy may hold per-Gaussian state when the number of Gaussians changes.
+        poll_parents: called at every iteration. It returns parents[M] if the structure has changed since its last call (row i of
+            every parameter now comes from row parents[i]); None: it has not, or the host does not say how.
         threshold: the host's densification threshold on the mean ‖∇_u‖ in NDC units; None: the score is not scaled.
         loss_scale: returns the factor of the host's loss (`scaler.get_scale` of an AMP gradient scaler).
         accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
+        masks: [h, w] by the name of a view, what the host multiplies its LR image by; the HR image is multiplied here.
         own_background: the host chooses the colour behind its renderings; `background` then counts for nothing.
 
     Attributes:
@@ -99,11 +99,12 @@ class Attachment:
         params: Callable[[], Mapping[str, Tensor]],
         *,
         views: Sequence[View],
+        poll_parents: Callable[[], Int[Tensor, " M"] | None],
         seed: int = 0,
-        poll_parents: Callable[[], Int[Tensor, " M"] | None] | None = None,
         threshold: float | None = None,
         loss_scale: Callable[[], float] | None = None,
         accumulation: int = 1,
+        masks: Mapping[str, Tensor] | None = None,
         own_background: bool = True,
     ) -> None:
         if accumulation < 1:
@@ -114,7 +115,7 @@ class Attachment:
                 f"lambda_lr={conductor.objective.lambda_lr}, lr_from={conductor.objective.lr_from!r}."
             )
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
-        self._own_background = own_background
+        self._masks, self._own_background = dict(masks or {}), own_background
         self.t = 1
         self.counts: Counter[str] = Counter()
         self.removed = False
@@ -127,7 +128,8 @@ class Attachment:
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(conductor, params)
         self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
-        self._logged: dict[str, Number] = {}
+        self._logged: dict[str, deferred.Number] = {}
+        self._hooks: list[Any] = []
         conductor.on_fit_start(len(views), seed, params()["means"].device, views)
         for s in conductor.strategies:
             if (prepared := s.summary()) is not None:
@@ -135,7 +137,7 @@ class Attachment:
         if not conductor.decorated and any(view.factor > 1 for view in views):
             _log.warning(
                 "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
-                ", ".join(_named(decorate) for decorate in conductor.decorators),
+                ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
             )
         itself = {"densifier": "densifies by"} | ({"background": "chooses its background"} if own_background else {})
         for hook, does in itself.items():
@@ -144,28 +146,28 @@ class Attachment:
         if not conductor.strategies:
             _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
 
-    def render_view(self, view: View, render_at: RenderAt, render_camera: RenderCamera) -> Any:
+    def render_view(self, view: View, render_at: RenderAt) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR."""
-        if self.removed:
-            return render_at("lr", None).returned
         self._finish_previous_step()
-        conductor, t = self.conductor, self.t
+        conductor, t, means = self.conductor, self.t, self.params()["means"]
         conductor.forget_logs()
         z = conductor.gate(t, self._n)
         if z is not None:
-            z = z.to(self.params()["means"])
+            z = z.to(means)
         hr_grads = None
         if conductor.wants_hr(t):
             self.counts["HR renders"] += 1
-            with _random_state_kept(self.params()["means"].device):
-                hr_rendering = render_at("hr", z)
-            hr_grads = conductor.hr_gradients(hr_rendering.shot, view, t)
+            with _random_state_kept(means.device):
+                shot = render_at("hr", z).shot
+            if (mask := self._masks.get(view.name)) is not None:
+                shot = replace(shot, image=shot.image * enlarged_mask(mask.to(shot.image), view.factor)[..., None])
+            hr_grads = conductor.hr_gradients(shot, view, t)
         self._step = Step(t, view) if hr_grads is None else hr_grads.step
         if self._passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
-                with _random_state_kept(self.params()["means"].device):
-                    self._extra.render(extra_views, t, render_camera)
+                with _random_state_kept(means.device):
+                    self._extra.render(extra_views, t, lambda camera: render_at(camera, None).shot)
         rendering = render_at("lr", z)
         if rendering.output.requires_grad:
             self._pending = rendering, hr_grads
@@ -176,31 +178,16 @@ class Attachment:
     @property
     def background(self) -> Color | None:
         """The colour behind every rendering of this iteration, for hosts that let the strategies choose it; None: their own."""
-        return None if self.removed or self._own_background else self.conductor.background(self.t)
+        return None if self._own_background else self.conductor.background(self.t)
 
-    def before_step(self) -> None:
-        """For a hook before the host's optimizer step: count the steps in which no strategy took part.
-
-        Raises:
-            HostError: the host steps for the first time, and none of its renderings was recognised.
-        """
-        if self.removed or self._extra.stepping:
-            return
-        merges = self.counts["merges"]
-        if not merges:
-            raise HostError(
-                "the host makes its first optimizer step, but none of its renderings was recognised as that of a training "
-                "view, so that no strategy would take part. Check that the training loop renders with the function that "
-                "was replaced, and with the cameras that were passed."
-            )
-        if merges == self._merges_before_step:
-            self.counts["steps of the host alone"] += 1
-        self._merges_before_step = merges
-
-    def after_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """For a hook after each step of each of the host's optimizers: the steps on extra views."""
-        if not self.removed and (made := self._extra.step(optimizer)):
-            self.counts["extra views"] += made
+    def hook(self, optimizers: Sequence[torch.optim.Optimizer]) -> None:
+        """Hook the steps of the host's optimizers, and no longer those of earlier ones. The first steps once an iteration."""
+        for hook in self._hooks:
+            hook.remove()
+        self._hooks = [
+            *(o.register_step_pre_hook(lambda *_: self._before_step()) for o in optimizers[:1]),
+            *(o.register_step_post_hook(lambda o, *_: self._after_step(o)) for o in optimizers),
+        ]
 
     def state_dict(self) -> dict[str, Any]:
         """The iteration, and what the strategies store per Gaussian, for the host's checkpoint."""
@@ -224,8 +211,29 @@ class Attachment:
     def remove(self) -> None:
         """Stop: the host's renderings pass through, and the gradients of one that is still pending stay unmerged."""
         self.removed, self._pending = True, None
+        self.hook([])
         self._extra.forget()
         self.conductor.on_fit_end()
+
+    def _before_step(self) -> None:
+        """Count the steps in which no strategy took part."""
+        if self._extra.stepping:
+            return
+        merges = self.counts["merges"]
+        if not merges:
+            raise HostError(
+                "the host makes its first optimizer step, but none of its renderings was recognised as that of a training "
+                "view, so that no strategy would take part. Check that the training loop renders with the function that "
+                "was replaced, and with the cameras that were passed."
+            )
+        if merges == self._merges_before_step:
+            self.counts["steps of the host alone"] += 1
+        self._merges_before_step = merges
+
+    def _after_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """The steps on extra views."""
+        if made := self._extra.step(optimizer):
+            self.counts["extra views"] += made
 
     def _finish_previous_step(self) -> None:
         """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified."""
@@ -239,7 +247,7 @@ class Attachment:
 
     def _resize(self, n: int) -> None:
         """Gather the strategies' per-Gaussian state if the structure has changed."""
-        parents = None if self._poll_parents is None else self._poll_parents()
+        parents = self._poll_parents()
         if parents is None and n == self._n:
             return
         state = ", ".join(self.conductor.state_dict())
@@ -327,20 +335,13 @@ class Attachment:
             return
         screen_lr = to_ndc(slot.per_gaussian(gradient, self._n), slot.size)
         score, ordinary = self.conductor.scores(screen_lr, hr_grads, self.t)
-        if (
-            score is ordinary
-        ):  # no strategy has a score: the densifier keeps the statistic that its threshold is meant for
+        if score is ordinary:  # without a strategy's score, the statistic that the host's threshold is meant for stays
             return
         own = torch.linalg.vector_norm(screen_lr, dim=-1)
         written = score_for_host(slot, score, own, shot.visible, self._scaler, grad_scale)
         if written is not None:
             slot.write(grad_scale * written)
             self.counts["scores written"] += 1
-
-
-def _named(decorate: Callable[..., Any]) -> str:
-    called = decorate.func if isinstance(decorate, functools.partial) else decorate
-    return str(getattr(called, "__name__", called))
 
 
 @contextmanager

@@ -14,9 +14,6 @@ from clear_strategies.merging.conductor import Conductor
 from integration.autograd_shot import AutogradShot
 from rasterizers.interface import Camera
 
-RenderCamera = Callable[[Camera], AutogradShot]
-"""Renders any camera by the host's own renderer, without a gate and without f_det."""
-
 
 class ExtraSteps:
     """Takes the gradient of each extra view before the host's step, and steps on it after that.
@@ -37,11 +34,11 @@ class ExtraSteps:
         self._rendered: Mapping[str, Tensor] = {}  # what they are gradients of
         self.stepping = False
 
-    def render(self, extra_views: Sequence[ExtraView], t: int, render_camera: RenderCamera) -> None:
-        """Render the extra views of iteration t and take their gradients."""
+    def render(self, extra_views: Sequence[ExtraView], t: int, render: Callable[[Camera], AutogradShot]) -> None:
+        """Render the extra views of iteration t, without a gate and without f_det, and take their gradients."""
         self._rendered = {name: p for name, p in self._params().items() if name != "detail"}
         for extra in extra_views:
-            shot = render_camera(extra.photo.camera)
+            shot = render(extra.photo.camera)
             self._gradients += shot.vjp(self._conductor.extra_loss(shot.image, extra, t).cotangents)
 
     @torch.no_grad()

@@ -24,18 +24,15 @@ from torch import Tensor
 
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment, HostRendering, Resolution
-from integration.autograd_shot import AutogradShot
+from integration.attachment import Attachment, Target
 from integration.densification import end_with_strategies
-from integration.detail import DetailFeature, sh0_offset
+from integration.detail import sh0_offset
 from integration.errors import HostError
-from integration.host_cameras import enlarged_camera, replaced_camera
-from integration.host_score import warn_if_score_is_unused
+from integration.host_cameras import enlarged_camera
 from integration.log import show_log
-from integration.model_proxy import ModelRenderer, Role
+from integration.model_proxy import AttachedModel, Role
 from integration.rows import ROWS, RowNumbers
 from integration.views import sr_images, sr_source, view
-from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
@@ -126,7 +123,7 @@ class Attached:
         self._sr, self._factor = sr_source(sr_images(settings.sr, settings.suffix), self._conductor, settings.factor)
         end_with_strategies(self._conductor, density, "densify_until_iter")
         self._views: dict[str, View] = {}
-        self._masks: dict[str, Tensor | None] = {}
+        self._masks: dict[str, Tensor] = {}
         self._batch: Any = None  # the host's, inside a training step
         self._resumed: Mapping[str, Any] = {}
         self._sh0_holds_detail = False  # while the host writes its files
@@ -137,13 +134,11 @@ class Attached:
         _replace(module, "on_save_checkpoint", self._save_state)
         _replace(module, "on_load_checkpoint", self._load_state)
         module.on_train_start_hooks.append(lambda *_: self._show_detail_in_viewer())
-        module.on_train_batch_end_hooks.append(lambda *_: self._detail.step())
+        module.on_train_batch_end_hooks.append(lambda *_: self._attached.detail.step())
         module.extra_train_metrics.append(self._add_metrics)
 
     def _attach(self) -> Attachment:
         module, settings = self._module, self._settings
-        threshold = getattr(self._density, "densify_grad_threshold", None)
-        warn_if_score_is_unused(self._conductor, self._density, threshold)
         if missing := [name for name in _NAMES.values() if name not in module.gaussian_model.gaussians]:
             raise HostError(
                 f"the Gaussians have no {missing[0]}, as those of a VanillaGaussian have. Use a model with spherical harmonics."
@@ -153,26 +148,20 @@ class Attached:
                 f"{type(module.renderer).__name__} trains an appearance model of its own, which two scales do not share. Use a "
                 "renderer without one."
             )
-        self._detail = DetailFeature(lambda: self._host_params()["means"], self._carry_rows(), self._conductor.detail)
-        self._renderer = ModelRenderer(
-            module.gaussian_model, _ROLES, self._host_params, self._detail if settings.detail else None, self._conductor
-        )
         self._views_from_dataset(module.trainer.train_dataloader.dataset)
         self._filter_at_hr()
-        attachment = Attachment(
-            self._conductor, self._renderer.params, views=list(self._views.values()), seed=settings.seed, threshold=threshold,
-            poll_parents=lambda: self._detail.poll_parents(self._conductor.state_dict),
+        self._attached = attached = AttachedModel(
+            module.gaussian_model, _ROLES, self._host_params, self._carry_rows(), self._conductor, list(self._views.values()),
+            detail=settings.detail, densifier=self._density, threshold=getattr(self._density, "densify_grad_threshold", None),
+            masks=self._masks, seed=settings.seed, to_pixels=_to_pixels,
         )  # fmt: skip
-        module.gaussian_optimizers[0].register_step_pre_hook(lambda *_: attachment.before_step())
-        for optimizer in module.gaussian_optimizers:
-            optimizer.register_step_post_hook(lambda o, *_: attachment.after_optimizer_step(o))
+        attached.attachment.hook(module.gaussian_optimizers)
         if self._resumed:
-            self._detail.load_state_dict(self._resumed["detail"])
-            attachment.load_state_dict(self._resumed["attachment"])
+            attached.load_state_dict(self._resumed)
         elif steps_done := module.trainer.global_step:
             _log.warning("resumed at step %d from a checkpoint without CLEAR: f_det starts from zero.", steps_done)
-            attachment.t = steps_done + 1
-        return attachment
+            attached.attachment.t = steps_done + 1
+        return attached.attachment
 
     def _carry_rows(self) -> RowNumbers:
         """Row numbers as one more property that is not trained, which the host's controllers gather with the others."""
@@ -202,10 +191,10 @@ class Attached:
             fx, fy, cx, cy = (float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy"))
             K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
             pixels = image.permute(1, 2, 0).to(device)
-            shown = None if mask is None else mask[0].to(device).float()
+            if mask is not None:
+                self._masks[name] = mask[0].to(device).float()
             pose = camera.world_to_camera.T
-            self._views[name] = view(name, pixels, pose, K, self._sr, self._factor, mask=shown)
-            self._masks[name] = shown
+            self._views[name] = view(name, pixels, pose, K, self._sr, self._factor, self._masks.get(name))
 
     def _training_step(self, original: Callable[..., Any], batch: Any, *args: Any, **kwargs: Any) -> Any:
         if self.attachment is None:
@@ -221,32 +210,18 @@ class Attached:
         if self.attachment is None:
             return original(camera, *args, **kwargs)
         if self._batch is None or not self._module.training:
-            with self._using(self._renderer.with_detail()):
+            with self._using(self._attached.with_detail()):
                 return original(camera, *args, **kwargs)
         _, photo, extra = self._batch
-        current, mask = self._views[photo[0]], self._masks[photo[0]]
 
-        def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
-            hr = resolution == "hr"
-            sized = enlarged_camera(camera, current.factor) if hr else camera
+        def render(model: Any, sized: Any, target: Target) -> Any:
+            with self._using(model):
+                result = original(sized, *args, **kwargs)
+            if target == "hr":  # at LR the host itself applies its exposure, bilateral grid …
+                self._module.output_processor.training_forward((sized, photo, extra), result)
+            return result
 
-            def render(model: Any) -> Any:
-                with self._using(model):
-                    result = original(sized, *args, **kwargs)
-                if hr:  # at LR the host itself applies its exposure, bilateral grid …
-                    self._module.output_processor.training_forward((sized, photo, extra), result)
-                return result
-
-            return self._renderer.render(render, current, resolution, gate, _to_pixels, mask)
-
-        def render_camera(other: Camera) -> AutogradShot:
-            def render(model: Any) -> Any:
-                with self._using(model):
-                    return original(replaced_camera(camera, other), *args, **kwargs)
-
-            return self._renderer.draw(render, other, _to_pixels)
-
-        return self.attachment.render_view(current, render_at, render_camera)
+        return self._attached.render_view(self._views[photo[0]], camera, render)
 
     @contextmanager
     def _using(self, model: Any) -> Iterator[None]:
@@ -264,7 +239,7 @@ class Attached:
             _replace(
                 viewer, "process_all_render_requests",
                 lambda original, _, *args: original(
-                    self._module.gaussian_model if self.attachment is None else self._renderer.with_detail(), *args
+                    self._module.gaussian_model if self.attachment is None else self._attached.with_detail(), *args
                 ),
             )  # fmt: skip
 
@@ -284,7 +259,7 @@ class Attached:
             return original(*args, **kwargs)
         sh0 = self._host_params()["sh0"]
         trained = sh0.clone()
-        sh0 += self._detail.offset(sh0)
+        sh0 += self._attached.detail.offset(sh0)
         self._sh0_holds_detail = True
         try:
             return original(*args, **kwargs)
@@ -297,10 +272,10 @@ class Attached:
         original(checkpoint)
         if self.attachment is None:
             return
-        checkpoint[_STATE] = {"detail": self._detail.state_dict(), "attachment": self.attachment.state_dict()}
+        checkpoint[_STATE] = self._attached.state_dict()
         if not self._sh0_holds_detail:
             sh0 = checkpoint["state_dict"][_SH0]
-            checkpoint["state_dict"][_SH0] = sh0 + self._detail.offset(sh0)
+            checkpoint["state_dict"][_SH0] = sh0 + self._attached.detail.offset(sh0)
 
     def _load_state(self, original: Callable[..., Any], checkpoint: dict[str, Any]) -> None:
         """Training continues with f_base and f_det, which the colours of a checkpoint hold as their sum."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import inspect
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any, Literal
@@ -17,17 +17,20 @@ from torch import Tensor
 
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import HostRendering, Resolution
+from integration.attachment import Attachment, HostRendering, Target
 from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 from integration.detail import DetailFeature, sh0_offset
 from integration.errors import HostError
-from integration.views import enlarged_mask
+from integration.host_cameras import enlarged_camera, replaced_camera
+from integration.host_score import warn_if_score_is_unused
+from integration.lineage import Lineage
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
 Role = Literal["gate", "detail"]
 """What an override changes: opacities are multiplied by the gate, colours are offset by f_det."""
+ToPixels = Callable[[Mapping[str, Any]], tuple[float, float] | None]
 
 
 @dataclass(slots=True, eq=False)
@@ -107,12 +110,19 @@ def _apply(value: Any, overrides: Overrides, role: Role) -> Any:
     return value
 
 
-class ModelRenderer:
-    """Renders a host's model through a proxy, at LR or HR, and warns once about what the host does not read.
+class AttachedModel:
+    """The strategies beside a host that renders its model as a whole: f_det, and renderings through a proxy.
 
     Args:
-        params: returns the host's current leaves, by gsplat's names.
-        detail: f_det, applied at HR and in renderings that do not train; None: there is none.
+        roles: see `proxy`. params: returns the host's current leaves, by gsplat's names.
+        lineage: finds the host's changes of structure.
+        detail: train f_det.
+        densifier, threshold: what densifies in the host, and its threshold on the screen gradient.
+        to_pixels: see `host_rendering`.
+        views, masks, seed: see `Attachment`.
+
+    Attributes:
+        detail: f_det, which follows the host's structure even if it is not trained.
     """
 
     def __init__(
@@ -120,81 +130,88 @@ class ModelRenderer:
         model: Any,
         roles: tuple[tuple[str, Role], ...],
         params: Callable[[], Mapping[str, Tensor]],
-        detail: DetailFeature | None,
+        lineage: Lineage,
         conductor: Conductor,
+        views: Sequence[View],
+        *,
+        detail: bool,
+        densifier: Any,
+        threshold: float | None,
+        masks: Mapping[str, Tensor],
+        seed: int,
+        to_pixels: ToPixels = lambda result: None,
     ) -> None:
-        self._model, self._roles, self._host_params, self._detail = model, roles, params, detail
-        scoring = conductor.owner("score")
-        self._scoring = None if scoring is None else type(scoring).__name__
+        warn_if_score_is_unused(conductor, densifier, threshold)
+        self._model, self._roles, self._host_params, self._to_pixels = model, roles, params, to_pixels
+        self.detail, self._has_detail = DetailFeature(lambda: params()["means"], lineage, conductor.detail), detail
+        self._scoring = conductor.owner("score")
         self._warned: set[str] = set()
+        self.attachment = Attachment(
+            conductor, self.params, views=views, seed=seed, threshold=threshold, masks=masks,
+            poll_parents=lambda: self.detail.poll_parents(conductor.state_dict),
+        )  # fmt: skip
 
     def params(self) -> dict[str, Tensor]:
         """The host's current leaves and f_det."""
-        detail = {} if self._detail is None else {"detail": self._detail.value}
-        return {**self._host_params(), **detail}
+        return {**self._host_params(), **({"detail": self.detail.value} if self._has_detail else {})}
 
     def with_detail(self) -> Any:
         """The model with colours f_base + f_det, for renderings that do not train: evaluation, viewers."""
-        overrides = Overrides(detail=None if self._detail is None else self._detail.value.detach())
+        overrides = Overrides(detail=self.detail.value.detach() if self._has_detail else None)
         return proxy(self._model, overrides, self._roles)
 
-    def render(
-        self,
-        render: Callable[[Any], Any],
-        view: View,
-        resolution: Resolution,
-        gate: Float[Tensor, " N"] | None,
-        to_pixels: Callable[[Mapping[str, Any]], tuple[float, float] | None] = lambda result: None,
-        mask: Float[Tensor, "h w"] | None = None,
-    ) -> HostRendering:
-        """Render the view at LR without f_det, or at HR with it.
+    def render_view(self, view: View, camera: Any, render: Callable[[Any, Any, Target], Any]) -> Any:
+        """Render a training view at both scales; returns what the host's render function returns at LR.
 
         Args:
-            render: the host's function of the model alone.
-            to_pixels: see `host_rendering`.
-            mask: what the host multiplies its LR image by after rendering; the HR image is multiplied by it here.
+            camera: the host's.
+            render: the host's function of a model and a camera; it also gets what is drawn.
         """
-        hr = resolution == "hr"
-        overrides = Overrides(gate, self._detail.value if hr and self._detail is not None else None)
+
+        def render_at(target: Target, gate: Tensor | None) -> HostRendering:
+            if target == "lr":
+                sized, pinhole = camera, view.lr.camera
+            elif target == "hr":
+                sized, pinhole = enlarged_camera(camera, view.factor), view.hr.camera
+            else:
+                sized, pinhole = replaced_camera(camera, target), target
+            return self._render(lambda model: render(model, sized, target), pinhole, gate, with_detail=target == "hr")
+
+        return self.attachment.render_view(view, render_at)
+
+    def _render(
+        self, render: Callable[[Any], Any], camera: Camera, gate: Float[Tensor, " N"] | None, *, with_detail: bool
+    ) -> HostRendering:
+        params = self.params() if with_detail else self._host_params()
+        overrides = Overrides(gate, params.get("detail"))
         result = render(proxy(self._model, overrides, self._roles))
-        if overrides.gate is not None and "gate" not in overrides.used:
-            self.warn_once("render reads none of the model's opacity getters: dropout has no effect.")
+        if gate is not None and "gate" not in overrides.used:
+            self._warn_once("render reads none of the model's opacity getters: dropout has no effect.")
         if overrides.detail is not None and "detail" not in overrides.used:
-            self.warn_once("render does not read the model's constant colours: the detail feature has no effect.")
-        params = self.params() if hr else self._host_params()
+            self._warn_once("render does not read the model's constant colours: the detail feature has no effect.")
         trained = {name: p for name, p in params.items() if p.requires_grad}
-        rendering = host_rendering(result, (view.hr if hr else view.lr).camera, trained, overrides.gate, to_pixels)
-        if hr and mask is not None:
-            shot = rendering.shot
-            masked = shot.image * enlarged_mask(mask.to(shot.image), view.factor)[..., None]
-            rendering = replace(rendering, shot=replace(shot, image=masked))
+        rendering = host_rendering(result, camera, trained, gate, self._to_pixels)
         slot = rendering.shot.gradient_slot
         if slot.tensor.shape[-1] == 3 and hasattr(self._model, "xyz_gradient_accum_abs"):
             # Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts.
-            rendering = replace(rendering, shot=replace(rendering.shot, slot=replace(slot, ranked=2)))
-        elif slot.tensor.shape[-1] == 4 and self._scoring is not None:
-            self.warn_once(
+            return replace(rendering, shot=replace(rendering.shot, slot=replace(slot, ranked=2)))
+        if slot.tensor.shape[-1] == 4 and self._scoring is not None:
+            self._warn_once(
                 "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
-                "score of %s goes to the first two columns only.", self._scoring,
+                "score of %s goes to the first two columns only.", type(self._scoring).__name__,
             )  # fmt: skip
         return rendering
 
-    def draw(
-        self,
-        render: Callable[[Any], Any],
-        camera: Camera,
-        to_pixels: Callable[[Mapping[str, Any]], tuple[float, float] | None] = lambda result: None,
-    ) -> AutogradShot:
-        """The model drawn by a camera of which there is no photo: without a gate and without f_det.
+    def state_dict(self) -> dict[str, Any]:
+        """What the host's checkpoint must hold to continue."""
+        return {"detail": self.detail.state_dict(), "attachment": self.attachment.state_dict()}
 
-        Args:
-            render: the host's function of the model alone, by that camera. to_pixels: see `host_rendering`.
-        """
-        trained = {name: p for name, p in self._host_params().items() if p.requires_grad}
-        return host_rendering(render(self._model), camera, trained, None, to_pixels).shot
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state; the host has loaded its parameters already."""
+        self.detail.load_state_dict(state["detail"])
+        self.attachment.load_state_dict(state["attachment"])
 
-    def warn_once(self, message: str, *values: Any) -> None:
-        """Log a warning the first time that it comes up."""
+    def _warn_once(self, message: str, *values: Any) -> None:
         if message not in self._warned:
             _log.warning(message, *values)
             self._warned.add(message)
@@ -205,7 +222,7 @@ def host_rendering(
     camera: Camera,
     params: Mapping[str, Tensor],
     gate: Float[Tensor, " N"] | None,
-    to_pixels: Callable[[Mapping[str, Any]], tuple[float, float] | None],
+    to_pixels: ToPixels,
 ) -> HostRendering:
     """The result of a host's `render`: a dict with "render" [3, H, W], "viewspace_points" [N, 2 or more], "radii" and
     "visibility_filter" [N]. Gaussians that the gate drops are marked as not visible in it.

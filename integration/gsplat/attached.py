@@ -6,7 +6,6 @@ import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any, Final
 
 import torch
@@ -17,7 +16,7 @@ from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.view import View
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment, HostRendering, Resolution
+from integration.attachment import Attachment, HostRendering, Target
 from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 from integration.densification import require_end
 from integration.detail import detail_adam, sh0_offset
@@ -25,7 +24,6 @@ from integration.errors import HostError
 from integration.host_score import warn_if_score_is_unused
 from integration.replacing import Replaced
 from integration.rows import RowNumbers
-from integration.views import enlarged_mask
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
@@ -77,41 +75,33 @@ class Attached:
             raise ValueError(
                 "at least one view is needed; integration.views.view(...) makes one from an image and a camera."
             )
-        self._params, self._names, self._views = params, {**dict.fromkeys(PARAMETERS), **(names or {})}, tuple(views)
-        host_names = [self._host_name(name) for name in PARAMETERS]
-        if missing := [name for name in host_names if name not in params]:
-            raise ValueError(f"params must hold {', '.join(host_names)}; {missing[0]} is missing.")
-        means = params[self._host_name("means")]
+        self._names = {name: name for name in PARAMETERS} | dict(names or {})
+        self._params, self._views = params, tuple(views)
+        if missing := [name for name in self._names.values() if name not in params]:
+            raise ValueError(f"params must hold {', '.join(self._names.values())}; {missing[0]} is missing.")
+        means = params[self._names["means"]]
         if detail and "detail" not in params:
             params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
             optimizers["detail"] = detail_adam(params["detail"], conductor.detail)
         self._rows = RowNumbers(
-            params if state is None else state,
-            lambda: self._params[self._host_name("means")],
-            as_parameter=state is None,
+            params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None
         )
         self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).to(means)
-        self._masks = dict(masks or {})
         self._named: View | None = None  # by `rendering`
         self._replaced: list[Replaced] = []
-        require_end(conductor, _refine_stop(strategy), "refine_stop_iter", first=0)
+        stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
+        require_end(conductor, stop, "refine_stop_iter", first=0)
+        warn_if_score_is_unused(conductor, strategy, threshold)
         self.attachment = Attachment(
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
-            poll_parents=self._poll_parents, threshold=_threshold(strategy, conductor),
-            own_background=own_background,
+            poll_parents=self._poll_parents, threshold=threshold, masks=masks, own_background=own_background,
         )  # fmt: skip
-        self._hooks = [
-            optimizers[self._host_name("means")].register_step_pre_hook(lambda *_: self.attachment.before_step()),
-            *(
-                optimizers[name].register_step_post_hook(lambda o, *_: self.attachment.after_optimizer_step(o))
-                for name in host_names
-            ),
-        ]
+        self.attachment.hook([optimizers[name] for name in self._names.values()])
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
-        found = {name: self._params[self._host_name(name)] for name in PARAMETERS}
-        return found | ({"detail": self._params["detail"]} if "detail" in self._params else {})
+        names = self._names | ({"detail": "detail"} if "detail" in self._params else {})
+        return {name: self._params[host_name] for name, host_name in names.items()}
 
     def wrap(self, rasterization: Rasterization) -> Rasterization:
         """`rasterization` that renders training views at both scales, and shows f_det in renderings without gradients."""
@@ -138,13 +128,10 @@ class Attached:
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
 
-            def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
-                return self._render(rasterization, call, view, resolution, gate)
+            def render_at(target: Target, gate: Tensor | None) -> HostRendering:
+                return self._render(rasterization, call, view, target, gate)
 
-            def render_camera(camera: Camera) -> AutogradShot:
-                return self._render_camera(rasterization, call, camera)
-
-            return self.attachment.render_view(view, render_at, render_camera)  # type: ignore[no-any-return]
+            return self.attachment.render_view(view, render_at)  # type: ignore[no-any-return]
 
         setattr(wrapped, _ATTACHED, self)
         return wrapped
@@ -168,22 +155,17 @@ class Attached:
     def fold_detail(self) -> None:
         """Add f_det to sh0 and set it to 0, for exports and viewers without a detail feature."""
         if "detail" in self._params:
-            sh0, detail = self._params[self._host_name("sh0")], self._params["detail"]
+            sh0, detail = self._params[self._names["sh0"]], self._params["detail"]
             sh0 += sh0_offset(detail, sh0)
             detail.zero_()
 
     def remove(self) -> None:
         """Restore the loop; f_det stays a parameter, see `fold_detail`."""
         self.attachment.remove()
-        for hook in self._hooks:
-            hook.remove()
         for replaced in self._replaced:
             replaced.undo()
         self._replaced.clear()
         self._rows.remove()
-
-    def _host_name(self, name: str) -> str:
-        return self._names.get(name) or name
 
     def _poll_parents(self) -> Int[Tensor, " M"] | None:
         change = self._rows.poll()
@@ -204,52 +186,34 @@ class Attached:
         return self._views[same[0]] if same else None
 
     def _render(
-        self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, resolution: Resolution, gate: Tensor | None
+        self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None
     ) -> HostRendering:  # fmt: skip
-        call = {**arguments, **self._background(arguments)}
+        call, params = {**arguments, **self._background(arguments)}, self.params()
         if gate is not None:
             call["opacities"] = call["opacities"] * gate.to(call["opacities"])
-        if resolution == "hr":
+        if target == "hr":
             call, factor = self._with_detail(call, trained=True), view.factor
-            call |= {
-                "Ks": _scaled(call["Ks"], factor),
-                "width": call["width"] * factor,
-                "height": call["height"] * factor,
-            }
-            call["render_mode"] = "RGB"
-        expected = view.hr.camera if resolution == "hr" else view.lr.camera
-        if (call["width"], call["height"]) != (expected.width, expected.height):
-            raise HostError(
-                f"{view.name} is rendered at {arguments['width']}x{arguments['height']}, but its photo has "
-                f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
-                "num_downscales=0)."
-            )
-        params = self.params()
-        if resolution == "lr":
+            call["Ks"] = call["Ks"] * call["Ks"].new_tensor([[factor], [factor], [1]])
+            call |= {"width": call["width"] * factor, "height": call["height"] * factor, "render_mode": "RGB"}
+        else:
             params.pop("detail", None)
-        rendering = self._drawn(rasterization, call, params, gate)
-        mask = self._masks.get(view.name)
-        if resolution == "lr" or mask is None:
-            return rendering
-        image = rendering.shot.image
-        masked = image * enlarged_mask(mask.to(image), view.factor)[..., None]
-        return replace(rendering, shot=replace(rendering.shot, image=masked))
-
-    def _render_camera(
-        self, rasterization: Rasterization, arguments: Mapping[str, Any], camera: Camera
-    ) -> AutogradShot:
-        """The Gaussians of a call, drawn by another camera."""
-        call = {**arguments, **self._background(arguments)}
-        call |= {
-            "viewmats": camera.world_to_camera.to(call["viewmats"]).reshape(call["viewmats"].shape),
-            "Ks": intrinsics(camera).to(call["Ks"]).reshape(call["Ks"].shape),
-            "width": camera.width,
-            "height": camera.height,
-            "render_mode": "RGB",
-        }
-        params = self.params()
-        params.pop("detail", None)
-        return self._drawn(rasterization, call, params, None).shot
+        if isinstance(target, Camera):
+            call |= {
+                "viewmats": target.world_to_camera.to(call["viewmats"]).reshape(call["viewmats"].shape),
+                "Ks": intrinsics(target).to(call["Ks"]).reshape(call["Ks"].shape),
+                "width": target.width,
+                "height": target.height,
+                "render_mode": "RGB",
+            }
+        else:
+            expected = view.hr.camera if target == "hr" else view.lr.camera
+            if (call["width"], call["height"]) != (expected.width, expected.height):
+                raise HostError(
+                    f"{view.name} is rendered at {arguments['width']}x{arguments['height']}, but its photo has "
+                    f"{view.lr.camera.width}x{view.lr.camera.height} pixels. Train at one resolution (nerfstudio: "
+                    "num_downscales=0)."
+                )
+        return self._drawn(rasterization, call, params, gate)
 
     def _drawn(
         self, rasterization: Rasterization, call: Mapping[str, Any], params: Mapping[str, Tensor], gate: Tensor | None
@@ -296,23 +260,7 @@ class Attached:
 attach = Attached
 
 
-def _threshold(strategy: Any, conductor: Conductor) -> float | None:
-    """The densification threshold of gsplat's strategy; warns about what the strategy does not follow."""
-    threshold = getattr(strategy, "grow_grad2d", None)
-    warn_if_score_is_unused(conductor, strategy, threshold)
-    return None if threshold is None else float(threshold)
-
-
-def _refine_stop(strategy: Any) -> int | None:
-    stop = getattr(strategy, "refine_stop_iter", None)
-    return None if stop is None else int(stop)
-
-
 def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, ...]:
     """Gaussians with positive radii: one number per Gaussian in gsplat 1.4, two in 1.5."""
     two_radii = radii.dim() == (2 if packed else 3)
     return (radii > 0).all(-1) if two_radii else radii > 0
-
-
-def _scaled(Ks: Float[Tensor, "*C 3 3"], factor: int) -> Float[Tensor, "*C 3 3"]:
-    return Ks * Ks.new_tensor([[factor], [factor], [1]])

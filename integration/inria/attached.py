@@ -11,19 +11,14 @@ import torch
 from torch import Tensor
 
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment, HostRendering, Resolution
-from integration.autograd_shot import AutogradShot
 from integration.densification import require_end
-from integration.detail import DetailFeature
 from integration.errors import HostError
-from integration.host_cameras import enlarged_camera, replaced_camera
-from integration.host_score import warn_if_score_is_unused
-from integration.inria.cameras import HostView, HostViews
+from integration.host_cameras import enlarged_camera
+from integration.inria.cameras import HostViews
 from integration.inria.rows import CarriedRows
-from integration.model_proxy import ModelRenderer, Role
+from integration.model_proxy import AttachedModel, Role
 from integration.replacing import Replaced
 from integration.views import SuperResolve, sr_source
-from rasterizers.interface import Camera
 
 Render = Callable[..., Any]
 
@@ -90,18 +85,14 @@ class Attached:
         if "save_ply" in vars(gaussians):
             raise HostError("these gaussians are attached already; remove() the attachment that did it first.")
         require_end(conductor, densify_until, "densify_until_iter")
-        warn_if_score_is_unused(conductor, gaussians, threshold)
-        self._model, self._conductor = gaussians, conductor
+        self._model = gaussians
         self.views = HostViews(cameras, *sr_source(sr, conductor, factor), gaussians._xyz.device)
         self._rows = CarriedRows(gaussians, self._host_params)
-        self._detail = DetailFeature(lambda: gaussians._xyz, self._rows, conductor.detail)
-        self._renderer = ModelRenderer(
-            gaussians, _ROLES, self._host_params, self._detail if detail else None, conductor
-        )
-        self.attachment = Attachment(
-            conductor, self.params, views=[host_view.view for host_view in self.views.all], seed=seed, threshold=threshold,
-            poll_parents=lambda: self._detail.poll_parents(conductor.state_dict),
+        self._attached = AttachedModel(
+            gaussians, _ROLES, self._host_params, self._rows, conductor, self.views.all, detail=detail, densifier=gaussians,
+            threshold=threshold, masks=self.views.masks, seed=seed,
         )  # fmt: skip
+        self.attachment = self._attached.attachment
         self._originals = {
             name: getattr(gaussians, name) for name in (*_SAVERS, _FILTER, "training_setup") if hasattr(gaussians, name)
         }
@@ -117,7 +108,7 @@ class Attached:
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
-        return self._renderer.params()
+        return self._attached.params()
 
     def wrap(self, render: Render) -> Render:
         """`render` that renders training cameras at both scales, and shows f_base + f_det anywhere else."""
@@ -126,14 +117,18 @@ class Attached:
         def wrapped(viewpoint_camera: Any, pc: Any, *args: Any, **kwargs: Any) -> Any:
             if self.attachment.removed or pc is not self._model:
                 return render(viewpoint_camera, pc, *args, **kwargs)
-            found = self.views.find(viewpoint_camera) if torch.is_grad_enabled() else None
-            if found is None:  # evaluation, a viewer, a camera without a photo
-                return render(viewpoint_camera, self._renderer.with_detail(), *args, **kwargs)
+            view = self.views.find(viewpoint_camera) if torch.is_grad_enabled() else None
+            if view is None:  # evaluation, a viewer, a camera without a photo
+                return render(viewpoint_camera, self._attached.with_detail(), *args, **kwargs)
             if kwargs.get("subpixel_offset") is not None:
                 raise HostError(
                     "rays are jittered, and two scales of a view cannot share that. Train without ray_jitter."
                 )
-            return self._render_view(render, viewpoint_camera, found, args, kwargs)
+            if self._model.optimizer is not self._optimizer:
+                self._hook_optimizer()
+            return self._attached.render_view(
+                view, viewpoint_camera, lambda model, camera, _: render(camera, model, *args, **kwargs)
+            )
 
         return wrapped
 
@@ -146,8 +141,8 @@ class Attached:
     @torch.no_grad()
     def fold_detail(self) -> None:
         """Add f_det to the constant band of the colours and set it to 0."""
-        self._model._features_dc += self._detail.offset(self._model._features_dc)
-        self._detail.value.zero_()
+        self._model._features_dc += self._attached.detail.offset(self._model._features_dc)
+        self._attached.detail.value.zero_()
 
     def remove(self) -> None:
         """Restore the loop; f_det is no longer shown, see `fold_detail`."""
@@ -159,23 +154,6 @@ class Attached:
             vars(self._model).pop(name, None)
         if self._replaced is not None:
             self._replaced.undo()
-
-    def _render_view(self, render: Render, camera: Any, host_view: HostView, args: Any, kwargs: Any) -> Any:
-        view = host_view.view
-        if self._model.optimizer is not self._optimizer:
-            self._hook_optimizer()
-
-        def render_at(resolution: Resolution, gate: Tensor | None) -> HostRendering:
-            sized = enlarged_camera(camera, view.factor) if resolution == "hr" else camera
-            return self._renderer.render(
-                lambda model: render(sized, model, *args, **kwargs), view, resolution, gate, mask=host_view.mask
-            )
-
-        def render_camera(other: Camera) -> AutogradShot:
-            sized = replaced_camera(camera, other)
-            return self._renderer.draw(lambda model: render(sized, model, *args, **kwargs), other)
-
-        return self.attachment.render_view(view, render_at, render_camera)
 
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}
@@ -195,15 +173,14 @@ class Attached:
             hook.remove()
         self._optimizer = optimizer = self._model.optimizer
         self._hooks = [
-            optimizer.register_step_pre_hook(lambda *_: self.attachment.before_step()),
-            optimizer.register_step_post_hook(lambda *_: self._detail.step()),
-            optimizer.register_step_post_hook(lambda o, *_: self.attachment.after_optimizer_step(o)),
+            optimizer.register_step_post_hook(lambda *_: self._attached.detail.step()),
             optimizer.register_state_dict_post_hook(self._save_state),
             optimizer.register_load_state_dict_pre_hook(self._load_state),
         ]
+        self.attachment.hook([optimizer])
 
     def _save_state(self, _: Any, stored: dict[str, Any]) -> None:
-        stored[_STATE] = {"detail": self._detail.state_dict(), "attachment": self.attachment.state_dict()}
+        stored[_STATE] = self._attached.state_dict()
 
     def _load_state(self, _: Any, stored: dict[str, Any]) -> None:
         if _STATE not in stored:
@@ -211,13 +188,12 @@ class Attached:
                 "the checkpoint was written without CLEAR: it holds neither the iteration nor f_det. Start from the "
                 "beginning, or from a checkpoint of a run with CLEAR."
             )
-        self._detail.load_state_dict(stored[_STATE]["detail"])
-        self.attachment.load_state_dict(stored[_STATE]["attachment"])
+        self._attached.load_state_dict(stored[_STATE])
 
     def _save_with_detail(self, save: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """`save_ply` with f_det in the colours of the file."""
         trained = self._model._features_dc
-        self._model._features_dc = torch.nn.Parameter(trained.detach() + self._detail.offset(trained))
+        self._model._features_dc = torch.nn.Parameter(trained.detach() + self._attached.detail.offset(trained))
         try:
             return save(*args, **kwargs)
         finally:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +18,6 @@ from integration.views import HostPhoto, SuperResolve
 _SAME_POSE = 1e-6  # largest difference between the entries of the poses of one camera and its copy
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HostView:
-    """A training camera of the host, and its view.
-
-    Args:
-        mask: what the host multiplies the LR image by after rendering; None: nothing is hidden.
-    """
-
-    camera: Any
-    view: View
-    mask: Float[Tensor, "h w"] | None = None
-
-
 class HostViews:
     """The training views of a 3DGS-style trainer, found by their camera objects.
 
@@ -41,7 +27,8 @@ class HostViews:
         device: of the Gaussians.
 
     Attributes:
-        factor: of all views.
+        all: by the order of the cameras. factor: of all views.
+        masks: by the name of a view, what the host multiplies the LR image by after rendering.
 
     Raises:
         SettingError: there is no camera.
@@ -63,30 +50,22 @@ class HostViews:
             )  # fmt: skip
         self.factor = factor
         photos = [photo_of(camera, device) for camera in cameras]
-        self.all = tuple(
-            HostView(camera, photo.view(sr, factor), photo.mask) for camera, photo in zip(cameras, photos, strict=True)
-        )
-        self._by_camera = {id(host_view.camera): host_view for host_view in self.all}
-        self._by_name: dict[str | None, HostView] = dict(zip(names, self.all, strict=True))
-
-    def __len__(self) -> int:
-        return len(self.all)
+        self.all = tuple(photo.view(sr, factor) for photo in photos)
+        self.masks = {photo.name: photo.mask for photo in photos if photo.mask is not None}
+        self._by_name: dict[str, tuple[Any, View]] = dict(zip(names, zip(cameras, self.all, strict=True), strict=True))
 
     def __getitem__(self, name: str) -> View:
         """The view of the photo of that name."""
-        return self._by_name[name].view
+        return self._by_name[name][1]
 
-    def find(self, camera: Any) -> HostView | None:
+    def find(self, camera: Any) -> View | None:
         """The view of a training camera, or of a copy: a camera of the same name and pose. None: it is another camera."""
-        found = self._by_camera.get(id(camera))
-        if found is not None:
-            return found
-        named = self._by_name.get(getattr(camera, "image_name", None))
-        if named is None:
+        if (name := getattr(camera, "image_name", None)) not in self._by_name:
             return None
-        poses = (named.camera.world_view_transform, camera.world_view_transform)
-        same = float((poses[0] - poses[1].to(poses[0])).abs().max()) <= _SAME_POSE
-        return named if same else None
+        original, view = self._by_name[name]
+        poses = original.world_view_transform, camera.world_view_transform
+        same = camera is original or float((poses[0] - poses[1].to(poses[0])).abs().max()) <= _SAME_POSE
+        return view if same else None
 
 
 def photo_of(camera: Any, device: torch.device | str = "cpu") -> HostPhoto:

@@ -71,11 +71,10 @@ class InDouble(HostViews):
     """The views in double precision."""
 
     def __getitem__(self, name):
-        return self.find(self._by_name[name].camera).view
+        return self.find(self._by_name[name][0])
 
     def find(self, camera):
-        found = super().find(camera)
-        return replace(found, view=double(found.view, camera))
+        return double(super().find(camera), camera)
 
 
 def test_its_steps_equal_those_of_our_own_trainer(inria_host, inria_capture):
