@@ -43,11 +43,10 @@ from integration.views import enlarged_mask
 from rasterizers.interface import Camera, Color
 
 _log = logging.getLogger(__name__)
+_LOGGED_EVERY: Final = 500  # merges between two lines of the log
 
 Target = Literal["lr", "hr"] | Camera
 """What a host draws: the view of this iteration at one of its sizes, or what a camera without a photo sees."""
-
-_LOGGED_EVERY: Final = 500  # merges between two lines of the log
 
 
 @dataclass(frozen=True, slots=True, eq=False)
