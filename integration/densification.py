@@ -21,7 +21,7 @@ def end_with_strategies(conductor: Conductor, settings: Any, name: str, first: i
     until = getattr(settings, name, None)
     if until is None:
         return
-    end = end_of_densification(conductor, int(until), first)
+    end = _end_of_densification(conductor, int(until), first)
     if end < until:
         _log.info("densification ends at %s=%d instead of %d (SVS: anchor_start).", name, end, until)
         setattr(settings, name, end)
@@ -36,7 +36,7 @@ def require_end(conductor: Conductor, until: int | None, name: str, first: int =
     Raises:
         SettingError: a strategy takes an anchor before the structure stops changing.
     """
-    if until is None or (end := end_of_densification(conductor, until, first)) == until:
+    if until is None or (end := _end_of_densification(conductor, until, first)) == until:
         return
     if any("anchor" in strategy.marks() for strategy in conductor.strategies):
         raise SettingError(
@@ -49,6 +49,6 @@ def require_end(conductor: Conductor, until: int | None, name: str, first: int =
     )  # fmt: skip
 
 
-def end_of_densification(conductor: Conductor, until: int, first: int = 1) -> int:
+def _end_of_densification(conductor: Conductor, until: int, first: int = 1) -> int:
     """The first iteration, in the host's count, at which a strategy no longer allows densification; at most `until`."""
     return next((i for i in range(first, until) if not conductor.may_densify(i + 1 - first)), until)

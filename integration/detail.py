@@ -38,8 +38,8 @@ class DetailFeature:
         rates: of the run's conductor.
     """
 
-    def __init__(self, means: Callable[[], Tensor], lineage: Lineage, rates: DetailRates | None = None) -> None:
-        self._means, self._lineage, self._rates = means, lineage, rates or DetailRates()
+    def __init__(self, means: Callable[[], Tensor], lineage: Lineage, rates: DetailRates) -> None:
+        self._means, self._lineage, self._rates = means, lineage, rates
         self._parents: Int[Tensor, " M"] | None = None  # since the last `poll_parents`
         self._value = torch.nn.Parameter(torch.zeros_like(means(), requires_grad=False))
         self._adam = detail_adam(self._value, self._rates)

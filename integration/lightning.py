@@ -31,6 +31,7 @@ from integration.errors import HostError
 from integration.host_cameras import enlarged_camera
 from integration.log import show_log
 from integration.model_proxy import AttachedModel, Role
+from integration.replacing import ReplacedMethods
 from integration.rows import ROWS, RowNumbers
 from integration.views import sr_images, sr_source, view
 
@@ -128,11 +129,10 @@ class Attached:
         self._resumed: Mapping[str, Any] = {}
         self._sh0_holds_detail = False  # while the host writes its files
         self.attachment: Attachment | None = None
-        _replace(module, "forward", self._forward)
-        _replace(module, "training_step", self._training_step)
-        _replace(module, "save_gaussians", self._save_with_detail)
-        _replace(module, "on_save_checkpoint", self._save_state)
-        _replace(module, "on_load_checkpoint", self._load_state)
+        ReplacedMethods(module, {
+            "forward": self._forward, "training_step": self._training_step, "save_gaussians": self._save_with_detail,
+            "on_save_checkpoint": self._save_state, "on_load_checkpoint": self._load_state,
+        })  # fmt: skip
         module.on_train_start_hooks.append(lambda *_: self._show_detail_in_viewer())
         module.on_train_batch_end_hooks.append(lambda *_: self._attached.detail.step())
         module.extra_train_metrics.append(self._add_metrics)
@@ -234,14 +234,11 @@ class Attached:
 
     def _show_detail_in_viewer(self) -> None:
         """The host's viewer calls the renderer itself."""
-        viewer = getattr(self._module, "web_viewer", None)
-        if viewer is not None:
-            _replace(
-                viewer, "process_all_render_requests",
-                lambda original, _, *args: original(
-                    self._module.gaussian_model if self.attachment is None else self._attached.with_detail(), *args
-                ),
-            )  # fmt: skip
+        if (viewer := getattr(self._module, "web_viewer", None)) is not None:
+            ReplacedMethods(viewer, {"process_all_render_requests": self._show})
+
+    def _show(self, original: Callable[..., Any], model: Any, *args: Any) -> Any:
+        return original(model if self.attachment is None else self._attached.with_detail(), *args)
 
     def _add_metrics(
         self, outputs: Any, batch: Any, model: Any, step: int, module: Any, metrics: Any, prog_bar: Any
@@ -290,9 +287,3 @@ class Attached:
 def _to_pixels(result: Mapping[str, Any]) -> tuple[float, float] | None:
     """The host's gsplat renderers keep centres in pixels; their results then hold a factor from pixels to NDC."""
     return (1.0, 1.0) if result.get("viewspace_points_grad_scale") is not None else None
-
-
-def _replace(owner: Any, name: str, replacement: Callable[..., Any]) -> None:
-    """Replace a method of this object; the replacement gets the original as its first argument."""
-    original = getattr(owner, name)
-    setattr(owner, name, functools.wraps(original)(functools.partial(replacement, original)))

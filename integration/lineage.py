@@ -121,7 +121,14 @@ def are_copies(rows: Mapping[str, Tensor], of: Mapping[str, Tensor], parents: In
 def nearest_copied(before: Mapping[str, Tensor], rows: Mapping[str, Tensor]) -> Int[Tensor, " M"]:
     """The Gaussian of the same rotation and colour as each of M rows, the nearest of several; -1: there is none."""
     old, new = (torch.cat([_bits(given[name]) for name in _COPIED], 1) for given in (before, rows))
-    return _nearest_equal(old, new, before["means"], rows["means"])
+    parents, (order, begin, end) = _first_equal(old, new)
+    ambiguous = (parents >= 0) & (end - begin > 1)
+    for first in sorted(set(begin[ambiguous].tolist())):
+        children = (ambiguous & (begin == first)).nonzero()[:, 0]
+        candidates = order[first : int(end[children[0]])]
+        distances = torch.cdist(rows["means"][children], before["means"][candidates])
+        parents[children] = candidates[distances.argmin(1)]
+    return parents
 
 
 def _bits(rows: Float[Tensor, "N ..."]) -> Int[Tensor, "N K"]:
@@ -152,16 +159,3 @@ def _first_equal(
     parents = order[begin.clamp_max(len(old) - 1)]
     parents[(old[parents] != new).any(1)] = -1
     return parents, (order, begin, end)
-
-
-def _nearest_equal(
-    old: Int[Tensor, "N K"], new: Int[Tensor, "M K"], old_means: Float[Tensor, "N 3"], new_means: Float[Tensor, "M 3"]
-) -> Int[Tensor, " M"]:
-    """The old row equal to each new row, the nearest by position if there are several, or -1."""
-    parents, (order, begin, end) = _first_equal(old, new)
-    ambiguous = (parents >= 0) & (end - begin > 1)
-    for first in sorted(set(begin[ambiguous].tolist())):
-        children = (ambiguous & (begin == first)).nonzero()[:, 0]
-        candidates = order[first : int(end[children[0]])]
-        parents[children] = candidates[torch.cdist(new_means[children], old_means[candidates]).argmin(1)]
-    return parents

@@ -1,9 +1,10 @@
-"""One function in place of another in every module that holds it, so that it does not matter how a script imported it."""
+"""Functions in place of a host's own: in every module that holds one, or in one object."""
 
 from __future__ import annotations
 
+import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 
@@ -27,3 +28,23 @@ class Replaced:
         for module, name in self._places:
             setattr(module, name, self._original)
         self._places.clear()
+
+
+class ReplacedMethods:
+    """Methods of one object that have been replaced; each replacement gets the original as its first argument.
+
+    Args:
+        replacements: by the name of the method. Those that the object does not have are left out.
+    """
+
+    def __init__(self, owner: Any, replacements: Mapping[str, Callable[..., Any]]) -> None:
+        self._owner = owner
+        self._names = [name for name in replacements if hasattr(owner, name)]
+        for name in self._names:
+            original = getattr(owner, name)
+            setattr(owner, name, functools.wraps(original)(functools.partial(replacements[name], original)))
+
+    def undo(self) -> None:
+        """Give the object the methods of its class."""
+        for name in self._names:
+            vars(self._owner).pop(name, None)

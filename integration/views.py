@@ -52,7 +52,24 @@ class HostPhoto:
 
     def view(self, sr: SuperResolve, factor: int) -> View:
         """See `view`."""
-        return view(self.name, self.image, self.world_to_camera, self.K, sr, factor, self.mask)
+        lr = self.posed
+        image, camera = lr.image, lr.camera
+        made = super_resolved(sr, self.name, image.cpu(), factor)
+        sr_image = made.image.to(image)
+        w, h = camera.width, camera.height
+        if sr_image.shape != (h * factor, w * factor, 3):
+            raise DataError(
+                self.name, "SR image", f"is {sr_image.shape[1]}x{sr_image.shape[0]}, but {factor} times {w}x{h} is "
+                f"{w * factor}x{h * factor}", "super-resolve the images that the host trains on",
+            )  # fmt: skip
+        if self.mask is not None:
+            image = image * self.mask[..., None]
+            sr_image = sr_image * enlarged_mask(self.mask, factor)[..., None]
+        return View(
+            self.name, Photo(camera, image), Photo(camera.scaled(factor), sr_image),
+            sr_source=getattr(sr, "label", "unknown"),
+            disagreement=None if made.disagreement is None else made.disagreement.to(image),
+        )  # fmt: skip
 
 
 def view(
@@ -67,30 +84,15 @@ def view(
     """One training view of a host, on the device of its image.
 
     Args:
-        image, world_to_camera, K: see `HostPhoto`.
+        name, image, world_to_camera, K: see `HostPhoto`.
         sr: gives the SR image. factor: HR pixels per LR pixel.
-        mask: what the host's loss multiplies its rendering by, in [0, 1]. Photo and SR image are multiplied by it, so that
-            a pixel that the host hides is hidden at both scales; the HR rendering must be as well, see `enlarged_mask`.
+        mask: see `HostPhoto`. Photo and SR image are multiplied by it, so that a pixel that the host hides is hidden at both
+            scales; the HR rendering must be as well, see `enlarged_mask`.
 
     Raises:
         DataError: the SR image is not `factor` times as large as the photo.
     """
-    lr = HostPhoto(name, image, world_to_camera, K).posed
-    image, camera = lr.image, lr.camera
-    w, h = camera.width, camera.height
-    made = super_resolved(sr, name, image.cpu(), factor)
-    sr_image = made.image.to(image)
-    if sr_image.shape != (h * factor, w * factor, 3):
-        raise DataError(
-            name, "SR image", f"is {sr_image.shape[1]}x{sr_image.shape[0]}, but {factor} times {w}x{h} is "
-            f"{w * factor}x{h * factor}", "super-resolve the images that the host trains on",
-        )  # fmt: skip
-    if mask is not None:
-        image, sr_image = image * mask[..., None], sr_image * enlarged_mask(mask, factor)[..., None]
-    return View(
-        name, Photo(camera, image), Photo(camera.scaled(factor), sr_image), sr_source=getattr(sr, "label", "unknown"),
-        disagreement=None if made.disagreement is None else made.disagreement.to(image),
-    )  # fmt: skip
+    return HostPhoto(name, image, world_to_camera, K, mask).view(sr, factor)
 
 
 def save_photos(photos: Iterable[HostPhoto], folder: Path | str) -> None:

@@ -10,22 +10,8 @@ none (`python -m integration.gsplat --sr sr_x4 simple_trainer.py default --data_
 The names, shapes and order of calls that `attach` relies on are those of gsplat 1.4 (radii [C, N]) and later (radii [C, N, 2]).
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
-
 from integration.gsplat.attached import Attached, attach
 from integration.gsplat.data import views_from_dataset
-
-if TYPE_CHECKING:
-    from integration.gsplat.simple_trainer import install
+from integration.gsplat.simple_trainer import install
 
 __all__ = ["Attached", "attach", "install", "views_from_dataset"]
-
-
-def __getattr__(name: str) -> Any:
-    if name == "install":  # brings Hydra
-        from integration.gsplat.simple_trainer import install
-
-        return install
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -12,7 +12,6 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from clear_strategies.compose import conductor
 from clear_strategies.errors import SettingError
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
@@ -74,6 +73,8 @@ def install(
         SettingError: `points` is neither of these.
         HostError: points=stereo, and the module of the class has no `create_splats_with_optimizers` or no `Dataset`.
     """
+    from clear_strategies.compose import conductor  # brings Hydra
+
     show_log()
     if wants_stereo(points):
         start_from_stereo(runner_class)

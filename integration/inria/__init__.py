@@ -9,21 +9,7 @@ or none:
 Only names that all these repositories share are used, and only their own train.py imports them.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
-
 from integration.inria.attached import THRESHOLD, Attached, Render, attach
-
-if TYPE_CHECKING:
-    from integration.inria.from_options import install
+from integration.inria.from_options import install
 
 __all__ = ["THRESHOLD", "Attached", "Render", "attach", "install"]
-
-
-def __getattr__(name: str) -> Any:
-    if name == "install":  # brings Hydra
-        from integration.inria.from_options import install
-
-        return install
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

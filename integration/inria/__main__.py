@@ -41,8 +41,7 @@ class _Run:
 
     def __init__(self, launch: Launch) -> None:
         self._launch = launch
-        self._scenes: list[Any] = []
-        self._installing = False
+        self._scene: Any = None
         self.attached: Attached | None = None
 
     def train(self) -> bool:
@@ -68,13 +67,13 @@ class _Run:
         @functools.wraps(init)
         def init_and_remember(loaded: Any, *args: Any, **kwargs: Any) -> None:
             init(loaded, *args, **kwargs)
-            self._scenes.append(loaded)
+            self._scene = loaded
 
         @functools.wraps(setup)
         def setup_and_install(gaussians: Any, opt: Any, *args: Any, **kwargs: Any) -> Any:
             result = setup(gaussians, opt, *args, **kwargs)
-            if self.attached is None and not self._installing:
-                self._install(gaussians, opt)
+            scene.GaussianModel.training_setup = setup  # points=stereo, and a restored checkpoint, call it again
+            self._install(gaussians, opt)
             return result
 
         scene.GaussianModel.training_setup, scene.Scene.__init__ = setup_and_install, init_and_remember
@@ -86,17 +85,15 @@ class _Run:
                 self.attached.remove()
 
     def _install(self, gaussians: Any, opt: Any) -> None:
-        if not self._scenes:
+        if self._scene is None:
             raise HostError(
                 "training_setup was called before a Scene was made, so the training cameras are unknown. Put the line "
                 "install(gaussians, scene, opt, …) into the script instead."
             )
-        scene = self._scenes[-1]
         if self._launch.save_lr is not None:
-            save_photos(map(photo_of, scene.getTrainCameras()), self._launch.save_lr)
+            save_photos(map(photo_of, self._scene.getTrainCameras()), self._launch.save_lr)
             raise SystemExit(0)
-        self._installing = True  # points=stereo calls training_setup again
-        self.attached = install(gaussians, scene, opt, **self._launch.settings)
+        self.attached = install(gaussians, self._scene, opt, **self._launch.settings)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from integration.host_cameras import enlarged_camera
 from integration.inria.cameras import HostViews
 from integration.inria.rows import CarriedRows
 from integration.model_proxy import AttachedModel, Role
-from integration.replacing import Replaced
+from integration.replacing import Replaced, ReplacedMethods
 from integration.views import SuperResolve, sr_source
 
 Render = Callable[..., Any]
@@ -33,7 +33,6 @@ _ROLES: Final[tuple[tuple[str, Role], ...]] = (
     ("_features_dc", "detail"),
 )
 _SAVERS: Final = ("save_ply", "save_fused_ply")
-_FILTER: Final = "compute_3D_filter"
 _STATE: Final = "clear"
 """Key of our state in the optimizer's state, which the host's checkpoints hold."""
 
@@ -93,15 +92,10 @@ class Attached:
             threshold=threshold, masks=self.views.masks, seed=seed,
         )  # fmt: skip
         self.attachment = self._attached.attachment
-        self._originals = {
-            name: getattr(gaussians, name) for name in (*_SAVERS, _FILTER, "training_setup") if hasattr(gaussians, name)
-        }
-        for name in _SAVERS:
-            if name in self._originals:
-                setattr(gaussians, name, functools.partial(self._save_with_detail, self._originals[name]))
-        if _FILTER in self._originals:
-            setattr(gaussians, _FILTER, self._compute_filter_at_hr)
-        gaussians.training_setup = self._training_setup
+        self._methods = ReplacedMethods(gaussians, {
+            **dict.fromkeys(_SAVERS, self._save_with_detail), "compute_3D_filter": self._compute_filter_at_hr,
+            "training_setup": self._training_setup,
+        })  # fmt: skip
         self._replaced: Replaced | None = None
         self._hooks: list[Any] = []
         self._hook_optimizer()
@@ -150,23 +144,22 @@ class Attached:
         self._rows.remove()
         for hook in self._hooks:
             hook.remove()
-        for name in self._originals:  # the instance's replacements of its class's methods
-            vars(self._model).pop(name, None)
+        self._methods.undo()
         if self._replaced is not None:
             self._replaced.undo()
 
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}
 
-    def _training_setup(self, *args: Any, **kwargs: Any) -> Any:
+    def _training_setup(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """The host starts again with a new optimizer, as `restore` does with the parameters of a checkpoint."""
-        result = self._originals["training_setup"](*args, **kwargs)
+        result = original(*args, **kwargs)
         self._hook_optimizer()
         return result
 
-    def _compute_filter_at_hr(self, cameras: Sequence[Any]) -> Any:
+    def _compute_filter_at_hr(self, original: Callable[..., Any], cameras: Sequence[Any]) -> Any:
         """Mip-Splatting's 3D filter limits Gaussians to what the finest training camera samples, and that is one at HR."""
-        return self._originals[_FILTER]([enlarged_camera(camera, self.views.factor) for camera in cameras])
+        return original([enlarged_camera(camera, self.views.factor) for camera in cameras])
 
     def _hook_optimizer(self) -> None:
         for hook in self._hooks:

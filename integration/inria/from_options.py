@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from clear_strategies.compose import conductor
 from integration.densification import end_with_strategies
 from integration.errors import HostError
 from integration.inria.attached import Attached
@@ -51,6 +50,8 @@ def install(
         SettingError: `points` is neither of these, or see `Attached`.
         DataError: see `Attached`; stereo confirms no depth.
     """
+    from clear_strategies.compose import conductor  # brings Hydra
+
     show_log()
     iterations = getattr(opt, "iterations", None)
     if iterations is None:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from integration.lineage import COMPARED, Change, MatchedRows, are_copies, is_same, nearest_copied
+from integration.replacing import ReplacedMethods
 
 _log = logging.getLogger(__name__)
 
@@ -34,13 +35,10 @@ class CarriedRows(MatchedRows):
     def __init__(self, model: Any, params: Callable[[], Mapping[str, Tensor]]) -> None:
         super().__init__(params)
         self._model, self._warned = model, False
-        hooks: dict[str, Callable[[Any], None]] = {
-            "_prune_optimizer": self._keep,
-            "cat_tensors_to_optimizer": self._append,
-        }
-        self._hooked = [name for name in hooks if hasattr(model, name)]
-        for name in self._hooked:
-            setattr(model, name, _after(hooks[name], getattr(model, name)))
+        self._methods = ReplacedMethods(model, {
+            "_prune_optimizer": functools.partial(_after, self._keep),
+            "cat_tensors_to_optimizer": functools.partial(_after, self._append),
+        })  # fmt: skip
 
     def restart(self) -> None:
         super().restart()
@@ -66,8 +64,7 @@ class CarriedRows(MatchedRows):
 
     def remove(self) -> None:
         """Give the model its own methods back."""
-        for name in self._hooked:
-            vars(self._model).pop(name, None)
+        self._methods.undo()
 
     def _number(self) -> None:
         """Every row comes from itself."""
@@ -94,13 +91,8 @@ class CarriedRows(MatchedRows):
         self._fresh = torch.cat((self._fresh, torch.ones_like(found, dtype=torch.bool)))
 
 
-def _after(hook: Callable[[Any], None], method: Callable[..., Any]) -> Callable[..., Any]:
-    """The method, called after the hook; both get the same first argument."""
-
-    @functools.wraps(method)
-    def hooked(*args: Any, **kwargs: Any) -> Any:
-        with torch.no_grad():
-            hook((*args, *kwargs.values())[0])
-        return method(*args, **kwargs)
-
-    return hooked
+def _after(hook: Callable[[Any], None], method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Call the method after the hook; both get the same first argument."""
+    with torch.no_grad():
+        hook((*args, *kwargs.values())[0])
+    return method(*args, **kwargs)

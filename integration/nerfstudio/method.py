@@ -29,9 +29,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
 from clear_strategies.errors import SettingError
-from integration.densification import end_of_densification
+from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat import Attached, attach
+from integration.log import show_log
 from integration.nerfstudio.data import photos_of, prior, views_from_datamanager
 from integration.nerfstudio.datamanager import ClearDatamanagerConfig
 from integration.views import save_photos
@@ -150,11 +151,8 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
             f"CLEAR: {', '.join(type(s).__name__ for s in chosen.strategies) or 'no strategy'}; "
             f"SR images x{config.factor}: {sr.label}."
         )
-        stop = self.strategy.refine_stop_iter
-        end = end_of_densification(chosen, stop, first=0)
-        if end < stop:
-            CONSOLE.log(f"CLEAR: densification ends at step {end} instead of {stop} (SVS: anchor_start).")
-            self.strategy.refine_stop_iter = end
+        show_log()
+        end_with_strategies(chosen, self.strategy, "refine_stop_iter", first=0)
         for group in host.optimizers.optimizers["detail"].param_groups:
             group["lr"] = chosen.detail.rate
         return attach(
@@ -173,8 +171,7 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
 
     def _detach(self, step: int) -> None:
         if self.attached is not None:
-            counts = ", ".join(f"{name} {n:,}" for name, n in self.attached.attachment.counts.items())
-            CONSOLE.log(f"CLEAR: detached after step {step}: {counts}.")
+            CONSOLE.log(f"CLEAR: detached after step {step}: {self.attached.attachment.summary()}.")
             self.attached.remove()
             self.attached = None
 
