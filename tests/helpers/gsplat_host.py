@@ -34,12 +34,12 @@ def drawn(function, splats, camera, **settings):
 class Host:
     """Parameters, optimizers and LR photos (name -> camera and image) of a gsplat-style trainer."""
 
-    def __init__(self, scene, extent=1.0, strategy=None, fused=False, scaler=None, accumulation=1, eps=1e-15):
+    def __init__(self, scene, extent=1.0, strategy=None, scaler=None, accumulation=1, eps=1e-15):
         self.photos = {v.name: v.lr for v in scene.train}
         raw = GaussianField.from_cloud(scene.cloud).raw()
         self.splats = {k: torch.nn.Parameter(p.clone()) for k, p in raw.items() if k != "detail"}
         rates = LearningRates().at(0, extent)
-        self.optimizers = {k: torch.optim.Adam([p], lr=rates[k], eps=eps, fused=fused) for k, p in self.splats.items()}
+        self.optimizers = {k: torch.optim.Adam([p], lr=rates[k], eps=eps) for k, p in self.splats.items()}
         self.strategy, self.state = strategy, None
         if strategy is not None:
             strategy.check_sanity(self.splats, self.optimizers)

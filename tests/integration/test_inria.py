@@ -11,23 +11,17 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-import rasterizers
 from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, Objective
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors import Images
-from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.errors import SettingError
-from clear_strategies.schedules import LogLinear, Ramp, scaled
+from clear_strategies.schedules import Ramp, scaled
 from clear_strategies.training.loop import iterate
-from clear_strategies.training.mip import MipFilter
-from clear_strategies.training.optim import LearningRates
-from clear_strategies.training.settings import FitSettings
-from clear_strategies.training.state import TrainState
-from integration.host_cameras import enlarged_camera
 from integration.inria import attach
 from integration.inria.cameras import HostViews
 from tests.helpers import toy
 from tests.helpers.inria import HR_FROM_START, WITHOUT_HR, N, loop, options
+from tests.helpers.own_trainer import RASTERIZER, in_double
 
 STEPS = 25
 
@@ -78,7 +72,7 @@ class InDouble(HostViews):
 
 
 def test_its_steps_equal_those_of_our_own_trainer(inria_host, inria_capture):
-    """In float64 and without spheres: Adam follows the sign of gradients that consist of rounding errors."""
+    """Without spheres, whose rotations have gradients that consist of rounding errors."""
     conductors = [
         Conductor(GCO(), P2G(patch=4), svs(), objective=scaled(Objective(), STEPS / 10_000), statistics_from=1)
         for _ in range(2)
@@ -90,26 +84,17 @@ def test_its_steps_equal_those_of_our_own_trainer(inria_host, inria_capture):
     clear.views = InDouble(scene.cameras, Images(str(inria_capture / "sr")), 4)
     views = tuple(clear.views[view.name] for view in toy_scene.train)
 
-    own = TrainState.start(
-        replace(toy_scene, train=views), conductors[1],
-        settings=FitSettings(iterations=STEPS, degree_every=1, fused="off", scale_schedule=False),
-        density=DensitySettings(start=1_000, stop=1_001),
-        rates=LearningRates(means=LogLinear(1.6e-4, 1.6e-4, 1)),
-        mip=MipFilter(variance=0),
-    )  # fmt: skip
-    own.field.double()
+    own = in_double(replace(toy_scene, train=views), conductors[1], STEPS)
     own.field.scales += 0.3 * torch.randn(N, 3, generator=torch.Generator().manual_seed(1))
-    adam, start = own.optimizer, own.field.scales.data.clone()
-    adam.first, adam.second = ({k: v.double() for k, v in moments.items()} for moments in (adam.first, adam.second))
-    rasterizer = rasterizers.load("torch", near=0.01, kernel=0.3, antialiased=False)
+    start = own.field.scales.data.clone()
     names = []
     for _ in range(STEPS):
         names.append(own.view().name.removesuffix(".png"))
-        iterate(own, rasterizer)
+        iterate(own, RASTERIZER)
 
     for name, p in clear.params().items():
         p.data = p.data.double() if name != "scales" else start
-    gaussians.optimizer.param_groups[0]["lr"] = 1.6e-4 * adam.extent
+    gaussians.optimizer.param_groups[0]["lr"] = 1.6e-4 * own.optimizer.extent
     gaussians.active_sh_degree = -1
     for camera in scene.cameras:
         camera.original_image, camera.world_view_transform = (
@@ -164,27 +149,10 @@ def test_a_host_that_densifies_after_the_anchor_nevertheless_is_stopped(inria_ho
         loop(inria_host, clear, opt, gaussians, scene)
 
 
-def test_without_a_strategy_the_gradient_is_that_of_the_summed_losses(inria_host, inria_capture):
-    """Also where the host trains only some parameters."""
-    grads, clear = run_once(inria_host, inria_capture)
-    opt = options(inria_host, inria_capture)
-    gaussians, scene = inria_host.setup(opt)
-    camera = scene.cameras[1]
-    view = clear.views[camera.image_name]
-    drawn = inria_host.render(camera, gaussians, None, None)["render"]
-    inria_host.photometric(drawn, camera.original_image).backward()
-    image = inria_host.render(enlarged_camera(camera, 4), gaussians, None, None)["render"].permute(1, 2, 0)
-    cotangents = HR_FROM_START.hr(image.detach(), view.hr.image).cotangents
-    (image * (cotangents[0] + 0.2 * cotangents[1])).sum().backward()
-    assert torch.allclose(
-        grads["means"], gaussians._xyz.grad, rtol=1e-4, atol=1e-7 * float(gaussians._xyz.grad.abs().max())
-    )
-    assert torch.allclose(grads["opacities"], gaussians._opacity.grad, rtol=1e-4, atol=1e-9)
-
+def test_a_parameter_that_the_host_does_not_train_gets_no_gradient(inria_host, inria_attached):
+    clear, gaussians, scene = inria_attached(GCO())
     gaussians._features_rest.requires_grad_(False)
-    clear = attach(gaussians, scene.cameras, Conductor(GCO(), objective=HR_FROM_START), sr=inria_capture / "sr")
-    gaussians.optimizer.zero_grad()
-    clear.wrap(inria_host.render)(camera, gaussians, None, None)["render"].sum().backward()
+    clear.wrap(inria_host.render)(scene.cameras[1], gaussians, None, None)["render"].sum().backward()
     assert gaussians._features_rest.grad is None
     assert clear.attachment.counts["merges"] == 1
 
