@@ -45,9 +45,10 @@ def host(monkeypatch):
 
 @pytest.fixture
 def sr(host, tmp_path):
+    """The controller's settings of the SR images."""
     for view in host.scene.train:
         write_png(tmp_path / f"{view.name}_x4.png", images.quantize(view.hr.image))
-    return str(tmp_path)
+    return {"sr": str(tmp_path), "suffix": "_x4"}
 
 
 def fitted(host, density, steps, pixels=True, start=0, mask=None, checkpoint=None):
@@ -60,8 +61,8 @@ def fitted(host, density, steps, pixels=True, start=0, mask=None, checkpoint=Non
     return module
 
 
-def sh0_of(detail):
-    return detail[:, None] / SH_C0
+def unfitted(host, sr):
+    return host.splatting.GaussianSplatting(host.scene.cloud, host.controller(**sr), host.splatting.Renderer())
 
 
 def attachment_of(module):
@@ -70,7 +71,7 @@ def attachment_of(module):
 
 def test_it_trains_with_the_hosts_density_controller(host, sr):
     to_the_end = [*FROM_START, "strategies.svs.anchor_start=10000"]  # the strategies let the host densify
-    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=to_the_end), 16)
+    module = fitted(host, host.controller(**sr, overrides=to_the_end), 16)
     n = module.gaussian_model.n_gaussians
     attachment = attachment_of(module)
     assert n != N
@@ -96,8 +97,7 @@ def test_it_trains_with_the_hosts_density_controller(host, sr):
 def test_centres_in_pixels_and_in_ndc_give_the_same_densification(host, sr):
     norms = []
     for pixels in (True, False):
-        settings = {"sr": sr, "suffix": "_x4", "strategies": "p2g", "overrides": FROM_START}
-        module = fitted(host, host.controller(**settings), 1, pixels)
+        module = fitted(host, host.controller(**sr, strategies="p2g", overrides=FROM_START), 1, pixels)
         size = torch.tensor([[12.0, 8.0]]) if pixels else 1.0
         norms.append((module.points.grad[:, :2] * size).norm(dim=-1))
     assert torch.allclose(*norms, rtol=1e-4, atol=1e-9)
@@ -115,7 +115,7 @@ def test_dropped_gaussians_have_no_gradient(host):
 
 
 def test_the_hosts_exposure_is_applied_at_both_scales(host, sr):
-    module = fitted(host, host.controller(strategies="baseline", sr=sr, suffix="_x4", overrides=FROM_START[:2]), 1)
+    module = fitted(host, host.controller(strategies="baseline", **sr, overrides=FROM_START[:2]), 1)
     assert module.output_processor.sizes == [96, 24]
 
 
@@ -129,9 +129,7 @@ def test_without_hr_no_sr_images_are_needed(host):
 
 def test_a_score_without_a_threshold_is_warned_of(host, sr, caplog):
     base = importlib.import_module("internal.density_controllers.density_controller").DensityController()
-    fitted(
-        host, host.controller(base=base, strategies="p2g", sr=sr, suffix="_x4", overrides=["strategies.p2g.patch=4"]), 1
-    )
+    fitted(host, host.controller(base=base, strategies="p2g", **sr, overrides=["strategies.p2g.patch=4"]), 1)
     assert (
         "DensityController does not read the screen gradient: the densification score of P2G has no effect"
         in caplog.text
@@ -140,17 +138,17 @@ def test_a_score_without_a_threshold_is_warned_of(host, sr, caplog):
 
 def test_max_steps_must_be_set(host, sr):
     with pytest.raises(HostError, match="max_steps=-1"):
-        fitted(host, host.controller(sr=sr, suffix="_x4"), -1)
+        fitted(host, host.controller(**sr), -1)
 
 
 def test_a_run_saves_its_checkpoint_and_continues_from_it_as_if_it_had_not_stopped(host, sr):
     """The host pickles its live renderer with every checkpoint, so nothing may hang on it."""
-    settings = {"sr": sr, "suffix": "_x4", "overrides": FROM_START}
+    settings = {**sr, "overrides": FROM_START}
     quiet = host.vanilla(densify_until_iter=0)
     whole = fitted(host, host.controller(base=quiet, **settings), 8)
     module = fitted(host, host.controller(base=quiet, **settings), 5)
     stored = torch.load(io.BytesIO(module.checkpoint), weights_only=False)
-    folded = module.gaussian_model.gaussians["shs_dc"] + sh0_of(attachment_of(module).params()["detail"])
+    folded = module.gaussian_model.gaussians["shs_dc"] + attachment_of(module).params()["detail"][:, None] / SH_C0
     assert torch.allclose(stored["state_dict"]["gaussian_model.gaussians.shs_dc"], folded, atol=1e-6)
     assert torch.equal(torch.load(io.BytesIO(module.save_checkpoint()), weights_only=False)["clear"]["detail"]["value"],
                        attachment_of(module).params()["detail"])  # fmt: skip
@@ -165,17 +163,13 @@ def test_a_run_saves_its_checkpoint_and_continues_from_it_as_if_it_had_not_stopp
 def test_a_masked_pixel_is_hidden_at_both_scales(host, sr):
     """A gradient of a hidden half would come from the SR image alone."""
     mask = torch.zeros(3, 16, 24)
-    module = fitted(
-        host, host.controller(strategies="gco", sr=sr, suffix="_x4", overrides=FROM_START[:2]), 1, mask=mask
-    )
+    module = fitted(host, host.controller(strategies="gco", **sr, overrides=FROM_START[:2]), 1, mask=mask)
     assert all(float(g.abs().max()) == 0 for g in module.grads.values())
     assert attachment_of(module).log["base"] == 0
 
 
 def test_mip_splattings_filter_is_that_of_the_hr_cameras(host, sr):
-    module = host.splatting.GaussianSplatting(
-        host.scene.cloud, host.controller(sr=sr, suffix="_x4"), host.splatting.Renderer()
-    )
+    module = unfitted(host, sr)
     model, widths = module.gaussian_model, []
     model._train_camera_set = [camera for _, camera, _ in host.photos]
     model.compute_3d_filter = lambda: widths.extend(int(camera.width) for camera in model._train_camera_set)
@@ -185,19 +179,19 @@ def test_mip_splattings_filter_is_that_of_the_hr_cameras(host, sr):
 
 
 def test_losses_of_hr_are_in_the_hosts_log(host, sr):
-    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=FROM_START), 3)
+    module = fitted(host, host.controller(**sr, overrides=FROM_START), 3)
     assert float(module.logged["clear_base"]) > 0
 
 
 def test_densification_ends_when_a_strategy_ends_it(host, sr):
-    module = fitted(host, host.controller(sr=sr, suffix="_x4", strategies="svs"), 16)
+    module = fitted(host, host.controller(**sr, strategies="svs"), 16)
     assert module.density_controller.config.densify_until_iter == 8
 
 
 def test_two_photos_of_one_name_are_refused(host, sr):
     host.photos.append(host.photos[0])
     with pytest.raises(HostError, match="two training photos are called"):
-        fitted(host, host.controller(sr=sr, suffix="_x4"), 1)
+        fitted(host, host.controller(**sr), 1)
 
 
 @pytest.mark.parametrize(
@@ -209,21 +203,18 @@ def test_two_photos_of_one_name_are_refused(host, sr):
     ids=["processes", "precision"],
 )
 def test_several_processes_and_half_precision_are_refused_before_the_first_step(trainer, message, host, sr):
-    module = host.splatting.GaussianSplatting(
-        host.scene.cloud, host.controller(sr=sr, suffix="_x4"), host.splatting.Renderer()
-    )
+    module = unfitted(host, sr)
     module.trainer = SimpleNamespace(global_step=0, max_steps=5, **trainer)
     with pytest.raises(HostError, match=message):
         module.density_controller.setup("fit", module)
 
 
 def test_models_whose_colours_are_not_those_of_the_gaussians_are_refused(host, sr):
-    density = host.controller(sr=sr, suffix="_x4")
-    module = host.splatting.GaussianSplatting(host.scene.cloud, density, host.splatting.Renderer())
+    module = unfitted(host, sr)
     module.renderer.appearance = torch.nn.Linear(2, 2)
     with pytest.raises(HostError, match="Renderer trains an appearance model of its own"):
         host.splatting.fit(module, host.photos, 1)
-    module = host.splatting.GaussianSplatting(host.scene.cloud, density, host.splatting.Renderer())
+    module = unfitted(host, sr)
     del module.gaussian_model.gaussians["shs_rest"]
     module.gaussian_model.training_setup = lambda: [torch.optim.Adam([module.gaussian_model.gaussians["means"]])]
     with pytest.raises(HostError, match="no shs_rest, as those of a VanillaGaussian have"):
@@ -231,6 +222,6 @@ def test_models_whose_colours_are_not_those_of_the_gaussians_are_refused(host, s
 
 
 def test_a_resumed_run_without_our_state_continues_at_its_step_and_warns(host, sr, caplog):
-    module = fitted(host, host.controller(sr=sr, suffix="_x4", overrides=FROM_START), 4, start=3)
+    module = fitted(host, host.controller(**sr, overrides=FROM_START), 4, start=3)
     assert attachment_of(module).t == 4
     assert "resumed at step 3 from a checkpoint without CLEAR" in caplog.text

@@ -37,60 +37,62 @@ from tests.helpers.gsplat_host import Host
 HR_FROM_START = WarmupDecay(start=0, full=1, decay_from=100, end=100)
 
 
-class Cameras:
-    """nerfstudio's cameras of two photos: one at (0, 0, 4) looks at the origin, one at (4, 5, 6) along +x."""
-
-    def __init__(self):
-        straight = torch.eye(4)[:3]
-        turned = torch.tensor([[0.0, 0, -1, 4], [0, 1, 0, 5], [1, 0, 0, 6]])
-        self.camera_to_worlds = torch.stack((straight, turned))
-        self.camera_to_worlds[0, 2, 3] = 4
-        self.fx = 30.0
-
-    def get_intrinsics_matrices(self):
-        return torch.tensor([[self.fx, 0, 12], [0, 31, 8], [0, 0, 1]]).expand(2, 3, 3)
-
-
 class DataManager:
-    """nerfstudio's data manager, as far as it is read: the first access undistorts photos and corrects cameras."""
+    """nerfstudio's data manager of the toy scene, as far as it is read. Its first access corrects photos and cameras."""
 
-    def __init__(self, files=("a/one.jpg", "a/two.jpg"), **extra):
-        self.train_dataset = SimpleNamespace(cameras=Cameras(), image_filenames=list(files))
-        g = torch.Generator().manual_seed(0)
-        self.photos = [
-            {"image": torch.randint(256, (16, 24, 3), generator=g, dtype=torch.uint8)} | extra for _ in files
-        ]
+    def __init__(
+        self,
+        kind=lambda image: (image * 255).round().to(torch.uint8),
+        files=("a/0.jpg", "a/1.jpg", "a/2.jpg"),
+        **extra,
+    ):
+        photos = [view.lr for view in toy.scene(24).train]
+        flip = torch.tensor([1.0, -1, -1, 1])
+        Ks = torch.cat([gsplat_host.intrinsics(photo.camera) for photo in photos])
+        self.lens = Ks / 2
+        cameras = SimpleNamespace(
+            camera_to_worlds=torch.stack([p.camera.world_to_camera.inverse() * flip for p in photos])[:, :3],
+            get_intrinsics_matrices=lambda: self.lens,
+        )
+        self.train_dataset, self._corrected = SimpleNamespace(cameras=cameras, image_filenames=list(files)), Ks
+        self.photos = [{"image": kind(photo.image)} | extra for photo in photos]
+        old = {"points3D_xyz": torch.zeros(5, 3), "points3D_rgb": torch.zeros(5, 3), "points3D_error": torch.zeros(5)}
+        self.train_dataparser_outputs = SimpleNamespace(metadata={"scale": 1.0} | old)
 
     @functools.cached_property
     def cached_train(self):
-        self.train_dataset.cameras.fx = 33.0
+        self.lens = self._corrected
         return self.photos
 
 
 def test_poses_are_converted_from_opengl_to_opencv():
-    straight, turned = world_to_camera(Cameras().camera_to_worlds)
-    assert (straight @ torch.tensor([1.0, 2, 3, 1])).tolist() == [1, -2, 1, 1]  # y down, one unit in front
-    assert (turned @ torch.tensor([6.0, 5, 6, 1])).tolist() == [0, 0, 2, 1]  # the camera looks along +x
-    for pose, given in zip((straight, turned), Cameras().camera_to_worlds, strict=True):
+    straight = torch.tensor([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 4]])  # at (0, 0, 4), looks at the origin
+    turned = torch.tensor([[0.0, 0, -1, 4], [0, 1, 0, 5], [1, 0, 0, 6]])  # at (4, 5, 6), looks along +x
+    poses = world_to_camera(torch.stack((straight, turned)))
+    assert (poses[0] @ torch.tensor([1.0, 2, 3, 1])).tolist() == [1, -2, 1, 1]  # y down, one unit in front
+    assert (poses[1] @ torch.tensor([6.0, 5, 6, 1])).tolist() == [0, 0, 2, 1]
+    for pose, given in zip(poses, (straight, turned), strict=True):
         assert torch.allclose(pose.double(), pose_from_opengl(Path("transforms.json"), "frame", given.tolist()))
 
 
 def test_views_are_the_photos_that_splatfacto_trains_on():
     manager = DataManager()
-    first, second = views_from_datamanager(manager, Bicubic(), 4)
-    assert [v.name for v in (first, second)] == ["one.jpg", "two.jpg"]
-    assert torch.equal(first.lr.image, manager.photos[0]["image"].float() / 255)
-    camera = second.hr.camera
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (4 * 33, 4 * 31, 48, 32)  # fx as undistorted
-    assert second.hr.image.shape == (64, 96, 3)
+    views = views_from_datamanager(manager, Bicubic(), 4)
+    assert [view.name for view in views] == ["0.jpg", "1.jpg", "2.jpg"]
+    for view, item, expected in zip(views, manager.photos, toy.scene(24).train, strict=True):
+        assert torch.equal(view.lr.image, item["image"].float() / 255)
+        camera, own = view.hr.camera, expected.hr.camera
+        assert camera.fx == pytest.approx(own.fx)  # as undistorted
+        assert (camera.fy, camera.cx, camera.cy) == pytest.approx((own.fy, own.cx, own.cy))
+        assert torch.allclose(camera.world_to_camera, own.world_to_camera.float(), atol=1e-5)
+        assert view.hr.image.shape == (64, 96, 3)
 
 
 def test_sr_images_are_found_by_the_photos_stem(tmp_path):
-    for stem in ("one", "two"):
-        write_png(tmp_path / f"{stem}.png", torch.full((64, 96, 3), 0.2 if stem == "one" else 0.4))
-    first, second = views_from_datamanager(DataManager(), prior(tmp_path), 4)
-    assert first.hr.image.unique().tolist() == pytest.approx([0.2])
-    assert second.hr.image.unique().tolist() == pytest.approx([0.4])
+    for i in range(3):
+        write_png(tmp_path / f"{i}.png", torch.full((64, 96, 3), 0.2 * i))
+    for i, view in enumerate(views_from_datamanager(DataManager(), prior(tmp_path), 4)):
+        assert view.hr.image.unique().tolist() == pytest.approx([0.2 * i])
     with pytest.raises(DataError, match="96x64, but 2 times"):
         views_from_datamanager(DataManager(), prior(tmp_path), 2)
 
@@ -98,7 +100,7 @@ def test_sr_images_are_found_by_the_photos_stem(tmp_path):
 def test_saved_lr_photos_are_the_training_photos(tmp_path):
     manager = DataManager()
     save_photos(photos_of(manager), tmp_path)
-    assert torch.equal((read_image(tmp_path / "two.png") * 255).round().byte(), manager.photos[1]["image"])
+    assert torch.equal((read_image(tmp_path / "1.png") * 255).round().byte(), manager.photos[1]["image"])
 
 
 def test_the_sr_setting_chooses_the_prior(tmp_path):
@@ -110,39 +112,15 @@ def test_the_sr_setting_chooses_the_prior(tmp_path):
 def test_masks_and_equal_stems_are_refused(tmp_path):
     with pytest.raises(DataError, match="mask"):
         views_from_datamanager(DataManager(mask=torch.ones(16, 24, 1)), Bicubic(), 4)
-    twins = DataManager(files=("a/one.jpg", "b/one.png"))
+    twins = DataManager(files=("a/0.jpg", "b/0.png", "a/1.jpg"))
     with pytest.raises(DataError, match="stem"):
         views_from_datamanager(twins, Bicubic(), 4)
     with pytest.raises(DataError, match="is that of two photos"):
         save_photos(photos_of(twins), tmp_path)
 
 
-class ToyManager:
-    """A data manager of the toy scene's photos, with another lens before they are undistorted."""
-
-    def __init__(self, kind=lambda image: (image * 255).round().to(torch.uint8), **extra):
-        photos = [view.lr for view in toy.scene(24).train]
-        flip = torch.tensor([1.0, -1, -1, 1])
-        Ks = torch.cat([gsplat_host.intrinsics(photo.camera) for photo in photos])
-        self.lens = Ks / 2
-        cameras = SimpleNamespace(
-            camera_to_worlds=torch.stack([p.camera.world_to_camera.inverse() * flip for p in photos])[:, :3],
-            get_intrinsics_matrices=lambda: self.lens,
-        )
-        names = [f"{i}.png" for i in range(len(photos))]
-        self.train_dataset, self._corrected = SimpleNamespace(cameras=cameras, image_filenames=names), Ks
-        self.photos = [{"image": kind(photo.image)} | extra for photo in photos]
-        old = {"points3D_xyz": torch.zeros(5, 3), "points3D_rgb": torch.zeros(5, 3), "points3D_error": torch.zeros(5)}
-        self.train_dataparser_outputs = SimpleNamespace(metadata={"scale": 1.0} | old)
-
-    @functools.cached_property
-    def cached_train(self):
-        self.lens = self._corrected
-        return self.photos
-
-
 def test_seed_points_are_the_stereo_cloud_of_the_undistorted_photos():
-    manager = ToyManager()
+    manager = DataManager()
     cameras = [view.lr.camera for view in toy.scene(24).train]
     seed_with_stereo(manager)
     metadata = manager.train_dataparser_outputs.metadata
@@ -168,7 +146,7 @@ def test_hidden_pixels_give_no_seed_points(by):
 
     kind = (lambda image: image) if by == "mask" else with_alpha
     mask = {} if by == "alpha" else {"mask": half[..., None].bool()}
-    assert 0 < len(stereo_cloud(ToyManager(kind, **mask))) < 0.8 * len(stereo_cloud(ToyManager()))
+    assert 0 < len(stereo_cloud(DataManager(kind, **mask))) < 0.8 * len(stereo_cloud(DataManager()))
 
 
 def test_photos_that_stay_on_disk_are_refused():
