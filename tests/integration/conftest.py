@@ -6,10 +6,13 @@ import importlib
 import sys
 
 import pytest
+from safetensors.torch import load_file
 
 from clear_strategies import Conductor
 from integration.inria import attach
+from integration.inria.__main__ import main
 from tests.helpers import inria, toy
+from tests.helpers.host_parts import FROM_START
 
 
 @pytest.fixture
@@ -41,3 +44,17 @@ def inria_attached(inria_host, inria_capture):
         )
 
     return made
+
+
+@pytest.fixture
+def inria_launched(inria_host, inria_capture):
+    """`run(name, *the script's arguments, points="own")`: the file that the unchanged train.py writes with CLEAR."""
+
+    def run(name, *arguments, points="own"):
+        file = inria_capture / name
+        clear = ["--points", points, "--sr", str(inria_capture / "sr"), *(f"--overrides={row}" for row in FROM_START)]
+        script = [str(inria.FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(file)]
+        assert main([*clear, *script, "--densify_until_iter", "0", *arguments]) == 0
+        return load_file(file)
+
+    return run

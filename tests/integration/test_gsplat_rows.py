@@ -1,11 +1,13 @@
-"""Which Gaussian came from which in a gsplat loop, whatever densifies it."""
+"""gsplat's own densifiers with CLEAR attached: which Gaussian came from which, and what follows them."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from clear_strategies import SVS, Conductor
+from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies.errors import SettingError
+from clear_strategies.schedules import Ramp
 from integration import HostError
 from integration.gsplat import attach
 from integration.rows import ROWS
@@ -54,6 +56,25 @@ def test_parents_are_where_each_gaussian_came_from(strategy):
         colors = colors[parents]
     assert torch.equal(colors, host.splats["sh0"].detach())
     assert len(colors) > 40
+
+
+def test_all_parameters_and_states_follow_the_densifier(gsplat_strategies):
+    followed = GCO(), P2G(patch=4), SVS(dropout=Ramp(full=50), anchor_start=25, anchor_strength=0.01)
+    host, clear = gsplat_host.densified(Conductor(*followed, objective=HR_FROM_START))
+    n = len(host.splats["means"])
+    assert n > 40
+    assert {len(p) for p in host.splats.values()} == {n}
+    assert ROWS not in host.splats
+    counts = clear.attachment.counts
+    assert counts["structure changes"] >= 3
+    assert counts["scores written"] == counts["merges"] == 30
+    assert float(host.splats["detail"].abs().max()) > 0
+
+
+def test_densification_after_the_anchor_is_refused_before_the_first_step(gsplat_strategies):
+    early = Conductor(SVS(anchor_start=5, anchor_strength=0.01), objective=HR_FROM_START)
+    with pytest.raises(SettingError, match=r"must end before the anchor is taken, got 24. Set refine_stop_iter=4"):
+        gsplat_host.densified(early)
 
 
 def test_an_anchor_is_taken_once_mcmc_has_ended(gsplat_strategies):

@@ -18,7 +18,6 @@ from tests.helpers.host_parts import FROM_START
 from tests.helpers.inria import FOLDER, N, options
 
 SETUP = "    gaussians.training_setup(opt)\n"
-OVERRIDES = [f"--overrides={override}" for override in FROM_START]
 
 
 def edited_train(folder, line, monkeypatch):
@@ -65,15 +64,19 @@ def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture)
         install(gaussians, scene, object(), sr=inria_capture / "sr")
 
 
-def test_a_run_continues_from_the_hosts_checkpoint_as_if_it_had_not_stopped(inria_host, inria_capture):
-    def run(name, *arguments):
-        script = [str(FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(inria_capture / name)]
-        common = ["--iterations", "8", "--densify_until_iter", "0", "--sh_interval", "1"]
-        assert main(["--sr", str(inria_capture / "sr"), *OVERRIDES, *script, *common, *arguments]) == 0
-
-    run("whole.ply", "--checkpoint", str(inria_capture / "5.pth"), "--checkpoint_iteration", "5")
-    run("resumed.ply", "--start_checkpoint", str(inria_capture / "5.pth"))
-    whole, resumed = (load_file(inria_capture / f"{name}.ply") for name in ("whole", "resumed"))
+@pytest.mark.parametrize("points", ["own", "stereo"])
+def test_a_run_continues_from_the_hosts_checkpoint_as_if_it_had_not_stopped(
+    points, inria_capture, inria_launched, caplog
+):
+    checkpoint, common = str(inria_capture / "5.pth"), ["--iterations", "8", "--sh_interval", "1"]
+    with caplog.at_level(logging.INFO):
+        whole = inria_launched(
+            "whole", *common, "--checkpoint", checkpoint, "--checkpoint_iteration", "5", points=points
+        )
+    assert caplog.text.count("points=stereo: ") == (points == "stereo")
+    assert "8 merges" in caplog.text
+    assert (len(whole["xyz"]) == N) == (points == "own")
+    resumed = inria_launched("resumed", *common, "--start_checkpoint", checkpoint, points=points)
     for name, rows in whole.items():
         assert torch.allclose(rows, resumed[name], atol=1e-5), name
 

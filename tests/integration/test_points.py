@@ -27,7 +27,7 @@ from integration.views import HostPhoto
 from rasterizers.geometry import SH_C0
 from tests.helpers import toy
 from tests.helpers.host_parts import FROM_START
-from tests.helpers.inria import FOLDER, N, options
+from tests.helpers.inria import N, options
 
 SCRIPT = Path(__file__).parents[1] / "helpers" / "simple_trainer.py"
 
@@ -245,24 +245,10 @@ def test_a_fork_of_another_shape_is_refused_with_the_file_as_remedy(
     assert "docs/how-to/stereo.md" in str(refused.value)
 
 
-def test_the_launcher_trains_from_stereo_and_continues_from_its_checkpoint(inria_host, inria_capture, caplog):
-    from safetensors.torch import load_file
-
-    def run(name, *arguments):
-        script = [str(FOLDER / "train.py"), "-s", str(inria_capture), "--save", str(inria_capture / name)]
-        clear = ["--points", "stereo", "--sr", str(inria_capture / "sr"), *(f"--overrides={row}" for row in FROM_START)]
-        assert inria_main([*clear, *script, "--iterations", "6", "--densify_until_iter", "0", *arguments]) == 0
-        return load_file(inria_capture / name)
-
-    checkpoint = str(inria_capture / "4.pth")
-    with caplog.at_level(logging.INFO):
-        whole = run("whole", "--checkpoint", checkpoint, "--checkpoint_iteration", "4")
-    assert caplog.text.count("points=stereo: ") == 1
-    assert "6 merges" in caplog.text
-    assert whole["xyz"].shape == expected().means.shape
-    assert float((whole["xyz"] - expected().means).norm(dim=1).median()) < 0.02
-    resumed = run("resumed", "--start_checkpoint", checkpoint)
-    assert all(torch.allclose(rows, resumed[name], atol=1e-5) for name, rows in whole.items())
+def test_the_launcher_trains_from_stereo(inria_launched):
+    means = inria_launched("whole", "--iterations", "6", points="stereo")["xyz"]
+    assert means.shape == expected().means.shape
+    assert float((means - expected().means).norm(dim=1).median()) < 0.02
 
 
 def test_the_launchers_name_the_flag_and_refuse_other_words_before_the_host_starts(capsys, caplog):
