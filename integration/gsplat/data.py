@@ -15,16 +15,13 @@ def photos_of(dataset: Any, device: torch.device | str = "cpu") -> list[HostPhot
 
     gsplat sets its rendering to 0 outside of a mask.
     """
-    return [_photo(dataset, i, device) for i in range(len(dataset))]
-
-
-def _photo(dataset: Any, i: int, device: torch.device | str) -> HostPhoto:
-    item = dataset[i]
-    image, mask = (item["image"] / 255).to(device), item.get("mask")
-    return HostPhoto(
-        str(dataset.parser.image_names[dataset.indices[i]]), image, torch.linalg.inv(item["camtoworld"]).to(device), item["K"],
-        None if mask is None or bool(mask.all()) else mask.to(image),
-    )  # fmt: skip
+    photos = []
+    for i in range(len(dataset)):
+        item, name = dataset[i], str(dataset.parser.image_names[dataset.indices[i]])
+        image, mask = (item["image"] / 255).to(device), item.get("mask")
+        shown = None if mask is None or bool(mask.all()) else mask.to(image)
+        photos.append(HostPhoto(name, image, torch.linalg.inv(item["camtoworld"]).to(device), item["K"], shown))
+    return photos
 
 
 def views_from_dataset(

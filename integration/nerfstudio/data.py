@@ -62,9 +62,7 @@ def seed_with_stereo(datamanager: Any) -> None:
     cloud = stereo_cloud(datamanager)
     points = {"points3D_xyz": cloud.means, "points3D_rgb": (cloud.colors * 255).round().to(torch.uint8)}
     metadata = datamanager.train_dataparser_outputs.metadata
-    for name in [
-        name for name in metadata if name.startswith("points3D_")
-    ]:  # errors and tracks are those of the old points
+    for name in [name for name in metadata if name.startswith("points3D_")]:  # also errors and tracks of the old points
         del metadata[name]
     metadata.update(points)
 

@@ -140,13 +140,10 @@ def test_densification_after_the_anchor_is_refused_before_the_first_step(inria_h
     assert "densifies until densify_until_iter=24, but a strategy ends densification at 5" in caplog.text
 
 
-def test_a_host_that_densifies_after_the_anchor_nevertheless_is_stopped(inria_host, inria_capture):
-    opt = options(inria_host, inria_capture)
-    gaussians, scene = inria_host.setup(opt)
-    early = Conductor(SVS(anchor_start=5, anchor_strength=0.01), objective=HR_FROM_START)
-    clear = attach(gaussians, scene.cameras, early, sr=inria_capture / "sr")
+def test_a_host_that_densifies_after_the_anchor_nevertheless_is_stopped(inria_host, inria_capture, inria_attached):
+    clear, gaussians, scene = inria_attached(SVS(anchor_start=5, anchor_strength=0.01))
     with pytest.raises(AnchorError, match=r"anchor was taken at t=5 for .* Inria: densify_until_iter\) or raise"):
-        loop(inria_host, clear, opt, gaussians, scene)
+        loop(inria_host, clear, options(inria_host, inria_capture), gaussians, scene)
 
 
 def test_a_parameter_that_the_host_does_not_train_gets_no_gradient(inria_host, inria_attached):

@@ -5,12 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from clear_strategies import Conductor
-from integration.inria import attach
 from integration.inria.rows import CarriedRows
 from integration.lineage import MatchedRows
 from tests.helpers import toy
-from tests.helpers.inria import HR_FROM_START, N, loop, options
+from tests.helpers.inria import N, loop, options
 
 ROWS = torch.arange(N)
 
@@ -101,14 +99,12 @@ def test_a_change_by_another_function_is_found_by_its_values(also_pruned, model,
     assert ("found by the values" in caplog.text) == also_pruned
 
 
-def test_the_loop_reports_the_rows_and_gets_its_methods_back(inria_host, inria_capture):
-    opt = options(inria_host, inria_capture)
-    gaussians, scene = inria_host.setup(opt)
+def test_the_loop_reports_the_rows_and_gets_its_methods_back(inria_host, inria_capture, inria_attached):
     recorder = toy.Recorder()
-    clear = attach(gaussians, scene.cameras, Conductor(recorder, objective=HR_FROM_START), sr=inria_capture / "sr")
+    clear, gaussians, scene = inria_attached(recorder)
     gaussians.optimizer.param_groups[1]["lr"] = 0.0  # colours stay, so that they identify Gaussians
     colors = gaussians._features_dc.detach().clone()
-    loop(inria_host, clear, opt, gaussians, scene)
+    loop(inria_host, clear, options(inria_host, inria_capture), gaussians, scene)
     assert len(recorder.changes) >= 3
     for parents in recorder.changes:
         colors = colors[parents]

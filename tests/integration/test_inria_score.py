@@ -42,12 +42,11 @@ def test_with_a_score_as_many_gaussians_pass_the_threshold_as_by_the_hosts_stati
     assert not torch.allclose(written, own)
 
 
-def test_mip_splattings_third_column_holds_the_score_too(inria_host, inria_capture, monkeypatch):
+def test_mip_splattings_third_column_holds_the_score_too(inria_host, inria_attached, monkeypatch):
     """It splits as many Gaussians by the largest absolute gradients as by the gradient, so it must rank by the score."""
     monkeypatch.setattr(importlib.import_module("gaussian_renderer"), "ABSOLUTE", True)
-    gaussians, scene = inria_host.setup(options(inria_host, inria_capture))
+    clear, gaussians, scene = inria_attached(P2G(patch=4))
     gaussians.xyz_gradient_accum_abs = torch.zeros(N, 1)
-    clear = attach(gaussians, scene.cameras, Conductor(P2G(patch=4), objective=HR_FROM_START), sr=inria_capture / "sr")
     gradient = screen_gradient(inria_host, clear.wrap(inria_host.render), scene.cameras[0], gaussians)
     assert torch.equal(gradient[:, 2], gradient[:, 0])
     assert float(gradient[:, 2].max()) > 0

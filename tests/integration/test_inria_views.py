@@ -70,10 +70,9 @@ def test_a_pixel_that_the_hosts_mask_hides_is_hidden_at_both_scales(inria_host, 
         assert float(gradient[..., :48].abs().max()) > 0
 
 
-def test_a_step_that_follows_no_recognised_rendering_is_an_error(inria_host, inria_capture):
+def test_a_step_that_follows_no_recognised_rendering_is_an_error(inria_host, inria_capture, inria_attached):
+    clear, gaussians, scene = inria_attached(GCO())
     opt = options(inria_host, inria_capture)
-    gaussians, scene = inria_host.setup(opt)
-    clear = attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr")
     with pytest.raises(HostError, match="none of its renderings was recognised"):
         inria_host.loop(opt, gaussians, scene)  # `render` was not replaced
     clear.remove()
