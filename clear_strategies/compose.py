@@ -114,7 +114,7 @@ def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
         SettingError: an interpolation leads to nothing, or to a value that is missing.
     """
     values: dict[str, Any] = OmegaConf.to_container(config)  # type: ignore[assignment]
-    if missing := _first_missing(values):
+    if missing := next((key for key, value in flat(values).items() if value == "???"), None):
         raise SettingError(f"{missing}: is needed and missing. Add {missing}=….")
     try:
         values = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
@@ -123,28 +123,19 @@ def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key not in without}
 
 
-def _first_missing(node: Any, key: str = "") -> str | None:
-    """The first key whose value is `???`."""
-    if node == "???":
-        return key
-    if not isinstance(node, dict):
-        return None
-    inner = (_first_missing(value, f"{key}.{name}" if key else str(name)) for name, value in node.items())
-    return next((found for found in inner if found is not None), None)
+def flat(node: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The leaves of a tree by their dotted keys."""
+    leaves: dict[str, Any] = {}
+    for name, value in node.items():
+        leaves |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return leaves
 
 
 def nearest_setting(key: str, arguments: Iterable[str]) -> str | None:
     """The setting of a run that an unknown key of its command line most resembles; None where there is none like it."""
     overrides = [a for a in arguments if not a.startswith(("-", "hydra.")) and a.partition("=")[0].lstrip("+") != key]
-    known = _keys(OmegaConf.to_container(composed(overrides, "config")))
-    return next(iter(difflib.get_close_matches(key, known, 1, 0.8)), None)
-
-
-def _keys(node: Any, prefix: str = "") -> list[str]:
-    """The dotted keys of a tree's leaves."""
-    if not isinstance(node, dict):
-        return [prefix]
-    return [key for name, value in node.items() for key in _keys(value, f"{prefix}.{name}" if prefix else str(name))]
+    known: Any = OmegaConf.to_container(composed(overrides, "config"))
+    return next(iter(difflib.get_close_matches(key, flat(known), 1, 0.8)), None)
 
 
 def composed(overrides: list[str], config: str = "conductor") -> DictConfig:

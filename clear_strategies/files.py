@@ -25,16 +25,10 @@ _LARGEST: Final = 64 << 30
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file beside the target, flush it to disk, then rename it to the target."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = partial_of(path)
-    try:
-        with partial.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)  # exists only after an exception or Ctrl-C above
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 @contextmanager
@@ -46,7 +40,7 @@ def replacing(path: Path) -> Iterator[Path]:
         yield partial
         partial.replace(path)
     finally:
-        partial.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)  # exists only after an exception or Ctrl-C
 
 
 def partial_of(path: Path) -> Path:
@@ -112,7 +106,7 @@ def write_csv(path: Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[s
     writer = csv.DictWriter(text, columns, restval="", extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for row in rows:
-        writer.writerow({name: "" if _is_nan(value) else value for name, value in row.items()})
+        writer.writerow({name: "" if isinstance(x, float) and math.isnan(x) else x for name, x in row.items()})
     write_text(path, text.getvalue())
 
 
@@ -122,7 +116,3 @@ def _without_nan(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_without_nan(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _is_nan(value: Any) -> bool:
-    return isinstance(value, float) and math.isnan(value)

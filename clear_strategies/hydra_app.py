@@ -109,7 +109,7 @@ def _end(
     number, launcher = hydra_config.job.get("num"), _launcher(hydra_config)
     if ours is not None and isinstance(error, HeldError) and config.fit.get("resume") == "auto":
         _log.warning("left to the other process: %s", message)
-        ours.note_left(number, message)
+        ours.note(sweep.LEFT, number, message)
         return
     _log.log(logging.INFO if code > exit_codes.SIGNALS else logging.ERROR, "%s", message)  # a stop is no error
     if code > exit_codes.SIGNALS:
@@ -122,7 +122,8 @@ def _end(
         sys.exit(code)
     if ours is None or (code == exit_codes.NO_DISK and launcher == "basic"):
         sys.exit(code)
-    ours.note_failure(number, message)  # the other jobs continue, and jobs on other machines may have another disk
+    # The other jobs continue, and jobs on other machines may have another disk.
+    ours.note(sweep.FAILED, number, message)
 
 
 class SweepCallback(Callback):
@@ -141,7 +142,7 @@ class SweepCallback(Callback):
         if ours is None:
             return
         _report(Path(config.hydra.sweep.dir))
-        stopped, failed, left = ours.stopped_by, ours.failures, ours.left
+        stopped, failed, left = ours.stopped_by, ours.notes(sweep.FAILED), ours.notes(sweep.LEFT)
         if left:
             _log.warning("%d job(s) were left to other processes: %s", len(left), " | ".join(left))
         if failed:

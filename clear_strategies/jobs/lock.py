@@ -45,7 +45,9 @@ def hold(folder: Path) -> Iterator[None]:
         if left:  # empty: this call has created it
             _require_stale(path, left)
         try:
-            _write(file, mine)
+            file.truncate(0)
+            file.write(mine)
+            file.flush()
         except OSError:  # a full disk: a partial lock names no owner
             path.unlink(missing_ok=True)
             raise
@@ -88,12 +90,6 @@ def _is_at(path: Path, file: TextIO) -> bool:
         return os.path.samestat(path.stat(), os.fstat(file.fileno()))
     except FileNotFoundError:
         return False
-
-
-def _write(file: TextIO, text: str) -> None:
-    file.truncate(0)
-    file.write(text)
-    file.flush()
 
 
 def _require_stale(path: Path, text: str) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from clear_strategies.compose import flat
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.baseline import FOLDER as BASELINE
@@ -29,16 +30,8 @@ _NOT_COMPARED: Final = CHANGES_NO_RESULT | {"fit.device"}
 
 def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
     """The configuration, flat and JSON-ready, without what a resumed run may change."""
-
-    def flatten(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
-        if isinstance(value, dict):
-            for key, item in value.items():
-                yield from flatten(f"{prefix}.{key}" if prefix else str(key), item)
-        else:
-            yield prefix, value
-
-    flat = {key: value for key, value in flatten("", values) if key not in _NOT_COMPARED}
-    return dict(json.loads(json.dumps(flat)))  # as it comes back from a file
+    compared = {key: value for key, value in flat(values).items() if key not in _NOT_COMPARED}
+    return dict(json.loads(json.dumps(compared)))  # as it comes back from a file
 
 
 def finished(folder: Path, config: Mapping[str, Any]) -> tuple[float | None] | None:
@@ -71,8 +64,7 @@ def resume(state: TrainState, asked: str | None, folder: Path, config: Mapping[s
     if asked == AUTO:
         _resume_newest(state, folder / CHECKPOINTS, config)
     elif asked is not None:
-        source = Path(asked)
-        restore(state, checkpoint.load(source), source, config)
+        restore(state, checkpoint.load(Path(asked)), Path(asked), config)
 
 
 def of_both(asked: str | None, run: Mapping[str, Any], baseline: Mapping[str, Any]) -> tuple[str | None, str | None]:

@@ -107,11 +107,13 @@ def _of_checkpoint(path: Path, folder: Path, rasterizer: str | None) -> SavedSpl
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(path, "tensors", f"hold no field ({error})", "give a run of this program") from error
     known = _cameras_near(folder, 0)
-    # None is the default, also of a field that only an earlier version had.
-    own = {key: value for key, value in _unflat(saved.config, "rasterizer").items() if value is not None}
-    drawing = _drawing(own, rasterizer).over(known[0].background if known else (0.0, 0.0, 0.0))
+    own = {  # None is the default, also of a field that only an earlier version had
+        key.removeprefix("rasterizer."): value
+        for key, value in saved.config.items()
+        if key.startswith("rasterizer.") and value is not None
+    }
     source = f"{folder}, {saved.t - 1} iterations, {len(field):,} Gaussians"
-    return SavedSplat(folder, source, _painter(field, drawing), known, baked=False)
+    return SavedSplat(folder, source, _painter(field, _drawing(own, rasterizer), known), known, baked=False)
 
 
 def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
@@ -129,12 +131,13 @@ def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
     with path.open("rb") as file:
         mip = _MIP_COMMENT in file.read(4096)
     drawing = _drawing({} if mip else {"kernel": 0.3, "antialiased": False}, rasterizer)
+    source = f"{path}, {len(field):,} Gaussians"
+    return SavedSplat(path.parent, source, _painter(field, drawing, known), known, baked=True)
+
+
+def _painter(field: GaussianField, drawing: Drawing, known: Sequence[SavedCamera]) -> Painter:
+    """Draws the field over the background of the known cameras; black where there are none."""
     drawing = drawing.over(known[0].background if known else (0.0, 0.0, 0.0))
-    folder = path.parent
-    return SavedSplat(folder, f"{path}, {len(field):,} Gaussians", _painter(field, drawing), known, baked=True)
-
-
-def _painter(field: GaussianField, drawing: Drawing) -> Painter:
     return Painter(field.to(drawing.device), drawing.make)
 
 
@@ -157,8 +160,3 @@ def _cameras_near(folder: Path, above: int) -> list[SavedCamera]:
         if (candidate / cameras.FILE).is_file():
             return cameras.read_cameras(candidate / cameras.FILE)
     return []
-
-
-def _unflat(config: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """One node of a flat configuration; its values are no nodes."""
-    return {name.removeprefix(f"{key}."): v for name, v in config.items() if name.startswith(f"{key}.")}

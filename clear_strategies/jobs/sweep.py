@@ -24,7 +24,9 @@ from clear_strategies import files
 _log = logging.getLogger(__name__)
 
 _ENVIRONMENT: Final = "CLEAR_SWEEP"
-_STOP, _FAILED, _LEFT = "stop", "failed_", "left_"
+_STOP: Final = "stop"
+FAILED, LEFT = "failed_", "left_"
+"""Of a job: it failed; it was left to another process, which holds its folder."""
 _SECONDS_BETWEEN_LOOKS: Final = 0.5  # for the stop; a look is one question to the file system
 
 
@@ -56,12 +58,14 @@ class Sweep:
     def begun_here(self) -> bool:
         return self.pid == os.getpid()
 
-    def note_failure(self, job: int, message: str) -> None:
-        files.write_text(self.folder / f"{_FAILED}{job:05d}", message)
+    def note(self, kind: str, job: int, message: str) -> None:
+        """Note what became of a job: `FAILED` or `LEFT`."""
+        files.write_text(self.folder / f"{kind}{job:05d}", message)
 
-    def note_left(self, job: int, message: str) -> None:
-        """Another process holds the job's folder."""
-        files.write_text(self.folder / f"{_LEFT}{job:05d}", message)
+    def notes(self, kind: str) -> list[str]:
+        """What was noted of all jobs, in their order."""
+        notes = sorted(self.folder.glob(f"{kind}*"))
+        return [f"job {int(note.name.removeprefix(kind))}: {note.read_text()}" for note in notes]
 
     def stop(self, signum: int) -> None:
         """Ask the jobs of this sweep to save and end, and start no other."""
@@ -74,18 +78,6 @@ class Sweep:
             return int((self.folder / _STOP).read_text())
         except FileNotFoundError:
             return None
-
-    @property
-    def failures(self) -> list[str]:
-        return self._notes(_FAILED)
-
-    @property
-    def left(self) -> list[str]:
-        return self._notes(_LEFT)
-
-    def _notes(self, kind: str) -> list[str]:
-        notes = sorted(self.folder.glob(f"{kind}*"))
-        return [f"job {int(note.name.removeprefix(kind))}: {note.read_text()}" for note in notes]
 
 
 def stop_on_signals(sweep: Sweep) -> None:
