@@ -8,7 +8,7 @@ so that the LR photo cannot tell (`SeededErrors.hidden`).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any, Final
 
 import pandas as pd
@@ -30,27 +30,6 @@ from clear_strategies.strategies.p2g import P2G
 _DEMO: Final = ("prior=demo",)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Found:
-    """What P2G says of the training views' patches.
-
-    Args:
-        R: per view. wrong: the known mask.
-    """
-
-    R: list[Float[Tensor, "ph pw"]]
-    wrong: list[Bool[Tensor, "ph pw"]]
-
-    def row(self) -> dict[str, float]:
-        R, wrong = (torch.cat([x.reshape(-1) for x in maps]) for maps in (self.R, self.wrong))
-        return {
-            "auc": auc(R[~wrong], R[wrong]),
-            "R right": R[~wrong].mean().item(),
-            "R wrong": R[wrong].mean().item(),
-            "patches": float(len(R)),
-        }
-
-
 def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
     """Fill `results` with a row for each kind of error, and a picture of the first view's R.
 
@@ -69,9 +48,12 @@ def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
     p2g, rows = P2G(down=settings.data.views.downsample), []
     for kind, wanted in (("seeded", replace(errors, hidden=False)), ("hidden", replace(errors, hidden=True))):
         views = [_with_errors(view, wanted) for view in scene.train]
-        found = _ask(p2g, views, wanted)
-        rows.append({"scene": scene.name, "errors": kind, **found.row()})
-        results.figures[f"evidence_{kind}"] = _picture(views[0], found, errors.patch)
+        maps = [p2g.patch_maps(view).reliability for view in views]
+        masks = [wanted.wrong(v.hr.camera.height, v.hr.camera.width, v.factor, v.name) for v in views]
+        R, wrong = (torch.cat([x.flatten() for x in of_views]) for of_views in (maps, masks))
+        found = {"auc": auc(R[~wrong], R[wrong]), "R right": R[~wrong].mean().item(), "R wrong": R[wrong].mean().item()}
+        rows.append({"scene": scene.name, "errors": kind, **found, "patches": float(len(R))})
+        results.figures[f"evidence_{kind}"] = _picture(views[0], maps[0], masks[0], errors.patch)
     results.tables["evidence"] = pd.DataFrame(rows)
     results.note(
         f"{scene.name}, {len(scene.train)} training views, errors in {errors.share:.0%} of the patches of {errors.patch} HR px."
@@ -106,27 +88,20 @@ def _with_errors(view: View, errors: SeededErrors) -> View:
     return replace(view, hr=Photo(view.hr.camera, image))
 
 
-def _ask(p2g: P2G, views: Sequence[View], errors: SeededErrors) -> _Found:
-    """R of every view."""
-    wrong = [errors.wrong(v.hr.camera.height, v.hr.camera.width, v.factor, v.name) for v in views]
-    return _Found([p2g.patch_maps(view).reliability for view in views], wrong)
-
-
-def _picture(view: View, found: _Found, patch: int) -> Figure:
+def _picture(view: View, R: Float[Tensor, "ph pw"], wrong: Bool[Tensor, "ph pw"], patch: int) -> Figure:
     """The SR image and R of it, with the wrong patches framed."""
     height, width = view.hr.image.shape[:2]
     figure = Figure(figsize=(6, 3 * height / width + 0.4), layout="constrained")
     image, of_patches = axes = figure.subplots(1, 2)
     image.imshow(view.hr.image.cpu().numpy(), interpolation="nearest")
     image.set_title("SR image, wrong patches framed", fontsize=9)
-    R = found.R[0].cpu().numpy()
     extent = (0, R.shape[1] * patch, R.shape[0] * patch, 0)
-    of_patches.imshow(R, vmin=0, vmax=1, cmap="gray", extent=extent, interpolation="nearest")
+    of_patches.imshow(R.cpu().numpy(), vmin=0, vmax=1, cmap="gray", extent=extent, interpolation="nearest")
     of_patches.set(xlim=(0, width), ylim=(height, 0))
     of_patches.set_title("R", fontsize=9)
     for axis in axes:
         axis.axis("off")
-        for row, column in torch.nonzero(found.wrong[0]).tolist():
+        for row, column in torch.nonzero(wrong).tolist():
             box = (column * patch + 2, row * patch + 2)
             axis.add_patch(Rectangle(box, patch - 4, patch - 4, fill=False, edgecolor="tab:red", linewidth=1.2))
     return figure

@@ -32,14 +32,6 @@ Leaves = Mapping[str, Tensor]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PeerRendering:
-    """An image and its `vjp`: K gradients, each attribute a list of K tensors, by K backward passes."""
-
-    image: Float[Tensor, "H W 3"]
-    vjp: Callable[[Float[Tensor, "K H W 3"]], SimpleNamespace]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Peer:
     """A rasterizer of another project.
 
@@ -49,7 +41,7 @@ class Peer:
     """
 
     name: str
-    render: Callable[[Workload], PeerRendering]
+    render: Callable[[Workload], SimpleNamespace]
     differences: str
     rules: Mapping[str, Any] = field(default_factory=dict)
 
@@ -118,10 +110,13 @@ def gswarp(library: Any, name: str) -> Peer:
     return Peer(name, _by_autograd(draw), differences, {"antialiased": False, "alpha_max": 0.99, "near": 0.2})
 
 
-def _by_autograd(draw: Callable[[Workload, Leaves], Tensor]) -> Callable[[Workload], PeerRendering]:
-    """One backward pass per cotangent; the graph is kept for the next."""
+def _by_autograd(draw: Callable[[Workload, Leaves], Tensor]) -> Callable[[Workload], SimpleNamespace]:
+    """Draws a workload: `image`, and `vjp` of K cotangents, whose attributes are lists of K gradients.
 
-    def render(workload: Workload) -> PeerRendering:
+    There is one backward pass per cotangent; the graph is kept for the next.
+    """
+
+    def render(workload: Workload) -> SimpleNamespace:
         leaves = {name: getattr(workload.splats, name).detach().requires_grad_() for name in ATTRIBUTES}
         with torch.enable_grad():
             image = draw(workload, leaves)
@@ -134,7 +129,7 @@ def _by_autograd(draw: Callable[[Workload, Leaves], Tensor]) -> Callable[[Worklo
             ]
             return SimpleNamespace(**dict(zip(leaves, zip(*gradients, strict=True), strict=True)))
 
-        return PeerRendering(image, vjp)
+        return SimpleNamespace(image=image, vjp=vjp)
 
     return render
 

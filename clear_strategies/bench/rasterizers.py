@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -56,6 +57,10 @@ class Contestant:
     def label(self) -> str:
         return " ".join(filter(None, (self.backend, self.module, self.preset)))
 
+    def names(self, workload: Workload) -> dict[str, Any]:
+        """The columns that say what a row of a table measured."""
+        return {"scene": workload.name, "backend": self.backend, "module": self.module, "preset": self.preset}
+
 
 def measure(
     results: Results,
@@ -101,7 +106,7 @@ def measure(
         if not contestants:
             continue
         cotangents = random_cotangents(workload)
-        contenders = {c.label: Turn(c, cotangents) for c in contestants}
+        contenders = {c.label: partial(turn, c, cotangents) for c in contestants}
         ms = interleaved(contenders, repeats, device=device, label=workload.name)
         turns.append(ms.assign(scene=workload.name))
         times += _time_rows(workload, contestants, medians(ms))
@@ -152,22 +157,17 @@ def usable(asked: Sequence[str] | None, device: str, note: Callable[[str], None]
     return found
 
 
-class Turn:
-    """Times every stage of a contestant once."""
-
-    def __init__(self, contestant: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> None:
-        self.contestant, self.cotangents = contestant, cotangents
-
-    def __call__(self) -> dict[str, float]:
-        work_log = WorkLog(self.cotangents.device)
-        with work_log.stage(FORWARD):
-            rendering = self.contestant.render()
-        for k, stage in enumerate(BACKWARD, 1):
-            with work_log.stage(stage):
-                rendering.vjp(self.cotangents[:k])
-        del rendering
-        self.contestant.stages(work_log)
-        return milliseconds(work_log)
+def turn(contestant: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> dict[str, float]:
+    """The milliseconds of every stage of a contestant, once."""
+    work_log = WorkLog(cotangents.device)
+    with work_log.stage(FORWARD):
+        rendering = contestant.render()
+    for k, stage in enumerate(BACKWARD, 1):
+        with work_log.stage(stage):
+            rendering.vjp(cotangents[:k])
+    del rendering
+    contestant.stages(work_log)
+    return milliseconds(work_log)
 
 
 def random_cotangents(workload: Workload) -> Float[Tensor, "K H W 3"]:
@@ -222,7 +222,7 @@ def _time_rows(workload: Workload, contestants: Sequence[Contestant], median: pd
     cotangents = random_cotangents(workload)
     for c in contestants:
         ms = median.loc[c.label].dropna().to_dict()
-        row: dict[str, Any] = {"scene": workload.name, "backend": c.backend, "module": c.module, "preset": c.preset}
+        row: dict[str, Any] = c.names(workload)
         row |= {f"{stage}_ms": value for stage, value in ms.items() if stage != SEPARATE}
         row |= {f"k{k}_over_k1": ms[BACKWARD[k - 1]] / ms[BACKWARD[0]] for k in range(2, COTANGENTS + 1)}
         if SEPARATE in ms:
@@ -243,11 +243,4 @@ def _error_rows(workload: Workload, contestants: Sequence[Contestant], backend: 
             key = tuple(sorted(rules.items()))
             if key not in truths:
                 truths[key] = accuracy.truth(backend, workload, cotangent, rules)
-            head = {
-                "scene": workload.name,
-                "backend": c.backend,
-                "module": c.module,
-                "preset": c.preset,
-                "truth": against,
-            }
-            yield head | accuracy.errors(found, truths[key])
+            yield {**c.names(workload), "truth": against, **accuracy.errors(found, truths[key])}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ from matplotlib.figure import Figure
 from torch.utils import collect_env
 
 from clear_strategies import files
+from clear_strategies.outputs.figures import save_png
 from clear_strategies.outputs.provenance import provenance
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -56,16 +56,9 @@ class Results:
         for name, table in self.tables.items():
             files.write_text(out / f"{name}.csv", table.to_csv(index=False, float_format="%.6g"))
         for name, figure in self.figures.items():
-            write_figure(out / f"{name}.png", figure)
+            save_png(figure, out / f"{name}.png")
         facts = {"options": self.options, "machine": machine(), "notes": self.notes}
         files.write_json(out / f"{self.question}.json", facts)
-
-
-def write_figure(path: Path, figure: Figure) -> None:
-    """Write a PNG, atomically."""
-    png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=110)
-    files.write_bytes(path, png.getvalue())
 
 
 def machine() -> dict[str, Any]:

@@ -4,7 +4,6 @@ exported field.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -13,6 +12,9 @@ from typing import Final
 import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
@@ -81,7 +83,7 @@ def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed:
     texture = 0.5 + 0.3 * np.sin(points * (7, 9, 5)) * np.cos(points[:, [1, 2, 0]] * 11)
     colors = texture + random.normal(0, 0.05, (n, 3))
     shuffled = random.permutation(n)  # a trained field has no order
-    splats = _splats(random, points, quats, scales, _sigmoid(random.normal(0.8, 2.2, n)), colors)
+    splats = _splats(random, points, quats, scales, expit(random.normal(0.8, 2.2, n)), colors)
     splats = Splats(*(getattr(splats, a)[shuffled] for a in PARAMETERS))
     return Workload(name, splats, Camera(_pose(), focal, focal, width / 2, height / 2, width, height))
 
@@ -134,8 +136,6 @@ def garden(path: Path) -> Workload:
     Raises:
         DataError: the file is missing or is not the garden.
     """
-    from scipy.spatial import cKDTree
-
     try:
         with np.load(path) as file:
             points, colors = file["means3d"].astype(np.float64), file["colors"] / 255.0
@@ -149,7 +149,7 @@ def garden(path: Path) -> Workload:
     gaps = np.asarray(cKDTree(points).query(points, k=4)[0])[:, 1:]
     size = np.sqrt(np.square(gaps).mean(1)).clip(1e-4)
     scales = size[:, None] * np.exp(random.normal(-0.3, 0.5, (n, 3)))
-    opacities = _sigmoid(random.normal(0.3, 1.9, n))
+    opacities = expit(random.normal(0.3, 1.9, n))
     splats = _splats(random, points, random.normal(size=(n, 4)), scales, opacities, colors)
     fx, fy, cx, cy = (float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
     camera = Camera(torch.from_numpy(pose).float(), fx, fy, cx, cy, width, height)
@@ -233,14 +233,7 @@ def _facing(normals: Float[Array, "n 3"], spin: Float[Array, " n"]) -> Float[Arr
 
 def _pose() -> Float[torch.Tensor, "4 4"]:
     """A camera pose slightly off the axes, so that nothing is aligned with the pixel grid."""
-    yaw, pitch = 0.03, -0.02
-    about_y = np.array([[math.cos(yaw), 0, math.sin(yaw)], [0, 1, 0], [-math.sin(yaw), 0, math.cos(yaw)]])
-    about_x = np.array([[1, 0, 0], [0, math.cos(pitch), -math.sin(pitch)], [0, math.sin(pitch), math.cos(pitch)]])
     pose = torch.eye(4)
-    pose[:3, :3] = torch.from_numpy(about_x @ about_y)
+    pose[:3, :3] = torch.from_numpy(Rotation.from_euler("XY", (-0.02, 0.03)).as_matrix())
     pose[:3, 3] = torch.tensor([0.05, -0.03, 0.1])
     return pose
-
-
-def _sigmoid(x: Array) -> Array:
-    return np.asarray(1 / (1 + np.exp(-x)))

@@ -189,14 +189,12 @@ def summary(trainings: pd.DataFrame) -> pd.DataFrame:
     base = trainings[trainings["variant"] == reference].set_index(["scene", "seed"])
     paired = trainings.join(base.add_suffix("_base"), on=["scene", "seed"])
     paired["psnr_over"] = paired["psnr"] - paired["psnr_base"]
-    for name, kind in (("training", "training"), ("command", "command")):
-        for suffix, end in (("", "_s"), ("_processor", "_processor_s")):
-            paired[name + suffix] = paired[f"reached_{kind}{end}"] / paired[f"reached_{kind}{end}_base"]
+    ratios = ["training", "training_processor", "command", "command_processor"]
+    for ratio in ratios:
+        paired[ratio] = paired[f"reached_{ratio}_s"] / paired[f"reached_{ratio}_s_base"]
     paired["of_run"] = paired["reached_training_processor_s"] / paired["training_processor_s_base"]
     groups = paired.groupby(["scene", "variant"], sort=False)
-    table = groups[["iterations", "psnr", "psnr_over"]].median()
-    ratios = ["training", "training_processor", "command", "command_processor", "of_run"]
-    table = table.join(groups[ratios].median())
+    table = groups[["iterations", "psnr", "psnr_over", *ratios, "of_run"]].median()
     for column in ("psnr_over", "training_processor"):
         table[f"{column}_low"], table[f"{column}_high"] = groups[column].min(), groups[column].max()
     table["seeds"], table["seeds_reached"] = groups["seed"].count(), groups["reached"].count()

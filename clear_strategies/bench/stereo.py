@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pandas as pd
 import torch
@@ -47,7 +47,10 @@ def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
     maps = depth_maps(photos, features.means, data.cloud.stereo, capture.background)
     end = time.perf_counter()
     errors = [_errors(capture, *of_view) for of_view in zip(frames, photos, maps, strict=True)]
-    rows = [{"view": Path(f.name).stem, **_row(e, m)} for f, e, m in zip(frames, errors, maps, strict=True)]
+    rows: list[dict[str, Any]] = [
+        {"view": Path(frame.name).stem, "coverage": found.coverage, **_shares(*of_view)}
+        for frame, found, of_view in zip(frames, maps, errors, strict=True)
+    ]
     known = torch.cat([error for error, _ in errors])
     asked = sum(total for _, total in errors)
     coverage = sum(m.coverage for m in maps) / len(maps)
@@ -60,10 +63,6 @@ def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
     )
     if asked == 0:
         results.note("there is nothing to compare with: the scene has neither SfM points nor known depth.")
-
-
-def _row(errors: tuple[Float[Tensor, " K"], int], found: DepthMap) -> dict[str, float]:
-    return {"coverage": found.coverage, **_shares(*errors)}
 
 
 def _shares(known: Float[Tensor, " K"], asked: int) -> dict[str, float]:

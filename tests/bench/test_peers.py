@@ -77,7 +77,7 @@ def test_gswarp_is_called_with_its_conventions_and_compared_by_its_rules(tiny):
 def test_k_cotangents_are_k_backward_passes(tiny):
     cotangents = drawing.random_cotangents(tiny)
     contestant = drawing.peer_on(tiny, peers.gswarp(Inria, "stand-in"))
-    assert list(drawing.Turn(contestant, cotangents)()) == [drawing.FORWARD, *drawing.BACKWARD]
+    assert list(drawing.turn(contestant, cotangents)) == [drawing.FORWARD, *drawing.BACKWARD]
     rendering = contestant.render()
     both, second = rendering.vjp(cotangents[:2]), rendering.vjp(cotangents[1:2])
     torch.testing.assert_close(both.means[1], second.means[0])
