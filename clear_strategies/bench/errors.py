@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from clear_strategies.data.prepare import photos_of
 from clear_strategies.data.view_settings import split
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.visibility import seen_by
-from clear_strategies.jobs.saved import SavedSplat, open_splat
+from clear_strategies.jobs.saved import open_splat
 from clear_strategies.jobs.scene import read
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.outputs import metrics
@@ -43,12 +43,11 @@ def measure(results: Results, *, run: Path, reference: Path | None = None) -> No
     if not frames:
         remedy = "train with test views: data.views.test_every=8"
         raise DataError(run, "test views", "there are none, and training photos say nothing of the error", remedy)
-    train = splats["run"].poses()
-    depths = [(camera, splats["run"].painter.depth(camera)) for camera in train]
+    field, train = splats["run"].painter, splats["run"].poses()
+    depths = [(camera, field.depth(camera)) for camera in train]
     centers = torch.stack([camera.center for camera in train])
     views = []
     for frame, photo in zip(frames, photos_of(frames, view_settings), strict=True):
-        field = splats["run"].painter
         views.append(
             HeldOut(
                 Path(frame.name).stem,
@@ -62,7 +61,11 @@ def measure(results: Results, *, run: Path, reference: Path | None = None) -> No
         )
     results.tables["errors"], results.tables["errors_views"] = budget(views), by_view(views)
     results.figures["errors"] = _picture(views)
-    _note(results, splats, views, lr=view_settings.photos_are == "lr")
+    for name, splat in splats.items():
+        mean = results.tables["errors_views"][f"{name}: psnr"].mean()
+        results.note(f"{name}: {splat.source}; mean PSNR of {len(views)} test views {mean:.2f} dB.")
+    if view_settings.photos_are == "lr":
+        results.note("HR is unknown: renders at LR are compared with the LR photos.")
 
 
 def _settings(run: Path) -> JobSettings:
@@ -75,16 +78,6 @@ def _settings(run: Path) -> JobSettings:
             node = node.setdefault(part, {})
         node[name] = value
     return settings_of(nested)
-
-
-def _note(results: Results, splats: Mapping[str, SavedSplat], views: Sequence[HeldOut], *, lr: bool) -> None:
-    table = results.tables["errors_views"]
-    for name, splat in splats.items():
-        results.note(
-            f"{name}: {splat.source}; mean PSNR of {len(views)} test views {table[f'{name}: psnr'].mean():.2f} dB."
-        )
-    if lr:
-        results.note("HR is unknown: renders at LR are compared with the LR photos.")
 
 
 def _picture(views: Sequence[HeldOut]) -> Figure:

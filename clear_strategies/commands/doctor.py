@@ -53,7 +53,9 @@ def main(arguments: Sequence[str]) -> None:
     _print("machine", _machine(facts))  # what follows needs torch, whose import takes most of the time
     _print("cache", _cache())
     broken: list[str] = []
-    _print("rasterizers, fastest first", _rasterizers(broken, slow=options.all))
+    from clear_strategies.commands import self_test
+
+    _print("rasterizers, fastest first", self_test.backends(broken, slow=options.all))
     if broken:
         raise SettingError(
             f"{', '.join(broken)} draws something else than the reference. Reinstall, or choose another: rasterizer=torch."
@@ -99,19 +101,12 @@ def _memory() -> str:
     return f"{free:.1f} of {total:.1f} GiB free"
 
 
-def _rasterizers(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
-    from clear_strategies.commands import self_test
-
-    return self_test.backends(broken, slow=slow)
-
-
 def _missing() -> Iterator[tuple[str, str]]:
-    none = True
-    for extra, (modules, what) in EXTRAS.items():
-        if lacks := [module for module in modules if not _is_installed(module)]:
-            none = False
-            yield extra, f"{what}: pip install 'clear-strategies[{extra}]' (lacks {', '.join(lacks)})"
-    if none:
+    lacks = {extra: [m for m in modules if not _is_installed(m)] for extra, (modules, _) in EXTRAS.items()}
+    for extra, (_, what) in EXTRAS.items():
+        if lacks[extra]:
+            yield extra, f"{what}: pip install 'clear-strategies[{extra}]' (lacks {', '.join(lacks[extra])})"
+    if not any(lacks.values()):
         yield "none", "all extras are installed"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,20 +28,10 @@ def main(arguments: Sequence[str]) -> None:
         "--to", required=True, choices=FORMATS, help="; ".join(f"{name}: {what}" for name, what in FORMATS.items())
     )
     parser.add_argument("--out", type=Path, metavar="FILE", help="where it goes (default: RUN/NAME.FORMAT)")
-    parser.add_argument(
-        "--sh",
-        type=int,
-        choices=range(4),
-        default=3,
-        metavar="0..3",
-        help="degree of view-dependent colour that is kept (3)",
-    )
+    kept = "degree of view-dependent colour that is kept (3)"
+    parser.add_argument("--sh", type=int, choices=range(4), default=3, metavar="0..3", help=kept)
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
-    _export(options)
-
-
-def _export(options: argparse.Namespace) -> None:
     from clear_strategies.jobs.saved import open_splat
     from clear_strategies.outputs.formats import Start, gaussians_of, write_format
     from clear_strategies.viewing import paths

@@ -27,10 +27,6 @@ def main(arguments: Sequence[str]) -> None:
     """
     options = _parser().parse_args(arguments)
     console.show(verbose=options.verbose)
-    _render(options)
-
-
-def _render(options: argparse.Namespace) -> None:
     from clear_strategies.commands.path_cameras import cameras_of
     from clear_strategies.jobs.saved import open_splat
     from clear_strategies.viewing import film, video

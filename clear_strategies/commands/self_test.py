@@ -13,6 +13,7 @@ from torch import Tensor
 
 import rasterizers
 from clear_strategies.core.gradients import PARAMETERS
+from clear_strategies.errors import one_line
 from rasterizers import native
 from rasterizers.interface import BackendUnavailable, Camera, Splats
 
@@ -28,31 +29,26 @@ def backends(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
         broken: takes the names of those that fail or differ.
         slow: test also those that compile for long first.
     """
-    with native.kernel_threads(
-        native.threads()
-    ):  # for pictures this small, torch's own threads cost more than they bring
-        yield from _each(broken, slow=slow)
-
-
-def _each(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
     splats, camera = _scene()
-    exact = rasterizers.load("torch", preset="accurate")(splats, camera).image
-    for name in rasterizers.names():
-        if name in _SLOW_TO_COMPILE and find_spec(name) is not None and not torch.cuda.is_available() and not slow:
-            yield name, "installed, not tested: it compiles for a minute first (--all tests it); slow without CUDA"
-            continue
-        try:
-            rasterizers.load(name)
-        except BackendUnavailable as reason:
-            yield name, f"not here: {reason}"
-            continue
-        try:
-            told, fine = _compared(name, splats, camera, exact)
-        except (BackendUnavailable, RuntimeError, ValueError) as error:
-            told, fine = f"FAILS: {' '.join(str(error).split())[:200]}", False
-        if not fine:
-            broken.append(name)
-        yield name, told
+    # For pictures this small, torch's own threads cost more than they bring.
+    with native.kernel_threads(native.threads()):
+        exact = rasterizers.load("torch", preset="accurate")(splats, camera).image
+        for name in rasterizers.names():
+            if name in _SLOW_TO_COMPILE and find_spec(name) is not None and not torch.cuda.is_available() and not slow:
+                yield name, "installed, not tested: it compiles for a minute first (--all tests it); slow without CUDA"
+                continue
+            try:
+                rasterizers.load(name)
+            except BackendUnavailable as reason:
+                yield name, f"not here: {reason}"
+                continue
+            try:
+                told, fine = _compared(name, splats, camera, exact)
+            except (BackendUnavailable, RuntimeError, ValueError) as error:
+                told, fine = f"FAILS: {one_line(error)[:200]}", False
+            if not fine:
+                broken.append(name)
+            yield name, told
 
 
 def _compared(name: str, splats: Splats, camera: Camera, exact: Tensor) -> tuple[str, bool]:
@@ -75,18 +71,11 @@ def _compared(name: str, splats: Splats, camera: Camera, exact: Tensor) -> tuple
 def _scene() -> tuple[Splats, Camera]:
     g = torch.Generator().manual_seed(0)
 
-    def normal(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=g)
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(_GAUSSIANS, *shape, generator=g)
 
-    n = _GAUSSIANS
-    splats = Splats(
-        normal(n, 3),
-        normal(n, 4),
-        (normal(n, 3) * 0.3 - 2).exp(),
-        normal(n).sigmoid(),
-        normal(n, 1, 3),
-        normal(n, 3, 3) * 0.2,
-    )
+    scales, opacities = (normal(3) * 0.3 - 2).exp(), normal().sigmoid()
+    splats = Splats(normal(3), normal(4), scales, opacities, normal(1, 3), normal(3, 3) * 0.2)
     pose = torch.eye(4)
     pose[2, 3] = 5
     focal = _SIZE / 2 / math.tan(0.4)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import functools
 import logging
 import webbrowser
@@ -30,10 +29,6 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
-    _view(options)
-
-
-def _view(options: argparse.Namespace) -> None:
     from clear_strategies.jobs.saved import open_splat
     from clear_strategies.viewing import live, points
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal
 
 import torch
@@ -54,17 +54,15 @@ class RasterizerSettings:
     lanes: int | None = None
     device: str | None = None
 
-    def load(self, device: Device | None) -> tuple[str, Callable[..., Rasterizer]]:
+    def load(self, device: Device | None) -> tuple[str, functools.partial[Rasterizer]]:
         """The name of the backend, and a function that makes the rasterizer."""
         name = rasterizers.fastest(device) if self.name == "auto" else self.name
-        chosen = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
-        settings = {key: value for key, value in chosen.items() if value is not None}
+        settings = {key: value for key, value in asdict(self).items() if key != "name" and value is not None}
         of_device = {} if device is None else rasterizers.for_device(name, device)
         return name, functools.partial(rasterizers.load, name, **{**of_device, **settings})
 
 
 _OWN: Final = f"{RasterizerSettings.__module__}.{RasterizerSettings.__qualname__}"
-_BY_NAME: Final = ("name", "preset", "memory", "threads", "isa", "lanes", "device")
 
 
 def rasterizer_node(node: Mapping[str, Any]) -> dict[str, Any]:
@@ -75,9 +73,7 @@ def rasterizer_node(node: Mapping[str, Any]) -> dict[str, Any]:
     """
     if node.get(TARGET) in (None, _OWN):
         return dict(node)
-    named = [name for name in _BY_NAME if node.get(name) not in (None, "auto")]
-    kept = {key: value for key, value in node.items() if value is not None and (key not in _BY_NAME or key in named)}
-    return {key: value for key, value in kept.items() if key != "name"} | {"_partial_": True}
+    return {key: value for key, value in node.items() if key != "name" and value is not None} | {"_partial_": True}
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,15 +89,13 @@ class Drawing:
     name: str
     device: Device
     kernel: float
-    make: Callable[..., Rasterizer]
+    make: functools.partial[Rasterizer]
 
     def over(self, background: Color) -> Drawing:
         """The same over the data set's background, unless the settings name one."""
-        keywords = getattr(self.make, "keywords", {})
-        if "background" in keywords:
+        if "background" in self.make.keywords:
             return self
-        rasterizer = self.make(background=background)
-        return Drawing(rasterizer, self.name, self.device, self.kernel, self.make)
+        return replace(self, rasterizer=self.make(background=background))
 
 
 def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked: Device | None) -> Drawing:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -268,7 +269,8 @@ def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[
     with ExitStack() as open_:
         if fit_settings.viewer:
             saved, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"
-            turn = open_.enter_context(live.watched(painter, saved, title, _tell_address))
+            tell = functools.partial(_log.info, "look while it trains: %s")
+            turn = open_.enter_context(live.watched(painter, saved, title, tell))
             calls.append(lambda: turn(state.t - 1))
         if fit_settings.log == "tensorboard":
             calls.append(open_.enter_context(tensorboard.logged(training.folder, state, place.scene, painter)))
@@ -278,10 +280,6 @@ def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[
                 call()
 
         yield after_step
-
-
-def _tell_address(address: str) -> None:
-    _log.info("look while it trains: %s", address)
 
 
 def _train(

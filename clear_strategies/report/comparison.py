@@ -23,11 +23,9 @@ def write_comparison(
     """Draw the same view of several runs, and below each the window where the runs differ most, enlarged.
 
     Args:
-        tiles: name of the run -> image in [0, 1]; all of one size. Without any no file is written.
+        tiles: name of the run -> image in [0, 1]; at least one, all of one size.
         captions: name of the run -> the line below its images.
     """
-    if not tiles:
-        return
     height, width = next(iter(tiles.values())).shape[:2]
     times = magnification(width)
     cell_w, cell_h = round(width * times), round(height * times)

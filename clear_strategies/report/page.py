@@ -12,7 +12,7 @@ import html
 import logging
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -94,13 +94,12 @@ def write_page(path: Path, sections: Sequence[Section], *, budget_mb: float = BU
     Images are embedded as PNG where they fit into the budget, else as JPEG, else as JPEG of fewer views; at least one view
     per scene is shown.
     """
+    splats = [_splats(section, path.parent) for section in sections]
     for lossy, views in ((False, _VIEWS), *((True, n) for n in range(_VIEWS, 0, -1))):
         images = Images(lossy)
         scenes = [_scene(section, images, views) for section in sections]
         limits = _limits(scenes, lossy=lossy, views=views)
-        page = _render(
-            sections, scenes, images, limits, [_splats(section, path.parent) for section in sections]
-        ).encode()
+        page = _render(sections, scenes, images, limits, splats).encode()
         if len(page) <= budget_mb * 1e6:
             break
     else:
@@ -213,7 +212,8 @@ def _render(
     from jinja2 import Environment, FileSystemLoader
 
     environment = Environment(loader=FileSystemLoader(_FOLDER), autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"rows": _transposed, "cell": _cell, "code": _code}
+    environment.globals["zip"] = zip
+    environment.filters |= {"cell": _cell, "code": _code}
     style, script = ((_FOLDER / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js"))
     names = [section.title for section in sections if section.runs]
     return environment.get_template("page.html.j2").render(
@@ -225,10 +225,6 @@ def _render(
         style=style,
         script=script,
     )
-
-
-def _transposed(columns: Iterable[Sequence[str]]) -> Iterable[tuple[str, ...]]:
-    return zip(*columns, strict=True)
 
 
 def _cell(text: str) -> Any:

@@ -35,7 +35,7 @@ from rasterizers.interface import Camera, Color
 FILE: Final = "cameras.json"
 PHOTOS: Final = "cameras"
 """The folder of the small pictures, beside the file."""
-_PHOTO_WIDTH: Final = 320  # px
+_PHOTO_WIDTH: Final = 320  # px, at most; photos are reduced by a whole number
 
 Split = Literal["train", "test"]
 
@@ -66,7 +66,9 @@ def write_cameras(folder: Path, scene: Scene) -> None:
             entry = {**_entry(len(entries), view), "split": split, "background": list(scene.background)}
             if split == "train":
                 entry["photo"] = f"{PHOTOS}/{Path(view.name).stem}.jpg"
-                files.write_bytes(folder / entry["photo"], jpeg(_small(view.lr.image), quality=80))
+                photo = view.lr.image.cpu()
+                small = images.area_mean(photo, math.ceil(photo.shape[1] / _PHOTO_WIDTH))
+                files.write_bytes(folder / entry["photo"], jpeg(small, quality=80))
             entries.append(entry)
     files.write_json(folder / FILE, entries)
 
@@ -136,12 +138,6 @@ def _entry(number: int, view: View) -> dict[str, Any]:
         "cy": camera.cy,
         "scale": view.factor,
     }
-
-
-def _small(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
-    """The image, reduced by a whole number to at most `_PHOTO_WIDTH` where it is wider."""
-    factor = math.ceil(image.shape[1] / _PHOTO_WIDTH)
-    return images.area_mean(image.cpu(), factor)
 
 
 class _Entry(msgspec.Struct):

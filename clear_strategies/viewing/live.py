@@ -57,20 +57,14 @@ class Turns:
         self._closed.set()
 
 
-def missing() -> str | None:
-    """What is not installed that the viewer needs, with the remedy; None where nothing is."""
-    lacks = [name for name in ("viser", "nerfview", "splines") if find_spec(name) is None]
-    return f"the viewer needs {' and '.join(lacks)}: pip install 'clear-strategies[view]'" if lacks else None
-
-
 def require_viewer() -> None:
     """Check that the viewer's libraries are installed.
 
     Raises:
         SettingError: one is not.
     """
-    if (lack := missing()) is not None:
-        raise SettingError(f"{lack}.")
+    if lacks := [name for name in ("viser", "nerfview", "splines") if find_spec(name) is None]:
+        raise SettingError(f"the viewer needs {' and '.join(lacks)}: pip install 'clear-strategies[view]'.")
 
 
 @contextmanager
@@ -82,7 +76,6 @@ def watched(
     Args:
         report: told the address.
     """
-    require_viewer()
     from clear_strategies.viewing import points
     from clear_strategies.viewing.server import Screen, SplatViewer
 

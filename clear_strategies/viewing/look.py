@@ -86,8 +86,6 @@ class Painter:
     def _rasterizer(self, look: Look, *, black: bool = False) -> Rasterizer:
         key = (look.mip, black)
         if key not in self._made:
-            settings = {} if look.mip else dict(_WITHOUT_MIP)
-            if black:
-                settings["background"] = (0.0, 0.0, 0.0)
-            self._made[key] = self.make(**settings)
+            settings = {} if look.mip else _WITHOUT_MIP
+            self._made[key] = self.make(**settings, **({"background": (0.0, 0.0, 0.0)} if black else {}))
         return self._made[key]

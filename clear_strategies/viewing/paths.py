@@ -77,8 +77,7 @@ def ellipse(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     _, turn = np.linalg.eigh(flat.T @ flat + 1e-12 * np.eye(2))
     plane, flat = turn.T @ plane, flat @ turn
     radii = np.quantile(np.abs(flat), 0.9, axis=0)
-    radii = np.maximum(radii, _SWAY * np.linalg.norm(offsets, axis=1).mean() * (len(cameras) == 1))
-    if not radii.any():
+    if not radii.any():  # one camera, or several at one place
         radii = np.full(2, _SWAY * max(np.linalg.norm(offsets, axis=1).mean(), 1e-6))
     angles = np.linspace(0, 2 * np.pi, frames, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1) * radii

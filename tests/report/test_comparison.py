@@ -32,8 +32,3 @@ def test_many_runs_go_to_more_lines_and_long_names_are_wrapped(tmp_path: Path) -
     drawn = read(tmp_path / "c.png")
     assert drawn.shape[1] < 7 * 260
     assert drawn.shape[0] > 2 * 2 * 160
-
-
-def test_nothing_to_compare_makes_no_file(tmp_path: Path) -> None:
-    write_comparison(tmp_path / "c.png", {}, {}, "scene")
-    assert not (tmp_path / "c.png").exists()
