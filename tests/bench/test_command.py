@@ -61,6 +61,9 @@ def test_auc_is_the_share_of_ordered_pairs():
     assert math.isnan(evidence.auc(torch.zeros(0), torch.ones(1)))
 
 
+NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -73,11 +76,8 @@ def test_auc_is_the_share_of_ordered_pairs():
         (["seconds", "fit.seed=3", "--variant"], "fit.seed=3: is set by the benchmark"),
         (["stereo", "data=nowhere"], "data=nowhere"),
         (["errors", "nowhere"], "has neither a checkpoint nor a point_cloud.ply"),
-        pytest.param(
-            ["rasterizers", "--device", "cuda"],
-            "no such device",
-            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU"),
-        ),
+        pytest.param(["rasterizers", "--device", "cuda"], "no such device", marks=NO_GPU),
+        pytest.param(["device"], "no such device", marks=NO_GPU),
     ],
 )
 def test_unusable_input_is_one_line_and_exit_code_2(arguments, message, caplog, tmp_path):

@@ -57,14 +57,6 @@ def test_contenders_take_turns_and_warm_ups_do_not_count(device, warm_ups):
     assert timing.medians(turns).loc["b", "stage"] == first + 3
 
 
-def test_medians_leave_out_stages_that_a_contender_has_not():
-    turns = timing.interleaved({"a": lambda: {"x": 1.0, "y": 2.0}, "b": lambda: {"x": 3.0}}, 1)
-    table = timing.medians(turns)
-    assert list(table.index) == ["a", "b"]
-    assert list(table.columns) == ["x", "y"]
-    assert math.isnan(table.loc["b", "y"])
-
-
 # --- rasterizers ------------------------------------------------------------------------------------------------------
 
 
@@ -96,9 +88,7 @@ def test_the_reference_takes_no_part_in_large_scenes():
     assert any("at most 10,000 Gaussians" in note for note in results.notes)
 
 
-def test_unknown_backends_are_refused_and_unavailable_ones_noted(monkeypatch):
-    with pytest.raises(DataError, match=r"cuda.*torch"):
-        drawing.usable(["cuda"], "cpu", print)
+def test_unavailable_backends_are_noted(monkeypatch):
     monkeypatch.setattr(rasterizers, "available", lambda: {"quick": "no compiler", "gsplat": None, "torch": None})
     notes = []
     assert drawing.usable(None, "cpu", notes.append) == ["torch"]
@@ -108,11 +98,6 @@ def test_unknown_backends_are_refused_and_unavailable_ones_noted(monkeypatch):
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
-
-
-def test_float64_has_no_error_against_itself(tiny):
-    truth = accuracy.truth("torch", tiny, drawing.random_cotangents(tiny)[0], accuracy.NO_CUT_OFFS)
-    assert set(accuracy.errors(truth, truth).values()) == {0.0}
 
 
 def test_errors_are_those_of_their_definitions():

@@ -67,8 +67,3 @@ def test_an_exported_field_is_drawn_as_the_field_draws_itself(tmp_path):
     found = rasterizer(workload.splats, workload.camera)
     torch.testing.assert_close(found.image, field.render(rasterizer, workload.camera), atol=1e-4, rtol=0)
     assert float(found.visible.float().mean()) > 0.7
-
-
-def test_an_unknown_scene_is_refused_with_the_known_ones():
-    with pytest.raises(DataError, match=r"nowhere.*s100k"):
-        scenes.load("nowhere")

@@ -25,9 +25,8 @@ from tests.helpers.configs import composed
 
 ITERATIONS = 12
 SLOW = pytest.mark.slow
-SMALL = [o for o in TINY if not o.startswith("fit.baseline")] + [
-    "fit.map_views=0", "fit.video=0", "fit.probe_every=0", "fit.checkpoint_every=0", "fit.threads=1", "prior=bicubic",
-]  # fmt: skip
+SMALL = [o for o in TINY if not o.startswith("fit.baseline")]
+SMALL += ["fit.probe_every=0", "fit.checkpoint_every=0", "fit.threads=1", "prior=bicubic"]
 
 
 @pytest.fixture(scope="module", autouse=True)

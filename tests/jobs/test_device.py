@@ -13,7 +13,7 @@ from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device
 from clear_strategies.jobs.device import RasterizerSettings, drawn_on
 from clear_strategies.jobs.settings import JobSettings, settings_of
-from rasterizers.interface import RasterSettings, Traits
+from rasterizers.interface import Traits
 from rasterizers.reference import ReferenceRasterizer
 from tests.helpers.configs import composed
 
@@ -74,12 +74,6 @@ def test_warp_gets_the_device_of_the_job(monkeypatch):
         drawing = device.drawing(RasterizerSettings(name="warp"), asked)
         assert (drawing.name, drawing.device) == ("warp", "cpu")
         assert given["warp"].get("device") == expected
-
-
-def test_the_shared_settings_have_the_defaults_of_every_rasterizer():
-    shared, ours = RasterSettings(), RasterizerSettings()
-    assert (ours.kernel, ours.near, ours.alpha_max) == (shared.kernel, shared.near, shared.alpha_max)
-    assert ours.antialiased == shared.antialiased
 
 
 def test_a_rasterizer_of_another_package_is_a_target_with_the_same_settings():

@@ -8,18 +8,18 @@ import pytest
 from clear_strategies.errors import SettingError
 from clear_strategies.viewing import video
 
+ffmpeg = pytest.importorskip("imageio_ffmpeg")
+
 FRAMES = [np.full((32, 48, 3), 20 * i, np.uint8) for i in range(10)]
 
 
 def read(path):
-    ffmpeg = pytest.importorskip("imageio_ffmpeg")
     reader = ffmpeg.read_frames(str(path))
     width, height = next(reader)["size"]
     return np.stack([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader])
 
 
 def test_an_mp4_holds_the_frames(tmp_path):
-    pytest.importorskip("imageio_ffmpeg")
     video.write_videos([tmp_path / "a.mp4"], FRAMES, fps=10)
     found = read(tmp_path / "a.mp4")
     assert found.shape == (10, 32, 48, 3)
@@ -27,15 +27,12 @@ def test_an_mp4_holds_the_frames(tmp_path):
 
 
 def test_a_gif_is_written_beside_it(tmp_path):
-    pytest.importorskip("imageio_ffmpeg")
     video.write_videos([tmp_path / "a.mp4", tmp_path / "a.gif"], iter(FRAMES), fps=10)
     assert (tmp_path / "a.gif").read_bytes()[:6] == b"GIF89a"
     assert {path.name for path in tmp_path.iterdir()} == {"a.mp4", "a.gif"}
 
 
 def test_a_video_that_breaks_leaves_nothing(tmp_path):
-    pytest.importorskip("imageio_ffmpeg")
-
     def broken():
         yield FRAMES[0]
         raise RuntimeError
@@ -47,7 +44,6 @@ def test_a_video_that_breaks_leaves_nothing(tmp_path):
 
 @pytest.mark.parametrize(("name", "frames"), [("a.avi", FRAMES), ("a.mp4", [])])
 def test_what_gives_no_video_is_refused(tmp_path, name, frames):
-    pytest.importorskip("imageio_ffmpeg")
     with pytest.raises(SettingError):
         video.write_videos([tmp_path / name], frames, fps=10)
 

@@ -1,9 +1,10 @@
-"""`fit.log=tensorboard` writes numbers and pictures, and changes nothing of the run."""
+"""`fit.viewer=true` and `fit.log=tensorboard` show a run while it trains, and change nothing of it."""
 
 from __future__ import annotations
 
 import json
-import sys
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -11,29 +12,54 @@ from clear_strategies.errors import SettingError
 from clear_strategies.outputs import tensorboard
 from tests.helpers.command_line import TINY, run
 
-SMALL = [*TINY, "fit.map_views=0", "fit.video=0", "fit.probe_every=5000", "fit.threads=1",
-         "prior=bicubic", "+strategy=gco"]  # fmt: skip
+SMALL = [*TINY, "fit.probe_every=5000", "fit.threads=1", "prior=bicubic", "+strategy=gco"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Path, str]]:
+    """Trains with some overrides; gives the folder and what was said."""
+    cwd = tmp_path_factory.mktemp("watched")
+
+    def train(name: str, *overrides: str) -> tuple[Path, str]:
+        done = run(*SMALL, *overrides, f"hydra.run.dir={name}", cwd=cwd)
+        assert done.returncode == 0, done.stderr
+        return cwd / name, done.stdout + done.stderr
+
+    return train
+
+
+@pytest.fixture(scope="module")
+def plain(trained) -> Path:
+    """A run that nothing watches."""
+    folder, said = trained("plain")
+    assert not (folder / "tensorboard").exists()
+    assert "look while it trains" not in said
+    return folder
 
 
 @pytest.mark.slow
-def test_numbers_and_pictures_are_there_and_a_resumed_run_goes_on_in_the_same_log(tmp_path):
+def test_a_run_with_a_viewer_has_the_bits_of_one_without(trained, plain):
+    pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
+    folder, said = trained("viewed", "fit.viewer=true")
+    assert "look while it trains: http://127.0.0.1:" in said
+    assert (folder / "point_cloud.ply").read_bytes() == (plain / "point_cloud.ply").read_bytes()
+
+
+@pytest.mark.slow
+def test_numbers_and_pictures_are_logged_and_the_run_has_the_bits_of_one_without(trained, plain):
     pytest.importorskip("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    first = run(*SMALL, "fit.log=tensorboard", "hydra.run.dir=logged", "fit.iterations=12", cwd=tmp_path)
-    assert first.returncode == 0, first.stderr
-    plain = run(*SMALL, "hydra.run.dir=plain", "fit.iterations=12", cwd=tmp_path)
-    assert plain.returncode == 0, plain.stderr
-    assert not (tmp_path / "plain" / "tensorboard").exists()
-    assert (tmp_path / "logged/point_cloud.ply").read_bytes() == (tmp_path / "plain/point_cloud.ply").read_bytes()
+    folder, _ = trained("logged", "fit.log=tensorboard")
+    assert (folder / "point_cloud.ply").read_bytes() == (plain / "point_cloud.ply").read_bytes()
 
-    log = EventAccumulator(str(tmp_path / "logged" / "tensorboard"), size_guidance={"scalars": 0, "images": 0}).Reload()
+    log = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0, "images": 0}).Reload()
     tags = log.Tags()
     expected = {"loss/lr", "loss/base", "psnr/train_lr", "psnr/test", "field/n_gaussians", "conflict/conflict",
                 "conflict/means", "learning rate/means", "schedule/lambda_hr"}  # fmt: skip
     assert expected <= set(tags["scalars"]), tags["scalars"]
     assert [event.step for event in log.Scalars("loss/lr")] == list(range(1, 13))
-    history = (tmp_path / "logged" / "history.csv").read_text().splitlines()
+    history = (folder / "history.csv").read_text().splitlines()
     column = history[0].split(",").index("loss_lr")
     assert [event.value for event in log.Scalars("loss/lr")] == pytest.approx(
         [float(row.split(",")[column]) for row in history[1:]], rel=1e-6
@@ -42,12 +68,11 @@ def test_numbers_and_pictures_are_there_and_a_resumed_run_goes_on_in_the_same_lo
     assert [event.step for event in log.Images(render)] == [6, 12]
     view = render.partition("/")[0]
     assert {f"{view}/{name}" for name in ("LR photo", "SR image", "HR photo")} <= set(tags["images"])
-    metrics = json.loads((tmp_path / "logged" / "metrics.json").read_text())
+    metrics = json.loads((folder / "metrics.json").read_text())
     assert view in metrics["test"]["views"]
 
 
 def test_without_the_package_the_extra_is_named_before_anything_is_read(monkeypatch):
-    monkeypatch.setitem(sys.modules, "tensorboard", None)
     monkeypatch.setattr(tensorboard, "find_spec", lambda _: None)
     with pytest.raises(SettingError, match=r"pip install 'clear-strategies\[log\]'"):
         tensorboard.require_tensorboard()
