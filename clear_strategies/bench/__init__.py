@@ -1,9 +1,7 @@
 """`python -m clear_strategies.bench`: run time against error, and what a second of training buys.
 
-The questions are `rasterizers`, `kernels`, `iteration` (one training iteration, stage by stage),
-`seconds` (whole trainings: seconds to the same PSNR) and `device` (all checks that need a GPU). `scenes`
-makes what is drawn; `timing` and `accuracy` take the measurements; `peers` wraps other rasterizers;
-`results` and `plots` write the files.
+A question of the command line is the module of its name. `scenes` makes what is drawn; `timing` and `accuracy` take the
+measurements; `peers` wraps other rasterizers; `results` and `plots` write the files.
 """
 
 from importlib.util import find_spec

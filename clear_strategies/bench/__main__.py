@@ -20,6 +20,7 @@ from clear_strategies import console
 from clear_strategies.bench import kernels, rasterizers
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
+from clear_strategies.commands.options import positive
 from clear_strategies.errors import ClearError
 from rasterizers.interface import PRESETS, BackendUnavailable
 
@@ -38,11 +39,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     }
     results = Results(question, _log.info, shown)
     try:
-        if (
-            out is not None and question != "device"
-        ):  # a folder that cannot be made is known before minutes of measuring
+        if out is not None and question != "device":  # a folder that cannot be made is known before the measuring
             out.mkdir(parents=True, exist_ok=True)
-        _measure(question, options, results)
+        module: Any = import_module(f"clear_strategies.bench.{question}")
+        if hasattr(module, "Request"):
+            module.measure(results, module.Request(**options))
+        else:
+            module.measure(results, **{name: value for name, value in options.items() if name != "out"})
         sys.stdout.write(results.text())
         if out is not None:
             results.write(out)
@@ -61,13 +64,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parser() -> argparse.ArgumentParser:
     """All questions and their options."""
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--threads", type=_positive, metavar="N", help="threads of torch and the backends")
+    common.add_argument("--threads", type=positive(int), metavar="N", help="threads of torch and the backends")
     out = argparse.ArgumentParser(add_help=False)
     out.add_argument(
         "--out", type=Path, metavar="FOLDER", help="write tables (CSV), figures (PNG) and the machine here"
     )
     turns = argparse.ArgumentParser(add_help=False)
-    turns.add_argument("--repeats", type=_positive, default=9, metavar="N", help="turns of each contender (default 9)")
+    turns.add_argument(
+        "--repeats", type=positive(int), default=9, metavar="N", help="turns of each contender (default 9)"
+    )
     turns.add_argument("--device", default="cpu", choices=["cpu", "cuda"], help="default: cpu")
     garden = argparse.ArgumentParser(add_help=False)
     garden.add_argument("--data", type=Path, metavar="FILE", help="gsplat's test_garden.npz, the scene `garden`")
@@ -91,7 +96,7 @@ def parser() -> argparse.ArgumentParser:
     )
     ask.add_argument("--size", nargs="+", default=list(kernels.SIZES), metavar="WxH", help="sizes of the images")
     ask.add_argument(
-        "--gaussians", nargs="*", type=_positive, default=[100_000, 500_000], metavar="N",
+        "--gaussians", nargs="*", type=positive(int), default=[100_000, 500_000], metavar="N",
         help="time the per-Gaussian step of N Gaussians (default: 100000 500000)",
     )  # fmt: skip
 
@@ -145,14 +150,18 @@ def _add_trainings(questions: Any, common: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     ask.add_argument("--seeds", nargs="+", type=int, default=[0, 1], metavar="SEED", help="default: 0 1")
     ask.add_argument(
-        "--probes", type=_positive, default=20, metavar="N", help="evaluations of the test views in a run (default 20)"
+        "--probes",
+        type=positive(int),
+        default=20,
+        metavar="N",
+        help="evaluations of the test views in a run (default 20)",
     )
     _add_kept(ask, "seconds")
     ask = questions.add_parser("next_photo", parents=[common], help="what the photo that a run advises brings")
     ask.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="of all trainings, as for a run")
     ask.add_argument("--scene", nargs="+", required=True, metavar="SCENE", help="of conf/scene, one after the other")
-    ask.add_argument("--start", type=_positive, default=4, metavar="N", help="photos at first (default 4)")
-    ask.add_argument("--others", type=_positive, default=4, metavar="N", help="random photos beside it (default 4)")
+    ask.add_argument("--start", type=positive(int), default=4, metavar="N", help="photos at first (default 4)")
+    ask.add_argument("--others", type=positive(int), default=4, metavar="N", help="random photos beside it (default 4)")
     ask.add_argument("--seed", type=int, default=0, help="of their choice (default 0)")
     _add_kept(ask, "next_photo")
 
@@ -162,21 +171,6 @@ def _add_kept(ask: argparse.ArgumentParser, question: str) -> None:
         "--out", type=Path, default=Path("outputs") / question, metavar="FOLDER",
         help="holds tables and trainings; finished trainings are kept (default: %(default)s)",
     )  # fmt: skip
-
-
-def _measure(question: str, options: dict[str, Any], results: Results) -> None:
-    """By the module of the question's name: its `measure` takes a `Request`, if the module has one, or else the options."""
-    module: Any = import_module(f"clear_strategies.bench.{question}")
-    if hasattr(module, "Request"):
-        module.measure(results, module.Request(**options))
-    else:
-        module.measure(results, **{name: value for name, value in options.items() if name != "out"})
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, got {text!r}")
-    return int(text)
 
 
 if __name__ == "__main__":

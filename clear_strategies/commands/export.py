@@ -16,11 +16,7 @@ _log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Write what the arguments ask for.
-
-    Raises:
-        DataError, SettingError: the run or an argument cannot be used, or a format needs what is not installed.
-    """
+    """Write what the arguments ask for."""
     parser = parser_of(
         "export", "Write a saved run, or a PLY file, in a format of viewers; f_det and the 3D filter included."
     )

@@ -20,11 +20,7 @@ _FRAMES: Final = 120
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Render what the arguments ask for.
-
-    Raises:
-        DataError, SettingError: the run or an argument cannot be used.
-    """
+    """Render what the arguments ask for."""
     options = _parser().parse_args(arguments)
     console.show(verbose=options.verbose)
     from clear_strategies.commands.path_cameras import cameras_of

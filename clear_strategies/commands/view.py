@@ -14,11 +14,7 @@ _log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Open the viewer and serve it until Ctrl-C.
-
-    Raises:
-        DataError, SettingError: the run cannot be opened, or the viewer's libraries are not installed.
-    """
+    """Open the viewer and serve it until Ctrl-C."""
     parser = parser_of("view", "Look at a saved run, or a PLY file, in the browser. The run's own rasterizer draws.")
     parser.add_argument("--port", type=int, default=8080, help="%(default)s, or the next one that is free")
     parser.add_argument(

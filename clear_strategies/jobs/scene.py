@@ -105,18 +105,14 @@ def load(
         decorated: what becomes of the chosen prior, see `Conductor.prior`.
         budget: of the run; SR images get no larger than its time allows.
     """
-    auto = isinstance(prior, AutoPrior) and data.save_lr is None
     capture, views = read(data, prior, budget)
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
-    elif isinstance(prior, AutoPrior):
-        chosen = prior.of(capture, views.sr_scale)
-    elif isinstance(prior, functools.partial):
-        chosen = prior(truth=_photos(capture))
     else:
-        chosen = cast("Prior", prior)
+        chosen = _chosen(prior, capture, views.sr_scale)
     scene = prepare(capture, views, decorated(cached(chosen)), data.cloud, seed=seed)
-    if auto and views.photos_are != "both":  # logged once the photos are known to be usable
+    # Logged once the photos are known to be usable.
+    if isinstance(prior, AutoPrior) and data.save_lr is None and views.photos_are != "both":
         if isinstance(chosen, Bicubic):
             _log.warning("prior: auto chose %s. %s.", chosen.label, _remedy(views.sr_scale))
         else:
@@ -126,14 +122,20 @@ def load(
 
 def read(data: DataSettings, prior: PriorSettings, budget: Budget | None = None) -> tuple[Capture, ViewSettings]:
     """The capture as the data set has it, and the settings of its views, both within the limit of the HR images."""
-    auto = isinstance(prior, AutoPrior) and data.save_lr is None
     capture, views = data.reader(), data.views
     if budget is not None and views.photos_are == "lr" and not isinstance(prior, functools.partial):
-        network = prior.of(capture, views.sr_scale) if isinstance(prior, AutoPrior) else cast("Prior", prior)
+        network = _chosen(prior, capture, views.sr_scale)
         found, limit = budget.megapixels(split(capture, views)[0], network), views.max_hr_megapixels
         if found is not None and (limit is None or found < limit):
             views = replace(views, max_hr_megapixels=found)
+    auto = isinstance(prior, AutoPrior) and data.save_lr is None
     return within_limit(capture, views, reaches=_reach(prior, auto), super_resolve=not auto)
+
+
+def _chosen(prior: PriorSettings, capture: Capture, factor: int) -> Prior:
+    if isinstance(prior, AutoPrior):
+        return prior.of(capture, factor)
+    return prior(truth=_photos(capture)) if isinstance(prior, functools.partial) else cast("Prior", prior)
 
 
 def _reach(prior: PriorSettings, auto: bool) -> Callable[[int], bool]:

@@ -61,11 +61,8 @@ def ellipse(cameras: Sequence[Camera], frames: int) -> list[Camera]:
         SettingError: as `through`.
     """
     _require(cameras, frames)
-    centers, axes = _centers(cameras), _axes(cameras)
-    focus = look_at(cameras)
-    up = _unit(-axes[:, :, 1].mean(0))
+    centers, focus, up, facing = _arranged(cameras)
     offsets = centers - focus
-    facing = (offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)).mean(0)
     if np.linalg.norm(facing) < _SURROUNDED:
         middle = focus + up * (offsets @ up).mean()
         normal = up
@@ -86,9 +83,8 @@ def ellipse(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 def overview(cameras: Sequence[Camera]) -> Camera:
     """A camera behind and above all of them that looks at what they look at, with the first one's lens and size."""
-    centers, focus, up = _centers(cameras), look_at(cameras), _unit(-_axes(cameras)[:, :, 1].mean(0))
+    centers, focus, up, facing = _arranged(cameras)
     offsets = centers - focus
-    facing = (offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)).mean(0)
     behind = _unit(facing if np.linalg.norm(facing) >= _SURROUNDED else offsets[0])
     center = focus + np.linalg.norm(offsets, axis=1).max() * (_BEHIND * behind + _ABOVE * up)
     return _placed(cameras[0], center, _looking(center, focus, up))
@@ -107,6 +103,14 @@ def look_at(cameras: Sequence[Camera]) -> Float[np.ndarray, " 3"]:
         if ((point - centers) * forward).sum(1).mean() > 0:  # ahead of the cameras
             return np.asarray(point)
     return np.asarray(centers.mean(0) + _unit(forward.mean(0)) * max(1.0, 2 * spread))
+
+
+def _arranged(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The cameras' centres [C, 3], what they look at, up, and the mean direction from there to the cameras, at most 1 long."""
+    centers, focus = _centers(cameras), look_at(cameras)
+    offsets = centers - focus
+    facing = (offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-9)).mean(0)
+    return centers, focus, _unit(-_axes(cameras)[:, :, 1].mean(0)), facing
 
 
 def _require(cameras: Sequence[Camera], frames: int) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from clear_strategies.data import strict_json
 from clear_strategies.data.photo_files import read_image
+from clear_strategies.geometry.projection import seen_pixels
 from clear_strategies.viewing.cameras import SavedCamera
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera
@@ -43,21 +44,14 @@ def colors(painter: Painter, folder: Path | None, cameras: Sequence[SavedCamera]
 
 def on_gaussians(painter: Painter, maps: Sequence[tuple[Camera, Float[Tensor, "H W"]]]) -> Float[Tensor, " N"]:
     """The mean of the maps where each Gaussian appears in them; nan for those that none shows."""
-    means = painter.field.means.data.cpu().double()
+    means = painter.field.means.data.cpu()
     total, count = torch.zeros(len(means)), torch.zeros(len(means))
     for camera, values in maps:
-        pose = camera.world_to_camera.double()
-        x, y, z = (means @ pose[:3, :3].T + pose[:3, 3]).unbind(1)
-        column = (camera.fx * x / z + camera.cx).floor()
-        row = (camera.fy * y / z + camera.cy).floor()
-        inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        at = (row[inside].long(), column[inside].long())
-        surface = painter.depth(camera)[at]
-        shown = inside.clone()
-        shown[inside] = z[inside].float() <= surface * (1 + _BEHIND)  # false where no depth is known
-        at = (row[shown].long(), column[shown].long())
-        total[shown] += values[at].float()
-        count[shown] += 1
+        inside, row, column, z = seen_pixels(camera, means)
+        shown = z <= painter.depth(camera)[row, column] * (1 + _BEHIND)  # false where no depth is known
+        which = inside.nonzero()[:, 0][shown]
+        total[which] += values[row[shown], column[shown]].float()
+        count[which] += 1
     return torch.where(count > 0, total / count.clamp_min(1), torch.nan)
 
 

@@ -6,6 +6,7 @@ Heavy: it imports viser and nerfview, and is itself imported only once a viewer 
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import logging
 import math
@@ -63,6 +64,7 @@ class View:
     grid: str = _WINDOW
 
 
+@dataclass(frozen=True, eq=False)
 class Screen:
     """Draws what a browser's camera sees.
 
@@ -71,9 +73,9 @@ class Screen:
         points: makes `Points`, which is asked for when the panel first needs it.
     """
 
-    def __init__(self, painter: Painter, cameras: Sequence[SavedCamera], points: Callable[[], Points] = dict) -> None:
-        self.painter, self.cameras, self.points = painter, cameras, points
-        self._scale: DepthScale | None = None
+    painter: Painter
+    cameras: Sequence[SavedCamera]
+    points: Callable[[], Points] = dict
 
     def draw(self, view: View, pose: Float[np.ndarray, "4 4"], fov: float, size: tuple[int, int]) -> Frame:
         """The picture of at most `size` (width, height) pixels; of the LR or HR grid, each pixel a square.
@@ -100,7 +102,7 @@ class Screen:
 
     def _picture(self, view: View, camera: Camera) -> Frame:
         if view.show == _DEPTH:
-            return self.depth_scale().picture(self.painter.depth(camera, view.look), legend=False)
+            return self.depth_scale.picture(self.painter.depth(camera, view.look), legend=False)
         if view.show == _COVERAGE:
             ones = torch.ones(len(self.painter.field))
             return to_bytes(self.painter.numbers(camera, ones, view.look)[..., None].expand(-1, -1, 3))
@@ -108,12 +110,11 @@ class Screen:
             return to_bytes(self.painter.points(camera, rgb, view.look))
         return to_bytes(self.painter.color(camera, view.look))
 
+    @functools.cached_property
     def depth_scale(self) -> DepthScale:
         """Chosen once, from the cameras of the run."""
-        if self._scale is None:
-            where = [at_most(saved.camera, _SMALL) for saved in self.cameras]
-            self._scale = DepthScale.of(self.painter, where) if where else DepthScale(0.0, 10.0)
-        return self._scale
+        where = [at_most(saved.camera, _SMALL) for saved in self.cameras]
+        return DepthScale.of(self.painter, where) if where else DepthScale(0.0, 10.0)
 
 
 class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no types
@@ -138,7 +139,11 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         aim(server, [saved.camera for saved in screen.cameras])
         super().__init__(server, self._render, output_dir=out, mode="rendering")
         server.gui.set_panel_label(title)
-        self._training = self._add_training() if live else None
+        self._training: dict[str, Any] | None = None
+        if live:
+            with server.gui.add_folder("Training", order=-1):
+                iteration = server.gui.add_number("Iteration", 0, disabled=True)
+                self._training = {"iteration": iteration, "pause": server.gui.add_checkbox("Pause", False)}
         self._told = 0.0
         self._add_cameras()
 
@@ -180,14 +185,6 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         """Stop serving."""
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
-
-    def _add_training(self) -> dict[str, Any]:
-        gui = self.server.gui
-        with gui.add_folder("Training", order=-1):
-            return {
-                "iteration": gui.add_number("Iteration", 0, disabled=True),
-                "pause": gui.add_checkbox("Pause", False),
-            }
 
     def _populate_rendering_tab(self) -> None:
         gui = self.server.gui
@@ -237,11 +234,8 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         train = [saved for saved in self._screen.cameras if saved.split == "train"][:_MOST_FRUSTUMS]
         if not train:
             return
-        poses = [saved.camera for saved in train]
-        size = drawn_length(poses)
-        gui, frustums = self.server.gui, []
-        for saved in train:
-            frustums.append(self._add_frustum(saved, size))
+        size = drawn_length([saved.camera for saved in train])
+        gui, frustums = self.server.gui, [self._add_frustum(saved, size) for saved in train]
         with gui.add_folder("Training cameras", order=1):
             shown = gui.add_checkbox("Show, with their photos", False, hint="a click on one goes there")
             chosen = gui.add_dropdown("Go to", tuple(saved.name for saved in train))

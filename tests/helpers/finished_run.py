@@ -53,6 +53,11 @@ def rows_of(*folders: Path) -> dict[str, report.Row]:
     return {row.method: row for row in report.compare(report.collect(folders))}
 
 
+def table_of(folder: Path) -> str:
+    """The table of all runs in the folder, as Markdown."""
+    return report.layout(report.compare(report.collect([folder]))).markdown
+
+
 def cells(text: str) -> list[dict[str, str]]:
     """The lines of a Markdown table."""
     header, _, *lines = [line.strip("|").split("|") for line in text.splitlines() if line.startswith("|")]

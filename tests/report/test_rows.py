@@ -9,7 +9,7 @@ import pytest
 
 from clear_strategies import report
 from clear_strategies.settings import CHANGES_NO_RESULT
-from tests.helpers.finished_run import cells, make_run, rows_of, scores
+from tests.helpers.finished_run import cells, make_run, rows_of, scores, table_of
 
 
 def test_runs_that_differ_in_their_seed_share_a_row(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_scores_of_training_views_or_against_lr_photos_are_marked(tmp_path: Path
 def test_methods_are_compared_with_the_first_and_baselines_appear_once(tmp_path: Path) -> None:
     for job, (strategy, psnr) in enumerate([("baseline", 20.0), *[("gco", 20.5)] * 9, ("clear", 19.25)]):
         make_run(tmp_path / str(job), f"+strategy={strategy}", psnr=psnr, seed=job)
-    lines = cells(report.layout(report.compare(report.collect([tmp_path]))).markdown)
+    lines = cells(table_of(tmp_path))
     assert [line["method"] for line in lines] == ["bicubic", "prior", "baseline", "gco", "clear"]
     assert [line["Δ"] for line in lines] == ["", "", "+0.00", "+0.50", "-0.75"]
     assert lines[0]["PSNR (dB) ↑"] == "18.00"
@@ -90,7 +90,7 @@ def test_each_scene_has_its_own_first_method_and_marks(tmp_path: Path) -> None:
     make_run(tmp_path / "a", "+strategy=gco", psnr=20.0, synthetic_prior=True)
     make_run(tmp_path / "b", "+strategy=gco", psnr=25.0, scene="fern")
     make_run(tmp_path / "c", "+strategy=clear", psnr=26.0, scene="fern")
-    lines = cells(report.layout(report.compare(report.collect([tmp_path]))).markdown)
+    lines = cells(table_of(tmp_path))
     found = {(line["scene"], line["method"]): line["Δ"] for line in lines}
     assert found["demo (synthetic prior)", "gco"] == "+0.00"
     assert found["fern", "clear"] == "+1.00"
@@ -105,7 +105,7 @@ def test_differences_are_paired_by_seed(tmp_path: Path) -> None:
     assert delta is not None
     assert (delta.mean, delta.pairs) == (0.75, 3)
     assert delta.error == pytest.approx((0.875 / 2 / 3) ** 0.5)
-    lines = {line["method"]: line for line in cells(report.layout(report.compare(report.collect([tmp_path]))).markdown)}
+    lines = {line["method"]: line for line in cells(table_of(tmp_path))}
     assert (lines["baseline"]["Δ"], lines["gco"]["Δ"]) == ("+0.00", "+0.75 ± 0.38")
 
 

@@ -5,23 +5,20 @@ from __future__ import annotations
 import html
 from pathlib import Path
 
-from clear_strategies import report
 from clear_strategies.report.table import Table, aligned
-from tests.helpers.finished_run import cells, make_run
+from tests.helpers.finished_run import cells, make_run, table_of
 
 
 def test_empty_columns_are_left_out(tmp_path: Path) -> None:
     make_run(tmp_path, "+strategy=gco", conflict={})
-    (line,) = (
-        c for c in cells(report.layout(report.compare(report.collect([tmp_path]))).markdown) if c["method"] == "gco"
-    )
+    (line,) = (c for c in cells(table_of(tmp_path)) if c["method"] == "gco")
     assert not {"conflict", "Δ", "best"} & set(line)
 
 
 def test_settings_that_all_runs_share_are_noted_once(tmp_path: Path) -> None:
     make_run(tmp_path / "0", "+strategy=gco", "data=llff", "fit.iterations=600")
     make_run(tmp_path / "1", "+strategy=clear", "data=llff", "fit.iterations=600")
-    text = report.layout(report.compare(report.collect([tmp_path]))).markdown
+    text = table_of(tmp_path)
     assert "All runs of demo: `data=llff fit.iterations=600`." in text
     assert text.count("data=llff") == 1
 
@@ -36,4 +33,4 @@ def test_a_name_is_text_and_no_markup() -> None:
 
 def test_a_bar_in_a_name_does_not_break_the_table(tmp_path: Path) -> None:
     make_run(tmp_path, "+strategy=gco", scene="a|b")
-    assert "a\\|b" in report.layout(report.compare(report.collect([tmp_path]))).markdown
+    assert "a\\|b" in table_of(tmp_path)
