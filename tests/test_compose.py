@@ -15,10 +15,10 @@ from omegaconf import OmegaConf
 
 from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies import compose as compose_module
-from clear_strategies.compose import CONF, conductor, require_each_once, tree
+from clear_strategies.compose import CONF, conductor, flat, require_each_once, tree
 from clear_strategies.data.priors import BackProjected, Bicubic
 from clear_strategies.data.view_settings import ViewSettings
-from clear_strategies.errors import SettingError, StrategyConflict
+from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device
 from clear_strategies.jobs.settings import RunSettings, settings_of
 from clear_strategies.merging.detail import DetailRates
@@ -95,11 +95,6 @@ def test_a_strategy_is_found_twice_however_deep_it_is_named(tmp_path, monkeypatc
     ):
         with pytest.raises(SettingError, match=f"got {twice} twice"):
             require_each_once([f"+strategy={said}"])
-
-
-def test_two_that_answer_one_question_are_refused():
-    with pytest.raises(StrategyConflict):
-        conductor("gco,splatsure")
 
 
 def test_a_hydra_application_keeps_its_own_state():
@@ -181,14 +176,6 @@ def test_every_option_composes_into_settings(group):
         assert isinstance(settings_of(tree(config)).conductor(1.0), Conductor), name
 
 
-def leaves(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    if isinstance(node, dict):
-        for key, value in node.items():
-            yield from leaves(value, (*path, str(key)))
-    else:
-        yield path, node
-
-
 def written() -> Iterator[tuple[Path, tuple[str, ...], Any]]:
     """Every value in conf/, with its file and its path in the whole configuration."""
     for file in sorted(CONF.rglob("*.yaml")):
@@ -198,9 +185,10 @@ def written() -> Iterator[tuple[Path, tuple[str, ...], Any]]:
         text = file.read_text()
         header = text.split("\n")[0].removeprefix("# @package ") if text.startswith("# @package") else None
         package = () if header == "_global_" else (header,) if header else group
-        for path, value in leaves(yaml.safe_load(text) or {}, package):
-            if path[len(package) :][:1] not in (("defaults",), ("hydra",)):
-                yield file, path, value
+        for key, value in flat(yaml.safe_load(text) or {}).items():
+            inner = tuple(key.split("."))
+            if inner[0] not in ("defaults", "hydra"):
+                yield file, (*package, *inner), value
 
 
 def default_at(path: tuple[str, ...], whole: Any) -> Any:

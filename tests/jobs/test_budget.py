@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,20 +15,42 @@ from clear_strategies.jobs import budget as budgets
 from clear_strategies.jobs.budget import Budget, Plan
 from clear_strategies.jobs.settings import RunSettings
 from clear_strategies.outputs import metrics
+from clear_strategies.training.field import GaussianField
 from clear_strategies.training.skips import SkipPolicy, Skips
 from tests.helpers import command_line, planes
 from tests.helpers.short_run import start
 from tests.helpers.toy import RASTERIZER
 
 
+class Clock:
+    """Takes the place of `time`; moves when it is told to."""
+
+    now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def takes(self, seconds: float) -> Callable[..., None]:
+        """What takes so long."""
+
+        def work(*_: object) -> None:
+            self.now += seconds
+
+        return work
+
+
 @pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(budgets, "_PILOT", 0.05)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(budgets, "time", clock)
+    monkeypatch.setattr(budgets, "iterate", clock.takes(0.1))
+    monkeypatch.setattr(GaussianField, "render", clock.takes(0.01))
+    return clock
 
 
 def planned(seconds: float, *, iterations: int = 5_000, trainings: int = 1, frames: int = 0) -> Plan:
-    budget = Budget(seconds, time.perf_counter())
-    return budget.iterations(start(("gco",), iterations), RASTERIZER, trainings=trainings, maps=0, frames=frames)
+    budget, state = Budget(seconds, budgets.time.perf_counter()), start(("gco",), iterations)
+    return budget.iterations(state, RASTERIZER, trainings=trainings, maps=0, frames=frames)
 
 
 def test_the_iterations_fit_into_the_time_that_files_leave() -> None:
@@ -47,45 +68,37 @@ def test_there_are_no_more_than_asked_for_and_never_too_few_to_look_at() -> None
     assert "longer" not in planned(20.0).says()
 
 
-class Slow:
-    """A network that takes 50 ms for each crop."""
-
-    label, files = "slow", ()
-
-    def __call__(self, name: str, lr: torch.Tensor, factor: int) -> torch.Tensor:
-        time.sleep(0.05)
+def test_sr_images_get_no_larger_than_a_fifth_of_the_time_allows(clock: Clock) -> None:
+    def slow(name: str, lr: torch.Tensor, factor: int) -> torch.Tensor:
+        clock.now += 0.05
         return lr.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
 
-
-def test_sr_images_get_no_larger_than_a_fifth_of_the_time_allows() -> None:
+    slow.label, slow.files = "slow", ()  # as every network has
     frame = Frame("a", planes.camera(0, 120, 100), lambda: torch.rand(100, 120, 3))
     each = 0.05 / (192 * 192)
-    found = Budget(100.0, time.perf_counter()).megapixels([frame] * 8, Slow())
+    found = Budget(100.0, clock.now).megapixels([frame] * 8, slow)
     assert found == pytest.approx(0.2 * 100 / 8 / each / 1e6, rel=0.1)
-    assert Budget(1e-3, time.perf_counter()).megapixels([frame] * 8, Slow()) == budgets._LEAST_MEGAPIXELS
-    assert Budget(100.0, time.perf_counter()).megapixels([frame] * 8, Bicubic()) is None
+    assert Budget(1e-3, clock.now).megapixels([frame] * 8, slow) == budgets._LEAST_MEGAPIXELS
+    assert Budget(100.0, clock.now).megapixels([frame] * 8, Bicubic()) is None
 
 
 @pytest.mark.parametrize(("seconds", "after"), [(1e6, 13), (0.0, 17)])
-def test_a_run_that_is_late_goes_on_where_the_rates_fall(seconds: float, after: int) -> None:
+def test_a_run_that_is_late_goes_on_where_the_rates_fall(seconds: float, after: int, clock: Clock) -> None:
     state = start(("gco",))
     state.skip_policy = SkipPolicy(Skips(plateau_from=10, plateau_to=16))
-    check = Plan(20, 0.1, 0.0, Budget(seconds, time.perf_counter())).hurry(state)
-    state.t = 9
+    check = Plan(20, 0.1, 0.0, Budget(seconds, clock.now)).hurry(state)
+    state.t, clock.now = 9, 0.1
     check()
     assert state.t == 9  # before there is anything to leave out
-    state.t, steps = 13, state.optimizer.steps
+    state.t, clock.now, steps = 13, 0.2, state.optimizer.steps
     check()
     assert state.t == after
     assert state.optimizer.steps - steps == after - 13
 
 
-@pytest.mark.parametrize(
-    ("settings", "rule"), [({"minutes": 0.0}, "above 0"), ({"minutes": 1.0, "resume": "auto"}, "exclude each other")]
-)
-def test_what_cannot_be_is_refused(settings: dict[str, object], rule: str) -> None:
-    with pytest.raises(SettingError, match=rule):
-        replace(RunSettings(), **settings)
+def test_a_resumed_run_takes_no_minutes() -> None:
+    with pytest.raises(SettingError, match="exclude each other"):
+        RunSettings(minutes=1.0, resume="auto")
 
 
 def test_a_run_of_some_seconds_says_what_was_chosen_and_keeps_the_number(tmp_path: Path) -> None:

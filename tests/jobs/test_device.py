@@ -43,8 +43,6 @@ def test_a_device_that_is_not_there_is_refused_in_one_sentence(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SettingError, match=r"fit\.device: is cuda, and torch finds no CUDA device"):
         device.drawing(RasterizerSettings(), "cuda")
-    with pytest.raises(SettingError, match=r"fit\.device: must be cpu or cuda or null, got 'tpu'"):
-        settings("fit.device=tpu")
 
 
 @pytest.mark.parametrize(

@@ -58,14 +58,6 @@ def test_a_process_that_has_the_number_of_a_dead_one_is_another(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("text", ["[]", '{"host": 3}', "damaged"])
-def test_a_lock_that_says_nothing_is_respected(tmp_path, text):
-    (tmp_path / NAME).write_text(text)
-    with pytest.raises(DataError, match="remove this file"), hold(tmp_path):
-        pass
-    assert (tmp_path / NAME).read_text() == text
-
-
 @pytest.mark.parametrize(("job", "restarts", "taken"), [("7", "1", True), ("7", "0", False), ("8", "1", False)])
 def test_a_job_that_slurm_starts_again_elsewhere_takes_over_from_itself(tmp_path, monkeypatch, job, restarts, taken):
     leave(tmp_path, host="elsewhere", slurm_job="7", slurm_restarts=0)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import rasterizers
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat, overview
 from clear_strategies.training import checkpoint
 from tests.helpers import saved_run, toy
@@ -89,13 +89,6 @@ def test_a_rasterizer_that_is_not_here_gives_way(run, tmp_path, caplog):
     assert "draws instead" in caplog.text
     with pytest.raises(SettingError, match="nothing"):
         open_splat(folder, "nothing")
-
-
-def test_what_holds_no_splat_is_refused(tmp_path):
-    with pytest.raises(DataError, match="neither a checkpoint nor"):
-        open_splat(tmp_path)
-    with pytest.raises(DataError):
-        open_splat(tmp_path / "nothing.ply")
 
 
 def test_the_overview_is_upright(run):

@@ -81,6 +81,7 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "lock held on another host": (_held(json.dumps(_ELSEWHERE).encode()), "cannot be known from"),
     "lock that is no JSON": (_held(b"{"), "cannot be known from"),
     "lock that is a list": (_held(b"[]"), "cannot be known from"),
+    "lock that names no process": (_held(b'{"host": 3}'), "remove this file"),
     "lock that is a folder": (_held(Path.mkdir), "lock: is a link or no regular file"),
     "lock that is a pipe": (_held(os.mkfifo), "lock: is a link or no regular file"),
     "lock that is a link": (
