@@ -25,6 +25,7 @@ import torch
 from clear_strategies import files
 from clear_strategies.bench import plots
 from clear_strategies.bench.results import Results, environment
+from clear_strategies.commands.train import quoted
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
 from clear_strategies.report.runs import history
@@ -90,10 +91,9 @@ def _without_folders(overrides: Sequence[str]) -> str:
 
 def train(folder: Path, overrides: Sequence[str]) -> str | None:
     """Train in a process of its own; returns the line that says why it failed, or None."""
-    where = str(folder.resolve()).replace("\\", "\\\\").replace("'", "\\'")
     program = [sys.executable, "-m", "clear_strategies.run", "fit.baseline=false"]
     child = subprocess.run(  # noqa: S603 - this interpreter
-        [*program, *overrides, f"hydra.run.dir='{where}'"],
+        [*program, *overrides, f"hydra.run.dir={quoted(str(folder.resolve()))}"],
         env=environment(), capture_output=True, text=True, errors="replace", check=False,
     )  # fmt: skip
     if child.returncode == 0:

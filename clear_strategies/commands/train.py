@@ -76,7 +76,7 @@ def overrides(arguments: Sequence[str]) -> list[str]:
         [] if any(override.startswith(_CHOOSE_ITERATIONS) for override in rest) else [f"fit.iterations={_ITERATIONS}"]
     )
     reader, root = detect(path) if path.is_dir() else ("photos", path)
-    return [*chosen, f"data={reader}", f"data.path={_quoted(str(root))}", *rest]
+    return [*chosen, f"data={reader}", f"data.path={quoted(str(root))}", *rest]
 
 
 def _settings(arguments: Sequence[str]) -> list[str]:
@@ -111,7 +111,7 @@ def detect(folder: Path) -> tuple[str, Path]:
     return "photos", folder / "images" if not has_photos and (folder / "images").is_dir() else folder
 
 
-def _quoted(value: str) -> str:
+def quoted(value: str) -> str:
     """A string of Hydra's grammar: paths may contain spaces, commas, brackets, equals signs and `${`, or look like
     numbers. A backslash is itself, except before a quote or `${`, where both libraries want two.
     """

@@ -82,9 +82,10 @@ def of_both(asked: str | None, run: Mapping[str, Any], baseline: Mapping[str, An
     if asked is None or asked == AUTO:
         return asked, asked
     source = Path(asked)
-    beside = _folder_of(source) / BASELINE
+    folder = folder_of(source)
+    beside = folder / BASELINE
     begun = bool(checkpoint.saved(beside / CHECKPOINTS))
-    if begun and not checkpoint.saved(_folder_of(source) / CHECKPOINTS):
+    if begun and not checkpoint.saved(folder / CHECKPOINTS):
         return None, str(beside)
     saved = checkpoint.load(source)
     if saved.config == baseline:
@@ -93,7 +94,7 @@ def of_both(asked: str | None, run: Mapping[str, Any], baseline: Mapping[str, An
     return asked, str(beside) if begun else None
 
 
-def _folder_of(source: Path) -> Path:
+def folder_of(source: Path) -> Path:
     """The run's folder, of itself, its folder of checkpoints, or one of these."""
     return next((path.parent for path in (source, source.parent) if path.name == CHECKPOINTS), source)
 

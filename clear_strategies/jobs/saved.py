@@ -15,7 +15,7 @@ from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import device
 from clear_strategies.jobs.device import Drawing, RasterizerSettings
-from clear_strategies.jobs.resume import CHECKPOINTS
+from clear_strategies.jobs.resume import CHECKPOINTS, folder_of
 from clear_strategies.settings import build, with_defaults
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import GaussianField
@@ -73,7 +73,7 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
     """
     if path.is_file():
         return _of_ply(path, rasterizer)
-    folder = next((p.parent for p in (path, path.parent) if p.name == CHECKPOINTS), path)
+    folder = folder_of(path)
     if checkpoint.saved(folder / CHECKPOINTS):
         return _of_checkpoint(path, folder, rasterizer)
     found = [folder / PLY, *sorted(folder.glob(f"point_cloud/iteration_*/{PLY}"), key=lambda p: len(p.parent.name))]
