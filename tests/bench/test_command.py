@@ -11,19 +11,23 @@ import pandas as pd
 import pytest
 import torch
 
-from clear_strategies.bench import evidence, plots
+from clear_strategies.bench import evidence, plots, rasterizers
 from clear_strategies.bench.__main__ import main
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 
-def test_rasterizers_writes_tables_figure_and_machine(tmp_path, capsys):
+def test_rasterizers_writes_every_stage_both_errors_a_figure_and_the_machine(tmp_path, capsys):
     out = tmp_path / "new" / "folder"
     asked = ["rasterizers", "--scene", "tiny", "--repeats", "1", "--preset", "fast", "--backend", "torch"]
     assert main([*asked, "--out", str(out)]) == 0
-    assert list(pd.read_csv(out / "rasterizers_time.csv")["backend"]) == ["torch"]
-    assert len(pd.read_csv(out / "rasterizers_error.csv")) == 2
-    assert len(pd.read_csv(out / "rasterizers_turns.csv")) == 6
+    time, error, turns = (pd.read_csv(out / f"rasterizers_{table}.csv") for table in ("time", "error", "turns"))
+    assert list(time["backend"]) == ["torch"]
+    assert time.loc[0, "k2_over_k1"] == pytest.approx(time["backward_k2_ms"][0] / time["backward_k1_ms"][0], rel=1e-4)
+    stages = (rasterizers.FORWARD, *rasterizers.BACKWARD, rasterizers.TOGETHER, rasterizers.SEPARATE)
+    assert list(turns["stage"]) == list(stages)
+    assert list(error["truth"]) == [rasterizers.SAME, rasterizers.NONE]
+    assert error["means_relative"][0] < 1e-4 < error["means_relative"][1]
     assert (out / "time_against_error.png").stat().st_size > 5_000
     machine = json.loads((out / "rasterizers.json").read_text())["machine"]
     assert {"date", "platform", "python", "torch", "nvidia_gpu_models"} <= set(machine)

@@ -60,17 +60,6 @@ def test_contenders_take_turns_and_warm_ups_do_not_count(device, warm_ups):
 # --- rasterizers ------------------------------------------------------------------------------------------------------
 
 
-def test_the_tables_hold_every_stage_and_both_errors():
-    tables = measured(drawing, scene=["tiny"], backend=["torch"], preset=["fast"], repeats=1).tables
-    time, error = tables["rasterizers_time"], tables["rasterizers_error"]
-    stages = (drawing.FORWARD, *drawing.BACKWARD, drawing.TOGETHER, drawing.SEPARATE)
-    assert list(tables["rasterizers_turns"]["stage"]) == list(stages)
-    assert time.loc[0, "k2_over_k1"] == pytest.approx(time.loc[0, "backward_k2_ms"] / time.loc[0, "backward_k1_ms"])
-    same, none = error["means_relative"]
-    assert list(error["truth"]) == [drawing.SAME, drawing.NONE]
-    assert same < 1e-4 < none
-
-
 def test_each_row_names_the_module_whose_kernels_ran():
     if why_not("cpp"):
         pytest.skip(str(why_not("cpp")))
