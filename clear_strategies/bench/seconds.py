@@ -107,9 +107,6 @@ def train(folder: Path, overrides: Sequence[str]) -> str | None:
 def measure(results: Results, request: Request, trainer: Trainer = train) -> None:
     """Train what is not finished yet, and say when each variant reached the reference.
 
-    Args:
-        trainer: trains into a folder with overrides.
-
     Raises:
         DataError: no reference finished.
     """

@@ -107,11 +107,9 @@ def _of_checkpoint(path: Path, folder: Path, rasterizer: str | None) -> SavedSpl
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(path, "tensors", f"hold no field ({error})", "give a run of this program") from error
     known = _cameras_near(folder, 0)
-    own = {  # None is the default, also of a field that only an earlier version had
-        key.removeprefix("rasterizer."): value
-        for key, value in saved.config.items()
-        if key.startswith("rasterizer.") and value is not None
-    }
+    # None is the default, also of a field that only an earlier version had.
+    chosen = {key: value for key, value in saved.config.items() if value is not None}
+    own = {key.removeprefix("rasterizer."): v for key, v in chosen.items() if key.startswith("rasterizer.")}
     source = f"{folder}, {saved.t - 1} iterations, {len(field):,} Gaussians"
     return SavedSplat(folder, source, _painter(field, _drawing(own, rasterizer), known), known, baked=False)
 

@@ -61,13 +61,12 @@ class RunSettings(FitSettings):
 
     def __post_init__(self) -> None:
         FitSettings.__post_init__(self)
-        for name, unit, written in (
-            ("map_views", "", "maps"),
-            ("video", " frames", "video"),
-            ("page", " Gaussians", "page"),
-        ):
-            if (value := getattr(self, name)) < 0:
-                raise SettingError(f"{name} must be at least 0{unit}, got {value}. 0 writes no {written}.")
+        if self.map_views < 0:
+            raise SettingError(f"map_views must be at least 0, got {self.map_views}. 0 writes no maps.")
+        if self.video < 0:
+            raise SettingError(f"video must be at least 0 frames, got {self.video}. 0 writes no video.")
+        if self.page < 0:
+            raise SettingError(f"page must be at least 0 Gaussians, got {self.page}. 0 writes no page.")
         if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise SettingError(f"minutes must be above 0, got {self.minutes}. null sets no limit.")
         if self.minutes is not None and self.resume is not None:
