@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
@@ -84,15 +85,20 @@ def test_help_and_wrong_words_wait_for_neither_torch_nor_hydra(line, code, tmp_p
     assert result.stderr.count("\n") == (1 if code else 0), result.stderr
 
 
-def test_settings_lists_groups_choices_and_values(capsys, monkeypatch):
-    """Hydra's help of the application, with the overrides behind the word."""
+@pytest.fixture
+def hydra_undone(monkeypatch) -> Iterator[None]:
+    """What Hydra's door sets is undone afterwards."""
     monkeypatch.setattr(sys, "argv", ["clear-strategies"])
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")  # so that what Hydra's door sets is undone
-    try:
-        with pytest.raises(SystemExit) as ended:
-            settings.main(["+strategy=gco", "strategies.gco.tolerance=0.25"])
-    finally:
-        GlobalHydra.instance().clear()
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    yield
+    GlobalHydra.instance().clear()
+
+
+@pytest.mark.usefixtures("hydra_undone")
+def test_settings_lists_groups_choices_and_values(capsys):
+    """Hydra's help of the application, with the overrides behind the word."""
+    with pytest.raises(SystemExit) as ended:
+        settings.main(["+strategy=gco", "strategies.gco.tolerance=0.25"])
     said = capsys.readouterr().out
     assert ended.value.code in (0, None)
     assert "clear-strategies is powered by Hydra" in said
@@ -100,13 +106,7 @@ def test_settings_lists_groups_choices_and_values(capsys, monkeypatch):
     assert "tolerance: 0.25" in said
 
 
-def test_a_setting_that_is_not_there_is_told_with_where_all_are(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["clear-strategies"])
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    try:
-        with pytest.raises(
-            SettingError, match=r"fit.nothing_like_it: there is no such setting. clear-strategies settings"
-        ):
-            hydra_app.main(["fit.nothing_like_it=1"])
-    finally:
-        GlobalHydra.instance().clear()
+@pytest.mark.usefixtures("hydra_undone")
+def test_a_setting_that_is_not_there_is_told_with_where_all_are():
+    with pytest.raises(SettingError, match="fit.nothing_like_it: there is no such setting. clear-strategies settings"):
+        hydra_app.main(["fit.nothing_like_it=1"])

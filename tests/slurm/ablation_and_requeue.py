@@ -19,12 +19,10 @@ import sys
 import time
 from pathlib import Path
 
+from tests.helpers.command_line import ROOT, TINY
 from tests.slurm.one_machine import cluster
 
-ROOT = Path(__file__).resolve().parents[2]
-DEMO = ["data.reader.width=64", "data.reader.height=48", "fit.max_degree=1", "data.cloud.init=random",
-        "data.cloud.random_points=60", "data.reader.views=5", "data.reader.train=2", "data.views.train=2",
-        "skips=none", "fit.baseline=false"]  # fmt: skip
+DEMO = [override for override in TINY if not override.startswith("fit.iterations=")]
 # What a user writes to go from this machine to a cluster.
 SLURM = ["-m", "hydra/launcher=submitit_slurm", "hydra.launcher.cpus_per_task=1", "fit.resume=auto"]
 ABLATION = [*SLURM, "+strategy=baseline,gco,[gco,p2g],clear", "hydra.sweep.dir=ablation", "fit.iterations=300", *DEMO]
@@ -137,12 +135,9 @@ class Experiment:
 
     def timed_out(self, expected: bytes) -> None:
         """The time limit is shorter than the run; before it Slurm sends SIGUSR2, as submitit asked it to."""
-        limits = [
-            "hydra.launcher.timeout_min=1",
-            "hydra.launcher.signal_delay_s=30",
-            "hydra.launcher.max_num_timeout=20",
-        ]
-        process = self.start(*SLURM, *limits, *LONG, "hydra.sweep.dir=timed_out", name="timed_out")
+        limits = {"timeout_min": 1, "signal_delay_s": 30, "max_num_timeout": 20}
+        asked = (f"hydra.launcher.{name}={value}" for name, value in limits.items())
+        process = self.start(*SLURM, *asked, *LONG, "hydra.sweep.dir=timed_out", name="timed_out")
         self.finish(process, "timed_out")
         for path in sorted((self.folder / "timed_out" / ".submitit").rglob("*_log.out")):
             _tell(path, r"submitit (WARNING|INFO).*(Caught signal|Requeued|completed)")
