@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Shot
 from clear_strategies.core.seeds import generator_at
 from clear_strategies.density.base import DensityError
 from clear_strategies.density.threshold import count_passing, topk_mask
-from clear_strategies.errors import SettingError
 from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import milestone
 from clear_strategies.training.field import GaussianField
@@ -68,16 +68,12 @@ class DensitySettings:
     min_gaussians: int = 10
 
     def __post_init__(self) -> None:
-        if not self.threshold > 0:
-            raise SettingError(f"threshold must be > 0, got {self.threshold}.")
-        if self.mode not in ("quantile", "fixed"):
-            raise SettingError(f"mode must be quantile or fixed, got {self.mode!r}.")
-        if min(self.every, self.max_gaussians, self.min_gaussians) < 1 or self.reset_every < 0:
-            raise SettingError("every, max_gaussians and min_gaussians must be at least 1, reset_every at least 0.")
-        if self.reduce not in ("mean", "max"):
-            raise SettingError(f"reduce must be mean or max, got {self.reduce!r}.")
-        if not 0 <= self.prune_opacity < 1:
-            raise SettingError(f"prune_opacity must lie in [0, 1), got {self.prune_opacity}.")
+        require_number("threshold", self.threshold, above=0)
+        require_choice("mode", self.mode, ("quantile", "fixed"))
+        for name, least in (("every", 1), ("max_gaussians", 1), ("min_gaussians", 1), ("reset_every", 0)):
+            require_whole(name, getattr(self, name), least=least)
+        require_choice("reduce", self.reduce, ("mean", "max"))
+        require_number("prune_opacity", self.prune_opacity, below=1)
 
     @property
     def interval(self) -> int:

@@ -17,12 +17,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Shot
 from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.view import View
 from clear_strategies.density.base import DensityError
-from clear_strategies.errors import SettingError
 from clear_strategies.geometry.pseudo_views import cut_out
 from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import LogLinear, milestone
@@ -39,19 +39,18 @@ _BINOMIALS: Final = torch.tensor(
     [[math.comb(n, j) for j in range(_MOST_COPIES + 1)] for n in range(_MOST_COPIES + 1)], dtype=torch.float64
 )
 _DENSE: Final = 4.0  # LR px between initial points, up to which their number tells how much surface there is
-_SHORT_RUN: Final = (
-    1_200  # the least `stop`, that of 1,500 iterations: in shorter runs density control adds detail sooner
-)
+_SHORT_RUN: Final = 750  # the least `stop`, that of 1,500 iterations; shorter runs gain more by density control
 _GATE: Final = 100.0  # slope of the noise's gate σ(100 (dead_opacity - o))
 _STILL: Final = 1e-4  # of the gate: below it, at opacities above 0.1, a Gaussian stays where it is
 
 
 @dataclass(frozen=True)
 class MCMC(Strategy):
-    """Gaussians move and are added by sampling, in iterations start < t < stop; faint ones wander. In place of `density`.
+    """Gaussians move and are added by sampling; faint ones wander. In place of `density`.
 
     Args:
-        start, stop: iterations between which the structure changes.
+        start: the structure changes in iterations after it.
+        stop: the first iteration without any of it. SVS takes its anchor then.
         every: iterations between rounds.
         growth: the share of Gaussians that a round adds, up to the cap.
         per_point: the cap, as a multiple of the Gaussians at the start, which are one for each initial point.
@@ -59,7 +58,7 @@ class MCMC(Strategy):
         min_gaussians: fewer visible ones are an error.
         dead_opacity: Gaussians of at most this opacity are moved.
         noise: strength of the noise. A Gaussian of covariance Σ moves by noise(t) σ(100 (dead_opacity - opacity)) Σ η / s̃ after
-            each iteration, with η ~ N(0, I) and s̃ the median of the Gaussians' largest scales; 0: none moves.
+            each iteration until `stop`, with η ~ N(0, I) and s̃ the median of the Gaussians' largest scales; 0: none moves.
         cooling: noise(t) / noise, which falls as the learning rate of the positions does.
 
     Raises:
@@ -67,7 +66,7 @@ class MCMC(Strategy):
     """
 
     start: int = milestone(500)
-    stop: int = milestone(8_000)
+    stop: int = milestone(5_000)
     every: int = milestone(100, least=1)
     growth: float = 0.05
     per_point: float = 5.0
@@ -78,13 +77,11 @@ class MCMC(Strategy):
     cooling: LogLinear = field(default_factory=lambda: LogLinear(initial=1.0, final=0.01))
 
     def __post_init__(self) -> None:
-        if min(self.every, self.max_gaussians, self.min_gaussians) < 1:
-            raise SettingError("every, max_gaussians and min_gaussians must be at least 1.")
+        for name in ("every", "max_gaussians", "min_gaussians"):
+            require_whole(name, getattr(self, name), least=1)
         for name, least in (("growth", 0), ("per_point", 1), ("noise", 0)):
-            if not least <= getattr(self, name) < math.inf:
-                raise SettingError(f"{name} must be at least {least} and finite, got {getattr(self, name)}.")
-        if not 0 < self.dead_opacity < 1:
-            raise SettingError(f"dead_opacity must lie in (0, 1), got {self.dead_opacity}.")
+            require_number(name, getattr(self, name), least=least)
+        require_number("dead_opacity", self.dead_opacity, above=0, below=1)
 
     def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Sampler | None:
         """None, which a message says, where sampling would be of no use."""
@@ -137,6 +134,8 @@ class Sampler:
         return False
 
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
+        if t >= self.settings.stop:
+            return False
         generator = hashed_generator_at(self.seed, t, field.means.device)
         parents = self._round(field, optimizer, t, generator) if self.due(t) else None
         if parents is not None:

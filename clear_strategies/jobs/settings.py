@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from clear_strategies.compose import ConductorSettings
+from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device, scene
@@ -61,21 +61,17 @@ class RunSettings(FitSettings):
 
     def __post_init__(self) -> None:
         FitSettings.__post_init__(self)
-        if self.map_views < 0:
-            raise SettingError(f"map_views must be at least 0, got {self.map_views}. 0 writes no maps.")
-        if self.video < 0:
-            raise SettingError(f"video must be at least 0 frames, got {self.video}. 0 writes no video.")
-        if self.page < 0:
-            raise SettingError(f"page must be at least 0 Gaussians, got {self.page}. 0 writes no page.")
-        if self.minutes is not None and not 0 < self.minutes < math.inf:
-            raise SettingError(f"minutes must be above 0, got {self.minutes}. null sets no limit.")
+        for name in ("map_views", "video", "page"):
+            require_whole(name, getattr(self, name), least=0)
+        if self.minutes is not None:
+            require_number("minutes", self.minutes, above=0)
         if self.minutes is not None and self.resume is not None:
             raise SettingError(
                 "minutes and resume exclude each other: a resumed run has the iterations that it began with. "
                 "Leave minutes out, and name fit.iterations as the run's metrics.json or run.log has it."
             )
-        if self.threads is not None and self.threads < 1:
-            raise SettingError(f"threads must be at least 1, got {self.threads}. null takes all cores.")
+        if self.threads is not None:
+            require_whole("threads", self.threads, least=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
