@@ -19,7 +19,7 @@ from torch import Tensor
 from clear_strategies.core.checks import require_choice
 
 DownKernel = Literal["bicubic", "bilinear", "lanczos", "area"]
-UpKernel = Literal["bicubic", "bilinear", "nearest"]
+UpKernel = Literal["bicubic", "nearest"]
 
 _PIL_FILTERS: Final = {
     "bicubic": Image.Resampling.BICUBIC,

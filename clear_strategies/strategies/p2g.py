@@ -18,9 +18,9 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.checks import require_choice, require_number, require_whole
-from clear_strategies.core.evidence import Evidence, Lookup, Outside, PatchMaps, lift
+from clear_strategies.core.evidence import Evidence, PatchMaps, lift
 from clear_strategies.core.gradients import Shot, screen_norm
-from clear_strategies.core.images import DownKernel, UpKernel, downsample, patch_means, quantize, upsample
+from clear_strategies.core.images import DownKernel, downsample, patch_means, quantize, upsample
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
@@ -28,7 +28,7 @@ from clear_strategies.strategies.base import ScreenGradients, Strategy
 
 _log = logging.getLogger(__name__)
 
-ScoreBy = Literal["evidence", "gradient", "sum", "max"]
+ScoreBy = Literal["evidence", "gradient", "sum"]
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,10 @@ class P2G(Strategy):
         normalize: divide m by its mean over the visible Gaussians. Detail then moves to where it is reliable and needed;
             as printed, m <= 1 only ever takes detail away, 60 % of it on average (F25).
         patch: edge of a patch in LR pixels; in HR pixels it is that times the SR factor.
-        down, up: D and U. D should be the operator that made the LR images (F21).
-        lookup: "nearest" patch of the projected centre, or "bilinear" between patches (F24).
-        outside: a visible Gaussian centred outside the image takes the border patch ("clamp"), or 0 ("neutral") (F24).
+        down: D, the operator that made the LR images (F21).
         detail_eps: ε of Eq. 9, image units; below it (1/40 of a grey level) differences are rounding, not detail (F23).
         score_by: the densification score: "evidence" S_i alone (the paper; large splats of a sparse initial cloud then
-            rarely split), the ordinary "gradient", or both at equal mean: their "sum" or "max" (F9).
+            rarely split), the ordinary "gradient", or their "sum" at equal mean (F9).
 
     Raises:
         SettingError: a setting is outside its range.
@@ -58,9 +56,6 @@ class P2G(Strategy):
     normalize: bool = True
     patch: int = 16
     down: DownKernel = "bicubic"
-    up: UpKernel = "bicubic"
-    lookup: Lookup = "nearest"
-    outside: Outside = "clamp"
     detail_eps: float = 1e-4
     score_by: ScoreBy = "sum"
 
@@ -69,16 +64,14 @@ class P2G(Strategy):
         require_number("floor", self.floor, most=1)
         require_whole("patch", self.patch, least=1)
         require_number("detail_eps", self.detail_eps, above=0)
-        for name, kind in (("down", DownKernel), ("up", UpKernel), ("lookup", Lookup),
-                           ("outside", Outside), ("score_by", ScoreBy)):  # fmt: skip
+        for name, kind in (("down", DownKernel), ("score_by", ScoreBy)):
             require_choice(name, getattr(self, name), get_args(kind))
 
     def observe(self, step: Step, hr: Shot) -> Evidence:
         """q_i and a_i of every Gaussian that is visible in this view."""
         view = step.view
         maps = torch.stack(self._cached_patches(view))  # R, A
-        size = (view.hr.camera.width, view.hr.camera.height)
-        q, a = lift(maps, hr.means2d, hr.visible, self.patch * view.factor, size, self.lookup, self.outside)
+        q, a = lift(maps, hr.means2d, hr.visible, self.patch * view.factor)
         visible = hr.visible.sum()
         self.log("mean_q", deferred.scalar(q.sum() / visible))  # both are 0 where a Gaussian is invisible
         self.log("mean_w", deferred.scalar((q * a).sum() / visible))
@@ -101,8 +94,7 @@ class P2G(Strategy):
         S: Tensor = step.evidence.weight * screen_norm(screen.hf)  # Eq. 14
         if self.score_by == "evidence":
             return S
-        S = S * (screen.ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny))
-        return torch.maximum(screen.ordinary, S) if self.score_by == "max" else screen.ordinary + S
+        return screen.ordinary + S * (screen.ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny))
 
     def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
         return "lambda_HR is 0 throughout" if lambda_hr == 0 else None
@@ -139,7 +131,7 @@ class P2G(Strategy):
         R = torch.exp(-patch_means(disagreement, self.patch) / tau_r)
         # All kernels of D but "area" round to 8 bits. What that loses of an SR image with more of them is no detail.
         shown = hr if self.down == "area" else quantize(hr)
-        residual = (shown - upsample(reduced, factor, self.up)).abs()
+        residual = (shown - upsample(reduced, factor)).abs()
         A = (patch_means(residual, self.patch * factor) / (2 * residual.mean() + self.detail_eps)).clamp(0, 1)
         return R, A
 

@@ -41,9 +41,6 @@ class Skips:
         plateau_window: iterations between two measurements.
         plateau_from: iteration of the earliest measurement.
         plateau_to: iteration from which every run trains: the learning rates fall, and HR is at full size.
-
-    Raises:
-        SettingError: a setting is outside its range.
     """
 
     coarse_until: int = milestone(0)

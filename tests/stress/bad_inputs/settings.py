@@ -101,8 +101,6 @@ _REFUSED: dict[str, str] = {
     "strategies.p2g.patch=0": "at least 1",
     "strategies.p2g.detail_eps=0": "> 0",
     "strategies.p2g.down=sharp": "bicubic",
-    "strategies.p2g.lookup=cubic": "nearest",
-    "strategies.p2g.outside=mirror": "clamp",
     "strategies.p2g.score_by=luck": "evidence",
     "strategies.svs.looks=-1": "at least 0",
     "strategies.svs.anchor_strength=-1": ">= 0",
