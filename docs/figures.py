@@ -3,8 +3,8 @@
 `python docs/figures.py` draws those of docs/explanation/evidence-sparse.md from its CSV files. `python docs/figures.py demo`
 trains the demo, as the README's first command does, and draws the README's picture of it, docs/images/demo.png; further
 words are overrides of the run. `python docs/figures.py notebook` runs docs/tutorial/notebook.ipynb and keeps what its
-cells show. `python docs/figures.py pages RUN` opens a run's splat.html and coverage.html and the viewer in Chromium, and
-takes a picture of each.
+cells show. `python docs/figures.py pages RUN` opens a run's splat.html and the viewer in Chromium, and takes a
+picture of each.
 """
 
 from __future__ import annotations
@@ -182,7 +182,7 @@ CLOSE_WARNING: Final = (
 
 
 def pages(folder: Path, run: Path) -> None:
-    """A run as Chromium shows it: the page of the splat, that of the coverage, and the viewer."""
+    """A run as Chromium shows it: the page of the splat, and the viewer."""
     from playwright.sync_api import sync_playwright
 
     from clear_strategies.jobs.saved import open_splat
@@ -192,7 +192,6 @@ def pages(folder: Path, run: Path) -> None:
     viewer = SplatViewer(Screen(splat.painter, splat.cameras), title=splat.name, port=8437, out=run)
     addresses = {
         "splat_page": (run / "splat.html").resolve().as_uri(),
-        "coverage_page": (run / "coverage.html").resolve().as_uri(),
         "viewer": viewer.address,
     }
     with sync_playwright() as playwright:

@@ -156,19 +156,8 @@ def _add_trainings(questions: Any, common: argparse.ArgumentParser) -> None:
         metavar="N",
         help="evaluations of the test views in a run (default 20)",
     )
-    _add_kept(ask, "seconds")
-    ask = questions.add_parser("next_photo", parents=[common], help="what the photo that a run advises brings")
-    ask.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="of all trainings, as for a run")
-    ask.add_argument("--scene", nargs="+", required=True, metavar="SCENE", help="of conf/scene, one after the other")
-    ask.add_argument("--start", type=positive(int), default=4, metavar="N", help="photos at first (default 4)")
-    ask.add_argument("--others", type=positive(int), default=4, metavar="N", help="random photos beside it (default 4)")
-    ask.add_argument("--seed", type=int, default=0, help="of their choice (default 0)")
-    _add_kept(ask, "next_photo")
-
-
-def _add_kept(ask: argparse.ArgumentParser, question: str) -> None:
     ask.add_argument(
-        "--out", type=Path, default=Path("outputs") / question, metavar="FOLDER",
+        "--out", type=Path, default=Path("outputs/seconds"), metavar="FOLDER",
         help="holds tables and trainings; finished trainings are kept (default: %(default)s)",
     )  # fmt: skip
 

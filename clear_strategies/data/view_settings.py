@@ -115,11 +115,11 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
         if len(pool) < views.train:
             problem = f"{views.train} training views are asked for, there are {len(pool)}"
             raise DataError(capture.name, "views", problem, "lower data.views.train")
-        pool = evenly_spaced(pool, views.train)
+        pool = _evenly_spaced(pool, views.train)
     if not pool:
         raise DataError(capture.name, "views", "none is left for training", "give more photos")
     if views.test_limit is not None and len(test) > views.test_limit:
-        test = evenly_spaced(test, views.test_limit)
+        test = _evenly_spaced(test, views.test_limit)
     return pool, test
 
 
@@ -138,6 +138,6 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-def evenly_spaced(frames: Sequence[Frame], count: int) -> list[Frame]:
+def _evenly_spaced(frames: Sequence[Frame], count: int) -> list[Frame]:
     """`count` of the frames by the papers' rule: round(linspace), halves to even."""
     return [frames[round(float(x))] for x in np.linspace(0, len(frames) - 1, count)]

@@ -1,8 +1,7 @@
-"""coverage.png and coverage.html: how many photos see each part of the scene, and from where the next ones should be taken."""
+"""coverage.png and coverage.html: how many photos see each part of the scene."""
 
 from __future__ import annotations
 
-import logging
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,24 +16,25 @@ from torch import Tensor
 from clear_strategies.data.scene import Scene
 from clear_strategies.geometry.visibility import seen_by, times_seen
 from clear_strategies.outputs import figures
-from clear_strategies.outputs.next_photos import COMPARED, ENOUGH, NextPhoto, next_photos, with_depth
 from clear_strategies.viewing import page
+from clear_strategies.viewing.cameras import at_most
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_log = logging.getLogger(__name__)
-
 PICTURE: Final = "coverage.png"
 PAGE: Final = "coverage.html"
 
+_ENOUGH: Final = 3  # photos that see a surface; more of them change little
+_COMPARED: Final = 64  # photos that are asked what they see, at most
+_LONGER_SIDE: Final = 96  # px at which the depth of what they see is drawn
 _SOLID: Final = 0.3  # opacity of the Gaussians that are counted as surface
 _MOST_POINTS: Final = 60_000  # of them in the page and on the map
 _COLORS: Final = (figures.RED, figures.YELLOW, figures.CYAN, figures.BLUE)
-_SEEN: Final = ("no photo", "one photo", "two photos", f"{ENOUGH} or more")
-_CAMERA, _NEXT = figures.INK, figures.GREEN
+_SEEN: Final = ("no photo", "one photo", "two photos", f"{_ENOUGH} or more")
+_CAMERA: Final = figures.INK
 _MOST_LINES: Final = 18  # of the text beside the map
 _CROP: Final = 0.03  # of the points, on each side of the map, that lie outside of it
 
@@ -46,55 +46,43 @@ class Coverage:
     Args:
         photos: the cameras by the photos' names.
         points, times: of the field's surface, and how many photos see each.
-        shares: of the pixels of a photo, by its name, those whose surface one, two, and `ENOUGH` or more photos see, itself
+        shares: of the pixels of a photo, by its name, those whose surface one, two, and three or more photos see, itself
             included; of many photos some.
-        advice: the next photos, the best first.
     """
 
     photos: Mapping[str, Camera]
     points: Float[Tensor, "N 3"]
     times: Int[Tensor, " N"]
     shares: Mapping[str, Sequence[float]]
-    advice: Sequence[NextPhoto]
-
-    def says(self) -> list[str]:
-        """A line for each next photo."""
-        return [f"{i}. {photo.where}: worth {photo.gain:.0%}" for i, photo in enumerate(self.advice, 1)]
 
 
 def coverage_of(scene: Scene, painter: Painter) -> Coverage:
-    """What the training photos see of the field, and what the next ones should."""
+    """What the training photos see of the field."""
     field, photos = painter.field, {view.name: view.hr.camera for view in scene.train}
-    seeing = with_depth(list(photos.values()), painter)
+    small = [at_most(camera, _LONGER_SIDE) for camera in figures.spaced(list(photos.values()), _COMPARED)]
+    seeing = [(camera, painter.depth(camera)) for camera in small]
     solid = field.means.data[field.opacities.data.sigmoid() > _SOLID].cpu()
     points = solid[:: -(-len(solid) // _MOST_POINTS) or 1]
     shares = {}
-    for name, (camera, depth) in zip(figures.spaced(list(photos), COMPARED), seeing, strict=True):
-        seen = seen_by(camera, depth, seeing)[depth.isfinite()].clamp(max=ENOUGH)
-        shares[name] = [int((seen == n).sum()) / max(1, len(seen)) for n in range(1, ENOUGH + 1)]
-    return Coverage(photos, points, times_seen(points, seeing), shares, next_photos(photos, painter))
+    for name, (camera, depth) in zip(figures.spaced(list(photos), _COMPARED), seeing, strict=True):
+        seen = seen_by(camera, depth, seeing)[depth.isfinite()].clamp(max=_ENOUGH)
+        shares[name] = [int((seen == n).sum()) / max(1, len(seen)) for n in range(1, _ENOUGH + 1)]
+    return Coverage(photos, points, times_seen(points, seeing), shares)
 
 
 def write_coverage(folder: Path, scene: Scene, painter: Painter, title: str) -> None:
-    """Write the picture, and the page where viser is installed.
-
-    Where there are no test views, so that the photos are the user's own, a message says where to stand next.
-    """
+    """Write the picture, and the page where viser is installed."""
     found = coverage_of(scene, painter)
-    _write_picture(folder / PICTURE, found, scene, painter, title)
+    _write_picture(folder / PICTURE, found, scene, title)
     if page.missing() is None:
         shown = [
             page.ShownCamera(view.hr.camera, view.name, _rgb(_CAMERA), (view.lr.image.cpu() * 255).byte().numpy())
             for view in scene.train
         ]
-        shown += [page.ShownCamera(p.camera, f"next photo {i}", _rgb(_NEXT)) for i, p in enumerate(found.advice, 1)]
         legend = {f"seen by {name}": _rgb(color) for name, color in zip(_SEEN, _COLORS, strict=True)}
-        legend |= {"the photos": _rgb(_CAMERA), "where to take the next": _rgb(_NEXT)}
+        legend["the photos"] = _rgb(_CAMERA)
         colors = torch.from_numpy(_colored(found.times))
         page.write_points_page(folder / PAGE, found.points, colors, shown, title, legend)
-    if found.advice:
-        level = logging.DEBUG if scene.test else logging.INFO
-        _log.log(level, "two more photos would help most from here (%s): %s", PICTURE, "; ".join(found.says()))
 
 
 def _rgb(color: str) -> page.RGB:
@@ -104,23 +92,20 @@ def _rgb(color: str) -> page.RGB:
 
 def _colored(times: Int[Tensor, "*S"]) -> Float[np.ndarray, "*S 3"]:
     palette = np.array([_rgb(color) for color in _COLORS], np.float32) / 255
-    return np.asarray(palette[times.clamp(max=ENOUGH).numpy()])
+    return np.asarray(palette[times.clamp(max=_ENOUGH).numpy()])
 
 
-def _write_picture(path: Path, found: Coverage, scene: Scene, painter: Painter, title: str) -> None:
+def _write_picture(path: Path, found: Coverage, scene: Scene, title: str) -> None:
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    figure = Figure(figsize=(13, 9 if found.advice else 6), layout="constrained")
-    grid = figure.add_gridspec(2, 10, height_ratios=(2, 1 if found.advice else 0.01))
-    above, beside = figure.add_subplot(grid[0, :6]), figure.add_subplot(grid[0, 6:])
+    figure = Figure(figsize=(13, 6), layout="constrained")
+    above, beside = figure.subplots(1, 2, width_ratios=(3, 2))
     _draw_map(above, found)
     beside.set_axis_off()
     beside.text(0, 1, "\n".join(_lines(found, scene)), va="top", fontsize=8.5, color=figures.INK, family="monospace")
     patches = [Patch(color=color, label=f"seen by {name}") for color, name in zip(_COLORS, _SEEN, strict=True)]
     above.legend(handles=patches, loc="lower left", fontsize=8, framealpha=0.8, edgecolor="none")
-    for i, photo in enumerate(found.advice):
-        _draw_next(figure.add_subplot(grid[1, 5 * i : 5 * i + 5]), i + 1, photo, painter)
     figures.set_title(figure, f"{title}: what the photos see, from above")
     figures.save_png(figure, path)
 
@@ -134,16 +119,14 @@ def _draw_map(axes: Axes, found: Coverage) -> None:
     plane = torch.stack([torch.linalg.cross(ahead, up), ahead], dim=1)  # [3, 2]: right and ahead of the first camera
     flat, order = (found.points.double() @ plane).numpy(), found.times.argsort(descending=True).numpy()
     axes.scatter(flat[order, 0], flat[order, 1], s=2, c=_colored(found.times)[order], linewidths=0)
-    shown = [(camera, _CAMERA, name) for name, camera in found.photos.items()]
-    shown += [(photo.camera, _NEXT, f"next {i}") for i, photo in enumerate(found.advice, 1)]
-    places = np.stack([(camera.center.double().cpu() @ plane).numpy() for camera, _, _ in shown])
+    places = np.stack([(camera.center.double().cpu() @ plane).numpy() for camera in found.photos.values()])
     low, high = np.quantile(flat, (_CROP, 1 - _CROP), axis=0) if len(flat) else (places.min(0), places.max(0))
     low, high = np.minimum(low, places.min(0)), np.maximum(high, places.max(0))
     length = 0.05 * float((high - low).max())
-    for (camera, color, name), place in zip(shown, places, strict=True):
+    for (name, camera), place in zip(found.photos.items(), places, strict=True):
         toward = (camera.world_to_camera[2, :3].double().cpu() @ plane).numpy() * length
-        axes.annotate("", place + toward, place, arrowprops={"arrowstyle": "-|>", "color": color, "linewidth": 1.8})
-        axes.annotate(name, place, xytext=(3, -9), textcoords="offset points", fontsize=7, color=color)
+        axes.annotate("", place + toward, place, arrowprops={"arrowstyle": "-|>", "color": _CAMERA, "linewidth": 1.8})
+        axes.annotate(name, place, xytext=(3, -9), textcoords="offset points", fontsize=7, color=_CAMERA)
     margin = 0.06 * (high - low).max()
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
@@ -151,24 +134,8 @@ def _draw_map(axes: Axes, found: Coverage) -> None:
     axes.set_axis_off()
 
 
-def _draw_next(axes: Axes, number: int, photo: NextPhoto, painter: Painter) -> None:
-    """What would be seen from there as far as it is known, redder where a photo is worth more."""
-    image = painter.color(photo.camera)
-    red = torch.tensor(_rgb(figures.RED)) / 255
-    worth = photo.worth.nan_to_num(0)[None, None]
-    weight = 0.6 * torch.nn.functional.interpolate(worth, image.shape[:2], mode="nearest")[0, 0, ..., None]
-    axes.imshow((image * (1 - weight) + weight * red).numpy())
-    axes.set_axis_off()
-    told = f"next photo {number}: {photo.where}"
-    axes.set_title("\n".join(textwrap.wrap(told, 60)), fontsize=9, color=_NEXT)
-
-
 def _lines(found: Coverage, scene: Scene) -> list[str]:
-    lines = ["WHERE TO STAND NEXT, aiming at the same spot"]
-    lines += found.says() or ["nowhere: enough photos see all of what is seen at all"]
-    lines += ["a step: the usual distance between neighbouring photos"]
-    lines += ["worth 100%: one photo alone shows all that it would show", ""]
-    lines += [f"{'SURFACE SEEN BY':<24}  one   two   {ENOUGH} or more photos"]
+    lines = [f"{'SURFACE SEEN BY':<24}  one   two   {_ENOUGH} or more photos"]
     for name, (one, two, more) in list(found.shares.items())[:_MOST_LINES]:
         short = name if len(name) <= 24 else f"…{name[-23:]}"
         lines.append(f"{short:<24} {one:4.0%}  {two:4.0%}  {more:4.0%}")
