@@ -37,7 +37,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     t, θ, ask, stage = s.t, s.field, s.conductor, s.conductor.work_log.stage
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
     view = s.skip_policy.view(s.view(), t)
-    hr_due = ask.wants_hr(t) and (not ask.wants_lr or s.skip_policy.hr_due(t, ask.work_log))
+    hr_due = ask.wants_hr(t)
     scales = {"lr": ask.wants_lr and s.skip_policy.lr_due(view, hr_due, ask.work_log), "hr": hr_due}
     before_color = over(rasterizer, ask.background(t))
     z = ask.gate(t, len(θ))  # zᵗ             Eq. 15       SVS

@@ -34,8 +34,6 @@ class Skips:
     Args:
         coarse_until: until this iteration HR is rendered and compared at half its size, and LR is not rendered where that is
             LR's size; 0: never.
-        hr_every: from `hr_every_from` on, HR is rendered in every n-th iteration only.
-        hr_every_from: iteration, see `hr_every`.
         plateau_gain: once the loss of the training views, drawn whole, has not fallen by at least this share within
             `plateau_window` iterations, training continues at iteration `plateau_to`; 0: never.
         plateau_window: iterations between two measurements.
@@ -44,15 +42,12 @@ class Skips:
     """
 
     coarse_until: int = milestone(0)
-    hr_every: int = 1
-    hr_every_from: int = milestone(5_000)
     plateau_gain: float = 0.0
     plateau_window: int = milestone(500)
     plateau_from: int = milestone(5_000)
     plateau_to: int = milestone(8_000)
 
     def __post_init__(self) -> None:
-        require_whole("hr_every", self.hr_every, least=1)
         require_number("plateau_gain", self.plateau_gain, below=1)
         require_whole("coarse_until", self.coarse_until, least=0)
 
@@ -61,8 +56,6 @@ class Skips:
         phrases = []
         if self.coarse_until > 0:
             phrases.append(f"HR at half its size until iteration {self.coarse_until}")
-        if self.hr_every > 1:
-            phrases.append(f"HR except every {self.hr_every} iterations from {self.hr_every_from}")
         if self.plateau_gain > 0:
             phrases.append(
                 f"the iterations until {self.plateau_to} once {self.plateau_window} iterations gain less than "
@@ -86,14 +79,6 @@ class SkipPolicy:
             hr = view.hr.reduced(_REDUCED)
             self._coarse[view.name] = replace(view, hr=hr, truth=None)
         return self._coarse[view.name]
-
-    def hr_due(self, t: int, work_log: WorkLog) -> bool:
-        """Whether HR is rendered in iteration t."""
-        s = self.skips
-        if t <= s.hr_every_from or t % s.hr_every == 0:
-            return True
-        work_log.skip("HR scale", f"every {s.hr_every} iterations (skips.hr_every)")
-        return False
 
     def lr_due(self, view: View, hr_due: bool, work_log: WorkLog) -> bool:
         """Whether LR is rendered: not where HR at half its size is as large as the photo, for one render then serves both."""

@@ -29,8 +29,8 @@ from rasterizers.interface import Rendering, SplatGradients, Traits
 from tests.helpers import toy
 from tests.helpers.short_run import ITERATIONS, SCENE, SUBSETS, start, tensors
 
-STEADY = (8, 12, 13, 14)  # HR coarse; the anchor is taken; HR left out; all there is
-EVERY_SKIP = Skips(coarse_until=9, hr_every=2, hr_every_from=12)
+STEADY = (8, 12, 13)  # HR coarse; the anchor is taken; all there is
+COARSE = Skips(coarse_until=9)
 
 
 @dataclass
@@ -123,7 +123,7 @@ def on_meta(monkeypatch, names: tuple[str, ...]) -> TrainState:
     state = start(names)
     cache_evidence(state)
     state.compiled_step = None
-    state.skip_policy = SkipPolicy(EVERY_SKIP)
+    state.skip_policy = SkipPolicy(COARSE)
     # Statistics are gathered; a round reads, and does not come.
     state.density.settings = replace(state.density.settings, start=90, stop=100, statistics_from=1)
     return state
@@ -166,7 +166,7 @@ def test_splatsure_reads_nothing_either(no_data, monkeypatch):
             for s in state.conductor.strategies:
                 if isinstance(s, SplatSuRe):
                     s._pose(seen.name, seen.hr.camera)
-    state.skip_policy = SkipPolicy(replace(EVERY_SKIP, coarse_until=0))
+    state.skip_policy = SkipPolicy()
     steadily(state)
 
 
@@ -223,7 +223,7 @@ def test_every_tensor_is_made_where_the_field_lies_and_late_numbers_are_the_same
 
     def begun() -> TrainState:
         state = start(names)
-        state.skip_policy, state.compiled_step = SkipPolicy(EVERY_SKIP), None
+        state.skip_policy, state.compiled_step = SkipPolicy(COARSE), None
         state.conductor.objective = replace(state.conductor.objective, kernels="torch")
         return state
 

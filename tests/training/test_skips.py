@@ -27,7 +27,6 @@ def loss_rows(*losses: float, column: str = PLATEAU_LOSS) -> list[dict[str, floa
 def test_nothing_is_left_out_by_default():
     view, skip_policy, work_log = toy.scene().train[0], SkipPolicy(), WorkLog()
     assert skip_policy.view(view, 1) is view
-    assert skip_policy.hr_due(10_000, work_log)
     assert not skip_policy.settled(loss_rows(*[1.0] * 20_000), 20_000)
     assert not work_log.entries
 
@@ -49,12 +48,6 @@ def test_photos_that_sr_does_not_enlarge_keep_their_reference_and_are_rendered_a
     assert skip_policy.view(same, 1) is same
     assert skip_policy.lr_due(same, True, work_log)
     assert not work_log.entries
-
-
-def test_hr_takes_part_in_every_nth_iteration_and_the_ledger_says_why_not_in_the_others():
-    skip_policy, work_log = SkipPolicy(Skips(hr_every=3, hr_every_from=6)), WorkLog()
-    assert [t for t in range(1, 16) if skip_policy.hr_due(t, work_log)] == [1, 2, 3, 4, 5, 6, 9, 12, 15]
-    assert sum(work_log.entries["HR scale"].skipped.values()) == 6
 
 
 @pytest.mark.parametrize(("now", "ends"), [(0.99, True), (0.97, False), (1.10, True)])
@@ -86,7 +79,7 @@ def test_the_loss_that_tells_a_plateau_is_of_every_gaussian(peak):
 
 def test_every_milestone_stretches_with_the_run():
     short = scaled(Skips(coarse_until=3_000), 0.1)
-    assert (short.coarse_until, short.hr_every_from, short.plateau_window, short.plateau_to) == (300, 500, 50, 800)
+    assert (short.coarse_until, short.plateau_from, short.plateau_window, short.plateau_to) == (300, 500, 50, 800)
 
 
 def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
@@ -100,10 +93,9 @@ def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
     assert sum(state.conductor.work_log.entries["iterations"].skipped.values()) == 9
 
 
-@pytest.mark.parametrize("skips", [Skips(coarse_until=12), Skips(hr_every=2, hr_every_from=3)])
-def test_every_skip_trains(skips):
+def test_a_coarse_start_trains():
     state = start(("gco", "p2g", "svs"))
-    state.skip_policy = SkipPolicy(skips)
+    state.skip_policy = SkipPolicy(Skips(coarse_until=12))
     for _ in range(ITERATIONS):
         iterate(state, toy.RASTERIZER)
     assert all(bool(p.isfinite().all()) for p in state.field.raw().values())

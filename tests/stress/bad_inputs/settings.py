@@ -57,7 +57,6 @@ _REFUSED: dict[str, str] = {
     "optim.rows=some": "all",
     "optim.means.initial=0": r"\(0, 100\]",
     "optim.means.initial=1e30": r"\(0, 100\]",
-    "skips.hr_every=0": "at least 1",
     "decorators.back_projected.rounds=0": "at least 1",
     "decorators.back_projected.rounds=1000000000000": "at most 100",
     "strategies.pseudo_views.every=0": "at least 1",
