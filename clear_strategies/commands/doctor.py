@@ -119,8 +119,6 @@ def _is_installed(module: str) -> bool:
 
 def _programs() -> Iterator[tuple[str, str]]:
     yield "compiler", shutil.which("c++") or "none: the C++ kernels are compiled at install only where there is one"
-    node = shutil.which("splat-transform") or shutil.which("npx")
-    yield "splat-transform", node or "neither it nor npx: export --to html needs Node.js 20 or later"
     brought = _is_installed("imageio_ffmpeg")
     yield "ffmpeg", "imageio-ffmpeg brings it" if brought else "none: videos need it: pip install imageio-ffmpeg"
 

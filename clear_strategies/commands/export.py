@@ -29,8 +29,7 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
     from clear_strategies.jobs.saved import open_splat
-    from clear_strategies.outputs.formats import Start, gaussians_of, write_format
-    from clear_strategies.viewing import paths
+    from clear_strategies.outputs.formats import gaussians_of, write_format
 
     splat = open_splat(options.run, options.rasterizer)
     g = gaussians_of(splat.painter.field)
@@ -38,7 +37,5 @@ def main(arguments: Sequence[str]) -> None:
     out = options.out or splat.folder / f"{splat.name}.{options.to}"
     if out.suffix != f".{options.to}":
         raise SettingError(f"--out: must end in .{options.to}, got {out.name}.")
-    poses = splat.poses()
-    background = splat.cameras[0].background if splat.cameras else (0.0, 0.0, 0.0)
-    write_format(out, g, options.to, Start(poses[0], paths.look_at(poses), background))
+    write_format(out, g, options.to)
     _log.info("%s: %s Gaussians, %.1f MB", out, f"{len(g):,}", out.stat().st_size / 1e6)

@@ -10,5 +10,4 @@ FORMATS: Final = {
     "glb": "binary glTF with Khronos' KHR_gaussian_splatting: nothing is lost; points for viewers without the extension",
     "spz": "Niantic's, version 4: a tenth of the PLY, the strong view-dependent colour included",
     "sog": "PlayCanvas's: a fifth of the PLY, view-dependent colour included; slow for large splats",
-    "html": "a page with PlayCanvas's viewer and a sog in it: no server, no network; needs Node.js",
 }

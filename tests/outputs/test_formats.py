@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shutil
 import struct
 import subprocess
@@ -162,16 +161,6 @@ def test_another_program_reads_what_is_written(run, tmp_path, form):
     np.testing.assert_allclose(opacity, exact.opacities.numpy()[order], atol=0.02)
 
 
-@by_another_program
-def test_a_page_needs_no_network_and_begins_at_a_camera(run, tmp_path):
-    folder, _ = run
-    export.main([str(folder), "--to", "html", "--out", str(tmp_path / "a.html")])
-    text = (tmp_path / "a.html").read_text()
-    assert not re.search(r"(?:src|href)=[\"']https?://", text)
-    x, y, z = saved_run.SCENE.train[0].hr.camera.center.tolist()
-    assert json.dumps([-x, -y, z])[1:12] in text
-
-
 @pytest.mark.parametrize(("form", "back"), [("spz", packed.turned), ("sog", lambda g: g)])
 def test_a_packed_file_holds_the_splats_of_the_ply(run, tmp_path, form, back):
     """Read by the library that wrote it; SPZ's y points up."""
@@ -206,22 +195,6 @@ def test_a_format_without_its_library_names_the_remedy(run, monkeypatch, form):
     monkeypatch.setitem(sys.modules, "gaussforge", None)
     with pytest.raises(SettingError, match=r"pip install 'clear-strategies\[export\]', or choose --to ply"):
         export.main([str(run[0]), "--to", form])
-
-
-def test_a_page_without_its_program_names_the_remedy(run, monkeypatch):
-    monkeypatch.setattr(formats.shutil, "which", lambda _: None)
-    with pytest.raises(SettingError, match=r"Node\.js 20 or later: install Node\.js from nodejs\.org, or take"):
-        export.main([str(run[0]), "--to", "html"])
-
-
-def test_a_program_that_fails_leaves_no_file_and_is_quoted(run, tmp_path, monkeypatch):
-    broken = tmp_path / "splat-transform"
-    broken.write_text("#!/bin/sh\necho it broke >&2\nexit 1\n")
-    broken.chmod(0o755)
-    monkeypatch.setattr(formats.shutil, "which", lambda _: str(broken))
-    with pytest.raises(SettingError, match="splat-transform failed: it broke"):
-        export.main([str(run[0]), "--to", "html", "--out", str(tmp_path / "a.html")])
-    assert not (tmp_path / "a.html").exists()
 
 
 @pytest.mark.parametrize(
