@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
@@ -38,7 +38,7 @@ from rasterizers.warp_runtime import require_warp
 
 _log = logging.getLogger(__name__)
 
-FusedMode = Literal["auto", "every_row", "off"]
+FusedMode = Literal["auto", "off"]
 
 GaussianPass = Callable[..., kernel.GaussianStep]
 """`gaussian_step.cpp.CppGaussianStep`, or another class of its signature."""
@@ -52,7 +52,7 @@ def compiled_step_for(conductor: Conductor, optimizer: Adam, mode: FusedMode = "
     """The compiled step for this conductor and optimizer; None, and a log line with the reason, where there is none."""
     reason = next(_why_not(conductor, optimizer, mode), None)
     if reason is None:
-        return CompiledStep(conductor, optimizer, skips=mode == "auto")
+        return CompiledStep(conductor, optimizer)
     _log.debug("The per-Gaussian step takes the readable path: %s.", reason)
     return None
 
@@ -100,7 +100,6 @@ class Factors:
     gradients: SplatGradients
     k: int
     activation: Activation
-    visible: Bool[Tensor, " N"]
 
     @property
     def screen(self) -> Float[Tensor, "N 2"]:
@@ -116,9 +115,10 @@ class CompiledStep:
     """A `Stepper`: merges as `Conductor.merge` does, steps as `Adam.step` does, and constrains the parameters.
 
     A row stays as it is where its gradient, both moments and the anchor's pull are 0, and so do bands of the spherical
-    harmonics above the active degree. With `skips` False every row is visited; the result has the same bits.
+    harmonics above the active degree.
 
     Args:
+        skips: for tests: False visits every row. The result has the same bits.
         passes: what computes; None: what runs on the device of the optimizer's moments.
 
     Raises:
@@ -140,7 +140,7 @@ class CompiledStep:
 
     def vjp(self, shot: FieldShot, cotangents: Float[Tensor, "K H W 3"]) -> list[Factors]:
         g = shot.gradients(cotangents)
-        return [Factors(g, k, shot.activation, shot.visible) for k in range(len(cotangents))]
+        return [Factors(g, k, shot.activation) for k in range(len(cotangents))]
 
     def step(
         self, params: Mapping[str, Tensor], g_lr: Factors, hr: HrGradients[Factors] | None, t: int
@@ -205,14 +205,11 @@ class CompiledStep:
             )
             for name, p in params.items()
         }  # fmt: skip
-        visible = None
-        if merged is None and self.optimizer.rates.rows == "visible":
-            visible = (g_lr.visible if hr is None else g_lr.visible | hr.base.visible).contiguous().view(torch.uint8)
         skips = self.skips and merged is None and self.optimizer.rates.eps > 0  # 0 / (√0 + 0) moves everything
         shN, active = params["shN"], g_lr.gradients.basis.shape[1] - 1
         bands = active if skips and self._above_is_quiet(shN, active, anchor.targets.get("shN")) else shN.shape[1]
         q = None if e is None else e.reliability.float().contiguous()
-        settings = kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, visible, skips, 3 * bands)
+        settings = kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, skips, 3 * bands)
         stepped = gaussians.step(attributes, rule, q, settings)
         if rule is not None and compared is not None:
             rule.report(_reports(rule, compared, stepped), e)
@@ -248,12 +245,8 @@ class CompiledStep:
 
     def _note_skips(self, stepped: kernel.StepCounts, bands: int, all_bands: int) -> None:
         skip = self.conductor.work_log.skip
-        for reason, rows in (
-            ("gradient, moments and anchor's pull are 0", stepped.still),
-            ("not visible (optim.rows=visible)", stepped.invisible),
-        ):
-            if isinstance(rows, Tensor) or rows:  # a number on the device is not read here
-                skip("optimizer rows", reason, rows)
+        if isinstance(stepped.still, Tensor) or stepped.still:  # a number on the device is not read here
+            skip("optimizer rows", "gradient, moments and anchor's pull are 0", stepped.still)
         if bands < all_bands:
             skip("SH bands in the optimizer", "above the active degree", all_bands - bands)
 

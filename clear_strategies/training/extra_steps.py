@@ -34,7 +34,7 @@ def extra_steps(s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[Ext
             else:
                 (grads,) = shot.vjp(losses.cotangents)
                 require_finite(where, grads)
-                s.optimizer.step(θ.raw(), grads, shot.visible)
+                s.optimizer.step(θ.raw(), grads)
                 θ.constrain()
             s.optimizer.steps = steps  # the learning rates follow the iteration
             row[LOSS] = losses.values["lr"]

@@ -11,7 +11,6 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from clear_strategies.core import deferred, images
@@ -47,7 +46,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     u = ask.update(θ.raw(), lr, hr, view, t, s.compiled_step)
     if u.grads is not None:  # else the compiled step has made the step
         with stage("optimizer"):
-            s.optimizer.step(θ.raw(), u.grads, torch.stack([shot.visible for shot in drawn]).any(0))
+            s.optimizer.step(θ.raw(), u.grads)
             θ.constrain()
     extra = extra_steps(s, before_color, ask.extra_views(t))
     ask.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS

@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from clear_strategies.core.checks import require_choice, require_number, require_whole
+from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.gradients import ATTRIBUTES
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import LARGEST_RATE, LogLinear
@@ -35,7 +35,6 @@ class LearningRates:
         geometry_steps: the iterations that the rates of means, scales and quats are for. In a run of T < geometry_steps
             these are (geometry_steps / T)^(1/3) times as high, see `of_run`; 0: as they stand in a run of any length.
         eps: Adam's. Gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
-        rows: "all", or only the rows "visible" in this step (faster but not exact: the others' momentum waits).
 
     Raises:
         SettingError: a setting is outside its range.
@@ -52,7 +51,6 @@ class LearningRates:
     detail_decay: float = DetailRates().decay
     geometry_steps: int = 30_000
     eps: float = 1e-15
-    rows: Literal["all", "visible"] = "all"
 
     def __post_init__(self) -> None:
         for name in ("quats", "scales", "opacities", "sh0", "shN"):
@@ -60,7 +58,6 @@ class LearningRates:
         require_number("eps", self.eps, below=1)
         require_whole("geometry_steps", self.geometry_steps, least=0)
         self.of_detail  # noqa: B018 - its ranges are checked here
-        require_choice("rows", self.rows, ("all", "visible"))
 
     @property
     def of_detail(self) -> DetailRates:
@@ -105,17 +102,13 @@ class Adam:
         self.first = {name: torch.zeros_like(p) for name, p in params.items()}
         self.second = {name: torch.zeros_like(p) for name, p in params.items()}
 
-    def step(
-        self, params: Mapping[str, Tensor], grads: Mapping[str, Tensor], visible: Bool[Tensor, " N"] | None = None
-    ) -> None:
+    def step(self, params: Mapping[str, Tensor], grads: Mapping[str, Tensor]) -> None:
         """One step in place. An attribute without gradient has gradient 0: its momentum still moves it."""
         rates, bias2 = self.advance()
-        rows = visible if self.rates.rows == "visible" else None
         if "detail" in grads and self.rates.detail_decay > 0:
             params["detail"].mul_(1 - self.rates.detail_decay)
         for name, p in params.items():
             m, v, g = self.first[name], self.second[name], grads.get(name)
-            before = None if rows is None else (p.clone(), m.clone(), v.clone())
             m.mul_(BETA1)
             v.mul_(BETA2)
             if g is not None:
@@ -123,10 +116,6 @@ class Adam:
                 v.addcmul_(g, g, value=1 - BETA2)
             denominator = (v / bias2).sqrt_().add_(self.rates.eps)
             p.addcdiv_(m, denominator, value=-rates[name])
-            if rows is not None and before is not None:
-                stepped = rows.view(-1, *[1] * (p.dim() - 1))
-                for now, then in zip((p, m, v), before, strict=True):
-                    torch.where(stepped, now, then, out=now)
 
     def advance(self) -> tuple[dict[str, float], float]:
         """Count a step. Returns each attribute's rate over the bias of the first moment, and the bias of the second."""

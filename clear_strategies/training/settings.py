@@ -27,7 +27,7 @@ class FitSettings:
         memory: MiB that training may take, loading included; None: what is free on this machine. More is refused before the
             first iteration.
         fused: "auto" merges, corrects, anchors and steps in one compiled pass where it can, and skips rows that would
-            not move; "every_row" skips none (the same bits); "off" takes the readable path.
+            not move; "off" takes the readable path.
 
     Raises:
         SettingError: a setting is outside its range.

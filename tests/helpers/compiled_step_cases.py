@@ -37,15 +37,12 @@ class Case:
     hr: SplatGradients
     m: torch.Tensor | float
     e: Evidence | None
-    visible: torch.Tensor
     z: torch.Tensor | None
 
     def factors(self, use: int, hr: str = "both") -> tuple:
         a = self.fields[use]._activate(self.z)
-        lr = Factors(self.lr, 0, a, self.visible)
-        return lr, self._bundle(
-            *(Factors(self.hr, k, a, self.visible) if k < HR_COTANGENTS[hr] else None for k in (0, 1))
-        )
+        lr = Factors(self.lr, 0, a)
+        return lr, self._bundle(*(Factors(self.hr, k, a) if k < HR_COTANGENTS[hr] else None for k in (0, 1)))
 
     def grads(self, use: int, hr: str = "both") -> tuple:
         a = self.fields[use]._activate(self.z)
@@ -100,7 +97,6 @@ def case(n=1000, degree=3, kind="random", seed=0, bands=15, gate=False, evidence
         hr = SplatGradients(
             *(getattr(lr, f).repeat(2, *[1] * (getattr(lr, f).dim() - 1)) * sign for f in ATTRIBUTES), basis
         )
-    visible = torch.ones(n, dtype=torch.bool)
     if kind == "sparse":  # most Gaussians are invisible, some are visible at one scale only
         visible = torch.rand(n, generator=g) < 0.2
         for s, rows in ((lr, visible), (hr, visible & (torch.rand(n, generator=g) < 0.5))):
@@ -114,7 +110,7 @@ def case(n=1000, degree=3, kind="random", seed=0, bands=15, gate=False, evidence
     m = 0.25 + 0.75 * torch.rand(n, generator=g) if evidence else 1.0
     e = Evidence(torch.rand(n, generator=g), torch.rand(n, generator=g)) if evidence else None
     z = (torch.rand(n, generator=g) > 0.2).float() / 0.8 if gate else None
-    return Case(fields, lr, hr, m, e, visible, z)
+    return Case(fields, lr, hr, m, e, z)
 
 
 def conductors(*makers, anchored=None, hf=0.2, λ=ALWAYS) -> tuple[Conductor, Conductor]:

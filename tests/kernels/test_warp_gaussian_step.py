@@ -29,10 +29,10 @@ def warp_step():
 
 
 def started(warp_step) -> tuple[Case, CompiledStep]:
-    """A case with all strategies, still rows, inactive bands and invisible rows."""
+    """A case with all strategies, still rows and inactive bands."""
     c = case(1000, degree=2, kind="sparse")
     _, conductor = conductors(GCO, P2G, SVS, anchored=c.fields[0])
-    adam = Adam(c.fields[1].raw(), LearningRates(detail_decay=0.1, rows="visible"), 1.0)
+    adam = Adam(c.fields[1].raw(), LearningRates(detail_decay=0.1), 1.0)
     return c, CompiledStep(conductor, adam, passes=warp_step.WarpGaussianStep)
 
 

@@ -52,7 +52,7 @@ class Lifecycle(RuleBasedStateMachine):
     def teardown(self) -> None:
         shutil.rmtree(self.folder)
 
-    @initialize(names=st.sampled_from(SUBSETS), fused=st.sampled_from(["auto", "every_row", "off"]))
+    @initialize(names=st.sampled_from(SUBSETS), fused=st.sampled_from(["auto", "off"]))
     def begin(self, names, fused) -> None:
         self.names, self.fused = names, fused
         self.state = self._fresh()

@@ -170,13 +170,11 @@ def test_splatsure_reads_nothing_either(no_data, monkeypatch):
     steadily(state)
 
 
-@pytest.mark.parametrize("change", ["visible rows", "clamped", "low from high"])
+@pytest.mark.parametrize("change", ["clamped", "low from high"])
 def test_other_settings_read_nothing_either(change, no_data, monkeypatch):
     state = on_meta(monkeypatch, ("gco", "p2g", "svs"))
     objective = state.conductor.objective
-    if change == "visible rows":
-        state.optimizer.rates = replace(state.optimizer.rates, rows="visible")
-    elif change == "clamped":
+    if change == "clamped":
         state.conductor.objective = replace(objective, clamp_render=True)
     else:
         state.conductor.objective = replace(objective, lr_from="hr", lambda_lr=0.6)

@@ -206,17 +206,6 @@ def test_a_short_run_moves_the_geometry_faster_and_nothing_else():
         LearningRates(geometry_steps=-1)
 
 
-def test_visible_rows_only_leaves_the_others_where_they_are():
-    field, _, _ = tagged()
-    params = field.raw()
-    adam = Adam(params, LearningRates(rows="visible"), extent=1.0)
-    before = params["means"].clone()
-    seen = torch.arange(12) < 5
-    adam.step(params, {name: torch.ones_like(value) for name, value in params.items()}, seen)
-    assert torch.equal(params["means"][5:], before[5:])
-    assert (params["means"][:5] != before[:5]).all()
-
-
 def test_the_3d_filter_by_hand_and_unseen_gaussians_take_the_largest():
     camera = toy.camera(0.0)
     means = torch.tensor([[0.0, 0, 0], [0, 0, 4], [0, 0, -100]])  # depths 4, 8, behind

@@ -62,7 +62,6 @@ class StepSettings:
 
     Args:
         bias2: bias of Adam's second moment.
-        visible: rows that may step, None: all.
         skips: skip rows that would not change.
         width: numbers of an shN row that are stepped, at least those of the active bands.
     """
@@ -72,7 +71,6 @@ class StepSettings:
     bias2: float
     eps: float
     lambda_hr: float
-    visible: Tensor | None
     skips: bool
     width: int
 
@@ -84,14 +82,12 @@ class StepCounts:
     Args:
         corrected, omega, at_lower_bound: by conflict group, rows corrected, Σ ω, and rows with ω at its lower bound.
         still: rows that were skipped because they would not change.
-        invisible: rows that took no step because they are not visible.
     """
 
     corrected: Sequence[int] | Int[Tensor, " 6"]
     omega: Sequence[float] | Float[Tensor, " 6"]
     at_lower_bound: Sequence[int] | Int[Tensor, " 6"]
     still: int | Int[Tensor, ""]
-    invisible: int | Int[Tensor, ""]
 
 
 class GaussianStep(Protocol):

@@ -38,9 +38,8 @@ struct Adam {
     m = multiply_add(g, s.gain1, m * Floats(s.beta1));
     v = multiply_add(g * Floats(s.gain2), g, v * Floats(s.beta2));
     Floats denominator = root(v * Floats(s.per_bias2)) + Floats(s.eps);
-    p = at_rest(a) + m * Floats(a.rate) / denominator;
+    p = p * Floats(a.keep) + m * Floats(a.rate) / denominator;
   }
-  CLEAR_INLINE Floats at_rest(const Attribute& a) const { return p * Floats(a.keep); }
 };
 
 // g + ∇ λ_stab ‖θ - θ^a‖²_W
@@ -48,25 +47,19 @@ CLEAR_INLINE Floats with_anchor(const Attribute& a, const Floats& g, const Float
   return g + (p - anchor) * Floats(a.stiffness);  // Eq. 16
 }
 
-// Steps sixteen numbers. Those with `moves` = 0 (null: none) only decay and are clamped to the limit.
+// Steps sixteen numbers, and clamps them to the limit.
 CLEAR_INLINE void step_sixteen(const AdamStep& s, const Attribute& a, float* p, float* m, float* v, const float* anchor,
-                               const float* g_in, const float* moves) {
+                               const float* g_in) {
   Adam x{Floats::load(p), Floats::load(m), Floats::load(v)};
   Floats g = Floats::load(g_in);
   if (anchor) g = with_anchor(a, g, x.p, Floats::load(anchor));
-  Adam y = x;
-  y.step(s, a, g);
-  if (moves) {
-    auto mask = Floats::load(moves) > Floats(0.0f);
-    y = {select(mask, y.p, x.at_rest(a)), select(mask, y.m, x.m), select(mask, y.v, x.v)};
-  }
-  clamp_keeping_nan(y.p, a.limit).store(p);
-  y.m.store(m), y.v.store(v);
+  x.step(s, a, g);
+  clamp_keeping_nan(x.p, a.limit).store(p);
+  x.m.store(m), x.v.store(v);
 }
 
 // Steps `count` numbers from `offset` on.
-inline void step_numbers(const AdamStep& s, const Attribute& a, std::int64_t offset, int count, const float* g,
-                         const float* moves) {
+inline void step_numbers(const AdamStep& s, const Attribute& a, std::int64_t offset, int count, const float* g) {
   if (a.merged) {
     for (int j = 0; j < count; ++j) {
       float from_anchor = a.anchor ? (a.p[offset + j] - a.anchor[offset + j]) * a.stiffness : 0.0f;
@@ -78,15 +71,14 @@ inline void step_numbers(const AdamStep& s, const Attribute& a, std::int64_t off
   const float* anchor = a.anchor ? a.anchor + offset : nullptr;
   int j = 0;
   for (; j + kLanes <= count; j += kLanes)
-    step_sixteen(s, a, p + j, m + j, v + j, anchor ? anchor + j : nullptr, g + j, moves ? moves + j : nullptr);
+    step_sixteen(s, a, p + j, m + j, v + j, anchor ? anchor + j : nullptr, g + j);
   if (j == count) return;
-  float last[5][kLanes] = {}, moving[kLanes] = {};  // the rest of the last rows
+  float last[5][kLanes] = {};  // the rest of the last rows
   std::size_t bytes = sizeof(float) * (count - j);
   std::memcpy(last[0], p + j, bytes), std::memcpy(last[1], m + j, bytes), std::memcpy(last[2], v + j, bytes);
   std::memcpy(last[4], g + j, bytes);
   if (anchor) std::memcpy(last[3], anchor + j, bytes);
-  if (moves) std::memcpy(moving, moves + j, bytes);
-  step_sixteen(s, a, last[0], last[1], last[2], anchor ? last[3] : nullptr, last[4], moves ? moving : nullptr);
+  step_sixteen(s, a, last[0], last[1], last[2], anchor ? last[3] : nullptr, last[4]);
   std::memcpy(p + j, last[0], bytes), std::memcpy(m + j, last[1], bytes), std::memcpy(v + j, last[2], bytes);
 }
 

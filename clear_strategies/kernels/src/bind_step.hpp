@@ -25,7 +25,7 @@ class Tensors {
     if (value.is_none() && optional) return nullptr;
     nb::ndarray<T, nb::c_contig, nb::device::cpu> array;
     if (!nb::try_cast(value, array, false))
-      throw nb::type_error((std::string(name) + " must be a contiguous " + type_name<T>() + " tensor in the CPU's memory").c_str());
+      throw nb::type_error((std::string(name) + " must be a contiguous float32 tensor in the CPU's memory").c_str());
     bool fits = array.ndim() >= 1 && std::int64_t(array.shape(0)) == n && std::int64_t(array.size()) == n * width;
     if (!fits) {
       std::string found;
@@ -39,12 +39,6 @@ class Tensors {
   }
 
  private:
-  template <class T>
-  static const char* type_name() {
-    if constexpr (sizeof(T) == 8) return "float64";
-    else if constexpr (sizeof(T) == 1) return "uint8";
-    else return "float32";
-  }
   std::vector<nb::object> kept_;
 };
 
@@ -78,7 +72,7 @@ class GaussianStep {
   }
 
   // Steps `attributes` {name: {p, m, v, anchor, merged, width, stiffness, rate, keep, limit}} in place.
-  // Returns (corrected rows, Σ ω, rows with ω at its lower bound) by group, still rows and invisible rows.
+  // Returns (corrected rows, Σ ω, rows with ω at its lower bound) by group, and still rows.
   nb::tuple step(nb::dict attributes, nb::object correction, nb::dict settings, int threads) const {
     Tensors tensors;
     Step s;
@@ -91,7 +85,6 @@ class GaussianStep {
     double beta1 = number("beta1"), beta2 = number("beta2");
     s.adam = {float(beta1), float(beta2), float(1 - beta1), float(1 - beta2), float(1 / number("bias2")), float(number("eps"))};
     s.lambda_hr = float(number("lambda_hr"));
-    s.visible = reinterpret_cast<const bool*>(tensors.rows<const std::uint8_t>(settings, "visible", g_.n, 1, true));
     s.skips = nb::cast<bool>(settings["skips"]);
     s.width = nb::cast<int>(settings["width"]);
     if (s.width % 3 || s.width < 3 * (g_.bases - 1) || s.width > s.shN.width || s.width > 45)
@@ -108,7 +101,7 @@ class GaussianStep {
       done = clear::step(g_, corrects ? &c : nullptr, s, threads);
     }
     return nb::make_tuple(list(done.corrected.rows), list(done.corrected.omega), list(done.corrected.at_lower_bound),
-                          done.still, done.invisible);
+                          done.still);
   }
 
  private:

@@ -104,23 +104,18 @@ class ChunkStep {
     load(g, i, count, b);
     std::uint32_t rows = first_bits(count);
     std::uint32_t still = s.skips ? still_rows(b, i, rows) : 0;
-    std::uint32_t invisible = 0;
-    if (s.visible)
-      for (int k = 0; k < count; ++k) invisible |= std::uint32_t(!s.visible[i + k]) << k;
-    done.invisible += __builtin_popcount(invisible);
-    done.still += __builtin_popcount(still & ~invisible);
-    std::uint32_t moving = rows & ~(still | invisible);
+    done.still += __builtin_popcount(still);
+    std::uint32_t moving = rows & ~still;
 
     double shN_multiple[kLanes] = {};
     if (correction) correct(b, i, count, shN_multiple, tally);
-    if (moving) {
-      std::uint32_t visible = rows & ~invisible;  // still rows among them may step, which leaves them unchanged
-      step_columns(s.means, b.lr.means, b.hr.means, i, count, visible);
-      step_columns(s.quats, b.lr.quats, b.hr.quats, i, count, visible);
-      step_columns(s.scales, b.lr.scales, b.hr.scales, i, count, visible);
-      step_columns(s.opacities, b.lr.opacities, b.hr.opacities, i, count, visible);
-      step_columns(s.sh0, b.lr.sh0, b.hr.sh0, i, count, visible);
-      step_detail(b, i, count, visible);
+    if (moving) {  // still rows beside a moving one step too, which leaves them unchanged
+      step_columns(s.means, b.lr.means, b.hr.means, i, count);
+      step_columns(s.quats, b.lr.quats, b.hr.quats, i, count);
+      step_columns(s.scales, b.lr.scales, b.hr.scales, i, count);
+      step_columns(s.opacities, b.lr.opacities, b.hr.opacities, i, count);
+      step_columns(s.sh0, b.lr.sh0, b.hr.sh0, i, count);
+      step_detail(b, i, count);
       step_rows(b, i, count, moving, shN_multiple);
     }
     if (moving) return;
@@ -161,25 +156,21 @@ class ChunkStep {
   }
 
   template <int D>
-  CLEAR_INLINE void step_columns(const Attribute& a, const Floats (&l)[D], const Floats (&h)[D], std::int64_t i, int count,
-                                 std::uint32_t moving) const {
+  CLEAR_INLINE void step_columns(const Attribute& a, const Floats (&l)[D], const Floats (&h)[D], std::int64_t i, int count) const {
     Floats merged[D];
     for (int d = 0; d < D; ++d) merged[d] = g.base ? l[d] + h[d] * Floats(s.lambda_hr) : l[d];  // Eq. 8
-    float numbers[D * kLanes], moves[D * kLanes];
+    float numbers[D * kLanes];
     join_rows(numbers, merged);
-    bool all = moving == first_bits(count);
-    if (!all)
-      for (int k = 0; k < D * kLanes; ++k) moves[k] = float(moving >> (k / D) & 1);
-    step_numbers(s.adam, a, D * i, D * count, numbers, all ? nullptr : moves);
+    step_numbers(s.adam, a, D * i, D * count, numbers);
     fetch_next(a, i, i + kLanes);
   }
 
   // f_det gets only the routed gradient of L_HF, uncorrected.
-  void step_detail(const Block& b, std::int64_t i, int count, std::uint32_t moving) const {
+  void step_detail(const Block& b, std::int64_t i, int count) const {
     Floats none[3] = {0.0f, 0.0f, 0.0f}, routed[3] = {0.0f, 0.0f, 0.0f};
     if (g.hf)
       for (int d = 0; d < 3; ++d) routed[d] = b.hf.rgb[d] * b.m * Floats(g.lambda_hf);
-    step_columns(s.detail, none, routed, i, count, moving);
+    step_columns(s.detail, none, routed, i, count);
   }
 
   void step_rows(const Block& b, std::int64_t i, int count, std::uint32_t moving, const double (&correction)[kLanes]) const {
@@ -206,7 +197,7 @@ class ChunkStep {
     if (a.merged || a.width < kLanes) {
       float numbers[3 * kLanes];
       for (int v = 0; v < plan.sixteens; ++v) gradient[v].store(numbers + plan.offset[v]);
-      step_numbers(s.adam, a, at, plan.width, numbers, nullptr);
+      step_numbers(s.adam, a, at, plan.width, numbers);
     } else if (plan.sixteens == 3) {
       step_sixteens<3>(at, gradient);
     } else if (plan.sixteens == 2) {
@@ -282,7 +273,7 @@ Stepped step(const Gradients& g, const Correction* correction, const Step& s, in
   Stepped total;
   for (const Stepped& part : parts) {
     total.corrected.add(part.corrected);
-    total.still += part.still, total.invisible += part.invisible;
+    total.still += part.still;
   }
   return total;
 }

@@ -14,14 +14,13 @@ struct Step {
   Attribute means, quats, scales, opacities, sh0, shN, detail;
   AdamStep adam;
   float lambda_hr;
-  const bool* visible = nullptr;  // rows that may step; null: all
-  bool skips = true;              // skip rows that would not change
-  int width = 0;                  // numbers of an shN row that are stepped, a multiple of 3: the active bands', or all
+  bool skips = true;  // skip rows that would not change
+  int width = 0;      // numbers of an shN row that are stepped, a multiple of 3: the active bands', or all
 };
 
 struct Stepped {
   Corrected corrected;
-  std::int64_t still = 0, invisible = 0;  // rows that took no step, and why
+  std::int64_t still = 0;  // rows that were skipped, because they would not change
 };
 
 // Counts comparable and opposed Gaussians by group.

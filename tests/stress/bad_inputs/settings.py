@@ -54,7 +54,6 @@ _REFUSED: dict[str, str] = {
     "optim.eps=1": r"\[0, 1\)",
     "optim.eps=-1e-15": r"\[0, 1\)",
     "optim.detail_decay=1": r"\[0, 1\)",
-    "optim.rows=some": "all",
     "optim.means.initial=0": r"\(0, 100\]",
     "optim.means.initial=1e30": r"\(0, 100\]",
     "decorators.back_projected.rounds=0": "at least 1",

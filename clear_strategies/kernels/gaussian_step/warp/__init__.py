@@ -89,8 +89,6 @@ class WarpGaussianStep:
                 "width must be a multiple of 3 between the active bands' numbers and an shN row's, got "
                 f"{settings.width} beside {3 * (self._bases - 1)} and {bands.width}."
             )
-        if settings.visible is not None:
-            self._required("visible", settings.visible, (self._n,), torch.uint8)
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
         counts, omegas = self._blocks(passes.Counts, torch.int32), self._blocks(conflict.Six, torch.float64)
@@ -98,7 +96,7 @@ class WarpGaussianStep:
         with on_stream(self._like.device):
             self._launch_tiled(
                 passes.step, *self._gradients, self._rule(rule, q), array(q), _options(rule is not None, settings),
-                adam_step, *parameters.values(), bands, array(settings.visible), array(colours), array(moving),
+                adam_step, *parameters.values(), bands, array(colours), array(moving),
                 array(counts, passes.Counts), array(omegas, conflict.Six),
             )  # fmt: skip
             wp.launch(
@@ -108,11 +106,8 @@ class WarpGaussianStep:
                     array(moving), adam_step, bands,
                 ],
             )  # fmt: skip
-        corrected, at_lower_bound, (still, invisible) = torch.split(counts.sum(0), [_GROUPS, _GROUPS, 2])
-        return StepCounts(
-            corrected, omegas.sum(0), at_lower_bound,
-            still if settings.skips else 0, 0 if settings.visible is None else invisible,
-        )  # fmt: skip
+        corrected, at_lower_bound, (still, _) = torch.split(counts.sum(0), [_GROUPS, _GROUPS, 2])
+        return StepCounts(corrected, omegas.sum(0), at_lower_bound, still if settings.skips else 0)
 
     @property
     def _lanes(self) -> int:
@@ -192,7 +187,7 @@ def _structure(owner: str, kind: Any, fields: tuple[tuple[str, int, int], ...], 
 def _options(corrects: bool, settings: StepSettings) -> Any:
     out = passes.StepOptions()
     out.lambda_hr, out.skips, out.width = settings.lambda_hr, settings.skips, settings.width
-    out.corrects, out.has_visible = corrects, settings.visible is not None
+    out.corrects = corrects
     return out
 
 

@@ -40,7 +40,7 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 
 Counts: Final[Any] = wp.types.vector(length=14, dtype=wp.int32)
 """For `compare`: comparable and opposed Gaussians, [7] each. For `step`: rows corrected, and with ω at its lower bound, [6]
-each; then still and invisible rows.
+each; then still rows.
 """
 
 
@@ -51,7 +51,6 @@ class StepOptions:
     lambda_hr: wp.float32
     corrects: wp.bool
     skips: wp.bool  # skip rows that would not change
-    has_visible: wp.bool  # only visible rows may step
     width: wp.int32  # numbers of an shN row that are stepped
 
 
@@ -93,7 +92,6 @@ def step(
     sh0: Attribute,
     detail: Attribute,
     shN: Attribute,
-    visible: wp.array[wp.uint8],
     colours: wp.array3d[wp.float32],
     moving: wp.array[wp.bool],
     counts: wp.array[Counts],
@@ -107,7 +105,6 @@ def step(
     at = block * wp.block_dim() + lane
     i = wp.min(at, view.n - 1)  # lanes beyond the last Gaussian neither count nor write
     g_lr, g_hr, g_hf = load(activation, lr, base, hf, view, i)
-    may_step = not options.has_visible or visible[i] != wp.uint8(0)
     still = options.skips and size(g_lr) + size(g_hr) + size(g_hf) <= 0.0
     still = still and is_still(means, i, 3) and is_still(quats, i, 4) and is_still(scales, i, 3)
     still = still and is_still(opacities, i, 1) and is_still(sh0, i, 3) and is_still(detail, i, 3)
@@ -117,7 +114,7 @@ def step(
         products = group_products(g_lr, g_hr, lr, base, view, i)
         change = correct(products, rule, reliability, i)
 
-    moves, λ = may_step and not still, options.lambda_hr
+    moves, λ = not still, options.lambda_hr
     d_means = merged3(g_lr.means, g_hr.means, change.multiple[MEANS], λ)
     d_quats = merged4(g_lr.quats, g_hr.quats, change.multiple[QUATS], λ)
     d_scales = merged3(g_lr.scales, g_hr.scales, change.multiple[SCALES], λ)
@@ -135,10 +132,8 @@ def step(
         for k in range(GROUPS):
             found[k] = (change.rows >> k) & 1
             found[GROUPS + k] = (change.at_lower_bound >> k) & 1
-        if not may_step:
-            found[13] = 1
-        elif still:
-            found[12] = 1
+        if still:
+            found[2 * GROUPS] = 1
     wp.tile_store(counts, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(block,))
     wp.tile_store(omegas, wp.tile_sum(wp.tile(omega, preserve_type=True)), offset=(block,))
     if at >= view.n:
