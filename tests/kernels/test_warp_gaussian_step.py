@@ -13,6 +13,7 @@ from clear_strategies.training.compiled_step import CompiledStep, compiled_step_
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.interface import BackendUnavailable
 from rasterizers.warp_runtime import require_warp
+from tests.helpers import toy
 from tests.helpers.compiled_step_cases import Case, T, as_floats, case, conductors
 
 
@@ -29,9 +30,10 @@ def warp_step():
 
 
 def started(warp_step) -> tuple[Case, CompiledStep]:
-    """A case with all strategies, still rows and inactive bands."""
+    """A case with all strategies, an anchor that pulls from the second step on, still rows and inactive bands."""
     c = case(1000, degree=2, kind="sparse")
-    _, conductor = conductors(GCO, P2G, SVS, anchored=c.fields[0])
+    _, conductor = conductors(GCO, P2G, SVS)
+    conductor.after_step(c.fields[1].raw(), toy.step(conductor.strategies[2].anchor_start))
     adam = Adam(c.fields[1].raw(), LearningRates(detail_decay=0.1), 1.0)
     return c, CompiledStep(conductor, adam, passes=warp_step.WarpGaussianStep)
 
