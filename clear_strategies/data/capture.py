@@ -153,10 +153,10 @@ def lens_notes(lenses: Sequence[Lens], frames: Sequence[Frame]) -> dict[str, str
 
 def _turned_as(path: Path, lens: Lens) -> bool | None:
     """As `read_image` takes it, for a photo whose lens may be that of the stored or of the upright pixels."""
-    stored = image_size(path, turn=False)
-    if lens.width == lens.height or stored == image_size(path, turn=True):
+    if lens.width == lens.height:
         return None
-    return (stored[0] > stored[1]) != (lens.width > lens.height)
+    width, height = stored = image_size(path, turn=False)
+    return None if stored == image_size(path, turn=True) else (width > height) != (lens.width > lens.height)
 
 
 def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None, turn: bool | None) -> Float[Tensor, "H W 3"]:

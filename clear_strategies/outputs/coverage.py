@@ -59,12 +59,12 @@ class Coverage:
 def coverage_of(scene: Scene, painter: Painter) -> Coverage:
     """What the training photos see of the field."""
     field, photos = painter.field, {view.name: view.hr.camera for view in scene.train}
-    small = [at_most(camera, _LONGER_SIDE) for camera in figures.spaced(list(photos.values()), _COMPARED)]
-    seeing = [(camera, painter.depth(camera)) for camera in small]
+    small = {name: at_most(photos[name], _LONGER_SIDE) for name in figures.spaced(list(photos), _COMPARED)}
+    seeing = [(camera, painter.depth(camera)) for camera in small.values()]
     solid = field.means.data[field.opacities.data.sigmoid() > _SOLID].cpu()
     points = solid[:: -(-len(solid) // _MOST_POINTS) or 1]
     shares = {}
-    for name, (camera, depth) in zip(figures.spaced(list(photos), _COMPARED), seeing, strict=True):
+    for name, (camera, depth) in zip(small, seeing, strict=True):
         seen = seen_by(camera, depth, seeing)[depth.isfinite()].clamp(max=_ENOUGH)
         shares[name] = [int((seen == n).sum()) / max(1, len(seen)) for n in range(1, _ENOUGH + 1)]
     return Coverage(photos, points, times_seen(points, seeing), shares)

@@ -144,7 +144,7 @@ class WarpGaussianStep:
         out.tolerance, out.weight_min, out.weight_max = rule.tolerance, rule.weight_min, rule.weight_max
         out.rotation_noise, out.has_reliability = ROTATION_NOISE, q is not None
         if q is not None:
-            self._required("reliability", q, (self._n,), torch.float32)
+            self._required("reliability", q, 1)
         return out
 
     def _structure(
@@ -157,19 +157,20 @@ class WarpGaussianStep:
     ) -> Any:
         """A structure of `kind` over tensors of n rows with `widths` numbers each."""
         fields = tuple(
-            (name, self._required(name, tensors[name], (self._n, width), torch.float32).data_ptr(), self._n * width)
+            (name, self._required(name, tensors[name], width).data_ptr(), self._n * width)
             for name, width in widths.items()
             if name not in optional or tensors[name] is not None
         )
         return _structure(owner, kind, fields, str(self._like.device))
 
-    def _required(self, name: str, tensor: Tensor | None, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        device, (rows, width) = self._like.device, (shape[0], math.prod(shape[1:]))
-        if tensor is None or tensor.dtype != dtype or tensor.device != device or not tensor.is_contiguous():
+    def _required(self, name: str, tensor: Tensor | None, width: int) -> Tensor:
+        """The tensor, if it has a row of `width` numbers for each Gaussian."""
+        device = self._like.device
+        if tensor is None or tensor.dtype != torch.float32 or tensor.device != device or not tensor.is_contiguous():
             where = "in the CPU's memory" if device.type == "cpu" else f"on {device}"
-            raise TypeError(f"{name} must be a contiguous {str(dtype).removeprefix('torch.')} tensor {where}.")
-        if tensor.dim() == 0 or tensor.shape[0] != rows or tensor.numel() != rows * width:
-            raise ValueError(f"{name} must have {rows} rows of {width} numbers, got shape {tuple(tensor.shape)}.")
+            raise TypeError(f"{name} must be a contiguous float32 tensor {where}.")
+        if tensor.dim() == 0 or tensor.shape[0] != self._n or tensor.numel() != self._n * width:
+            raise ValueError(f"{name} must have {self._n} rows of {width} numbers, got shape {tuple(tensor.shape)}.")
         return tensor
 
 
