@@ -68,7 +68,7 @@ def stereo(
         masks: one for each photo, [h, w] of its size: 0 or False where the photo hides its pixels, which then give neither
             depth nor points; None among them, or in their place: nothing is hidden.
         settings: of the comparison; None: `StereoSettings()`.
-        fill: add points at interpolated inverse depth where a photo's depth is unknown. Needs SciPy.
+        fill: add points at completed depth where a photo's depth is unknown. Needs SciPy.
         features: (means [N, 3] in world units, colors [N, 3] in [0, 1]) of points that are known already, e.g. COLMAP's.
             They give the range of depth, judge the maps, and are part of the cloud where no map knows depth. None:
             features of the photos are triangulated, which needs OpenCV, kornia and SciPy; without them, the cameras give

@@ -63,7 +63,7 @@ def test_the_cloud_of_the_demo_is_the_trainers_to_the_bit(fill: bool) -> None:
 
 
 def test_means_lie_on_the_plane_and_the_summary_says_how_much_is_known(found: Stereo) -> None:
-    assert ((found.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.95
+    assert ((found.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.9
     assert found.colors.min() >= 0
     assert found.colors.max() <= 1
     shares = ", ".join(f"{depth.coverage:.0%}" for depth in found.depths)

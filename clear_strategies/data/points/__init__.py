@@ -21,7 +21,7 @@ from clear_strategies.errors import DataError
 from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, voxel_grid, without_outliers
 from clear_strategies.geometry.dense_stereo.cloud import stereo_cloud
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.interpolation import STRIDE, densify, pixel_grid
+from clear_strategies.geometry.filling import STRIDE, densify, pixel_grid
 from clear_strategies.geometry.sift import TriangulationSettings, triangulate
 from rasterizers.interface import Color
 
@@ -49,7 +49,7 @@ class CloudSettings:
         path: the PLY file for init=ply.
         min_views: training views that must observe a point, for init=sfm_train.
         enough: the fewest triangulated points that init=auto takes.
-        densify: add points between those found, at interpolated inverse depth, one every `stride` LR px of each view;
+        densify: add points between those found, at completed depth, one every `stride` LR px of each view;
             "auto": if the cloud has fewer points than those grids. With stereo, true and auto add points only where
             there is no depth and no other view looks through them. Random points are never densified.
         stride: see `densify`, LR px.

@@ -13,7 +13,7 @@ from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, without_outliers
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.interpolation import STRIDE, grid_points
+from clear_strategies.geometry.filling import STRIDE, grid_points
 from clear_strategies.geometry.libraries import REMEDY, missing
 from clear_strategies.geometry.projection import back_project, seen_pixels
 from rasterizers.interface import Color
@@ -42,7 +42,7 @@ def stereo_cloud(
         features: points of the surfaces, e.g. triangulated ones; there may be none.
         background: the colour of pixels without a surface.
         masks: of each photo, False where it hides pixels, which are not filled.
-        fill: add a grid of `stride` px at interpolated inverse depth where a photo's depth is unknown.
+        fill: add a grid of `stride` px at completed depth where a photo's depth is unknown.
         outlier_neighbours, outlier_ratio: see `without_outliers`.
     """
     if not any(found.coverage > 0 for found in maps):
@@ -61,12 +61,12 @@ def stereo_cloud(
         _log.warning("no outlier is removed and nothing is filled without %s: %s", lacking, REMEDY)
         return PointCloud(means, colors, f"{source}, neither cleaned nor filled without {lacking}")
     if silent and fill:
-        source += f", {silent} of them interpolated alone"
+        source += f", {silent} of them completed alone"
     cloud = without_outliers(PointCloud(means, colors, source), outlier_neighbours, outlier_ratio)
     if not fill:
         return cloud
     added, shades = grid_points(cloud.means, photos, stride, background, maps, masks)
-    source = f"{source}, filled by {len(added):,} at interpolated inverse depth"
+    source = f"{source}, filled by {len(added):,} at completed depth"
     return PointCloud(torch.cat((cloud.means, added)), torch.cat((cloud.colors, shades)), source)
 
 

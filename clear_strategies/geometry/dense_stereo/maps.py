@@ -17,6 +17,7 @@ from clear_strategies.geometry.dense_stereo.depth import Estimate, estimate
 from clear_strategies.geometry.dense_stereo.image import Grey, grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons
+from clear_strategies.geometry.dense_stereo.speckles import speckles
 from clear_strategies.geometry.projection import is_background, seen_pixels
 from clear_strategies.geometry.sift import features_of
 from rasterizers.interface import Color
@@ -26,6 +27,7 @@ _log = logging.getLogger(__name__)
 _MANY_PHOTOS = 12  # from here on, two others must agree
 _ASKED = 8  # the most photos that are asked to confirm one
 _FEW_POINTS = 10  # triangulated points in a photo below which they do not judge its depth
+_LIKE = 0.05  # relative difference of depth up to which neighbouring pixels show one surface
 _CLOSE = 0.1  # relative error up to which depth agrees with a triangulated point
 
 
@@ -69,6 +71,7 @@ def depth_maps(
         if masks is not None:
             good &= masks[i].to(good.device)
         confidence = mine.correlation.clamp(0, 1) * (agreeing.float() / 2).clamp(max=1)
+        good &= ~speckles(torch.where(good, 1 / inverse_depth, torch.nan), settings.speckle, _LIKE)
         depth = torch.where(good, 1 / inverse_depth, torch.nan)
         found = DepthMap(depth, torch.where(good, confidence, 0.0))
         maps.append(_judged(photo, found, points, settings))

@@ -31,6 +31,7 @@ class StereoSettings:
         tolerance: largest relative difference between the depths that two photos find of one point.
         reprojection: largest distance of a pixel from itself after going to the other photo and back, LR px.
         agreeing: other photos whose depth must agree; None: 2 where there are at least 12 photos, else 1.
+        speckle: fewer connected pixels of similar depth than these are unknown; 0: none are. Needs SciPy.
         spacing: distance of the points on the surface, LR px of the photo that sees them.
         trust: a photo is used whose stereo covers at least this share of its pixels.
 
@@ -50,6 +51,7 @@ class StereoSettings:
     tolerance: float = 0.02
     reprojection: float = 1.5
     agreeing: int | None = None
+    speckle: int = 10
     spacing: float = 1.5
     trust: float = 0.05
 
@@ -58,6 +60,7 @@ class StereoSettings:
             require_whole(name, getattr(self, name), least=least)
         if self.window % 2 == 0:
             refuse("window", "must be odd", self.window, "window=5")
+        require_whole("speckle", self.speckle, least=0)
         if self.agreeing is not None:
             require_whole("agreeing", self.agreeing, least=1)
         for name in ("plane_step", "small_step", "large_step", "tolerance", "reprojection"):

@@ -9,7 +9,7 @@ from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry.dense_stereo.cloud import points_of
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.interpolation import grid_points
+from clear_strategies.geometry.filling import grid_points
 from tests.helpers.planes import photo
 
 

@@ -1,4 +1,4 @@
-"""More points on the same surfaces, at inverse depths interpolated between points that are known."""
+"""More points on the same surfaces, at depths completed from those that are known."""
 
 from __future__ import annotations
 
@@ -11,17 +11,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.geometry.projection import (
-    back_project,
-    inside_of,
-    is_background,
-    project,
-    sample_colors,
-    seen_pixels,
-)
+from clear_strategies.geometry.completion import completed
+from clear_strategies.geometry.projection import back_project, is_background, sample_colors, seen_pixels
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
@@ -29,7 +24,10 @@ _log = logging.getLogger(__name__)
 STRIDE: Final = 2
 """LR px between the points of a grid, by default."""
 
-_FEWEST_SAMPLES: Final = 4  # projected points from which a view's depth is interpolated
+_FEWEST_SAMPLES: Final = 4  # pixels of known depth from which a view's depth is completed
+_OF_POINTS: Final = 0.3  # confidence in a point that projects into a photo, which may hide it; its own depth has 1
+_MAX_PIXELS: Final = 16_000  # a larger photo is reduced first: 0.5 s of CPU time each
+_BEYOND: Final = 2.0  # no depth is completed further than this factor of those that are known
 _NEARER: Final = 0.95  # a point in front of this share of another photo's depth floats in free space
 
 
@@ -39,7 +37,7 @@ def densify(cloud: PointCloud, photos: Sequence[Photo], stride: int, background:
     if len(means) == 0:
         _log.warning("densify added no point.")
         return cloud
-    source = f"{cloud.source}, densified by {len(means):,} at interpolated inverse depth"
+    source = f"{cloud.source}, densified by {len(means):,} at completed depth"
     return replace(
         cloud, means=torch.cat((cloud.means, means)), colors=torch.cat((cloud.colors, colors)), source=source
     )
@@ -53,10 +51,7 @@ def grid_points(
     maps: Sequence[DepthMap] | None = None,
     masks: Sequence[Bool[Tensor, "h w"]] | None = None,
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
-    """(positions, colours): in each photo a point every `stride` pixels, at inverse depth interpolated between `means`.
-
-    Inverse depth is linear on planes. It is interpolated linearly between the projected points; outside their convex
-    hull it is that of the nearest point.
+    """(positions, colours): in each photo a point every `stride` pixels, at depth that is completed from `means` and `maps`.
 
     Args:
         background: pixels of this colour show no surface and get no point.
@@ -78,14 +73,15 @@ def grid_points(
         if background is not None:
             surface = ~is_background(shade, background)
             grid, shade = grid[surface], shade[surface]
-        inverse_depth = _interpolated(means, photo, grid, 2 * stride) if len(grid) else None
+        found = None if maps is None else maps[i]
+        inverse_depth = _completed(means, photo, grid, 2 * stride, found) if len(grid) else None
         if inverse_depth is None:
             continue
         points = back_project(photo.camera, grid, 1 / inverse_depth)
         kept = torch.ones(len(points), dtype=torch.bool)
-        for j, found in enumerate(maps or ()):
+        for j, other in enumerate(maps or ()):
             if j != i:
-                kept &= ~_floats(points, photos[j], found)
+                kept &= ~_floats(points, photos[j], other)
         added.append(points[kept])
         colors.append(shade[kept])
     return torch.cat(added), torch.cat(colors)
@@ -105,30 +101,35 @@ def _floats(points: Float[Tensor, "N 3"], photo: Photo, found: DepthMap) -> Bool
     return inside
 
 
-def _interpolated(
-    means: Float[Tensor, "N 3"], photo: Photo, at: Float[Tensor, "G 2"], cell: int
+def _completed(
+    means: Float[Tensor, "N 3"], photo: Photo, at: Float[Tensor, "G 2"], cell: int, found: DepthMap | None
 ) -> Float[Tensor, " G"] | None:
-    """Inverse depth at these pixels; None where fewer than 4 points project into the photo.
+    """Inverse depth at these pixels, from the photo's own depth and the points; None where fewer than 4 are known.
 
     Occluded points would distort the depth, so only the nearest point per square of `cell` pixels counts.
     """
-    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-    from scipy.spatial import QhullError
-
-    pixels, depth = project(photo.camera, means)
-    inside = inside_of(photo.camera, pixels, depth)
-    pixels, depth = pixels[inside], depth[inside]
+    _, row, column, depth = seen_pixels(photo.camera, means)
     order = torch.argsort(depth, stable=True)
-    column, row = (pixels[order] / cell).long().unbind(dim=1)
-    _, first = np.unique((row * photo.camera.width + column).numpy(), return_index=True)
+    square = row[order] // cell * photo.camera.width + column[order] // cell
+    _, first = np.unique(square.numpy(), return_index=True)
     nearest = order[torch.from_numpy(first)]
-    if len(nearest) < _FEWEST_SAMPLES:
-        _log.warning("depth of a view cannot be interpolated: only %d points project into it.", len(nearest))
+    known = torch.full((photo.camera.height, photo.camera.width), torch.nan, dtype=torch.float64)
+    confidence = torch.full_like(known, _OF_POINTS)
+    known[row[nearest], column[nearest]] = 1 / depth[nearest]
+    if found is not None:
+        own = found.known.cpu()
+        known[own], confidence[own] = 1 / found.depth.cpu()[own].double(), 1.0
+    count = int(known.isfinite().sum())
+    if count < _FEWEST_SAMPLES:
+        _log.warning("depth of a view cannot be completed: only %d points project into it.", count)
         return None
-    samples, values = pixels[nearest].numpy(), (1 / depth[nearest]).numpy()
-    result = np.asarray(NearestNDInterpolator(samples, values)(at.numpy()))
-    try:
-        linear = np.asarray(LinearNDInterpolator(samples, values)(at.numpy()))
-    except QhullError:  # all samples lie on one line
-        return torch.from_numpy(result)
-    return torch.from_numpy(np.where(np.isfinite(linear), linear, result))
+    factor = photo.factor_to(_MAX_PIXELS)
+    small = photo.reduced(factor)
+    if factor > 1:  # the nearest of each block, and how sure the surest is
+        known, confidence = (max_pool2d(values[None], factor)[0] for values in (known.nan_to_num(0.0), confidence))
+        known[known == 0] = torch.nan
+    finite = known[known.isfinite()]
+    inverse_depth = completed(known, confidence, small.image)
+    inverse_depth = inverse_depth.clamp(finite.min() / _BEYOND, finite.max() * _BEYOND)
+    x, y = (at / factor).long().unbind(dim=1)
+    return inverse_depth[y.clamp(max=small.camera.height - 1), x.clamp(max=small.camera.width - 1)]
