@@ -52,7 +52,7 @@ def test_two_views_are_enough() -> None:
 @pytest.mark.slow
 def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
     photos, threads = photos_of(bump, 2, (200, 170)), torch.get_num_threads()
-    settings = StereoSettings(max_planes=8)
+    settings = StereoSettings(max_planes=8, speckle=0)  # so few planes give speckles alone
     found = []
     try:
         for count in (1, 2):
