@@ -59,13 +59,13 @@ def completed(
     )
     level = sum(_LEVEL * D.T @ sp.diags(e.ravel()) @ D for D, e in ((dx, across), (dy, down)))
     level += _HELD * sp.eye(h * w)
-    u: Any = None
+    missed, bent = np.zeros(h * w), [np.zeros(D.shape[0]) for D, _ in bends]
     for _ in range(_ROUNDS):
-        trust = c if u is None else c / (1 + ((u - d) / _OUTLIER) ** 2) ** 2
+        trust = c / (1 + (missed / _OUTLIER) ** 2) ** 2
         H = sp.diags(trust) + level
-        for D, e in bends:
-            H += D.T @ sp.diags(e if u is None else e / np.hypot(D @ u / _BEND, 1)) @ D
-        u = splu(H.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}).solve(
-            trust * d + _HELD
-        )
+        for (D, e), bend in zip(bends, bent, strict=True):
+            H += D.T @ sp.diags(e / np.hypot(bend / _BEND, 1)) @ D
+        solver = splu(H.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        u = solver.solve(trust * d + _HELD)
+        missed, bent = u - d, [D @ u for D, _ in bends]
     return torch.from_numpy((scale * u).reshape(h, w))

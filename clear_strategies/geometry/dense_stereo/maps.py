@@ -71,9 +71,9 @@ def depth_maps(
         if masks is not None:
             good &= masks[i].to(good.device)
         confidence = mine.correlation.clamp(0, 1) * (agreeing.float() / 2).clamp(max=1)
-        good &= ~speckles(torch.where(good, 1 / inverse_depth, torch.nan), settings.speckle, _LIKE)
         depth = torch.where(good, 1 / inverse_depth, torch.nan)
-        found = DepthMap(depth, torch.where(good, confidence, 0.0))
+        good &= ~speckles(depth, settings.speckle, _LIKE)
+        found = DepthMap(torch.where(good, depth, torch.nan), torch.where(good, confidence, 0.0))
         maps.append(_judged(photo, found, points, settings))
     return maps
 

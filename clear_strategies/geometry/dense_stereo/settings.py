@@ -56,11 +56,11 @@ class StereoSettings:
     trust: float = 0.05
 
     def __post_init__(self) -> None:
-        for name, least in (("enlarge", 1), ("max_pixels", 1), ("sources", 1), ("max_planes", 4), ("window", 3)):
+        wholes = {"enlarge": 1, "max_pixels": 1, "sources": 1, "max_planes": 4, "window": 3, "speckle": 0}
+        for name, least in wholes.items():
             require_whole(name, getattr(self, name), least=least)
         if self.window % 2 == 0:
             refuse("window", "must be odd", self.window, "window=5")
-        require_whole("speckle", self.speckle, least=0)
         if self.agreeing is not None:
             require_whole("agreeing", self.agreeing, least=1)
         for name in ("plane_step", "small_step", "large_step", "tolerance", "reprojection"):
