@@ -82,7 +82,7 @@ class Drawing:
 
     Args:
         name: for the plan. device: that it draws on and the field lies on.
-        make: makes the rasterizer anew, with a background.
+        make: makes the rasterizer anew, with other settings.
     """
 
     rasterizer: Rasterizer
@@ -95,7 +95,8 @@ class Drawing:
         """The same over the data set's background, unless the settings name one."""
         if "background" in self.make.keywords:
             return self
-        return replace(self, rasterizer=self.make(background=background))
+        make = functools.partial(self.make, background=background)
+        return replace(self, rasterizer=make(), make=make)
 
 
 def drawing(settings: RasterizerSettings | functools.partial[Rasterizer], asked: Device | None) -> Drawing:

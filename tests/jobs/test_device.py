@@ -80,6 +80,7 @@ def test_a_rasterizer_of_another_package_is_a_target_with_the_same_settings():
     drawing = device.drawing(found, None).over((1.0, 1.0, 1.0))
     assert (type(drawing.rasterizer), drawing.name, drawing.kernel) == (Theirs, "Theirs", 0.3)
     assert (drawing.rasterizer.sharpness, drawing.rasterizer.background) == (2, (1.0, 1.0, 1.0))
+    assert drawing.make().background == (1.0, 1.0, 1.0)
     own = device.drawing(settings(target, "rasterizer.background=[0,0,1]").rasterizer, None).over((1.0, 1.0, 1.0))
     assert own.rasterizer.background == (0, 0, 1)
     with pytest.raises(SettingError, match=r"rasterizer.sharp: .* Did you mean rasterizer.sharpness\?"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 
@@ -36,6 +37,15 @@ def test_a_run_its_checkpoints_and_one_of_them_open_alike(run):
         assert splat.folder == folder
         assert not splat.baked
         assert len(splat.poses()) == 3
+
+
+def test_a_run_is_drawn_over_the_background_of_its_photos(run, tmp_path):
+    folder, field = shutil.copytree(run[0], tmp_path / "run"), run[1]
+    entries = json.loads((folder / "cameras.json").read_text())
+    (folder / "cameras.json").write_text(json.dumps([{**entry, "background": [1.0, 1.0, 1.0]} for entry in entries]))
+    white = field.render(rasterizers.load("torch", background=(1.0, 1.0, 1.0)), CAMERA).clamp(0, 1)
+    assert not torch.equal(white, exact(field))
+    assert torch.equal(open_splat(folder).painter.color(CAMERA), white)
 
 
 def test_a_ply_file_looks_the_same(run):
