@@ -22,11 +22,13 @@ class Photo:
 
     Args:
         shown: False at hidden pixels (a mask): no loss compares them, and they have no depth. None: every pixel is shown.
+        transparency: 1 - alpha, in [0, 1]: how far the background shows through. None: the photo has no alpha.
     """
 
     camera: Camera
     image: Float[Tensor, "H W 3"]
     shown: Bool[Tensor, "H W"] | None = None
+    transparency: Float[Tensor, "H W"] | None = None
 
     def __post_init__(self) -> None:
         found = tuple(self.image.shape)
@@ -35,12 +37,15 @@ class Photo:
                 f"an image of {self.camera.width}x{self.camera.height} pixels has shape "
                 f"({self.camera.height}, {self.camera.width}, 3), got {found}."
             )
-        if self.shown is not None and self.shown.shape != found[:2]:
-            raise ValueError(f"shown must be {found[:2]}, a boolean for each pixel, got {tuple(self.shown.shape)}.")
+        for name in ("shown", "transparency"):
+            if (layer := getattr(self, name)) is not None and layer.shape != found[:2]:
+                raise ValueError(f"{name} must be {found[:2]}, one value for each pixel, got {tuple(layer.shape)}.")
 
     def to(self, device: torch.device | str) -> Photo:
         """The same photo with its image on `device`. The camera stays on the CPU, where kernels read its numbers."""
-        return replace(self, image=self.image.to(device), shown=None if self.shown is None else self.shown.to(device))
+        layers = (self.shown, self.transparency)
+        shown, transparency = (None if layer is None else layer.to(device) for layer in layers)
+        return replace(self, image=self.image.to(device), shown=shown, transparency=transparency)
 
     def factor_to(self, max_pixels: int) -> int:
         """The smallest whole factor that reduces it to at most `max_pixels`."""
@@ -52,12 +57,15 @@ class Photo:
         """
         if factor == 1:
             return self
-        image = images.area_mean(images.crop_to_multiple(self.image, factor), factor)
+
+        def mean(x: Tensor) -> Tensor:
+            return images.area_mean(images.crop_to_multiple(x, factor), factor)
+
+        image = mean(self.image)
         camera = replace(self.camera, width=image.shape[1] * factor, height=image.shape[0] * factor)
-        if self.shown is None:
-            return Photo(camera.scaled(1 / factor), image)
-        whole = images.area_mean(images.crop_to_multiple(self.shown[..., None].float(), factor), factor)[..., 0] == 1
-        return Photo(camera.scaled(1 / factor), image, whole)
+        shown = None if self.shown is None else mean(self.shown[..., None].float())[..., 0] == 1
+        through = None if self.transparency is None else mean(self.transparency[..., None])[..., 0]
+        return Photo(camera.scaled(1 / factor), image, shown, through)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,11 +161,28 @@ class View:
         fine = shown.repeat_interleave(self.factor, 0).repeat_interleave(self.factor, 1)
         return replace(self, lr=replace(self.lr, shown=shown), hr=replace(self.hr, shown=fine))
 
+    def over(self, color: Color | None) -> View:
+        """The view before another background: both images where `transparency` lets it through. Itself for None."""
+        if color is None:
+            return self
+        change = self.lr.image.new_tensor(color) - self.lr.image.new_tensor(self.background)
+
+        def before(photo: Photo) -> Photo:
+            if photo.transparency is None:
+                return photo
+            return replace(photo, image=(photo.image + photo.transparency[..., None] * change).clamp(0, 1))
+
+        return replace(self, lr=before(self.lr), hr=before(self.hr))
+
     def brightened(self, gain: Float[Tensor, " 3"]) -> View:
-        """The same view with its images times a gain for each channel, in [0, 1]."""
-        hr = replace(self.hr, image=(self.hr.image * gain).clamp(0, 1))
+        """The same view with its images times a gain for each channel, in [0, 1]. Its background is then no longer
+        `background`, so that no other can take its place.
+        """
+        lr, hr = (
+            replace(photo, image=(photo.image * gain).clamp(0, 1), transparency=None) for photo in (self.lr, self.hr)
+        )
         truth = hr.image if self.hr_is_photo else None if self.truth is None else (self.truth * gain).clamp(0, 1)
-        return replace(self, lr=replace(self.lr, image=(self.lr.image * gain).clamp(0, 1)), hr=hr, truth=truth)
+        return replace(self, lr=lr, hr=hr, truth=truth)
 
     def to(self, device: torch.device | str) -> View:
         hr = self.hr.to(device)

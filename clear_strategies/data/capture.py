@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.data.cameras import Lens
-from clear_strategies.data.photo_files import image_size, read_image
+from clear_strategies.data.photo_files import has_alpha, image_size, read_image
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
@@ -33,6 +33,7 @@ class Frame:
         split: "train" or "test" where the data set itself defines the split (Blender), else None.
         sfm_id: the frame's id in `SfmPoints.track_image`, or None.
         shown: decodes the photo's mask at the photo's own size, False at hidden pixels; None: there is no mask.
+        transparency: decodes 1 - alpha at the photo's own size; None: its file has no alpha.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Frame:
     split: str | None = None
     sfm_id: int | None = None
     shown: Callable[[], Bool[Tensor, "H W"]] | None = None
+    transparency: Callable[[], Float[Tensor, "H W"]] | None = None
 
     @staticmethod
     def of_photo(
@@ -77,7 +79,8 @@ class Frame:
         load = partial(_load, path, fitted, pinhole, background, turn)
         mask = mask or _mask_of(path)
         shown = None if mask is None else partial(_load_mask, mask, fitted, pinhole, turn)
-        return Frame(name, camera, load, split=split, sfm_id=sfm_id, shown=shown)
+        through = partial(_load_transparency, path, fitted, pinhole, turn) if has_alpha(path) else None
+        return Frame(name, camera, load, split=split, sfm_id=sfm_id, shown=shown, transparency=through)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,6 +170,12 @@ def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None, turn:
 def _mask_of(path: Path) -> Path | None:
     folder = path.parent.parent / "masks"
     return next((m for m in (folder / f"{path.stem}.png", folder / f"{path.name}.png") if m.is_file()), None)
+
+
+def _load_transparency(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Float[Tensor, "H W"]:
+    """The photo over white less the photo over black."""
+    white, black = (_load(path, lens, pinhole, (c, c, c), turn) for c in (1.0, 0.0))
+    return (white - black).mean(dim=2).clamp(0, 1)
 
 
 def _load_mask(path: Path, lens: Lens, pinhole: Lens, turn: bool | None) -> Bool[Tensor, "H W"]:

@@ -107,6 +107,16 @@ def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
         return _upright(image.size, orientation_of(image)) if turn else image.size
 
 
+def has_alpha(path: Path) -> bool:
+    """Whether the file may have transparent pixels, from the header only.
+
+    Raises:
+        DataError: as `read_image`, as far as the header tells.
+    """
+    with _opened(path, False) as image:
+        return _has_alpha(image)
+
+
 def orientation_of(image: Image.Image) -> int:
     """The EXIF orientation of an opened image, 1 to 8; 1, upright, where there is none or it cannot be read."""
     try:
@@ -285,8 +295,11 @@ def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.nd
         return _read_sixteen_bits(path)
     if image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
         raise DataError(path, "colour mode", f"is {image.mode}", "convert the image to 8-bit or 16-bit RGB")
-    has_alpha = image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
-    return np.asarray(image.convert("RGBA" if has_alpha else "RGB"), np.float32) / 255
+    return np.asarray(image.convert("RGBA" if _has_alpha(image) else "RGB"), np.float32) / 255
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info
 
 
 def _read_sixteen_bits(path: Path) -> Float[np.ndarray, "H W C"]:

@@ -7,7 +7,7 @@ prints.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
@@ -181,12 +182,11 @@ def _view(
             size = (lr_camera.width, lr_camera.height)
             lr = Photo(lr_camera, read_image(lr_files[frame.name], background=capture.background, expect=size))
         else:
-            lr = Photo(lr_camera, images.downsample(truth, views.sr_scale, views.downsample))
-    if views.photos_are == "both" and truth is not None:
-        sr_source = "the photos themselves"
-        return View(
-            frame.name, lr, Photo(hr_camera, truth), truth=truth, sr_source=sr_source, background=capture.background
-        )
+            down = partial(images.downsample, factor=views.sr_scale, kernel=views.downsample)
+            lr = Photo(lr_camera, down(truth), transparency=_of_layer(down, photo.transparency))
+    if views.photos_are == "both":
+        sr_source, hr = "the photos themselves", replace(photo, shown=None)
+        return View(frame.name, lr, hr, truth=truth, sr_source=sr_source, background=capture.background)
     try:
         made, sr_source = super_resolved(prior, frame.name, lr.image, views.sr_scale), prior.label
     except DataError as missing:
@@ -195,10 +195,20 @@ def _view(
         _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", frame.name, missing.problem)
         bicubic = Bicubic()
         made, sr_source = super_resolved(bicubic, frame.name, lr.image, views.sr_scale), bicubic.label
+    enlarge = network_of(prior) or Bicubic()
+    through = _of_layer(lambda layer: enlarge(frame.name, layer, views.sr_scale), lr.transparency) if required else None
+    hr = Photo(hr_camera, made.image, transparency=through)
     return View(
-        frame.name, lr, Photo(hr_camera, made.image), truth=truth, sr_source=sr_source, disagreement=made.disagreement,
+        frame.name, lr, hr, truth=truth, sr_source=sr_source, disagreement=made.disagreement,
         background=capture.background,
     )  # fmt: skip
+
+
+def _of_layer(
+    resize: Callable[[Float[Tensor, "H W 3"]], Float[Tensor, "h w 3"]], layer: Float[Tensor, "H W"] | None
+) -> Float[Tensor, "h w"] | None:
+    """What resizes images, for a layer of one; None for None."""
+    return None if layer is None else resize(layer[..., None].expand(-1, -1, 3).contiguous()).mean(dim=2)
 
 
 def _moved(views: Sequence[View], down: DownKernel) -> dict[str, str]:
@@ -241,14 +251,17 @@ def _grey_levels(differences: Sequence[Tensor]) -> float:
 
 
 def _reduced(frame: Frame, views: ViewSettings) -> Photo:
-    """The photo at the size that `views` asks for, and its mask: a pixel is shown if all that it covers is."""
+    """The photo at the size that `views` asks for, its transparency, and its mask: a pixel is shown if all that it covers is."""
     image = frame.load()
-    photo = _sized(image, frame.camera, views)
-    if frame.shown is None:
-        return photo
-    shown = frame.shown().float()[..., None].expand(-1, -1, 3)
-    shown = images.resize(shown, (image.shape[1], image.shape[0]), "area")  # within_limit reduces photos alone
-    return replace(photo, shown=_sized(shown, frame.camera, views).image[..., 0] > _WHOLE)
+
+    def sized(layer: Tensor) -> Tensor:
+        layer = images.resize(layer, (image.shape[1], image.shape[0]), "area")  # within_limit reduces photos alone
+        return _sized(layer, frame.camera, views).image
+
+    through = None if frame.transparency is None else _of_layer(sized, frame.transparency())
+    shown = None if frame.shown is None else _of_layer(sized, frame.shown().float())
+    photo = replace(_sized(image, frame.camera, views), transparency=through)
+    return photo if shown is None else replace(photo, shown=shown > _WHOLE)
 
 
 def _sized(image: Tensor, camera: Camera, views: ViewSettings) -> Photo:

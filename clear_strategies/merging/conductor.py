@@ -117,6 +117,10 @@ class Conductor:
         """The colour behind every rendering of iteration t; None: the scene's own."""
         return self._one["background"].background(t) if "background" in self._one else None
 
+    def shown(self, view: View, t: int) -> View:
+        """The view over `background`, which transparent photos show: what the losses of iteration t compare with."""
+        return view.over(self.background(t))
+
     def wants_hr(self, t: int) -> bool:
         """Whether the HR render has any use at t: λ_HR > 0, Î_LR is made of it, or a densification score needs it."""
         if self.objective.lambda_hr(t) > 0 or not self.wants_lr:
@@ -163,10 +167,10 @@ class Conductor:
             )
         self.forget_logs()
         with stage("losses LR"):
-            low = rendered.image.detach()
-            l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, view.lr.image, view.lr.shown)  # Eq. 4
+            low, photo = rendered.image.detach(), self.shown(view, t).lr
+            l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, photo.image, photo.shown)  # Eq. 4
         where = f"t={t}, view {view.name}"
-        require_finite_losses(where, l_lr.values, {"the LR photo": view.lr.image, "the LR render": low})
+        require_finite_losses(where, l_lr.values, {"the LR photo": photo.image, "the LR render": low})
         g_lr: Any = None
         from_hr: HrGradients[Any] | None = None
         if not reduced:
@@ -312,10 +316,11 @@ class Conductor:
         lr_cotangents: Tensor | None = None,
     ) -> tuple[Any | None, HrGradients[Any]]:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
-        stage, view = self.work_log.stage, step.view
+        stage = self.work_log.stage
         with stage("losses HR"):
-            losses = self.objective.hr(hr.image.detach(), view.hr.image, view.hr.shown)  # Eq. 5
-        require_finite_losses(where, losses.values, {"the SR image": view.hr.image, "the HR render": hr.image})
+            sr = self.shown(step.view, step.t).hr
+            losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown)  # Eq. 5
+        require_finite_losses(where, losses.values, {"the SR image": sr.image, "the HR render": hr.image})
         with stage("backward HR"):  # one pass for all cotangents
             both = losses.cotangents if lr_cotangents is None else torch.cat((lr_cotangents, losses.cotangents))
             gradients = list(vjp(hr, both))

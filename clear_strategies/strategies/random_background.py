@@ -3,7 +3,9 @@
 Over a black background, a dark surface can be thin: the background is as dark as it. From another camera something else shows
 through, and its dark parts are holes. Over a colour that changes at each iteration, only an opaque surface matches its photo.
 
-Many views hold a surface from several sides; there the changing colour is noise, and costs more than it brings.
+Many views hold a surface from several sides; there the changing colour is noise, and costs more than it brings. Not so where
+photos are transparent around an object: they are composited over the same colour, and only Gaussians that an object needs
+match all of them.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import torch
 
 from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import View
+from clear_strategies.geometry.projection import is_background
 from clear_strategies.geometry.pseudo_views import cut_out
 from clear_strategies.schedules import milestone
 from clear_strategies.strategies.base import Strategy
@@ -27,9 +30,10 @@ _LONG_RUN: Final = 1_350  # iterations over other colours; with fewer, surfaces 
 
 @dataclass(frozen=True)
 class RandomBackground(Strategy):
-    """A background of a random colour at each iteration, for at most five photos that show surfaces everywhere.
+    """A background of a random colour at each iteration, for at most five photos that show surfaces everywhere, and for any
+    number of photos of an object whose background is transparent.
 
-    Photos of an object before a plain background keep that background: they do show what is behind the object.
+    Photos of an object before a plain background that is not transparent keep it: they do show what is behind the object.
 
     Args:
         until: the iteration after which the background is the scene's own, so that the run ends on what it is tested with.
@@ -41,11 +45,7 @@ class RandomBackground(Strategy):
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
-        self.cache["seed"], self.cache["kept"] = seed, ""
-        if n_views > _FEW_VIEWS:
-            self.cache["kept"] = f"because there are more than {_FEW_VIEWS} training views"
-        elif self.until < _LONG_RUN:
-            self.cache["kept"] = f"because the run has fewer than {_LONG_RUN:,} iterations for it"
+        self.cache["seed"], self.cache["kept"] = seed, self._kept(n_views)
 
     def summary(self) -> str | None:
         kept: str = self.cache.get("kept", "")
@@ -55,11 +55,18 @@ class RandomBackground(Strategy):
         return True
 
     def on_views(self, views: Sequence[View]) -> None:
-        """Whether the photos show an object before a plain background, or hide pixels by masks."""
+        self.cache["kept"] = self._kept(len(views), views)
+
+    def _kept(self, n_views: int, views: Sequence[View] = ()) -> str:
+        """Why the background stays as it is; empty where it changes."""
+        if self.until < _LONG_RUN:
+            return f"because the run has fewer than {_LONG_RUN:,} iterations for it"
         if any(view.lr.shown is not None for view in views):
-            self.cache["kept"] = "because masks hide a part of the photos"
-        elif views and cut_out((view.lr.to("cpu") for view in views), views[0].background):
-            self.cache["kept"] = "because the photos show an object before a plain background"
+            return "because masks hide a part of the photos"
+        if views and cut_out((view.lr.to("cpu") for view in views), views[0].background):
+            opaque = "because the photos show an object before a plain background that is not transparent"
+            return "" if all(map(_transparent, views)) else opaque
+        return f"because there are more than {_FEW_VIEWS} training views" if n_views > _FEW_VIEWS else ""
 
     def background(self, t: int) -> Color | None:
         """RGB, uniform in [0, 1]: a function of (seed, t)."""
@@ -67,3 +74,11 @@ class RandomBackground(Strategy):
             return None
         r, g, b = torch.rand(3, generator=generator_at(self.cache.get("seed", 0), t)).tolist()
         return r, g, b
+
+
+def _transparent(view: View) -> bool:
+    """Whether the photo is transparent where it has the colour of the background."""
+    if view.lr.transparency is None:
+        return False
+    behind = is_background(view.lr.image, view.background)
+    return float(view.lr.transparency[behind].sum()) >= 0.5 * float(behind.sum())

@@ -1,10 +1,11 @@
-"""Views: the depth map of a photo at a smaller size."""
+"""Views: before another background; the depth map of a photo at a smaller size."""
 
 from __future__ import annotations
 
 import torch
 
-from clear_strategies.core.view import DepthMap
+from clear_strategies.core.view import DepthMap, Photo, View
+from tests.helpers import toy
 
 
 def test_a_reduced_depth_map_holds_the_median_of_each_block_of_which_enough_is_known():
@@ -26,3 +27,23 @@ def test_a_depth_map_is_completed_only_where_it_knows_nothing():
     whole = mine.completed_by(DepthMap(torch.tensor([[7.0, 8.0]]), torch.tensor([[0.9, 0.4]])))
     assert whole.depth.tolist() == [[1.0, 8.0]]
     assert torch.equal(whole.confidence, torch.tensor([[0.5, 0.4]]))
+
+
+def test_a_view_before_another_background_is_composited_over_it():
+    camera, generator = toy.camera(0.0), torch.Generator().manual_seed(0)
+    size = (camera.height, camera.width)
+    rgb, alpha = torch.rand(*size, 3, generator=generator), torch.rand(*size, generator=generator)
+
+    def over(color):
+        image = rgb * alpha[..., None] + torch.tensor(color) * (1 - alpha)[..., None]
+        photo = Photo(camera, image, transparency=1 - alpha)
+        return View("photo", photo.reduced(2), photo, background=color)
+
+    white, sky = over((1.0, 1.0, 1.0)), over((0.2, 0.5, 0.9))
+    moved = white.over(sky.background)
+    torch.testing.assert_close(moved.hr.image, sky.hr.image)
+    torch.testing.assert_close(moved.lr.image, sky.lr.image)
+    assert white.over(None) is white
+    opaque = View("photo", Photo(camera, rgb), Photo(camera, rgb))
+    assert torch.equal(opaque.over((0.2, 0.5, 0.9)).lr.image, rgb)
+    assert white.brightened(torch.full((3,), 0.5)).lr.transparency is None

@@ -6,8 +6,10 @@ import logging
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from clear_strategies.core import images
 from clear_strategies.core.view import DepthMap
@@ -16,12 +18,13 @@ from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import check_headers, prepare
 from clear_strategies.data.priors import BackProjected, Bicubic, DemoPrior
-from clear_strategies.data.readers import demo
+from clear_strategies.data.readers import blender, demo
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.strategies.p2g import P2G
 from rasterizers import Camera
+from tests.helpers import captures as tiny
 
 # Training indices among the n photos of each LLFF scene, and the number of test views: the 3-view protocol of RegNeRF,
 # FSGS, CoR-GS and DropGaussian.
@@ -309,3 +312,23 @@ def test_without_depth_equalize_says_that_it_has_no_effect(caplog):
     made = prepare(capture(), ViewSettings(sr_scale=2, equalize=True), Bicubic(), POINTS)
     assert "data.views.equalize has no effect" in caplog.text
     assert "equalized" not in made.notes
+
+
+@pytest.mark.parametrize("photos_are", ["hr", "lr", "both"])
+def test_transparent_photos_can_be_shown_before_any_background(tmp_path, photos_are):
+    root = tiny.blender(tmp_path)
+    pixels = np.full((tiny.HEIGHT, tiny.WIDTH, 4), (200, 100, 50, 0), np.uint8)
+    pixels[..., 3] = np.linspace(0, 255, tiny.WIDTH)
+    for photo in (root / "train").glob("*.png"):
+        Image.fromarray(pixels).save(photo)
+    views = ViewSettings(photos_are=photos_are, sr_scale=2)
+    white, black = (
+        prepare(blender.read(root, background=(c, c, c)), views, Bicubic(), POINTS).train for c in (1.0, 0.0)
+    )
+    for mine, expected in zip(white, black, strict=True):
+        shown = mine.over((0.0, 0.0, 0.0))
+        for scale in ("lr", "hr"):
+            moved, photo = getattr(shown, scale), getattr(expected, scale)
+            assert moved.transparency.shape == photo.image.shape[:2]
+            torch.testing.assert_close(moved.image, photo.image, atol=2.5 / 255, rtol=0)
+    assert prepare(capture(), replace(views, photos_are="hr"), Bicubic(), POINTS).train[0].lr.transparency is None

@@ -50,10 +50,24 @@ def test_what_the_photos_show_behind_an_object_or_hide_stays_as_it_is():
         for view in SCENE.train
     ]
     assert prepared(white).background(1) is None
+    assert "not transparent" in prepared(white).summary()
     hiding = [
         view.hiding(torch.arange(view.lr.camera.width).expand(view.lr.image.shape[:2]) > 3) for view in SCENE.train
     ]
     assert prepared(hiding).background(1) is None
+
+
+def test_an_object_before_transparency_gets_other_backgrounds_however_many_views_there_are():
+    height, width = SCENE.train[0].lr.image.shape[:2]
+    behind = torch.arange(width).expand(height, width) >= width // 2
+
+    def cut_out(transparency):
+        image = torch.where(behind[..., None], 1.0, 0.5).expand(-1, -1, 3)
+        photo = replace(SCENE.train[0].lr, image=image, transparency=transparency)
+        return [replace(SCENE.train[0], lr=photo, background=(1.0, 1.0, 1.0))] * 6
+
+    assert prepared(cut_out(behind.float())).background(1) is not None
+    assert prepared(cut_out(torch.zeros(height, width))).background(1) is None  # the white is painted
 
 
 def test_the_trainer_renders_over_it_and_evaluates_over_the_background_of_the_scene():
@@ -65,3 +79,21 @@ def test_the_trainer_renders_over_it_and_evaluates_over_the_background_of_the_sc
     psnr = -10 * float((color - view.lr.image).square().mean().log10())
     assert state.history_as_floats()[0]["psnr_train_lr"] == pytest.approx(psnr, abs=1e-3)
     assert float(state.field.render(RASTERIZER, view.lr.camera).max()) < 1e-4
+
+
+def test_the_trainer_compares_transparent_photos_over_the_colour_that_it_renders_over():
+    state = start((), more=[RandomBackground(until=1_350)])
+    state.field.opacities.data.fill_(-5.0)  # nearly nothing but the background
+    empty = [
+        replace(view, **{
+            scale: replace(photo, image=torch.zeros_like(photo.image), transparency=torch.ones(photo.image.shape[:2]))
+            for scale, photo in (("lr", view.lr), ("hr", view.hr))
+        })
+        for view in state.views
+    ]  # fmt: skip
+    state.views = empty
+    for _ in range(4):  # HR counts from the fourth
+        iterate(state, RASTERIZER)
+    row = state.history_as_floats()[-1]
+    assert row["psnr_train_lr"] > 40
+    assert max(row["loss_lr"], row["loss_base"]) < 0.02
