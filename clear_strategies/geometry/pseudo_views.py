@@ -69,11 +69,11 @@ def pseudo_views(
         max_pixels: larger photos are reduced by a whole factor first.
         background: of the scene; its colour belongs to no surface.
     """
-    sources = [
-        _source(*_reduced(photo, depths[name], max_pixels), background)
-        for name, photo in photos.items()
-        if name in depths and bool(depths[name].known.any())
-    ]
+    sources = []
+    for name, photo in photos.items():
+        factor = photo.factor_to(max_pixels)
+        if name in depths and bool((found := depths[name].reduced(factor)).known.any()):
+            sources.append(_source(photo.reduced(factor), found, background))
     if len(sources) < 2:
         return []
     generator = torch.Generator().manual_seed(seed)
@@ -117,18 +117,6 @@ def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.
     )
     direction[2] *= _ALONG
     return moved(camera, direction * reach * distance, aim=distance)
-
-
-def _reduced(photo: Photo, found: DepthMap, max_pixels: int) -> tuple[Photo, DepthMap]:
-    """Both at the size of the first whole factor that leaves at most `max_pixels`; the depth of each block's middle."""
-    factor = photo.factor_to(max_pixels)
-    smaller = photo.reduced(factor)
-    height, width = smaller.image.shape[:2]
-    depth, confidence = (
-        values[factor // 2 :: factor, factor // 2 :: factor][:height, :width]
-        for values in (found.depth, found.confidence)
-    )
-    return smaller, DepthMap(depth, confidence)
 
 
 def _source(photo: Photo, found: DepthMap, background: Color) -> _Source:
