@@ -195,13 +195,21 @@ def _view(
         _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", frame.name, missing.problem)
         bicubic = Bicubic()
         made, sr_source = super_resolved(bicubic, frame.name, lr.image, views.sr_scale), bicubic.label
-    enlarge = network_of(prior) or Bicubic()
-    through = _of_layer(lambda layer: enlarge(frame.name, layer, views.sr_scale), lr.transparency) if required else None
+    through = _enlarged(lr.transparency, frame.name, prior, views.sr_scale) if required else None
     hr = Photo(hr_camera, made.image, transparency=through)
     return View(
         frame.name, lr, hr, truth=truth, sr_source=sr_source, disagreement=made.disagreement,
         background=capture.background,
     )  # fmt: skip
+
+
+def _enlarged(
+    transparency: Float[Tensor, "h w"] | None, name: str, prior: Prior, factor: int
+) -> Float[Tensor, "H W"] | None:
+    """Transparency at HR, enlarged by the prior's network; by bicubic where there is none, or nothing shows through."""
+    seen_through = transparency is not None and bool(transparency.any())
+    enlarge = (network_of(prior) if seen_through else None) or Bicubic()
+    return _of_layer(lambda image: enlarge(name, image, factor), transparency)
 
 
 def _of_layer(

@@ -117,8 +117,8 @@ class Conductor:
         """The colour behind every rendering of iteration t; None: the scene's own."""
         return self._one["background"].background(t) if "background" in self._one else None
 
-    def shown(self, view: View, t: int) -> View:
-        """The view over `background`, which transparent photos show: what the losses of iteration t compare with."""
+    def target(self, view: View, t: int) -> View:
+        """What the losses of iteration t compare with: the view, over `background` where its photos are transparent."""
         return view.over(self.background(t))
 
     def wants_hr(self, t: int) -> bool:
@@ -167,7 +167,7 @@ class Conductor:
             )
         self.forget_logs()
         with stage("losses LR"):
-            low, photo = rendered.image.detach(), self.shown(view, t).lr
+            low, photo = rendered.image.detach(), self.target(view, t).lr
             l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, photo.image, photo.shown)  # Eq. 4
         where = f"t={t}, view {view.name}"
         require_finite_losses(where, l_lr.values, {"the LR photo": photo.image, "the LR render": low})
@@ -318,7 +318,7 @@ class Conductor:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage = self.work_log.stage
         with stage("losses HR"):
-            sr = self.shown(step.view, step.t).hr
+            sr = self.target(step.view, step.t).hr
             losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown)  # Eq. 5
         require_finite_losses(where, losses.values, {"the SR image": sr.image, "the HR render": hr.image})
         with stage("backward HR"):  # one pass for all cotangents

@@ -133,7 +133,7 @@ def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Nu
     row: dict[str, Number] = {
         "t": float(s.t),
         "lambda_hr": s.conductor.objective.lambda_hr(s.t),
-        "psnr_train_lr": psnr_of(lr_image, s.conductor.shown(view, s.t).lr.image),
+        "psnr_train_lr": psnr_of(lr_image, s.conductor.target(view, s.t).lr.image),
         "n_gaussians": float(len(s.field)),
         "detail_abs": deferred.scalar(s.field.detail.data.abs().mean()),
     }
