@@ -47,6 +47,13 @@ class Photo:
         shown, transparency = (None if layer is None else layer.to(device) for layer in layers)
         return replace(self, image=self.image.to(device), shown=shown, transparency=transparency)
 
+    def over(self, color: Color | None, background: Color) -> Photo:
+        """The photo before `color` in place of `background`, as far as it is transparent; itself for None."""
+        if color is None or self.transparency is None:
+            return self
+        change = self.image.new_tensor(color) - self.image.new_tensor(background)
+        return replace(self, image=(self.image + self.transparency[..., None] * change).clamp(0, 1))
+
     def factor_to(self, max_pixels: int) -> int:
         """The smallest whole factor that reduces it to at most `max_pixels`."""
         return max(1, math.ceil(math.sqrt(self.camera.width * self.camera.height / max_pixels)))
@@ -160,19 +167,6 @@ class View:
         """The same view, at both scales without the LR pixels where `shown` is False."""
         fine = shown.repeat_interleave(self.factor, 0).repeat_interleave(self.factor, 1)
         return replace(self, lr=replace(self.lr, shown=shown), hr=replace(self.hr, shown=fine))
-
-    def over(self, color: Color | None) -> View:
-        """The view before another background: both images where `transparency` lets it through. Itself for None."""
-        if color is None:
-            return self
-        change = self.lr.image.new_tensor(color) - self.lr.image.new_tensor(self.background)
-
-        def before(photo: Photo) -> Photo:
-            if photo.transparency is None:
-                return photo
-            return replace(photo, image=(photo.image + photo.transparency[..., None] * change).clamp(0, 1))
-
-        return replace(self, lr=before(self.lr), hr=before(self.hr))
 
     def brightened(self, gain: Float[Tensor, " 3"]) -> View:
         """The same view with its images times a gain for each channel, in [0, 1]. Its background is then no longer

@@ -56,7 +56,8 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     held_out = len(train_frames) < len(capture.frames)  # so the capture's points may know what training must not
     require_source(cloud, capture.points)
     progress = Progress("photos and their SR images", "photos", len(train_frames) + len(test_frames))
-    frames, found, work_log = (*train_frames, *test_frames), list[View](), WorkLog()
+    frames = [*train_frames, *(replace(frame, transparency=None) for frame in test_frames)]  # only training needs it
+    found, work_log = list[View](), WorkLog()
     with work_log.stage("photos and SR images"):
         for frame, reduced in zip(frames, photos_of(frames, views), strict=True):
             view = _view(frame, reduced, capture, views, prior, lr_files, required=len(found) < len(train_frames))
@@ -195,8 +196,7 @@ def _view(
         _log.info("%s: no SR image for this test view (%s); bicubic replaces it.", frame.name, missing.problem)
         bicubic = Bicubic()
         made, sr_source = super_resolved(bicubic, frame.name, lr.image, views.sr_scale), bicubic.label
-    through = _enlarged(lr.transparency, frame.name, prior, views.sr_scale) if required else None
-    hr = Photo(hr_camera, made.image, transparency=through)
+    hr = Photo(hr_camera, made.image, transparency=_enlarged(lr.transparency, frame.name, prior, views.sr_scale))
     return View(
         frame.name, lr, hr, truth=truth, sr_source=sr_source, disagreement=made.disagreement,
         background=capture.background,

@@ -117,10 +117,6 @@ class Conductor:
         """The colour behind every rendering of iteration t; None: the scene's own."""
         return self._one["background"].background(t) if "background" in self._one else None
 
-    def target(self, view: View, t: int) -> View:
-        """What the losses of iteration t compare with: the view, over `background` where its photos are transparent."""
-        return view.over(self.background(t))
-
     def wants_hr(self, t: int) -> bool:
         """Whether the HR render has any use at t: λ_HR > 0, Î_LR is made of it, or a densification score needs it."""
         if self.objective.lambda_hr(t) > 0 or not self.wants_lr:
@@ -167,7 +163,7 @@ class Conductor:
             )
         self.forget_logs()
         with stage("losses LR"):
-            low, photo = rendered.image.detach(), self.target(view, t).lr
+            low, photo = rendered.image.detach(), view.lr.over(self.background(t), view.background)
             l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, photo.image, photo.shown)  # Eq. 4
         where = f"t={t}, view {view.name}"
         require_finite_losses(where, l_lr.values, {"the LR photo": photo.image, "the LR render": low})
@@ -318,7 +314,7 @@ class Conductor:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage = self.work_log.stage
         with stage("losses HR"):
-            sr = self.target(step.view, step.t).hr
+            sr = step.view.hr.over(self.background(step.t), step.view.background)
             losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown)  # Eq. 5
         require_finite_losses(where, losses.values, {"the SR image": sr.image, "the HR render": hr.image})
         with stage("backward HR"):  # one pass for all cotangents

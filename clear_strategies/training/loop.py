@@ -130,10 +130,11 @@ def fit(
 
 
 def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Number]:
+    photo = view.lr.over(s.conductor.background(s.t), view.background)
     row: dict[str, Number] = {
         "t": float(s.t),
         "lambda_hr": s.conductor.objective.lambda_hr(s.t),
-        "psnr_train_lr": psnr_of(lr_image, s.conductor.target(view, s.t).lr.image),
+        "psnr_train_lr": psnr_of(lr_image, photo.image),
         "n_gaussians": float(len(s.field)),
         "detail_abs": deferred.scalar(s.field.detail.data.abs().mean()),
     }

@@ -1,4 +1,4 @@
-"""Views: before another background; the depth map of a photo at a smaller size."""
+"""Photos before another background; the depth map of a photo at a smaller size."""
 
 from __future__ import annotations
 
@@ -29,21 +29,20 @@ def test_a_depth_map_is_completed_only_where_it_knows_nothing():
     assert torch.equal(whole.confidence, torch.tensor([[0.5, 0.4]]))
 
 
-def test_a_view_before_another_background_is_composited_over_it():
+def test_a_photo_before_another_background_is_composited_over_it():
     camera, generator = toy.camera(0.0), torch.Generator().manual_seed(0)
     size = (camera.height, camera.width)
     rgb, alpha = torch.rand(*size, 3, generator=generator), torch.rand(*size, generator=generator)
 
     def over(color):
         image = rgb * alpha[..., None] + torch.tensor(color) * (1 - alpha)[..., None]
-        photo = Photo(camera, image, transparency=1 - alpha)
-        return View("photo", photo.reduced(2), photo, background=color)
+        return Photo(camera, image, transparency=1 - alpha)
 
-    white, sky = over((1.0, 1.0, 1.0)), over((0.2, 0.5, 0.9))
-    moved = white.over(sky.background)
-    torch.testing.assert_close(moved.hr.image, sky.hr.image)
-    torch.testing.assert_close(moved.lr.image, sky.lr.image)
-    assert white.over(None) is white
-    opaque = View("photo", Photo(camera, rgb), Photo(camera, rgb))
-    assert torch.equal(opaque.over((0.2, 0.5, 0.9)).lr.image, rgb)
-    assert white.brightened(torch.full((3,), 0.5)).lr.transparency is None
+    white, sky = (1.0, 1.0, 1.0), (0.2, 0.5, 0.9)
+    torch.testing.assert_close(over(white).over(sky, white).image, over(sky).image)
+    torch.testing.assert_close(over(white).reduced(2).over(sky, white).image, over(sky).reduced(2).image)
+    photo = over(white)
+    assert photo.over(None, white) is photo
+    assert torch.equal(Photo(camera, rgb).over(sky, white).image, rgb)
+    view = View("photo", photo.reduced(2), photo, background=white)
+    assert view.brightened(torch.full((3,), 0.5)).lr.transparency is None

@@ -326,9 +326,8 @@ def test_transparent_photos_can_be_shown_before_any_background(tmp_path, photos_
         prepare(blender.read(root, background=(c, c, c)), views, Bicubic(), POINTS).train for c in (1.0, 0.0)
     )
     for mine, expected in zip(white, black, strict=True):
-        shown = mine.over((0.0, 0.0, 0.0))
         for scale in ("lr", "hr"):
-            moved, photo = getattr(shown, scale), getattr(expected, scale)
+            moved, photo = getattr(mine, scale).over((0.0, 0.0, 0.0), mine.background), getattr(expected, scale)
             assert moved.transparency.shape == photo.image.shape[:2]
             torch.testing.assert_close(moved.image, photo.image, atol=2.5 / 255, rtol=0)
     assert prepare(capture(), replace(views, photos_are="hr"), Bicubic(), POINTS).train[0].lr.transparency is None
