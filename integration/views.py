@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import torch
 from jaxtyping import Float
@@ -19,6 +20,8 @@ from clear_strategies.merging.conductor import Conductor
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
+_SHOWN: Final = 0.5  # a mask above it shows its pixel
+_OVERSHOOT: Final = 0.5  # of a network's images outside of [0, 1] at edges
 
 SuperResolve = Callable[[str, Float[Tensor, "h w 3"], int], Float[Tensor, "H W 3"]]
 """I_HR of a view from its name, its LR image and the factor: a prior of `clear_strategies.data.priors`, or your function."""
@@ -62,14 +65,22 @@ class HostPhoto:
                 self.name, "SR image", f"is {sr_image.shape[1]}x{sr_image.shape[0]}, but {factor} times {w}x{h} is "
                 f"{w * factor}x{h * factor}", "super-resolve the images that the host trains on",
             )  # fmt: skip
+        low, high = float(sr_image.min()), float(sr_image.max())
+        if not (low >= -_OVERSHOOT and high <= 1 + _OVERSHOOT):
+            raise DataError(
+                self.name, "SR image", f"has values from {low:.3g} to {high:.3g}, must be RGB in [0, 1]",
+                "divide 8-bit values by 255",
+            )  # fmt: skip
+        sr_image = sr_image.clamp(0, 1)
         if self.mask is not None:
             image = image * self.mask[..., None]
             sr_image = sr_image * enlarged_mask(self.mask, factor)[..., None]
-        return View(
+        view = View(
             self.name, Photo(camera, image), Photo(camera.scaled(factor), sr_image),
             sr_source=getattr(sr, "label", "unknown"),
             disagreement=None if made.disagreement is None else made.disagreement.to(image),
         )  # fmt: skip
+        return view if self.mask is None else view.hiding(self.mask > _SHOWN)
 
 
 def view(
@@ -90,9 +101,25 @@ def view(
             scales; the HR rendering must be as well, see `enlarged_mask`.
 
     Raises:
-        DataError: the SR image is not `factor` times as large as the photo.
+        DataError: the SR image is not `factor` times as large as the photo, or not in [0, 1] but for a network's overshoot.
     """
     return HostPhoto(name, image, world_to_camera, K, mask).view(sr, factor)
+
+
+def by_name(views: Sequence[View]) -> dict[str, View]:
+    """The views by their names.
+
+    Raises:
+        SettingError: two have the same.
+    """
+    named = {view.name: view for view in views}
+    if len(named) < len(views):
+        twice = next(view.name for view in views if named[view.name] is not view)
+        raise SettingError(
+            f"views: strategies know each by its name, but {twice!r} is the name of several. Where folders have equal file "
+            "names, name the views with their folders."
+        )
+    return named
 
 
 def save_photos(photos: Iterable[HostPhoto], folder: Path | str) -> None:
