@@ -23,7 +23,7 @@ def end_with_strategies(conductor: Conductor, settings: Any, name: str, first: i
         return
     end = _end_of_densification(conductor, int(until), first)
     if end < until:
-        _log.info("densification ends at %s=%d instead of %d (SVS: anchor_start).", name, end, until)
+        _log.info("densification ends at %s=%d instead of %d (%s).", name, end, until, _who(conductor, end + 1 - first))
         setattr(settings, name, end)
 
 
@@ -44,11 +44,26 @@ def require_end(conductor: Conductor, until: int | None, name: str, first: int =
             "strategies.svs.anchor_start."
         )
     _log.warning(
-        "the host densifies until %s=%d, but a strategy ends densification at %d (SVS: anchor_start). Lower %s to that "
-        "iteration.", name, until, end, name,
+        "the host densifies until %s=%d, but %s ends densification at %d. Lower %s to that iteration.",
+        name, until, _who(conductor, end + 1 - first), end, name,
     )  # fmt: skip
 
 
 def _end_of_densification(conductor: Conductor, until: int, first: int = 1) -> int:
-    """The first iteration, in the host's count, at which a strategy no longer allows densification; at most `until`."""
-    return next((i for i in range(first, until) if not conductor.may_densify(i + 1 - first)), until)
+    """The first iteration, in the host's count, from which on the strategies no longer allow densification; at most `until`.
+
+    A host has an end, but cannot be asked at each iteration: it densifies where a strategy forbids it earlier, with a warning.
+    """
+    allowed = [i for i in range(first, until) if conductor.may_densify(i + 1 - first)]
+    end = allowed[-1] + 1 if allowed else first
+    if gaps := sorted({*range(first, end)} - {*allowed}):
+        _log.warning(
+            "%s forbids densification at %d of the iterations before %d, the first is %d, but the host densifies there: "
+            "only the end can be set from here.", _who(conductor, gaps[0] + 1 - first), len(gaps), end, gaps[0],
+        )  # fmt: skip
+    return end
+
+
+def _who(conductor: Conductor, t: int) -> str:
+    """The strategies that forbid densification at iteration t."""
+    return ", ".join(type(s).__name__ for s in conductor.strategies if not s.may_densify(t))
