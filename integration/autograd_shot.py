@@ -83,16 +83,17 @@ class AutogradShot:
         return self.slot or ScreenGradientSlot(self.means2d, (self.image.shape[1], self.image.shape[0]))
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> list[Grads]:
-        """One backward pass through the host's graph per cotangent; the graph is kept."""
-        slot = self.gradient_slot
+        """One backward pass through the host's graph per cotangent; the graph is kept. Frozen parameters have gradient 0."""
+        slot, trained = self.gradient_slot, {name: p for name, p in self.params.items() if p.requires_grad}
+        frozen = {name: torch.zeros_like(p) for name, p in self.params.items() if name not in trained}
         projected = [slot.tensor] if slot.tensor.requires_grad else []  # gsplat's 3DGUT draws without projected centres
         results = []
         for cotangent in cotangents:
             gradients = torch.autograd.grad(
-                self.image, [*self.params.values(), *projected], cotangent, retain_graph=True, allow_unused=True,
+                self.image, [*trained.values(), *projected], cotangent, retain_graph=True, allow_unused=True,
                 materialize_grads=True,
             )  # fmt: skip
-            values = dict(zip(self.params, gradients, strict=False))
+            values = frozen | dict(zip(trained, gradients, strict=False))
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
         return results

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -51,7 +52,7 @@ class ExtraSteps:
             return 0
         present = [p for group in optimizer.param_groups for p in group["params"]]
         known = {id(p) for p in present}
-        mine = {name: p for name, p in self._rendered.items() if id(p) in known}
+        mine = {name: p for name, p in self._rendered.items() if id(p) in known and p.requires_grad}
         if not mine:
             return 0
         before, self.stepping = [p.grad for p in present], True
@@ -74,10 +75,7 @@ class ExtraSteps:
 
 
 def _step(optimizer: torch.optim.Optimizer, mine: Mapping[str, Tensor]) -> None:
-    """One step; 3DGS's SparseGaussianAdam needs to know which Gaussians move, and how many there are."""
-    if "visibility" not in inspect.signature(type(optimizer).step).parameters:
-        optimizer.step()
-        return
-    rows = next(iter(mine.values()))
-    everywhere = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
-    optimizer.step(everywhere, len(rows))  # type: ignore[call-overload]
+    """One step. An Adam of visible Gaussians is told which move, 3DGS's SparseGaussianAdam also how many there are."""
+    takes, rows = inspect.signature(type(optimizer).step).parameters, next(iter(mine.values()))
+    told: dict[str, Any] = {"visibility": torch.ones(len(rows), dtype=torch.bool, device=rows.device), "N": len(rows)}
+    optimizer.step(**{name: value for name, value in told.items() if name in takes})

@@ -163,3 +163,30 @@ def test_views_that_were_made_without_a_decorator_are_warned_of(caplog):
             conductor.prior(Bicubic())
         attach(a_host.splats, a_host.optimizers, scene.train, conductor).remove()
         assert ("BackProjected has no effect: the views were made without it" in caplog.text) != prior_asked
+
+
+@pytest.mark.parametrize("names", [("visibility",), ("visibility", "N")], ids=["gsplat", "3dgs"])
+def test_an_adam_of_visible_gaussians_is_told_what_it_asks_for(names):
+    told = []
+
+    class Selective(torch.optim.Adam):
+        if len(names) == 1:
+
+            def step(self, visibility):
+                told.append((visibility,))
+
+        else:
+
+            def step(self, visibility, N):
+                told.append((visibility, N))
+
+    scene = toy.scene(20)
+    trainer = Host(scene)
+    trainer.optimizers = {name: Selective([p]) for name, p in trainer.splats.items()}
+    clear = attach(trainer.splats, trainer.optimizers, scene.train, dark())
+    rasterization = clear.wrap(gsplat_host.rasterization)
+    gsplat_host.drawn(rasterization, trainer.splats, scene.train[0].lr.camera)[0].mean().backward()
+    everyone = torch.ones(20, dtype=torch.bool)
+    trainer.optimizers["means"].step(*(everyone, 20)[: len(names)])
+    assert [torch.equal(step[0], everyone) for step in told] == [True, True]
+    assert {step[1:] for step in told} == {(20,)[: len(names) - 1]}
