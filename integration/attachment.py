@@ -22,6 +22,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, Literal, Protocol
 
 import torch
@@ -29,7 +30,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.gradients import Grads, conflict_columns, to_ndc
+from clear_strategies.core.gradients import Grads, conflict_columns
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
@@ -38,8 +39,8 @@ from clear_strategies.merging.iteration import HrGradients, only
 from integration.autograd_shot import AutogradShot
 from integration.errors import HostError
 from integration.extra_steps import ExtraSteps
-from integration.host_score import ScoreScaler, score_for_host
-from integration.views import enlarged_mask
+from integration.host_score import ScoreScaler, write_score
+from integration.views import by_name, enlarged_mask
 from rasterizers.interface import Camera, Color
 
 _log = logging.getLogger(__name__)
@@ -113,6 +114,7 @@ class Attachment:
                 "objective: a host renders LR itself, so lambda_lr must be > 0 and lr_from must be lr, got "
                 f"lambda_lr={conductor.objective.lambda_lr}, lr_from={conductor.objective.lr_from!r}."
             )
+        self._views = by_name(views)
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
         self._masks, self._own_background = dict(masks or {}), own_background
         self.t = 1
@@ -170,7 +172,7 @@ class Attachment:
         rendering = render_at("lr", z)
         if rendering.output.requires_grad:
             self._pending = rendering, hr_grads
-            rendering.output.register_hook(self._on_backward)  # type: ignore[no-untyped-call]
+            rendering.output.register_hook(lambda _: self._on_backward(rendering))  # type: ignore[no-untyped-call]
         self.counts["LR renders"] += 1
         return rendering.returned
 
@@ -190,13 +192,21 @@ class Attachment:
 
     def state_dict(self) -> dict[str, Any]:
         """The iteration, and what the strategies store per Gaussian, for the host's checkpoint."""
-        return {"t": self.t, "passes": self._passes, "strategies": self.conductor.state_dict()}
+        return {
+            "t": self.t, "passes": self._passes, "strategies": self.conductor.state_dict(),
+            "view": None if self._step is None else self._step.view.name,
+            "score": None if self._scaler is None else self._scaler.state_dict(),
+        }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue from a state; the host has loaded its parameters already."""
         self.t, self._passes = int(state["t"]), int(state["passes"])
         self.conductor.load_state_dict(state["strategies"])
         self._n = len(self.params()["means"])
+        if (view := self._views.get(state.get("view") or "")) is not None:
+            self._step = Step(self.t, view)
+        if self._scaler is not None and state.get("score") is not None:
+            self._scaler.load_state_dict(state["score"])
 
     def summary(self) -> str:
         """What was done how often, e.g. for the end of a log."""
@@ -264,10 +274,16 @@ class Attachment:
         self.counts["structure changes"] += 1
         self._n = n
 
-    def _on_backward(self, _: Tensor) -> None:
+    def _on_backward(self, rendering: HostRendering) -> None:
         """The host's backward pass has reached Î_LR, but no parameter yet."""
         if self._pending is None:
             return
+        if self._pending[0] is not rendering:
+            raise HostError(
+                "one backward pass reaches two renderings of training views, but each is merged by itself. With several views "
+                "for a step, call backward() after each rendering and set accumulation=, or use joint_loss. For a second pass "
+                "over the same view, e.g. for normals: with attached.rendering(None): …"
+            )
         self._grads_before = {name: p.grad.clone() for name, p in self.params().items() if p.grad is not None}
         centres = self._pending[0].shot.gradient_slot.tensor
         screen_gradients: list[Tensor] = []
@@ -303,7 +319,9 @@ class Attachment:
             g = merged.grads[name] * grad_scale if name in merged.grads else torch.zeros_like(p)
             p.grad = (g + self._grads_before[name] if name in self._grads_before else g).to(p)
         if screen_gradient is not None and hr_grads is not None:
-            self._write_score(rendering.shot, screen_gradient / grad_scale, hr_grads, grad_scale)
+            scores = partial(self.conductor.scores, hr=hr_grads, t=self.t)
+            if write_score(rendering.shot, screen_gradient / grad_scale, scores, self._scaler, grad_scale):
+                self.counts["scores written"] += 1
         self._grads_before = {}
         self._passes += 1
         self.counts["merges"] += 1
@@ -323,24 +341,6 @@ class Attachment:
                 "rasterization(sparse_grad=False)."
             )
         return p.grad - self._grads_before[name] if name in self._grads_before else p.grad
-
-    def _write_score(
-        self, shot: AutogradShot, gradient: Tensor, hr_grads: HrGradients[Grads], grad_scale: float
-    ) -> None:
-        """Write the score where the host's densifier reads the screen gradient, if it reads it."""
-        slot = shot.gradient_slot
-        retained = slot.tensor.is_leaf or slot.tensor.retains_grad
-        if not retained or slot.tensor.grad is None:
-            return
-        screen_lr = to_ndc(slot.per_gaussian(gradient, self._n), slot.size)
-        score, ordinary = self.conductor.scores(screen_lr, hr_grads, self.t)
-        if score is ordinary:  # without a strategy's score, the statistic that the host's threshold is meant for stays
-            return
-        own = torch.linalg.vector_norm(screen_lr, dim=-1)
-        written = score_for_host(slot, score, own, shot.visible, self._scaler, grad_scale)
-        if written is not None:
-            slot.write(grad_scale * written)
-            self.counts["scores written"] += 1
 
 
 @contextmanager

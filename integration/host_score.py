@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import torch
@@ -13,7 +14,7 @@ from clear_strategies.core.gradients import screen_norm, to_ndc
 from clear_strategies.density.threshold import count_passing, topk_threshold
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
-from integration.autograd_shot import ScreenGradientSlot
+from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 
 _log = logging.getLogger(__name__)
 
@@ -50,6 +51,7 @@ class ScoreScaler:
         """The scaled score of one view; a changed number of Gaussians starts the means anew."""
         if self._sums is None or self._sums.shape[1] != len(score):
             self._sums, self._views = score.new_zeros(3, len(score)), 0
+        self._sums = self._sums.to(score)  # a checkpoint may have been loaded onto another device
         self._sums *= self._decay
         self._sums += torch.stack((score, ordinary, torch.ones_like(score))) * visible
         if self._views % _VIEWS_PER_FIT == 0:
@@ -57,6 +59,13 @@ class ScoreScaler:
             self.factor = self._fit_factor(mean_score, mean_ordinary)
         self._views += 1
         return score * self.factor
+
+    def state_dict(self) -> dict[str, Any]:
+        """The means so far, to continue from."""
+        return {"factor": self.factor, "sums": None if self._sums is None else self._sums.clone(), "views": self._views}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self.factor, self._sums, self._views = float(state["factor"]), state["sums"], int(state["views"])
 
     def _fit_factor(self, score: Float[Tensor, " N"], ordinary: Float[Tensor, " N"]) -> float:
         passing = count_passing(ordinary, self.threshold)
@@ -86,6 +95,34 @@ def score_for_host(
             return None
         ordinary = screen_norm(to_ndc(absgrad / loss_scale, slot.size))
     return score if score is ordinary or scaler is None else scaler(score, ordinary, visible)
+
+
+def write_score(
+    shot: AutogradShot,
+    screen_gradient: Tensor,
+    scores: Callable[[Float[Tensor, "N 2"]], tuple[Float[Tensor, " N"], Float[Tensor, " N"]]],
+    scaler: ScoreScaler | None,
+    loss_scale: float = 1.0,
+) -> bool:
+    """Write the score where the host's densifier reads the screen gradient; False: it does not read it, or there is no score.
+
+    Args:
+        screen_gradient: of the LR loss, as the slot of `shot` has it, without `loss_scale`.
+        scores: `Conductor.scores` of this iteration.
+        loss_scale: the factor that the slot's own gradients carry.
+    """
+    slot = shot.gradient_slot
+    if not (slot.tensor.is_leaf or slot.tensor.retains_grad) or slot.tensor.grad is None:
+        return False
+    screen_lr = to_ndc(slot.per_gaussian(screen_gradient, len(shot.visible)), slot.size)
+    score, ordinary = scores(screen_lr)
+    if score is ordinary:  # without a strategy's score, the statistic that the host's threshold is meant for stays
+        return False
+    own = torch.linalg.vector_norm(screen_lr, dim=-1)
+    written = score_for_host(slot, score, own, shot.visible, scaler, loss_scale)
+    if written is not None:
+        slot.write(loss_scale * written)
+    return written is not None
 
 
 def warn_if_score_is_unused(conductor: Conductor, densifier: Any, threshold: float | None) -> None:

@@ -31,10 +31,13 @@ class RowNumbers:
     ) -> None:  # fmt: skip
         self._entries: Any = entries
         self._means, self._as_parameter = means, as_parameter
-        self._hook = (
-            entries.register_state_dict_post_hook(_leave_out)  # type: ignore[no-untyped-call]
+        self._hooks = (
+            [
+                entries.register_state_dict_post_hook(_leave_out),  # type: ignore[no-untyped-call]
+                entries.register_load_state_dict_pre_hook(_put_in),  # type: ignore[no-untyped-call]
+            ]
             if isinstance(entries, torch.nn.ParameterDict)
-            else None
+            else []
         )
         self.restart()
 
@@ -71,10 +74,15 @@ class RowNumbers:
         """Take the row numbers out of the host."""
         if ROWS in self._entries:
             del self._entries[ROWS]
-        if self._hook is not None:
-            self._hook.remove()
+        for hook in self._hooks:
+            hook.remove()
 
 
 def _leave_out(_: Any, stored: dict[str, Any], prefix: str, *__: Any) -> None:
     """A host's checkpoints hold what it trains."""
     stored.pop(f"{prefix}{ROWS}", None)
+
+
+def _put_in(module: Any, stored: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Loading such a checkpoint keeps the numbers."""
+    stored.setdefault(f"{prefix}{ROWS}", module[ROWS])

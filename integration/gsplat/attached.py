@@ -82,12 +82,14 @@ class Attached:
         means = params[self._names["means"]]
         if detail and "detail" not in params:
             params["detail"] = torch.nn.Parameter(means.new_zeros(len(means), 3))
+        if detail and "detail" not in optimizers:  # also where a checkpoint of the host held the parameter
             optimizers["detail"] = detail_adam(params["detail"], conductor.detail)
         self._rows = RowNumbers(
             params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None
         )
         self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).to(means)
-        self._named: View | None = None  # by `rendering`
+        self._named: View | None = None  # by `rendering`, if it was called
+        self._found_by_pose = True
         self._replaced: list[Replaced] = []
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
@@ -96,7 +98,7 @@ class Attached:
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=self._poll_parents, threshold=threshold, masks=masks, own_background=own_background,
         )  # fmt: skip
-        self.attachment.hook([optimizers[name] for name in self._names.values()])
+        self.attachment.hook([optimizers[name] for name in self._names.values() if name in optimizers])
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
@@ -124,7 +126,7 @@ class Attached:
                 return rasterization(**call)
             if not torch.is_grad_enabled():
                 return rasterization(**self._with_detail(call, trained=False))
-            view = self._named or self._find_view(call["viewmats"])
+            view = self._find_view(call["viewmats"]) if self._found_by_pose else self._named
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
 
@@ -138,12 +140,15 @@ class Attached:
 
     @contextmanager
     def rendering(self, view: View | None) -> Iterator[None]:
-        """Renderings with gradients are those of this view, whatever their pose (pose optimization, pose noise)."""
-        before, self._named = self._named, view
+        """Renderings with gradients are those of this view, whatever their pose (pose optimization, pose noise); None: of no
+        training view, e.g. a second pass for normals.
+        """
+        before = self._named, self._found_by_pose
+        self._named, self._found_by_pose = view, False
         try:
             yield
         finally:
-            self._named = before
+            self._named, self._found_by_pose = before
 
     def replace_everywhere(self, rasterization: Rasterization) -> Rasterization:
         """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
@@ -219,7 +224,12 @@ class Attached:
         self, rasterization: Rasterization, call: Mapping[str, Any], params: Mapping[str, Tensor], gate: Tensor | None
     ) -> HostRendering:
         """One rendering. Gaussians that the gate drops are marked as not visible in its `info`."""
-        renders, alphas, info = rasterization(**call)
+        if len(result := rasterization(**call)) != 3:
+            raise HostError(
+                f"the wrapped function returns {len(result)} values, gsplat's rasterization returns 3: colours, alphas and info. "
+                "2DGS draws other primitives and is not supported."
+            )
+        renders, alphas, info = result
         size, n, packed = (call["width"], call["height"]), len(params["means"]), info["means2d"].dim() == 2
         rows = info["gaussian_ids"] if packed else None
         visible = _visible(info["radii"], packed)

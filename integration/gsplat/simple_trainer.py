@@ -80,6 +80,7 @@ def install(
         start_from_stereo(runner_class)
     images = sr_images(sr, suffix)
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
+    in_use: list[_Installed] = []  # of the last Runner: its evaluation may come after its training
 
     @functools.wraps(train)
     def train_with_clear(runner: Any) -> Any:
@@ -89,7 +90,10 @@ def install(
         source, scale = sr_source(images, chosen, factor)
         photos = photos_of(runner.trainset, runner.device)
         masks = {photo.name: photo.mask for photo in photos if photo.mask is not None}
+        if in_use:
+            in_use.pop().finish()
         runner.clear = _Installed(runner, [photo.view(source, scale) for photo in photos], masks, chosen, seed)
+        in_use.append(runner.clear)
         installed(runner.clear.attached)
         result = train(runner)
         _log.info("%s.", runner.clear.attached.attachment.summary())
@@ -136,6 +140,11 @@ class _Installed:
         if export is not None:
             Replaced(export, functools.wraps(export)(functools.partial(self._export, export)))
         runner.splats.register_state_dict_post_hook(functools.partial(self._fold))  # torch marks it by an attribute
+
+    def finish(self) -> None:
+        """Leave its splats as they are drawn, and the rasterization to the next Runner."""
+        self.attached.fold_detail()
+        self.attached.remove()
 
     def _export(self, export: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """`export_splats` of the trained splats, with f_det in their constant band."""

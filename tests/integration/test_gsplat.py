@@ -275,3 +275,79 @@ def test_radii_of_gsplat_1_4_are_supported(monkeypatch):
     old, _ = first_gradient(scene, subset("clear"), function=older)
     for name, g in new.items():
         assert torch.equal(old[name], g), name
+
+
+def started(strategies=(), **settings):
+    """A host on the toy scene, and a function that renders its photos with CLEAR."""
+    scene = toy.scene(20)
+    host = Host(scene)
+    clear = attach(
+        host.splats, host.optimizers, scene.train, Conductor(*strategies, objective=HR_FROM_START), **settings
+    )
+    rasterization = clear.wrap(gsplat_host.rasterization)
+    return host, clear, lambda i: gsplat_host.drawn(rasterization, host.splats, scene.train[i].lr.camera)[0]
+
+
+def test_two_views_in_one_backward_pass_are_refused():
+    _, _, render = started()
+    with pytest.raises(HostError, match="two renderings of training views"):
+        (render(0).mean() + render(1).mean()).backward()
+
+
+def test_a_second_pass_over_the_view_can_stand_beside_it():
+    _, clear, render = started()
+    first = render(0)
+    with clear.rendering(None):
+        second = render(0)
+    (first.mean() + second.mean()).backward()
+    assert clear.attachment.counts["LR renders"] == clear.attachment.counts["merges"] == 1
+
+
+def test_a_rendering_without_backward_is_forgotten():
+    _, clear, render = started()
+    render(0)
+    render(1).mean().backward()
+    assert clear.attachment.counts["merges"] == 1
+
+
+def test_a_frozen_parameter_stays():
+    host, _, render = started((GCO(), toy.ShowsDark()))
+    host.splats["means"].requires_grad_(False)
+    before = host.splats["means"].clone()
+    for i in (0, 1):
+        render(i).mean().backward()
+        for optimizer in host.optimizers.values():
+            optimizer.step()
+    assert torch.equal(host.splats["means"], before)
+    assert host.splats["means"].grad is None
+
+
+def test_the_detail_feature_of_a_checkpoint_is_trained():
+    scene = toy.scene(20)
+    host = Host(scene)
+    host.splats["detail"] = torch.nn.Parameter(torch.zeros(20, 3))  # as a checkpoint of the host holds it
+    gsplat_host.trained(host, scene, Conductor(P2G(), objective=HR_FROM_START), [v.name for v in scene.train])
+    assert float(host.splats["detail"].abs().max()) > 0
+
+
+def test_splats_with_the_strategies_load_their_own_checkpoint():
+    scene = toy.scene(20)
+    host = Host(scene)
+    splats = torch.nn.ParameterDict(host.splats)
+    clear = attach(splats, host.optimizers, scene.train, Conductor())
+    stored = {name: p.clone() + 1 for name, p in splats.state_dict().items()}
+    splats.load_state_dict(stored)
+    assert torch.equal(splats["means"], stored["means"])
+    clear.remove()
+
+
+def test_a_rasterization_with_other_results_is_refused():
+    @functools.wraps(autograd.rasterization)
+    def rasterization_2dgs(*args, **kwargs):
+        return (*autograd.rasterization(*args, backend="torch", **kwargs), None)
+
+    scene = toy.scene(20)
+    host = Host(scene)
+    clear = attach(host.splats, host.optimizers, scene.train, Conductor())
+    with pytest.raises(HostError, match="returns 4 values, gsplat's rasterization returns 3"):
+        gsplat_host.drawn(clear.wrap(rasterization_2dgs), host.splats, scene.train[0].lr.camera)

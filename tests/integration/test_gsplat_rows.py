@@ -121,3 +121,28 @@ def test_checkpoints_and_later_loops_know_nothing_of_the_rows():
     assert set(splats.state_dict()) == {*host.splats, "detail"}
     clear.remove()
     assert ROWS not in splats
+
+
+@pytest.mark.parametrize("stopped_at", [1, 2, 3])
+def test_a_resumed_loop_takes_the_anchor_as_if_it_had_not_stopped(stopped_at):
+    scene = toy.scene(20)
+
+    def program(steps, splats=None, state=None):
+        host = Host(scene)
+        for name, p in (splats or {}).items():
+            host.splats.setdefault(name, torch.nn.Parameter(p)).data = p
+        conductor = Conductor(SVS(anchor_start=2, anchor_strength=0.01), objective=HR_FROM_START)
+        clear = attach(host.splats, host.optimizers, scene.train, conductor)
+        if state is not None:
+            clear.attachment.load_state_dict(state)
+        clear.replace_everywhere(gsplat_host.rasterization)
+        host.train([scene.train[t % 3].name for t in steps])
+        clear.remove()
+        return host.splats, clear.attachment
+
+    _, whole = program(range(4))
+    splats, first = program(range(stopped_at))
+    stored = {name: p.detach().clone() for name, p in splats.items()}
+    _, resumed = program(range(stopped_at, 4), stored, first.state_dict())
+    assert resumed.t == whole.t
+    assert set(resumed.conductor.state_dict()) == set(whole.conductor.state_dict()) != set()

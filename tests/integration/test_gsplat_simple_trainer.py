@@ -110,3 +110,21 @@ def test_one_line_before_cli_does_the_same(trainer, monkeypatch, caplog):
     with caplog.at_level(logging.INFO):
         runpy.run_path(str(edited), run_name="__main__")
     assert "8 merges" in caplog.text
+
+
+def test_a_second_runner_in_one_process_trains_too(trainer, monkeypatch):
+    from integration.gsplat import install
+    from tests.helpers import simple_trainer
+
+    runner_class = type("Runner", (simple_trainer.Runner,), {})
+    monkeypatch.setattr(simple_trainer, "rasterization", gsplat.rendering.rasterization)
+    install(runner_class, sr=trainer.folder / "sr", overrides=FROM_START)
+    drawn = []
+    for name in ("first", "second"):
+        (trainer.folder / name).mkdir()
+        runner = runner_class(0, 0, 1, simple_trainer.Config(str(trainer.folder / name)))
+        runner.train()
+        drawn.append(torch.load(trainer.folder / name / "image.pt"))
+        assert runner.clear.attached.attachment.counts["merges"] == 8
+    assert torch.equal(*drawn)
+    runner.clear.finish()

@@ -43,6 +43,19 @@ def test_the_factor_follows_recent_views_and_restarts_when_the_number_of_gaussia
     assert len(scaler(torch.ones(7), torch.ones(7), everyone(7))) == 7
 
 
+def test_a_restored_factor_continues():
+    views = [(torch.rand(9) / 9, torch.rand(9)) for _ in range(25)]
+    whole, first, resumed = (ScoreScaler(threshold=0.5) for _ in range(3))
+    for score, ordinary in views[:15]:
+        first(score, ordinary, everyone(9))
+    resumed.load_state_dict(first.state_dict())
+    last = [
+        [scaler(*view, everyone(9)) for view in part][-1] for scaler, part in ((whole, views), (resumed, views[15:]))
+    ]
+    assert torch.equal(*last)
+    assert resumed.factor != 1
+
+
 def test_a_score_of_zeros_stays_zero():
     assert torch.equal(ScoreScaler(threshold=1.0)(torch.zeros(5), torch.ones(5) * 2, everyone(5)), torch.zeros(5))
 
