@@ -32,9 +32,7 @@ def test_what_a_mask_hides_is_hidden_at_both_scales():
 
 def test_an_sr_image_may_overshoot_but_not_have_other_values():
     assert float(of_host(sr=lambda *a: torch.full((64, 96, 3), 1.03)).hr.image.max()) == 1
-    with pytest.raises(
-        DataError, match="has values from 200 to 200, must be RGB"
-    ):
+    with pytest.raises(DataError, match="has values from 200 to 200, must be RGB"):
         of_host(sr=lambda *a: torch.full((64, 96, 3), 200.0))
 
 
