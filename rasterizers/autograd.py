@@ -6,9 +6,11 @@ that a loop written for gsplat runs on a CPU. Each backward pass handles one cot
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from enum import Enum
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,7 +19,20 @@ from torch import Tensor
 import rasterizers
 from rasterizers.checks import require_depth
 from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera, Color, Rasterizer, Splats
+from rasterizers.interface import Camera, Color, Rasterizer, Rendering, Splats, over
+
+# Arguments of gsplat 1.5 that change its speed, or leave out Gaussians that are too small or too far to matter …
+_WITHOUT_EFFECT: Final = {
+    "sparse_grad",
+    "tile_size",
+    "radius_clip",
+    "far_plane",
+    "channel_chunk",
+    "distributed",
+    "segmented",
+}
+# … and of the others, the values that this package draws; None where none is named.
+_SUPPORTED: Final = {"camera_model": "pinhole", "with_ut": False, "with_eval3d": False, "rolling_shutter": "GLOBAL"}
 
 
 class Drawn(NamedTuple):
@@ -39,7 +54,9 @@ class Drawn(NamedTuple):
 def draw(
     rasterizer: Rasterizer, splats: Splats, camera: Camera, means2d: Tensor | None = None, *, depth: bool = False
 ) -> Drawn:
-    """Draw the splats. Gradients flow from the image to the splats' tensors; alpha and depth have none.
+    """Draw the splats. Gradients flow from the image and its alpha to the splats' tensors; depth has none.
+
+    A loss of alpha draws the splats a second time, over another background, and takes a second backward pass.
 
     Args:
         means2d: a tensor that receives the projected centres and whose `.grad` will be the screen gradient; None makes one.
@@ -71,27 +88,45 @@ class _Draw(torch.autograd.Function):
         offset: Tensor | None,
         *tensors: Tensor,
     ) -> Any:
-        ctx.offset = offset is not None
+        ctx.rasterizer, ctx.camera, ctx.offset = rasterizer, camera, offset is not None
+        ctx.save_for_backward(*tensors, *([] if offset is None else [offset]))
         detached = Splats(*(x.detach() for x in tensors))
         if offset is not None:
             detached = replace(detached, rgb_offset=offset.detach())
         ctx.rendering = rasterizer(detached, camera, depth=True) if depth else rasterizer(detached, camera)
         means2d.data.copy_(ctx.rendering.means2d)
-        ctx.mark_non_differentiable(ctx.rendering.alpha, ctx.rendering.visible)
+        ctx.mark_non_differentiable(ctx.rendering.visible)
         ctx.set_materialize_grads(False)
         return ctx.rendering.image, ctx.rendering.alpha, ctx.rendering.visible, ctx.rendering.depth
 
     @staticmethod
-    def backward(ctx: Any, of_image: Tensor | None, _alpha: None, _visible: None, of_depth: Tensor | None) -> Any:
+    def backward(ctx: Any, of_image: Tensor | None, of_alpha: Tensor | None, _: None, of_depth: Tensor | None) -> Any:
         if of_depth is not None and bool(of_depth.any()):  # silence would leave out a part of the loss
             raise NotImplementedError(
                 "the loss depends on a rendered depth, which has no gradient in this package; detach it, or draw with "
                 "gsplat's own rasterization on a GPU."
             )
+        saved = [x.detach() for x in ctx.saved_tensors]  # raises if one was changed in place since it was drawn
         cotangent = torch.zeros_like(ctx.rendering.image) if of_image is None else of_image
-        g = ctx.rendering.vjp(cotangent[None])
-        gradients = (g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN)
-        return None, None, None, g.screen[0], g.rgb[0] if ctx.offset else None, *(x[0] for x in gradients)
+        if of_alpha is None or not bool(of_alpha.any()):
+            total = _gradients(ctx.rendering, cotangent)
+        else:
+            # With C the colour and T = 1 - alpha, I(b) = C + T b. The difference of two backgrounds has the gradient of T.
+            b = ctx.rasterizer.background
+            other = (0.0 if b[0] > 0.5 else 1.0, *b[1:])
+            of_red = torch.zeros_like(cotangent)
+            of_red[..., 0] = of_alpha / (other[0] - b[0])
+            splats = Splats(*saved[:6], *saved[6:])
+            over_other = over(ctx.rasterizer, other)(splats, ctx.camera)
+            pairs = zip(_gradients(ctx.rendering, cotangent + of_red), _gradients(over_other, -of_red), strict=True)
+            total = [g + h for g, h in pairs]
+        screen, rgb, *gradients = total
+        return None, None, None, screen, rgb if ctx.offset else None, *gradients
+
+
+def _gradients(rendering: Rendering, cotangent: Float[Tensor, "H W 3"]) -> list[Tensor]:
+    g = rendering.vjp(cotangent[None])
+    return [x[0] for x in (g.screen, g.rgb, g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN)]
 
 
 def rasterization(
@@ -113,7 +148,7 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: str = "classic",
     backend: str = "auto",
-    **ignored: Any,
+    **others: Any,
 ) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"], dict[str, Any]]:
     """Stands in for gsplat's `rasterization` with a backend of this package: pinhole cameras, RGB and expected depth.
 
@@ -122,17 +157,17 @@ def rasterization(
         render_mode: "RGB", or "RGB+ED" with the expected depth as a fourth channel of the images, to look at: a loss of
             it raises `NotImplementedError` in `backward`.
         packed: has no effect; `info` is always unpacked.
-        ignored: gsplat's other arguments (sparse_grad, tile_size, far_plane …) have no effect.
+        others: gsplat's other arguments. Those that change only how it computes (sparse_grad, tile_size …) have no effect.
         backend: a name of `rasterizers.load`.
 
     Returns:
-        images, alphas (not differentiable), and what gsplat's strategies read: `means2d` [C, N, 2] (`retain_grad` works),
+        images, alphas, and what gsplat's strategies read: `means2d` [C, N, 2] (`retain_grad` works),
         `radii` [C, N, 2] (1 for the visible, 0 for the others), `width`, `height`, `n_cameras`, `gaussian_ids`.
 
     Raises:
-        ValueError: a mode that only gsplat supports.
+        ValueError: a mode or an argument that only gsplat supports, or poses that require a gradient.
     """
-    _require_supported(render_mode, rasterize_mode, absgrad)
+    _require_supported(render_mode, rasterize_mode, absgrad, viewmats.requires_grad, others)
     n = len(means)
     if sh_degree is None:
         base, bands = (colors[:, None] - 0.5) / SH_C0, colors.new_zeros(n, 0, 3)
@@ -157,7 +192,19 @@ def rasterization(
     return torch.stack(images), torch.stack([s.alpha for s in shots])[..., None], info
 
 
-def _require_supported(render_mode: str, rasterize_mode: str, absgrad: bool) -> None:
+def _require_supported(
+    render_mode: str, rasterize_mode: str, absgrad: bool, poses_learn: bool, others: Mapping[str, Any]
+) -> None:
+    refused = ["a gradient of viewmats"] if poses_learn else []
+    for name in others.keys() - _WITHOUT_EFFECT:
+        value, supported = others[name], _SUPPORTED.get(name)
+        value = value.name if isinstance(value, Enum) else value
+        if value is not supported and not (isinstance(value, str | bool) and value == supported):
+            refused.append(f"{name}={value!r}" if isinstance(value, str | bool | int | float) else name)
+    if refused:
+        raise ValueError(
+            f"this stand-in for gsplat's rasterization does not support {', '.join(sorted(refused))}. gsplat's own needs CUDA."
+        )
     if render_mode not in ("RGB", "RGB+ED") or rasterize_mode not in ("classic", "antialiased") or absgrad:
         raise ValueError(
             "this stand-in for gsplat's rasterization draws render_mode='RGB' or 'RGB+ED', rasterize_mode='classic' or "

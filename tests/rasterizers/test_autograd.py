@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import fields, replace
 
 import pytest
@@ -63,3 +64,60 @@ def test_the_stand_in_for_gsplats_rasterization_has_our_rasterizers_gradients():
     require_gradients(splats, info["means2d"].grad[0], expected.vjp(v))
     with pytest.raises(ValueError, match="needs CUDA"):
         autograd.rasterization(*geometry, render_mode="D", **settings)
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (0.9, 0.2, 0.4)])
+def test_a_loss_of_alpha_has_the_gradient_of_another_background(background):
+    """C + (1 - alpha) b over black is what a rasterizer draws over b."""
+    b, view = torch.tensor(background, dtype=torch.float64), camera(40, 30)
+    v = torch.randn(30, 40, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    composed, drawn_over = (leaves(scene(60, dtype=torch.float64)) for _ in range(2))
+    for over in (background, (0.3, 0.3, 0.3)):
+        rasterizer = ReferenceRasterizer(background=over)
+        shot = autograd.draw(rasterizer, composed, view)
+        image = shot.image + (1 - shot.alpha)[..., None] * (b - torch.tensor(over, dtype=torch.float64))
+        (image * v).sum().backward()
+    expected = ReferenceRasterizer(background=background)(drawn_over, view).vjp(v[None])
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        assert torch.allclose(getattr(composed, name).grad, 2 * getattr(expected, name)[0], rtol=1e-6, atol=1e-9), name
+
+
+def test_splats_changed_in_place_since_they_were_drawn_are_refused():
+    splats = leaves(scene(60))
+    image = autograd.draw(ReferenceRasterizer(), splats, camera(40, 30)).image
+    with torch.no_grad():
+        splats.means.add_(1)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        image.sum().backward()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "refused"),
+    [
+        ({"camera_model": "fisheye"}, "camera_model='fisheye'"), ({"rendermode": "D"}, "rendermode='D'"),
+        ({"covars": torch.zeros(60, 3, 3)}, "covars"), ({"with_ut": True}, "with_ut=True"),
+    ],
+)  # fmt: skip
+def test_arguments_that_only_gsplat_supports_are_refused(arguments, refused):
+    with pytest.raises(ValueError, match=f"does not support {refused}"):
+        stand_in(**arguments)
+
+
+def test_poses_that_should_learn_are_refused():
+    with pytest.raises(ValueError, match="does not support a gradient of viewmats"):
+        stand_in(camera(40, 30).world_to_camera.float()[None].requires_grad_())
+
+
+def test_gsplats_own_defaults_are_drawn():
+    given = inspect.signature(pytest.importorskip("gsplat").rasterization).parameters
+    defaults = {name: p.default for name, p in given.items() if p.default is not p.empty and name != "sh_degree"}
+    assert stand_in(**defaults)[0].shape == (1, 30, 40, 3)
+
+
+def stand_in(viewmats=None, **arguments):
+    """The toy scene by gsplat's arguments."""
+    s, view = scene(60), camera(40, 30)
+    pose = view.world_to_camera.float()[None] if viewmats is None else viewmats
+    colors = torch.cat((s.sh0, s.shN), 1)
+    geometry = (s.means, s.quats, s.scales, s.opacities, colors, pose, intrinsics(view).float()[None], 40, 30)
+    return autograd.rasterization(*geometry, sh_degree=1, backend="torch", **arguments)
