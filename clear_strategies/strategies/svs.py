@@ -127,7 +127,7 @@ class SVS(Strategy):
 
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
         """θ^a = sg(θ(t_a)); the last structural change was at t < t_a."""
-        if step.t == self.anchor_start and self.anchor_strength > 0:
+        if step.t >= self.anchor_start and self.anchor_strength > 0 and not self.state:  # skips may jump over t_a
             self.state.update({name: params[name].detach().clone() for name in self.keeps() if name in params})
             self.cache.pop("extent", None)
 

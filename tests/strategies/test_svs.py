@@ -123,3 +123,14 @@ def test_a_changed_number_of_gaussians_under_an_anchor_is_an_error():
         svs.regularize(params(21), 6)
     with pytest.raises(AnchorError, match="Stop densification at t_a"):
         svs.on_resize(torch.arange(19))
+
+
+def test_an_iteration_that_a_skip_jumped_over_takes_the_anchor_once():
+    svs = SVS(anchor_start=5, anchor_strength=0.01)
+    svs.on_fit_start(3, 0)
+    svs.after_step(params(), toy.step(4))
+    assert not svs.state
+    at_seven = params()
+    svs.after_step(at_seven, toy.step(7))
+    svs.after_step({name: p + 1 for name, p in at_seven.items()}, toy.step(8))
+    assert torch.equal(svs.state["means"], at_seven["means"])
