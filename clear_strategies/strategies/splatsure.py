@@ -92,7 +92,7 @@ class SplatSuRe(Strategy):
         """Store the sampling rates of the Gaussians that the view of this step shows."""
         if step.visible is None:
             return
-        name, camera = step.view.name, step.view.hr.camera
+        name, camera = step.view.name, step.view.lr.camera  # skips halve the HR side for a part of the run
         pose = self._pose(name, camera).to(params["means"])
         z = params["means"] @ pose[2, :3] + pose[2, 3]
         before = self.state.get(name, torch.zeros_like(z))

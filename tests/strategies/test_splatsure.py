@@ -97,3 +97,13 @@ def test_two_views_are_warned_of(caplog):
 def test_settings_outside_their_range_are_refused(setting):
     with pytest.raises(ValueError, match=next(iter(setting))):
         SplatSuRe(**setting)
+
+
+def test_an_hr_side_of_half_the_size_changes_no_rate():
+    rates = []
+    for factor in (2, 4):
+        strategy, lr, hr = started(), camera(4.0), camera(4.0, 10.0 * factor)
+        view = View("a", Photo(lr, torch.zeros(8, 8, 3)), Photo(hr, torch.zeros(8, 8, 3)))
+        strategy.after_step({"means": torch.zeros(1, 3)}, Step(1, view, torch.tensor([True])))
+        rates.append(strategy.state["a"])
+    assert torch.equal(*rates)
