@@ -193,10 +193,12 @@ class ExtraView:
     Args:
         photo: the target, and its camera. Any size; the smaller, the cheaper.
         weight: >= 0 for each pixel, a multiple of λ_LR; 0 where the target is unknown.
+        background: see `View.background`; what a transparent photo lies over.
     """
 
     photo: Photo
     weight: Float[Tensor, "h w"]
+    background: Color = (0.0, 0.0, 0.0)
 
     def to(self, device: torch.device | str) -> ExtraView:
-        return ExtraView(self.photo.to(device), self.weight.to(device))
+        return replace(self, photo=self.photo.to(device), weight=self.weight.to(device))

@@ -99,7 +99,10 @@ def border_views(photos: Iterable[Photo], *, field: float, max_pixels: int) -> l
         wide = replace(c, cx=c.cx + x, cy=c.cy + y, width=c.width + 2 * x, height=c.height + 2 * y)
         known = torch.zeros(wide.height, wide.width, dtype=torch.bool)
         known[y : y + c.height, x : x + c.width] = True if photo.shown is None else photo.shown
-        made.append(PseudoView(Photo(wide, torch.nn.functional.pad(photo.image, (0, 0, x, x, y, y))), known))
+        image = torch.nn.functional.pad(photo.image, (0, 0, x, x, y, y))
+        through = photo.transparency
+        through = None if through is None else torch.nn.functional.pad(through, (x, x, y, y))
+        made.append(PseudoView(Photo(wide, image, transparency=through), known))
     return made
 
 

@@ -211,7 +211,7 @@ class Conductor:
             DivergedError: the loss is not finite.
         """
         weight = extra.weight[..., None]
-        target = torch.where(weight > 0, extra.photo.image, 0.0)
+        target = torch.where(weight > 0, extra.photo.over(self.background(t), extra.background).image, 0.0)
         found = self.objective.lr(torch.where(weight > 0, image.detach(), 0.0), target)
         require_finite_losses(f"t={t}, an extra view", found.values, {"it": target, "the render": image})
         return found._replace(cotangents=found.cotangents * weight)

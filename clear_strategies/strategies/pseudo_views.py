@@ -21,6 +21,7 @@ from clear_strategies.core.view import DepthMap, ExtraView, Photo, View
 from clear_strategies.geometry.continuation import continued
 from clear_strategies.geometry.pseudo_views import PseudoView, border_views, cut_out, pseudo_views
 from clear_strategies.strategies.base import Strategy
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
@@ -103,8 +104,8 @@ class PseudoViews(Strategy):
             left = "only shows the borders of the photos" if borders else "has no effect"
             _log.warning("PseudoViews %s: stereo finds depth in fewer than two of %d photos.", left, len(photos))
         self.cache[_KNOWN] = sum(float(view.known.float().mean()) for view in made) / max(1, len(made))
-        self.cache[_MADE] = tuple(self._target(view) for view in made)
-        self.cache[_BORDERS] = tuple(self._target(view) for view in borders)
+        self.cache[_MADE] = tuple(self._target(view, background) for view in made)
+        self.cache[_BORDERS] = tuple(self._target(view, background) for view in borders)
 
     def _moved_aside(self, views: Sequence[View], photos: dict[str, Photo]) -> list[PseudoView]:
         if len(photos) < 2:
@@ -124,10 +125,10 @@ class PseudoViews(Strategy):
             seed=self.cache[_SEED],
         )
 
-    def _target(self, view: PseudoView) -> ExtraView:
+    def _target(self, view: PseudoView, background: Color) -> ExtraView:
         weight = torch.where(view.known, 1.0, self.continued if bool(view.known.any()) else 0.0) * self.weight
         image = continued(view.photo.image, view.known) if self.continued > 0 else view.photo.image
-        return ExtraView(replace(view.photo, image=image), weight).to(self.device)
+        return ExtraView(replace(view.photo, image=image), weight, background).to(self.device)
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         """One of them every `every` iterations: a function of (seed, t)."""

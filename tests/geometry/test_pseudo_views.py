@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -130,3 +132,11 @@ def test_a_border_view_shows_its_photo_in_the_middle_of_a_wider_field(max_pixels
     y, x = (int(axis.nonzero()[0]) for axis in (wide.known.any(1), wide.known.any(0)))
     scale = column / photo.camera.width
     assert there.tolist() == pytest.approx((here * scale + torch.tensor([x, y])).tolist(), abs=1e-4)
+
+
+def test_a_border_view_is_as_transparent_as_its_photo():
+    photo = planes.plane_photos(1)[0]
+    photo = replace(photo, transparency=torch.rand(photo.image.shape[:2], generator=torch.Generator().manual_seed(0)))
+    (wide,) = border_views([photo], field=1.3, max_pixels=10**6)
+    assert torch.equal(wide.photo.transparency[wide.known], photo.transparency.flatten())
+    assert not wide.photo.transparency[~wide.known].any()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from clear_strategies import SVS, ExtraView, Photo, Strategy
+from clear_strategies import SVS, Conductor, ExtraView, Objective, Photo, Strategy
 from clear_strategies.core import deferred
 from clear_strategies.errors import DivergedError
 from clear_strategies.training.extra_steps import LOSS, extra_steps
@@ -25,6 +25,12 @@ class Dark(Strategy):
 
     def extra_views(self, t):
         return () if t % self.every else (black(),)
+
+
+@dataclass(frozen=True)
+class Red(Strategy):
+    def background(self, t):
+        return 1.0, 0.0, 0.0
 
 
 def black(weight: float = 1.0) -> ExtraView:
@@ -112,3 +118,12 @@ def test_a_number_that_is_not_finite_is_found_before_the_step(fused):
     with pytest.raises(DivergedError, match="t=1, an extra view"):
         extra_steps(state, toy.RASTERIZER, [extra])
     assert all(torch.equal(value, before[name]) for name, value in state.field.raw().items())
+
+
+def test_a_transparent_picture_is_compared_before_the_background_of_the_iteration():
+    white = (1.0, 1.0, 1.0)
+    photo = Photo(toy.camera(0.0, 24, 16), torch.ones(16, 24, 3), transparency=torch.ones(16, 24))
+    conductor = Conductor(Red(), objective=Objective(kernels="torch"))
+    render = torch.tensor([1.0, 0.0, 0.0]).expand(16, 24, 3)
+    loss = conductor.extra_loss(render, ExtraView(photo, torch.ones(16, 24), white), 1)
+    assert float(loss.cotangents.abs().max()) < 1e-12
