@@ -197,7 +197,7 @@ class TrainState:
             self.field = GaussianField(parameters, degree=int(saved.facts["degree"])).to(device)
             self.field.filter_3d = parameters["filter_3d"].to(device, copy=True)
             self.optimizer.load_state_dict(tables["optimizer"], int(saved.facts["optimizer_steps"]))
-            self.density.load_state_dict(tables["density"])
+            self.density.load_state_dict(tables.get("density", {}))
             self.conductor.load_state_dict(tables.get("strategies", {}))
             self.conductor.work_log.load_state_dict(saved.work_log)
         except (KeyError, ValueError, TypeError) as error:
@@ -223,7 +223,9 @@ class TrainState:
             for key, x in rows.items():
                 if x.dtype != here.dtype or tuple(x.shape) != (n, *here.shape[1:]):
                     raise ValueError(f"{key} is {x.dtype} {tuple(x.shape)}, not {here.dtype} {(n, *here.shape[1:])}")
-        statistics = {name: x for name, x in tables["density"].items() if name in ("score", "ordinary", "count")}
+        statistics = {
+            name: x for name, x in tables.get("density", {}).items() if name in ("score", "ordinary", "count")
+        }
         per_row = (field["filter_3d"], *statistics.values())
         if any(tuple(x.shape) != (n,) for x in per_row):
             raise ValueError(f"filter_3d or a statistic has not one number for each of {n} Gaussians")

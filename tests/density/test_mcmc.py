@@ -247,3 +247,19 @@ def test_views_change_nothing_by_themselves():
         step(theta, optimizer, densifier, 5)
         fields.append(theta.raw())
     assert all(torch.equal(fields[0][name], fields[1][name]) for name in fields[0])
+
+
+def test_a_densifier_without_state_resumes(tmp_path):
+    class Stateless(Sampler):
+        def state_dict(self):
+            return {}
+
+        def load_state_dict(self, tensors):
+            assert not tensors
+
+    state = start(())
+    state.density = Stateless(EVERY, len(state.field), seed=0)
+    iterate(state, toy.RASTERIZER)
+    saved = checkpoint.load(checkpoint.save(tmp_path, state.checkpoint({})))
+    state.restore(saved, tmp_path)
+    assert state.t == 2
