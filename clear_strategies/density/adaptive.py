@@ -140,8 +140,9 @@ class Density:
     def reset_due(self, t: int) -> bool:
         """Whether opacities are reset at t."""
         s = self.settings
-        early = self.white_background and t == s.start
-        return early or (s.start < t < s.stop and s.reset_every > 0 and t % s.reset_every == 0)
+        if not s.start <= t < s.stop:
+            return False
+        return self.white_background if t == s.start else s.reset_every > 0 and t % s.reset_every == 0
 
     def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         if due := self.due(t):
