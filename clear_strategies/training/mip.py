@@ -14,12 +14,13 @@ from torch import Tensor
 
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.schedules import milestone
-from rasterizers.interface import Camera
+from rasterizers.interface import Camera, RasterSettings
 
 _log = logging.getLogger(__name__)
 
-_NEAR: Final = 0.2  # Mip-Splatting: a camera samples what is farther in front of it than this …
-_MARGIN: Final = 0.15  # … and projects into its image enlarged by this share on each side
+# A camera samples what it draws, whatever the capture's unit (Mip-Splatting: what is farther than 0.2) …
+_NEAR: Final = RasterSettings().near
+_MARGIN: Final = 0.15  # … and projects into its image enlarged by this share on each side (Mip-Splatting)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,9 @@ def filter_std(means: Float[Tensor, "N 3"], cameras: Sequence[Camera], variance:
         z_min = torch.where((z > _NEAR) & inside, torch.minimum(z_min, z), z_min)
     seen = z_min.isfinite()
     if not bool(seen.any()):
-        _log.warning("no training camera sees any Gaussian: the 3D filter is off.")
+        _log.warning(
+            "no training camera sees a Gaussian farther away than %g world units: the 3D filter is off.", _NEAR
+        )
         return means.new_zeros(len(means))
     z_min = torch.where(seen, z_min, z_min[seen].max())
     std: Tensor = z_min * (math.sqrt(variance) / max(camera.fx for camera in cameras))

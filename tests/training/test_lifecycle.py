@@ -147,6 +147,8 @@ def test_white_backgrounds_get_an_early_reset():
     black = Density(DensitySettings(), 1, extent=1.0, seed=0)
     assert [t for t in range(1, 10_001) if white.reset_due(t)] == [500, 3000]
     assert [t for t in range(1, 10_001) if black.reset_due(t)] == [3000]
+    off = Density(DensitySettings(stop=0), 1, extent=1.0, seed=0, white_background=True)
+    assert not any(map(off.reset_due, range(1, 10_001)))
 
 
 def test_an_anchor_follows_a_reordering_of_its_gaussians():
@@ -253,3 +255,12 @@ def test_extent_of_cameras():
     centers = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0]])
     assert cameras_extent(centers) == pytest.approx(1.1)
     assert cameras_extent(centers[:1]) > 0
+
+
+def test_the_3d_filter_does_not_depend_on_the_unit_of_the_world():
+    camera = toy.camera(0.0)
+    means = torch.tensor([[0.0, 0, -3.8], [0, 0, 0], [0, 0, 4]])  # depths 0.2, 4, 8
+    pose = camera.world_to_camera.clone()
+    pose[:3, 3] *= 0.1
+    smaller = replace(camera, world_to_camera=pose)
+    assert torch.allclose(filter_std(0.1 * means, [smaller], 0.2), 0.1 * filter_std(means, [camera], 0.2))
