@@ -11,7 +11,7 @@ def generator_at(seed: int, t: int, device: torch.device | str = "cpu") -> torch
     Two purposes that ask at the same (seed, t) begin with the same random bits. A purpose that must be independent of the
     others takes `hashed_generator_at`.
     """
-    return torch.Generator(device).manual_seed(seed * 1_000_003 + t)
+    return torch.Generator(device).manual_seed((seed * 1_000_003 + t) % 2**63)
 
 
 def hashed_generator_at(seed: int, t: int, device: torch.device | str = "cpu") -> torch.Generator:

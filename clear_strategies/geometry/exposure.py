@@ -18,29 +18,24 @@ from clear_strategies.geometry.projection import back_project, inside_of, projec
 
 _TOLERANCE: Final = 0.02  # relative difference of depth up to which two photos show the same surface
 _UNCLIPPED: Final = (0.05, 0.92)  # darker, a ratio is that of noise; lighter, the photo may have been clipped
+_PARTNERS: Final = 12  # of a photo, those with the nearest cameras
 _FEWEST: Final = 100  # shared pixels of a pair, per channel
 
 
 def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float[Tensor, "V 3"]:
     """The gains that bring the photos to their common exposure: photo × gain.
 
-    Each pair of photos gives the median ratio of the colours of the surfaces that both show; least squares over all pairs make
-    one gain of each photo of them. Over photos that are connected by pairs, the gains of a channel have the geometric mean 1.
-    A photo that shares nothing with another has the gain 1.
+    Each pair of neighbouring photos gives the median ratio of the colours of the surfaces that both show; least squares over
+    all pairs make one gain of each photo of them. Over photos that are connected by pairs, the gains of a channel have the
+    geometric mean 1. A photo that shares nothing with another has the gain 1.
 
     Args:
         depths: of the photos, on their pixels.
     """
-    ratios, weights, pairs = [], [], []
-    for a, (photo, depth) in enumerate(zip(photos, depths, strict=True)):
-        for b, (other, its_depth) in enumerate(zip(photos, depths, strict=True)):
-            if a != b:
-                ratio, weight = _ratio(photo, depth, other, its_depth)
-                pairs.append((a, b))
-                ratios.append(ratio)
-                weights.append(weight)
+    pairs = [(a, b) for a, partners in enumerate(_neighbours(photos)) for b in partners]
     if not pairs:
         return torch.ones(len(photos), 3)
+    ratios, weights = zip(*(_ratio(photos[a], depths[a], photos[b], depths[b]) for a, b in pairs), strict=True)
     difference = torch.zeros(len(pairs), len(photos), dtype=torch.float64)
     for row, (a, b) in enumerate(pairs):
         difference[row, a], difference[row, b] = 1, -1
@@ -50,6 +45,13 @@ def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float
         torch.linalg.pinv(root[:, c, None] * difference) @ (root[:, c] * torch.stack(ratios)[:, c]) for c in range(3)
     ]
     return torch.exp(-torch.stack(logs, dim=1)).float()
+
+
+def _neighbours(photos: Sequence[Photo]) -> list[list[int]]:
+    """The photos from the nearest cameras, for each: with all pairs, a hundred photos would take minutes."""
+    centers = torch.stack([photo.camera.center for photo in photos])
+    nearest = torch.cdist(centers, centers).argsort(dim=1, stable=True).tolist()
+    return [sorted([b for b in row if b != a][:_PARTNERS]) for a, row in enumerate(nearest)]
 
 
 def _ratio(photo: Photo, depth: DepthMap, other: Photo, its_depth: DepthMap) -> tuple[Tensor, Tensor]:

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo, View
-from clear_strategies.geometry import exposure_gains
+from clear_strategies.geometry import exposure, exposure_gains
 from tests.helpers import planes
 
 DEPTH = 4.0
+NOTHING = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
 CASTS = torch.tensor([[1.1, 1.0, 0.95], [0.92, 1.0, 1.08], [1.0, 1.04, 1.0]])
 
 
@@ -66,3 +67,15 @@ def test_a_view_is_brightened_at_both_scales_and_its_photo_stays_its_truth():
     assert made.truth is not None
     assert made.truth[0, 0].tolist() == pytest.approx([0.75, 1.0, 0.25])
     assert View("v", lr, hr, truth=hr.image).brightened(gain).hr_is_photo
+
+
+def test_with_many_photos_only_neighbours_are_compared(monkeypatch):
+    asked = []
+    monkeypatch.setattr(exposure, "_ratio", lambda photo, _, other, __: asked.append((photo, other)) or NOTHING)
+    row = [
+        replace(photo, camera=replace(photo.camera, world_to_camera=planes.camera(float(i)).world_to_camera))
+        for i, photo in enumerate(planes.plane_photos(1) * 40)
+    ]
+    exposure_gains(row, depths(40))
+    assert len(asked) == 40 * 12
+    assert max(abs(float(a.camera.center[0] - b.camera.center[0])) for a, b in asked) == pytest.approx(12)
