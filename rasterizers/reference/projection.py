@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rasterizers.geometry import rotation_matrix, spherical_harmonics
+from rasterizers.geometry import BLACK, rotation_matrix, spherical_harmonics
 from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
 
 # The Jacobian is clamped beyond this share of the half field of view outside the image.
@@ -122,7 +122,8 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: 
             raw_rgb = raw_rgb + splats.rgb_offset.detach()[rows]
         if not raw_rgb.requires_grad:
             raw_rgb.requires_grad_()  # without higher bands the colour depends on no leaf
-        rgb = raw_rgb.clamp_min(0)
+        drawn = raw_rgb + (raw_rgb.clamp_min(0) - raw_rgb).detach()
+        rgb = torch.where(raw_rgb >= -BLACK, drawn, 0)  # clamped at 0; the gradient reaches down to -BLACK
 
     with torch.no_grad():
         # alpha >= alpha_min  <=>  exponent <= power_max, with a margin; `blend` applies the exact cut-off per pixel.

@@ -7,6 +7,7 @@ from typing import Any
 
 import warp as wp
 
+from rasterizers import geometry
 from rasterizers.warp_backend.bins import count_tiles, depth_key, reaches_image
 from rasterizers.warp_backend.colour import colour_of
 from rasterizers.warp_backend.geometry import Footprint, Sums, centre_of, footprint_of, geometry_of, geometry_vjp
@@ -14,6 +15,7 @@ from rasterizers.warp_backend.types import FAR, SUMS, Cuts, Ellipse, Grid, Pose,
 
 wp.set_module_options({"enable_backward": False})
 
+BLACK = wp.constant(geometry.BLACK)
 HUGE = wp.constant(1e30)  # such an ellipse, of 1e-15 px, covers no pixel centre, and the square would overflow
 
 
@@ -175,7 +177,7 @@ def project_vjp(K: int) -> Any:
             out = geometry_vjp(pose, grid, cuts, g, f, scales[i], sums)
             rgb = wp.vec3(0.0, 0.0, 0.0)
             for c in range(3):
-                if ellipse.rgb[c] >= 0.0:  # where the colour is clamped, the image does not depend on it
+                if ellipse.rgb[c] >= -BLACK:  # where the colour is clamped, the image does not depend on it
                     rgb[c] = total[W * k + SUMS + c]
             if has_slopes:
                 out.mean += wp.transpose(slopes[i]) * rgb

@@ -9,7 +9,8 @@ from functools import cache
 import pytest
 import torch
 
-from rasterizers import SplatGradients
+from rasterizers import Camera, SplatGradients, Splats
+from rasterizers.geometry import SH_C0
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import CHECKS, gradient_of, magnitude, pixels_of, scene, select, to
 from tests.helpers.agreement import require_gradient, require_image, require_same_bits
@@ -234,3 +235,16 @@ def test_an_image_stays_valid_while_later_ones_are_drawn(backend):
     for _ in range(5):
         backend()(splats, view).vjp(cotangents(1, 150, 200))
     assert torch.equal(kept, before)
+
+
+@backends()
+def test_a_black_gaussian_gets_the_gradient_of_its_colour(backend):
+    """A colour of exactly 0 may come out below it by rounding."""
+    black = Splats(
+        means=torch.tensor([[0.0, 0, 4]]), quats=torch.tensor([[1.0, 0, 0, 0]]), scales=torch.full((1, 3), 0.3),
+        opacities=torch.tensor([0.5]), sh0=torch.tensor([[[-0.5 / SH_C0, -0.5 / SH_C0, 0.0]]]), shN=torch.zeros(1, 0, 3),
+    )  # fmt: skip
+    view = Camera(torch.eye(4), 20.0, 20.0, 8.0, 8.0, 16, 16)
+    gradient = backend()(black, view).vjp(torch.ones(1, 16, 16, 3)).sh0[0, 0, 0]
+    assert torch.allclose(gradient[:2], gradient[2:].expand(2), rtol=1e-5)
+    assert float(gradient[2]) > 0

@@ -8,6 +8,10 @@
 
 namespace clear {
 
+// rasterizers.geometry.BLACK: a colour of 0 comes out this much below it by rounding, and still gets its gradient.
+template <class T>
+inline constexpr T kBlack = T(1e-6);
+
 // ∂rgb/∂mean of a drawn Gaussian, channel by channel: one register, so that any sixteen of them are read by a transpose.
 template <class T>
 struct alignas(kLanes * sizeof(T)) Slope {
@@ -183,7 +187,10 @@ void colour_group(const Pose& pose, const Splats<T>& splats, std::vector<Target<
     }
     T clamped[3][kLanes];
     std::uint32_t lit[3];
-    for (int c = 0; c < 3; ++c) maximum(rgb[c], L(T(0))).store(clamped[c]), lit[c] = (rgb[c] >= L(T(0))).bits();
+    for (int c = 0; c < 3; ++c) {
+      maximum(rgb[c], L(T(0))).store(clamped[c]);
+      lit[c] = (rgb[c] >= L(-kBlack<T>)).bits();
+    }
     for (int i = 0; i < group.count; ++i) {
       Ellipse<T>& e = target.ellipses[group.rows[i]];
       e.r = clamped[0][i], e.g = clamped[1][i], e.b = clamped[2][i];
