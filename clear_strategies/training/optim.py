@@ -14,7 +14,7 @@ from torch import Tensor
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.gradients import ATTRIBUTES
 from clear_strategies.merging.detail import DetailRates
-from clear_strategies.schedules import LARGEST_RATE, LogLinear
+from clear_strategies.schedules import LARGEST_RATE, LogLinear, milestone
 
 _log = logging.getLogger(__name__)
 
@@ -34,6 +34,8 @@ class LearningRates:
         detail, detail_steps, detail_decay: rate, steps and decay of `DetailRates`.
         geometry_steps: the iterations that the rates of means, scales and quats are for. In a run of T < geometry_steps
             these are (geometry_steps / T)^(1/3) times as high, see `of_run`; 0: as they stand in a run of any length.
+        cool_from, end: between these iterations all rates but that of the means, which falls all along, fall linearly to 0, so
+            that a run ends on what its views agree on and not on the last of them. Equal, no rate does.
         eps: Adam's. Gradients of mean losses are near 1e-6, so torch's default of 1e-8 would freeze the small ones.
 
     Raises:
@@ -50,6 +52,8 @@ class LearningRates:
     detail_steps: int = DetailRates().steps
     detail_decay: float = DetailRates().decay
     geometry_steps: int = 30_000
+    cool_from: int = milestone(9_000)
+    end: int = milestone(10_000)
     eps: float = 1e-15
 
     def __post_init__(self) -> None:
@@ -57,6 +61,8 @@ class LearningRates:
             require_number(name, getattr(self, name), most=LARGEST_RATE)
         require_number("eps", self.eps, below=1)
         require_whole("geometry_steps", self.geometry_steps, least=0)
+        require_whole("cool_from", self.cool_from, least=0)
+        require_whole("end", self.end, least=self.cool_from)
         self.of_detail  # noqa: B018 - its ranges are checked here
 
     @property
@@ -85,7 +91,8 @@ class LearningRates:
 
     def at(self, t: int, extent: float) -> dict[str, float]:
         """Every attribute's rate at iteration t, in its own unit."""
-        rates = {name: getattr(self, name) for name in ATTRIBUTES if name != "means"}
+        warmth = min(1.0, max(0, self.end + 1 - t) / (self.end + 1 - self.cool_from))
+        rates = {name: warmth * getattr(self, name) for name in ATTRIBUTES if name != "means"}
         return {"means": self.means(t) * extent, **rates}
 
 

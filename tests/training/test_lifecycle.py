@@ -15,6 +15,7 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.points import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.errors import SettingError
+from clear_strategies.schedules import scaled
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training.densifier import cameras_extent
 from clear_strategies.training.field import GaussianField
@@ -206,6 +207,22 @@ def test_a_short_run_moves_the_geometry_faster_and_nothing_else():
     assert plain.of_run(1_500) == plain
     with pytest.raises(SettingError, match="geometry_steps: must be a whole number of at least 0"):
         LearningRates(geometry_steps=-1)
+
+
+def test_in_the_last_tenth_all_rates_fall_to_zero_but_that_of_the_means_falls_all_along():
+    rates, held = LearningRates(), LearningRates(cool_from=10_000)
+    assert rates.at(9_000, 1.0) == held.at(9_000, 1.0)
+    half, last = (rates.at(t, 1.0) for t in (9_501, 10_000))
+    for name, rate in held.at(1, 1.0).items():
+        if name == "means":
+            assert (half[name], last[name]) == (rates.means(9_501), rates.means(10_000))
+        else:
+            assert held.at(10_000, 1.0)[name] == rate
+            assert half[name] == pytest.approx(rate / 2, rel=2e-3)
+            assert last[name] == pytest.approx(rate / 1_001)
+    assert scaled(rates, 0.15).at(1_500, 1.0)["scales"] == pytest.approx(rates.scales / 151)
+    with pytest.raises(SettingError, match="end: must be a whole number of at least 9000"):
+        LearningRates(end=8_000)
 
 
 def test_the_3d_filter_by_hand_and_unseen_gaussians_take_the_largest():
