@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from clear_strategies.data.capture import Frame
-from clear_strategies.data.priors import Prior, network_of
+from clear_strategies.data.priors import Prior, network_of, passes_of
 from clear_strategies.training.loop import iterate, kernel_threads
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer
@@ -50,14 +50,18 @@ class Budget:
         """Seconds."""
         return self.began + self.seconds - time.perf_counter()
 
-    def megapixels(self, frames: Sequence[Frame], prior: Prior) -> float | None:
-        """The megapixels of an HR image up to which the SR images of all frames fit; None where no network makes them."""
+    def megapixels(self, frames: Sequence[Frame], prior: Prior, factor: int) -> float | None:
+        """The megapixels of an HR image up to which the SR images of all frames fit; None where no network makes them.
+
+        Args:
+            factor: by which the prior enlarges.
+        """
         if (network := network_of(prior)) is None or not frames:
             return None
         photo = frames[0].load()[:_CROP, :_CROP]
         began = time.perf_counter()
-        made = network("a crop, to measure the time", photo, 2)
-        each = (time.perf_counter() - began) / (made.shape[0] * made.shape[1])
+        made = network("a crop, to measure the time", photo, factor)
+        each = passes_of(prior) * (time.perf_counter() - began) / (made.shape[0] * made.shape[1])
         return max(_LEAST_MEGAPIXELS, _SR * self.left / (len(frames) * each * 1e6))
 
     def iterations(self, state: TrainState, rasterizer: Rasterizer, *, trainings: int, maps: int, frames: int) -> Plan:

@@ -125,7 +125,7 @@ def read(data: DataSettings, prior: PriorSettings, budget: Budget | None = None)
     capture, views = data.reader(), data.views
     if budget is not None and views.photos_are == "lr" and not isinstance(prior, functools.partial):
         network = _chosen(prior, capture, views.sr_scale)
-        found, limit = budget.megapixels(split(capture, views)[0], network), views.max_hr_megapixels
+        found, limit = budget.megapixels(split(capture, views)[0], network, views.sr_scale), views.max_hr_megapixels
         if found is not None and (limit is None or found < limit):
             views = replace(views, max_hr_megapixels=found)
     auto = isinstance(prior, AutoPrior) and data.save_lr is None

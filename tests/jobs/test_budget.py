@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from clear_strategies.data.capture import Frame
-from clear_strategies.data.priors import Bicubic
+from clear_strategies.data.priors import BackProjected, Bicubic, SelfEnsembled
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import budget as budgets
 from clear_strategies.jobs.budget import Budget, Plan
@@ -70,16 +70,19 @@ def test_there_are_no_more_than_asked_for_and_never_too_few_to_look_at() -> None
 
 def test_sr_images_get_no_larger_than_a_fifth_of_the_time_allows(clock: Clock) -> None:
     def slow(name: str, lr: torch.Tensor, factor: int) -> torch.Tensor:
+        assert factor == 4  # the network knows no other
         clock.now += 0.05
         return lr.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
 
     slow.label, slow.files = "slow", ()  # as every network has
     frame = Frame("a", planes.camera(0, 120, 100), lambda: torch.rand(100, 120, 3))
-    each = 0.05 / (192 * 192)
-    found = Budget(100.0, clock.now).megapixels([frame] * 8, slow)
+    each = 0.05 / (384 * 384)
+    found = Budget(100.0, clock.now).megapixels([frame] * 8, slow, 4)
     assert found == pytest.approx(0.2 * 100 / 8 / each / 1e6, rel=0.1)
-    assert Budget(1e-3, clock.now).megapixels([frame] * 8, slow) == budgets._LEAST_MEGAPIXELS
-    assert Budget(100.0, clock.now).megapixels([frame] * 8, Bicubic()) is None
+    eight_times = BackProjected(SelfEnsembled(slow))
+    assert Budget(100.0, clock.now).megapixels([frame] * 8, eight_times, 4) == pytest.approx(found / 8, rel=0.1)
+    assert Budget(1e-3, clock.now).megapixels([frame] * 8, slow, 4) == budgets._LEAST_MEGAPIXELS
+    assert Budget(100.0, clock.now).megapixels([frame] * 8, Bicubic(), 4) is None
 
 
 @pytest.mark.parametrize(("seconds", "after"), [(1e6, 13), (0.0, 17)])

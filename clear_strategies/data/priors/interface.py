@@ -70,6 +70,14 @@ def network_of(prior: object) -> Network | None:
     return prior
 
 
+def passes_of(prior: object) -> int:
+    """How often a prior runs the network behind it for one photo."""
+    passes = 1
+    while prior is not None:
+        passes, prior = passes * getattr(prior, "passes", 1), getattr(prior, "prior", None)
+    return passes
+
+
 def fingerprint(network: Network) -> str:
     """The names of a network's files, each with the first 16 digits of its SHA-256."""
     digests = ((file.name, hashlib.sha256(file.read_bytes()).hexdigest()) for file in network.files)

@@ -41,8 +41,12 @@ class SelfEnsembled:
         object.__setattr__(self, "prior", network)
 
     @property
+    def passes(self) -> int:
+        return len(_ORIENTATIONS)
+
+    @property
     def label(self) -> str:
-        return f"{self.prior.label}, mean of {len(_ORIENTATIONS)} orientations"
+        return f"{self.prior.label}, mean of {self.passes} orientations"
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         total = lr.new_zeros(lr.shape[0] * factor, lr.shape[1] * factor, 3)
@@ -50,4 +54,4 @@ class SelfEnsembled:
             turned = torch.rot90(lr.flip(1) if mirrored else lr, turns).contiguous()
             sr = torch.rot90(self.prior(name, turned, factor), -turns)
             total += sr.flip(1) if mirrored else sr
-        return images.quantize(total / len(_ORIENTATIONS))
+        return images.quantize(total / self.passes)
