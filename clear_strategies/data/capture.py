@@ -56,6 +56,7 @@ class Frame:
         split: str | None = None,
         sfm_id: int | None = None,
         mask: Path | None = None,
+        photos: Path | None = None,
     ) -> Frame:
         """The frame of a file, with the lens fitted to the photo's real size. Reads the file's header only.
 
@@ -66,7 +67,8 @@ class Frame:
                 whether its lens is, and other turned photos are refused.
             background: behind transparent pixels; None: black, logged.
             mask: an image of the photo's size, black where it hides; None: masks/STEM.png or masks/NAME.png (COLMAP's way) beside
-                the photo's folder, if one is there.
+                the folder of the photos, if one is there.
+            photos: that folder, where the photo may lie in one below it, as its mask then does; None: the photo's own.
 
         Raises:
             DataError: the photo is not there, or has another aspect ratio than the lens.
@@ -77,7 +79,7 @@ class Frame:
         pinhole = fitted.undistorted(path)
         camera = Camera(pose, pinhole.fx, pinhole.fy, pinhole.cx, pinhole.cy, width, height)
         load = partial(_load, path, fitted, pinhole, background, turn)
-        mask = mask or _mask_of(path)
+        mask = mask or _mask_of(path, photos or path.parent)
         shown = None if mask is None else partial(_load_mask, mask, fitted, pinhole, turn)
         through = partial(_load_transparency, path, fitted, pinhole, turn) if has_alpha(path) else None
         return Frame(name, camera, load, split=split, sfm_id=sfm_id, shown=shown, transparency=through)
@@ -167,8 +169,8 @@ def _load(path: Path, lens: Lens, pinhole: Lens, background: Color | None, turn:
     return lens.undistort(image, pinhole) if lens.distorts else image
 
 
-def _mask_of(path: Path) -> Path | None:
-    folder = path.parent.parent / "masks"
+def _mask_of(path: Path, photos: Path) -> Path | None:
+    folder = photos.parent / "masks" / path.parent.relative_to(photos)
     return next((m for m in (folder / f"{path.stem}.png", folder / f"{path.name}.png") if m.is_file()), None)
 
 

@@ -175,12 +175,15 @@ def list_images(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise DataError(folder, "folder", "is not there", "check the path")
-    found = sorted(
-        p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file() and not p.name.startswith(".")
-    )
-    if not found:
+    if not (found := images_in(folder)):
         raise DataError(folder, "images", f"holds no image ({', '.join(SUFFIXES)})", "check the path")
     return found
+
+
+def images_in(folder: Path, pattern: str = "*") -> list[Path]:
+    """As `list_images`, also where there is none; with the pattern "**/*" those of the folders below, too."""
+    found = sorted(p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and p.is_file())
+    return [p for p in found if not any(part.startswith(".") for part in p.relative_to(folder).parts)]
 
 
 def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> None:

@@ -13,7 +13,7 @@ import torch
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
-from clear_strategies.data.photo_files import folder_note, image_folder, inside, list_images
+from clear_strategies.data.photo_files import folder_note, image_folder, images_in, inside
 from clear_strategies.data.readers.colmap_model import Model, find_model, pose_of, read_model
 from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
@@ -85,7 +85,7 @@ def capture(
     frames = [
         Frame.of_photo(
             paths[image.name].relative_to(folder).as_posix(), paths[image.name], model.lenses[image.camera],
-            pose_of(image), upright=upright, background=background, sfm_id=image.id,
+            pose_of(image), upright=upright, background=background, sfm_id=image.id, photos=folder,
         )
         for image in kept
     ]  # fmt: skip
@@ -94,8 +94,11 @@ def capture(
         "poses": f"COLMAP {_label(root, model)} ({model.ending[1:]}), {len(frames)}{some_of} images",
         "photos": folder_note(folder),
     }
-    unposed = sorted({p.name for p in list_images(folder)} - {p.name for p in paths.values()})
-    if unposed:
+    nested = any(path.parent != folder for path in paths.values())
+    posed = set(paths.values())
+    if unposed := [
+        p.relative_to(folder).as_posix() for p in images_in(folder, "**/*" if nested else "*") if p not in posed
+    ]:
         notes["without pose"] = f"{len(unposed)} photos, not used: {', '.join(unposed[:8])}"
         _log.debug("%s: %d photos have no pose and are not used: %s.", root, len(unposed), ", ".join(unposed[:8]))
     notes |= lens_notes([model.lenses[image.camera] for image in kept], frames)

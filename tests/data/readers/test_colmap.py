@@ -66,6 +66,34 @@ def test_photos_without_a_pose_are_noted(tmp_path: Path) -> None:
     assert colmap.read(tmp_path).notes["without pose"] == "1 photos, not used: d.png"
 
 
+def rig(root: Path) -> Path:
+    """A model whose photos lie in a folder for each camera."""
+    listing = tiny.colmap_txt(root) / "sparse/0/images.txt"
+    text = listing.read_text()
+    for name in tiny.NAMES:
+        (root / f"images/cam_{name[0]}").mkdir()
+        (root / "images" / name).rename(root / f"images/cam_{name[0]}/1.png")
+        text = text.replace(f" {name}\n", f" cam_{name[0]}/1.png\n")
+    listing.write_text(text)
+    return root
+
+
+def test_photos_may_all_lie_in_subfolders(tmp_path: Path) -> None:
+    assert [frame.name for frame in colmap.read(rig(tmp_path)).frames] == ["cam_a/1.png", "cam_b/1.png", "cam_c/1.png"]
+    shutil.copytree(tmp_path / "images/cam_a", tmp_path / "images/cam_d")
+    assert colmap.read(tmp_path).notes["without pose"] == "1 photos, not used: cam_d/1.png"
+
+
+def test_the_mask_of_a_photo_in_a_subfolder_lies_in_one_of_the_same_name(tmp_path: Path) -> None:
+    rig(tmp_path)
+    for place, grey in (("cam_a/1.png.png", 0.0), ("cam_b/1.png", 1.0)):
+        photo_files.write_png(tmp_path / "masks" / place, torch.full((12, 16), grey))
+    a, b, c = (frame.shown for frame in colmap.read(tmp_path).frames)
+    assert a is not None
+    assert b is not None
+    assert (bool(a().any()), bool(b().all()), c) == (False, True, None)
+
+
 def test_of_several_models_the_one_with_most_photos_is_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     tiny.colmap_txt(tmp_path)
     small = tmp_path / "sparse/0"
