@@ -10,7 +10,7 @@ import logging
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -99,13 +99,24 @@ def _write_chosen(path: Path, count: int | None, folder: Path) -> None:
     with tempfile.TemporaryDirectory(prefix=f"{folder.name}.", dir=folder.parent) as work:
         made = Path(work) / "frames"
         made.mkdir()
-        wanted = "+".join(f"eq(n\\,{i})" for i in choice.frames)
         pattern = str(made / f"{path.stem.replace('%', '_')}_%03d.jpg")
-        command = [*_filtered(path, f"select={wanted}"), "-q:v", "1", pattern]
-        subprocess.run(command, check=False, stdin=subprocess.DEVNULL)  # noqa: S603 - ffmpeg, by arguments
+        command = [*_filtered(path, f"select={_any_of(choice.frames.tolist())}"), "-q:v", "1", pattern]
+        ended = subprocess.run(command, check=False, stdin=subprocess.DEVNULL)  # noqa: S603 - ffmpeg, by arguments
+        written = len(list(made.iterdir()))
+        if ended.returncode != 0 or written != len(choice.frames):
+            problem = f"ffmpeg wrote {written} of the {len(choice.frames)} chosen frames (exit code {ended.returncode})"
+            raise DataError(path, "video", problem, f"see what it says above, and the space left in {folder.parent}")
         (made / CHOICE).write_text(choice.summary())
         shutil.rmtree(folder, ignore_errors=True)
         made.rename(folder)
+
+
+def _any_of(numbers: Sequence[int]) -> str:
+    """The expression of these frames in ffmpeg, a balanced tree: its parser refuses a long sum."""
+    if len(numbers) == 1:
+        return f"eq(n\\,{numbers[0]})"
+    half = len(numbers) // 2
+    return f"({_any_of(numbers[:half])}+{_any_of(numbers[half:])})"
 
 
 def _judged(path: Path) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -159,7 +170,7 @@ def _filtered(path: Path, filters: str) -> list[str]:
 
 
 def _key(path: Path, count: int | None) -> str:
-    digest = hashlib.sha256(repr(("frames by path and sharpness", count, path.stem)).encode())
+    digest = hashlib.sha256(repr(("all frames by path and sharpness", count, path.stem)).encode())
     with path.open("rb") as file:
         while block := file.read(1 << 20):
             digest.update(block)

@@ -65,6 +65,22 @@ def test_the_frames_are_files_that_are_made_once(clip):
     assert files[0].stat().st_mtime_ns == before
 
 
+def test_hundreds_of_frames_can_be_chosen(tmp_path, monkeypatch):
+    long = tmp_path / "long.mp4"
+    write_videos([long], (np.full((32, 32, 3), i, np.uint8) for i in range(250)), fps=30)
+    monkeypatch.setattr(video, "_judged", lambda _: (np.ones(250), np.ones(250)))
+    files = sorted(frames_of(long, 240).glob("*.jpg"))
+    assert len(files) == 240
+    assert cv2.imread(str(files[-1])).mean() == pytest.approx(249, abs=4)
+
+
+def test_a_choice_that_ffmpeg_did_not_write_whole_is_refused_and_not_kept(clip, monkeypatch):
+    monkeypatch.setattr(video, "_judged", lambda _: (np.ones(120), np.ones(120)))  # the clip has 80 frames
+    for _ in range(2):
+        with pytest.raises(DataError, match=r"ffmpeg wrote 6 of the 8 chosen frames.*space left in"):
+            frames_of(clip, 8)
+
+
 def test_the_number_of_frames_follows_the_path():
     steady = np.ones(1000)
     assert len(choose(steady, np.full(1000, 0.003), None).frames) == 25  # three widths
