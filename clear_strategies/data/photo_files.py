@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image
+from PIL.TiffImagePlugin import TiffImageFile
 from torch import Tensor
 
 from clear_strategies.core.images import to_bytes
@@ -52,6 +53,8 @@ _TURNS: Final[dict[int, Callable[[np.ndarray], np.ndarray]]] = {
     8: lambda a: a.swapaxes(0, 1)[::-1],
 }
 _ON_THE_SIDE: Final = (5, 6, 7, 8)
+_BACK: Final = {6: 8, 8: 6}  # the turn that undoes a turn; all others undo themselves
+_TIFF_SIZE: Final = (256, 257)  # tags: the width and height that are stored
 
 
 def read_image(
@@ -74,11 +77,12 @@ def read_image(
             an unknown colour mode, or has another size.
     """
     with _opened(path, turn) as image:
-        size = _upright(image.size, orientation_of(image)) if turn else image.size
+        sixteen_bits = ";16" in str(getattr(image, "tile", ""))  # the layout in the file, unknown after decoding
+        size = _size(image, turn)
         if expect is not None and size != expect:
             problem = f"is {size[0]}x{size[1]} where {expect[0]}x{expect[1]} is expected"
             raise DataError(path, "size", problem, "use images of the size the cameras were made for")
-        sixteen_bits = ";16" in str(getattr(image, "tile", ""))  # the layout in the file, unknown after decoding
+        undone = orientation_of(image) if image.format == "TIFF" else 1  # PIL and OpenCV decode TIFF upright
         try:
             image.load()
         except Exception as error:  # PIL's decoders raise many types of error on damaged bytes
@@ -87,8 +91,10 @@ def read_image(
         if turn is None:
             _refuse_turned(path, image)
         pixels = _to_float(path, image, sixteen_bits)
-        if turn:
+        if turn and image.format != "TIFF":
             pixels = _TURNS[orientation_of(image)](pixels)
+        elif not turn:
+            pixels = _TURNS[_BACK.get(undone, undone)](pixels)
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
     if alpha.size and alpha.min() < 1:
         if background is None:
@@ -104,7 +110,7 @@ def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
         DataError: as `read_image`, as far as the header tells.
     """
     with _opened(path, turn) as image:
-        return _upright(image.size, orientation_of(image)) if turn else image.size
+        return _size(image, turn)
 
 
 def has_alpha(path: Path) -> bool:
@@ -283,8 +289,10 @@ def _refuse_turned(path: Path, image: Image.Image) -> None:
         raise DataError(path, "EXIF orientation", problem, remedy)
 
 
-def _upright(size: tuple[int, int], orientation: int) -> tuple[int, int]:
-    return (size[1], size[0]) if orientation in _ON_THE_SIDE else size
+def _size(image: Image.Image, turn: bool | None) -> tuple[int, int]:
+    """(width, height) of an image that is not decoded yet. Of a turned TIFF some versions of PIL say the upright size."""
+    width, height = (image.tag_v2[tag] for tag in _TIFF_SIZE) if isinstance(image, TiffImageFile) else image.size
+    return (height, width) if turn and orientation_of(image) in _ON_THE_SIDE else (width, height)
 
 
 def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.ndarray, "H W C"]:

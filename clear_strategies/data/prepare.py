@@ -260,15 +260,18 @@ def _grey_levels(differences: Sequence[Tensor]) -> float:
 
 def _reduced(frame: Frame, views: ViewSettings) -> Photo:
     """The photo at the size that `views` asks for, its transparency, and its mask: a pixel is shown if all that it covers is."""
-    image = frame.load()
+    image, camera = frame.load(), frame.camera
+    if image.shape[:2] != (camera.height, camera.width):
+        problem = f"is {image.shape[1]}x{image.shape[0]}, but its camera is for {_size(camera)}"
+        raise DataError(frame.name, "size", problem, "give the photo that its camera was estimated from")
 
     def sized(layer: Tensor) -> Tensor:
         layer = images.resize(layer, (image.shape[1], image.shape[0]), "area")  # within_limit reduces photos alone
-        return _sized(layer, frame.camera, views).image
+        return _sized(layer, camera, views).image
 
     through = None if frame.transparency is None else _of_layer(sized, frame.transparency())
     shown = None if frame.shown is None else _of_layer(sized, frame.shown().float())
-    photo = replace(_sized(image, frame.camera, views), transparency=through)
+    photo = replace(_sized(image, camera, views), transparency=through)
     return photo if shown is None else replace(photo, shown=shown > _WHOLE)
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageOps
 
 from clear_strategies.data import photo_files
 from clear_strategies.errors import DataError
@@ -29,15 +29,16 @@ def test_eight_bits_become_their_share_of_255(tmp_path: Path) -> None:
     torch.testing.assert_close(photo_files.read_image(path), expected)
 
 
+@pytest.mark.parametrize("turn", [None, True])
 @pytest.mark.parametrize("channels", [1, 3, 4])
 @pytest.mark.parametrize("ending", [".png", ".tiff"])
-def test_sixteen_bits_stay_sixteen_bits(channels: int, ending: str, tmp_path: Path) -> None:
+def test_sixteen_bits_stay_sixteen_bits(channels: int, ending: str, turn: bool | None, tmp_path: Path) -> None:
     values = np.array([[[1000, 2000, 65535, 65535]], [[257, 1, 0, 65535]]], np.uint16)
     stored = {1: values[..., 0], 3: values[..., 2::-1], 4: values[..., [2, 1, 0, 3]]}[channels]  # OpenCV writes BGR(A)
     path = tmp_path / f"a{ending}"
     assert cv2.imwrite(str(path), stored)
     expected = (values[..., [0, 0, 0]] if channels == 1 else values[..., :3]) / 65535
-    torch.testing.assert_close(photo_files.read_image(path), torch.tensor(expected, dtype=torch.float32))
+    torch.testing.assert_close(photo_files.read_image(path, turn=turn), torch.tensor(expected, dtype=torch.float32))
 
 
 def test_sixteen_bit_grey_with_alpha_is_composited(tmp_path: Path) -> None:
@@ -80,6 +81,21 @@ def test_the_header_tells_the_size(ending: str, tmp_path: Path) -> None:
     assert photo_files.read_image(path, expect=(16, 12)).shape == (12, 16, 3)
     with pytest.raises(DataError, match="is 16x12 where 12x16 is expected"):
         photo_files.read_image(path, expect=(12, 16))
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_turned_photo_is_read_as_it_is_stored_or_upright(ending: str, orientation: int, tmp_path: Path) -> None:
+    left_above = np.zeros((12, 16, 3), np.uint8)
+    left_above[:6, :4] = 255
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = save(tmp_path / f"a{ending}", left_above, exif=exif)
+    upright = ImageOps.exif_transpose(Image.open(save(tmp_path / "turned.png", left_above, exif=exif)))
+    for turn, expected in ((False, left_above), (True, np.asarray(upright))):
+        found = photo_files.read_image(path, turn=turn, expect=(expected.shape[1], expected.shape[0]))
+        assert np.array_equal(found.numpy() > 0.5, expected > 127)
+        assert photo_files.image_size(path, turn=turn) == found.shape[1::-1]
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

@@ -181,6 +181,12 @@ def test_ready_made_lr_images_are_used(tmp_path):
     assert torch.allclose(view.lr.image, torch.tensor(0.2))
 
 
+def test_a_photo_of_another_size_than_its_camera_is_refused():
+    turned = capture(n=2, width=16, height=12, image=torch.zeros(16, 12, 3))
+    with pytest.raises(DataError, match=r"0001.png: size: is 12x16, but its camera is for 16x12"):
+        prepare(turned, papers(train=1), Bicubic(), POINTS)
+
+
 @pytest.mark.parametrize("init", ["sfm", "sfm_train", "ply"])
 def test_points_that_do_not_exist_are_refused_before_a_photo_is_decoded(init):
     with pytest.raises(DataError, match=r"there are none|is not there"):
