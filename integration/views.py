@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import Photo, View
-from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors.interface import super_resolved
+from clear_strategies.data.view_names import write_pngs
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from rasterizers.interface import Camera
@@ -128,20 +128,13 @@ def save_photos(photos: Iterable[HostPhoto], folder: Path | str) -> None:
     Raises:
         DataError: two photos would have the same file.
     """
-    written: set[Path] = set()
-    for photo in photos:
-        file = (Path(folder) / photo.name).with_suffix(".png")
-        if file in written:
-            raise DataError(
-                file, "file name", "is that of two photos",
-                "give every photo its own name; this trainer ignores folders and endings",
-            )  # fmt: skip
+
+    def shown(photo: HostPhoto) -> Float[Tensor, "h w 3"]:
         image = photo.posed.image
-        write_png(file, image if photo.mask is None else image * photo.mask[..., None])
-        written.add(file)
-    _log.info(
-        "%d LR photos written to %s. Enlarge them and pass the folder of the results as sr.", len(written), folder
-    )
+        return image if photo.mask is None else image * photo.mask[..., None]
+
+    written = write_pngs(Path(folder), ((photo.name, shown(photo)) for photo in photos))
+    _log.info("%d LR photos written to %s. Enlarge them and pass the folder of the results as sr.", written, folder)
 
 
 def enlarged_mask(mask: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "H W"]:

@@ -25,10 +25,11 @@ from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import Photo, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.photo_files import image_size, inside, list_images, read_image, write_png
+from clear_strategies.data.photo_files import image_size, inside, read_image
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
 from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of, super_resolved
 from clear_strategies.data.scene import Scene
+from clear_strategies.data.view_names import ViewFiles, write_pngs
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.exposure import exposure_gains
@@ -135,13 +136,11 @@ def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Pat
     if views.lr_folder is None:
         return {}
     folder = Path(views.lr_folder)
-    by_stem = {file.stem: file for file in reversed(list_images(folder))}
-    found = {}
+    files, found = ViewFiles(folder, "LR image", "name the LR images like the photos"), {}
     for frame in frames:
-        stem, (width, height) = Path(frame.name).stem, lr_size(frame.camera, views)
-        if stem not in by_stem:
-            raise DataError(folder, stem, "has no LR image of this name", "name the LR images like the photos")
-        file = found[frame.name] = inside(folder, by_stem[stem].name, file=folder)
+        width, height = lr_size(frame.camera, views)
+        name = files.file(frame.name).relative_to(folder).as_posix()
+        file = found[frame.name] = inside(folder, name, file=folder)
         size = image_size(file)
         if size != (width, height):
             problem = f"is {size[0]}x{size[1]} where {width}x{height} is expected"
@@ -151,10 +150,9 @@ def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Pat
 
 def save_lr(scene: Scene, folder: Path) -> None:
     """Write the training and test LR images as PNG for an external SR model; prior=images reads its results."""
-    for view in (*scene.train, *scene.test):
-        write_png((folder / view.name).with_suffix(".png"), view.lr.image)
+    written = write_pngs(folder, ((view.name, view.lr.image) for view in (*scene.train, *scene.test)))
     message = "%d LR images written to %s. Super-resolve them, then train with prior=images prior.path=<results>."
-    _log.info(message, len(scene.train) + len(scene.test), folder)
+    _log.info(message, written, folder)
 
 
 def photos_of(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from clear_strategies.data.photo_files import SUFFIXES
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+
+from clear_strategies.data.photo_files import SUFFIXES, by_stem, list_images, write_png
+from clear_strategies.errors import DataError
 
 
 def bare(name: str) -> str:
@@ -14,3 +22,71 @@ def bare(name: str) -> str:
 def file_stem(name: str) -> str:
     """The stem of a file that is made of the view, one of its own in a flat folder: "cam1_0001" of "cam1/0001.png"."""
     return bare(name).replace("/", "_")
+
+
+def named(names: Sequence[str], wanted: str) -> list[str]:
+    """Those of the views' names that `wanted` may stand for: the one that it is, with or without suffix, else by file name."""
+    return [n for n in names if wanted in (n, bare(n))] or [n for n in names if wanted in (_file(n), _file(bare(n)))]
+
+
+def write_pngs(folder: Path, images: Iterable[tuple[str, Float[Tensor, "h w 3"]]]) -> int:
+    """Write images by their views' names, and return how many. `ViewFiles` finds those that are made of them.
+
+    Raises:
+        DataError: two views would have the same file.
+    """
+    written = set[Path]()
+    for name, image in images:
+        file = folder / f"{bare(name)}.png"
+        if file in written:
+            raise DataError(
+                file, "file name", "is that of two photos", "give every photo its own name, without its ending"
+            )
+        write_png(file, image)
+        written.add(file)
+    return len(written)
+
+
+@dataclass(frozen=True, slots=True)
+class ViewFiles:
+    """A folder with one image per view, see `clear_strategies.data.priors.Images`.
+
+    Args:
+        what: the images are, for messages.
+        remedy: of a missing file.
+    """
+
+    folder: Path
+    what: str
+    remedy: str
+    suffix: str = ""
+    _view_of: dict[Path, str] = field(default_factory=dict, init=False)
+    _listed: dict[Path, dict[str, list[Path]]] = field(default_factory=dict, init=False)
+
+    def file(self, name: str) -> Path:
+        """The image of the view.
+
+        Raises:
+            DataError: it has none or several, or shares one with another view that was asked for.
+        """
+        view = bare(name)
+        below, stem = self.folder / view.rpartition("/")[0], _file(view) + self.suffix
+        folder = below if below.is_dir() else self.folder
+        if stem not in self._listed.get(folder, {}):
+            self._listed[folder] = by_stem(list_images(folder))
+        found = self._listed[folder].get(stem, [])
+        if not found:
+            raise DataError(folder, _file(view), f"has no {self.what} {stem} ({', '.join(SUFFIXES)})", self.remedy)
+        if len(found) > 1:
+            twins = " and ".join(file.name for file in found)
+            raise DataError(folder, _file(view), f"has {twins} for one view", "keep one of them")
+        if (other := self._view_of.setdefault(found[0], view)) != view:
+            problem = f"would be that of two views, {other} and {view}"
+            raise DataError(
+                found[0], self.what, problem, f"put the {self.what}s into subfolders like those of the photos"
+            )
+        return found[0]
+
+
+def _file(name: str) -> str:
+    return name.rpartition("/")[2]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.images import DownKernel
 from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.view_names import bare, named
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
 
@@ -25,7 +25,7 @@ class ViewSettings:
 
     Args:
         train: the number of training views, evenly spaced among those that are not for testing; None: all of them.
-        train_names: exactly these training views instead, by file name without its ending.
+        train_names: exactly these training views instead, by name or file name, with or without its ending.
         test_every: every view of this number, in order of names, is for testing, unless the data set has its own split;
             None or 0: none is.
         own_split: keep to the data set's own split, if it has one; false: all of its views are alike.
@@ -40,7 +40,7 @@ class ViewSettings:
             training never sees, and LR is made from them, as in the papers. "both": they are trained on at HR, in place of
             SR images, and LR is made from them.
         downsample: D, the operator that makes LR.
-        lr_folder: ready-made LR images by the photos' names, instead of making them.
+        lr_folder: ready-made LR images by the photos' names, as prior=images finds them, instead of making them.
         equalize: bring the training photos to their common exposure and white balance, by a gain for each photo and channel
             (`clear_strategies.geometry.exposure_gains`); needs the depth of data.cloud.init=stereo or auto. Test photos stay as
             they are.
@@ -104,12 +104,8 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
     else:
         pool, test = frames, []
     if views.train_names is not None:
-        by_name = {Path(f.name).stem: f for f in (pool if own_split else frames)}
-        missing = [name for name in views.train_names if name not in by_name]
-        if missing:
-            remedy = f"choose among {', '.join(by_name)}"
-            raise DataError(capture.name, "train_names", f"there is no view {missing[0]!r}", remedy)
-        pool = [by_name[name] for name in views.train_names]
+        by_name = {f.name: f for f in (pool if own_split else frames)}
+        pool = [by_name[_only(capture, tuple(by_name), name)] for name in views.train_names]
         test = [f for f in test if f not in pool]
     elif views.train is not None:
         if len(pool) < views.train:
@@ -136,6 +132,18 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
     return replace(
         camera, fx=camera.fx * x, fy=camera.fy * y, cx=camera.cx * x, cy=camera.cy * y, width=width, height=height
     )
+
+
+def _only(capture: Capture, names: Sequence[str], wanted: str) -> str:
+    """The one view that a name in `train_names` stands for."""
+    found = named(names, wanted)
+    if not found:
+        remedy = f"choose among {', '.join(map(bare, names))}"
+        raise DataError(capture.name, "train_names", f"there is no view {wanted!r}", remedy)
+    if len(found) > 1:
+        problem = f"{wanted!r} may be {' or '.join(map(repr, found))}"
+        raise DataError(capture.name, "train_names", problem, "give the whole name of one of them")
+    return found[0]
 
 
 def _evenly_spaced(frames: Sequence[Frame], count: int) -> list[Frame]:

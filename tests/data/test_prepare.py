@@ -16,7 +16,7 @@ from clear_strategies.core.view import DepthMap
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.prepare import check_headers, prepare
+from clear_strategies.data.prepare import check_headers, prepare, save_lr
 from clear_strategies.data.priors import BackProjected, Bicubic, DemoPrior
 from clear_strategies.data.readers import blender, demo
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
@@ -179,6 +179,53 @@ def test_ready_made_lr_images_are_used(tmp_path):
         write_png(tmp_path / f"{name}.png", torch.full((10, 14, 3), 0.2))
     view = made("crop", lr_folder=str(tmp_path))
     assert torch.allclose(view.lr.image, torch.tensor(0.2))
+
+
+RIG = ("cam1/0001.png", "cam1/0002.png", "cam2/0001.png", "cam2/rgb.0003.png")
+
+
+def rig() -> Capture:
+    """Photos of two cameras, each of its own grey."""
+    frames = capture(len(RIG)).frames
+    return Capture("rig", tuple(
+        replace(frame, name=name, load=lambda i=i: torch.full((16, 16, 3), i / 5))
+        for i, (frame, name) in enumerate(zip(frames, RIG, strict=True))
+    ))  # fmt: skip
+
+
+def test_a_view_is_chosen_by_its_file_name_where_that_is_its_own():
+    views = ViewSettings(train_names=["cam2/0001", "0002", "rgb.0003", "cam1/0001.png"])
+    assert [frame.name for frame in split(rig(), views)[0]] == [RIG[2], RIG[1], RIG[3], RIG[0]]
+    with pytest.raises(DataError, match=r"'0001' may be 'cam1/0001.png' or 'cam2/0001.png'"):
+        split(rig(), ViewSettings(train_names=["0001"]))
+    with pytest.raises(DataError, match=r"no view 'rgb'.*choose among cam1/0001, .*cam2/rgb.0003"):
+        split(rig(), ViewSettings(train_names=["rgb"]))
+
+
+def test_a_training_view_is_not_taken_for_the_test_view_of_its_name(tmp_path):
+    views = ViewSettings(train_names=["a"], own_split=False)
+    both = [replace(frame, name=name) for frame, name in zip(capture(2).frames, ("a", "test/a"), strict=True)]
+    assert split(Capture("blender", tuple(both)), views)[0] == [both[0]]
+
+
+def test_saved_lr_images_are_those_of_their_views_when_they_are_read(tmp_path):
+    saved = prepare(rig(), papers(train=4, test_every=0), Bicubic(), POINTS)
+    save_lr(saved, tmp_path / "lr")
+    assert sorted(str(p.relative_to(tmp_path / "lr")) for p in (tmp_path / "lr").rglob("*.png")) == sorted(RIG)
+    read = prepare(rig(), papers(train=4, test_every=0, lr_folder=str(tmp_path / "lr")), Bicubic(), POINTS)
+    for view, expected in zip(read.train, saved.train, strict=True):
+        torch.testing.assert_close(view.lr.image, expected.lr.image, atol=1 / 255, rtol=0)
+    for name in ("0001.png", "0002.png"):
+        write_png(tmp_path / name, torch.zeros(4, 4, 3))
+    with pytest.raises(DataError, match=r"0001.png: LR image: would be that of two views, cam1/0001 and cam2/0001"):
+        check_headers(rig().frames, papers(lr_folder=str(tmp_path)))
+
+
+def test_two_photos_that_differ_by_their_ending_are_not_saved_as_one(tmp_path):
+    both = [replace(frame, name=name) for frame, name in zip(capture(2).frames, ("a.png", "a.jpg"), strict=True)]
+    scene = prepare(Capture("twins", tuple(both)), papers(train=2, test_every=0), Bicubic(), POINTS)
+    with pytest.raises(DataError, match="is that of two photos"):
+        save_lr(scene, tmp_path)
 
 
 def test_a_photo_of_another_size_than_its_camera_is_refused():

@@ -9,8 +9,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
-from clear_strategies.data.photo_files import SUFFIXES, image_size, list_images, read_image
+from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.data.priors.interface import require_path, warn_if_far_from_lr
+from clear_strategies.data.view_names import ViewFiles
 from clear_strategies.errors import DataError
 
 
@@ -31,17 +32,19 @@ class Images:
 
     path: str = ""
     suffix: str = ""
-    _view_of: dict[Path, Path] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _files: ViewFiles = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         require_path(self.path, "the folder of the SR images")
+        remedy = "name the SR images like the views, or set prior.suffix"
+        object.__setattr__(self, "_files", ViewFiles(Path(self.path), "SR image", remedy, self.suffix))
 
     @property
     def label(self) -> str:
         return f"images {self.path}"
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-        file = self._file(name)
+        file = self._files.file(name)
         expected = (lr.shape[1] * factor, lr.shape[0] * factor)
         found = image_size(file)
         if found != expected:
@@ -52,24 +55,3 @@ class Images:
         result = images.quantize(read_image(file))
         warn_if_far_from_lr(file.name, result, lr, factor)
         return result
-
-    def _file(self, name: str) -> Path:
-        folder, stem = Path(self.path), Path(name).stem + self.suffix
-        if (folder / Path(name).parent).is_dir():
-            folder /= Path(name).parent
-        found = [file for file in list_images(folder) if file.stem == stem]
-        if not found:
-            raise DataError(
-                folder, Path(name).stem, f"has no SR image {stem} ({', '.join(SUFFIXES)})",
-                "name the SR images like the views, or set prior.suffix",
-            )  # fmt: skip
-        if len(found) > 1:
-            twins = " and ".join(file.name for file in found)
-            raise DataError(folder, Path(name).stem, f"has {twins} for one view", "keep one of them")
-        view = Path(name).with_suffix("")
-        if (other := self._view_of.setdefault(found[0], view)) != view:
-            raise DataError(
-                found[0], "SR image", f"would be that of two views, {other} and {view}",
-                "put the SR images into subfolders like those of the photos",
-            )  # fmt: skip
-        return found[0]

@@ -30,6 +30,15 @@ def test_views_of_two_folders_have_their_images_in_two_folders(tmp_path: Path) -
         assert torch.equal(found(name, lr, 4), read_image(tmp_path / name)), name
 
 
+def test_a_number_behind_a_dot_belongs_to_the_name(tmp_path: Path) -> None:
+    lr = photo(6, 8)
+    for number in (1, 2):
+        write_png(tmp_path / f"rgb.{number:04d}_x4.png", images.upsample(photo(6, 8, number), 4))
+    found = Images(str(tmp_path), suffix="_x4")
+    for name in ("rgb.0001", "rgb.0002.jpg"):
+        assert torch.equal(found(name, lr, 4), read_image(tmp_path / f"{name[:8]}_x4.png"))
+
+
 def test_images_of_another_view_give_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     lr = photo(16, 16, seed=1)
     write_png(tmp_path / "right.png", images.upsample(lr, 4))
