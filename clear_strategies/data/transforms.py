@@ -5,12 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
+from clear_strategies.data.cameras import Lens
+from clear_strategies.data.photo_files import image_size, inside
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.errors import DataError
+
+# Distortion keys of each model, in OpenCV's order. nerfstudio's OPENCV has a k4 that OpenCV's polynomial lacks.
+_MODELS: Final = {
+    "PINHOLE": (),
+    "SIMPLE_PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
 
 
 class Transform(msgspec.Struct):
@@ -53,6 +65,37 @@ class Transform(msgspec.Struct):
             fy = fx if angle is None else focal_of(path, f"{where}.camera_angle_y", angle, height)
         return fx, fy, width / 2 if self.cx is None else self.cx, height / 2 if self.cy is None else self.cy
 
+    def lens(self, path: Path, where: str, image: Path) -> Lens:
+        """The lens, for the sizes that the frame gives, else for the size of its image.
+
+        Args:
+            path, where: of this frame, for the message.
+        """
+        # Of a turned photo only given sizes tell whether they are those of the stored pixels.
+        real = (0, 0) if self.w is not None and self.h is not None else image_size(image)
+        width, height = (
+            float(size) if given is None else given for given, size in zip((self.w, self.h), real, strict=True)
+        )
+        fx, fy, cx, cy = self.pinhole(path, where, width, height)
+        model = "OPENCV_FISHEYE" if self.is_fisheye else self.camera_model
+        if model not in _MODELS:
+            raise DataError(path, f"{where}.camera_model", f"is {model[:40]!r}", f"use one of {', '.join(_MODELS)}")
+        keys = _MODELS[model]
+        unused = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if key not in keys and getattr(self, key) != 0]
+        if unused:
+            raise DataError(
+                path, f"{where}.{unused[0]}", f"is not 0, but {model} has no such term that OpenCV could undistort",
+                "set camera_model to what the coefficients belong to, or undistort the images first",
+            )  # fmt: skip
+        bend = tuple(getattr(self, key) for key in keys)
+        distortion = (*bend, *[0.0] * (4 - len(bend))) if bend else ()
+        fisheye = model == "OPENCV_FISHEYE"
+        return Lens(round(width), round(height), fx, fy, cx, cy, distortion, fisheye).check(path, where)
+
+    def mask(self, path: Path, allow_outside: bool) -> Path | None:
+        """The file of the mask that the frame names, inside the folder of the frame's file."""
+        return inside(path.parent, self.mask_path, file=path, allow_outside=allow_outside) if self.mask_path else None
+
 
 def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
     """The frames of a file's content; what a frame has itself wins."""
@@ -70,10 +113,8 @@ def require_paths(path: Path, frames: list[Transform]) -> None:
             raise DataError(path, f"frames[{i}].file_path", "is missing", "name the frame's image")
 
 
-def focal_of(path: Path, where: str, angle: float | None, size: float) -> float:
+def focal_of(path: Path, where: str, angle: float, size: float) -> float:
     """The focal length of an image that is so many pixels wide or high, from the angle in radians that it spans."""
-    if angle is None:
-        raise DataError(path, where, "is missing", "give radians")
     if not 0 < angle < math.pi:
         raise DataError(path, where, f"is {angle:g}; it must lie in (0, pi) radians", "correct the field")
     return size / (2 * math.tan(angle / 2))

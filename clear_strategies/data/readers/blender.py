@@ -10,10 +10,10 @@ from typing import Final
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.cameras import Lens, pose_from_opengl
-from clear_strategies.data.capture import Capture, Frame, sorted_by_name
-from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
+from clear_strategies.data.capture import Capture, Frame, lens_notes, sorted_by_name
+from clear_strategies.data.photo_files import SUFFIXES, inside
 from clear_strategies.data.strict_json import read_object
-from clear_strategies.data.transforms import focal_of, require_paths, transforms_of
+from clear_strategies.data.transforms import require_paths, transforms_of
 from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
@@ -49,16 +49,18 @@ def read(
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     faults = partial(usable, path_of=lambda entry: entry[0], missing=missing, broken=broken)
-    frames = _frames(root, root / "transforms_train.json", "train", background, allow_outside, faults)
+    found = _frames(root, root / "transforms_train.json", "train", background, allow_outside, faults)
     files = ["transforms_train.json"]
     if (root / "transforms_test.json").exists():
-        frames += _frames(root, root / "transforms_test.json", "test", background, allow_outside, faults)
+        found += _frames(root, root / "transforms_test.json", "test", background, allow_outside, faults)
         files.append("transforms_test.json")
     else:
         _log.warning("%s has no transforms_test.json: there are no test views.", root)
+    lenses, frames = [lens for lens, _ in found], [frame for _, frame in found]
     sorted_by_name(frames, root)  # only to refuse two frames of one name
     color = "white" if background == _WHITE else f"RGB {background}"
     notes = {"poses": ", ".join(files), "order": "of the files", "background": f"{color} behind transparent pixels"}
+    notes |= lens_notes(lenses, frames)
     return Capture(root.resolve().name, tuple(frames), None, background, notes)
 
 
@@ -69,18 +71,16 @@ def _frames(
     background: Color,
     allow_outside: bool,
     faults: Callable[[Path, list[tuple[Path, int]]], list[tuple[Path, int]]],
-) -> list[Frame]:
+) -> list[tuple[Lens, Frame]]:
     transforms, photos = transforms_of(file, read_object(file)), []
     require_paths(file, transforms)
     for i, transform in enumerate(transforms):
         ending = "" if transform.file_path.lower().endswith(SUFFIXES) else ".png"
         photos.append((inside(root, transform.file_path + ending, file=file, allow_outside=allow_outside), i))
-    frames = []
+    found = []
     for path, i in faults(file, photos):
         pose = pose_from_opengl(file, f"frames[{i}].transform_matrix", transforms[i].transform_matrix)
-        width, height = image_size(path)
-        focal = focal_of(file, "camera_angle_x", transforms[i].camera_angle_x, width)
-        lens = Lens(width, height, focal, focal, width / 2, height / 2).check(file, "camera_angle_x")
+        lens, mask = transforms[i].lens(file, f"frames[{i}]", path), transforms[i].mask(file, allow_outside)
         label = path.stem if split == "train" else f"{split}/{path.stem}"
-        frames.append(Frame.of_photo(label, path, lens, pose, background=background, split=split))
-    return frames
+        found.append((lens, Frame.of_photo(label, path, lens, pose, background=background, split=split, mask=mask)))
+    return found

@@ -12,27 +12,18 @@ import msgspec
 import torch
 
 from clear_strategies.core.checks import as_color
-from clear_strategies.data.cameras import Lens, pose_from_opengl
+from clear_strategies.data.cameras import pose_from_opengl
 from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
-from clear_strategies.data.photo_files import SUFFIXES, image_size, inside
+from clear_strategies.data.photo_files import SUFFIXES, inside
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.strict_json import read_object, typed
-from clear_strategies.data.transforms import Transform, require_paths, transforms_of
+from clear_strategies.data.transforms import require_paths, transforms_of
 from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
-# Distortion keys of each model, in OpenCV's order. nerfstudio's OPENCV has a k4 that OpenCV's polynomial lacks.
-_MODELS: Final = {
-    "PINHOLE": (),
-    "SIMPLE_PINHOLE": (),
-    "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"),
-    "OPENCV": ("k1", "k2", "p1", "p2", "k3"),
-    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-}
 _SPLITS: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
 
 
@@ -82,11 +73,10 @@ def read(
     for i in kept:
         where, transform, path = f"frames[{i}]", transforms[i], paths[i]
         pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
-        lens = _lens(file, where, transform, path)
+        lens, mask = transform.lens(file, where, path), transform.mask(file, allow_outside)
         lenses.append(lens)
-        mask = transform.mask_path and inside(folder, transform.mask_path, file=file, allow_outside=allow_outside)
         split = splits.get(names[i])
-        frames.append(Frame.of_photo(short[i], path, lens, pose, background=background, split=split, mask=mask or None))
+        frames.append(Frame.of_photo(short[i], path, lens, pose, background=background, split=split, mask=mask))
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(lenses, frames)}
     if splits:
         notes["split"] = _split_note(file, names, [names[i] for i in kept], splits)
@@ -112,29 +102,6 @@ def _photo(folder: Path, name: str, file: Path, allow_outside: bool) -> Path:
     if name.lower().endswith(SUFFIXES) or path.is_file():
         return path
     return inside(folder, f"{name}.png", file=file, allow_outside=allow_outside)
-
-
-def _lens(file: Path, where: str, frame: Transform, image: Path) -> Lens:
-    # Of a turned photo only given sizes tell whether they are those of the stored pixels.
-    real = (0, 0) if frame.w is not None and frame.h is not None else image_size(image)
-    width, height = (
-        float(size) if given is None else given for given, size in zip((frame.w, frame.h), real, strict=True)
-    )
-    fx, fy, cx, cy = frame.pinhole(file, where, width, height)
-    model = "OPENCV_FISHEYE" if frame.is_fisheye else frame.camera_model
-    if model not in _MODELS:
-        raise DataError(file, f"{where}.camera_model", f"is {model[:40]!r}", f"use one of {', '.join(_MODELS)}")
-    keys = _MODELS[model]
-    unused = [key for key in ("k1", "k2", "k3", "k4", "p1", "p2") if key not in keys and getattr(frame, key) != 0]
-    if unused:
-        raise DataError(
-            file, f"{where}.{unused[0]}", f"is not 0, but {model} has no such term that OpenCV could undistort",
-            "set camera_model to what the coefficients belong to, or undistort the images first",
-        )  # fmt: skip
-    bend = tuple(getattr(frame, key) for key in keys)
-    distortion = (*bend, *[0.0] * (4 - len(bend))) if bend else ()
-    fisheye = model == "OPENCV_FISHEYE"
-    return Lens(round(width), round(height), fx, fy, cx, cy, distortion, fisheye).check(file, where)
 
 
 def _splits(file: Path, listed: _Listed) -> dict[str, str]:

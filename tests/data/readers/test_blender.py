@@ -38,6 +38,22 @@ def test_the_order_is_that_of_the_file_and_endings_may_be_given(tmp_path: Path) 
     assert [frame.name for frame in blender.read(tmp_path).frames] == ["r_2", "r_10", "test/c"]
 
 
+def test_the_lens_and_the_masks_that_a_file_names_are_used(tmp_path: Path) -> None:
+    tiny.blender(tmp_path)
+    Image.new("L", (tiny.WIDTH, tiny.HEIGHT)).save(tmp_path / "m.png")
+    real = {"camera_angle_x": 0.9, "w": 32, "h": 24, "fl_x": 44.0, "fl_y": 46.0, "cx": 15.0, "cy": 13.0}
+    frames = [{"file_path": "train/a", "transform_matrix": tiny.opengl(0), "mask_path": "m.png"}]
+    for name, lens in (("transforms_train.json", {}), ("transforms_test.json", {"k1": -0.1})):
+        tiny.write_json(tmp_path / name, {**real, **lens, "frames": frames})
+    capture = blender.read(tmp_path)
+    train, test = capture.frames
+    assert (train.camera.fx, train.camera.fy, train.camera.cx, train.camera.cy) == (22, 23, 7.5, 6.5)
+    assert train.shown is not None
+    assert not train.shown().any()
+    assert "1 of 2 photos undistorted" in capture.notes["lens"]
+    assert not torch.equal(test.load(), train.load())
+
+
 def test_a_scene_without_test_views_is_read_and_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tiny.blender(tmp_path) / "transforms_test.json").unlink()
     assert [frame.split for frame in blender.read(tmp_path).frames] == ["train", "train"]

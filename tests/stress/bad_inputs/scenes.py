@@ -250,7 +250,7 @@ INPUTS = [
     case("JSON not UTF-8", "blender", write(TRAIN, b'{"a": "\xff"}'), r"transforms_train\.json: json"),
     case("5000 digits", "blender", write(TRAIN, b'{"camera_angle_x": ' + b"7" * 5000 + b"}"), r"json: is not valid"),
     case("no frames", "blender", edit(TRAIN, lambda v: v.update(frames=[])), r"transforms_train\.json: frames"),
-    case("no angle", "blender", edit(TRAIN, lambda v: v.pop("camera_angle_x")), r"camera_angle_x: is missing"),
+    case("no angle", "blender", edit(TRAIN, lambda v: v.pop("camera_angle_x")), r"fl_x: is missing.*camera_angle_x"),
     case("angle beyond pi", "blender", edit(TRAIN, lambda v: v.update(camera_angle_x=4)), r"camera_angle_x: is 4"),
     case("two frames of one file", "blender", edit_frame(TRAIN, file_path="./train/a"), r"'a' belongs to two"),
     case("frame without image", "blender", edit_frame(TRAIN, file_path="./train/x"), r"train\.json: photos: 1 of 2 .* x\.png: "),
