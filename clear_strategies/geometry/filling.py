@@ -32,8 +32,8 @@ _NEARER: Final = 0.95  # a point in front of this share of another photo's depth
 
 
 def densify(cloud: PointCloud, photos: Sequence[Photo], stride: int, background: Color | None = None) -> PointCloud:
-    """The cloud, with what `grid_points` adds where no depth is known."""
-    means, colors = grid_points(cloud.means, photos, stride, background)
+    """The cloud, with what `grid_points` adds where the photos hide nothing."""
+    means, colors = grid_points(cloud.means, photos, stride, background, masks=[photo.shown for photo in photos])
     if len(means) == 0:
         _log.warning("densify added no point.")
         return cloud
@@ -49,7 +49,7 @@ def grid_points(
     stride: int,
     background: Color | None = None,
     maps: Sequence[DepthMap] | None = None,
-    masks: Sequence[Bool[Tensor, "h w"]] | None = None,
+    masks: Sequence[Bool[Tensor, "h w"] | None] | None = None,
 ) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
     """(positions, colours): in each photo a point every `stride` pixels, at depth that is completed from `means` and `maps`.
 
@@ -57,7 +57,7 @@ def grid_points(
         background: pixels of this colour show no surface and get no point.
         maps: of each photo; only pixels of unknown depth get a point, unless it floats in front of the depth that another
             photo knows. None: no depth is known.
-        masks: of each photo, False where it hides pixels.
+        masks: of each photo, False where it hides pixels; None: it hides none.
     """
     added, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
     for i, photo in enumerate(photos):
@@ -66,8 +66,8 @@ def grid_points(
         wanted = torch.ones(photo.image.shape[:2], dtype=torch.bool)
         if maps is not None:
             wanted &= ~maps[i].known.cpu()
-        if masks is not None:
-            wanted &= masks[i].cpu()
+        if masks is not None and (shown := masks[i]) is not None:
+            wanted &= shown.cpu()
         grid = grid[wanted[y, x]]
         shade = sample_colors(photo.image, grid)
         if background is not None:

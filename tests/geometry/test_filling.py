@@ -58,6 +58,14 @@ def test_the_background_gets_no_points() -> None:
     assert bool((project(view.camera, new)[0][:, 0] > 30).all())
 
 
+def test_what_a_mask_hides_gets_no_points() -> None:
+    view = replace(photo(), shown=torch.arange(40).expand(40, 40) >= 30)
+    points = cloud_of(torch.randn(200, 3) * 0.4 + torch.tensor([0, 0, 5.0]))
+    new = densify(points, [view, photo()], 1).means[200:]
+    assert len(new) == 10 * 40 + 40 * 40
+    assert bool((project(view.camera, new[:400])[0][:, 0] > 30).all())
+
+
 def test_points_on_a_line_are_enough() -> None:
     line = torch.stack((torch.linspace(-0.5, 0.5, 30), torch.zeros(30), torch.full((30,), 5.0)), dim=1)
     new = densify(cloud_of(line), [photo()], 2).means[30:]
