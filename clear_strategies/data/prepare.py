@@ -28,6 +28,7 @@ from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import image_size, inside, read_image
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
 from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of, super_resolved
+from clear_strategies.data.priors.interface import warn_if_far_from_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import ViewFiles, write_pngs
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
@@ -78,12 +79,6 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     train, exposure = _equalized(train) if views.equalize else (train, {})
     sample, photo, sr = train[0], train_frames[0].camera, views.photos_are != "both"
     network = network_of(prior) if sr else None
-    made = {
-        "hr": f"{'PIL ' if views.downsample != 'area' else ''}{views.downsample} of the HR photo"
-        if views.lr_folder is None else f"read from {views.lr_folder} (D is taken to be {views.downsample})",
-        "lr": "the photos themselves; HR is unknown",
-        "both": f"PIL {views.downsample} of the photos",
-    }[views.photos_are]  # fmt: skip
     unused = len(capture.frames) - len(train) - len(test)
     notes = {
         "scene": f"{capture.name}, {len(capture.frames)} photos",
@@ -94,7 +89,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
         else "none: all are trained on (data.views.test_every=8 keeps every 8th for testing)",
         **({"not used": f"{unused} photos, by data.views"} if unused and not test else {}),
         "sizes": f"photos of {_size(photo)}, shrink {views.shrink}, {views.sizes} to whole pixels at both scales",
-        "LR": f"{_size(sample.lr.camera)}, {made}",
+        "LR": f"{_size(sample.lr.camera)}, {_lr_source(views)}",
         "HR": f"{_size(sample.hr.camera)} (x{views.sr_scale}), {'SR images: ' if sr else ''}{sample.sr_source}",
         **_hidden(train),
         **exposure,
@@ -180,6 +175,8 @@ def _view(
         if frame.name in lr_files:
             size = (lr_camera.width, lr_camera.height)
             lr = Photo(lr_camera, read_image(lr_files[frame.name], background=capture.background, expect=size))
+            check = f"{lr_files[frame.name]} shows this view, undistorted as data.save_lr writes it"
+            warn_if_far_from_lr(f"{frame.name}: the photo", truth, lr.image, views.sr_scale, check)
         else:
             down = partial(images.downsample, factor=views.sr_scale, kernel=views.downsample)
             lr = Photo(lr_camera, down(truth), transparency=_of_layer(down, photo.transparency))
@@ -283,6 +280,16 @@ def _sized(image: Tensor, camera: Camera, views: ViewSettings) -> Photo:
     image = images.crop_to_multiple(image, views.shrink * multiple)
     camera = replace(camera, width=image.shape[1], height=image.shape[0])
     return Photo(camera.scaled(1 / views.shrink), images.downsample(image, views.shrink, views.downsample))
+
+
+def _lr_source(views: ViewSettings) -> str:
+    """Where the LR photos come from, for the plan."""
+    if views.photos_are == "lr":
+        return "the photos themselves; HR is unknown"
+    if views.lr_folder is not None:
+        return f"read from {views.lr_folder} (D is taken to be {views.downsample})"
+    by = "" if views.downsample == "area" else "PIL "
+    return f"{by}{views.downsample} of the {'HR photo' if views.photos_are == 'hr' else 'photos'}"
 
 
 def _added_detail(views: Sequence[View]) -> float:

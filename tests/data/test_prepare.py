@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -179,6 +180,17 @@ def test_ready_made_lr_images_are_used(tmp_path):
         write_png(tmp_path / f"{name}.png", torch.full((10, 14, 3), 0.2))
     view = made("crop", lr_folder=str(tmp_path))
     assert torch.allclose(view.lr.image, torch.tensor(0.2))
+
+
+def test_a_ready_made_lr_image_that_is_not_like_its_photo_gives_a_warning(tmp_path, caplog):
+    views = papers(train=1, test_every=0, photos_are="both", lr_folder=str(tmp_path))
+    photos = capture(1, image=torch.full((16, 16, 3), 0.5))
+    for grey, warned in ((0.5, False), (0.4, True)):
+        write_png(tmp_path / "0000.png", torch.full((4, 4, 3), grey))
+        made = prepare(photos, views, Bicubic(), POINTS)
+        message = r"0000.png: the photo, reduced again, differs .* check that .*0000.png shows this view, undistorted"
+        assert bool(re.search(message, caplog.text)) is warned
+    assert made.notes["LR"] == f"4x4, read from {tmp_path} (D is taken to be bicubic)"
 
 
 RIG = ("cam1/0001.png", "cam1/0002.png", "cam2/0001.png", "cam2/rgb.0003.png")

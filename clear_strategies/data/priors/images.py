@@ -53,5 +53,5 @@ class Images:
                 "super-resolve the very LR images that this run trains on (data.save_lr writes them)",
             )  # fmt: skip
         result = images.quantize(read_image(file))
-        warn_if_far_from_lr(file.name, result, lr, factor)
+        warn_if_far_from_lr(f"{file.name}: the SR image", result, lr, factor)
         return result

@@ -106,16 +106,25 @@ def require_file(path: Path, what: str) -> None:
         raise DataError(path, "file", "cannot be read", "check its permissions")
 
 
-def warn_if_far_from_lr(what: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int) -> None:
-    """Warn where the SR image, reduced again, differs from its LR image.
+def warn_if_far_from_lr(
+    what: str,
+    hr: Float[Tensor, "H W 3"],
+    lr: Float[Tensor, "h w 3"],
+    factor: int,
+    check: str = "it shows this view, and is RGB in [0, 1]",
+) -> None:
+    """Warn where the image at HR, reduced, differs from its LR image.
 
     That happens with the image of another view, and with a network that expects BGR or values in [0, 255].
+
+    Args:
+        check: what the user should look at.
     """
-    distance = float((images.downsample(sr, factor, "area") - lr).abs().mean())
+    distance = float((images.downsample(hr, factor, "area") - lr).abs().mean())
     if distance > _USUAL_DISTANCE:
         _log.warning(
-            "%s: the SR image, reduced again, differs from its LR image by %.3f on average (usual: below %.2f); check "
-            "that it shows this view, and is RGB in [0, 1].", what, distance, _USUAL_DISTANCE,
+            "%s, reduced again, differs from its LR image by %.3f on average (usual: below %.2f); check that %s.",
+            what, distance, _USUAL_DISTANCE, check,
         )  # fmt: skip
 
 
@@ -129,5 +138,5 @@ def finished(
     seconds = time.perf_counter() - began
     _log.debug("%s: %s made %dx%d in %.1f s.", name, label, sr.shape[1], sr.shape[0], seconds)
     result = images.quantize(sr).to(lr.device)
-    warn_if_far_from_lr(label, result, lr, factor)
+    warn_if_far_from_lr(f"{label}: the SR image", result, lr, factor)
     return result
