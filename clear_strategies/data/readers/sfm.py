@@ -107,11 +107,12 @@ def copy_name(index: int) -> str:
 
 def _require_placed(root: Path, sizes: Sequence[int], count: int, least: float) -> None:
     placed = sizes[0] if sizes else 0
-    if placed >= max(FEWEST, least * count):
+    if placed >= FEWEST and placed / count >= least:
         return
     remedy = MORE
     if placed >= FEWEST:
-        remedy += f"; or go on with the {placed}: data.reader.least_placed={placed / count:.2g}"
+        share = 1000 * placed // count / 1000  # rounded up, it would be refused again
+        remedy += f"; or go on with the {placed}: data.reader.least_placed={share}"
     found = f"only {placed}" if placed else "none"
     raise DataError(root, "poses", f"{found} of the {count} photos could be related to each other", remedy)
 

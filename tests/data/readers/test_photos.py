@@ -113,9 +113,13 @@ def test_a_photo_without_a_pose_is_told_with_the_placed_photo_that_it_has_most_i
     }
 
 
-def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_takes_them() -> None:
-    with pytest.raises(DataError, match=r"only 4 of the 10 photos .*overlap.* data\.reader\.least_placed=0\.4"):
-        photos.sfm._require_placed(Path("mine"), [4, 2], 10, 0.5)
+@pytest.mark.parametrize(("placed", "count"), [(4, 10), (5, 12), (7, 100), (106, 1000)])
+def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_takes_them(placed: int, count: int) -> None:
+    with pytest.raises(DataError, match=rf"only {placed} of the {count} photos .*overlap") as refused:
+        photos.sfm._require_placed(Path("mine"), [placed, 2], count, 0.5)
+    least = float(str(refused.value).rpartition("data.reader.least_placed=")[2])
+    assert least == pytest.approx(placed / count, abs=1e-3)
+    photos.sfm._require_placed(Path("mine"), [placed, 2], count, least)
     photos.sfm._require_placed(Path("mine"), [6, 3], 10, 0.5)
 
 
