@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -13,7 +14,7 @@ import torch
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
-from clear_strategies.data.photo_files import folder_note, image_folder, images_in, inside
+from clear_strategies.data.photo_files import by_stem, folder_note, image_folder, images_in, inside
 from clear_strategies.data.readers.colmap_model import Model, find_model, pose_of, read_model
 from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
@@ -53,7 +54,8 @@ def read(
     model = read_model(find_model(root))
     folder = image_folder(root, images)
     listing = model.folder / f"images{model.ending}"
-    paths = {image.name: _photo(folder, image.name, listing, allow_outside) for image in model.images}
+    listed = cache(lambda parent: by_stem(images_in(parent)))
+    paths = {image.name: _photo(folder, image.name, listing, allow_outside, listed) for image in model.images}
     if not any(path.is_file() for path in paths.values()):
         first = model.images[0].name
         remedy = "set data.reader.images to the folder that the model was made from"
@@ -132,15 +134,24 @@ def _label(root: Path, model: Model) -> str:
     return model.folder.relative_to(root).as_posix() if model.folder.is_relative_to(root) else model.folder.name
 
 
-def _photo(folder: Path, name: str, listing: Path, allow_outside: bool) -> Path:
+def _photo(
+    folder: Path,
+    name: str,
+    listing: Path,
+    allow_outside: bool,
+    listed: Callable[[Path], Mapping[str, Sequence[Path]]],
+) -> Path:
     """The photo of this name, else the only one of the same stem: images_4 often holds PNG files for JPG names.
 
     The path of a missing photo leads to no file.
+
+    Args:
+        listed: the images of a folder by their stems.
     """
     path = inside(folder, name, file=listing, allow_outside=allow_outside)
     if path.is_file():
         return path
-    twins = [p for p in path.parent.glob("*") if p.stem == path.stem and p.is_file()]
+    twins = listed(path.parent).get(path.stem, ())
     if len(twins) != 1:
         return path
     if not allow_outside:

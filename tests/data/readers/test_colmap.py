@@ -61,6 +61,18 @@ def test_photos_may_differ_from_the_model_in_their_ending(tmp_path: Path) -> Non
     assert [frame.name for frame in colmap.read(tmp_path).frames] == ["a.png", "b.jpg", "c.png"]
 
 
+def test_a_folder_is_listed_once_however_many_endings_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    photos = tiny.colmap_bin(tmp_path) / "images"
+    for name in tiny.NAMES:
+        Image.open(photos / name).save((photos / name).with_suffix(".jpg"))
+        (photos / name).unlink()
+    listed: list[Path] = []
+    original = Path.glob
+    monkeypatch.setattr(Path, "glob", lambda self, pattern: listed.append(self) or original(self, pattern))
+    assert [frame.name for frame in colmap.read(tmp_path).frames] == ["a.jpg", "b.jpg", "c.jpg"]
+    assert listed.count(photos) <= 2  # for the endings, and for photos without a pose
+
+
 def test_photos_without_a_pose_are_noted(tmp_path: Path) -> None:
     shutil.copy(tiny.colmap_bin(tmp_path) / "images/a.png", tmp_path / "images/d.png")
     assert colmap.read(tmp_path).notes["without pose"] == "1 photos, not used: d.png"
