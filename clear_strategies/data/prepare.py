@@ -28,6 +28,7 @@ from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import image_size, inside, read_image
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
 from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of, super_resolved
+from clear_strategies.data.priors.cache import kept_network_of
 from clear_strategies.data.priors.interface import warn_if_far_from_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import ViewFiles, write_pngs
@@ -203,7 +204,7 @@ def _enlarged(
 ) -> Float[Tensor, "H W"] | None:
     """Transparency at HR, enlarged by the prior's network; by bicubic where there is none, or nothing shows through."""
     seen_through = transparency is not None and bool(transparency.any())
-    enlarge = (network_of(prior) if seen_through else None) or Bicubic()
+    enlarge = (kept_network_of(prior) if seen_through else None) or Bicubic()
     return _of_layer(lambda image: enlarge(name, image, factor), transparency)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import check_headers, prepare, save_lr
-from clear_strategies.data.priors import BackProjected, Bicubic, DemoPrior
+from clear_strategies.data.priors import BackProjected, Bicubic, Cached, DemoPrior
 from clear_strategies.data.readers import blender, demo
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError, SettingError
@@ -396,3 +396,23 @@ def test_transparent_photos_can_be_shown_before_any_background(tmp_path, photos_
             assert moved.transparency.shape == photo.image.shape[:2]
             torch.testing.assert_close(moved.image, photo.image, atol=2.5 / 255, rtol=0)
     assert prepare(capture(), replace(views, photos_are="hr"), Bicubic(), POINTS).train[0].lr.transparency is None
+
+
+def test_a_network_enlarges_the_transparency_of_a_photo_once(tmp_path):
+    @dataclass(frozen=True)
+    class Counting:
+        calls: list[str] = field(default_factory=list, compare=False)
+        label, files = "counting", ()
+
+        def __call__(self, name, lr, factor):
+            self.calls.append(name)
+            return images.upsample(lr, factor, "nearest")
+
+    network = Counting()
+    half = torch.full((16, 16), 0.5)
+    frames = [replace(frame, transparency=lambda: half) for frame in capture(1).frames]
+    for _ in range(2):
+        prior = BackProjected(Cached(network, tmp_path))
+        made = prepare(Capture("glass", tuple(frames)), papers(train=1, test_every=0), prior, POINTS).train[0]
+        assert float((made.hr.transparency - 0.5).abs().max()) <= 1 / 255
+    assert network.calls == ["0000.png"] * 2  # the photo and its transparency

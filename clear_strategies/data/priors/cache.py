@@ -29,6 +29,14 @@ def cached(prior: Prior) -> Prior:
     return Cached(prior) if isinstance(prior, Network) else prior
 
 
+def kept_network_of(prior: object) -> Prior | None:
+    """The network behind a prior, as `network_of` finds it, in its cache where it has one."""
+    while not isinstance(prior, Network | Cached):
+        if (prior := getattr(prior, "prior", None)) is None:
+            return None
+    return prior
+
+
 @dataclass(frozen=True, slots=True)
 class Cached:
     """A network whose results are kept, by LR image, factor, the model's bytes and its settings.
