@@ -23,6 +23,7 @@ from torch import Tensor
 from clear_strategies import console
 from clear_strategies.commands import train as train_command
 from clear_strategies.compose import composed
+from clear_strategies.core.checks import refuse
 from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.strict_json import read_object
@@ -125,6 +126,9 @@ def train(
     name = "demo" if photos is None else Path(photos).resolve().stem
     into = Path(folder) if folder is not None else Path("outputs") / name / time.strftime("%Y-%m-%d_%H-%M-%S")
     config = composed(overrides, "config")
+    if (lr := config.data.get("save_lr")) is not None:
+        rule = "must be null, since a run that writes LR images does not train"
+        refuse("data.save_lr", rule, lr, f"clear-strategies train PHOTOS data.save_lr={lr} on the command line")
     into.mkdir(parents=True, exist_ok=True)
     threads = torch.get_num_threads()
     try:

@@ -59,6 +59,9 @@ def test_a_folder_without_a_finished_run_and_a_wrong_setting_are_told(tmp_path: 
         cs.Run(tmp_path)
     with pytest.raises(SettingError, match="iteration"):
         cs.train(None, "fit.iteration=3", folder=tmp_path / "run")
+    with pytest.raises(SettingError, match=r"data\.save_lr: must be null, since .* on the command line"):
+        cs.train(None, f"data.save_lr={tmp_path / 'lr'}", folder=tmp_path / "run")
+    assert not (tmp_path / "lr").exists()
     assert not (tmp_path / "run").exists()
     with pytest.raises(SettingError, match="is not there"):
         cs.train(tmp_path / "nothing")
