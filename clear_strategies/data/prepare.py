@@ -157,6 +157,16 @@ def photos_of(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:
         yield from pool.map(partial(_reduced, views=views), frames)
 
 
+def at_hr(capture: Capture, views: ViewSettings) -> Capture:
+    """The capture with photos that load as `photos_of` gives them, for priors that know the truth."""
+    plain = (replace(frame, shown=None, transparency=None) for frame in capture.frames)
+    return replace(capture, frames=tuple(replace(f, load=partial(_image, f, views)) for f in plain))
+
+
+def _image(frame: Frame, views: ViewSettings) -> Float[Tensor, "H W 3"]:
+    return _reduced(frame, views).image
+
+
 def _view(
     frame: Frame,
     photo: Photo,

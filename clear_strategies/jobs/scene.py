@@ -11,7 +11,7 @@ from typing import Any, Final, cast
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.hr_limit import within_limit
 from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.prepare import prepare
+from clear_strategies.data.prepare import at_hr, prepare
 from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
 from clear_strategies.data.priors.ncnn import factors, missing_packages
 from clear_strategies.data.scene import Scene
@@ -109,7 +109,7 @@ def load(
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
     else:
-        chosen = _chosen(prior, capture, views.sr_scale)
+        chosen = _chosen(prior, at_hr(capture, views), views.sr_scale)
     scene = prepare(capture, views, decorated(cached(chosen)), data.cloud, seed=seed)
     # Logged once the photos are known to be usable.
     if isinstance(prior, AutoPrior) and data.save_lr is None and views.photos_are != "both":

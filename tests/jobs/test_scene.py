@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from clear_strategies.compose import tree
 from clear_strategies.data.points import CloudSettings
-from clear_strategies.data.priors import Bicubic, Corrupted, Ncnn, ncnn
+from clear_strategies.data.priors import Bicubic, Corrupted, DemoPrior, Ncnn, ncnn
 from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_settings import ViewSettings
@@ -55,6 +56,17 @@ def test_auto_takes_waifu2x_where_it_is_installed_and_says_nothing_else_of_it(tm
         again = of_photos()
     assert caplog.text.count("SR image from the cache (waifu2x (photo model))") == 4
     assert [(v.hr.image == w.hr.image).all() for v, w in zip(scene.train, again.train, strict=True)] == [True, True]
+
+
+@pytest.mark.parametrize("sizes", ["crop", "round"])
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_the_demo_prior_without_errors_gives_the_hr_photos_whatever_their_size(sizes, shrink):
+    photos = demo.read(width=58, height=45, views=3, train=2)
+    views = ViewSettings(photos_are="hr", sizes=sizes, shrink=shrink)
+    data = DataSettings(reader=lambda: photos, views=views, cloud=CloudSettings(init="random", random_points=20))
+    scene = load(data, functools.partial(DemoPrior, share=0.0), 0)
+    for view in scene.train:
+        assert float((view.hr.image - view.truth).abs().max()) <= 0.51 / 255  # a prior's image has 8 bits
 
 
 @pytest.mark.parametrize(

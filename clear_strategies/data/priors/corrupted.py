@@ -141,10 +141,9 @@ class DemoPrior(SeededErrors):
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         truth, height, width = self.truth[name](), lr.shape[0] * factor, lr.shape[1] * factor
-        spare = (truth.shape[1] - width, truth.shape[0] - height)
-        if not all(0 <= pixels < factor for pixels in spare):
+        if truth.shape[:2] != (height, width):
+            problem = f"is {truth.shape[1]}x{truth.shape[0]} where HR is {width}x{height}"
             raise DataError(
-                name, "truth", f"is {truth.shape[1]}x{truth.shape[0]} where HR is {width}x{height}",
-                "use the photos at their own size (shrink=1, photos_are=hr), or another prior",
-            )  # fmt: skip
-        return self.corrupt(truth[:height, :width], lr, factor, name)  # cropped as the HR photo is
+                name, "truth", problem, "use photos that are HR (data.views.photos_are=hr), or another prior"
+            )
+        return self.corrupt(truth, lr, factor, name)
