@@ -91,7 +91,8 @@ def job(config: DictConfig) -> float | None:
         from clear_strategies.jobs import job as one
 
         require_each_once(hydra_config.overrides.task)
-        return one.run(config, Path(hydra_config.runtime.output_dir), _watch())
+        folder, overrides = Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
+        return one.run(config, folder, _watch(), overrides)
     except (Exception, KeyboardInterrupt) as error:
         if (ending := exit_codes.describe(error)) is None:
             raise

@@ -133,7 +133,7 @@ def train(
     threads = torch.get_num_threads()
     try:
         with console.logged(into / "run.log"):
-            job.run(config, into)
+            job.run(config, into, overrides=overrides)
     finally:
         torch.set_num_threads(threads)
     _log.info("%s", into)

@@ -32,6 +32,7 @@ def test_a_run_has_its_numbers_and_its_gaussians_by_gsplats_names(run: cs.Run) -
     widths = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (3, 3)}
     assert {name: tuple(rows.shape) for name, rows in run.splats.items()} == {k: (n, *w) for k, w in widths.items()}
     assert {"pseudo_views", "fading_opacity"} <= set(run.metrics["strategies"])  # best, unless another is chosen
+    assert {"+strategy=best", "prior=bicubic"} <= set(run.metrics["overrides"])
     assert "threads" in (run.folder / "run.log").read_text()  # a line that the console shows with -v alone
 
 

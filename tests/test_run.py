@@ -30,6 +30,7 @@ def test_a_run_leaves_everything_it_promises(finished):
     assert len(list((out / "renders").glob("*.png"))) == 3
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["strategies"] == ["gco", "p2g", "svs"]
+    assert metrics["overrides"][0] == "+strategy=clear"
     assert metrics["synthetic_prior"] is True
     assert set(metrics["test"]["mean"]) == {"ours", "bicubic", "prior"}
     assert set(metrics["test"]["mean"]["ours"]) == {"psnr", "ssim", "gmsd", "blur"}

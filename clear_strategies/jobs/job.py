@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +28,7 @@ from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs import plan, results, score_table, tensorboard
 from clear_strategies.outputs.baseline import FOLDER as BASELINE
-from clear_strategies.outputs.baseline import Baseline
+from clear_strategies.outputs.baseline import Baseline, overrides_of
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.schedules import scaled
@@ -51,6 +51,7 @@ class _Training:
         compared: the configuration from `resume.comparable`, which a resumed run must have in common.
         folder: where its files go.
         pictures: what shows it there; None for a baseline, which the run's own pictures show.
+        overrides: of the command line, for the report; None: unknown.
         timed: how it keeps to its minutes; None: it has no limit.
     """
 
@@ -59,6 +60,7 @@ class _Training:
     compared: Mapping[str, Any]
     folder: Path
     pictures: results.Pictures | None
+    overrides: Sequence[str] | None = None
     timed: TimePlan | None = None
 
     @classmethod
@@ -72,7 +74,8 @@ class _Training:
         """The training beside this one, without any strategy, in a folder within its folder."""
         without = replace(self.settings, strategies={})
         alone = _Training.of(without, {**values, "strategies": {}}, self.folder / BASELINE)
-        return replace(alone, pictures=None)
+        overrides = None if self.overrides is None else overrides_of(self.overrides)
+        return replace(alone, pictures=None, overrides=overrides)
 
     def lasting(self, iterations: int) -> _Training:
         """The same training with this number of iterations, whatever time it takes."""
@@ -89,7 +92,7 @@ class _Training:
 
     @property
     def chosen(self) -> plan.Chosen:
-        return plan.Chosen(self.settings.method, list(self.settings.strategies))
+        return plan.Chosen(self.settings.method, list(self.settings.strategies), self.overrides)
 
     def start(self, place: _Place, source: str | None) -> TrainState:
         """The state that training starts from: the initial one, or the checkpoint that `source` asks for.
@@ -134,13 +137,19 @@ class _Place:
     watch: Callable[[], None] | None
 
 
-def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = None) -> float | None:
+def run(
+    config: DictConfig,
+    folder: Path,
+    watch: Callable[[], None] | None = None,
+    overrides: Sequence[str] | None = None,
+) -> float | None:
     """Run one job and write its files into `folder`.
 
     Every setting is checked before the folder is locked and before data is read.
 
     Args:
         watch: called after each iteration.
+        overrides: that the configuration was composed of, which the report names the run by.
 
     Returns:
         The mean PSNR of the test views, dB, which a sweeper may optimize; of the training views if there are no test views.
@@ -158,7 +167,7 @@ def run(config: DictConfig, folder: Path, watch: Callable[[], None] | None = Non
         live.require_viewer()
     if settings.fit.log == "tensorboard":
         tensorboard.require_tensorboard()
-    ours, baseline = _Training.of(settings, values, folder), None
+    ours, baseline = replace(_Training.of(settings, values, folder), overrides=overrides), None
     if settings.fit.baseline and _why_without_baseline(settings) is None:
         baseline = ours.baseline(values)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -13,7 +13,13 @@ from clear_strategies.outputs.image_scores import ImageScores
 
 FOLDER: Final = "baseline"
 """Its name, in the folder of the run that it trained beside."""
+_STRATEGIES: Final = ("strategy=", "strategies.")  # how the overrides begin that a baseline does not have
 _TRAIN_AGAIN: Final = "remove this baseline's metrics.json: it is then trained again"
+
+
+def overrides_of(run: Iterable[str]) -> list[str]:
+    """The overrides of the baseline beside a run with these: all but those of its strategies."""
+    return [override for override in run if not override.lstrip("+~").startswith(_STRATEGIES)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,10 +1,12 @@
 """Scores of a whole scene, and the content of metrics.json.
 
-metrics.json: {"scene", "method", "strategies", "seed", "iterations", "gaussians", "seconds", "conflict",
+metrics.json: {"scene", "method", "strategies", "overrides", "seed", "iterations", "gaussians", "seconds", "conflict",
 "synthetic_prior", "baseline", "config", "provenance", "note", "test": TABLE, "train": TABLE}, where TABLE is {"against", "views":
 {view: {image: scores}}, "mean": {image: scores}}.
 
 - "method" is the name of a published baseline (`+method=`), null where none was chosen.
+- "overrides" are those of the command line, null where they are unknown. Hydra's own file of them is no record of the run:
+  a later command rewrites it even where that command is refused.
 - The images are "ours", "bicubic" (U of the view's own LR photo) and "prior" (the view's SR image). "bicubic" is missing where
   the HR photo is unknown, both where the HR side is photos (`photos_are=both`).
 - "baseline" is the one that trained beside the run (`fit.baseline`), null where none did: {"folder", "seconds", "test":
@@ -90,6 +92,7 @@ class Metrics(msgspec.Struct):
     provenance: Provenance
     config: dict[str, Any] = msgspec.field(default_factory=dict)
     method: str | None = None
+    overrides: list[str] | None = None
 
     @property
     def shown(self) -> Part:

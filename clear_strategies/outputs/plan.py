@@ -27,10 +27,16 @@ _SHORT: Final[Sequence[str]] = (
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """What the command line chose, by name; `method` is a published baseline (`+method=`)."""
+    """What the command line chose, by name.
+
+    Args:
+        method: a published baseline (`+method=`).
+        overrides: all that was chosen, as it was written; None: unknown.
+    """
 
     method: str | None
     strategies: Sequence[str]
+    overrides: Sequence[str] | None = None
 
     @property
     def title(self) -> str:

@@ -100,6 +100,7 @@ def write_results(
             scene=scene.name,
             method=chosen.method,
             strategies=list(chosen.strategies),
+            overrides=chosen.overrides,
             seed=state.settings.seed,
             iterations=state.t - 1,
             gaussians=len(field),

@@ -24,7 +24,6 @@ _HYDRA: Final = ".hydra"
 _SEED: Final = "fit.seed="
 # The overrides that name a run; the others are its settings.
 _METHOD, _STRATEGY = "method=", "strategy="
-_STRATEGIES: Final = "strategies."
 # Where the data lie: the scene has a name.
 _PATH: Final = re.compile(r"scene|data\.root|data\.[\w.]*path")
 
@@ -64,10 +63,11 @@ class Run:
         """Read a run's folder.
 
         Raises:
-            DataError: metrics.json or .hydra/overrides.yaml is damaged.
+            DataError: metrics.json is damaged, or .hydra/overrides.yaml where metrics.json holds no overrides.
         """
         path = folder / "metrics.json"
-        content, overrides = metrics.read(path, "train the run again"), _overrides(folder)
+        content = metrics.read(path, "train the run again")
+        overrides = _overrides_by_hydra(folder) if content.overrides is None else content.overrides
         part = content.shown
         marks = ["synthetic prior"] * content.synthetic_prior
         marks += [] if part is content.test else ["training views"]
@@ -143,8 +143,9 @@ def _each_baseline_once(runs: Sequence[Run]) -> list[Run]:
 
 
 def _owner(folder: Path) -> Path:
-    """The run that a baseline trained beside, else the folder itself. Hydra's files are the run's."""
-    beside = folder.name == baseline.FOLDER and not (folder / _HYDRA).is_dir() and (folder.parent / _HYDRA).is_dir()
+    """The run that a baseline trained beside, else the folder itself. Hydra's files are the run's; one from Python has none."""
+    of_run = any((folder.parent / name).exists() for name in (_HYDRA, "metrics.json"))
+    beside = folder.name == baseline.FOLDER and not (folder / _HYDRA).is_dir() and of_run
     return folder.parent if beside else folder
 
 
@@ -168,9 +169,9 @@ def skips(folder: Path) -> list[dict[str, str]]:
         return []
 
 
-def _overrides(folder: Path) -> tuple[str, ...]:
-    """The overrides of the command line, from Hydra's file; empty where there is no such file. Of a baseline beside a run
-    they are the run's, without its strategies.
+def _overrides_by_hydra(folder: Path) -> Sequence[str]:
+    """The overrides of a run whose metrics.json has none, from Hydra's file; empty where there is no such file. Of a baseline
+    beside a run they are the run's, without its strategies.
     """
     import yaml  # comes with Hydra
 
@@ -182,9 +183,7 @@ def _overrides(folder: Path) -> tuple[str, ...]:
         problem = f"cannot be read ({str(error)[:120]})"
         raise DataError(path, "overrides", problem, "remove it: the run is then named by its strategies") from error
     overrides = tuple(map(str, content)) if isinstance(content, list) else ()
-    if owner == folder:
-        return overrides
-    return tuple(o for o in overrides if not o.lstrip("+~").startswith((_STRATEGY, _STRATEGIES)))
+    return overrides if owner == folder else baseline.overrides_of(overrides)
 
 
 def _is_setting(override: str) -> bool:

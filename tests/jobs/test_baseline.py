@@ -54,7 +54,8 @@ def logged(caplog: pytest.LogCaptureFixture) -> None:
 def train(
     folder: Path, *overrides: str, strategy: str = "gco", watch: Callable[[], None] | None = None
 ) -> float | None:
-    return job.run(composed(f"+strategy={strategy}", "fit.baseline=true", *SMALL, *overrides), folder, watch)
+    chosen = [f"+strategy={strategy}", "fit.baseline=true", *SMALL, *overrides]
+    return job.run(composed(*chosen), folder, watch, chosen)
 
 
 class Iterations:
@@ -122,6 +123,11 @@ def test_the_baseline_is_the_run_without_strategies_on_the_same_scene(whole, tmp
     assert OURS_MINUS_BASELINE in caplog.text
     plan, first, done = (caplog.text.index(words) for words in ("initial points", "trains first", "done in"))
     assert plan < first < done
+
+
+def test_the_baseline_keeps_the_overrides_of_the_run_but_those_of_its_strategies(whole):
+    ours, beside = (json.loads((whole / f / "metrics.json").read_text())["overrides"] for f in (".", "baseline"))
+    assert (ours[0], ours[1:]) == ("+strategy=gco", beside)
 
 
 def test_a_run_is_the_same_with_and_without_its_baseline(whole, tmp_path):

@@ -22,6 +22,27 @@ def test_a_run_is_named_by_its_strategies_as_given_on_the_command_line(tmp_path:
     assert {"baseline", "gco + p2g", "clear_paper", "mine + svs"} <= set(rows_of(tmp_path))
 
 
+def test_a_later_command_in_its_folder_does_not_rename_a_run(tmp_path: Path) -> None:
+    folder = make_run(
+        tmp_path / "run", "+strategy=clear", "fit.iterations=20", overrides=["+strategy=gco", "fit.seed=3"]
+    )
+    run = report.Run.read(folder)
+    assert (run.name, run.settings) == ("gco", ())
+
+
+def test_runs_from_python_are_told_apart_as_those_of_the_command_line(tmp_path: Path) -> None:
+    for iterations in (20, 60):
+        chosen, folder = [f"fit.iterations={iterations}"], tmp_path / str(iterations)
+        make_run(folder / "baseline", strategies=[], overrides=chosen, config={"of": chosen})
+        make_run(folder, overrides=[*chosen, "+strategy=best"])
+    for hydra in list(tmp_path.rglob(".hydra")):
+        shutil.rmtree(hydra)
+    assert [run.folder.name for run in report.collect([tmp_path])] == ["baseline", "20", "baseline", "60"]
+    assert [m for m in rows_of(tmp_path) if m.startswith("b") and "bicubic" not in m] == [
+        "baseline, fit.iterations=20", "best, fit.iterations=20", "baseline, fit.iterations=60", "best, fit.iterations=60",
+    ]  # fmt: skip
+
+
 def test_a_method_replaces_the_strategies_before_it(tmp_path: Path) -> None:
     run = report.Run.read(make_run(tmp_path / "run", "+strategy=clear", "+method=srgs"))
     assert run.name == "srgs"
