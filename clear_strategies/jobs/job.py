@@ -83,6 +83,13 @@ class _Training:
         compared = {**self.compared, "fit.iterations": iterations, "fit.minutes": None}
         return replace(self, settings=settings, conductor=settings.conductor(settings.fit.stretch), compared=compared)
 
+    def with_data(self, data: scene.DataSettings) -> _Training:
+        """The same training with this limit of its HR images."""
+        if data is self.settings.data:
+            return self
+        compared = {**self.compared, "data.views.max_hr_megapixels": data.views.max_hr_megapixels}
+        return replace(self, settings=replace(self.settings, data=data), compared=compared)
+
     def timed_by(self, budget: Budget, place: _Place, trainings: int) -> _Training:
         """The same training with as many iterations as fit into the time that is left for it and the others."""
         fit = self.settings.fit
@@ -202,7 +209,8 @@ def _run(
         return finished[0]
     threads, why = device.threads(settings.fit.threads)
     torch.set_num_threads(threads)
-    loaded = scene.load(settings.data, settings.prior, settings.fit.seed, ours.conductor.prior, budget)
+    loaded, data = _loaded(ours, budget)
+    ours, baseline = ours.with_data(data), None if baseline is None else baseline.with_data(data)
     if settings.data.save_lr is not None:
         save_lr(loaded, Path(settings.data.save_lr))
         return None
@@ -246,6 +254,15 @@ def _run(
         _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, ours.folder, evaluation, seconds))
     mean = evaluation.mean("test") or evaluation.mean("train")
     return None if mean is None else mean.psnr
+
+
+def _loaded(training: _Training, budget: Budget | None) -> tuple[Scene, scene.DataSettings]:
+    """The scene, and the data set's settings with the size of HR that the time allows."""
+    settings, capture, data = training.settings, None, training.settings.data
+    if budget is not None:
+        capture = data.reader()
+        data = scene.timed(capture, data, settings.prior, budget)
+    return scene.load(data, settings.prior, settings.fit.seed, training.conductor.prior, capture), data
 
 
 def _trained_first(training: _Training, state: TrainState | None, place: _Place) -> Baseline:

@@ -97,15 +97,15 @@ def load(
     prior: PriorSettings,
     seed: int,
     decorated: Callable[[Prior], Prior] = lambda prior: prior,
-    budget: Budget | None = None,
+    known: Capture | None = None,
 ) -> Scene:
     """Read the data set and prepare its views and its initial points.
 
     Args:
         decorated: what becomes of the chosen prior, see `Conductor.prior`.
-        budget: of the run; SR images get no larger than its time allows.
+        known: the capture, where it has been read already.
     """
-    capture, views = read(data, prior, budget)
+    capture, views = read(data, prior, known)
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
     else:
@@ -120,16 +120,22 @@ def load(
     return scene
 
 
-def read(data: DataSettings, prior: PriorSettings, budget: Budget | None = None) -> tuple[Capture, ViewSettings]:
+def read(data: DataSettings, prior: PriorSettings, known: Capture | None = None) -> tuple[Capture, ViewSettings]:
     """The capture as the data set has it, and the settings of its views, both within the limit of the HR images."""
-    capture, views = data.reader(), data.views
-    if budget is not None and views.photos_are == "lr" and not isinstance(prior, functools.partial):
-        network = _chosen(prior, capture, views.sr_scale)
-        found, limit = budget.megapixels(split(capture, views)[0], network, views.sr_scale), views.max_hr_megapixels
-        if found is not None and (limit is None or found < limit):
-            views = replace(views, max_hr_megapixels=found)
+    capture = data.reader() if known is None else known
     auto = isinstance(prior, AutoPrior) and data.save_lr is None
-    return within_limit(capture, views, reaches=_reach(prior, auto), super_resolve=not auto)
+    return within_limit(capture, data.views, reaches=_reach(prior, auto), super_resolve=not auto)
+
+
+def timed(capture: Capture, data: DataSettings, prior: PriorSettings, budget: Budget) -> DataSettings:
+    """The data set with HR images no larger than the time allows that SR images take; the limit is one that can be typed."""
+    views = data.views
+    if views.photos_are != "lr" or isinstance(prior, functools.partial):
+        return data
+    found = budget.megapixels(split(capture, views)[0], _chosen(prior, capture, views.sr_scale), views.sr_scale)
+    if found is None or (views.max_hr_megapixels is not None and views.max_hr_megapixels <= found):
+        return data
+    return replace(data, views=replace(views, max_hr_megapixels=float(f"{found:.3g}")))
 
 
 def _chosen(prior: PriorSettings, capture: Capture, factor: int) -> Prior:

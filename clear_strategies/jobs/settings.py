@@ -67,8 +67,9 @@ class RunSettings(FitSettings):
             require_number("minutes", self.minutes, above=0)
         if self.minutes is not None and self.resume is not None:
             raise SettingError(
-                "minutes and resume exclude each other: a resumed run has the iterations that it began with. "
-                "Leave minutes out, and name fit.iterations as the run's metrics.json or run.log has it."
+                "minutes and resume exclude each other: a resumed run has the iterations and the size of HR that it began "
+                "with. Leave minutes out, and give fit.iterations and data.views.max_hr_megapixels the values that the run "
+                "chose; where one differs, resuming refuses and names it."
             )
         if self.threads is not None:
             require_whole("threads", self.threads, least=1)
