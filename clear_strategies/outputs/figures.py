@@ -85,8 +85,12 @@ def finish(axis: Axes, *, legend: Literal["best", "upper right"] | None = "best"
         axis.legend(fontsize=8, loc=legend, framealpha=0.8, edgecolor="none")
 
 
+AS_WRITTEN: Final = {"parse_math": False}
+"""Style of a text with names of the user's: matplotlib would read what lies between two $ as mathematics."""
+
+
 def set_title(figure: Figure, title: str) -> None:
-    figure.suptitle(title, fontsize=12, color=INK, x=0.01, ha="left")
+    figure.suptitle(title, fontsize=12, color=INK, x=0.01, ha="left", **AS_WRITTEN)
 
 
 def save_png(figure: Figure, path: Path) -> None:
@@ -160,7 +164,7 @@ class PixelPage:
 
     def text(self, x: float, y: float, words: str, *, size: float = 8.5, **style: Any) -> None:
         """Write words at (x, y), centred vertically unless `va` says otherwise."""
-        place = {"ha": "left", "va": "center", "color": INK, **style}
+        place = {"ha": "left", "va": "center", "color": INK, **AS_WRITTEN, **style}
         self.figure.text(x / self.width, 1 - y / self.height, words, fontsize=size, **place)
 
 

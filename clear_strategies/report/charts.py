@@ -50,10 +50,12 @@ def draw_runs(histories: Mapping[str, History], title: str) -> Figure:
         figures.finish(axis, legend=None)
     if known:
         names = [textwrap.fill(run, width=60) for run in known]
-        figure.legend(
+        legend = figure.legend(
             known.values(), names, fontsize=9, frameon=False, loc="outside lower center", labelcolor=figures.INK,
             ncols=min(3, len(known)),
         )  # fmt: skip
+        for text in legend.get_texts():
+            text.set(**figures.AS_WRITTEN)
     figures.set_title(figure, title)
     return figure
 

@@ -14,7 +14,7 @@ from clear_strategies.data.priors import Bicubic, Corrupted, DemoPrior, Ncnn, nc
 from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_settings import ViewSettings
-from clear_strategies.errors import SettingError
+from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs.scene import AutoPrior, DataSettings, load, require_factor
 from clear_strategies.jobs.settings import settings_of
 from tests.helpers import captures, fake_ncnn
@@ -31,6 +31,18 @@ def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
         scene = load(DataSettings(reader=lambda: replace(capture, frames=frames), views=views), AutoPrior(), 0)
     assert tiny.name not in {view.name for view in (*scene.train, *scene.test)}
     assert "prior: auto chose demo" in caplog.text
+
+
+@pytest.mark.parametrize("whose", ["capture", "frame", "unplaced"])
+def test_a_name_that_is_no_text_is_refused_before_training(whose: str):
+    capture, name = demo.read(width=64, height=48, views=5, train=2), "photo_\udce9"  # as Python reads a Latin-1 é
+    named = {
+        "capture": {"name": name},
+        "frame": {"frames": (replace(capture.frames[0], name=name), *capture.frames[1:])},
+        "unplaced": {"unplaced": {name: "blurred"}},
+    }
+    with pytest.raises(DataError, match=r"^photo_\\udce9: name: must be UTF-8"):
+        load(DataSettings(reader=lambda: replace(capture, **named[whose])), AutoPrior(), 0)
 
 
 def of_photos(factor: int = 4) -> Scene:

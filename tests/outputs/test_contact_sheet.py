@@ -72,6 +72,11 @@ def test_every_caption_and_the_small_print_are_on_the_page(tmp_path: Path, monke
     assert {"scene · strategy", "a", "baseline", "ours", "20.00 dB", "21.00 dB", OWN_PHOTO} <= set(words)
 
 
+def test_dollars_in_names_are_no_mathematics(tmp_path: Path) -> None:
+    write_contact_sheet(tmp_path / "sheet.png", [row("a$1_$.png", 0)], "scan $20_$")
+    assert (tmp_path / "sheet.png").is_file()
+
+
 def test_no_rows_make_no_sheet(tmp_path: Path) -> None:
     write_contact_sheet(tmp_path / "sheet.png", [], "scene")
     assert not (tmp_path / "sheet.png").exists()

@@ -42,6 +42,13 @@ def test_the_picture_names_photos_without_a_pose_and_the_page_is_whole(tmp_path:
     assert all(f"</span> {label}</div>" in written for label in ("seen by no photo", "the photos"))
 
 
+def test_dollars_in_names_are_no_mathematics(tmp_path: Path) -> None:
+    train = tuple(replace(view, name=f"a${i}_$.png") for i, view in enumerate(SCENE.train))
+    scene = replace(SCENE, train=train, unplaced={"b$1_$.png": "blurred"})
+    coverage.write_coverage(tmp_path, scene, wall.painter(), "toy $20_$")
+    assert (tmp_path / coverage.PICTURE).is_file()
+
+
 def test_points_have_the_colour_of_their_number_of_photos() -> None:
     colors = coverage._colored(torch.tensor([0, 1, 2, 3, 9]))
     assert (colors[3] == colors[4]).all()
