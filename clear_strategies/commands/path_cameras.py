@@ -7,6 +7,7 @@ import logging
 from pathlib import Path
 
 from clear_strategies.commands.options import LONGEST, STILLS
+from clear_strategies.data.view_names import file_stem
 from clear_strategies.data.view_settings import resized
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import SavedSplat
@@ -27,7 +28,7 @@ def cameras_of(splat: SavedSplat, options: argparse.Namespace) -> tuple[list[str
         chosen = [saved for saved in splat.cameras if saved.split == path]
         if not chosen:
             raise SettingError(f"--path {path}: {splat.folder} has no {path} cameras. Try --path cameras.")
-        names = [Path(saved.name).with_suffix("").as_posix().replace("/", "_") for saved in chosen]
+        names = [file_stem(saved.name) for saved in chosen]
         found = [saved.camera for saved in chosen]
     else:
         found, fps = _of_path(splat, path, options.frames)

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.image_scores import ImageScores
@@ -63,7 +64,7 @@ class Baseline:
 
     def render_of(self, view: str) -> Path:
         """The file of its render of a test view."""
-        return self.folder / "renders" / f"{Path(view).stem}.png"
+        return self.folder / "renders" / f"{file_stem(view)}.png"
 
     def to_json(self) -> dict[str, Any]:
         """What metrics.json of the run holds of it."""

@@ -12,6 +12,7 @@ import torch
 
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.view_names import file_stem
 from clear_strategies.viewing import FPS, cameras, film, page, paths, video
 from clear_strategies.viewing.film import DepthScale
 from clear_strategies.viewing.look import Painter
@@ -46,7 +47,7 @@ def write_depths(folder: Path, views: Sequence[View], painter: Painter) -> None:
     scale = DepthScale.of(painter, where)
     for view, camera in zip(views, where, strict=True):
         picture = scale.picture(painter.depth(camera))
-        write_png(folder / f"{Path(view.name).stem}.png", torch.from_numpy(picture) / 255)
+        write_png(folder / f"{file_stem(view.name)}.png", torch.from_numpy(picture) / 255)
 
 
 def write_splat_page(

@@ -30,6 +30,7 @@ from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.view_names import file_stem
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.outputs.maps_picture import write_depth, write_maps_picture
 from clear_strategies.schedules import WarmupDecay
@@ -72,7 +73,7 @@ def write_maps(
     for view in views:
         found = view_maps(field, conductor, rasterizer, view)
         means[view.name] = found.means
-        own = folder / Path(view.name).stem
+        own = folder / file_stem(view.name)
         for name, values in {**found.maps, "lr": view.lr.image, "prior": view.hr.image}.items():
             write_png(own / f"{name}.png", values)
         write_maps_picture(own / "maps.png", view, found.maps, found.means)

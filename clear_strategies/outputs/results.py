@@ -17,6 +17,7 @@ from clear_strategies.core.view import View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.scene import Scene
+from clear_strategies.data.view_names import file_stem
 from clear_strategies.outputs import coverage, metrics
 from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.contact_sheet import OWN_PHOTO, TRAINED_ON, SheetRow, write_contact_sheet
@@ -79,7 +80,7 @@ def write_results(
     with work_log.stage("evaluate"):
         evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera).cpu(), down=down)
     for name, image in evaluation.renders.items():
-        write_png(folder / "renders" / f"{Path(name).stem}.png", image)
+        write_png(folder / "renders" / f"{file_stem(name)}.png", image)
     export_ply(folder / "point_cloud.ply", field)
     synthetic = " · SYNTHETIC prior" * scene.synthetic_prior
     title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}{synthetic}"
@@ -136,7 +137,7 @@ def _write_sheet(folder: Path, scene: Scene, evaluation: Evaluation, title: str,
     for view in _shown(scene):
         for kind, shown in {"lr": view.lr.image, "prior": view.hr.image, "truth": view.truth}.items():
             if shown is not None:
-                write_png(folder / "views" / f"{Path(view.name).stem}_{kind}.png", shown)
+                write_png(folder / "views" / f"{file_stem(view.name)}_{kind}.png", shown)
         columns: dict[str, Tensor] = {}
         if not view.hr_is_photo:
             columns["LR, enlarged"] = images.upsample(view.lr.image, view.factor, "nearest")

@@ -21,6 +21,7 @@ from urllib.parse import quote
 from clear_strategies import files
 from clear_strategies.data.photo_files import image_size, jpeg, read_image
 from clear_strategies.data.strict_json import read_object
+from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError
 from clear_strategies.outputs.figures import ERROR_MAX, spaced
 from clear_strategies.report.runs import Run, skips
@@ -168,7 +169,7 @@ def _maps(section: Section, images: Images, views: int) -> list[dict[str, Any]]:
         try:
             means = read_object(folder / "maps.json")["views"] if folder.is_dir() else {}
             for name in spaced(list(means), views):
-                own = folder / Path(name).stem
+                own = folder / (stem := file_stem(name))
                 if name not in found:
                     width, height = image_size(own / "prior.png")
                     under = [
@@ -176,7 +177,7 @@ def _maps(section: Section, images: Images, views: int) -> list[dict[str, Any]]:
                         for kind, label in (("prior", "SR prior"), ("lr", "LR, enlarged"))
                     ]
                     size = {"width": width, "height": height}
-                    found[name] = {"name": Path(name).stem, **size, "under": under, "methods": []}
+                    found[name] = {"name": stem, **size, "under": under, "methods": []}
                 maps = {kind: own / f"{kind}.png" for kind in MAPS if (own / f"{kind}.png").is_file()}
                 found[name]["methods"].append({
                     "label": method,

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from clear_strategies.data.view_names import file_stem
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import baseline, metrics
 from clear_strategies.settings import CHANGES_NO_RESULT
@@ -83,7 +84,7 @@ class Run:
                 seed=content.seed,
                 iterations=content.iterations,
                 scores={m: asdict(part.mean[m].numbers) for m in methods},
-                views={Path(view).stem: metrics.as_float(of["ours"].psnr) for view, of in part.views.items()},
+                views={file_stem(view): metrics.as_float(of["ours"].psnr) for view, of in part.views.items()},
                 facts={
                     "conflict": metrics.as_float(content.conflict.get("gaussian")),
                     "gaussians": content.gaussians,

@@ -28,6 +28,7 @@ from clear_strategies.data.photo_files import jpeg
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.data.transforms import Transform, transforms_of
+from clear_strategies.data.view_names import file_stem
 from clear_strategies.data.view_settings import resized
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
@@ -65,7 +66,7 @@ def write_cameras(folder: Path, scene: Scene) -> None:
         for view in views:
             entry = {**_entry(len(entries), view), "split": split, "background": list(scene.background)}
             if split == "train":
-                entry["photo"] = f"{PHOTOS}/{Path(view.name).stem}.jpg"
+                entry["photo"] = f"{PHOTOS}/{file_stem(view.name)}.jpg"
                 photo = view.lr.image.cpu()
                 small = images.area_mean(photo, math.ceil(photo.shape[1] / _PHOTO_WIDTH))
                 files.write_bytes(folder / entry["photo"], jpeg(small, quality=80))

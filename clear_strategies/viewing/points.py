@@ -13,6 +13,7 @@ from torch import Tensor
 
 from clear_strategies.data import strict_json
 from clear_strategies.data.photo_files import read_image
+from clear_strategies.data.view_names import file_stem
 from clear_strategies.geometry.projection import seen_pixels
 from clear_strategies.viewing.cameras import SavedCamera
 from clear_strategies.viewing.look import Painter
@@ -60,7 +61,7 @@ def _maps(folder: Path, name: str, cameras: Sequence[SavedCamera]) -> list[tuple
     views = strict_json.read_object(folder / "maps" / "maps.json").get("views", {})
     found = []
     for view in views:
-        path = folder / "maps" / Path(view).stem / f"{name}.png"
+        path = folder / "maps" / file_stem(view) / f"{name}.png"
         if view in by_name and path.is_file():
             camera = by_name[view]
             found.append((camera, read_image(path, expect=(camera.width, camera.height))[..., 0]))

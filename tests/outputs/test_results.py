@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, files
+from clear_strategies import GCO, P2G, files, report
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.scene import Scene
@@ -26,6 +26,8 @@ from clear_strategies.outputs.results import Pictures, write_results
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import TrainState
+from clear_strategies.viewing import points
+from clear_strategies.viewing.cameras import read_cameras, write_cameras
 from clear_strategies.viewing.look import Painter
 from tests.helpers import toy
 from tests.helpers.image_files import holds, read
@@ -130,6 +132,31 @@ def test_a_run_without_test_views_shows_training_views(tmp_path: Path, state: Tr
     times = round(magnification(SCENE.train[0].hr.image.shape[1]))
     assert holds(shown, SCENE.train[0].hr.image.numpy(), times=times)
     assert not (tmp_path / "path.mp4").exists()
+
+
+def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(
+    tmp_path: Path, state: TrainState, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("write_curves", "write_contact_sheet"):
+        monkeypatch.setattr(results, name, lambda *_: None)
+    rig = ("left/0000.png", "right/0000.png")
+    train, test = (
+        tuple(replace(view, name=name) for view, name in zip(SCENE.train, rig, strict=False)) for _ in range(2)
+    )
+    scene, pictures = replace(SCENE, train=train, test=test), Pictures(2, 0, 0)
+    monkeypatch.setattr(state, "views", train)
+    write(tmp_path, state, scene=scene, pictures=pictures)
+    write_cameras(tmp_path, scene)
+    stems = {"left_0000", "right_0000"}
+    for folder in ("renders", "depth"):
+        assert names(tmp_path / folder) == {f"{stem}.png" for stem in stems}
+    assert {name.rpartition("_")[0] for name in names(tmp_path / "views")} == stems
+    assert names(tmp_path / "maps") == {"maps.json", *(f"{stem}/" for stem in stems)}
+    found = [camera for camera in read_cameras(tmp_path / "cameras.json") if camera.split == "train"]
+    assert [camera.photo for camera in found] == [tmp_path / "cameras" / f"{stem}.jpg" for stem in sorted(stems)]
+    assert len(points._maps(tmp_path, "conflict", found)) == 2
+    baseline = Baseline.read(tmp_path)
+    assert {baseline.render_of(view).stem for view in baseline.views} == set(report.Run.read(tmp_path).views) == stems
 
 
 def test_the_sheet_of_photos_at_hr_shows_no_sr(
