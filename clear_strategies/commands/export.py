@@ -32,7 +32,7 @@ def main(arguments: Sequence[str]) -> None:
     from clear_strategies.outputs.formats import gaussians_of, write_format
 
     splat = open_splat(options.run, options.rasterizer)
-    g = gaussians_of(splat.painter.field)
+    g = gaussians_of(splat.painter.field, antialiased=splat.antialiased)
     g = replace(g, shN=g.shN[:, : (options.sh + 1) ** 2 - 1])
     out = options.out or splat.folder / f"{splat.name}.{options.to}"
     if out.suffix != f".{options.to}":

@@ -23,6 +23,7 @@ from rasterizers.geometry import SH_C0
 _log = logging.getLogger(__name__)
 
 _BANDS: Final = (0, 3, 8, 15)  # (degree + 1)² - 1
+_MIP: Final = "SplatRenderMode: mip"  # tells viewers to draw with opacity compensation
 _OPAQUE: Final = 16.0  # logit: sigmoid gives 1 as closely as float32 tells it from 1
 
 _XYZ: Final = ("x", "y", "z")
@@ -40,6 +41,7 @@ class GaussianPly:
     Args:
         sh0, shN: colour as spherical harmonics; B in {0, 3, 8, 15} bands in `shN`.
         opacities: logit. scales: natural logarithm. quats: wxyz, any norm.
+        antialiased: they are drawn with opacity compensation, as they were trained: see `RasterSettings`.
 
     Raises:
         ValueError: the shapes do not match.
@@ -51,6 +53,7 @@ class GaussianPly:
     opacities: Float[Tensor, " N"]
     scales: Float[Tensor, "N 3"]
     quats: Float[Tensor, "N 4"]
+    antialiased: bool = True
 
     def __post_init__(self) -> None:
         n, bands = len(self.means), self.shN.shape[1]
@@ -66,11 +69,8 @@ class GaussianPly:
         return self.means.shape[0]
 
 
-def write_gaussians(path: Path, g: GaussianPly, *, comments: Sequence[str] = ("SplatRenderMode: mip",)) -> None:
+def write_gaussians(path: Path, g: GaussianPly) -> None:
     """Binary little-endian, atomically.
-
-    Args:
-        comments: header comments; "SplatRenderMode: mip" tells viewers to draw with opacity compensation.
 
     Raises:
         ValueError: a number is not finite.
@@ -86,7 +86,7 @@ def write_gaussians(path: Path, g: GaussianPly, *, comments: Sequence[str] = ("S
     if not finite.all():
         i, k = np.argwhere(~finite)[0]
         raise ValueError(f"Gaussians must be finite, got {names[k]} = {columns[i, k]} in number {i}.")
-    _write(path, unstructured_to_structured(columns.astype("<f4"), names=names), comments)
+    _write(path, unstructured_to_structured(columns.astype("<f4"), names=names), (_MIP,) if g.antialiased else ())
 
 
 def read_gaussians(path: Path) -> GaussianPly:
@@ -101,6 +101,8 @@ def read_gaussians(path: Path) -> GaussianPly:
     rest = _rest_names(sum(name.startswith("f_rest_") for name in names_of(table)))
     if len(rest) not in {3 * bands for bands in _BANDS}:
         raise DataError(path, "f_rest", f"has {len(rest)} properties where 0, 9, 24 or 45 belong", "export it again")
+    with path.open("rb") as file:
+        antialiased = _MIP.encode() in file.read(4096)
     layout = {*_XYZ, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION}
     extra = [name for name in names_of(table) if name not in layout]
     if extra:
@@ -112,6 +114,7 @@ def read_gaussians(path: Path) -> GaussianPly:
         opacities=columns(path, table, ("opacity",), infinite=_OPAQUE)[:, 0],
         scales=columns(path, table, _SCALE),
         quats=columns(path, table, _ROTATION),
+        antialiased=antialiased,
     )
 
 

@@ -91,6 +91,11 @@ class Drawing:
     kernel: float
     make: functools.partial[Rasterizer]
 
+    @property
+    def antialiased(self) -> bool:
+        """Whether opacities are compensated, see `RasterSettings`."""
+        return bool(self.make.keywords.get("antialiased", _SHARED.antialiased))
+
     def over(self, background: Color) -> Drawing:
         """The same over the data set's background, unless the settings name one."""
         if "background" in self.make.keywords:

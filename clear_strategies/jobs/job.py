@@ -339,6 +339,7 @@ def _train(
         pictures=training.pictures,
         seconds=seconds,
         config=training.compared,
+        antialiased=place.drawing.antialiased,
         baseline=beside,
     )
     return evaluation, seconds

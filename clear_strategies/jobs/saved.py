@@ -27,7 +27,6 @@ from rasterizers.interface import Camera
 _log = logging.getLogger(__name__)
 
 PLY: Final = "point_cloud.ply"
-_MIP_COMMENT: Final = b"SplatRenderMode: mip"
 _FAR: Final = 2.5  # distance of the camera that is made up for a lone PLY file, in radii of the scene
 _SIZE: Final = (1280, 720)  # px, of that camera
 _DEPTH: Final = 3  # cameras.json lies at most so many folders above a PLY file
@@ -41,6 +40,7 @@ class SavedSplat:
         folder: of the run, or of the PLY file.
         source: what was opened, for messages.
         cameras: of the run; empty where none are known.
+        antialiased: it was trained with opacity compensation.
         baked: it comes from a PLY file, where f_det and the 3D filter can no longer be told apart from the rest.
     """
 
@@ -48,6 +48,7 @@ class SavedSplat:
     source: str
     painter: Painter
     cameras: Sequence[SavedCamera]
+    antialiased: bool
     baked: bool
 
     @property
@@ -111,7 +112,8 @@ def _of_checkpoint(path: Path, folder: Path, rasterizer: str | None) -> SavedSpl
     chosen = {key: value for key, value in saved.config.items() if value is not None}
     own = {key.removeprefix("rasterizer."): v for key, v in chosen.items() if key.startswith("rasterizer.")}
     source = f"{folder}, {saved.t - 1} iterations, {len(field):,} Gaussians"
-    return SavedSplat(folder, source, _painter(field, _drawing(own, rasterizer), known), known, baked=False)
+    painter, antialiased = _painter(field, _drawing(own, rasterizer), known), bool(own.get("antialiased", True))
+    return SavedSplat(folder, source, painter, known, antialiased, baked=False)
 
 
 def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
@@ -126,11 +128,9 @@ def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
     )  # fmt: skip
     field.degree = field.max_degree
     known = _cameras_near(path.parent, _DEPTH)
-    with path.open("rb") as file:
-        mip = _MIP_COMMENT in file.read(4096)
-    drawing = _drawing({} if mip else {"kernel": 0.3, "antialiased": False}, rasterizer)
+    drawing = _drawing({} if g.antialiased else {"kernel": 0.3, "antialiased": False}, rasterizer)
     source = f"{path}, {len(field):,} Gaussians"
-    return SavedSplat(path.parent, source, _painter(field, drawing, known), known, baked=True)
+    return SavedSplat(path.parent, source, _painter(field, drawing, known), known, g.antialiased, baked=True)
 
 
 def _painter(field: GaussianField, drawing: Drawing, known: Sequence[SavedCamera]) -> Painter:

@@ -35,15 +35,17 @@ def write_format(path: Path, g: GaussianPly, form: str) -> None:
         files.write_bytes(path, packed_bytes(g, form))
 
 
-def export_ply(path: Path, field: GaussianField) -> None:
+def export_ply(path: Path, field: GaussianField, *, antialiased: bool = True) -> None:
     """Write the standard 3DGS layout; f_det is folded into the colour, the 3D filter into scales and opacities.
 
-    A viewer that honours the header's `SplatRenderMode: mip` draws the file with opacity compensation, as in training.
+    Args:
+        antialiased: the field was trained with opacity compensation. The header then says `SplatRenderMode: mip`, and a viewer
+            that honours this draws the file in the same way.
     """
-    write_gaussians(path, gaussians_of(field))
+    write_gaussians(path, gaussians_of(field, antialiased=antialiased))
 
 
-def gaussians_of(field: GaussianField) -> GaussianPly:
+def gaussians_of(field: GaussianField, *, antialiased: bool) -> GaussianPly:
     """The Gaussians of `export_ply`."""
     splats = field.baked()
     tiny = torch.finfo(torch.float32).eps
@@ -57,6 +59,7 @@ def gaussians_of(field: GaussianField) -> GaussianPly:
         opacities=torch.logit(splats.opacities.clamp(tiny, 1 - tiny)),
         scales=splats.scales.log(),
         quats=torch.nn.functional.normalize(splats.quats, dim=-1),
+        antialiased=antialiased,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -65,6 +65,7 @@ def write_results(
     pictures: Pictures | None,
     seconds: float,
     config: Mapping[str, Any],
+    antialiased: bool,
     baseline: Baseline | None = None,
 ) -> Evaluation:
     """Evaluate a finished run and write its files; returns its scores.
@@ -74,6 +75,7 @@ def write_results(
         down: D, by which the LR images were made.
         painter: of the state's field, for depth and video.
         pictures: None writes none but the renders, which is all that another run's contact sheet needs.
+        antialiased: the rasterizer compensates opacities, see `RasterSettings`.
         baseline: the one that trained beside it.
     """
     field, work_log, history = state.field, state.conductor.work_log, state.history_as_floats()
@@ -81,7 +83,7 @@ def write_results(
         evaluation = metrics.evaluate(scene, lambda camera: field.render(rasterizer, camera).cpu(), down=down)
     for name, image in evaluation.renders.items():
         write_png(folder / "renders" / f"{file_stem(name)}.png", image)
-    export_ply(folder / "point_cloud.ply", field)
+    export_ply(folder / "point_cloud.ply", field, antialiased=antialiased)
     synthetic = " · SYNTHETIC prior" * scene.synthetic_prior
     title = f"{scene.name} · {chosen.title} · {state.t - 1} iterations · seed {state.settings.seed}{synthetic}"
     if pictures is not None:
@@ -97,22 +99,12 @@ def write_results(
     files.write_json(
         folder / "metrics.json",
         metrics.to_json(
-            evaluation,
-            scene=scene.name,
-            method=chosen.method,
-            strategies=list(chosen.strategies),
-            overrides=chosen.overrides,
-            seed=state.settings.seed,
-            iterations=state.t - 1,
-            gaussians=len(field),
-            seconds=seconds,
-            conflict=_mean_conflict(history),
-            synthetic_prior=scene.synthetic_prior,
-            baseline=None if baseline is None else baseline.to_json(),
-            config=config,
+            evaluation, scene=scene.name, **asdict(chosen), seed=state.settings.seed, iterations=state.t - 1,
+            gaussians=len(field), seconds=seconds, conflict=_mean_conflict(history), synthetic_prior=scene.synthetic_prior,
+            baseline=None if baseline is None else baseline.to_json(), config=config,
             provenance=provenance(seed=state.settings.seed, backend=backend, plan=scene.notes),
         ),
-    )
+    )  # fmt: skip
     return evaluation
 
 

@@ -74,6 +74,11 @@ def test_warp_gets_the_device_of_the_job(monkeypatch):
         assert given["warp"].get("device") == expected
 
 
+@pytest.mark.parametrize("chosen", [(), ("+method=3dgs_lr",)])
+def test_the_method_says_whether_opacities_are_compensated(chosen: tuple[str, ...]):
+    assert device.drawing(settings(*chosen).rasterizer, None).antialiased == (not chosen)
+
+
 def test_a_rasterizer_of_another_package_is_a_target_with_the_same_settings():
     target = f"rasterizer._target_={__name__}.Theirs"
     found = settings(target, "rasterizer.kernel=0.3", "+rasterizer.sharpness=2").rasterizer

@@ -10,8 +10,10 @@ import pytest
 import torch
 
 import rasterizers
+from clear_strategies.commands import export
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat, overview
+from clear_strategies.outputs.formats import export_ply
 from clear_strategies.training import checkpoint
 from tests.helpers import saved_run, toy
 
@@ -63,6 +65,17 @@ def test_a_ply_file_of_3dgs_is_drawn_with_its_blur(run, tmp_path):
     plain, mip = (open_splat(path, "torch").painter for path in (tmp_path / "a.ply", folder / "point_cloud.ply"))
     rasterizer = rasterizers.load("torch", kernel=0.3, antialiased=False)
     assert torch.equal(plain.color(CAMERA), mip.field.render(rasterizer, CAMERA).clamp(0, 1))
+
+
+def test_a_run_without_compensation_has_a_ply_file_that_says_so(run, tmp_path):
+    _, field = run
+    export_ply(tmp_path / "run" / "point_cloud.ply", field, antialiased=False)
+    export.main([str(tmp_path / "run"), "--to", "ply", "--out", str(tmp_path / "again.ply")])
+    rasterizer = rasterizers.load("torch", kernel=0.3, antialiased=False)
+    for path in (tmp_path / "run" / "point_cloud.ply", tmp_path / "again.ply"):
+        assert b"SplatRenderMode" not in path.read_bytes()[:300]
+        found = open_splat(path, "torch").painter.color(CAMERA)
+        torch.testing.assert_close(found, field.render(rasterizer, CAMERA).clamp(0, 1), atol=2e-5, rtol=0)
 
 
 def test_a_lone_ply_file_has_a_camera_that_sees_it(run, tmp_path):

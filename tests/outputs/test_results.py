@@ -15,6 +15,7 @@ import torch
 from clear_strategies import GCO, P2G, files, report
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.data.ply import read_gaussians
 from clear_strategies.data.scene import Scene
 from clear_strategies.merging.objective import Objective
 from clear_strategies.outputs import results
@@ -58,7 +59,7 @@ def write(
     return write_results(
         folder, scene, state, toy.RASTERIZER, Chosen(None, ["gco", "p2g"]), backend="torch", down="bicubic",
         painter=Painter(state.field, lambda **_: toy.RASTERIZER), pictures=pictures, seconds=1.5, config={"fit": {"seed": 0}},
-        baseline=baseline,
+        baseline=baseline, antialiased=False,
     )  # fmt: skip
 
 
@@ -118,6 +119,11 @@ def test_conflict_csv_holds_columns_of_history_csv(tmp_path: Path, state: TrainS
     assert json.loads((tmp_path / "metrics.json").read_text())["conflict"]["gaussian"] == pytest.approx(mean)
 
 
+def test_the_ply_file_says_how_the_run_was_drawn(tmp_path: Path, state: TrainState) -> None:
+    write(tmp_path, state, pictures=None)
+    assert not read_gaussians(tmp_path / "point_cloud.ply").antialiased
+
+
 def test_no_map_views_means_no_maps(tmp_path: Path, state: TrainState) -> None:
     write(tmp_path, state, pictures=replace(PICTURES, map_views=0))
     assert not (tmp_path / "maps").exists()
@@ -140,12 +146,10 @@ def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(
     for name in ("write_curves", "write_contact_sheet"):
         monkeypatch.setattr(results, name, lambda *_: None)
     rig = ("left/0000.png", "right/0000.png")
-    train, test = (
-        tuple(replace(view, name=name) for view, name in zip(SCENE.train, rig, strict=False)) for _ in range(2)
-    )
-    scene, pictures = replace(SCENE, train=train, test=test), Pictures(2, 0, 0)
-    monkeypatch.setattr(state, "views", train)
-    write(tmp_path, state, scene=scene, pictures=pictures)
+    views = tuple(replace(view, name=name) for view, name in zip(SCENE.train, rig, strict=False))
+    scene = replace(SCENE, train=views, test=views)
+    monkeypatch.setattr(state, "views", views)
+    write(tmp_path, state, scene=scene, pictures=Pictures(map_views=2, video_frames=0, page_gaussians=0))
     write_cameras(tmp_path, scene)
     stems = {"left_0000", "right_0000"}
     for folder in ("renders", "depth"):
