@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import atexit
 import gc
+import os
+import signal
 import sys
 
 from clear_strategies import commands
@@ -20,6 +22,10 @@ def main() -> None:
     atexit.register(gc.freeze)  # else Python looks through all of torch's objects before it ends, for 0.3 s
     try:
         (commands.named(sys.argv[1:]) or _of_hydra)()
+        sys.stdout.flush()
+    except BrokenPipeError:  # who read the output has left, as head does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is left of it goes there when Python ends
+        sys.exit(exit_codes.SIGNALS + signal.SIGPIPE)
     except (Exception, KeyboardInterrupt) as error:
         if (ending := exit_codes.describe(error)) is None:
             raise

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import errno
 import signal
 from importlib.util import find_spec
 from typing import Final, NamedTuple
@@ -16,6 +17,8 @@ _NO_MEMORY: Final = "can't allocate memory"  # of torch's allocator on the CPU
 _LESS_MEMORY: Final = (
     "Lower density.max_gaussians or raise data.views.shrink; rasterizer.memory bounds the rasterizer's lists."
 )
+
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 UNUSABLE: Final = 2
 NO_DISK: Final = 3
@@ -37,7 +40,7 @@ def describe(error: BaseException) -> Ending | None:
     if isinstance(error, ClearError):
         return Ending(error.exit_code, one_line(error))
     if isinstance(error, KeyboardInterrupt):
-        return Ending(SIGNALS + signal.SIGINT, "stopped by SIGINT before training began. Nothing was saved.")
+        return Ending(SIGNALS + signal.SIGINT, "stopped by SIGINT.")  # a job says what it has saved
     if isinstance(error, _told_by_libraries()):
         return Ending(UNUSABLE, of_hydra(error))  # before OSError: Hydra's error for an option that is not there is one
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
@@ -45,10 +48,9 @@ def describe(error: BaseException) -> Ending | None:
     disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it where it cannot open its file
     if isinstance(disk, OSError):
         where = f"{disk.filename or 'output'}: {disk.strerror or disk}"
-        return Ending(
-            NO_DISK,
-            f"{where}. Free space, or write elsewhere (hydra.run.dir=FOLDER). Earlier checkpoints are untouched.",
-        )
+        remedy = "Free space, or write elsewhere" if disk.errno in _FULL else "Write elsewhere"
+        elsewhere = "hydra.run.dir=FOLDER of a run, --out of a command"
+        return Ending(NO_DISK, f"{where}. {remedy} ({elsewhere}). Earlier checkpoints are untouched.")
     return None
 
 

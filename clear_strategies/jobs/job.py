@@ -32,7 +32,7 @@ from clear_strategies.outputs.baseline import Baseline, overrides_of
 from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.schedules import scaled
-from clear_strategies.training import memory
+from clear_strategies.training import memory, signals
 from clear_strategies.training.loop import fit
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing import live
@@ -178,7 +178,7 @@ def run(
     if settings.fit.baseline and _why_without_baseline(settings) is None:
         baseline = ours.baseline(values)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
-    with hold(folder):
+    with hold(folder), signals.told("before training began"):
         files.sweep(folder)
         return _run(ours, baseline, drawing, watch, budget)
 
@@ -316,30 +316,21 @@ def _train(
     Args:
         beside: the finished baseline, to show next to the run's results.
     """
-    settings, rasterizer = training.settings, place.drawing.rasterizer
-    write_cameras(training.folder, place.scene)
+    settings, rasterizer, alone = training.settings, place.drawing.rasterizer, device.jobs_at_once() == 1
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
-    watched = _watched(training, state, place)
-    alone = device.jobs_at_once() == 1
-    with watched as after_step, progress_bar(state, after_step, training.chosen.title, shown=alone) as progress:
-        checkpoints = training.folder / resume.CHECKPOINTS
-        fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)
-    seconds = time.perf_counter() - began
-    training.conductor.on_fit_end()  # its memory is for the results
-    memory.release()
-    evaluation = results.write_results(
-        training.folder,
-        place.scene,
-        state,
-        rasterizer,
-        training.chosen,
-        backend=place.drawing.name,
-        down=settings.data.views.downsample,
-        painter=Painter(state.field, place.drawing.make),
-        pictures=training.pictures,
-        seconds=seconds,
-        config=training.compared,
-        antialiased=place.drawing.antialiased,
-        baseline=beside,
-    )
+    with signals.told("before the run was finished", lambda: resume.newest(training.folder)):
+        write_cameras(training.folder, place.scene)
+        watched = _watched(training, state, place)
+        with watched as after_step, progress_bar(state, after_step, training.chosen.title, shown=alone) as progress:
+            checkpoints = training.folder / resume.CHECKPOINTS
+            fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)
+        seconds = time.perf_counter() - began
+        training.conductor.on_fit_end()  # its memory is for the results
+        memory.release()
+        evaluation = results.write_results(
+            training.folder, place.scene, state, rasterizer, training.chosen,
+            backend=place.drawing.name, down=settings.data.views.downsample,
+            painter=Painter(state.field, place.drawing.make), pictures=training.pictures, seconds=seconds,
+            config=training.compared, antialiased=place.drawing.antialiased, baseline=beside,
+        )  # fmt: skip
     return evaluation, seconds

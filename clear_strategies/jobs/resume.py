@@ -99,6 +99,11 @@ def folder_of(source: Path) -> Path:
     return next((path.parent for path in (source, source.parent) if path.name == CHECKPOINTS), source)
 
 
+def newest(folder: Path) -> Path | None:
+    """The newest checkpoint of the run in this folder."""
+    return next(reversed(checkpoint.saved(folder / CHECKPOINTS)), None)
+
+
 def _resume_newest(state: TrainState, folder: Path, config: Mapping[str, Any]) -> None:
     found = checkpoint.saved(folder)
     for source in reversed(found):

@@ -121,7 +121,7 @@ def fit(
             if progress is not None:
                 progress(state)
             if pending:
-                raise Interrupted(foremost(pending), save(), state.t)
+                raise Interrupted(foremost(pending), f"before iteration {state.t}", save())
             if settings.checkpoint_every and done % settings.checkpoint_every == 0 and not ended:
                 save()
     save()

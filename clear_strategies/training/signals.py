@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -16,12 +16,17 @@ _log = logging.getLogger(__name__)
 
 
 class Interrupted(ClearError):
-    """The run was asked to stop (Ctrl-C, SIGTERM, a cluster's own signal); it finished its step and saved."""
+    """The run was asked to stop (Ctrl-C, SIGTERM, a cluster's own signal).
 
-    def __init__(self, signum: int, saved: Path | None, t: int) -> None:
+    Args:
+        when: for the message, "before iteration 8".
+        saved: the newest checkpoint.
+    """
+
+    def __init__(self, signum: int, when: str, saved: Path | None) -> None:
         self.signum = signum
-        where = f"Go on with fit.resume={saved}" if saved else "Nothing was saved: this run keeps no checkpoints"
-        super().__init__(f"stopped by {signal.Signals(signum).name} before iteration {t}. {where}.")
+        where = f"Go on with fit.resume={saved}" if saved else "Nothing was saved"
+        super().__init__(f"stopped by {signal.Signals(signum).name} {when}. {where}.")
 
     @property
     def exit_code(self) -> int:
@@ -61,6 +66,15 @@ def deferred_signals() -> Iterator[list[int]]:
     finally:
         for s, handler in before.items():
             signal.signal(s, handler)
+
+
+@contextmanager
+def told(when: str, saved: Callable[[], Path | None] = lambda: None) -> Iterator[None]:
+    """Ctrl-C where no step defers it becomes `Interrupted`, with the checkpoint that is the newest then."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        raise Interrupted(signal.SIGINT, when, saved()) from error
 
 
 def foremost(pending: list[int]) -> int:

@@ -13,6 +13,7 @@ from clear_strategies.jobs import job, resume
 from clear_strategies.jobs.budget import Budget
 from clear_strategies.outputs import metrics
 from clear_strategies.training.loop import iterate
+from clear_strategies.training.signals import Interrupted
 from tests.helpers import pictures, toy
 from tests.helpers.command_line import TINY
 from tests.helpers.configs import composed
@@ -52,3 +53,15 @@ def test_a_run_is_not_resumed_with_another_size_of_hr_than_its_time_allowed(tmp_
         with pytest.raises(DataError, match=r"data\.views\.max_hr_megapixels: 0\.03 then, 2\.1 now"):
             job.run(composed(*again), tmp_path / "again")
         job.run(composed(*again, "data.views.max_hr_megapixels=0.03"), tmp_path / "again")
+
+
+def test_ctrl_c_after_training_names_the_checkpoint_that_was_saved(tmp_path: Path, monkeypatch):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(job.results, "write_results", stopped)
+    with pytest.raises(Interrupted) as told:
+        job.run(composed(*TINY, "+strategy=gco", "prior=bicubic", "fit.threads=1", "fit.iterations=3"), tmp_path)
+    saved = tmp_path / "checkpoints" / "step_0000004"
+    assert saved.is_dir()
+    assert str(told.value) == f"stopped by SIGINT before the run was finished. Go on with fit.resume={saved}."
