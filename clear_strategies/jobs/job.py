@@ -120,12 +120,6 @@ class _Training:
         resume.resume(state, source, self.folder, self.compared)
         return state
 
-    def remove_earlier_metrics(self) -> None:
-        metrics = self.folder / "metrics.json"
-        if metrics.exists():
-            _log.warning("%s: of an earlier run; removed, because its presence says that a run is finished.", metrics)
-            metrics.unlink()
-
 
 @dataclass(frozen=True, slots=True)
 class _Place:
@@ -243,7 +237,9 @@ def _run(
     memory.require(found, None if settings.fit.memory is None else settings.fit.memory << 20, most)
     if settings.fit.baseline and baseline is None:
         _log.log(level, "fit.baseline: no baseline trains beside this run, %s.", _why_without_baseline(settings))
-    ours.remove_earlier_metrics()
+    results.remove_earlier(ours.folder, all_files=state.t == 1)
+    if baseline is None and state.t == 1:
+        results.remove_earlier(ours.folder / BASELINE, all_files=True)
     beside = None if baseline is None else _trained_first(baseline, first, place)
     first = None  # its memory is for what trains now
     evaluation, seconds = _train(ours, state, place, beside)
@@ -276,7 +272,7 @@ def _trained_first(training: _Training, state: TrainState | None, place: _Place)
             "the baseline trains first: no strategy, all else as above (fit.baseline=false leaves it out): %s",
             training.folder,
         )
-        training.remove_earlier_metrics()
+        results.remove_earlier(training.folder, all_files=state.t == 1)
         _train(training, state, place)
     baseline = Baseline.read(training.folder)
     _log.info("%s", score_table.describe_baseline(baseline))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +20,7 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.view_names import file_stem
+from clear_strategies.errors import DataError
 from clear_strategies.outputs import coverage, metrics
 from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.contact_sheet import OWN_PHOTO, TRAINED_ON, SheetRow, write_contact_sheet
@@ -31,9 +34,22 @@ from clear_strategies.outputs.plan import Chosen, marks
 from clear_strategies.outputs.provenance import provenance
 from clear_strategies.training import memory
 from clear_strategies.training.state import TrainState
+from clear_strategies.viewing import cameras, points
+from clear_strategies.viewing import page as splat_page
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Rasterizer
 
+_log = logging.getLogger(__name__)
+
+_METRICS: Final = "metrics.json"
+_OF_RUN: Final = (
+    "contact_sheet.png", "curves.png", "history.csv", "conflict.csv", "timing.csv", "point_cloud.ply", "path.mp4",
+    "path.gif", splat_page.FILE, coverage.PICTURE, coverage.PAGE, cameras.FILE, "maps/maps.json",
+)  # fmt: skip
+_OF_VIEW: Final = (
+    "renders/{}.png", "depth/{}.png", f"{cameras.PHOTOS}/{{}}.jpg", *(f"views/{{}}_{k}.png" for k in ("lr", "prior", "truth")),
+    *(f"maps/{{}}/{name}.png" for name in (*points.MAPS, "lr", "prior", "maps", "depth")),
+)  # fmt: skip
 _SHEET_VIEWS: Final = 4  # test views on the contact sheet, in views/ and in depth/, at most
 
 
@@ -97,7 +113,7 @@ def write_results(
         _write_views(folder, scene, painter, pictures, work_log, title)
     _write_tables(folder, history, [*scene.work_log.rows(), *work_log.rows()])
     files.write_json(
-        folder / "metrics.json",
+        folder / _METRICS,
         metrics.to_json(
             evaluation, scene=scene.name, **asdict(chosen), seed=state.settings.seed, iterations=state.t - 1,
             gaussians=len(field), seconds=seconds, conflict=_mean_conflict(history), synthetic_prior=scene.synthetic_prior,
@@ -108,17 +124,40 @@ def write_results(
     return evaluation
 
 
+def remove_earlier(folder: Path, *, all_files: bool) -> None:
+    """Remove metrics.json of an earlier run, because its presence says that a run is finished.
+
+    Args:
+        all_files: also the other files of that run, which would pass as those of a run that starts anew. They are known by the
+            views of its metrics.json; files of others stay.
+    """
+    path = folder / _METRICS
+    if not path.exists():
+        return
+    _log.warning("%s: of an earlier run; removed%s.", path, ", and the pictures and tables of that run" * all_files)
+    stems: set[str] = set()
+    with suppress(DataError):
+        content = metrics.read(path, "")
+        stems = {file_stem(name) for part in (content.test, content.train) for name in part.views}
+    path.unlink()
+    for name in (*_OF_RUN, *(name.format(stem) for stem in stems for name in _OF_VIEW)) if all_files and stems else ():
+        (folder / name).unlink(missing_ok=True)
+        for emptied in list(Path(name).parents)[:-1]:
+            with suppress(OSError):  # files of others are in it
+                (folder / emptied).rmdir()
+
+
 def _write_views(
     folder: Path, scene: Scene, painter: Painter, pictures: Pictures, work_log: WorkLog, title: str
 ) -> None:
     """The field from the cameras of the contact sheet, along a loop, and in a page."""
-    cameras = [view.hr.camera for view in scene.train]
+    train = [view.hr.camera for view in scene.train]
     with work_log.stage("depth pictures"):
         write_depths(folder / "depth", _shown(scene), painter)
     with work_log.stage("video"):
-        write_loop(folder, cameras, painter, pictures.video_frames)
+        write_loop(folder, train, painter, pictures.video_frames)
     with work_log.stage("page"):
-        write_splat_page(folder, cameras, painter, pictures.page_gaussians, title, scene.background)
+        write_splat_page(folder, train, painter, pictures.page_gaussians, title, scene.background)
     if len(painter.field) <= pictures.page_gaussians:
         with work_log.stage("coverage"):
             coverage.write_coverage(folder, scene, painter, title)

@@ -204,6 +204,13 @@ def test_the_metrics_of_an_earlier_run_go_before_the_baseline_trains(tmp_path, c
     assert "of an earlier run" in caplog.text
 
 
+def test_a_run_that_starts_anew_removes_the_baseline_of_an_earlier_one(whole, tmp_path):
+    shutil.copytree(whole, tmp_path / "run")
+    train(tmp_path / "run", "fit.baseline=false", "fit.iterations=3")
+    assert not (tmp_path / "run" / "baseline" / "metrics.json").exists()
+    assert not (tmp_path / "run" / "baseline" / "renders").exists()
+
+
 @pytest.mark.parametrize(
     ("overrides", "why"),
     [(["+method=srgs"], "since +method=srgs is one itself"), (["~strategies.gco"], "since it has no strategy")],

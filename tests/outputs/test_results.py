@@ -163,6 +163,24 @@ def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(
     assert {baseline.render_of(view).stem for view in baseline.views} == set(report.Run.read(tmp_path).views) == stems
 
 
+def test_an_earlier_run_goes_with_all_of_its_files_and_no_other(tmp_path: Path, state: TrainState) -> None:
+    write(tmp_path, state, pictures=replace(PICTURES, page_gaussians=0))
+    write_cameras(tmp_path, SCENE)
+    kept = {tmp_path / "notes.txt", tmp_path / "depth" / "measured.png", tmp_path / "checkpoints" / "step_0000004"}
+    for path in kept:
+        files.write_text(path, "mine")
+    results.remove_earlier(tmp_path, all_files=True)
+    assert {path for path in tmp_path.rglob("*") if path.is_file()} == kept
+    assert names(tmp_path) == {"notes.txt", "depth/", "checkpoints/"}
+
+
+def test_of_a_file_that_is_no_runs_nothing_else_is_removed(tmp_path: Path) -> None:
+    for name in ("metrics.json", "curves.png"):
+        files.write_text(tmp_path / name, "{}")
+    results.remove_earlier(tmp_path, all_files=True)
+    assert names(tmp_path) == {"curves.png"}
+
+
 def test_the_sheet_of_photos_at_hr_shows_no_sr(
     tmp_path: Path, state: TrainState, monkeypatch: pytest.MonkeyPatch
 ) -> None:
