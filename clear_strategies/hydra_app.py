@@ -161,7 +161,7 @@ def _report(folder: Path) -> None:
 
     try:
         _log.info("%s", report.write(report.collect([folder]), folder))
-    except ClearError as error:  # nothing is finished yet, or a run's files are damaged; the jobs themselves are not
+    except (ClearError, OSError) as error:  # nothing is finished, or a file is damaged or in the way; the jobs are well
         _log.warning("there is no report: %s", error)
 
 

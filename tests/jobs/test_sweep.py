@@ -10,12 +10,15 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+from clear_strategies.hydra_app import SweepCallback
 from clear_strategies.jobs import sweep
 from clear_strategies.jobs.sweep import Sweep, Watch
 from clear_strategies.training import checkpoint
 from tests.helpers.command_line import TINY, run, started, stopped_by, trains, wait_for
 from tests.helpers.configs import composed
+from tests.helpers.finished_run import make_run
 
 AUTO = ["fit.resume=auto", *TINY]
 SWEEP = ["-m", "hydra.sweep.dir=all", *AUTO]
@@ -225,3 +228,15 @@ def test_a_stopped_sweep_signals_a_job_once_and_does_not_kill_one_that_is_saving
     finally:
         signal.signal(signal.SIGTERM, before)
     assert raised == [signal.SIGTERM]
+
+
+def test_failed_jobs_are_told_where_the_report_cannot_be_written(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("CLEAR_SWEEP", "")  # restored afterwards
+    Sweep.begin(tmp_path).note(sweep.FAILED, 1, "no such photo")
+    make_run(tmp_path / "0")
+    (tmp_path / "report.md").mkdir()
+    with pytest.raises(SystemExit) as ended:
+        SweepCallback().on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}}))
+    assert ended.value.code == 2
+    assert "1 job(s) failed: job 1: no such photo" in caplog.text
+    assert "there is no report: [Errno" in caplog.text
