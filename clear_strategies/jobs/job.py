@@ -172,7 +172,7 @@ def run(
     if settings.fit.baseline and _why_without_baseline(settings) is None:
         baseline = ours.baseline(values)
     drawing = device.drawing(settings.rasterizer, settings.fit.device)
-    with hold(folder), signals.told("before training began"):
+    with hold(folder), signals.interrupted("before training began"):
         files.sweep(folder)
         return _run(ours, baseline, drawing, watch, budget)
 
@@ -314,7 +314,7 @@ def _train(
     """
     settings, rasterizer, alone = training.settings, place.drawing.rasterizer, device.jobs_at_once() == 1
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
-    with signals.told("before the run was finished", lambda: resume.newest(training.folder)):
+    with signals.interrupted("before the run was finished", lambda: resume.newest(training.folder)):
         write_cameras(training.folder, place.scene)
         watched = _watched(training, state, place)
         with watched as after_step, progress_bar(state, after_step, training.chosen.title, shown=alone) as progress:

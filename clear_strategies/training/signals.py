@@ -69,7 +69,7 @@ def deferred_signals() -> Iterator[list[int]]:
 
 
 @contextmanager
-def told(when: str, saved: Callable[[], Path | None] = lambda: None) -> Iterator[None]:
+def interrupted(when: str, saved: Callable[[], Path | None] = lambda: None) -> Iterator[None]:
     """Ctrl-C where no step defers it becomes `Interrupted`, with the checkpoint that is the newest then."""
     try:
         yield
