@@ -41,7 +41,7 @@ CHANGES_NO_RESULT: Final = frozenset(
         "baseline", "checkpoint_every", "keep", "log", "map_views", "memory", "page", "probe_every", "probe_views", "resume",
         "threads", "verbose", "video", "viewer",
     )
-)  # fmt: skip
+) | {"rasterizer.memory"}  # fmt: skip
 """Settings with which the same field is trained, bit for bit: what is kept, shown and written beside it, and how fast. Resuming
 does not compare them, a sweep's folders are not named by them, and a report does not tell runs apart by them.
 """

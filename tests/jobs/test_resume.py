@@ -34,8 +34,8 @@ def test_resuming_on_another_device_is_logged(caplog):
     assert "this run trained on cuda until now and continues on cpu" in caplog.text
 
 
-def test_device_and_threads_may_differ_and_defaults_are_compared_too():
-    assert compared("fit.device=cpu", "fit.threads=1") == compared()
+def test_device_threads_and_memory_may_differ_and_defaults_are_compared_too():
+    assert compared("fit.device=cpu", "fit.threads=1", "rasterizer.memory=512") == compared()
     assert compared()["fit.seed"] == 0  # a default of the class, which no file gives
     saved = replace(start(()).checkpoint({}), config=compared("density.every=50"))
     with pytest.raises(DataError, match=r"density\.every: 50 then, 100 now"):
