@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import functools
 import logging
+import socket
 import webbrowser
 from collections.abc import Sequence
 
 from clear_strategies import console
 from clear_strategies.commands.options import parser_of
+from clear_strategies.errors import SettingError
 
 _log = logging.getLogger(__name__)
 
@@ -25,6 +27,7 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
+    _require_own(options.host)
     from clear_strategies.jobs.saved import open_splat
     from clear_strategies.viewing import live, points
 
@@ -43,3 +46,20 @@ def main(arguments: Sequence[str]) -> None:
     if not options.no_browser:
         webbrowser.open(viewer.address)
     viewer.serve_until_stopped()
+
+
+def _require_own(host: str) -> None:
+    """The viewer's server would wait for ever for an address of another machine.
+
+    Raises:
+        SettingError: this machine has no such address.
+    """
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as found:
+            found.bind(address)
+    except OSError as error:
+        remedy = "Take 127.0.0.1, for this machine alone, or 0.0.0.0, for all that reach it."
+        raise SettingError(
+            f"--host: must be an address of this machine, got {host} ({error.strerror}). {remedy}"
+        ) from error

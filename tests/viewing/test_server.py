@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from clear_strategies.commands import view
 from clear_strategies.core.images import to_bytes
+from clear_strategies.errors import SettingError
 from clear_strategies.jobs.saved import open_splat
 from clear_strategies.viewing import points
 from clear_strategies.viewing.look import Look
@@ -93,3 +95,8 @@ def test_the_viewer_opens_and_closes(splat, screen):
         assert not viewer.paused
     finally:
         viewer.close()
+
+
+def test_an_address_of_another_machine_is_refused():
+    with pytest.raises(SettingError, match=r"^--host: must be an address of this machine, got 192\.0\.2\.1 \("):
+        view.main(["nowhere", "--host", "192.0.2.1"])
