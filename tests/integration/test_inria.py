@@ -137,7 +137,7 @@ def test_densification_after_the_anchor_is_refused_before_the_first_step(inria_h
         trained(inria_host, inria_capture, (early,))
     with caplog.at_level(logging.WARNING):
         trained(inria_host, inria_capture, (SVS(anchor_start=5),), iterations=1)  # which takes no anchor
-    assert "densifies until densify_until_iter=24, but a strategy ends densification at 5" in caplog.text
+    assert "densifies until densify_until_iter=24, but SVS ends densification at 5" in caplog.text
 
 
 def test_a_host_that_densifies_after_the_anchor_nevertheless_is_stopped(inria_host, inria_capture, inria_attached):
