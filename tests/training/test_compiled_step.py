@@ -202,7 +202,9 @@ def test_rows_and_bands_that_are_left_out_would_not_have_moved(passes, degree, a
         both = conductors(GCO, SVS, anchored=c.fields[0] if anchored else None)
         if anchored:  # at θ^a itself nothing pulls
             for conductor in both:
-                conductor.after_step(c.fields[1].raw(), toy.step(conductor.strategies[1].anchor_start))
+                svs = conductor.strategies[1]
+                svs.state.clear()
+                conductor.after_step(c.fields[1].raw(), toy.step(svs.anchor_start))
         adams = three_steps(passes, c, both, rates, skips=skips)
         states.append([*c.fields[1].raw().values(), *adams[1].first.values(), *adams[1].second.values()])
         ledgers.append(both[1].work_log.entries)

@@ -165,7 +165,7 @@ def test_splatsure_reads_nothing_either(no_data, monkeypatch):
             seen = state.skip_policy.view(view, t)
             for s in state.conductor.strategies:
                 if isinstance(s, SplatSuRe):
-                    s._pose(seen.name, seen.hr.camera)
+                    s._pose(seen.name, seen.lr.camera)
     state.skip_policy = SkipPolicy()
     steadily(state)
 
