@@ -13,7 +13,7 @@ from torch import Tensor
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
-from clear_strategies.data.priors.interface import Network, Prior, require_file
+from clear_strategies.data.priors.interface import Network, Prior, layers, require_file
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -31,10 +31,7 @@ def cached(prior: Prior) -> Prior:
 
 def kept_network_of(prior: object) -> Prior | None:
     """The network behind a prior, as `network_of` finds it, in its cache where it has one."""
-    while not isinstance(prior, Network | Cached):
-        if (prior := getattr(prior, "prior", None)) is None:
-            return None
-    return prior
+    return next((inner for inner in layers(prior) if isinstance(inner, Network | Cached)), None)
 
 
 @dataclass(frozen=True, slots=True)

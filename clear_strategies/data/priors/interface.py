@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import os
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
@@ -64,18 +66,19 @@ class Network(Prior, Protocol):
 
 def network_of(prior: object) -> Network | None:
     """The network behind a prior, which may be cached or have errors added; None where there is none."""
-    while not isinstance(prior, Network):
-        if (prior := getattr(prior, "prior", None)) is None:
-            return None
-    return prior
+    return next((inner for inner in layers(prior) if isinstance(inner, Network)), None)
+
+
+def layers(prior: object) -> Iterator[object]:
+    """A prior, what it decorates, and so on."""
+    while prior is not None:
+        yield prior
+        prior = getattr(prior, "prior", None)
 
 
 def passes_of(prior: object) -> int:
     """How often a prior runs the network behind it for one photo."""
-    passes = 1
-    while prior is not None:
-        passes, prior = passes * getattr(prior, "passes", 1), getattr(prior, "prior", None)
-    return passes
+    return math.prod(getattr(inner, "passes", 1) for inner in layers(prior))
 
 
 def fingerprint(network: Network) -> str:
