@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import torch
@@ -103,14 +103,8 @@ def _write_picture(path: Path, found: Coverage, scene: Scene, title: str) -> Non
     above, beside = figure.subplots(1, 2, width_ratios=(3, 2))
     _draw_map(above, found)
     beside.set_axis_off()
-    style: dict[str, Any] = {
-        "va": "top",
-        "fontsize": 8.5,
-        "color": figures.INK,
-        "family": "monospace",
-        **figures.AS_WRITTEN,
-    }
-    beside.text(0, 1, "\n".join(_lines(found, scene)), **style)
+    lines = "\n".join(_lines(found, scene))
+    beside.text(0, 1, lines, va="top", fontsize=8.5, color=figures.INK, family="monospace", **figures.AS_WRITTEN)
     patches = [Patch(color=color, label=f"seen by {name}") for color, name in zip(_COLORS, _SEEN, strict=True)]
     above.legend(handles=patches, loc="lower left", fontsize=8, framealpha=0.8, edgecolor="none")
     figures.set_title(figure, f"{title}: what the photos see, from above")
@@ -130,11 +124,12 @@ def _draw_map(axes: Axes, found: Coverage) -> None:
     low, high = np.quantile(flat, (_CROP, 1 - _CROP), axis=0) if len(flat) else (places.min(0), places.max(0))
     low, high = np.minimum(low, places.min(0)), np.maximum(high, places.max(0))
     length = 0.05 * float((high - low).max())
-    style: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "color": _CAMERA, **figures.AS_WRITTEN}
     for (name, camera), place in zip(found.photos.items(), places, strict=True):
         toward = (camera.world_to_camera[2, :3].double().cpu() @ plane).numpy() * length
         axes.annotate("", place + toward, place, arrowprops={"arrowstyle": "-|>", "color": _CAMERA, "linewidth": 1.8})
-        axes.annotate(name, place, xytext=(3, -9), **style)
+        axes.annotate(
+            name, place, xytext=(3, -9), textcoords="offset points", fontsize=7, color=_CAMERA, **figures.AS_WRITTEN
+        )
     margin = 0.06 * (high - low).max()
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)

@@ -85,7 +85,7 @@ def finish(axis: Axes, *, legend: Literal["best", "upper right"] | None = "best"
         axis.legend(fontsize=8, loc=legend, framealpha=0.8, edgecolor="none")
 
 
-AS_WRITTEN: Final = {"parse_math": False}
+AS_WRITTEN: Final[dict[str, Any]] = {"parse_math": False}
 """Style of a text with names of the user's: matplotlib would read what lies between two $ as mathematics."""
 
 
