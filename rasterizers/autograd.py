@@ -88,7 +88,7 @@ class _Draw(torch.autograd.Function):
         offset: Tensor | None,
         *tensors: Tensor,
     ) -> Any:
-        ctx.rasterizer, ctx.camera, ctx.offset = rasterizer, camera, offset is not None
+        ctx.rasterizer, ctx.camera = rasterizer, camera
         ctx.save_for_backward(*tensors, *([] if offset is None else [offset]))
         detached = Splats(*(x.detach() for x in tensors))
         if offset is not None:
@@ -121,7 +121,7 @@ class _Draw(torch.autograd.Function):
             pairs = zip(_gradients(ctx.rendering, cotangent + of_red), _gradients(over_other, -of_red), strict=True)
             total = [g + h for g, h in pairs]
         screen, rgb, *gradients = total
-        return None, None, None, screen, rgb if ctx.offset else None, *gradients
+        return None, None, None, screen, rgb if len(saved) > 6 else None, *gradients
 
 
 def _gradients(rendering: Rendering, cotangent: Float[Tensor, "H W 3"]) -> list[Tensor]:

@@ -140,7 +140,9 @@ def remove_earlier(folder: Path, *, all_files: bool) -> None:
         content = metrics.read(path, "")
         stems = {file_stem(name) for part in (content.test, content.train) for name in part.views}
     path.unlink()
-    for name in (*_OF_RUN, *(name.format(stem) for stem in stems for name in _OF_VIEW)) if all_files and stems else ():
+    if not (all_files and stems):
+        return
+    for name in (*_OF_RUN, *(name.format(stem) for stem in stems for name in _OF_VIEW)):
         (folder / name).unlink(missing_ok=True)
         for emptied in list(Path(name).parents)[:-1]:
             with suppress(OSError):  # files of others are in it
