@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
@@ -87,13 +88,13 @@ class CopiedBack:
 
 
 def moved(tensors, device: str, there: dict[int, torch.Tensor] | None = None):
-    """Splats or gradients on another device; `there` holds the copies made before."""
-    there = {} if there is None else there
-    found = {f.name: getattr(tensors, f.name) for f in fields(tensors)}
-    return replace(
-        tensors,
-        **{name: there.setdefault(id(x), x.to(device)) if x is not None else None for name, x in found.items()},
-    )
+    """Splats or gradients on another device, wrong tensors included; `there` holds the copies made before."""
+    there, result = {} if there is None else there, copy(tensors)
+    for field in fields(tensors):
+        x = getattr(tensors, field.name)
+        if x is not None and not x.is_meta:
+            object.__setattr__(result, field.name, there.setdefault(id(x), x.to(device)))
+    return result
 
 
 BACKENDS = {
