@@ -125,7 +125,7 @@ class Attachment:
         self._n = len(params()["means"])
         self._passes = 0  # backward passes of this iteration
         self._merges_before_step = 0  # at the host's last step
-        self._pending: tuple[HostRendering, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
+        self._pending: tuple[int, HostRendering, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(conductor, params)
         self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
@@ -170,10 +170,10 @@ class Attachment:
                 with _random_state_kept(means.device):
                     self._extra.render(extra_views, t, lambda camera: render_at(camera, None).shot)
         rendering = render_at("lr", z)
-        if rendering.output.requires_grad:
-            self._pending = rendering, hr_grads
-            rendering.output.register_hook(lambda _: self._on_backward(rendering))  # type: ignore[no-untyped-call]
         self.counts["LR renders"] += 1
+        if rendering.output.requires_grad:
+            self._pending = (nth := self.counts["LR renders"]), rendering, hr_grads
+            rendering.output.register_hook(partial(self._on_backward, nth))  # type: ignore[no-untyped-call]
         return rendering.returned
 
     @property
@@ -274,18 +274,18 @@ class Attachment:
         self.counts["structure changes"] += 1
         self._n = n
 
-    def _on_backward(self, rendering: HostRendering) -> None:
-        """The host's backward pass has reached Î_LR, but no parameter yet."""
+    def _on_backward(self, nth: int, _: Tensor) -> None:
+        """Backward has reached Î_LR of the nth rendering, but no parameter. A hook that holds the rendering is never freed."""
         if self._pending is None:
             return
-        if self._pending[0] is not rendering:
+        if nth != self._pending[0]:
             raise HostError(
                 "one backward pass reaches two renderings of training views, but each is merged by itself. With several views "
                 "for a step, call backward() after each rendering and set accumulation=, or use joint_loss. For a second pass "
                 "over the same view, e.g. for normals: with attached.rendering(None): …"
             )
         self._grads_before = {name: p.grad.clone() for name, p in self.params().items() if p.grad is not None}
-        centres = self._pending[0].shot.gradient_slot.tensor
+        centres = self._pending[1].shot.gradient_slot.tensor
         screen_gradients: list[Tensor] = []
         if centres.requires_grad:
             hook = centres.register_hook(screen_gradients.append)  # type: ignore[no-untyped-call]
@@ -302,7 +302,7 @@ class Attachment:
         """The host's backward pass has ended: replace its gradients by the merged ones."""
         if self._pending is None:
             return
-        (rendering, hr_grads), self._pending = self._pending, None
+        (_, rendering, hr_grads), self._pending = self._pending, None
         grad_scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
         trained = {name: p for name, p in self.params().items() if p.grad is not None or name == "detail"}
         g_lr = Grads({

@@ -51,7 +51,8 @@ class HostPhoto:
         image = self.image.float() / 255 if self.image.dtype == torch.uint8 else self.image.float()
         h, w = image.shape[:2]
         (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
-        return Photo(Camera(self.world_to_camera.detach().float(), fx, fy, cx, cy, w, h), image[..., :3])
+        pose = self.world_to_camera.detach().float().cpu()  # cameras stay there, see `Photo.to`
+        return Photo(Camera(pose, fx, fy, cx, cy, w, h), image[..., :3])
 
     def view(self, sr: SuperResolve, factor: int) -> View:
         """See `view`."""

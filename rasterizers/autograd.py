@@ -95,9 +95,11 @@ class _Draw(torch.autograd.Function):
             detached = replace(detached, rgb_offset=offset.detach())
         ctx.rendering = rasterizer(detached, camera, depth=True) if depth else rasterizer(detached, camera)
         means2d.data.copy_(ctx.rendering.means2d)
-        ctx.mark_non_differentiable(ctx.rendering.visible)
+        ctx.mark_non_differentiable(visible := ctx.rendering.visible.data)
         ctx.set_materialize_grads(False)
-        return ctx.rendering.image, ctx.rendering.alpha, ctx.rendering.visible, ctx.rendering.depth
+        # Other tensors over the same memory: an output that ctx holds would hold ctx in turn, and nothing would free either.
+        depth_map = None if ctx.rendering.depth is None else ctx.rendering.depth.data
+        return ctx.rendering.image.data, ctx.rendering.alpha.data, visible, depth_map
 
     @staticmethod
     def backward(ctx: Any, of_image: Tensor | None, of_alpha: Tensor | None, _: None, of_depth: Tensor | None) -> Any:

@@ -53,21 +53,28 @@ class Demo:
         return float(torch.stack(errors).log10().mean() * -10)
 
 
-def load_demo(width: int = 256, height: int = 192, factor: int = 4, train: int = 3) -> Demo:
+def load_demo(
+    width: int = 256, height: int = 192, factor: int = 4, train: int = 3, device: torch.device | str = "cpu"
+) -> Demo:
     """The demo's twelve views, of which `train` are for training.
 
     Args:
         width, height: of the HR images, px; multiples of `factor`, by which the training photos are reduced (bicubic).
+        device: of the photos and the cameras.
     """
     frames = demo.read(width=width, height=height, train=train).frames
     trained = [frame for frame in frames if frame.split == "train"]
     return Demo(
         [frame.name for frame in trained],
-        torch.stack([images.downsample(frame.load(), factor) for frame in trained]),
-        torch.stack([frame.camera.world_to_camera for frame in trained]),
-        torch.stack([intrinsics(frame.camera.scaled(1 / factor)).float() for frame in trained]),
+        torch.stack([images.downsample(frame.load(), factor) for frame in trained]).to(device),
+        torch.stack([frame.camera.world_to_camera.float() for frame in trained]).to(device),
+        torch.stack([intrinsics(frame.camera.scaled(1 / factor)).float() for frame in trained]).to(device),
         DemoPrior(truth={frame.name: frame.load for frame in trained}),
-        [(f.camera.world_to_camera, intrinsics(f.camera).float(), f.load()) for f in frames if f.split == "test"],
+        [
+            (f.camera.world_to_camera.float().to(device), intrinsics(f.camera).float().to(device), f.load().to(device))
+            for f in frames
+            if f.split == "test"
+        ],
     )
 
 

@@ -271,7 +271,7 @@ class WarpRendering:
                 view.grid, frame.cuts, array(view.ellipses, types.Row), array(lists.gaussians),
                 array(lists.places), array(lists.starts), array(lists.ends), array(self._transmittance),
                 array(self._ended), array(self._reached), array(v, wp.vec3),
-                wp.from_torch(pair_sums, row),
+                array(pair_sums, row),
             ],
         )  # fmt: skip
         widths = (wp.vec3, wp.vec4, wp.vec3, wp.float32, wp.vec2, wp.vec3)

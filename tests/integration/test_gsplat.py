@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 from contextlib import ExitStack
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from clear_strategies.schedules import scaled
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.optim import LearningRates
 from integration import HostError
+from integration.attachment import HostRendering
 from integration.gsplat import attach
 from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
@@ -301,6 +303,18 @@ def test_a_second_pass_over_the_view_can_stand_beside_it():
         second = render(0)
     (first.mean() + second.mean()).backward()
     assert clear.attachment.counts["LR renders"] == clear.attachment.counts["merges"] == 1
+
+
+def test_renderings_are_freed_after_their_step():
+    def kept():
+        gc.collect()
+        return sum(isinstance(thing, HostRendering) for thing in gc.get_objects())
+
+    before = kept()
+    _, _, render = started()
+    for i in (0, 1, 0):
+        render(i).mean().backward()
+    assert kept() == before
 
 
 def test_a_rendering_without_backward_is_forgotten():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import inspect
+import weakref
 from dataclasses import fields, replace
 
 import pytest
@@ -24,6 +26,21 @@ def require_gradients(splats: Splats, screen: torch.Tensor, expected: SplatGradi
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         assert torch.allclose(getattr(splats, name).grad, getattr(expected, name)[0], rtol=1e-9, atol=1e-12), name
     assert torch.allclose(screen, expected.screen[0])
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_what_was_drawn_is_freed_with_its_image(depth, monkeypatch):
+    drawn, draw = [], ReferenceRasterizer.__call__
+
+    def remembering(*arguments, **options):
+        rendering = draw(*arguments, **options)
+        drawn.append(weakref.ref(rendering))
+        return rendering
+
+    monkeypatch.setattr(ReferenceRasterizer, "__call__", remembering)
+    autograd.draw(ReferenceRasterizer(), leaves(scene(20)), camera(40, 30), depth=depth).image.sum().backward()
+    gc.collect()
+    assert drawn[0]() is None
 
 
 @pytest.mark.parametrize("depth", [False, True])

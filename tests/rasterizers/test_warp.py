@@ -21,6 +21,24 @@ no_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA")
 
 
 @installed
+@pytest.mark.parametrize(
+    ("tensor", "dtype"),
+    [
+        (torch.rand(5), None), (torch.rand(6, 8), None), (torch.zeros(4, dtype=torch.bool), None), (torch.rand(0, 3), "vec3"),
+        (torch.rand(5, 3), "vec3"), (torch.rand(5, 2, 3)[:, 0], "vec3"), (torch.rand(6, 8, 3), "vec3"),
+        (torch.rand(5, 3, 3), "mat33"), (torch.rand(5, 4)[1:], "vec4"),
+    ],
+)  # fmt: skip
+def test_a_tensor_is_described_as_warp_describes_it(tensor, dtype):
+    import warp as wp
+
+    from rasterizers.warp_runtime import array
+
+    kind = None if dtype is None else getattr(wp, dtype)
+    assert bytes(array(tensor, kind)) == bytes(wp.from_torch(tensor, kind, return_ctype=True))
+
+
+@installed
 @no_cuda
 def test_without_cuda_the_error_says_what_to_install():
     with pytest.raises(BackendUnavailable, match=r"no CUDA device\. Install .* device=cpu runs here"):
