@@ -19,14 +19,14 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final
+from weakref import WeakMethod
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core import deferred
@@ -36,40 +36,15 @@ from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients, only
-from integration.autograd_shot import AutogradShot
 from integration.errors import HostError
 from integration.extra_steps import ExtraSteps
+from integration.host_rendering import HostRendering, RenderAt, called_at, random_state_kept
 from integration.host_score import ScoreScaler, write_score
 from integration.views import by_name, enlarged_mask
-from rasterizers.interface import Camera, Color
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 _LOGGED_EVERY: Final = 500  # merges between two lines of the log
-
-Target = Literal["lr", "hr"] | Camera
-"""What a host draws: the view of this iteration at one of its sizes, or what a camera without a photo sees."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HostRendering:
-    """One rendering by a host, as an adapter passes it to an `Attachment`.
-
-    Args:
-        output: a tensor that the host computes its loss from. Its gradient marks the start of the host's backward pass.
-        returned: what the host's own render function returns.
-    """
-
-    shot: AutogradShot
-    output: Tensor
-    returned: Any
-
-
-class RenderAt(Protocol):
-    """Renders by the host's own renderer: with f_det at HR, without it at LR and by another camera."""
-
-    def __call__(self, target: Target, gate: Float[Tensor, " N"] | None) -> HostRendering:
-        """The rendering, whose opacities are multiplied by `gate`."""
-        ...
 
 
 class Attachment:
@@ -158,7 +133,7 @@ class Attachment:
         hr_grads = None
         if conductor.wants_hr(t):
             self.counts["HR renders"] += 1
-            with _random_state_kept(means.device):
+            with random_state_kept(means.device):
                 shot = render_at("hr", z).shot
             if (mask := self._masks.get(view.name)) is not None:
                 shot = replace(shot, image=shot.image * enlarged_mask(mask.to(shot.image), view.factor)[..., None])
@@ -167,13 +142,13 @@ class Attachment:
         if self._passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
-                with _random_state_kept(means.device):
+                with random_state_kept(means.device):
                     self._extra.render(extra_views, t, lambda camera: render_at(camera, None).shot)
         rendering = render_at("lr", z)
         self.counts["LR renders"] += 1
         if rendering.output.requires_grad:
             self._pending = (nth := self.counts["LR renders"]), rendering, hr_grads
-            rendering.output.register_hook(partial(self._on_backward, nth))  # type: ignore[no-untyped-call]
+            rendering.output.register_hook(called_at(WeakMethod(self._on_backward), nth))  # type: ignore[no-untyped-call]
         return rendering.returned
 
     @property
@@ -192,6 +167,8 @@ class Attachment:
 
     def state_dict(self) -> dict[str, Any]:
         """The iteration, and what the strategies store per Gaussian, for the host's checkpoint."""
+        if not self.removed:
+            self._resize(len(self.params()["means"]))  # the host may have densified since it rendered
         return {
             "t": self.t, "passes": self._passes, "strategies": self.conductor.state_dict(),
             "view": None if self._step is None else self._step.view.name,
@@ -274,8 +251,8 @@ class Attachment:
         self.counts["structure changes"] += 1
         self._n = n
 
-    def _on_backward(self, nth: int, _: Tensor) -> None:
-        """Backward has reached Î_LR of the nth rendering, but no parameter. A hook that holds the rendering is never freed."""
+    def _on_backward(self, nth: int) -> None:
+        """The host's backward pass has reached Î_LR of the nth rendering, but no parameter yet."""
         if self._pending is None:
             return
         if nth != self._pending[0]:
@@ -341,10 +318,3 @@ class Attachment:
                 "rasterization(sparse_grad=False)."
             )
         return p.grad - self._grads_before[name] if name in self._grads_before else p.grad
-
-
-@contextmanager
-def _random_state_kept(device: torch.device) -> Iterator[None]:
-    """Restore torch's random generators, so that a dropout inside the host's render drops the same at both scales."""
-    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
-        yield

@@ -24,11 +24,12 @@ from torch import Tensor
 
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment, Target
+from integration.attachment import Attachment
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.errors import HostError
 from integration.host_cameras import enlarged_camera
+from integration.host_rendering import Target
 from integration.log import show_log
 from integration.model_proxy import AttachedModel, Role
 from integration.replacing import ReplacedMethods

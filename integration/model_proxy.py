@@ -17,11 +17,12 @@ from torch import Tensor
 
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment, HostRendering, Target
+from integration.attachment import Attachment
 from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 from integration.detail import DetailFeature, sh0_offset
 from integration.errors import HostError
 from integration.host_cameras import enlarged_camera, replaced_camera
+from integration.host_rendering import HostRendering, Target
 from integration.host_score import warn_if_score_is_unused
 from integration.lineage import Lineage
 from rasterizers.interface import Camera
@@ -245,6 +246,9 @@ def host_rendering(
             f"render must return an image of {camera.width}x{camera.height} pixels, got shape {tuple(image.shape)}. Train "
             "at the resolution of the photos."
         )
+    if image._is_view():  # its hook would be lost where the host multiplies it in place by a mask
+        image = image.clone()
+        result = {**result, "render": image}
     visible = radii > 0 if radii.dim() == 1 else (radii > 0).all(-1)
     if gate is not None:
         kept = gate > 0

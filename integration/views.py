@@ -73,15 +73,16 @@ class HostPhoto:
                 "divide 8-bit values by 255",
             )  # fmt: skip
         sr_image = sr_image.clamp(0, 1)
-        if self.mask is not None:
-            image = image * self.mask[..., None]
-            sr_image = sr_image * enlarged_mask(self.mask, factor)[..., None]
+        mask = None if self.mask is None else self.mask.to(image)
+        if mask is not None:
+            image = image * mask[..., None]
+            sr_image = sr_image * enlarged_mask(mask, factor)[..., None]
         view = View(
             self.name, Photo(camera, image), Photo(camera.scaled(factor), sr_image),
             sr_source=getattr(sr, "label", "unknown"),
             disagreement=None if made.disagreement is None else made.disagreement.to(image),
         )  # fmt: skip
-        return view if self.mask is None else view.hiding(self.mask > _SHOWN)
+        return view if mask is None else view.hiding(mask > _SHOWN)
 
 
 def view(
@@ -132,7 +133,7 @@ def save_photos(photos: Iterable[HostPhoto], folder: Path | str) -> None:
 
     def shown(photo: HostPhoto) -> Float[Tensor, "h w 3"]:
         image = photo.posed.image
-        return image if photo.mask is None else image * photo.mask[..., None]
+        return image if photo.mask is None else image * photo.mask.to(image)[..., None]
 
     written = write_pngs(Path(folder), ((photo.name, shown(photo)) for photo in photos))
     _log.info("%d LR photos written to %s. Enlarge them and pass the folder of the results as sr.", written, folder)

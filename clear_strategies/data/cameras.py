@@ -197,3 +197,8 @@ def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "H W"],
     size, bend = (lens.width, lens.height), np.array(lens.distortion)
     x, y = maps(lens.matrix(), bend, np.eye(3), pinhole.matrix(), size, cv2.CV_32FC1)
     return x, y
+
+
+def forget_maps() -> None:
+    """Free what `Lens.undistort` keeps for the next photo of a lens: 8 bytes per pixel."""
+    _sampling_maps.cache_clear()

@@ -24,6 +24,7 @@ from clear_strategies.core.images import DownKernel
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import Photo, View
 from clear_strategies.core.work_log import WorkLog
+from clear_strategies.data.cameras import forget_maps
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import image_size, inside, read_image
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
@@ -155,6 +156,7 @@ def photos_of(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:
     """The photos of these frames at their HR size, where that is unknown at their LR size, in order; a few are read at once."""
     with ThreadPoolExecutor(min(torch.get_num_threads(), _READERS)) as pool:
         yield from pool.map(partial(_reduced, views=views), frames)
+    forget_maps()
 
 
 def at_hr(capture: Capture, views: ViewSettings) -> Capture:

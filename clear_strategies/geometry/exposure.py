@@ -32,9 +32,11 @@ def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float
     Args:
         depths: of the photos, on their pixels.
     """
+    device = photos[0].image.device if photos else "cpu"
     pairs = [(a, b) for a, partners in enumerate(_neighbours(photos)) for b in partners]
     if not pairs:
-        return torch.ones(len(photos), 3)
+        return torch.ones(len(photos), 3).to(device)
+    photos, depths = [photo.to("cpu") for photo in photos], [depth.to("cpu") for depth in depths]
     ratios, weights = zip(*(_ratio(photos[a], depths[a], photos[b], depths[b]) for a, b in pairs), strict=True)
     difference = torch.zeros(len(pairs), len(photos), dtype=torch.float64)
     for row, (a, b) in enumerate(pairs):
@@ -44,7 +46,7 @@ def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float
     logs = [
         torch.linalg.pinv(root[:, c, None] * difference) @ (root[:, c] * torch.stack(ratios)[:, c]) for c in range(3)
     ]
-    return torch.exp(-torch.stack(logs, dim=1)).float()
+    return torch.exp(-torch.stack(logs, dim=1)).float().to(device)
 
 
 def _neighbours(photos: Sequence[Photo]) -> list[list[int]]:

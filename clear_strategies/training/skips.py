@@ -73,7 +73,10 @@ class SkipPolicy:
 
     def view(self, view: View, t: int) -> View:
         """The view of iteration t: with a coarse SR image at first, where the factor is even."""
-        if t > self.skips.coarse_until or view.factor % _REDUCED:
+        if t > self.skips.coarse_until:
+            self._coarse.clear()  # no later iteration needs them
+            return view
+        if view.factor % _REDUCED:
             return view
         if view.name not in self._coarse:
             hr = view.hr.reduced(_REDUCED)

@@ -16,11 +16,12 @@ from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.view import View
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
-from integration.attachment import Attachment, HostRendering, Target
+from integration.attachment import Attachment
 from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 from integration.densification import require_end
 from integration.detail import detail_adam, sh0_offset
 from integration.errors import HostError
+from integration.host_rendering import HostRendering, Target
 from integration.host_score import warn_if_score_is_unused
 from integration.replacing import Replaced
 from integration.rows import RowNumbers

@@ -36,6 +36,34 @@ def test_the_other_device_does_not_mix_with_the_cpu():
     assert "Expected all tensors to be on the same device" in ran.stderr
 
 
+def test_public_functions_take_photos_of_another_device():
+    code = """
+import torch
+from clear_strategies.compose import conductor
+from clear_strategies.geometry import depth_maps, exposure_gains
+from integration.examples.demo import load_demo
+from integration.views import view
+from tests.helpers.elsewhere import NAME, Elsewhere
+
+with Elsewhere():
+    demo = load_demo(64, 48, device=NAME)
+    best = conductor("best", iterations=10)
+
+    def enlarged(name, image, factor):  # a network that answers from where it runs
+        return image.to(NAME).repeat_interleave(factor, 0).repeat_interleave(factor, 1)
+
+    one = next(zip(demo.images, demo.viewmats, demo.Ks))
+    made = view("one", *one, sr=best.prior(enlarged), mask=torch.ones(12, 16))
+    print(made.hr.image.device, best.prior(demo.prior)(demo.names[0], demo.images[0], 4).device)
+    photos = [view(name, *photo, sr=enlarged).lr for name, *photo in zip(demo.names, demo.images, demo.viewmats, demo.Ks)]
+    maps = depth_maps(photos, torch.rand(5, 3, device=NAME) + 2)
+    print(exposure_gains(photos, maps).device)
+"""
+    ran = run(["-c", code])
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.split() == ["elsewhere:0"] * 3
+
+
 @pytest.mark.slow
 def test_strategies_train_in_a_gsplat_loop_elsewhere():
     pytest.importorskip("gsplat")

@@ -18,8 +18,8 @@ from clear_strategies.schedules import scaled
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.optim import LearningRates
 from integration import HostError
-from integration.attachment import HostRendering
 from integration.gsplat import attach
+from integration.host_rendering import HostRendering
 from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
@@ -305,15 +305,19 @@ def test_a_second_pass_over_the_view_can_stand_beside_it():
     assert clear.attachment.counts["LR renders"] == clear.attachment.counts["merges"] == 1
 
 
-def test_renderings_are_freed_after_their_step():
+@pytest.mark.parametrize("last_one_has_backward", [True, False])
+def test_renderings_are_freed_after_their_step_and_with_the_loop(last_one_has_backward):
     def kept():
         gc.collect()
         return sum(isinstance(thing, HostRendering) for thing in gc.get_objects())
 
     before = kept()
-    _, _, render = started()
+    host, clear, render = started()
     for i in (0, 1, 0):
         render(i).mean().backward()
+    if not last_one_has_backward:
+        render(0)
+        del host, clear, render
     assert kept() == before
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, Objective
+from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, Objective, SplatSuRe
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors import Images
 from clear_strategies.errors import SettingError
@@ -129,6 +129,24 @@ def test_everything_follows_the_densifier_before_or_after_the_step(step_first, i
     assert bool((clear.params()["detail"] != 0).any())
     assert clear.attachment.conductor.state_dict()["SVS.means"].shape == (n, 3)  # anchored at t = 24
     assert all(bool(g.isfinite().all()) for g in grads.values())
+
+
+def test_a_checkpoint_has_the_rows_of_a_densification_since_the_last_rendering(inria_host, inria_capture):
+    gaussians, clear, _ = trained(inria_host, inria_capture, [SplatSuRe()], iterations=5)
+    assert len(gaussians._xyz) > N
+    state = clear.attachment.state_dict()["strategies"]
+    assert state
+    assert {len(rows) for rows in state.values()} == {len(gaussians._xyz)}
+
+
+def test_a_host_that_masks_its_rendering_in_place_trains(inria_host, inria_capture):
+    opt = options(inria_host, inria_capture, iterations=2)
+    gaussians, scene = inria_host.setup(opt)
+    for camera in scene.cameras:
+        camera.alpha_mask = torch.ones(1, 16, 24)
+    clear = attach(gaussians, scene.getTrainCameras(), Conductor(objective=HR_FROM_START), sr=inria_capture / "sr")
+    loop(inria_host, clear, opt, gaussians, scene)
+    assert clear.attachment.counts["merges"] == 2
 
 
 def test_densification_after_the_anchor_is_refused_before_the_first_step(inria_host, inria_capture, caplog):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 
 import pytest
@@ -38,8 +39,11 @@ def test_the_coarse_reference_is_the_mean_of_blocks_seen_by_the_scaled_camera():
     assert torch.equal(coarse.hr.image, images.downsample(view.hr.image, 2, "area"))
     assert coarse.hr.camera.fx == view.hr.camera.fx / 2
     assert coarse.lr is view.lr
-    assert skip_policy.view(view, 11) is view
     assert skip_policy.view(view, 9) is coarse
+    assert skip_policy.view(view, 11) is view
+    freed = weakref.ref(coarse.hr.image)
+    del coarse
+    assert freed() is None
 
 
 def test_photos_that_sr_does_not_enlarge_keep_their_reference_and_are_rendered_at_both_scales():

@@ -51,7 +51,7 @@ class BackProjected:
 
     def super_resolved(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> SuperResolved:
         """The SR image, and how far the prior's own image was from the LR photo."""
-        sr = self.prior(name, lr, factor)
+        sr = self.prior(name, lr, factor).to(lr)  # a function may have made it on a GPU
         disagreement = (images.downsample(sr, factor, self.down) - lr).abs()
         moved = images.back_projected(sr, lr, factor, self.rounds, self.down)
         return SuperResolved(images.quantize(moved), disagreement)

@@ -140,7 +140,7 @@ class DemoPrior(SeededErrors):
         return f"demo (synthetic: truth with seeded errors in {self.share:.0%} of the patches)"
 
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
-        truth, height, width = self.truth[name](), lr.shape[0] * factor, lr.shape[1] * factor
+        truth, height, width = self.truth[name]().to(lr), lr.shape[0] * factor, lr.shape[1] * factor
         if truth.shape[:2] != (height, width):
             problem = f"is {truth.shape[1]}x{truth.shape[0]} where HR is {width}x{height}"
             raise DataError(

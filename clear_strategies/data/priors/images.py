@@ -52,6 +52,6 @@ class Images:
                 file, "size", f"is {found[0]}x{found[1]}, but {factor} times the LR image is {expected[0]}x{expected[1]}",
                 "super-resolve the very LR images that this run trains on (data.save_lr writes them)",
             )  # fmt: skip
-        result = images.quantize(read_image(file))
+        result = images.quantize(read_image(file)).to(lr)
         warn_if_far_from_lr(f"{file.name}: the SR image", result, lr, factor)
         return result

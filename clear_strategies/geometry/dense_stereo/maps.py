@@ -42,7 +42,7 @@ def depth_maps(
 
     Args:
         photos: posed, of any sizes, on one device.
-        points: of the surfaces, world units, on the CPU: they give the range of depth and judge the result. There may be
+        points: of the surfaces, world units: they give the range of depth and judge the result. There may be
             none; then the cameras give the range. None: features are triangulated where OpenCV, kornia and SciPy are
             installed.
         background: the colour of pixels without a surface, RGB in [0, 1].
@@ -54,6 +54,7 @@ def depth_maps(
     settings = settings or StereoSettings()
     if points is None:
         points = features_of(photos).means
+    points = points.cpu()
     compared = comparisons(photos, points)
     estimates = _estimates(photos, compared, settings)
     needed = settings.agreeing or (2 if len(photos) >= _MANY_PHOTOS else 1)
