@@ -52,7 +52,7 @@ class Needs:
         held: per Gaussian, for the whole run: parameters, moments, statistics, and what strategies keep.
         worked: per Gaussian, while an iteration runs.
         lists: per Gaussian, of the rasterizer; at most `most_lists` in all.
-        pixels: of the images of one iteration.
+        pixels: of the images of one iteration, and of the coarse SR images of all views.
         cuda: this is the device's memory, not the process's.
     """
 
@@ -107,7 +107,8 @@ def needs(state: TrainState, rasterizer: Rasterizer) -> Needs:
         worked=_FLOAT * floats + copied,
         lists=lists,
         most_lists=most,
-        pixels=_FLOAT * _PER_PIXEL * (view.hr.image.shape[0] * view.hr.image.shape[1]),
+        pixels=_FLOAT * _PER_PIXEL * (view.hr.image.shape[0] * view.hr.image.shape[1])
+        + state.skip_policy.coarse_bytes(state.views, state.t),
         cuda=cuda,
     )
 
