@@ -36,7 +36,7 @@ def test_the_other_device_does_not_mix_with_the_cpu():
     assert "Expected all tensors to be on the same device" in ran.stderr
 
 
-def test_public_functions_take_photos_of_another_device():
+def test_public_functions_take_photos_of_another_device_and_cameras_stay_on_the_cpu():
     code = """
 import torch
 from clear_strategies.compose import conductor
@@ -54,14 +54,15 @@ with Elsewhere():
 
     one = next(zip(demo.images, demo.viewmats, demo.Ks))
     made = view("one", *one, sr=best.prior(enlarged), mask=torch.ones(12, 16))
-    print(made.hr.image.device, best.prior(demo.prior)(demo.names[0], demo.images[0], 4).device)
+    print(made.lr.image.device, made.hr.image.device, made.lr.camera.world_to_camera.device)
+    print(best.prior(demo.prior)(demo.names[0], demo.images[0], 4).device)
     photos = [view(name, *photo, sr=enlarged).lr for name, *photo in zip(demo.names, demo.images, demo.viewmats, demo.Ks)]
     maps = depth_maps(photos, torch.rand(5, 3, device=NAME) + 2)
     print(exposure_gains(photos, maps).device)
 """
     ran = run(["-c", code])
     assert ran.returncode == 0, ran.stderr
-    assert ran.stdout.split() == ["elsewhere:0"] * 3
+    assert ran.stdout.split() == ["elsewhere:0", "elsewhere:0", "cpu", "elsewhere:0", "elsewhere:0"]
 
 
 @pytest.mark.slow
