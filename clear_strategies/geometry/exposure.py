@@ -35,7 +35,7 @@ def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float
     device = photos[0].image.device if photos else "cpu"
     pairs = [(a, b) for a, partners in enumerate(_neighbours(photos)) for b in partners]
     if not pairs:
-        return torch.ones(len(photos), 3).to(device)
+        return torch.ones(len(photos), 3, device=device)
     photos, depths = [photo.to("cpu") for photo in photos], [depth.to("cpu") for depth in depths]
     ratios, weights = zip(*(_ratio(photos[a], depths[a], photos[b], depths[b]) for a, b in pairs), strict=True)
     difference = torch.zeros(len(pairs), len(photos), dtype=torch.float64)
