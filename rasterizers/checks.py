@@ -118,6 +118,6 @@ def require_depth(rasterizer: Rasterizer) -> None:
         )
 
 
-def packed_rows(shN: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
+def packed_rows(sh: Float[Tensor, "N B 3"]) -> Float[Tensor, "N B 3"]:
     """The tensor with contiguous rows. A view of the active bands has gaps between its rows, and is returned as it is."""
-    return shN if shN.numel() == 0 or shN.stride()[1:] == (3, 1) else shN.contiguous()
+    return sh if sh.numel() == 0 or sh.stride()[1:] == (3, 1) else sh.contiguous()

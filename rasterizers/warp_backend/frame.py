@@ -81,7 +81,7 @@ class Frame:
         self.means, self.quats, self.scales = (
             x.detach().contiguous() for x in (splats.means, splats.quats, splats.scales)
         )
-        self.sh0, self.shN = splats.sh0.detach()[:, 0], packed_rows(splats.shN.detach())
+        self.sh0, self.shN = packed_rows(splats.sh0.detach())[:, 0], packed_rows(splats.shN.detach())
         self.bands = self.shN.shape[1]
         self.colours = self.empty(self.n, 3)
         self.slopes = self.empty(self.n if self.bands else 0, 3, 3)

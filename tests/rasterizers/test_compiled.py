@@ -221,6 +221,15 @@ def test_a_view_of_the_active_bands_is_drawn_like_a_copy(backend):
     require_same_bits(everything(backend()(active, view), v), everything(backend()(packed, view), v))
 
 
+@pytest.mark.parametrize("name", [name for name in ATTRIBUTES if name != "screen"])
+@backends()
+def test_a_tensor_of_any_layout_is_drawn_like_a_copy(backend, name):
+    splats, view = scene(60, bands=15), camera()
+    v, copy = cotangents(1, view.height, view.width), getattr(splats, name)
+    transposed = replace(splats, **{name: copy.movedim(0, -1).contiguous().movedim(-1, 0)})
+    require_same_bits(everything(backend()(transposed, view), v), everything(backend()(splats, view), v))
+
+
 @backends()
 def test_a_budget_of_no_memory_is_refused(backend):
     with pytest.raises(ValueError, match="at least 1 MiB"):
