@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 import rasterizers
 from rasterizers.checks import require_depth
@@ -65,6 +66,7 @@ def draw(
     Raises:
         ValueError: depth is asked of a rasterizer without the trait.
         NotImplementedError: in `backward`, if the loss depends on the depth.
+        RuntimeError: in `backward`, if the loss depends on these gradients, e.g. by a gradient penalty.
     """
     if depth:
         require_depth(rasterizer)
@@ -102,6 +104,7 @@ class _Draw(torch.autograd.Function):
         return ctx.rendering.image.data, ctx.rendering.alpha.data, visible, depth_map
 
     @staticmethod
+    @once_differentiable  # a second derivative would silently be 0
     def backward(ctx: Any, of_image: Tensor | None, of_alpha: Tensor | None, _: None, of_depth: Tensor | None) -> Any:
         if of_depth is not None and bool(of_depth.any()):  # silence would leave out a part of the loss
             raise NotImplementedError(

@@ -61,6 +61,14 @@ def test_a_loss_of_depth_is_refused_rather_than_left_out():
         (drawn.image.sum() + drawn.depth.sum()).backward()
 
 
+def test_a_loss_of_gradients_is_refused_rather_than_left_out():
+    splats = leaves(scene(60))
+    image = autograd.draw(ReferenceRasterizer(), splats, camera(40, 30)).image
+    (slope,) = torch.autograd.grad(image.square().sum(), splats.means, create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiate twice"):
+        (image.sum() + slope.square().sum()).backward()
+
+
 def test_depth_that_was_not_asked_for_is_not_drawn():
     assert autograd.draw(ReferenceRasterizer(), scene(5), camera(40, 30)).depth is None
 
