@@ -144,6 +144,7 @@ def rasterization(
     Ks: Float[Tensor, "C 3 3"],
     width: int,
     height: int,
+    *,  # the order of gsplat's others is not ours
     near_plane: float = 0.01,
     eps2d: float = 0.3,
     sh_degree: int | None = None,
@@ -171,6 +172,7 @@ def rasterization(
 
     Raises:
         ValueError: a mode or an argument that only gsplat supports, or poses that require a gradient.
+        TypeError: an argument after `height` is given by position.
     """
     _require_supported(render_mode, rasterize_mode, absgrad, viewmats.requires_grad, others)
     n = len(means)

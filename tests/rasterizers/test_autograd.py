@@ -128,9 +128,15 @@ def test_arguments_that_only_gsplat_supports_are_refused(arguments, refused):
         stand_in(**arguments)
 
 
+def test_arguments_by_position_after_the_size_are_refused():
+    """The eleventh is far_plane in gsplat; it was taken for eps2d."""
+    with pytest.raises(TypeError, match="positional arguments"):
+        stand_in(0.01, 1e10)
+
+
 def test_poses_that_should_learn_are_refused():
     with pytest.raises(ValueError, match="does not support a gradient of viewmats"):
-        stand_in(camera(40, 30).world_to_camera.float()[None].requires_grad_())
+        stand_in(viewmats=camera(40, 30).world_to_camera.float()[None].requires_grad_())
 
 
 def test_gsplats_own_defaults_are_drawn():
@@ -139,10 +145,10 @@ def test_gsplats_own_defaults_are_drawn():
     assert stand_in(**defaults)[0].shape == (1, 30, 40, 3)
 
 
-def stand_in(viewmats=None, **arguments):
+def stand_in(*positional, viewmats=None, **arguments):
     """The toy scene by gsplat's arguments."""
     s, view = scene(60), camera(40, 30)
     pose = view.world_to_camera.float()[None] if viewmats is None else viewmats
     colors = torch.cat((s.sh0, s.shN), 1)
     geometry = (s.means, s.quats, s.scales, s.opacities, colors, pose, intrinsics(view).float()[None], 40, 30)
-    return autograd.rasterization(*geometry, sh_degree=1, backend="torch", **arguments)
+    return autograd.rasterization(*geometry, *positional, sh_degree=1, backend="torch", **arguments)
