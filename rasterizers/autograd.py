@@ -159,7 +159,8 @@ def rasterization(
     """Stands in for gsplat's `rasterization` with a backend of this package: pinhole cameras, RGB and expected depth.
 
     Args:
-        colors: [N, K, 3] spherical harmonics with `sh_degree` the active degree, or [N, 3] RGB if `sh_degree` is None.
+        colors: [N, K, 3] spherical harmonics with `sh_degree` the active degree, or [N, 3] RGB in any
+            range if `sh_degree` is None, e.g. normals.
         render_mode: "RGB", or "RGB+ED" with the expected depth as a fourth channel of the images, to look at: a loss of
             it raises `NotImplementedError` in `backward`.
         packed: has no effect; `info` is always unpacked.
@@ -175,16 +176,15 @@ def rasterization(
         TypeError: an argument after `height` is given by position.
     """
     _require_supported(render_mode, rasterize_mode, absgrad, viewmats.requires_grad, others)
-    n = len(means)
+    behind = colors.new_zeros(len(viewmats), 3) if backgrounds is None else backgrounds
+    low, span = (0.0, 1.0) if sh_degree is not None else _low_and_span(colors, behind)
     if sh_degree is None:
-        base, bands = (colors[:, None] - 0.5) / SH_C0, colors.new_zeros(n, 0, 3)
-    else:
-        base, bands = colors[:, :1], colors[:, 1 : (sh_degree + 1) ** 2]
-    splats = Splats(means, quats, scales, opacities, base, bands)
-    means2d = means.new_zeros(len(viewmats), n, 2).requires_grad_()
+        colors, sh_degree = ((colors - low) / span - 0.5)[:, None] / SH_C0, 0
+    splats = Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1 : (sh_degree + 1) ** 2])
+    means2d = means.new_zeros(len(viewmats), len(means), 2).requires_grad_()
     shots = []
     for i, (pose, K) in enumerate(zip(viewmats, Ks, strict=True)):
-        background = tuple(backgrounds[i].tolist()) if backgrounds is not None else (0.0, 0.0, 0.0)
+        background = tuple((x - low) / span for x in behind[i].tolist())
         antialiased = rasterize_mode == "antialiased"
         rasterizer = _loaded(backend, means.device.type, near_plane, eps2d, antialiased, background)
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
@@ -195,8 +195,23 @@ def rasterization(
         "means2d": means2d, "radii": visible[..., None].expand(-1, -1, 2).int(), "gaussian_ids": None,
         "width": width, "height": height, "n_cameras": len(shots),
     }  # fmt: skip
-    images = [s.image if s.depth is None else torch.cat((s.image, s.depth[..., None]), -1) for s in shots]
-    return torch.stack(images), torch.stack([s.alpha for s in shots])[..., None], info
+    images, alphas = (
+        torch.stack(x) for x in zip(*((shot.image, shot.alpha[..., None]) for shot in shots), strict=True)
+    )
+    if (low, span) != (0.0, 1.0):
+        images = low + span * images
+    depths = [shot.depth for shot in shots if shot.depth is not None]
+    return torch.cat((images, torch.stack(depths)[..., None]), -1) if depths else images, alphas, info
+
+
+def _low_and_span(colors: Float[Tensor, "N 3"], backgrounds: Float[Tensor, "C 3"]) -> tuple[float, float]:
+    """RGB in any range is drawn as (RGB - low) / span, with colours >= 0 over backgrounds in [0, 1].
+
+    The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn.
+    """
+    finite = torch.cat((colors, backgrounds)).detach().nan_to_num(0, 0, 0)  # the rasterizer says which is not
+    low = min(0.0, float(finite.min()))
+    return low, max(1.0, float(finite[len(colors) :].max()) - low)
 
 
 def _require_supported(

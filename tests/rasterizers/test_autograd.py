@@ -128,10 +128,25 @@ def test_arguments_that_only_gsplat_supports_are_refused(arguments, refused):
         stand_in(**arguments)
 
 
+def test_rgb_may_have_any_range_as_in_gsplat():
+    """Normals are rendered so. Images are linear in it; what is below 0 was cut off."""
+    g = torch.Generator().manual_seed(0)
+    rgb, background = 3 * torch.randn(60, 3, generator=g), torch.tensor([[-0.5, 0.2, 1.7]])
+    signed = rgb.clone().requires_grad_()
+    image = stand_in(sh_degree=None, colors=signed, backgrounds=background)[0]
+    above, below = rgb.clamp_min(0).requires_grad_(), (-rgb).clamp_min(0)
+    lit, alpha, _ = stand_in(sh_degree=None, colors=above)
+    unlit = stand_in(sh_degree=None, colors=below)[0]
+    assert torch.allclose(image, lit - unlit + (1 - alpha) * background, atol=1e-5)
+    image.square().sum().backward()
+    (lit * image.detach() * 2).sum().backward()
+    assert torch.allclose(signed.grad, above.grad, rtol=1e-4, atol=1e-4)
+
+
 def test_arguments_by_position_after_the_size_are_refused():
     """The eleventh is far_plane in gsplat; it was taken for eps2d."""
     with pytest.raises(TypeError, match="positional arguments"):
-        stand_in(0.01, 1e10)
+        autograd.rasterization(*[None] * 9, 0.01, 1e10)
 
 
 def test_poses_that_should_learn_are_refused():
@@ -145,10 +160,12 @@ def test_gsplats_own_defaults_are_drawn():
     assert stand_in(**defaults)[0].shape == (1, 30, 40, 3)
 
 
-def stand_in(*positional, viewmats=None, **arguments):
+def stand_in(**arguments):
     """The toy scene by gsplat's arguments."""
     s, view = scene(60), camera(40, 30)
-    pose = view.world_to_camera.float()[None] if viewmats is None else viewmats
-    colors = torch.cat((s.sh0, s.shN), 1)
-    geometry = (s.means, s.quats, s.scales, s.opacities, colors, pose, intrinsics(view).float()[None], 40, 30)
-    return autograd.rasterization(*geometry, *positional, sh_degree=1, backend="torch", **arguments)
+    given = {
+        "means": s.means, "quats": s.quats, "scales": s.scales, "opacities": s.opacities,
+        "colors": torch.cat((s.sh0, s.shN), 1), "sh_degree": 1, "backend": "torch",
+        "viewmats": view.world_to_camera.float()[None], "Ks": intrinsics(view).float()[None], "width": 40, "height": 30,
+    }  # fmt: skip
+    return autograd.rasterization(**given | arguments)
