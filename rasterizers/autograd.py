@@ -172,10 +172,11 @@ def rasterization(
         `radii` [C, N, 2] (1 for the visible, 0 for the others), `width`, `height`, `n_cameras`, `gaussian_ids`.
 
     Raises:
-        ValueError: a mode or an argument that only gsplat supports, or poses that require a gradient.
+        ValueError: a mode or an argument that only gsplat supports, poses that require a gradient, or a wrong shape.
         TypeError: an argument after `height` is given by position.
     """
     _require_supported(render_mode, rasterize_mode, absgrad, viewmats.requires_grad, others)
+    _require_shapes(len(means), colors, viewmats, Ks, backgrounds, sh_degree)
     behind = colors.new_zeros(len(viewmats), 3) if backgrounds is None else backgrounds
     low, span = (0.0, 1.0) if sh_degree is not None else _low_and_span(colors, behind)
     if sh_degree is None:
@@ -212,6 +213,31 @@ def _low_and_span(colors: Float[Tensor, "N 3"], backgrounds: Float[Tensor, "C 3"
     finite = torch.cat((colors, backgrounds)).detach().nan_to_num(0, 0, 0)  # the rasterizer says which is not
     low = min(0.0, float(finite.min()))
     return low, max(1.0, float(finite[len(colors) :].max()) - low)
+
+
+def _require_shapes(
+    n: int, colors: Tensor, viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None, sh_degree: int | None
+) -> None:
+    cameras = len(viewmats)
+    shapes = {
+        "viewmats": (viewmats, (cameras, 4, 4)),
+        "Ks": (Ks, (cameras, 3, 3)),
+        "backgrounds": (backgrounds, (cameras, 3)),
+    }
+    for name, (value, shape) in shapes.items():
+        if value is not None and value.shape != shape:
+            inner = ", ".join(map(str, shape[1:]))
+            raise ValueError(f"{name} must have the shape [C, {inner}] for C cameras, got {list(value.shape)}.")
+    if sh_degree is None and colors.shape != (n, 3):
+        raise ValueError(
+            f"colors without sh_degree must be RGB of the shape [{n}, 3], got {list(colors.shape)}; draw other channels three "
+            "at a time."
+        )
+    if sh_degree is not None and (colors.dim() != 3 or colors.shape[1] < (sh_degree + 1) ** 2):
+        raise ValueError(
+            f"colors with sh_degree={sh_degree} must have the shape [{n}, K, 3] with K >= {(sh_degree + 1) ** 2}, got "
+            f"{list(colors.shape)}."
+        )
 
 
 def _require_supported(

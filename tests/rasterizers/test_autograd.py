@@ -143,6 +143,26 @@ def test_rgb_may_have_any_range_as_in_gsplat():
     assert torch.allclose(signed.grad, above.grad, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ({"colors": torch.zeros(60, 4, 3), "sh_degree": 3}, r"\[60, K, 3\] with K >= 16, got \[60, 4, 3\]"),
+        ({"colors": torch.zeros(60, 16), "sh_degree": None}, r"\[60, 3\], got \[60, 16\]; draw other channels three at a time"),
+    ],
+)  # fmt: skip
+def test_colors_of_another_shape_are_refused(arguments, expected):
+    with pytest.raises(ValueError, match=f"^colors with.* must .*{expected}"):
+        stand_in(**arguments)
+
+
+@pytest.mark.parametrize("name", ["viewmats", "Ks", "backgrounds"])
+def test_tensors_of_cameras_need_one_row_for_each(name):
+    """Under pytest the shape annotations of `rasterization` would raise first."""
+    right = {"viewmats": torch.zeros(2, 4, 4), "Ks": torch.zeros(2, 3, 3), "backgrounds": torch.zeros(2, 3)}
+    with pytest.raises(ValueError, match=rf"^{name} must have the shape \[C, .* for C cameras, got"):
+        autograd._require_shapes(5, torch.zeros(5, 3), **{**right, name: right[name][0]}, sh_degree=None)
+
+
 def test_arguments_by_position_after_the_size_are_refused():
     """The eleventh is far_plane in gsplat; it was taken for eps2d."""
     with pytest.raises(TypeError, match="positional arguments"):
