@@ -201,6 +201,8 @@ def rasterization(
     )
     if (low, span) != (0.0, 1.0):
         images = low + span * images
+    if behind.requires_grad:  # adds 0, whose gradient is the background's
+        images = images + (1 - alphas.detach()) * (behind - behind.detach())[:, None, None]
     depths = [shot.depth for shot in shots if shot.depth is not None]
     return torch.cat((images, torch.stack(depths)[..., None]), -1) if depths else images, alphas, info
 

@@ -143,6 +143,14 @@ def test_rgb_may_have_any_range_as_in_gsplat():
     assert torch.allclose(signed.grad, above.grad, rtol=1e-4, atol=1e-4)
 
 
+def test_backgrounds_have_a_gradient():
+    background = torch.rand(1, 3, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    image, alpha, _ = stand_in(backgrounds=background)
+    assert torch.equal(image, stand_in(backgrounds=background.detach())[0])
+    image.sum().backward()
+    assert torch.allclose(background.grad, (1 - alpha).sum().expand(1, 3))
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
