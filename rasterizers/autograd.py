@@ -64,12 +64,17 @@ def draw(
         depth: also draw the expected depth.
 
     Raises:
-        ValueError: depth is asked of a rasterizer without the trait.
+        ValueError: depth is asked of a rasterizer without the trait, or the pose should learn.
         NotImplementedError: in `backward`, if the loss depends on the depth.
         RuntimeError: in `backward`, if the loss depends on these gradients, e.g. by a gradient penalty.
     """
     if depth:
         require_depth(rasterizer)
+    if torch.is_grad_enabled() and camera.world_to_camera.requires_grad:  # silence would leave the pose as it is
+        raise ValueError(
+            "poses have no gradient in this package, and camera.world_to_camera (viewmats) requires one; detach it, or draw "
+            "with gsplat's own rasterization on a GPU."
+        )
     if means2d is None:
         means2d = splats.means.new_zeros(len(splats), 2).requires_grad_()
     tensors = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN)
@@ -175,7 +180,7 @@ def rasterization(
         ValueError: a mode or an argument that only gsplat supports, poses that require a gradient, or a wrong shape.
         TypeError: an argument after `height` is given by position.
     """
-    _require_supported(render_mode, rasterize_mode, absgrad, viewmats.requires_grad, others)
+    _require_supported(render_mode, rasterize_mode, absgrad, others)
     _require_shapes(len(means), colors, viewmats, Ks, backgrounds, sh_degree)
     behind = colors.new_zeros(len(viewmats), 3) if backgrounds is None else backgrounds
     low, span = (0.0, 1.0) if sh_degree is not None else _low_and_span(colors, behind)
@@ -189,7 +194,7 @@ def rasterization(
         antialiased = rasterize_mode == "antialiased"
         rasterizer = _loaded(backend, means.device.type, near_plane, eps2d, antialiased, background)
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
-        camera = Camera(pose.detach(), fx, fy, cx, cy, width, height)
+        camera = Camera(pose, fx, fy, cx, cy, width, height)
         shots.append(draw(rasterizer, splats, camera, means2d[i], depth=render_mode == "RGB+ED"))
     visible = torch.stack([shot.visible for shot in shots])
     info = {
@@ -242,10 +247,8 @@ def _require_shapes(
         )
 
 
-def _require_supported(
-    render_mode: str, rasterize_mode: str, absgrad: bool, poses_learn: bool, others: Mapping[str, Any]
-) -> None:
-    refused = ["a gradient of viewmats"] if poses_learn else []
+def _require_supported(render_mode: str, rasterize_mode: str, absgrad: bool, others: Mapping[str, Any]) -> None:
+    refused = []
     for name in others.keys() - _WITHOUT_EFFECT:
         value, supported = others[name], _SUPPORTED.get(name)
         value = value.name if isinstance(value, Enum) else value
