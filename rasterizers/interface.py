@@ -15,6 +15,7 @@ the splats. Every backend in this package implements this interface, and so can 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -46,8 +47,8 @@ class Camera:
         fx, fy, cx, cy: focal lengths and principal point, in pixels of a `width` × `height` image.
 
     Raises:
-        ValueError: a size or focal length is not positive, a number is not finite, or the transform is not rigid within
-            1e-3.
+        ValueError: a size or focal length is not positive, a size is no integer, a number is not finite, or the transform is
+            not rigid within 1e-3.
     """
 
     world_to_camera: Float[Tensor, "4 4"]
@@ -64,6 +65,12 @@ class Camera:
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not (all(map(math.isfinite, intrinsics)) and bool(self.world_to_camera.isfinite().all())):
             raise ValueError(f"a camera's numbers must be finite, got {self!r}.")
+        for name in ("width", "height"):
+            size = getattr(self, name)
+            try:
+                object.__setattr__(self, name, operator.index(size))  # numpy's and torch's integers are no int
+            except TypeError:
+                raise ValueError(f"{name} must be a whole number of pixels, an int, got {size!r}.") from None
         if not _is_rigid(self.world_to_camera):
             raise ValueError(
                 "world_to_camera must be a rotation and a translation, without scale or reflection, and its last row "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -70,6 +71,20 @@ def test_batches_do_not_change_the_picture(lanes):
     assert torch.allclose(found.image, expected.image, atol=1e-14)
     v = torch.ones(1, 33, 41, 3, dtype=torch.float64)
     assert torch.allclose(found.vjp(v).means, expected.vjp(v).means, rtol=1e-9, atol=1e-12)
+
+
+def test_the_size_of_a_camera_is_of_integers():
+    """Under pytest beartype would refuse others in the constructor; elsewhere nobody does."""
+    camera = Camera(torch.eye(4), 40.0, 44.0, 17.0, 15.0, 40, 32)
+
+    def resize(height):
+        object.__setattr__(camera, "height", height)
+        camera.__post_init__()
+        return camera.height
+
+    assert [type(resize(height)) for height in (np.int64(32), torch.tensor(32))] == [int, int]
+    with pytest.raises(ValueError, match=r"height must be a whole number of pixels, an int, got 32\.0"):
+        resize(64 / 2)
 
 
 def test_a_scaled_camera_has_the_same_field_of_view():
