@@ -64,7 +64,7 @@ def _descriptor() -> Any:
     """Warp's structure of an array: (address, address of the gradient, dimensions, shape, strides in bytes)."""
     import warp as wp
 
-    return type(wp.from_torch(torch.empty(1), return_ctype=True))
+    return type(wp.from_torch(torch.empty(1, device="cpu"), return_ctype=True))
 
 
 def on_stream(device: torch.device) -> AbstractContextManager[Any]:

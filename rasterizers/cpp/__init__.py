@@ -120,7 +120,7 @@ class _Frame:
             budget=settings.memory << 20,
         )
         self.means2d = [self.empty(n, 2) for _ in jobs]
-        self.visible = [torch.empty(n, dtype=torch.bool) for _ in jobs]
+        self.visible = [torch.empty(n, dtype=torch.bool, device="cpu") for _ in jobs]
         self._basis: Tensor | None = None
         grids = [[c.fx, c.fy, c.cx, c.cy, float(c.width), float(c.height)] for c in self.cameras]
         if not self.native.project(

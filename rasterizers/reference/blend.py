@@ -140,7 +140,7 @@ def _composite(
 ) -> Slab:
     u, v = rows[..., MEAN].unbind(-1)
     A, B, C = rows[..., CONIC].unbind(-1)
-    pixel = torch.arange(grid.tile, device=rows.device) + 0.5
+    pixel = torch.arange(grid.tile, dtype=rows.dtype, device=rows.device) + 0.5
     dx = ((tiles % grid.columns * grid.tile)[:, None] + pixel)[:, None, None, :] - u[..., None, None]
     dy = ((tiles // grid.columns * grid.tile)[:, None] + pixel)[:, None, :, None] - v[..., None, None]
     A, B, C = (x[..., None, None] for x in (A, B, C))
@@ -168,8 +168,9 @@ def _table_gradient(
     m, mx, my, mxx, mxy, myy = (q @ monomials).unbind(-1)
     u, v = rows[..., MEAN].unbind(-1)
     A, B, C = rows[..., CONIC].unbind(-1)
-    ox = ((tiles % grid.columns + 0.5) * grid.tile)[:, None] - u
-    oy = ((tiles // grid.columns + 0.5) * grid.tile)[:, None] - v
+    columns, rows_of_tiles = (tiles % grid.columns).to(u.dtype), (tiles // grid.columns).to(v.dtype)
+    ox = ((columns + 0.5) * grid.tile)[:, None] - u
+    oy = ((rows_of_tiles + 0.5) * grid.tile)[:, None] - v
     qx, qy = mx + ox * m, my + oy * m
     qxx = mxx + 2 * ox * mx + ox * ox * m
     qxy = mxy + ox * my + oy * mx + ox * oy * m

@@ -193,6 +193,15 @@ def test_images_of_any_layout_are_supported(name):
 
 
 @every_implementation
+@pytest.mark.parametrize("loss", LOSSES.values(), ids=LOSSES)
+def test_a_loss_is_where_its_images_are_whatever_torchs_default_device(name, loss):
+    x, y = photo(20, 30), photo(20, 30, 6)
+    with torch.device("meta"):
+        value, gradient = loss(x, y, name)
+    assert value.device == gradient.device == x.device
+
+
+@every_implementation
 def test_gradients_are_written_to_out(name):
     x, y = photo(20, 30), photo(20, 30, 6)
     out = torch.full((2, 20, 30, 3), torch.nan)

@@ -11,7 +11,8 @@ import torch
 from rasterizers.cpp import CppRasterizer
 from rasterizers.interface import Splats
 from rasterizers.testing import scene
-from tests.helpers.backends import EVERY, camera, needs
+from tests.helpers.agreement import require_same_bits
+from tests.helpers.backends import EVERY, camera, cotangents, everything, needs
 
 OTHERS = ("quats", "scales", "opacities", "sh0", "shN", "rgb_offset")
 ROWS = ("opacities", "rgb_offset", "shN", "quats", "scales", "sh0")
@@ -75,6 +76,24 @@ def test_a_number_that_is_not_finite_is_refused(draw, name, bad):
 def test_bands_that_no_degree_has_are_refused(draw):
     with pytest.raises(ValueError, match=r"splats.shN must hold 0, 3, 8 or 15 bands, got 5"):
         draw(changed("shN", lambda x: x.new_zeros(20, 5, 3)), camera())
+
+
+@pytest.fixture
+def other_defaults():
+    """A host's defaults, as of `torch.set_default_device("cuda")`."""
+    torch.set_default_device("meta")
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_device(None)
+    torch.set_default_dtype(torch.float32)
+
+
+def test_torchs_default_dtype_and_device_play_no_part(draw, request):
+    splats, view = scene(20), camera()
+    v = cotangents(1, view.height, view.width)
+    expected = everything(draw(splats, view, depth=True), v)
+    request.getfixturevalue("other_defaults")
+    require_same_bits(everything(draw(splats, view, depth=True), v), expected)
 
 
 @needs("cpp")

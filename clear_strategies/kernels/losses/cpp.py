@@ -36,9 +36,9 @@ def native() -> ModuleType:
 def photometric(images: ImagePair, l1: float, dssim: float) -> Float[Tensor, ""]:
     """The value l1 · mean |x - y| + dssim · (1 - SSIM), in one pass; with dssim = 0 no SSIM is computed."""
     l1_mean, dissimilarity = native().photometric(*images, l1, dssim, threads())
-    return torch.tensor(l1 * l1_mean + dssim * dissimilarity, dtype=torch.float32)
+    return torch.tensor(l1 * l1_mean + dssim * dissimilarity, dtype=torch.float32, device="cpu")
 
 
 def haar_l1(images: ImagePair, levels: int) -> Float[Tensor, ""]:
     """The mean |detail| of each level, averaged over the levels."""
-    return torch.tensor(native().haar_l1(*images, levels, threads()), dtype=torch.float32)
+    return torch.tensor(native().haar_l1(*images, levels, threads()), dtype=torch.float32, device="cpu")
