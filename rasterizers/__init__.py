@@ -92,8 +92,14 @@ def fastest(device: str | None = None) -> str:
 
     Args:
         device: "cpu" or "cuda", where the splats' tensors are; None: any.
+
+    Raises:
+        BackendUnavailable: none draws tensors there.
     """
-    return next(name for name, backend in _runnable() if device is None or device in backend.traits.devices)
+    for name, backend in _runnable():
+        if device is None or device in backend.traits.devices:
+            return name
+    raise BackendUnavailable(f"no rasterizer draws tensors on {device!r}; move the splats to 'cpu' or 'cuda'.")
 
 
 def for_device(name: str, device: str) -> dict[str, str]:

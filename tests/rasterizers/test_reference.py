@@ -73,6 +73,11 @@ def test_batches_do_not_change_the_picture(lanes):
     assert torch.allclose(found.vjp(v).means, expected.vjp(v).means, rtol=1e-9, atol=1e-12)
 
 
+def test_where_no_rasterizer_draws_the_error_says_so():
+    with pytest.raises(rasterizers.BackendUnavailable, match="no rasterizer draws tensors on 'mps'; move the splats"):
+        rasterizers.fastest("mps")
+
+
 def test_the_size_of_a_camera_is_of_integers():
     """Under pytest beartype would refuse others in the constructor; elsewhere nobody does."""
     camera = Camera(torch.eye(4), 40.0, 44.0, 17.0, 15.0, 40, 32)
