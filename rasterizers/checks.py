@@ -47,6 +47,16 @@ def _same_gaussians_and_pose(first: tuple[Splats, Camera], other: tuple[Splats, 
     return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
 
 
+def require_device(device: str) -> None:
+    """Refuse what is no type of a device: CUDA's tensors are drawn on the device that they are on.
+
+    Raises:
+        ValueError: it is neither "cpu" nor "cuda".
+    """
+    if device not in ("cpu", "cuda"):
+        raise ValueError(f"device must be cpu or cuda, got {device!r}.")
+
+
 def require_splats(splats: Splats, traits: Traits) -> None:
     """Refuse splats whose tensors differ in dtype, device or number of rows, or that the backend does not draw.
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from rasterizers.checks import Backend, require_cotangents, require_finite, require_splats
+from rasterizers.checks import Backend, require_cotangents, require_device, require_finite, require_splats
 from rasterizers.geometry import SH_C0, spherical_harmonics
 from rasterizers.interface import BackendUnavailable, Camera, Rendering, SplatGradients, Splats, Traits
 
@@ -42,7 +42,7 @@ class GsplatRasterizer(Backend):
     """gsplat's `rasterization` as a rasterizer.
 
     Args:
-        device: where the splats' tensors are.
+        device: "cuda", or "cpu" with a `rasterization` for it: where the splats' tensors are.
         rasterization: a function with the signature of gsplat's, for tests; None: gsplat's own.
 
     Raises:
@@ -55,6 +55,7 @@ class GsplatRasterizer(Backend):
 
     def __post_init__(self) -> None:
         Backend.__post_init__(self)
+        require_device(self.device)
         for name, fixed in _FIXED.items():
             if getattr(self, name) != fixed:
                 raise ValueError(

@@ -7,7 +7,7 @@ from typing import Final
 
 import torch
 
-from rasterizers.checks import Backend
+from rasterizers.checks import Backend, require_device
 from rasterizers.interface import Camera, Traits
 from rasterizers.warp_runtime import require_warp
 
@@ -43,8 +43,7 @@ class WarpSettings(Backend):
         Backend.__post_init__(self)
         if self.memory < 1:
             raise ValueError(f"memory must be at least 1 MiB, got {self.memory}.")
-        if self.device not in ("cpu", "cuda"):
-            raise ValueError(f"device must be cpu or cuda, got {self.device!r}.")
+        require_device(self.device)
         require_warp("the warp rasterizer", self.device, "device=cpu runs here, slowly")
 
     @property

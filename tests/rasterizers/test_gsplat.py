@@ -57,6 +57,12 @@ def test_render_scales_draws_each_job():
     assert low.image.shape == (16, 24, 3)
 
 
+@pytest.mark.parametrize("device", ["cuda:1", "cpu:0"])
+def test_a_device_with_a_number_is_refused(device):
+    with pytest.raises(ValueError, match=f"device must be cpu or cuda, got '{device}'"):
+        GsplatRasterizer(rasterization=STAND_IN, device=device)
+
+
 def test_other_cut_offs_and_other_devices_are_refused():
     with pytest.raises(ValueError, match="alpha_min must stay"):
         both(alpha_min=1 / 4096)
