@@ -166,7 +166,8 @@ def _filtered(path: Path, filters: str) -> list[str]:
     except ImportError as error:
         raise DataError("video", "ffmpeg", "is not installed", "pip install 'clear-strategies[train]'") from error
     ffmpeg = str(imageio_ffmpeg.get_ffmpeg_exe())
-    return [ffmpeg, "-v", "error", "-i", str(path), "-vf", filters, "-fps_mode", "passthrough"]
+    file = f"file:{path}"  # what stands before a colon, as in 10:30.mp4, would be a protocol
+    return [ffmpeg, "-v", "error", "-i", file, "-vf", filters, "-fps_mode", "passthrough"]
 
 
 def _key(path: Path, count: int | None) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -63,6 +65,12 @@ def test_the_frames_are_files_that_are_made_once(clip):
     before = files[0].stat().st_mtime_ns
     assert frames_of(clip, 5) == folder
     assert files[0].stat().st_mtime_ns == before
+
+
+def test_a_video_may_be_named_by_the_time_of_its_making(clip, tmp_path, monkeypatch):
+    shutil.copy(clip, tmp_path / "2026-11-26T10:30:00.mp4")
+    monkeypatch.chdir(tmp_path)
+    assert len([*frames_of(Path("2026-11-26T10:30:00.mp4"), 3).glob("*.jpg")]) == 3
 
 
 def test_hundreds_of_frames_can_be_chosen(tmp_path, monkeypatch):
