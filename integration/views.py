@@ -37,6 +37,9 @@ class HostPhoto:
         world_to_camera: OpenCV axes (x right, y down, z forward).
         K: focal lengths and principal point in pixels of `image`; pixel (0, 0) spans [0, 1)².
         mask: what the host's loss multiplies its rendering by, in [0, 1]; None: nothing is hidden.
+
+    Raises:
+        DataError: one has another shape, or values outside of [0, 1].
     """
 
     name: str
@@ -44,6 +47,22 @@ class HostPhoto:
     world_to_camera: Float[Tensor, "4 4"]
     K: Float[Tensor, "3 3"]
     mask: Float[Tensor, "h w"] | None = None
+
+    def __post_init__(self) -> None:
+        shape, K = tuple(self.image.shape), tuple(self.K.shape)
+        if len(shape) != 3 or shape[-1] not in (3, 4):
+            raise DataError(self.name, "image", f"must have shape [h, w, 3], got {shape}", "put the RGB channels last")
+        if K != (3, 3):
+            raise DataError(
+                self.name, "K", f"must have shape [3, 3], got {K}", "give the camera matrix of this photo alone"
+            )
+        if self.image.dtype != torch.uint8:
+            _require_range(self.name, "image", self.image)
+        if self.mask is not None:
+            if self.mask.shape != shape[:2]:
+                problem = f"must have shape {shape[:2]}, got {tuple(self.mask.shape)}"
+                raise DataError(self.name, "mask", problem, "give [h, w] of its photo")
+            _require_range(self.name, "mask", self.mask)
 
     @property
     def posed(self) -> Photo:
@@ -66,12 +85,7 @@ class HostPhoto:
                 self.name, "SR image", f"is {sr_image.shape[1]}x{sr_image.shape[0]}, but {factor} times {w}x{h} is "
                 f"{w * factor}x{h * factor}", "super-resolve the images that the host trains on",
             )  # fmt: skip
-        low, high = float(sr_image.min()), float(sr_image.max())
-        if not (low >= -_OVERSHOOT and high <= 1 + _OVERSHOOT):
-            raise DataError(
-                self.name, "SR image", f"has values from {low:.3g} to {high:.3g}, must be RGB in [0, 1]",
-                "divide 8-bit values by 255",
-            )  # fmt: skip
+        _require_range(self.name, "SR image", sr_image)
         sr_image = sr_image.clamp(0, 1)
         mask = None if self.mask is None else self.mask.to(image)
         if mask is not None:
@@ -103,9 +117,17 @@ def view(
             scales; the HR rendering must be as well, see `enlarged_mask`.
 
     Raises:
-        DataError: the SR image is not `factor` times as large as the photo, or not in [0, 1] but for a network's overshoot.
+        DataError: photo, mask or K has another shape; the SR image is not `factor` times as large as the photo; an image is not
+            in [0, 1] but for a network's overshoot.
     """
     return HostPhoto(name, image, world_to_camera, K, mask).view(sr, factor)
+
+
+def _require_range(name: str, what: str, values: Tensor) -> None:
+    low, high = float(values.min()), float(values.max())
+    if not (low >= -_OVERSHOOT and high <= 1 + _OVERSHOOT):  # nan too
+        problem = f"must lie in [0, 1], has values from {low:.3g} to {high:.3g}"
+        raise DataError(name, what, problem, "divide 8-bit values by 255")
 
 
 def by_name(views: Sequence[View]) -> dict[str, View]:

@@ -17,7 +17,9 @@ def of_host(
 ):
     c = PHOTO.camera
     K = torch.tensor([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-    return view(name, PHOTO.image, c.world_to_camera, K, sr, **settings)
+    return view(
+        **{"name": name, "image": PHOTO.image, "world_to_camera": c.world_to_camera, "K": K, "sr": sr} | settings
+    )
 
 
 def test_what_a_mask_hides_is_hidden_at_both_scales():
@@ -32,8 +34,23 @@ def test_what_a_mask_hides_is_hidden_at_both_scales():
 
 def test_an_sr_image_may_overshoot_but_not_have_other_values():
     assert float(of_host(sr=lambda *a: torch.full((64, 96, 3), 1.03)).hr.image.max()) == 1
-    with pytest.raises(DataError, match="has values from 200 to 200, must be RGB"):
+    with pytest.raises(DataError, match=r"SR image: must lie in \[0, 1\], has values from 200 to 200"):
         of_host(sr=lambda *a: torch.full((64, 96, 3), 200.0))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"image": 255 * PHOTO.image}, r"image: must lie in \[0, 1\]"),
+        ({"image": PHOTO.image.permute(2, 0, 1)}, r"image: must have shape \[h, w, 3\], got \(3, 16, 24\)"),
+        ({"K": torch.eye(4)}, r"K: must have shape \[3, 3\], got \(4, 4\)"),
+        ({"mask": torch.ones(16, 24, 1)}, r"mask: must have shape \(16, 24\), got \(16, 24, 1\)"),
+        ({"mask": torch.full((16, 24), 255, dtype=torch.uint8)}, r"mask: must lie in \[0, 1\]"),
+    ],
+)
+def test_a_photo_mask_or_K_of_another_shape_or_range_is_refused(wrong, message):
+    with pytest.raises(DataError, match=message):
+        of_host(**wrong)
 
 
 def test_two_views_of_one_name_are_refused():
