@@ -160,9 +160,10 @@ class Attachment:
         """Hook the steps of the host's optimizers, and no longer those of earlier ones. The first steps once an iteration."""
         for hook in self._hooks:
             hook.remove()
+        each = list(dict.fromkeys(optimizers))  # one optimizer may have several parameters
         self._hooks = [
-            *(o.register_step_pre_hook(lambda *_: self._before_step()) for o in optimizers[:1]),
-            *(o.register_step_post_hook(lambda o, *_: self._after_step(o)) for o in optimizers),
+            *(o.register_step_pre_hook(lambda *_: self._before_step()) for o in each[:1]),
+            *(o.register_step_post_hook(lambda o, *_: self._after_step(o)) for o in each),
         ]
 
     def state_dict(self) -> dict[str, Any]:

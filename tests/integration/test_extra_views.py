@@ -96,6 +96,27 @@ def test_accumulated_passes_are_one_step_with_one_extra_step(drawn):
     assert clear.attachment.counts["steps of the host alone"] == 0
 
 
+def stepped(make, scaler=None):
+    """The parameters after a step by the optimizers that `make` gives for them, and how many extra steps were counted."""
+    scene = toy.scene(20)
+    trainer = Host(scene)
+    trainer.optimizers = make(trainer.splats)
+    loss_scale = None if scaler is None else scaler.get_scale
+    clear = attach(trainer.splats, trainer.optimizers, scene.train, dark(), detail=False, loss_scale=loss_scale)
+    loss = gsplat_host.drawn(clear.wrap(gsplat_host.rasterization), trainer.splats, scene.train[0].lr.camera)[0].mean()
+    (loss if scaler is None else scaler.scale(loss)).backward()
+    for optimizer in dict.fromkeys(trainer.optimizers.values()):
+        optimizer.step() if scaler is None else scaler.step(optimizer)
+    return trainer.splats, clear.attachment.counts["extra views"]
+
+
+def test_an_adam_of_all_parameters_makes_one_extra_step():
+    one = stepped(lambda splats: dict.fromkeys(splats, torch.optim.Adam(list(splats.values()))))
+    each = stepped(lambda splats: {name: torch.optim.Adam([p]) for name, p in splats.items()})
+    assert one[1] == each[1] == 1
+    assert all(torch.equal(p, one[0][name]) for name, p in each[0].items())
+
+
 @pytest.mark.parametrize("step_first", [False, True], ids=["densify, step", "step, densify"])
 def test_an_inria_style_host_draws_it_and_steps_on_it_whenever_it_densifies(
     step_first, inria_host, inria_capture, drawn
