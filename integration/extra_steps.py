@@ -56,6 +56,11 @@ class ExtraSteps:
         if not mine:
             return 0
         before, self.stepping = [p.grad for p in present], True
+        scale = getattr(
+            optimizer, "grad_scale", None
+        )  # that a fused optimizer is to divide by, of an AMP gradient scaler
+        if scale is not None:
+            optimizer.grad_scale = None  # type: ignore[attr-defined]
         try:
             for grads in self._gradients:
                 for p in present:
@@ -65,6 +70,8 @@ class ExtraSteps:
                 _step(optimizer, mine)
         finally:
             self.stepping = False
+            if scale is not None:
+                optimizer.grad_scale = scale  # type: ignore[attr-defined]
             for p, grad in zip(present, before, strict=True):
                 p.grad = grad
         return len(self._gradients) if "means" in mine else 0

@@ -117,6 +117,15 @@ def test_an_adam_of_all_parameters_makes_one_extra_step():
     assert all(torch.equal(p, one[0][name]) for name, p in each[0].items())
 
 
+def test_a_scaler_of_losses_leaves_the_extra_step_of_a_fused_adam_as_it_is():
+    def fused(splats):
+        return {name: torch.optim.Adam([p], eps=1e-15, fused=True) for name, p in splats.items()}
+
+    scaled, plain = stepped(fused, torch.amp.GradScaler("cpu", init_scale=1024.0)), stepped(fused)
+    for name, p in plain[0].items():
+        assert torch.allclose(p, scaled[0][name], rtol=0, atol=1e-6), name
+
+
 @pytest.mark.parametrize("step_first", [False, True], ids=["densify, step", "step, densify"])
 def test_an_inria_style_host_draws_it_and_steps_on_it_whenever_it_densifies(
     step_first, inria_host, inria_capture, drawn
