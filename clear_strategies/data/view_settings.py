@@ -105,7 +105,10 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
         pool, test = frames, []
     if views.train_names is not None:
         by_name = {f.name: f for f in (pool if own_split else frames)}
-        pool = [by_name[_only(capture, tuple(by_name), name)] for name in views.train_names]
+        names = [_only(capture, tuple(by_name), name) for name in views.train_names]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise DataError(capture.name, "train_names", f"{twice!r} is named twice", "name each view once")
+        pool = [by_name[name] for name in names]
         test = [f for f in test if f not in pool]
     elif views.train is not None:
         if len(pool) < views.train:

@@ -212,6 +212,8 @@ def test_a_view_is_chosen_by_its_file_name_where_that_is_its_own():
         split(rig(), ViewSettings(train_names=["0001"]))
     with pytest.raises(DataError, match=r"no view 'rgb'.*choose among cam1/0001, .*cam2/rgb.0003"):
         split(rig(), ViewSettings(train_names=["rgb"]))
+    with pytest.raises(DataError, match=r"'cam1/0002\.png' is named twice"):
+        split(rig(), ViewSettings(train_names=["0002", "cam2/0001", "cam1/0002.png"]))
 
 
 def test_a_training_view_is_not_taken_for_the_test_view_of_its_name(tmp_path):
