@@ -66,7 +66,9 @@ def read(
     require_paths(file, transforms)
     listed, names = typed(file, content, _Listed), [transform.file_path for transform in transforms]
     splits = _splits(file, listed)
-    short = _short_names(names)
+    parts = [PurePosixPath(name).parts for name in names]
+    shared = _shared_folders(parts)
+    photos = folder.joinpath(*parts[0][:shared]) if shared else None
     lenses, frames = [], []
     paths = [_photo(folder, name, file, allow_outside) for name in names]
     kept = usable(file, range(len(transforms)), lambda i: paths[i], missing=missing, broken=broken)
@@ -75,8 +77,10 @@ def read(
         pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
         lens, mask = transform.lens(file, where, path), transform.mask(file, allow_outside)
         lenses.append(lens)
-        split = splits.get(names[i])
-        frames.append(Frame.of_photo(short[i], path, lens, pose, background=background, split=split, mask=mask))
+        short, split = "/".join(parts[i][shared:]), splits.get(names[i])
+        frames.append(
+            Frame.of_photo(short, path, lens, pose, background=background, split=split, mask=mask, photos=photos)
+        )
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(lenses, frames)}
     if splits:
         notes["split"] = _split_note(file, names, [names[i] for i in kept], splits)
@@ -88,12 +92,10 @@ def read(
     return Capture(folder.resolve().name, sorted_by_name(frames, file), points, background or (0.0, 0.0, 0.0), notes)
 
 
-def _short_names(names: Sequence[str]) -> list[str]:
-    """Names without the folders that all of them share."""
-    parts = [PurePosixPath(name).parts for name in names]
+def _shared_folders(parts: Sequence[tuple[str, ...]]) -> int:
+    """How many folders all of these paths share; names of frames are without them."""
     first, last = min(part[:-1] for part in parts), max(part[:-1] for part in parts)  # all share what these two share
-    shared = len(list(takewhile(lambda pair: pair[0] == pair[1], zip(first, last, strict=False))))
-    return ["/".join(part[shared:]) for part in parts]
+    return len(list(takewhile(lambda pair: pair[0] == pair[1], zip(first, last, strict=False))))
 
 
 def _photo(folder: Path, name: str, file: Path, allow_outside: bool) -> Path:

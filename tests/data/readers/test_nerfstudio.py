@@ -91,6 +91,21 @@ def test_the_masks_it_names_hide_their_black_pixels_and_are_undistorted_with_the
         assert found[:, 6:].all()
 
 
+def test_masks_lie_in_subfolders_like_those_of_their_photos(tmp_path: Path) -> None:
+    def rig(value: dict[str, Any]) -> None:
+        for folder, frame in zip(("left", "right", "right"), value["frames"], strict=True):
+            photo = tmp_path / frame["file_path"]
+            moved = photo.parent / folder / photo.name
+            moved.parent.mkdir(exist_ok=True)
+            photo.rename(moved)
+            write_png(tmp_path / "masks" / folder / photo.name, torch.zeros(12, 16))
+            frame["file_path"] = f"images/{folder}/{photo.name}"
+
+    frames = nerfstudio.read(changed(tmp_path, rig)).frames
+    assert [frame.name for frame in frames] == ["left/a.png", "right/b.png", "right/c.png"]
+    assert all(frame.shown is not None and not frame.shown().any() for frame in frames)
+
+
 def test_points_of_a_ply_have_no_tracks(tmp_path: Path) -> None:
     changed(tmp_path, lambda value: value.update(ply_file_path="points.ply", applied_transform=[[1, 0, 0, 5]]))
     write_points(tmp_path / "points.ply", torch.tensor([[1.0, 2, 3]]), torch.tensor([[1, 0, 0.2]]))
