@@ -94,9 +94,10 @@ def read(
     if (folder / "cameras.bin").is_file():
         _log.debug("%s: poses from the cache %s.", root, folder)
     else:
-        settings = sfm.SfmSettings(max_side, max_features, careful, least_placed, threads, seed)
+        settings = sfm.SfmSettings(max_side, max_features, careful, threads, seed)
         sfm.reconstruct(root, photos, folder, settings)
     found = _capture(root, paths, photos, folder)
+    sfm.require_placed(root, len(found.frames), len(paths), least_placed)
     return replace(found, name=name, notes={**found.notes, **notes})
 
 

@@ -14,7 +14,7 @@ import signal
 import sqlite3
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -50,7 +50,6 @@ class SfmSettings:
     max_side: int
     max_features: int
     precise: bool
-    least_placed: float
     threads: int
     seed: int
 
@@ -84,7 +83,7 @@ def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings:
             models = _map(pycolmap, photos, Path(work), settings)
             models.sort(key=lambda model: model.num_reg_images(), reverse=True)
             sizes = [model.num_reg_images() for model in models]
-            _require_placed(root, sizes, count, settings.least_placed)
+            require_placed(root, sizes[0] if sizes else 0, count)
             result = Path(work) / "result"
             result.mkdir()
             models[0].write_binary(str(result))
@@ -105,8 +104,15 @@ def copy_name(index: int) -> str:
     return f"{index:05d}.jpg"
 
 
-def _require_placed(root: Path, sizes: Sequence[int], count: int, least: float) -> None:
-    placed = sizes[0] if sizes else 0
+def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> None:
+    """Refuse poses of too few photos.
+
+    Args:
+        least: the least share of the photos.
+
+    Raises:
+        DataError: fewer than `FEWEST` of `count` photos are placed, or a smaller share.
+    """
     if placed >= FEWEST and placed / count >= least:
         return
     remedy = MORE

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +23,7 @@ from clear_strategies.data.exif import Exif
 from clear_strategies.data.readers import colmap, photos, sfm
 from clear_strategies.data.readers.sfm import SfmSettings
 from clear_strategies.errors import DataError
+from tests.helpers import captures
 from tests.helpers.captures import largest_turn
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -116,11 +120,39 @@ def test_a_photo_without_a_pose_is_told_with_the_placed_photo_that_it_has_most_i
 @pytest.mark.parametrize(("placed", "count"), [(4, 10), (5, 12), (7, 100), (106, 1000)])
 def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_takes_them(placed: int, count: int) -> None:
     with pytest.raises(DataError, match=rf"only {placed} of the {count} photos .*overlap") as refused:
-        photos.sfm._require_placed(Path("mine"), [placed, 2], count, 0.5)
+        sfm.require_placed(Path("mine"), placed, count, 0.5)
     least = float(str(refused.value).rpartition("data.reader.least_placed=")[2])
     assert least == pytest.approx(placed / count, abs=1e-3)
-    photos.sfm._require_placed(Path("mine"), [placed, 2], count, least)
-    photos.sfm._require_placed(Path("mine"), [6, 3], 10, 0.5)
+    sfm.require_placed(Path("mine"), placed, count, least)
+    sfm.require_placed(Path("mine"), 6, 10, 0.5)
+
+
+def test_poses_of_the_cache_are_refused_and_taken_as_those_just_estimated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimated = []
+
+    def reconstruct(root: Path, listed: Any, folder: Path, settings: SfmSettings) -> None:
+        estimated.append(folder)
+        shutil.copytree(captures.colmap_bin(tmp_path / "scene") / "sparse/0", folder)
+        images = (folder / "images.bin").read_bytes()
+        for i, name in enumerate(captures.NAMES):
+            images = images.replace(name.encode(), sfm.copy_name(i).encode())
+        (folder / "images.bin").write_bytes(images)
+        (folder / sfm.UNPLACED).write_text("{}")
+
+    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    captures.write_photos(tmp_path / "photos")
+    for i in range(4):
+        Image.new("RGB", (captures.WIDTH, captures.HEIGHT)).save(tmp_path / "photos" / f"z{i}.png")
+    for least in (0.4, 0.5):
+        read = partial(photos.read, tmp_path / "photos", tmp_path / "cache", least_placed=least)
+        if least == 0.4:
+            assert len(read().frames) == 3
+        else:
+            with pytest.raises(DataError, match=r"only 3 of the 7 photos .*data\.reader\.least_placed=0\.428"):
+                read()
+    assert len(estimated) == 1
 
 
 class FakeModel:
@@ -143,7 +175,7 @@ def test_of_several_models_the_largest_is_kept_and_the_others_are_told(
     monkeypatch.setattr(sfm, "_map", lambda *_: models)
     monkeypatch.setattr(sfm, "_unplaced", lambda _, placed: {"all": sorted(placed)})
     listed = {tmp_path / f"{i}.jpg": Exif() for i in range(10)}
-    sfm.reconstruct(tmp_path, listed, tmp_path / "poses", SfmSettings(1600, 8192, False, 0.5, threads=1, seed=0))
+    sfm.reconstruct(tmp_path, listed, tmp_path / "poses", SfmSettings(1600, 8192, False, threads=1, seed=0))
     assert (tmp_path / "poses/images.bin").read_text() == "3,4,5,6,7"
     assert "groups that nothing connects (5, 3, 2 photos); the largest is used" in caplog.text
 
@@ -153,10 +185,10 @@ def test_the_memory_of_matching_is_bounded_on_machines_of_many_cores(
     monkeypatch: pytest.MonkeyPatch, precise: bool
 ) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
-    settings = SfmSettings(1600, 8192, precise, 0.5, threads=-1, seed=0)
+    settings = SfmSettings(1600, 8192, precise, threads=-1, seed=0)
     assert 3 << 30 < settings.matchers * settings.memory <= 4 << 30
-    assert SfmSettings(1600, 8192, precise, 0.5, threads=2, seed=0).matchers == 2
-    assert SfmSettings(1600, 100_000, precise, 0.5, threads=-1, seed=0).matchers == 1
+    assert SfmSettings(1600, 8192, precise, threads=2, seed=0).matchers == 2
+    assert SfmSettings(1600, 100_000, precise, threads=-1, seed=0).matchers == 1
 
 
 def test_no_photo_has_more_features_than_asked_for(tmp_path: Path) -> None:
