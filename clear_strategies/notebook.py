@@ -114,7 +114,7 @@ def train(
         folder: for the run's files; None: outputs/<name>/<time>.
 
     Raises:
-        SettingError, StrategyConflict: a setting cannot be used.
+        SettingError, StrategyConflict: a setting cannot be used; those of Hydra itself (hydra.run.dir) cannot.
         DataError: a photo or a file cannot be used.
     """
     exit_codes.require_train()
@@ -123,6 +123,11 @@ def train(
     overrides = list(settings) if photos is None else train_command.overrides([str(photos), *settings])
     if photos is None and not any(word.startswith(train_command.CHOOSE_STRATEGIES) for word in settings):
         overrides.append("+strategy=best")
+    if word := next((word for word in overrides if word.lstrip("+~").startswith("hydra.")), None):
+        key, _, value = word.partition("=")
+        refuse(
+            key, "must be left out, since Hydra takes no part in a run from Python", value, "folder=… is for its files"
+        )
     name = "demo" if photos is None else Path(photos).resolve().stem
     into = Path(folder) if folder is not None else Path("outputs") / name / time.strftime("%Y-%m-%d_%H-%M-%S")
     config = composed(overrides, "config")
