@@ -56,10 +56,8 @@ class ExtraSteps:
         if not mine:
             return 0
         before, self.stepping = [p.grad for p in present], True
-        scale = getattr(
-            optimizer, "grad_scale", None
-        )  # that a fused optimizer is to divide by, of an AMP gradient scaler
-        if scale is not None:
+        scale = getattr(optimizer, "grad_scale", None)  # an AMP gradient scaler's, which a fused optimizer divides by
+        if scale is not None:  # gradients of extra views are not scaled
             optimizer.grad_scale = None  # type: ignore[attr-defined]
         try:
             for grads in self._gradients:
