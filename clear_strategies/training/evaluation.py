@@ -22,7 +22,7 @@ _VIEWS_OF_LOSS: Final = 4
 def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int) -> None:
     """Add the mean PSNR of the first few test views, as far as their HR photos are known, to the last row of the history."""
     work_log = state.conductor.work_log
-    if state.density.reset_due(done) and not state.ended:
+    if state.reset_due(done) and not state.ended:
         work_log.skip(PROBING, "opacities were reset in this iteration")
         return
     with work_log.stage(PROBING):

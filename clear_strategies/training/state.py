@@ -151,6 +151,10 @@ class TrainState:
         self.conductor.on_resize(parents)
         self.refilter()
 
+    def reset_due(self, t: int) -> bool:
+        """Whether opacities are lowered at t; renders right after that say nothing about the field."""
+        return self.conductor.may_densify(t) and self.density.reset_due(t)
+
     def filter_due(self) -> bool:
         """Whether the 3D filter is recomputed at t; every change of structure does so as well."""
         return self.t % self.mip.every == 0 and self.t <= self.settings.iterations - self.mip.last

@@ -18,11 +18,13 @@ from clear_strategies.errors import SettingError
 from clear_strategies.schedules import scaled
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training.densifier import cameras_extent
+from clear_strategies.training.evaluation import evaluate
 from clear_strategies.training.field import GaussianField
+from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import filter_std
 from clear_strategies.training.optim import Adam, LearningRates
 from rasterizers.geometry import SH_C0
-from tests.helpers import toy
+from tests.helpers import short_run, toy
 
 
 def tagged(n=12):
@@ -150,6 +152,15 @@ def test_white_backgrounds_get_an_early_reset():
     assert [t for t in range(1, 10_001) if black.reset_due(t)] == [3000]
     off = Density(DensitySettings(stop=0), 1, extent=1.0, seed=0, white_background=True)
     assert not any(map(off.reset_due, range(1, 10_001)))
+
+
+@pytest.mark.parametrize(("anchor_start", "probed"), [(6, True), (7, False)])
+def test_opacities_that_a_strategy_keeps_from_a_reset_are_evaluated(anchor_start, probed):
+    state = short_run.start((), more=[SVS(anchor_start=anchor_start)])  # a reset falls on t = 6
+    for _ in range(6):
+        iterate(state, toy.RASTERIZER)
+    evaluate(state, toy.scene(), toy.RASTERIZER, 6)
+    assert ("psnr_test" in state.history[-1]) is probed
 
 
 def test_an_anchor_follows_a_reordering_of_its_gaussians():
