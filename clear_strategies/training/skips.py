@@ -22,7 +22,7 @@ from clear_strategies.schedules import milestone
 _log = logging.getLogger(__name__)
 
 PLATEAU_LOSS: Final = "loss_views"
-"""The column of the history that tells a plateau: the mean loss of training views, every Gaussian drawn."""
+"""Begins the columns of the history that tell a plateau: the mean loss of training views, every Gaussian drawn."""
 
 _REDUCED: Final = 2  # the coarse SR image has half the size of the fine one
 
@@ -73,7 +73,7 @@ class SkipPolicy:
 
     def view(self, view: View, t: int) -> View:
         """The view of iteration t: with a coarse SR image at first, where the factor is even."""
-        if t > self.skips.coarse_until:
+        if not self.coarse(t):
             self._coarse.clear()  # no later iteration needs them
             return view
         if view.factor % _REDUCED:
@@ -83,9 +83,13 @@ class SkipPolicy:
             self._coarse[view.name] = replace(view, hr=hr, truth=None)
         return self._coarse[view.name]
 
+    def coarse(self, t: int) -> bool:
+        """Whether SR images are coarse at iteration t."""
+        return t <= self.skips.coarse_until
+
     def coarse_bytes(self, views: Sequence[View], t: int) -> int:
         """Of the coarse SR images that are kept from iteration t on."""
-        if t > self.skips.coarse_until:
+        if not self.coarse(t):
             return 0
         return sum(view.hr.image.nbytes // _REDUCED**2 for view in views if view.factor % _REDUCED == 0)
 
@@ -107,10 +111,13 @@ class SkipPolicy:
         )
 
     def settled(self, history: Sequence[dict[str, Number]], t: int) -> bool:
-        """Whether the training views have stopped improving by iteration t; `plateau_to` then follows."""
+        """Whether the training views have stopped improving by iteration t; `plateau_to` then follows. Unknown, and so False,
+        where the structure has changed at one end of the window, or where another loss was measured there.
+        """
         window = self.skips.plateau_window
         if not (self.measured(t) and self.measured(t - window)):
             return False
         rows = deferred.resolve(history)
         before, now = rows[t - window - 1], rows[t - 1]
-        return now[PLATEAU_LOSS] > (1 - self.skips.plateau_gain) * before[PLATEAU_LOSS]
+        alike = [name for name in now if name.startswith(PLATEAU_LOSS) and name in before]
+        return any(now[name] > (1 - self.skips.plateau_gain) * before[name] for name in alike)

@@ -83,6 +83,24 @@ def test_the_loss_that_tells_a_plateau_is_of_every_gaussian(peak):
     assert with_dropout != without
 
 
+def test_what_raises_the_measured_loss_is_no_plateau():
+    """HR begins after t = 8 and is whole after t = 10; at t = 12 the structure changes and opacities are lowered."""
+    state = start(())
+    state.density.settings = replace(state.density.settings, start=11)
+    hr = WarmupDecay(start=8, full=9, decay_from=14, end=ITERATIONS)
+    state.conductor = Conductor(objective=Objective(lambda_hr=hr))
+    state.skip_policy = SkipPolicy(
+        Skips(coarse_until=10, plateau_gain=1e-9, plateau_window=1, plateau_from=7, plateau_to=14)
+    )
+    fit(state, toy.scene(), toy.RASTERIZER)
+    measured = {int(row["t"]): name for row in state.history for name in row if name.startswith(PLATEAU_LOSS)}
+    lr, coarse, whole = (f"{PLATEAU_LOSS}_{kind}" for kind in ("lr", "coarse_base", "base"))
+    assert measured == {7: lr, 8: lr, 9: coarse, 10: coarse, 11: whole, 13: whole}
+    assert len(state.history) == ITERATIONS
+    policy = SkipPolicy(Skips(plateau_gain=0.5, plateau_window=4, plateau_from=4))
+    assert not policy.settled([*loss_rows(*[1.0] * 7), *loss_rows(2.0, column=whole)], 8)
+
+
 def test_every_milestone_stretches_with_the_run():
     short = scaled(Skips(coarse_until=3_000), 0.1)
     assert (short.coarse_until, short.plateau_from, short.plateau_window, short.plateau_to) == (300, 500, 50, 800)
@@ -90,6 +108,7 @@ def test_every_milestone_stretches_with_the_run():
 
 def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
     state = start(("gco",))
+    state.density.settings = replace(state.density.settings, stop=0)  # a change of structure is no plateau
     state.skip_policy = SkipPolicy(Skips(plateau_gain=0.99, plateau_window=2, plateau_from=6, plateau_to=17))
     with caplog.at_level("DEBUG"):
         fit(state, toy.scene(), toy.RASTERIZER)
