@@ -91,7 +91,8 @@ class LearningRates:
 
     def at(self, t: int, extent: float) -> dict[str, float]:
         """Every attribute's rate at iteration t, in its own unit."""
-        warmth = min(1.0, max(0, self.end + 1 - t) / (self.end + 1 - self.cool_from))
+        cools = self.cool_from < self.end
+        warmth = min(1.0, max(0, self.end + 1 - t) / (self.end + 1 - self.cool_from)) if cools else 1.0
         rates = {name: warmth * getattr(self, name) for name in ATTRIBUTES if name != "means"}
         return {"means": self.means(t) * extent, **rates}
 

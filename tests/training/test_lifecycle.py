@@ -231,6 +231,7 @@ def test_in_the_last_tenth_all_rates_fall_to_zero_but_that_of_the_means_falls_al
             assert held.at(10_000, 1.0)[name] == rate
             assert half[name] == pytest.approx(rate / 2, rel=2e-3)
             assert last[name] == pytest.approx(rate / 1_001)
+    assert held.at(30_000, 1.0)["sh0"] == held.sh0  # of a longer run, whose milestones do not stretch
     assert scaled(rates, 0.15).at(1_500, 1.0)["scales"] == pytest.approx(rates.scales / 151)
     with pytest.raises(SettingError, match="end: must be a whole number of at least 9000"):
         LearningRates(end=8_000)
