@@ -205,7 +205,7 @@ class CompiledStep:
             )
             for name, p in params.items()
         }  # fmt: skip
-        skips = self.skips and merged is None and self.optimizer.rates.eps > 0  # 0 / (√0 + 0) moves everything
+        skips = self.skips and merged is None
         shN, active = params["shN"], g_lr.gradients.basis.shape[1] - 1
         bands = active if skips and self._above_is_quiet(shN, active, anchor.targets.get("shN")) else shN.shape[1]
         q = None if e is None else e.reliability.float().contiguous()

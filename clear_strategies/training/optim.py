@@ -59,7 +59,7 @@ class LearningRates:
     def __post_init__(self) -> None:
         for name in ("quats", "scales", "opacities", "sh0", "shN"):
             require_number(name, getattr(self, name), most=LARGEST_RATE)
-        require_number("eps", self.eps, below=1)
+        require_number("eps", self.eps, above=0, below=1)  # 0 / (√0 + 0) moves what has no gradient
         require_whole("geometry_steps", self.geometry_steps, least=0)
         require_whole("cool_from", self.cool_from, least=0)
         require_whole("end", self.end, least=self.cool_from)
