@@ -49,6 +49,8 @@ class FitSettings:
         require_whole("iterations", self.iterations, least=1)
         require_whole("max_degree", self.max_degree, least=0, most=3)
         require_whole("keep", self.keep, least=1)
+        for name in ("degree_every", "probe_every", "probe_views", "checkpoint_every"):
+            require_whole(name, getattr(self, name), least=0)
         if self.memory is not None and self.memory < 1:
             refuse("memory", "must be at least 1 MiB", self.memory, "null takes what is free")
         if self.fused not in get_args(FusedMode):
