@@ -74,6 +74,9 @@ class DensitySettings:
             require_whole(name, getattr(self, name), least=least)
         require_choice("reduce", self.reduce, ("mean", "max"))
         require_number("prune_opacity", self.prune_opacity, below=1)
+        require_number("clone_below", self.clone_below)
+        if self.prune_world is not None:
+            require_number("prune_world", self.prune_world, above=0)
 
     @property
     def interval(self) -> int:
@@ -168,10 +171,10 @@ class Density:
         if s.prune_world is not None:
             keep &= largest <= s.prune_world * self.extent
         if int(keep.sum()) < s.min_gaussians:
+            larger = "" if s.prune_world is None else f", or raise density.prune_world={s.prune_world}"
             raise DensityError(
-                f"t={t}: pruning (opacity < {s.prune_opacity}, world size > {s.prune_world}) would leave "
-                f"{int(keep.sum())} of {n:,} Gaussians, fewer than min_gaussians={s.min_gaussians}. Lower "
-                "density.prune_opacity, or start from a denser cloud."
+                f"t={t}: pruning would leave {int(keep.sum())} of {n:,} Gaussians, fewer than min_gaussians={s.min_gaussians}. "
+                f"Lower density.prune_opacity={s.prune_opacity}{larger}, or start from a denser cloud."
             )
         rows = torch.arange(n, device=chosen.device)
         stay, clones, splits = rows[keep & ~split], rows[keep & chosen & ~split], rows[keep & split]

@@ -14,6 +14,7 @@ from clear_strategies import SVS, Conductor, Update
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.points import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
+from clear_strategies.density.base import DensityError
 from clear_strategies.errors import SettingError
 from clear_strategies.schedules import scaled
 from clear_strategies.strategies.testing import StubShot
@@ -161,6 +162,15 @@ def test_opacities_that_a_strategy_keeps_from_a_reset_are_evaluated(anchor_start
         iterate(state, toy.RASTERIZER)
     evaluate(state, toy.scene(), toy.RASTERIZER, 6)
     assert ("psnr_test" in state.history[-1]) is probed
+
+
+@pytest.mark.parametrize("prune_world", [1e-6, None])
+def test_an_error_names_each_setting_that_pruned_too_many(prune_world):
+    field, optimizer, density = tagged()
+    density.settings = replace(density.settings, prune_world=prune_world, prune_opacity=0.99)
+    with pytest.raises(DensityError, match=r"leave 0 of 12 .* Lower density.prune_opacity=0.99") as error:
+        density.restructure(field, optimizer, 10)
+    assert ("raise density.prune_world=1e-06" in str(error.value)) is (prune_world is not None)
 
 
 def test_an_anchor_follows_a_reordering_of_its_gaussians():

@@ -49,6 +49,8 @@ _REFUSED: dict[str, str] = {
     "density.max_gaussians=0": "at least 1",
     "density.min_gaussians=0": "at least 1",
     "density.reset_every=-1": "at least 0",
+    "density.prune_world=0": "> 0",
+    "density.clone_below=-1": ">= 0",
     "density.prune_opacity=1": r"\[0, 1\)",
     "density.prune_opacity=-0.1": r"\[0, 1\)",
     "optim.quats=-1": "must lie in",
