@@ -79,7 +79,7 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
     """The strategies of conf/, with their objective, for a host's loop.
 
     Args:
-        strategy: as after `+strategy=`: "clear", "gco", "gco,svs", "baseline" …
+        strategy: as after `+strategy=`: "clear", "gco", "gco,svs", "[gco,svs]", "baseline" …
         overrides: as on the command line of `run`: "strategies.gco.tolerance=0.1", "objective=paper", "~strategies.p2g".
         iterations: of the host; every milestone stretches from 10,000 to it.
 
@@ -89,8 +89,8 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
     """
     if iterations < 1:
         raise SettingError(f"iterations must be at least 1, got {iterations}.")
-    names = [name.strip() for name in strategy.split(",")]
-    chosen = f"+strategy=[{','.join(names)}]" if len(names) > 1 else f"+strategy={names[0]}"
+    names = strategy.strip()
+    chosen = f"+strategy=[{names}]" if "," in names and not names.startswith("[") else f"+strategy={names}"
     config = composed([chosen, *overrides])
     settings: ConductorSettings = build(tree(config, _TRAINERS))
     return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
