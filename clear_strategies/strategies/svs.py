@@ -69,8 +69,9 @@ class SVS(Strategy):
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
         self.cache["seed"] = seed
+        n_views = max(1, n_views)
         # How far a run that sees each view `dropout.full` / n_views times needs the rate.
-        self.cache["share"] = min(1.0, self.dropout.full / (self.looks * max(1, n_views))) if self.looks else 1.0
+        self.cache["share"] = min(1.0, self.dropout.full / (self.looks * n_views)) if self.looks else 1.0
         if self.cache["share"] < 1 and self.dropout.maximum > 0:
             _log.debug(
                 "dropout rises to %.3f instead of %.3f: each of the %d training views is seen %d times (svs.looks: %d).",

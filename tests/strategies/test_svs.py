@@ -57,6 +57,12 @@ def params(n=20, seed=0):
     }  # fmt: skip
 
 
+def test_a_short_run_that_does_not_know_its_views_counts_one():
+    svs = SVS(Ramp(0.2, "constant", full=400), looks=1_000)
+    svs.on_fit_start(0, 0)
+    assert float((svs.gate(400, 100_000) > 0).float().mean()) == pytest.approx(1 - 0.08, abs=4e-3)
+
+
 @pytest.mark.parametrize(("n_views", "rate"), [(2, 0.2), (4, 0.2), (8, 0.1), (80, 0.01)])
 def test_the_rate_falls_with_the_looks_at_each_view(n_views, rate):
     svs = SVS(Ramp(0.2, full=4_000), looks=1_000)
