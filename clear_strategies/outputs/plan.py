@@ -80,7 +80,7 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[s
         if (prepared := s.summary()) is not None:
             lines[name.replace("_", " ")] = prepared
     lines["skipped"] = "; ".join(_skipped(state)) or "nothing"
-    _warn_of_idle_strategies(conductor)
+    _warn_of_idle_strategies(conductor, settings.iterations)
     short = {label: lines[label] for label in _SHORT if label in lines}
     details = {label: text for label, text in lines.items() if label not in short}
     short["more"] = f"{len(details)} lines in run.log, or here with -v"
@@ -112,9 +112,9 @@ def _skipped(state: TrainState) -> list[str]:
     return skipped + state.skip_policy.skips.says()
 
 
-def _warn_of_idle_strategies(conductor: Conductor) -> None:
+def _warn_of_idle_strategies(conductor: Conductor, iterations: int) -> None:
     objective = conductor.objective
-    largest = max(objective.lambda_hr.peak, objective.lambda_hr.final)
+    largest = max(map(objective.lambda_hr, range(1, iterations + 1)))
     for s in conductor.strategies:
         if (why := s.without_effect(lambda_lr=objective.lambda_lr, lambda_hr=largest)) is not None:
             _log.warning("%s has no effect: %s.", type(s).__name__, why)

@@ -58,13 +58,15 @@ class Quiet(Strategy):
 
 
 def test_any_strategy_states_what_it_skips_marks_and_warns_of(caplog: pytest.LogCaptureFixture) -> None:
-    state = started(Quiet())
+    state = started(Quiet(), lambda_hr=WarmupDecay(start=0, full=1))
     assert "the loud part" in lines(state, "quiet")["skipped"]
     assert plan.marks(state)["silence"] == 5
     assert "Quiet has no effect: lambda_HR is at most 1." in caplog.text
     caplog.clear()
-    lines(started(Quiet(), lambda_hr=WarmupDecay(peak=2, final=0)), "quiet")
+    lines(started(Quiet(), lambda_hr=WarmupDecay(peak=2, final=0, start=0, full=1)), "quiet")
     assert "no effect" not in caplog.text
+    lines(started(GCO(), lambda_hr=WarmupDecay(start=state.settings.iterations)), "gco")
+    assert "GCO has no effect: lambda_HR is 0 throughout." in caplog.text
 
 
 def test_a_run_ends_with_what_its_history_shows_of_a_strategy() -> None:

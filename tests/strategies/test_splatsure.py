@@ -93,6 +93,11 @@ def test_two_views_are_warned_of(caplog):
     assert "SplatSuRe has no effect: 2 training views are fewer than min_views=3" in caplog.text
 
 
+def test_without_hr_there_is_nothing_to_withhold():
+    assert SplatSuRe().without_effect(lambda_lr=1, lambda_hr=0) == "lambda_HR is 0 throughout"
+    assert SplatSuRe().without_effect(lambda_lr=0, lambda_hr=1) is None
+
+
 @pytest.mark.parametrize("setting", [{"ratio": 0.9}, {"softness": 0.0}, {"min_views": 0}], ids=str)
 def test_settings_outside_their_range_are_refused(setting):
     with pytest.raises(ValueError, match=next(iter(setting))):
