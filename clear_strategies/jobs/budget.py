@@ -124,7 +124,7 @@ class Plan:
             ticks.append(time.perf_counter())
             recent = ticks[-_PACE - 1 :]
             pace = (recent[-1] - recent[0]) / (len(recent) - 1)
-            to = min(skips.plateau_to, state.settings.iterations)
+            to = min(skips.plateau_to, state.settings.iterations - 1)  # the last one is trained and evaluated
             if (
                 skips.plateau_from <= state.t < to
                 and (state.settings.iterations - to) * pace > self.budget.left - self.files

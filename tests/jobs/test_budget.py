@@ -16,9 +16,10 @@ from clear_strategies.jobs.budget import Budget, Plan
 from clear_strategies.jobs.settings import RunSettings
 from clear_strategies.outputs import metrics
 from clear_strategies.training.field import GaussianField
+from clear_strategies.training.loop import fit
 from clear_strategies.training.skips import SkipPolicy, Skips
 from tests.helpers import command_line, planes
-from tests.helpers.short_run import start
+from tests.helpers.short_run import ITERATIONS, SCENE, start
 from tests.helpers.toy import RASTERIZER
 
 
@@ -97,6 +98,14 @@ def test_a_run_that_is_late_goes_on_where_the_rates_fall(seconds: float, after: 
     check()
     assert state.t == after
     assert state.optimizer.steps - steps == after - 13
+
+
+def test_a_late_run_whose_rates_fall_after_its_end_makes_its_last_iteration_and_no_more() -> None:
+    state = start(())
+    state.skip_policy = SkipPolicy(Skips(plateau_from=8, plateau_to=50))
+    check = Plan(ITERATIONS, 0.1, 0.0, Budget(0.0, 0.0)).hurry(state)
+    fit(state, SCENE, RASTERIZER, progress=lambda _: check())
+    assert [int(row["t"]) for row in state.history] == [*range(1, 8), ITERATIONS]
 
 
 def test_a_resumed_run_takes_no_minutes() -> None:
