@@ -20,7 +20,8 @@ _log = logging.getLogger(__name__)
 Key = TypeVar("Key", bound=Hashable)
 
 # Overrides that choose what the baselines see.
-_INPUT: Final = ("data", "prior", "experiment")
+_INPUT: Final = ("data", "prior", "experiment", "protocol")
+_DECORATORS: Final = "decorators."
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,13 +107,13 @@ def shared_settings(runs: Sequence[Run]) -> list[str]:
 
 def _baseline_rows(runs: Sequence[Run]) -> list[Row]:
     """Of one scene: one row per baseline, or one per input (data, prior) where the runs differ in it."""
-    shared = shared_settings(runs)
     rows = []
     for baseline in BASELINES:
+        inputs = {run: _inputs(run, baseline) for run in runs if baseline in run.scores}
+        shared = [s for s in next(iter(inputs.values()), ()) if all(s in of for of in inputs.values())]
         by_input: dict[str, list[Run]] = {}
-        for run in (run for run in runs if baseline in run.scores):
-            inputs = [s for s in run.settings if _is_input(s)]
-            by_input.setdefault(_label(baseline, inputs, shared), []).append(run)
+        for run, of in inputs.items():
+            by_input.setdefault(_label(baseline, of, shared), []).append(run)
         for label, same in by_input.items():
             # Runs with the same input have the same baseline, unless the prior depends on the seed.
             values = {m: sorted(set(_known(run.scores[baseline][m] for run in same))) for m in SCORES}
@@ -174,11 +175,21 @@ def _by_identity(rows: Sequence[Row]) -> dict[tuple[str, tuple[str, ...]], Row]:
     shared = shared_settings([run for row in rows for run in row.runs])
     found = {}
     for row in rows:
-        settings = [s for s in row.runs[0].settings if not (s in shared and _is_input(s, ("data",)))]
-        if row.is_baseline:
-            settings = [s for s in settings if _is_input(s)]
+        own = _inputs(row.runs[0], row.name) if row.is_baseline else row.runs[0].settings
+        settings = [s for s in own if not (s in shared and _is_input(s, ("data",)))]
         found[row.name, tuple(sorted(settings))] = row
     return found
+
+
+def _inputs(run: Run, baseline: str) -> list[str]:
+    """What the images of a baseline depend on: the settings of data and prior; for the SR images also their decorators,
+    which a strategy may bring.
+    """
+    inputs = [s for s in run.settings if _is_input(s)]
+    if baseline != "prior":
+        return inputs
+    decorators = {key.split(".")[1] for key in run.config if key.startswith(_DECORATORS)}
+    return [*inputs, *sorted(decorators), *(s for s in run.settings if _is_input(s, (_DECORATORS,)))]
 
 
 def _is_input(setting: str, groups: tuple[str, ...] = _INPUT) -> bool:

@@ -68,6 +68,23 @@ def test_baselines_of_different_inputs_have_rows_of_their_own(tmp_path: Path) ->
     assert rows["prior, prior=bicubic"].values["psnr"] == [18.0]
 
 
+def test_sr_images_that_a_strategy_changes_have_a_row_of_their_own(tmp_path: Path) -> None:
+    for scene in ("fern", "horns"):
+        make_run(tmp_path / f"{scene}0", "+strategy=clear", scene=scene)
+        back_projected = {"decorators.back_projected.rounds": 10, "decorators.back_projected.down": "bicubic"}
+        make_run(tmp_path / f"{scene}1", "+strategy=best", scene=scene, bicubic=20.0, config=back_projected)
+    averages = {row.method: row for row in report.compare(report.collect([tmp_path])) if not row.runs}
+    for rows in (rows_of(tmp_path / "fern0", tmp_path / "fern1"), averages):
+        assert {19.0} == set(rows["prior"].values["psnr"])
+        assert {21.0} == set(rows["prior, back_projected"].values["psnr"])
+
+
+def test_baselines_of_two_protocols_have_rows_of_their_own(tmp_path: Path) -> None:
+    for protocol, bicubic in (("llff_x4", 18.0), ("llff_x4_quarter", 17.0)):
+        make_run(tmp_path / protocol, "+strategy=clear", f"+protocol={protocol}", bicubic=bicubic)
+    assert rows_of(tmp_path)["bicubic, +protocol=llff_x4"].values["psnr"] == [18.0]
+
+
 def test_scores_of_training_views_or_against_lr_photos_are_marked(tmp_path: Path) -> None:
     lr = {"against": "LR photos", "views": {}, "mean": {"ours": scores(20.0), "prior": scores(21.0)}}
     nothing: dict[str, Any] = {"against": "nothing", "views": {}, "mean": {}}
