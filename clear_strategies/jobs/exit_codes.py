@@ -47,7 +47,7 @@ def describe(error: BaseException) -> Ending | None:
         return Ending(UNUSABLE, f"out of memory: {one_line(error) or 'Python had none left'} {_LESS_MEMORY}")
     disk = error if isinstance(error, OSError) else error.__cause__  # logging wraps it where it cannot open its file
     if isinstance(disk, OSError):
-        where = f"{disk.filename or 'output'}: {disk.strerror or disk}"
+        where = one_line(f"{disk.filename or 'output'}: {disk.strerror or disk}")
         remedy = "Free space, or write elsewhere" if disk.errno in _FULL else "Write elsewhere"
         elsewhere = "hydra.run.dir=FOLDER of a run, --out of a command"
         return Ending(NO_DISK, f"{where}. {remedy} ({elsewhere}). Earlier checkpoints are untouched.")

@@ -30,6 +30,12 @@ def test_space_is_a_remedy_of_a_full_disk_alone(number: int, remedy: str) -> Non
     assert "--out of a command" in message
 
 
+def test_the_message_of_a_library_that_cannot_write_is_one_line() -> None:
+    ending = exit_codes.describe(OSError("Broken pipe\n\nFFMPEG COMMAND:\nffmpeg -y"))
+    assert ending is not None
+    assert ending.message.startswith("output: Broken pipe FFMPEG COMMAND: ffmpeg -y. Write elsewhere")
+
+
 def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:
     reads, writes = os.pipe()
     os.close(reads)

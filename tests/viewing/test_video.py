@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,12 @@ def test_an_mp4_holds_the_frames(tmp_path):
     found = read(tmp_path / "a.mp4")
     assert found.shape == (10, 32, 48, 3)
     assert np.abs(found.mean((1, 2, 3)) - np.arange(10) * 20).max() < 4
+
+
+def test_a_folder_named_by_the_time_of_day_is_no_protocol(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    video.write_videos([Path("10:30/a.mp4"), Path("10:30/a.gif")], FRAMES, fps=10)
+    assert len(read(tmp_path / "10:30" / "a.mp4")) == len(FRAMES)
 
 
 def test_a_gif_is_written_beside_it(tmp_path):
