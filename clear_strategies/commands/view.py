@@ -7,12 +7,15 @@ import logging
 import socket
 import webbrowser
 from collections.abc import Sequence
+from typing import Final
 
 from clear_strategies import console
 from clear_strategies.commands.options import parser_of
 from clear_strategies.errors import SettingError
 
 _log = logging.getLogger(__name__)
+
+_LAST_PORT: Final = 65535
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -28,6 +31,8 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     console.show(verbose=options.verbose)
     _require_own(options.host)
+    if not 0 <= options.port <= _LAST_PORT:
+        raise SettingError(f"--port: must be 0 to {_LAST_PORT}, got {options.port}.")
     from clear_strategies.jobs.saved import open_splat
     from clear_strategies.viewing import live, points
 

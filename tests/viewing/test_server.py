@@ -97,6 +97,12 @@ def test_the_viewer_opens_and_closes(splat, screen):
         viewer.close()
 
 
+@pytest.mark.parametrize("port", ["-1", "65536"])
+def test_a_port_that_no_machine_has_is_refused(port):
+    with pytest.raises(SettingError, match=f"^--port: must be 0 to 65535, got {port}"):
+        view.main(["nowhere", "--port", port])
+
+
 def test_an_address_of_another_machine_is_refused():
     with pytest.raises(SettingError, match=r"^--host: must be an address of this machine, got 192\.0\.2\.1 \("):
         view.main(["nowhere", "--host", "192.0.2.1"])
