@@ -8,6 +8,7 @@ import json
 import logging
 import math
 import os
+import secrets
 import shutil
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -35,7 +36,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """The path that a library writes to in place of `path`, with the same suffix; renamed to it afterwards, or removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{os.getpid()}{_PARTIAL}{path.suffix}")
+    partial = path.with_name(f".{path.stem}.{_unique()}{_PARTIAL}{path.suffix}")
     try:
         yield partial
         partial.replace(path)
@@ -44,8 +45,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def partial_of(path: Path) -> Path:
-    """Where this process writes what will be renamed to `path`."""
-    return path.with_name(f".{path.name}.{os.getpid()}{_PARTIAL}")
+    """Where one call writes what will be renamed to `path`; each time another."""
+    return path.with_name(f".{path.name}.{_unique()}{_PARTIAL}")
+
+
+def _unique() -> str:
+    """No process number: in containers, which may share a cache, every program has the same one."""
+    return secrets.token_hex(4)
 
 
 def require_regular(path: Path, *, most: int = _LARGEST) -> None:

@@ -28,6 +28,14 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
     assert list(tmp_path.iterdir()) == [target]
 
 
+def test_processes_of_one_number_in_two_containers_do_not_write_into_one_file(tmp_path: Path) -> None:
+    with files.replacing(tmp_path / "sr.png") as first, files.replacing(tmp_path / "sr.png") as second:
+        first.write_text("first")
+        second.write_text("second")
+    assert (tmp_path / "sr.png").read_text() == "first"  # the context that ends last
+    assert list(tmp_path.iterdir()) == [tmp_path / "sr.png"]
+
+
 def test_missing_folders_are_made_and_an_old_file_is_replaced(tmp_path: Path) -> None:
     target = tmp_path / "a" / "b" / "ω.txt"
     files.write_text(target, "1")
