@@ -23,7 +23,9 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--to", required=True, choices=FORMATS, help="; ".join(f"{name}: {what}" for name, what in FORMATS.items())
     )
-    parser.add_argument("--out", type=Path, metavar="FILE", help="where it goes (default: RUN/NAME.FORMAT)")
+    parser.add_argument(
+        "--out", type=Path, metavar="FILE", help="where it goes (default: RUN/NAME.FORMAT, beside a PLY file)"
+    )
     kept = "degree of view-dependent colour that is kept (3)"
     parser.add_argument("--sh", type=int, choices=range(4), default=3, metavar="0..3", help=kept)
     options = parser.parse_args(arguments)
@@ -37,5 +39,7 @@ def main(arguments: Sequence[str]) -> None:
     out = options.out or splat.folder / f"{splat.name}.{options.to}"
     if out.suffix != f".{options.to}":
         raise SettingError(f"--out: must end in .{options.to}, got {out.name}.")
+    if out.exists() and out.samefile(options.run):
+        raise SettingError(f"--out: must be another file than the one that is read, got {out}.")
     write_format(out, g, options.to)
     _log.info("%s: %s Gaussians, %.1f MB", out, f"{len(g):,}", out.stat().st_size / 1e6)

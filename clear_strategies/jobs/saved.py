@@ -38,6 +38,7 @@ class SavedSplat:
 
     Args:
         folder: of the run, or of the PLY file.
+        name: of the folder, or of a PLY file that has one of its own; one word, for files and the title of a window.
         source: what was opened, for messages.
         cameras: of the run; empty where none are known.
         antialiased: it was trained with opacity compensation.
@@ -45,16 +46,12 @@ class SavedSplat:
     """
 
     folder: Path
+    name: str
     source: str
     painter: Painter
     cameras: Sequence[SavedCamera]
     antialiased: bool
     baked: bool
-
-    @property
-    def name(self) -> str:
-        """One word for the title of a window."""
-        return self.folder.name or "splat"
 
     def poses(self) -> list[Camera]:
         """The training cameras, or, where none are known, one that sees the whole splat."""
@@ -113,7 +110,7 @@ def _of_checkpoint(path: Path, folder: Path, rasterizer: str | None) -> SavedSpl
     own = {key.removeprefix("rasterizer."): v for key, v in chosen.items() if key.startswith("rasterizer.")}
     source = f"{folder}, {saved.t - 1} iterations, {len(field):,} Gaussians"
     painter, antialiased = _painter(field, _drawing(own, rasterizer), known), bool(own.get("antialiased", True))
-    return SavedSplat(folder, source, painter, known, antialiased, baked=False)
+    return SavedSplat(folder, _name(folder), source, painter, known, antialiased, baked=False)
 
 
 def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
@@ -130,7 +127,12 @@ def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
     known = _cameras_near(path.parent, _DEPTH)
     drawing = _drawing({} if g.antialiased else {"kernel": 0.3, "antialiased": False}, rasterizer)
     source = f"{path}, {len(field):,} Gaussians"
-    return SavedSplat(path.parent, source, _painter(field, drawing, known), known, g.antialiased, baked=True)
+    name = _name(path.parent) if path.name == PLY else path.stem
+    return SavedSplat(path.parent, name, source, _painter(field, drawing, known), known, g.antialiased, baked=True)
+
+
+def _name(folder: Path) -> str:
+    return folder.name or "splat"
 
 
 def _painter(field: GaussianField, drawing: Drawing, known: Sequence[SavedCamera]) -> Painter:
