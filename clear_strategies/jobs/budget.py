@@ -24,6 +24,7 @@ _log = logging.getLogger(__name__)
 _STARTED: Final = 3.0  # seconds before a job begins: Python, torch, the configuration
 _SR: Final = 0.2  # share of the time that is left which SR images may take
 _CROP: Final = 96  # px of the crop that a network is timed on
+_LOADED: Final = 32  # px of one before it: the first call of a network also loads it
 _LEAST_MEGAPIXELS: Final = 0.1
 _LEAST: Final = 60  # iterations: with fewer there is nothing to look at
 _PILOT: Final = 8.0  # seconds of iterations that are timed
@@ -59,6 +60,7 @@ class Budget:
         if (network := network_of(prior)) is None or not frames:
             return None
         photo = frames[0].load()[:_CROP, :_CROP]
+        network("a crop, to load the network", photo[:_LOADED, :_LOADED], factor)
         began = time.perf_counter()
         made = network("a crop, to measure the time", photo, factor)
         each = passes_of(prior) * (time.perf_counter() - began) / (made.shape[0] * made.shape[1])
