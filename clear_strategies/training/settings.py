@@ -22,7 +22,7 @@ class FitSettings:
         degree_every: iterations after which one more degree becomes active.
         probe_every: iterations between evaluations of the test views; 0: never.
         probe_views: how many test views these evaluate.
-        checkpoint_every: iterations between checkpoints; 0: only when interrupted.
+        checkpoint_every: iterations between checkpoints; 0: only at the end, or when interrupted.
         keep: how many checkpoints stay, at least 1.
         memory: MiB that training may take, loading included; None: what is free on this machine. More is refused before the
             first iteration.
