@@ -98,14 +98,15 @@ class Run:
 
 
 def collect(folders: Iterable[Path]) -> list[Run]:
-    """Every finished run at or below the folders: the jobs of a sweep by number, other runs by path. A baseline that
-    trained beside a run (`fit.baseline`) comes before it, and once: it is left out, with a message, where another run of
-    the same configuration is there. Unfinished and damaged runs are logged and left out.
+    """Every finished run at or below the folders and the links in them: the jobs of a sweep by number, other runs by path. A
+    baseline that trained beside a run (`fit.baseline`) comes before it, and once: it is left out, with a message, where another
+    run of the same configuration is there. Unfinished and damaged runs are logged and left out.
 
     Raises:
         DataError: there is no finished run.
     """
     folders = list(folders)
+    folders += [link for folder in folders for link in _sorted(folder.glob("*")) if link.is_symlink() and link.is_dir()]
     found: dict[Path, None] = {}
     for folder in folders:
         runs_here = _sorted(path.parent for path in folder.rglob("metrics.json"))

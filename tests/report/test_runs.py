@@ -55,6 +55,13 @@ def test_runs_of_a_sweep_are_in_the_order_of_their_jobs(tmp_path: Path) -> None:
     assert [run.name for run in report.collect([tmp_path])] == ["baseline", "clear", "more"]
 
 
+def test_runs_that_are_linked_into_a_folder_belong_to_it_and_count_once(tmp_path: Path) -> None:
+    ours = make_run(tmp_path / "runs" / "ours", "+strategy=gco")
+    (tmp_path / "runs" / "latest").symlink_to(ours)
+    (tmp_path / "runs" / "sweep").symlink_to(make_run(tmp_path / "disk" / "sweep" / "0", "+strategy=clear").parent)
+    assert [run.name for run in report.collect([tmp_path / "runs"])] == ["gco", "clear"]
+
+
 def test_damaged_and_unfinished_runs_are_left_out_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
