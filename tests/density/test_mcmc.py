@@ -11,7 +11,7 @@ from clear_strategies import MCMC, Update
 from clear_strategies.core.gradients import Grads
 from clear_strategies.density.base import DensityError
 from clear_strategies.density.mcmc import Sampler, relocation
-from clear_strategies.errors import DivergedError, SettingError
+from clear_strategies.errors import DivergedError
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training import checkpoint
 from clear_strategies.training.densifier import Densifier
@@ -220,21 +220,6 @@ def test_a_number_that_is_not_finite_ends_the_run_before_a_round():
     theta.scales.data[4] = torch.nan
     with pytest.raises(DivergedError, match="before densification, the parameter of scales"):
         step(theta, optimizer, densifier)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"every": 0}, "every: must"),
-        ({"growth": -0.1}, "growth: must"),
-        ({"per_point": 0.5}, "per_point: must"),
-        ({"noise": float("inf")}, "noise: must"),
-        ({"dead_opacity": 0.0}, "dead_opacity: must"),
-    ],
-)
-def test_settings_outside_their_range_are_refused(changes, message):
-    with pytest.raises(SettingError, match=message):
-        replace(EVERY, **changes)
 
 
 def test_views_change_nothing_by_themselves():

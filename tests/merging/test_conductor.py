@@ -195,8 +195,6 @@ def test_a_scale_that_the_objective_needs_is_asked_for():
         Conductor().update(field.raw(), None, hr, view, 5)
     with pytest.raises(ValueError, match="L_base must act from the first iteration"):
         Objective(lambda_lr=0.0)
-    with pytest.raises(ValueError, match="lambda_lr: must be a finite number >= 0"):
-        Objective(lambda_lr=-1.0)
 
 
 def test_a_weight_without_warm_up_is_constant_from_the_first_iteration():

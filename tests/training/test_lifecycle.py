@@ -15,7 +15,6 @@ from clear_strategies.core.gradients import Grads
 from clear_strategies.core.points import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.density.base import DensityError
-from clear_strategies.errors import SettingError
 from clear_strategies.schedules import scaled
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training.densifier import cameras_extent
@@ -213,8 +212,6 @@ def test_a_short_run_gives_f_det_a_share_of_its_rate(caplog):
     assert "rate of 0.0005 instead of 0.0025: the run has 300 iterations" in caplog.text
     assert plain.of_run(1_500) == plain
     assert replace(plain, detail_steps=0).of_run(1) == replace(plain, detail_steps=0)
-    with pytest.raises(SettingError, match="detail_steps: must be a whole number of at least 0"):
-        LearningRates(detail_steps=-1)
 
 
 def test_a_short_run_moves_the_geometry_faster_and_nothing_else():
@@ -226,8 +223,6 @@ def test_a_short_run_moves_the_geometry_faster_and_nothing_else():
     assert replace(short, means=plain.means, scales=plain.scales, quats=plain.quats) == rates
     assert rates.of_run(30_000) == rates.of_run(60_000) == rates
     assert plain.of_run(1_500) == plain
-    with pytest.raises(SettingError, match="geometry_steps: must be a whole number of at least 0"):
-        LearningRates(geometry_steps=-1)
 
 
 def test_in_the_last_tenth_all_rates_fall_to_zero_but_that_of_the_means_falls_all_along():
@@ -243,8 +238,6 @@ def test_in_the_last_tenth_all_rates_fall_to_zero_but_that_of_the_means_falls_al
             assert last[name] == pytest.approx(rate / 1_001)
     assert held.at(30_000, 1.0)["sh0"] == held.sh0  # of a longer run, whose milestones do not stretch
     assert scaled(rates, 0.15).at(1_500, 1.0)["scales"] == pytest.approx(rates.scales / 151)
-    with pytest.raises(SettingError, match="end: must be a whole number of at least 9000"):
-        LearningRates(end=8_000)
 
 
 def test_the_3d_filter_by_hand_and_unseen_gaussians_take_the_largest():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from clear_strategies.data.points import CloudSettings, initial_points
 from clear_strategies.data.points.compared import compared_at
 from clear_strategies.data.readers import llff
 from clear_strategies.data.view_settings import ViewSettings, split
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import DataError
 from clear_strategies.geometry import StereoSettings, depth_maps
 from clear_strategies.geometry.projection import project
 from tests.helpers.planes import photo, plane_photos, sfm
@@ -160,33 +159,6 @@ def test_outliers_are_removed_before_densification_and_voxels_averaged_after(tmp
     chosen = CloudSettings(init="ply", path=str(tmp_path / "p.ply"))
     assert initial_points(chosen, [photo()]).cloud.means[:, 2].max() < 6
     assert len(initial_points(replace(chosen, voxel=1000.0), [photo()]).cloud) == 1
-
-
-@pytest.mark.parametrize(
-    ("wrong", "value", "rule"),
-    [
-        ("init", "dense", "must be one of auto, stereo, triangulated, sfm_train, sfm, ply, random"),
-        ("densify", "maybe", "must be one of True, False, auto"),
-        ("stride", 0, "must be a whole number of at least 1"),
-        ("stride", 1.5, "must be a whole number of at least 1"),
-        ("max_points", -1, "must be a whole number of at least 1"),
-        ("outlier_neighbours", 1, "must be 0 or at least 2"),
-        ("outlier_ratio", math.nan, "must be a finite number > 0"),
-        ("outlier_ratio", None, "must be a finite number > 0"),
-        ("voxel", 0.0, "must be a finite number > 0"),
-        ("box", math.inf, "must be a finite number > 0"),
-    ],
-)
-def test_settings_out_of_range_are_refused_by_name(wrong: str, value: object, rule: str) -> None:
-    chosen = CloudSettings()
-    object.__setattr__(chosen, wrong, value)  # past the type checks, which only tests have
-    with pytest.raises(SettingError, match=rf"data\.cloud\.{wrong}: {rule}.*, got {value!r}: "):
-        chosen.__post_init__()
-
-
-def test_a_file_must_be_named() -> None:
-    with pytest.raises(SettingError, match=r"data\.cloud\.path: init=ply needs a PLY file, got None"):
-        CloudSettings(init="ply")
 
 
 def test_fern_is_triangulated_from_three_lr_images(shared_data: Path) -> None:
