@@ -5,30 +5,18 @@ from __future__ import annotations
 import pytest
 import torch
 
-from clear_strategies.data.capture import Capture, Frame
+from clear_strategies.data.capture import Capture
 from clear_strategies.data.hr_limit import within_limit
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import prepare
 from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.view_settings import ViewSettings
-from rasterizers import Camera
-
-
-def capture(*sizes: tuple[int, int]) -> Capture:
-    """Photos of these sizes, (width, height)."""
-    frames = []
-    for i, (width, height) in enumerate(sizes):
-        pose = torch.eye(4)
-        pose[0, 3] = -i
-        image = torch.linspace(0, 1, width)[None, :, None].expand(height, width, 3)
-        camera = Camera(pose, 1.2 * width, 1.2 * width, width / 2, height / 2, width, height)
-        frames.append(Frame(f"{i}.png", camera, lambda image=image: image.contiguous()))
-    return Capture("made up", tuple(frames))
+from tests.helpers.captures import in_a_row
 
 
 def held(size: tuple[int, int], *, super_resolve: bool = False, **settings) -> tuple[Capture, ViewSettings]:
     return within_limit(
-        capture(size, size), ViewSettings(**settings), reaches=lambda _: True, super_resolve=super_resolve
+        in_a_row(size, size), ViewSettings(**settings), reaches=lambda _: True, super_resolve=super_resolve
     )
 
 
@@ -82,7 +70,7 @@ def test_without_a_limit_and_under_the_protocols_nothing_changes():
 def test_photos_of_two_sizes_are_reduced_by_one_ratio_and_trained_on_at_both_scales():
     views = ViewSettings(max_hr_megapixels=0.004)
     found, views = within_limit(
-        capture((100, 80), (80, 100), (50, 40)), views, reaches=lambda _: True, super_resolve=False
+        in_a_row((100, 80), (80, 100), (50, 40)), views, reaches=lambda _: True, super_resolve=False
     )
     sizes = [(frame.camera.width, frame.camera.height) for frame in found.frames]
     assert sizes == [(72, 56), (56, 72), (36, 28)]

@@ -39,13 +39,9 @@ POINT = struct.pack("<3f", 1, 2, 3)
 def test_gaussians_are_written_byte_for_byte_in_the_standard_layout(tmp_path: Path) -> None:
     shN = torch.arange(9.0).view(1, 3, 3) + 10  # band b, channel c: 10 + 3b + c
     one = GaussianPly(
-        means=torch.tensor([[1.0, 2, 3]]),
-        sh0=torch.tensor([[[4.0, 5, 6]]]),
-        shN=shN,
-        opacities=torch.tensor([7.0]),
-        scales=torch.tensor([[-1.0, -2, -3]]),
-        quats=torch.tensor([[0.5, 0.25, 0.125, 0]]),
-    )
+        means=torch.tensor([[1.0, 2, 3]]), sh0=torch.tensor([[[4.0, 5, 6]]]), shN=shN, opacities=torch.tensor([7.0]),
+        scales=torch.tensor([[-1.0, -2, -3]]), quats=torch.tensor([[0.5, 0.25, 0.125, 0]]),
+    )  # fmt: skip
     write_gaussians(tmp_path / "g.ply", one)
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(9)]

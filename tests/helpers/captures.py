@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from clear_strategies.data.capture import Frame
+from clear_strategies.data.capture import Capture, Frame
+from rasterizers import Camera
 
 WIDTH, HEIGHT = 16, 12
 FOCAL = 20.0
@@ -49,6 +50,20 @@ def largest_turn(a: Sequence[Frame], b: Sequence[Frame]) -> float:
     relative = (found[1:] @ found[:1].mT) @ (real[1:] @ real[:1].mT).mT
     cosine = (relative.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2
     return float(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))).max())
+
+
+def in_a_row(*sizes: tuple[int, int], image: torch.Tensor | None = None) -> Capture:
+    """Photos of these sizes, (width, height), from places side by side; gradients, unless an image is given."""
+    frames = []
+    for i, (width, height) in enumerate(sizes):
+        pose = torch.eye(4)
+        pose[0, 3] = -i
+        camera = Camera(pose, 1.2 * width, 1.2 * width, 0.45 * width, 0.55 * height, width, height)
+        shown = (
+            torch.linspace(0, 1, width)[None, :, None].expand(height, width, 3).contiguous() if image is None else image
+        )
+        frames.append(Frame(f"{i:04d}.png", camera, lambda shown=shown: shown))
+    return Capture("made up", tuple(frames))
 
 
 def write_photos(folder: Path, size: tuple[int, int] = (WIDTH, HEIGHT), mode: str = "RGB") -> None:

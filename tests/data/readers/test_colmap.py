@@ -54,13 +54,6 @@ def test_smaller_photos_rescale_their_cameras_per_axis(tmp_path: Path) -> None:
     assert "16x12 to 8x7" in capture.notes["cameras"]
 
 
-def test_photos_may_differ_from_the_model_in_their_ending(tmp_path: Path) -> None:
-    image = tiny.colmap_bin(tmp_path) / "images/b.png"
-    Image.open(image).save(image.with_suffix(".jpg"))
-    image.unlink()
-    assert [frame.name for frame in colmap.read(tmp_path).frames] == ["a.png", "b.jpg", "c.png"]
-
-
 def test_a_folder_is_listed_once_however_many_endings_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     photos = tiny.colmap_bin(tmp_path) / "images"
     for name in tiny.NAMES:

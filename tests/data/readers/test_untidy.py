@@ -92,11 +92,3 @@ def test_a_photo_on_its_side_is_turned_where_the_camera_is_not_that_of_the_store
     frame = read(root).frames[1]
     assert (frame.camera.width, frame.camera.height) == (WIDTH, HEIGHT)
     assert torch.equal((frame.load() * 255).round().to(torch.uint8), torch.from_numpy(expected))
-
-
-def test_a_photo_upside_down_is_refused_because_no_camera_tells(tmp_path):
-    root, folder, read = built(tmp_path, "colmap")
-    captures.turn(folder / "b.png", 3, rotate=False)
-    with pytest.raises(DataError) as refusal:
-        read(root)
-    one_line(refusal, "b.png", "EXIF orientation", "mogrify -auto-orient")
