@@ -88,11 +88,8 @@ def test_a_strategy_is_found_twice_however_deep_it_is_named(tmp_path, monkeypatc
     require_each_once(["+strategy=all"])
     require_each_once(["+strategy=[clear,extra]"])
     for said, twice in (
-        ("[p2g,all]", "p2g"),
-        ("[extra,best]", "extra"),
-        ("[all,clear]", "gco"),
-        ("[best,best]", "gco"),
-    ):
+        ("[p2g,all]", "p2g"), ("[extra,best]", "extra"), ("[all,clear]", "gco"), ("[best,best]", "gco"),
+    ):  # fmt: skip
         with pytest.raises(SettingError, match=f"got {twice} twice"):
             require_each_once([f"+strategy={said}"])
 
@@ -140,18 +137,13 @@ def test_the_two_sets_of_readings_differ_where_they_say():
 @pytest.mark.parametrize(
     ("chosen", "steps"),
     [
-        ((), 30_000),
-        (("+strategy=best", "+scene=fern"), 30_000),
-        (("optim=3dgs",), 0),
-        (("+method=srgs",), 0),
-        (("+method=dropgaussian_srgs", "optim=by_length"), 30_000),
-        (("+protocol=llff_x4",), 0),
-        (("+protocol=llff_x4", "+strategy=best", "optim=by_length"), 30_000),
-        (("experiment=llff_x4",), 0),
+        ((), 30_000), (("+strategy=best", "+scene=fern"), 30_000), (("optim=3dgs",), 0), (("+method=srgs",), 0),
+        (("+method=dropgaussian_srgs", "optim=by_length"), 30_000), (("+protocol=llff_x4",), 0),
+        (("+protocol=llff_x4", "+strategy=best", "optim=by_length"), 30_000), (("experiment=llff_x4",), 0),
         (("experiment=evidence",), 0),
     ],
     ids=str,
-)
+)  # fmt: skip
 def test_what_was_published_keeps_its_rates(chosen, steps):
     assert composed(*chosen).optim.geometry_steps == steps
 
@@ -246,14 +238,8 @@ def test_a_host_gets_the_strategies_and_the_decorators_of_best():
     best = conductor("best")
     assert [type(s) for s in best.strategies] == [type(s) for s in run.conductor(1.0).strategies]
     assert [type(s).__name__ for s in best.strategies] == [
-        "GCO",
-        "P2G",
-        "SVS",
-        "PseudoViews",
-        "FadingOpacity",
-        "MCMC",
-        "RandomBackground",
-    ]
+        "GCO", "P2G", "SVS", "PseudoViews", "FadingOpacity", "MCMC", "RandomBackground",
+    ]  # fmt: skip
     assert best.prior(Bicubic()) == run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic())
 
 

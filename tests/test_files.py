@@ -54,10 +54,8 @@ def test_json_has_null_where_a_number_is_not_finite(tmp_path: Path) -> None:
 
 def test_csv_leaves_a_missing_cell_and_a_nan_empty(tmp_path: Path) -> None:
     rows: list[dict[str, object]] = [
-        {"t": 1, "loss": 0.5, "ignored": 9},
-        {"t": 2, "loss": math.nan},
-        {"t": 3, "why": 'a, "b"'},
-    ]
+        {"t": 1, "loss": 0.5, "ignored": 9}, {"t": 2, "loss": math.nan}, {"t": 3, "why": 'a, "b"'},
+    ]  # fmt: skip
     files.write_csv(tmp_path / "t.csv", rows, ["t", "loss", "why"])
     with (tmp_path / "t.csv").open(newline="") as file:
         assert list(csv.reader(file)) == [

@@ -12,14 +12,10 @@ from clear_strategies.errors import SettingError
 @pytest.mark.parametrize(
     ("file", "kind"),
     [
-        ("transforms_train.json", "blender"),
-        ("transforms.json", "nerfstudio"),
-        ("poses_bounds.npy", "llff"),
-        ("sparse/0/cameras.bin", "colmap"),
-        ("sparse/cameras.txt", "colmap"),
-        ("photo.jpg", "photos"),
+        ("transforms_train.json", "blender"), ("transforms.json", "nerfstudio"), ("poses_bounds.npy", "llff"),
+        ("sparse/0/cameras.bin", "colmap"), ("sparse/cameras.txt", "colmap"), ("photo.jpg", "photos"),
     ],
-)
+)  # fmt: skip
 def test_the_reader_is_the_one_of_what_lies_in_the_folder(tmp_path, file, kind):
     (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / file).touch()
@@ -57,14 +53,8 @@ def test_a_folder_of_any_name_becomes_data_path(tmp_path, name):
     assert tree(config)["data"]["path"] == str(folder)
     assert config.fit.iterations == 7
     assert set(config.strategies) == {
-        "gco",
-        "p2g",
-        "svs",
-        "pseudo_views",
-        "fading_opacity",
-        "mcmc",
-        "random_background",
-    }
+        "gco", "p2g", "svs", "pseudo_views", "fading_opacity", "mcmc", "random_background",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

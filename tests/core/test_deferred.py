@@ -49,11 +49,8 @@ def test_a_number_that_takes_part_in_several_crosses_once(on_a_device, monkeypat
     monkeypatch.setattr(torch, "stack", lambda tensors, real=torch.stack: moved.append(len(tensors)) or real(tensors))
     a, b = torch.tensor(1.0), torch.tensor(2.0)
     assert deferred.read([deferred.defer(deferred.added, a, b), deferred.defer(deferred.ratio, a, b), a, 5.0]) == [
-        3.0,
-        0.5,
-        1.0,
-        5.0,
-    ]
+        3.0, 0.5, 1.0, 5.0,
+    ]  # fmt: skip
     assert moved == [2]
 
 

@@ -14,12 +14,9 @@ from types import ModuleType
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = [
-    ROOT / "README.md",
-    ROOT / "CONTRIBUTING.md",
-    ROOT / "CHANGELOG.md",
-    ROOT / "integration" / "README.md",
+    ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "integration" / "README.md",
     *sorted(DOCS.rglob("*.md")),
-]
+]  # fmt: skip
 OURS = ("clear_strategies", "rasterizers", "integration")
 
 

@@ -58,43 +58,28 @@ def start(
         "gco": GCO,
         "p2g": P2G,
         "svs": lambda: SVS(
-            dropout=Ramp(full=ITERATIONS),
-            anchor_start=12,
-            anchor_strength=0.01,
+            dropout=Ramp(full=ITERATIONS), anchor_start=12, anchor_strength=0.01,
             anchor_weights={"means": 1.0, "scales": 1.0, "sh0": 0.1, "detail": 0.1},
         ),
         "pseudo_views": lambda: PseudoViews(count=8, reach=0.1),
         "fading_opacity": lambda: FadingOpacity(rate=0.02, until=1_350),
         "random_background": lambda: RandomBackground(until=1_350),
-    }
+    }  # fmt: skip
     objective = Objective(lambda_hr=WarmupDecay(final=0.1, start=3, full=8, decay_from=14, end=ITERATIONS))
     return TrainState.start(
         with_depth(SCENE) if "pseudo_views" in names else SCENE,
         Conductor(*(make[name]() for name in names), *more, objective=objective, statistics_from=1),
         settings=FitSettings(
-            iterations=iterations,
-            scale_schedule=False,
-            degree_every=6,
-            probe_every=0,
-            checkpoint_every=0,
-            seed=5,
+            iterations=iterations, scale_schedule=False, degree_every=6, probe_every=0, checkpoint_every=0, seed=5,
             fused=fused,
         ),
         density=DensitySettings(
-            start=1,
-            stop=13,
-            statistics_from=1,
-            every=5,
-            reset_every=6,
-            threshold=1e-5,
-            prune_opacity=0.005,
-            prune_world=PRUNE_WORLD,
-            min_gaussians=2,
-            max_gaussians=40,
+            start=1, stop=13, statistics_from=1, every=5, reset_every=6, threshold=1e-5, prune_opacity=0.005,
+            prune_world=PRUNE_WORLD, min_gaussians=2, max_gaussians=40,
         ),
         rates=LearningRates(means=LogLinear(end=ITERATIONS), detail_decay=0.01),
         mip=MipFilter(every=7, last=1),
-    )
+    )  # fmt: skip
 
 
 def tensors(state: TrainState) -> dict[str, torch.Tensor]:

@@ -71,11 +71,9 @@ def scene(n: int = 40, seed: int = 0, train: int = 3, test: int = 1) -> Scene:
     # The held-out view lies between training views.
     held = set(range(1, 2 * test, 2))
     return Scene(
-        "toy",
-        train=tuple(v for i, v in enumerate(views) if i not in held),
-        test=tuple(v for i, v in enumerate(views) if i in held),
-        cloud=cloud,
-    )
+        "toy", train=tuple(v for i, v in enumerate(views) if i not in held),
+        test=tuple(v for i, v in enumerate(views) if i in held), cloud=cloud,
+    )  # fmt: skip
 
 
 def cloud(n: int = 12, seed: int = 0) -> PointCloud:

@@ -125,14 +125,11 @@ def test_3dgut_trains_without_a_score(host, scene, tmp_path):
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (["--app-opt"], "app_opt"),
-        (["--random-bkgd"], "random_bkgd"),
-        (["--visible-adam"], "visible_adam"),
-        (["--batch-size", "2"], "batch_size"),
-        (["--patch-size", "8"], "patch_size"),
+        (["--app-opt"], "app_opt"), (["--random-bkgd"], "random_bkgd"), (["--visible-adam"], "visible_adam"),
+        (["--batch-size", "2"], "batch_size"), (["--patch-size", "8"], "patch_size"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
-)
+)  # fmt: skip
 def test_options_that_change_one_scale_are_refused_before_the_first_step(host, scene, tmp_path, options, named):
     if named == "visible_adam" and host.name == "gsplat-1.6.0":
         pytest.skip("this gsplat's script gives its SelectiveAdam an argument that it does not take")

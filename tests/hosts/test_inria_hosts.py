@@ -41,11 +41,8 @@ def host(request):
 def training(host, **more):
     """The trainer's options."""
     return [
-        *HOSTS[host.name],
-        "--eval",
-        "--port=0",
-        *(f"--{name}={value}" for name, value in (TRAINING | more).items()),
-    ]
+        *HOSTS[host.name], "--eval", "--port=0", *(f"--{name}={value}" for name, value in (TRAINING | more).items()),
+    ]  # fmt: skip
 
 
 def launched(host, scene, model, *extra, points="own", status=0, **more):

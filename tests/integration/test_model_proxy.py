@@ -13,12 +13,9 @@ from rasterizers.geometry import SH_C0
 
 N = 8
 ROLES = (
-    ("get_opacity", "gate"),
-    ("get_opacity_with_3D_filter", "gate"),
-    ("get_scaling_n_opacity_with_3D_filter", "gate"),
-    ("get_opacities", "gate"),
-    ("_features_dc", "detail"),
-)
+    ("get_opacity", "gate"), ("get_opacity_with_3D_filter", "gate"), ("get_scaling_n_opacity_with_3D_filter", "gate"),
+    ("get_opacities", "gate"), ("_features_dc", "detail"),
+)  # fmt: skip
 
 
 class Model:

@@ -151,14 +151,11 @@ def test_the_command_line_has_its_settings():
 @pytest.mark.parametrize(
     "setting",
     [
-        {"num_downscales": 2},
-        {"background_color": "random"},
-        {"use_bilateral_grid": True},
-        {"sh_degree": 0},
+        {"num_downscales": 2}, {"background_color": "random"}, {"use_bilateral_grid": True}, {"sh_degree": 0},
         {"factor": 1},
     ],
     ids=lambda setting: next(iter(setting)),
-)
+)  # fmt: skip
 def test_settings_that_do_not_work_with_two_scales_are_refused(setting):
     with pytest.raises(SettingError, match=next(iter(setting))):
         ClearSplatfactoModelConfig(**setting)

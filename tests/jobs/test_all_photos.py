@@ -74,10 +74,8 @@ def fingerprint(scene: Scene) -> str:
                 digest.update((image * 255).round().to(torch.uint8).numpy().tobytes())
             for camera in (view.lr.camera, view.hr.camera):
                 size = (
-                    camera.width,
-                    camera.height,
-                    *(round(x, 6) for x in (camera.fx, camera.fy, camera.cx, camera.cy)),
-                )
+                    camera.width, camera.height, *(round(x, 6) for x in (camera.fx, camera.fy, camera.cx, camera.cy)),
+                )  # fmt: skip
                 pose = [[round(x, 6) + 0.0 for x in row] for row in camera.world_to_camera.tolist()]
                 digest.update(json.dumps([view.name, size, pose]).encode())
     return digest.hexdigest()[:16]

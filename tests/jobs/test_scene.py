@@ -84,12 +84,10 @@ def test_the_demo_prior_without_errors_gives_the_hr_photos_whatever_their_size(s
 @pytest.mark.parametrize(
     ("write", "reader"),
     [
-        (captures.llff, llff.read),
-        (captures.colmap_bin, colmap.read),
-        (captures.nerfstudio, nerfstudio.read),
+        (captures.llff, llff.read), (captures.colmap_bin, colmap.read), (captures.nerfstudio, nerfstudio.read),
         (captures.blender, blender.read),
     ],
-)
+)  # fmt: skip
 def test_no_photos_of_a_folder_called_demo_are_taken_for_their_own_sr_images(write, reader, tmp_path, monkeypatch):
     monkeypatch.setattr(ncnn, "find_spec", lambda name: None)
     root = write(tmp_path / "demo")

@@ -19,15 +19,12 @@ def history(n: int = 100, **columns: float) -> list[dict[str, float]]:
 @pytest.mark.parametrize(
     "rows",
     [
-        [],
-        history(1, loss_lr=0.1),
-        history(loss_lr=0.1),
-        history(loss_lr=0.0, conflict=math.nan),
+        [], history(1, loss_lr=0.1), history(loss_lr=0.1), history(loss_lr=0.0, conflict=math.nan),
         history(loss_lr=0.1, loss_base=0.2, loss_hf=0.05, conflict=0.3, conflict_means=0.2, mean_q=0.9, corrected=0.1),
         [*history(5, loss_lr=0.1), {"t": 6.0, "loss_lr": math.inf, "psnr_test": 20.0, "n_gaussians": 100.0}],
     ],
     ids=["nothing", "one iteration", "LR alone", "zeros and NaN", "everything", "an infinity"],
-)
+)  # fmt: skip
 @pytest.mark.filterwarnings("error")
 def test_curves_draw_whatever_was_measured(tmp_path: Path, rows: list[dict[str, float]]) -> None:
     marks = {"HR from": 5, "HR full": 30, "opacity reset": 30, "anchor": 50}

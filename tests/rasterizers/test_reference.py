@@ -103,14 +103,11 @@ def test_a_scaled_camera_has_the_same_field_of_view():
 @pytest.mark.parametrize(
     "change",
     [
-        lambda p: p.mul_(0),
-        lambda p: p[:3, :3].mul_(2),
-        lambda p: p[0].neg_(),
-        lambda p: p[0, 1].add_(0.1),
+        lambda p: p.mul_(0), lambda p: p[:3, :3].mul_(2), lambda p: p[0].neg_(), lambda p: p[0, 1].add_(0.1),
         lambda p: p[3, 3].mul_(2),
     ],
     ids=["zero", "scaled", "reflected", "sheared", "last row"],
-)
+)  # fmt: skip
 def test_a_pose_that_is_not_rigid_is_refused(change):
     pose = torch.eye(4)
     change(pose)

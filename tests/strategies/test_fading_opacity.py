@@ -70,11 +70,9 @@ def test_a_run_fades_and_every_row_has_the_bits_of_the_pass_that_skips_some():
     states = {
         name: start(("gco", "svs"), more=more)
         for name, more in (
-            ("plain", ()),
-            ("fading", (FadingOpacity(rate=0.05),)),
-            ("every row", (FadingOpacity(rate=0.05),)),
+            ("plain", ()), ("fading", (FadingOpacity(rate=0.05),)), ("every row", (FadingOpacity(rate=0.05),)),
         )
-    }
+    }  # fmt: skip
     every_row = states["every row"]
     every_row.compiled_step = CompiledStep(every_row.conductor, every_row.optimizer, skips=False)
     for state in states.values():

@@ -100,14 +100,8 @@ def attacks() -> Iterator[BadInput]:
 
 
 _EVENTS = {
-    "os.system",
-    "os.exec",
-    "os.posix_spawn",
-    "os.fork",
-    "subprocess.Popen",
-    "socket.connect",
-    "socket.getaddrinfo",
-}
+    "os.system", "os.exec", "os.posix_spawn", "os.fork", "subprocess.Popen", "socket.connect", "socket.getaddrinfo",
+}  # fmt: skip
 _WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _SECRETS = ("secret", "/etc/passwd", "/etc/hostname")
 

@@ -26,13 +26,9 @@ def without_time(history: list[dict[str, float]]) -> str:
 
 
 STATES = [
-    (),
-    ("gco",),
-    ("p2g",),
-    ("svs",),
-    ("gco", "p2g", "svs"),
+    (), ("gco",), ("p2g",), ("svs",), ("gco", "p2g", "svs"),
     ("gco", "p2g", "svs", "pseudo_views", "fading_opacity", "random_background"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.slow

@@ -71,18 +71,10 @@ def test_a_transforms_file_is_a_path(tmp_path):
 @pytest.mark.parametrize(
     "content",
     [
-        "",
-        "[]",
-        "[1]",
-        "{}",
-        '{"frames": []}',
-        '{"camera_path": []}',
-        '{"camera_path": [{"fov": 50}]}',
-        "[{}]",
-        "[{",
-        "nonsense",
+        "", "[]", "[1]", "{}", '{"frames": []}', '{"camera_path": []}', '{"camera_path": [{"fov": 50}]}', "[{}]",
+        "[{", "nonsense",
     ],
-)
+)  # fmt: skip
 def test_what_is_no_path_is_refused_in_one_line(tmp_path, content):
     (tmp_path / "path.json").write_text(content)
     with pytest.raises(DataError, match=r"path\.json"):

@@ -36,13 +36,9 @@ class GaussianModel:
 
     def training_setup(self, opt):
         rates = {
-            "xyz": opt.position_lr,
-            "f_dc": 2.5e-3,
-            "f_rest": 1.25e-4,
-            "opacity": 0.05,
-            "scaling": 5e-3,
+            "xyz": opt.position_lr, "f_dc": 2.5e-3, "f_rest": 1.25e-4, "opacity": 0.05, "scaling": 5e-3,
             "rotation": 1e-3,
-        }
+        }  # fmt: skip
         groups = [{"params": [getattr(self, a)], "lr": rates[name], "name": name} for name, a in GROUPS.items()]
         self.optimizer = torch.optim.Adam(groups, lr=0.0, eps=1e-15)
 
