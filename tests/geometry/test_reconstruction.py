@@ -15,7 +15,7 @@ from clear_strategies.data.readers import demo
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry import Stereo, StereoSettings, depth_maps, stereo
 from clear_strategies.geometry.projection import intrinsics
-from tests.helpers.planes import plane_photos
+from tests.helpers.planes import plane_photos, same_maps
 
 QUICK = StereoSettings(enlarge=1, max_planes=32)
 
@@ -35,11 +35,7 @@ def arguments(photos: Sequence[Photo]) -> dict[str, Any]:
 
 
 def same(a: Stereo, b: Stereo) -> bool:
-    maps = [
-        torch.equal(x.depth.nan_to_num(-1), y.depth.nan_to_num(-1)) and torch.equal(x.confidence, y.confidence)
-        for x, y in zip(a.depths, b.depths, strict=True)
-    ]
-    return all(maps) and torch.equal(a.means, b.means) and torch.equal(a.colors, b.colors)
+    return same_maps(a.depths, b.depths) and torch.equal(a.means, b.means) and torch.equal(a.colors, b.colors)
 
 
 @pytest.fixture(scope="module")
@@ -125,9 +121,7 @@ def test_no_filled_point_is_hidden_in_the_only_photo_that_sees_it() -> None:
     assert float(of(photos).means[:, 1].max()) > float(found.means[:, 1].max())
 
 
-def test_without_opencv_and_kornia_the_cameras_give_the_range(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_opencv_and_kornia_the_cameras_give_the_range(monkeypatch, caplog):
     without(monkeypatch, "cv2", "kornia")
     found = of(plane_photos(3, 64, 48))
     assert all(depth.coverage > 0.4 for depth in found.depths)
@@ -136,9 +130,7 @@ def test_without_opencv_and_kornia_the_cameras_give_the_range(
     assert line.endswith("pip install 'clear-strategies[train]'")
 
 
-def test_without_scipy_nothing_is_filled_or_removed(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_scipy_nothing_is_filled_or_removed(monkeypatch, caplog):
     without(monkeypatch, "scipy")
     found = of(plane_photos(3, 64, 48))
     assert len(found.means) > 500
@@ -153,10 +145,7 @@ def test_depth_maps_alone_are_those_of_stereo(found: Stereo) -> None:
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "one photo": ({"images": [torch.rand(48, 64, 3)]}, "images: must be at least 2 photos, got 1"),
-    "poses": (
-        {"world_to_camera": torch.eye(4)},
-        r"world_to_camera: must have shape \(2, 4, 4\) for 2 photos, got \(4, 4\)",
-    ),
+    "poses": ({"world_to_camera": torch.eye(4)}, r"world_to_camera: must have shape \(2, 4, 4\) .*, got \(4, 4\)"),
     "Ks": ({"Ks": torch.eye(3).expand(3, 3, 3)}, r"Ks: must have shape \(2, 3, 3\)"),
     "alpha": ({"images": torch.rand(2, 48, 64, 4)}, r"images\[0\]: must have shape \[h, w, 3\], got \(48, 64, 4\)"),
     "whole numbers": ({"images": torch.ones(2, 4, 4, 3, dtype=torch.long)}, "must be uint8 or floating point"),
@@ -169,19 +158,13 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "normalized K": ({"Ks": torch.diag(torch.tensor([0.0, 0, 1])).expand(2, 3, 3)}, "camera 0: focal lengths"),
     "features": ({"features": (torch.zeros(2, 3), torch.zeros(3, 3))}, "features: must be positions"),
-    "features far away": (
-        {"features": (torch.full((1, 3), torch.inf), torch.zeros(1, 3))},
-        "must have finite positions",
-    ),
+    "features far away": ({"features": (torch.full((1, 3), torch.inf), torch.zeros(1, 3))}, "have finite positions"),
     "colours": ({"features": (torch.zeros(1, 3), torch.full((1, 3), 255.0))}, r"must have colours in \[0, 1\]"),
     "too few masks": ({"masks": [None]}, "masks: must be one for each of 2 photos, got 1"),
-    "mask of another size": (
-        {"masks": [None, torch.ones(64, 48)]},
-        r"masks\[1\]: must have shape \(48, 64\), got \(64, 48\)",
-    ),
+    "mask of another size": ({"masks": [None, torch.ones(64, 48)]}, r"masks\[1\]: must have shape \(48, 64\)"),
     "one place": (
         {"world_to_camera": torch.eye(4).expand(2, 4, 4)},
-        "images: stereo confirms no depth in any of the 2 photos: check the poses",
+        "images: stereo confirms no depth in any of the 2",
     ),
 }
 

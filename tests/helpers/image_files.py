@@ -10,6 +10,10 @@ from PIL import Image
 from torch import Tensor
 
 
+def noise(seed: int, height: int = 24, width: int = 20) -> Tensor:
+    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed))
+
+
 def random_image(seed: int, height: int = 40, width: int = 60) -> Tensor:
     """8-bit levels, so that a PNG holds it exactly."""
     generator = torch.Generator().manual_seed(seed)

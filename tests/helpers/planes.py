@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from clear_strategies.core.points import PointCloud
-from clear_strategies.core.view import Photo
+from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import SfmPoints
 from rasterizers.interface import Camera
 
@@ -35,6 +37,14 @@ def plane_photos(count: int, width: int = 120, height: int = 90) -> list[Photo]:
     return [
         Photo(camera(0.4 * i, width, height), texture[:, 10 * i : 10 * i + width].contiguous()) for i in range(count)
     ]
+
+
+def same_maps(a: Sequence[DepthMap], b: Sequence[DepthMap]) -> bool:
+    """Whether depth and confidence have the same bits."""
+    return all(
+        torch.equal(x.depth.nan_to_num(-1), y.depth.nan_to_num(-1)) and torch.equal(x.confidence, y.confidence)
+        for x, y in zip(a, b, strict=True)
+    )
 
 
 def cloud_of(means: Tensor) -> PointCloud:

@@ -17,14 +17,11 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.outputs.image_scores import PSNR_CAP, ImageScores, score
+from tests.helpers.image_files import noise
 
 
 def grey(level: float, height: int = 16, width: int = 16) -> Tensor:
     return torch.full((height, width, 3), level)
-
-
-def noise(seed: int, height: int = 24, width: int = 20) -> Tensor:
-    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed))
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,10 +18,7 @@ from clear_strategies.data.scene import Scene
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.image_scores import PSNR_CAP, score
 from rasterizers.interface import Camera
-
-
-def noise(seed: int, height: int = 24, width: int = 20) -> Tensor:
-    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed))
+from tests.helpers.image_files import noise
 
 
 def view(name: str, truth: Tensor, *, known: bool = True) -> View:
@@ -76,9 +72,7 @@ def test_a_scene_without_test_views_has_no_mean() -> None:
     assert content["test"] == {"against": "nothing", "views": {}, "mean": {}}
 
 
-def test_a_render_that_is_not_finite_has_a_warning_and_null_in_the_file(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_render_that_is_not_finite_has_a_warning_and_null_in_the_file(tmp_path, caplog):
     a = view("a", noise(0, 48, 64))
     evaluation = metrics.evaluate(scene((), (a,)), lambda camera: torch.full((48, 64, 3), math.nan))
     assert "a: its render is not finite" in caplog.text

@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies.core.view import DepthMap, Photo
+from clear_strategies.core.view import Photo
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from tests.helpers.planes import same_maps
 from tests.helpers.textured import Surface, bump, camera, cast, slanted
 
 NONE = torch.zeros(0, 3)
@@ -18,13 +19,6 @@ QUICK = StereoSettings(enlarge=1, max_planes=64)
 
 def photos_of(surface: Surface, count: int = 3, size: tuple[int, int] = (64, 48)) -> list[Photo]:
     return [cast(surface, camera(0.4 * i - 0.4, 4 * (i - 1), size))[0] for i in range(count)]
-
-
-def same(a: list[DepthMap], b: list[DepthMap]) -> bool:
-    return all(
-        torch.equal(x.depth.nan_to_num(-1), y.depth.nan_to_num(-1)) and torch.equal(x.confidence, y.confidence)
-        for x, y in zip(a, b, strict=True)
-    )
 
 
 @pytest.mark.parametrize("surface", [slanted, bump])
@@ -61,7 +55,7 @@ def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
     finally:
         torch.set_num_threads(threads)
     assert found[0][0].coverage > 0
-    assert same(*found)
+    assert same_maps(*found)
 
 
 def test_photos_may_have_different_odd_sizes() -> None:
@@ -97,9 +91,7 @@ SEEN_BY_BOTH = torch.rand(50, 3) * 0.2 + torch.tensor([-0.1, -0.1, 3.9])
     ],
     ids=["textureless", "from one place", "too far apart"],
 )
-def test_photos_that_tell_no_depth_have_none_and_the_log_says_why(
-    photos: list[Photo], points: torch.Tensor, reason: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_photos_that_tell_no_depth_have_none_and_the_log_says_why(photos, points, reason, caplog):
     caplog.set_level("DEBUG")
     assert all(found.coverage == 0 for found in depth_maps(photos, points, QUICK))
     assert reason in caplog.text
