@@ -70,17 +70,6 @@ def test_the_exported_ply_looks_as_it_was_measured(finished):
     assert torch.isfinite(image).all()
 
 
-def test_report_of_a_run(finished):
-    result = run("here", "--out", "report", cwd=finished, module="clear_strategies.report")
-    assert result.returncode == 0, result.stderr
-    assert "| bicubic" in result.stdout
-    assert (finished / "report" / "report.csv").is_file()
-    assert "data:image/png" in (finished / "report" / "report.html").read_text(encoding="utf-8")
-    nothing = run("cache", cwd=finished, module="clear_strategies.report")
-    assert nothing.returncode == 2
-    assert "Traceback" not in nothing.stderr
-
-
 @pytest.mark.slow
 def test_resuming_through_the_door_gives_the_same_field(finished):
     """A run cut by SIGTERM and resumed ends where the uninterrupted one did."""

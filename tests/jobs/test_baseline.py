@@ -143,37 +143,21 @@ def test_a_finished_run_is_not_trained_again_with_auto(whole, caplog):
     assert "nothing is trained" in caplog.text
 
 
-@pytest.mark.parametrize(
-    "leads_to", ["auto", *(pytest.param(s, marks=SLOW) for s in ("run", "baseline", "checkpoint"))]
-)
-def test_a_run_that_was_stopped_in_its_baseline_goes_on_there(whole, cut, tmp_path, leads_to, caplog):
-    told = cut(5, tmp_path / "cut")
+@pytest.mark.parametrize("after", [5, ITERATIONS + 5], ids=["in its baseline", "after its baseline"])
+@pytest.mark.parametrize("leads_to", ["auto", *(pytest.param(s, marks=SLOW) for s in ("run", "folder", "checkpoint"))])
+def test_a_run_that_was_stopped_goes_on_where_it_stopped(whole, cut, tmp_path, after, leads_to, caplog):
+    told, run = cut(after, tmp_path / "cut"), tmp_path / "cut"
     assert told.exit_code == 128 + signal.SIGINT
-    assert not list((tmp_path / "cut").rglob("metrics.json"))
-    (saved,) = (tmp_path / "cut" / "baseline" / "checkpoints").iterdir()
-    assert re.search(rf"fit\.resume=\S*{saved.relative_to(tmp_path / 'cut')}", str(told))
-    paths = {"auto": "auto", "run": tmp_path / "cut", "baseline": tmp_path / "cut" / "baseline", "checkpoint": saved}
+    trained = list(run.rglob("metrics.json"))
+    assert trained == ([run / "baseline" / "metrics.json"] if after > ITERATIONS else [])
+    stopped_in = run if trained else run / "baseline"
+    (saved,) = (stopped_in / "checkpoints").iterdir()
+    assert re.search(rf"fit\.resume=\S*{saved.relative_to(run)}", str(told))
+    paths = {"auto": "auto", "run": run, "folder": saved.parent if trained else stopped_in, "checkpoint": saved}
     folder, watch = tmp_path / ("cut" if leads_to == "auto" else "resumed"), Iterations()
     train(folder, f"fit.resume={paths[leads_to]}", watch=watch)
-    assert watch.done == ITERATIONS - 5 + ITERATIONS
-    assert "5 iterations are done" in caplog.text
-    assert field(folder / "baseline") == field(whole / "baseline")
-    assert field(folder) == field(whole)
-
-
-@pytest.mark.parametrize(
-    "leads_to", ["auto", *(pytest.param(s, marks=SLOW) for s in ("run", "checkpoints", "checkpoint"))]
-)
-def test_a_run_that_was_stopped_after_its_baseline_does_not_train_it_again(whole, cut, tmp_path, leads_to):
-    cut(ITERATIONS + 5, tmp_path / "cut")
-    assert (tmp_path / "cut" / "baseline" / "metrics.json").is_file()
-    assert not (tmp_path / "cut" / "metrics.json").exists()
-    checkpoints = tmp_path / "cut" / "checkpoints"
-    (saved,) = checkpoints.iterdir()
-    paths = {"auto": "auto", "run": tmp_path / "cut", "checkpoints": checkpoints, "checkpoint": saved}
-    folder, watch = tmp_path / ("cut" if leads_to == "auto" else "resumed"), Iterations()
-    train(folder, f"fit.resume={paths[leads_to]}", watch=watch)
-    assert watch.done == ITERATIONS - 5
+    assert watch.done == 2 * ITERATIONS - after
+    assert trained or "5 iterations are done" in caplog.text
     assert field(folder / "baseline") == field(whole / "baseline")
     assert field(folder) == field(whole)
 
