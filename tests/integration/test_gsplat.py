@@ -57,6 +57,18 @@ def attached():
         yield lambda *args, **settings: stack.enter_context(gsplat_host.attached(*args, **settings))
 
 
+@pytest.fixture
+def begun(attached):
+    """`made(conductor)`: a host with CLEAR in its loop, CLEAR, and their scene."""
+
+    def made(conductor=None, **settings):
+        scene = toy.scene(20)
+        host = Host(scene)
+        return host, attached(host, scene, conductor or Conductor(), **settings), scene
+
+    return made
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SUBSETS)
 def test_fifty_steps_equal_those_of_our_own_trainer(name, attached):
@@ -145,10 +157,8 @@ def test_gradient_scaling_and_accumulation_do_not_change_the_merge(accumulation,
         assert torch.allclose(host.grads[name] / 1024, g, rtol=1e-4, atol=1e-6 * float(g.abs().max())), name
 
 
-def test_renderings_without_gradients_show_the_detail_feature_and_train_nothing(attached):
-    scene = toy.scene(20)
-    host = Host(scene)
-    clear = attached(host, scene, Conductor())
+def test_renderings_without_gradients_show_the_detail_feature_and_train_nothing(begun):
+    host, clear, scene = begun()
     with torch.no_grad():
         before, _, _ = host.render(scene.train[0].hr.camera, 3)
         host.splats["detail"] += 0.2
@@ -162,18 +172,14 @@ def test_renderings_without_gradients_show_the_detail_feature_and_train_nothing(
 
 
 @pytest.mark.parametrize(("iterations", "share"), [(300, 0.2), (30_000, 1)])
-def test_f_det_learns_at_a_lower_rate_in_a_short_run(iterations, share, attached):
-    scene = toy.scene(20)
-    host = Host(scene)
-    attached(host, scene, composed_conductor("baseline", iterations=iterations))
+def test_f_det_learns_at_a_lower_rate_in_a_short_run(iterations, share, begun):
+    host, _, _ = begun(composed_conductor("baseline", iterations=iterations))
     assert host.optimizers["detail"].param_groups[0]["lr"] == pytest.approx(LearningRates().detail * share)
 
 
-def test_f_det_fades_as_the_readings_of_the_conductor_say(attached):
-    scene = toy.scene(20)
+def test_f_det_fades_as_the_readings_of_the_conductor_say(begun):
     for decay in (0.0, 0.5):
-        host = Host(scene)
-        clear = attached(host, scene, Conductor(objective=HR_FROM_START, detail=DetailRates(decay=decay)))
+        host, clear, scene = begun(Conductor(objective=HR_FROM_START, detail=DetailRates(decay=decay)))
         host.splats["detail"].data += 1.0
         host.optimizers["detail"].param_groups[0]["lr"] = 0.0
         host.train([scene.train[0].name])
@@ -181,21 +187,18 @@ def test_f_det_fades_as_the_readings_of_the_conductor_say(attached):
         clear.remove()
 
 
-def test_remove_restores_the_loop(attached):
-    scene = toy.scene(20)
+def test_remove_restores_the_loop(begun):
+    host, clear, scene = begun(Conductor(GCO()), detail=False)
+    clear.remove()
     alone = Host(scene)
-    alone.train([v.name for v in scene.train])
-    host = Host(scene)
-    attached(host, scene, Conductor(GCO()), detail=False).remove()
-    host.train([v.name for v in scene.train])
+    for each in (alone, host):
+        each.train([v.name for v in scene.train])
     for name, p in alone.splats.items():
         assert torch.equal(p, host.splats[name])
 
 
-def test_other_cameras_show_the_detail_feature_and_wrong_sizes_are_refused(attached):
-    scene = toy.scene(20)
-    host = Host(scene)
-    clear = attached(host, scene, Conductor())
+def test_other_cameras_show_the_detail_feature_and_wrong_sizes_are_refused(begun):
+    host, clear, scene = begun()
     host.splats["detail"].data += 0.2
     elsewhere = toy.camera(1.2).scaled(0.25)
     with torch.no_grad():
@@ -241,18 +244,10 @@ def test_a_renderer_without_projected_centres_trains_without_a_score(monkeypatch
     assert float(host.splats["detail"].abs().max()) > 0
 
 
-def test_a_function_with_other_parameters_is_refused():
-    host = Host(toy.scene(20))
-    clear = attach(host.splats, host.optimizers, toy.scene(20).train, Conductor())
-    with pytest.raises(HostError, match="has no parameter Ks"):
-        clear.wrap(lambda means, opacities, colors, viewmats, width, height: None)
-
-
-def test_a_wrapped_function_cannot_be_wrapped_again(attached):
-    scene = toy.scene(20)
-    attached(Host(scene), scene, Conductor())
+def test_a_wrapped_function_cannot_be_wrapped_again(begun):
+    begun()
     with pytest.raises(HostError, match="wrapped already"):
-        attached(Host(scene), scene, Conductor())
+        begun()
 
 
 def test_missing_parameters_and_views_are_refused():
@@ -279,13 +274,11 @@ def test_radii_of_gsplat_1_4_are_supported(monkeypatch):
         assert torch.equal(old[name], g), name
 
 
-def started(strategies=(), **settings):
-    """A host on the toy scene, and a function that renders its photos with CLEAR."""
+def started(strategies=()):
+    """A host on the toy scene, CLEAR, and a function that renders the host's photos with it."""
     scene = toy.scene(20)
     host = Host(scene)
-    clear = attach(
-        host.splats, host.optimizers, scene.train, Conductor(*strategies, objective=HR_FROM_START), **settings
-    )
+    clear = attach(host.splats, host.optimizers, scene.train, Conductor(*strategies, objective=HR_FROM_START))
     rasterization = clear.wrap(gsplat_host.rasterization)
     return host, clear, lambda i: gsplat_host.drawn(rasterization, host.splats, scene.train[i].lr.camera)[0]
 
@@ -359,13 +352,13 @@ def test_splats_with_the_strategies_load_their_own_checkpoint():
     clear.remove()
 
 
-def test_a_rasterization_with_other_results_is_refused():
+def test_a_function_with_other_parameters_or_results_is_refused():
     @functools.wraps(autograd.rasterization)
     def rasterization_2dgs(*args, **kwargs):
         return (*autograd.rasterization(*args, backend="torch", **kwargs), None)
 
-    scene = toy.scene(20)
-    host = Host(scene)
-    clear = attach(host.splats, host.optimizers, scene.train, Conductor())
+    host, clear, _ = started()
+    with pytest.raises(HostError, match="has no parameter Ks"):
+        clear.wrap(lambda means, opacities, colors, viewmats, width, height: None)
     with pytest.raises(HostError, match="returns 4 values, gsplat's rasterization returns 3"):
-        gsplat_host.drawn(clear.wrap(rasterization_2dgs), host.splats, scene.train[0].lr.camera)
+        gsplat_host.drawn(clear.wrap(rasterization_2dgs), host.splats, toy.scene(20).train[0].lr.camera)

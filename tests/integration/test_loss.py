@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor, ExtraView, Objective, Photo, Strategy
-from clear_strategies.schedules import WarmupDecay
+from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies.training.field import GaussianField
 from integration import AutogradShot, extra_loss, joint_loss
 from rasterizers import Splats, autograd
 from tests.helpers import toy
-
-OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1, decay_from=100, end=100))
+from tests.helpers.inria import HR_FROM_START
 
 
 class Host:
@@ -39,13 +35,13 @@ class Host:
 def test_backward_gives_the_conductors_gradient(strategies):
     scene = toy.scene(20)
     host, view = Host(scene), scene.train[0]
-    conductor = Conductor(*strategies, objective=OBJECTIVE)
+    conductor = Conductor(*strategies, objective=HR_FROM_START)
     conductor.on_fit_start(3, 0)
     z = conductor.gate(5, 20)
     lr, hr = host.render(view.lr.camera, z, detail=False), host.render(view.hr.camera, z)
     (2.0 * joint_loss(conductor, host.params, lr, hr, view, 5)[0]).backward()
 
-    ours = Conductor(*strategies, objective=OBJECTIVE)
+    ours = Conductor(*strategies, objective=HR_FROM_START)
     ours.on_fit_start(3, 0)
     shots = host.field.render_scales(toy.RASTERIZER, view, gate=ours.gate(5, 20))
     expected = ours.update(host.field.raw(), *shots, view, 5).grads
@@ -57,7 +53,7 @@ def test_backward_gives_the_conductors_gradient(strategies):
 def test_its_value_is_the_sum_of_the_losses():
     scene = toy.scene(20)
     host, view = Host(scene), scene.train[0]
-    conductor = Conductor(GCO(), objective=OBJECTIVE)
+    conductor = Conductor(GCO(), objective=HR_FROM_START)
     lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
     loss, update = joint_loss(conductor, host.params, lr, hr, view, 50)
     l = update.losses
@@ -67,10 +63,9 @@ def test_its_value_is_the_sum_of_the_losses():
 
 def test_an_extra_view_is_learned_from_in_a_step_of_its_own():
     scene = toy.scene(20)
-    host, photo = Host(scene), scene.train[0].lr
-    dark = ExtraView(Photo(photo.camera, torch.zeros_like(photo.image)), torch.ones(photo.image.shape[:2]))
-    conductor = Conductor(Shows(dark), objective=OBJECTIVE)
+    host, conductor = Host(scene), Conductor(toy.ShowsDark(), objective=HR_FROM_START)
     conductor.on_fit_start(3, 0)
+    conductor.on_views(scene.train)
     optimizer = torch.optim.Adam(list(host.params.values()), lr=5e-3, eps=1e-15)
     losses = []
     for t in range(1, 25):
@@ -82,13 +77,3 @@ def test_an_extra_view_is_learned_from_in_a_step_of_its_own():
             losses.append(float(loss))
     assert len(losses) == 24
     assert losses[-1] < 0.8 * losses[0]
-
-
-@dataclass(frozen=True)
-class Shows(Strategy):
-    """Shows one picture at every iteration."""
-
-    extra: ExtraView
-
-    def extra_views(self, t):
-        return (self.extra,)

@@ -13,14 +13,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, Conductor, Objective
+from clear_strategies import GCO, P2G, Conductor
 from clear_strategies.data.cameras import pose_from_opengl
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.priors import Bicubic, Cached, Images
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry import stereo
-from clear_strategies.schedules import WarmupDecay
-from integration.gsplat import attach
 from integration.nerfstudio.data import (
     over_black,
     photos_of,
@@ -33,8 +31,7 @@ from integration.nerfstudio.data import (
 from integration.views import save_photos
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
-
-HR_FROM_START = WarmupDecay(start=0, full=1, decay_from=100, end=100)
+from tests.helpers.inria import HR_FROM_START
 
 
 class DataManager:
@@ -199,17 +196,13 @@ def with_absgrad(rasterization):
 
 
 def trained(host, scene, *strategies, threshold=None, monkeypatch=None):
-    clear = attach(
-        host.splats, host.optimizers, scene.train, Conductor(*strategies, objective=Objective(lambda_hr=HR_FROM_START)),
-        names=getattr(host, "names", None), strategy=threshold and SimpleNamespace(grow_grad2d=threshold),
-    )  # fmt: skip
+    function = with_absgrad(gsplat_host.rasterization) if isinstance(host, Splatfacto) else gsplat_host.rasterization
     with monkeypatch.context() as patch:
-        original = gsplat_host.rasterization
-        function = with_absgrad(original) if isinstance(host, Splatfacto) else original
-        patch.setattr(gsplat_host, "rasterization", clear.wrap(function))
-        host.train([scene.train[0].name])
-    clear.remove()
-    return clear
+        patch.setattr(gsplat_host, "rasterization", function)
+        return gsplat_host.trained(
+            host, scene, Conductor(*strategies, objective=HR_FROM_START), [scene.train[0].name], function=function,
+            names=getattr(host, "names", None), strategy=threshold and SimpleNamespace(grow_grad2d=threshold),
+        )  # fmt: skip
 
 
 def test_splatfactos_shapes_give_the_same_gradients_as_gsplats(monkeypatch):

@@ -31,8 +31,7 @@ from clear_strategies.strategies.testing import CHECKS, ContractError, check_str
 from clear_strategies.training.field import GaussianField
 from rasterizers import Splats, autograd
 from tests.helpers import toy
-
-ALWAYS = WarmupDecay(start=0, full=1, decay_from=10, end=10)
+from tests.helpers.compiled_step_cases import ALWAYS
 
 
 @dataclass(frozen=True)
@@ -202,18 +201,7 @@ def test_a_weight_without_warm_up_is_constant_from_the_first_iteration():
     assert {constant(t) for t in (1, 2, 5_000, 5_001, 9_999, 10_000, 20_000)} == {0.4}
 
 
-def test_the_detail_feature_moves_by_routed_high_frequencies_alone():
-    field, view, lr, hr = drawn()
-    objective, p2g = Objective(lambda_hr=ALWAYS), P2G()
-    update = Conductor(GCO(), p2g, objective=objective).update(field.raw(), lr, hr, view, 5)
-    _, g_hf = hr.vjp(objective.hr(hr.image, view.hr.image).cotangents)
-    m = p2g.route(update.step)
-    assert torch.allclose(update.grads["detail"], 0.2 * m[:, None] * g_hf["detail"], rtol=1e-6, atol=1e-15)
-    without = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0))
-    assert "detail" not in without.update(field.raw(), lr, hr, view, 5).grads
-
-
-def test_routing_weighs_the_high_frequency_gradient_only():
+def test_routing_weighs_the_high_frequency_gradient_only_by_which_alone_the_detail_feature_moves():
     field, view, lr, hr = drawn()
     objective, p2g = Objective(lambda_hr=ALWAYS), P2G()
     update = Conductor(p2g, objective=objective).update(field.raw(), lr, hr, view, 5)
@@ -222,6 +210,11 @@ def test_routing_weighs_the_high_frequency_gradient_only():
     m = p2g.route(update.step)[:, None]
     expected = g_lr["means"] + g_base["means"] + 0.2 * m * g_hf["means"]
     assert torch.allclose(update.grads["means"], expected, rtol=1e-6, atol=1e-15)
+    for strategies in ((p2g,), (GCO(), p2g)):
+        moved = Conductor(*strategies, objective=objective).update(field.raw(), lr, hr, view, 5).grads["detail"]
+        assert torch.allclose(moved, 0.2 * m * g_hf["detail"], rtol=1e-6, atol=1e-15)
+    without = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0))
+    assert "detail" not in without.update(field.raw(), lr, hr, view, 5).grads
 
 
 def test_two_owners_of_one_question_are_refused():
