@@ -58,9 +58,7 @@ def test_straight_alpha_is_composited_over_the_background(tmp_path: Path) -> Non
     torch.testing.assert_close(found, torch.tensor([[[1.0, 0.8, 0.4], [1.0, 1.0, 0.5]]]))
 
 
-def test_without_a_background_alpha_is_composited_over_black_and_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_a_background_alpha_is_composited_over_black_and_logged(tmp_path, caplog):
     path = save(tmp_path / "a.png", np.array([[[255, 0, 0, 51]]], np.uint8))
     with caplog.at_level("DEBUG"):
         torch.testing.assert_close(photo_files.read_image(path), torch.tensor([[[0.2, 0.0, 0.0]]]))

@@ -71,9 +71,7 @@ def test_points_are_written_byte_for_byte_as_3dgs_reads_them(tmp_path: Path) -> 
         (torch.zeros(1, 3), torch.full((1, 3), 255.0), "divide 8-bit values by 255"),
     ],
 )
-def test_points_that_no_file_should_hold_are_refused(
-    tmp_path: Path, means: torch.Tensor, colors: torch.Tensor, message: str
-) -> None:
+def test_points_that_no_file_should_hold_are_refused(tmp_path, means, colors, message):
     with pytest.raises(ValueError, match=message):
         write_points(tmp_path / "p.ply", means, colors)
     assert not (tmp_path / "p.ply").exists()

@@ -215,12 +215,7 @@ def test_gradients_are_written_to_out(name):
 @pytest.mark.parametrize(
     ("x", "y", "error", "message"),
     [
-        (
-            torch.rand(4, 5, 3).double(),
-            torch.rand(4, 5, 3),
-            TypeError,
-            "x must be float32 on the CPU, got torch.float64",
-        ),
+        (torch.rand(4, 5, 3).double(), torch.rand(4, 5, 3), TypeError, "x must be float32 on the CPU, got .*float64"),
         (torch.rand(4, 5, 3), torch.rand(4, 5, 3).half(), TypeError, "y must be float32"),
         (torch.rand(4, 5, 3), torch.rand(4, 5, 3, device="meta"), TypeError, "on meta"),
         (torch.rand(4, 5, 3), torch.rand(5, 4, 3), ValueError, "as large as x"),

@@ -40,9 +40,7 @@ def test_truth_and_error_are_shown_where_they_are_known(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("sizes", "times"), [([(30, 250), (80, 100)], 1), ([(40, 60)], 4)], ids=["pixel for pixel", "to reach 240"]
 )
-def test_images_of_any_size_are_shown_at_a_whole_multiple(
-    tmp_path: Path, sizes: list[tuple[int, int]], times: int
-) -> None:
+def test_images_of_any_size_are_shown_at_a_whole_multiple(tmp_path, sizes, times):
     rows = [row("a", 10 * i, size=size) for i, size in enumerate(sizes)]
     write_contact_sheet(tmp_path / "sheet.png", rows, "scene")
     sheet = read(tmp_path / "sheet.png")

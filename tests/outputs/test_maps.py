@@ -161,9 +161,7 @@ def test_views_with_stereo_show_their_depth(tmp_path: Path) -> None:
         assert not (tmp_path / state.views[1].name / "depth.png").exists()
 
 
-def test_without_a_strategy_that_corrects_or_has_evidence_its_maps_are_missing(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_a_strategy_that_corrects_or_has_evidence_its_maps_are_missing(tmp_path, caplog):
     caplog.set_level("DEBUG")
     state = trained()
     write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER)

@@ -140,9 +140,7 @@ def test_a_run_without_test_views_shows_training_views(tmp_path: Path, state: Tr
     assert not (tmp_path / "path.mp4").exists()
 
 
-def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(
-    tmp_path: Path, state: TrainState, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(tmp_path, state, monkeypatch):
     for name in ("write_curves", "write_contact_sheet"):
         monkeypatch.setattr(results, name, lambda *_: None)
     rig = ("left/0000.png", "right/0000.png")
@@ -181,9 +179,7 @@ def test_of_a_file_that_is_no_runs_nothing_else_is_removed(tmp_path: Path) -> No
     assert names(tmp_path) == {"curves.png"}
 
 
-def test_the_sheet_of_photos_at_hr_shows_no_sr(
-    tmp_path: Path, state: TrainState, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_sheet_of_photos_at_hr_shows_no_sr(tmp_path, state, monkeypatch):
     def photos(view: View) -> View:
         return replace(view, hr=replace(view.hr, image=view.truth))
 
@@ -196,9 +192,7 @@ def test_the_sheet_of_photos_at_hr_shows_no_sr(
     assert note == ""
 
 
-def test_a_video_that_cannot_be_written_is_named(
-    tmp_path: Path, state: TrainState, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_video_that_cannot_be_written_is_named(tmp_path, state, monkeypatch, caplog):
     monkeypatch.setattr("clear_strategies.viewing.video.find_spec", lambda _: None)
     with caplog.at_level("DEBUG"):
         write(tmp_path, state, pictures=replace(PICTURES, map_views=0))
@@ -206,9 +200,7 @@ def test_a_video_that_cannot_be_written_is_named(
     assert not (tmp_path / "path.mp4").exists()
 
 
-def test_metrics_json_is_missing_where_another_file_could_not_be_written(
-    tmp_path: Path, state: TrainState, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_metrics_json_is_missing_where_another_file_could_not_be_written(tmp_path, state, monkeypatch):
     def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 

@@ -15,7 +15,6 @@ from tests.helpers.agreement import require_same_bits
 from tests.helpers.backends import EVERY, camera, cotangents, everything, needs
 
 OTHERS = ("quats", "scales", "opacities", "sh0", "shN", "rgb_offset")
-ROWS = ("opacities", "rgb_offset", "shN", "quats", "scales", "sh0")
 
 
 @pytest.fixture(params=[pytest.param(make, id=name, marks=needs(name)) for name, make in EVERY.items()])
@@ -32,9 +31,7 @@ def changed(name: str, change) -> Splats:
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_tensor_of_another_dtype_is_refused(draw, name):
-    with pytest.raises(
-        TypeError, match=f"^splats.{name} must be float32 on .*, as splats.means is, got float64 on .*$"
-    ):
+    with pytest.raises(TypeError, match=f"^splats.{name} must be float32 on .*, as splats.means is, got float64"):
         draw(changed(name, torch.Tensor.double), camera())
 
 
@@ -46,7 +43,7 @@ def test_a_tensor_of_another_dtype_in_a_second_job_is_refused(draw):
         draw.render_scales(jobs)
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", OTHERS)
 def test_a_tensor_with_another_number_of_rows_is_refused(draw, name):
     with pytest.raises(ValueError, match=rf"^splats.{name} must have the shape \[20.*, got \[19.*$"):
         draw(changed(name, lambda x: x[:-1]), camera())

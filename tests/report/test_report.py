@@ -33,9 +33,7 @@ def test_a_report_has_a_table_records_a_page_and_images(tmp_path: Path) -> None:
     assert (records["bicubic"]["conflict"], records["bicubic"]["psnr_delta"]) == ("", "")
 
 
-def test_runs_without_images_or_history_are_still_in_the_table(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_runs_without_images_or_history_are_still_in_the_table(tmp_path, caplog):
     run = make_run(tmp_path / "0", "+strategy=gco")
     (run / "history.csv").write_text("t,psnr_test\n1,oops\n")
     (run / "renders" / "view.png").write_bytes(b"no image")
@@ -57,9 +55,7 @@ def test_the_command_prints_the_table_on_an_ascii_terminal_and_does_not_import_h
     assert "| demo  | gco" in done.stdout
 
 
-def test_without_runs_the_command_logs_one_line_and_exits_with_2(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_runs_the_command_logs_one_line_and_exits_with_2(tmp_path, caplog, capsys):
     assert report.main([str(tmp_path)]) == 2
     assert len(caplog.records) == 1
     assert capsys.readouterr().out == ""

@@ -50,9 +50,7 @@ def test_several_runs_with_one_seed_in_a_row_give_a_warning(tmp_path: Path, capl
     assert "demo, clear: a row holds several runs with the same seed" in caplog.text
 
 
-def test_a_run_without_a_finite_score_is_left_out_with_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_run_without_a_finite_score_is_left_out_with_a_warning(tmp_path, caplog):
     make_run(tmp_path / "0", "+strategy=gco", psnr=20.0)
     make_run(tmp_path / "1", "+strategy=gco", psnr=None, seed=1)
     assert rows_of(tmp_path)["gco"].values["psnr"] == [20.0]

@@ -37,9 +37,7 @@ def test_as_many_gaussians_fit_as_the_budget_holds(budget):
 
 def test_a_run_whose_start_is_over_the_budget_is_refused_and_one_that_may_outgrow_it_warned_of(caplog):
     assert NEEDS.fits(149 * MIB) == 0
-    with pytest.raises(
-        SettingError, match=r"^fit\.memory: 1,000 Gaussians need 150 MiB, and 149 MiB fit\.memory allows"
-    ):
+    with pytest.raises(SettingError, match=r"^fit\.memory: 1,000 Gaussians need 150 MiB, and 149 MiB fit\.memory all"):
         memory.require(NEEDS, 149 * MIB, None)
     with caplog.at_level(logging.WARNING):
         memory.require(NEEDS, 4000 * MIB, 100_000)

@@ -73,9 +73,7 @@ def test_what_changes_the_result_changes_the_key_and_nothing_else_does(model: Pa
 
 
 @pytest.mark.parametrize("damage", ["truncated", "garbage", "another size"])
-def test_a_damaged_entry_is_logged_and_computed_again(
-    model: Path, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_damaged_entry_is_logged_and_computed_again(model, tmp_path, damage, caplog):
     folder, lr = tmp_path / "cache", photo(16, 16)
     counting = Counting(str(model))
     first = Cached(counting, folder)("view", lr, 2)
@@ -90,9 +88,7 @@ def test_a_damaged_entry_is_logged_and_computed_again(
     assert torch.equal(read_image(entry), first)
 
 
-def test_a_cache_that_cannot_be_written_costs_time_but_no_result(
-    model: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_cache_that_cannot_be_written_costs_time_but_no_result(model, tmp_path, caplog):
     (tmp_path / "file").write_bytes(b"in the way of a folder")
     lr = photo(5, 6)
     assert Cached(Counting(str(model)), tmp_path / "file" / "cache")("view", lr, 2).shape == (10, 12, 3)

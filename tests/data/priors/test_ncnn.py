@@ -63,9 +63,7 @@ def test_another_model_is_refused() -> None:
     ("does", "problem"),
     [(b"unreadable", "cannot be read by ncnn"), (b"nan", "values that are not finite"), (b"out of memory", "gives ")],
 )
-def test_a_network_that_fails_is_refused_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, does: bytes, problem: str
-) -> None:
+def test_a_network_that_fails_is_refused_in_one_line(tmp_path, monkeypatch, does, problem):
     fake_ncnn.install(tmp_path, monkeypatch, does)
     with pytest.raises(DataError, match=rf"UP2X\.bin: network: .*{problem}.*: pip install --force-reinstall sr-vulk"):
         Ncnn()("view", photo(4, 4), 2)

@@ -51,9 +51,7 @@ def test_a_network_with_another_channel_order_gives_a_warning(tmp_path: Path, ca
     assert "check that it shows this view, and is RGB in [0, 1]" in caplog.text
 
 
-def test_a_good_network_logs_model_size_and_time_and_no_warning(
-    network: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_good_network_logs_model_size_and_time_and_no_warning(network, caplog):
     with caplog.at_level("DEBUG"):
         Onnx(str(network))("view", photo(8, 12), 4)
     assert "view: onnx tiny_x4.onnx made 48x32 in" in caplog.text

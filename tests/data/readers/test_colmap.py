@@ -188,9 +188,7 @@ def test_undistortion_is_the_lens_formula_and_leaves_no_border(lens: Lens) -> No
         ("OPENCV_FISHEYE", (20.0, 20.0, 8.0, 6.0, 0.1, 0.0, 0.0, 0.0)),
     ],
 )
-def test_distorted_models_become_pinholes_and_are_noted(
-    model: str, parameters: tuple[float, ...], tmp_path: Path
-) -> None:
+def test_distorted_models_become_pinholes_and_are_noted(model, parameters, tmp_path):
     capture = colmap.read(tiny.colmap_bin(tmp_path, model, parameters))
     assert capture.notes["lens"].startswith("3 of 3 photos undistorted by OpenCV")
     raw = photo_files.read_image(tmp_path / "images/a.png")

@@ -45,16 +45,12 @@ def test_colmap_is_preferred_and_renamed_photos_are_matched_by_order(tmp_path: P
 
 
 def test_an_unknown_source_of_poses_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(
-        SettingError, match=r"data\.reader\.poses: must be one of auto, colmap, poses_bounds, got 'best'"
-    ):
+    with pytest.raises(SettingError, match=r"data\.reader\.poses: must be .* colmap, poses_bounds, got 'best'"):
         llff.read(tiny.llff(tmp_path), poses="best")
 
 
 @pytest.mark.parametrize(("scene", "views", "size"), [("fern", 20, (1008, 756)), ("horns", 62, (504, 378))])
-def test_both_sources_of_poses_agree_up_to_a_similarity(
-    scene: str, views: int, size: tuple[int, int], shared_data: Path
-) -> None:
+def test_both_sources_of_poses_agree_up_to_a_similarity(scene, views, size, shared_data):
     ours, theirs = (llff.read(shared_data / scene, poses=poses) for poses in ("colmap", "poses_bounds"))
     assert len(ours.frames) == len(theirs.frames) == views
     assert [f.name for f in ours.frames] == [f.name for f in theirs.frames]

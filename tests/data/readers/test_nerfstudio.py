@@ -61,9 +61,7 @@ def test_distortion_is_removed_and_noted(model: str, tmp_path: Path) -> None:
     assert capture.frames[0].load().shape == (12, 16, 3)
 
 
-def test_the_files_lists_split_the_frames_and_the_rest_is_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_files_lists_split_the_frames_and_the_rest_is_logged(tmp_path, caplog):
     lists = {"train_filenames": ["images/b.png"], "val_filenames": ["images/a.png"], "test_filenames": []}
     capture = nerfstudio.read(changed(tmp_path, lambda value: value.update(lists)))
     assert [frame.split for frame in capture.frames] == ["test", "train", None]

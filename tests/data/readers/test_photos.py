@@ -30,9 +30,7 @@ pycolmap = pytest.importorskip("pycolmap")
 
 
 @pytest.mark.slow
-def test_poses_are_those_of_the_ground_truth(
-    shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poses_are_those_of_the_ground_truth(shared_data, tmp_path, monkeypatch):
     """Five views of fountain-P11 at 384x256: rotations within 1 degree, centres within 2 % of their largest offset."""
     folder = tmp_path / "photos"
     folder.mkdir()
@@ -168,9 +166,7 @@ class FakeModel:
         (Path(folder) / "images.bin").write_text(",".join(image.name for image in self.images.values()))
 
 
-def test_of_several_models_the_largest_is_kept_and_the_others_are_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_of_several_models_the_largest_is_kept_and_the_others_are_told(tmp_path, monkeypatch, caplog):
     models = [FakeModel("0", "1", "2"), FakeModel("3", "4", "5", "6", "7"), FakeModel("8", "9")]
     monkeypatch.setattr(sfm, "_map", lambda *_: models)
     monkeypatch.setattr(sfm, "_unplaced", lambda _, placed: {"all": sorted(placed)})
@@ -181,9 +177,7 @@ def test_of_several_models_the_largest_is_kept_and_the_others_are_told(
 
 
 @pytest.mark.parametrize("precise", [True, False])
-def test_the_memory_of_matching_is_bounded_on_machines_of_many_cores(
-    monkeypatch: pytest.MonkeyPatch, precise: bool
-) -> None:
+def test_the_memory_of_matching_is_bounded_on_machines_of_many_cores(monkeypatch, precise):
     monkeypatch.setattr(os, "cpu_count", lambda: 64)
     settings = SfmSettings(1600, 8192, precise, threads=-1, seed=0)
     assert 3 << 30 < settings.matchers * settings.memory <= 4 << 30
