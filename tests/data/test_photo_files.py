@@ -23,10 +23,18 @@ def save(path: Path, pixels: np.ndarray, **options: object) -> Path:
     return path
 
 
-def test_eight_bits_become_their_share_of_255(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.png", np.array([[[0, 51, 255], [102, 204, 1]]], np.uint8))
-    expected = torch.tensor([[[0.0, 0.2, 1.0], [0.4, 0.8, 1 / 255]]])
-    torch.testing.assert_close(photo_files.read_image(path), expected)
+@pytest.mark.parametrize(
+    ("pixels", "background", "expected"),
+    [
+        ([[[0, 51, 255], [102, 204, 1]]], None, [[[0.0, 0.2, 1.0], [0.4, 0.8, 1 / 255]]]),
+        ([[51]], None, [[[0.2, 0.2, 0.2]]]),
+        ([[[255, 0, 0, 51], [9, 9, 9, 0]]], (1.0, 1.0, 0.5), [[[1.0, 0.8, 0.4], [1.0, 1.0, 0.5]]]),
+    ],
+    ids=["RGB", "grey", "straight alpha over a background"],
+)
+def test_eight_bits_become_their_share_of_255(tmp_path: Path, pixels, background, expected) -> None:
+    path = save(tmp_path / "a.png", np.array(pixels, np.uint8))
+    torch.testing.assert_close(photo_files.read_image(path, background=background), torch.tensor(expected))
 
 
 @pytest.mark.parametrize("turn", [None, True])
@@ -52,12 +60,6 @@ def test_sixteen_bit_grey_with_alpha_is_composited(tmp_path: Path) -> None:
     torch.testing.assert_close(photo_files.read_image(path), torch.full((1, 1, 3), 0.2))
 
 
-def test_straight_alpha_is_composited_over_the_background(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.png", np.array([[[255, 0, 0, 51], [9, 9, 9, 0]]], np.uint8))
-    found = photo_files.read_image(path, background=(1.0, 1.0, 0.5))
-    torch.testing.assert_close(found, torch.tensor([[[1.0, 0.8, 0.4], [1.0, 1.0, 0.5]]]))
-
-
 def test_without_a_background_alpha_is_composited_over_black_and_logged(tmp_path, caplog):
     path = save(tmp_path / "a.png", np.array([[[255, 0, 0, 51]]], np.uint8))
     with caplog.at_level("DEBUG"):
@@ -65,9 +67,7 @@ def test_without_a_background_alpha_is_composited_over_black_and_logged(tmp_path
     assert "a.png has transparent pixels" in caplog.text
 
 
-def test_grey_and_palette_become_rgb(tmp_path: Path) -> None:
-    grey = save(tmp_path / "grey.png", np.array([[51]], np.uint8))
-    torch.testing.assert_close(photo_files.read_image(grey), torch.full((1, 1, 3), 0.2))
+def test_a_palette_becomes_rgb(tmp_path: Path) -> None:
     Image.new("RGB", (1, 1), (0, 51, 255)).quantize(2).save(tmp_path / "palette.png")
     torch.testing.assert_close(photo_files.read_image(tmp_path / "palette.png"), torch.tensor([[[0.0, 0.2, 1.0]]]))
 

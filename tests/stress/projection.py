@@ -20,7 +20,6 @@ LOGITS = (-100.0, -15.0, -5.0, 0.0, 5.0, 15.0, 100.0)
 NORMS = [10.0**k for k in (-20, -15, -10, -5, 0, 5, 10, 15, 20)]
 NAMES = ("means", "quats", "scales", "opacities", "sh0")
 _IMAGE, _GRADIENT = 1e-4, 1e-3
-_FLIP = 8e-3  # a pixel at which rounding flips a cut-off
 
 # The rotation does not matter for a ball, so the axes differ. The direction is off the camera's axis.
 _SHAPE = torch.tensor([[1.0, 0.7, 0.4]])

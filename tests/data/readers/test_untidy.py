@@ -5,6 +5,7 @@ Folders of photos without poses are in test_untidy_photos.py.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,11 +24,15 @@ READERS = {
     "blender": (captures.blender, blender.read, "train"),
     "llff": (captures.llff, llff.read, "images_4"),
 }
-SKIPPING = ["colmap", "nerfstudio", "blender"]  # LLFF's table has rows without names: a missing photo is not known
-
-
-def names(capture: Capture) -> list[str]:
-    return [Path(frame.name).stem for frame in capture.frames]
+# What happens to photos, what the refusal says, the setting that goes on without them, and the photos that are then used.
+DEFECTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], dict[str, object], str]] = {
+    "missing": (lambda f: (f / "b.png").unlink(), ("1 of ", "b.png", "data.missing=skip"), {"missing": "skip"}, "ac"),
+    "truncated": (lambda f: os.truncate(f / "b.png", 200), ("b.png", "data.broken=skip"), {"broken": "skip"}, "ac"),
+    "linked": (lambda f: captures.link(f, f.parents[1] / "elsewhere"), ("leads out of", "data.reader.allow_outside=true"),
+               {"allow_outside": True}, "abc"),
+}  # fmt: skip
+# LLFF's table has rows without names: a missing photo is not known.
+CASES = [(defect, reader) for defect in DEFECTS for reader in READERS if (defect, reader) != ("missing", "llff")]
 
 
 def built(tmp_path: Path, reader: str) -> tuple[Path, Path, Callable[..., Capture]]:
@@ -37,20 +42,19 @@ def built(tmp_path: Path, reader: str) -> tuple[Path, Path, Callable[..., Captur
     return root, root / folder, read
 
 
-def one_line(refusal: pytest.ExceptionInfo[DataError], *parts: str) -> None:
-    assert "\n" not in str(refusal.value)
-    assert all(part in str(refusal.value) for part in parts), str(refusal.value)
-
-
-@pytest.mark.parametrize("reader", SKIPPING)
-def test_a_missing_photo_is_counted_and_named_with_its_cure_and_skipped_on_request(tmp_path, reader, caplog):
+@pytest.mark.parametrize(("defect", "reader"), CASES)
+def test_a_defect_is_refused_in_one_line_with_the_setting_that_goes_on(tmp_path, defect, reader, caplog):
     root, folder, read = built(tmp_path, reader)
-    (folder / "b.png").unlink()
+    spoil, says, cure, used = DEFECTS[defect]
+    spoil(folder)
     with pytest.raises(DataError) as refusal:
-        read(root)
-    one_line(refusal, "1 of ", "b.png", "data.missing=skip")
-    assert names(read(root, missing="skip")) == ["a", "c"]
-    assert "b.png. They are skipped." in caplog.text
+        [frame.load() for frame in read(root).frames]
+    assert "\n" not in str(refusal.value)
+    assert all(part in str(refusal.value) for part in says), str(refusal.value)
+    capture = read(root, **cure)
+    assert [Path(frame.name).stem for frame in capture.frames] == list(used)
+    assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
+    assert ("b.png" in caplog.text) == (used == "ac")
 
 
 def test_a_capture_without_any_photo_is_refused_even_where_missing_ones_are_skipped(tmp_path):
@@ -59,30 +63,6 @@ def test_a_capture_without_any_photo_is_refused_even_where_missing_ones_are_skip
         (folder / name).unlink()
     with pytest.raises(DataError, match=r"transforms\.json: photos: none of 3 can be used: check the path"):
         read(root, missing="skip")
-
-
-@pytest.mark.parametrize("reader", READERS)
-def test_a_truncated_photo_is_named_with_its_cure_and_skipped_on_request(tmp_path, reader, caplog):
-    root, folder, read = built(tmp_path, reader)
-    whole = (folder / "b.png").read_bytes()
-    (folder / "b.png").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(DataError) as refusal:
-        [frame.load() for frame in read(root).frames]
-    one_line(refusal, "b.png", "data.broken=skip")
-    capture = read(root, broken="skip")
-    assert names(capture) == ["a", "c"]
-    assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
-    assert "b.png" in caplog.text
-
-
-@pytest.mark.parametrize("reader", READERS)
-def test_linked_photos_are_followed_by_a_switch_that_the_refusal_names(tmp_path, reader):
-    root, folder, read = built(tmp_path, reader)
-    captures.link(folder, tmp_path / "elsewhere")
-    with pytest.raises(DataError) as refusal:
-        read(root)
-    one_line(refusal, "leads out of", "data.reader.allow_outside=true")
-    assert names(read(root, allow_outside=True)) == ["a", "b", "c"]
 
 
 @pytest.mark.parametrize("rotate", [True, False])
