@@ -1,4 +1,4 @@
-"""Importing an adapter, or the geometry, brings no heavy library into the host."""
+"""Importing the library, an adapter or the geometry brings no heavy library into the host."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ HEAVY = ("cv2", "gsplat", "hydra", "kornia", "matplotlib", "nerfstudio", "open3d
 
 
 MODULES = (
+    "clear_strategies", "rasterizers",
     "integration", "integration.gsplat", "integration.inria", "integration.nerfstudio", "clear_strategies.geometry",
 )  # fmt: skip
 

@@ -19,7 +19,7 @@ import sys
 import time
 from pathlib import Path
 
-from tests.helpers.command_line import ROOT, TINY
+from tests.helpers.command_line import ROOT, TINY, wait_for
 from tests.slurm.one_machine import cluster
 
 DEMO = [override for override in TINY if not override.startswith("fit.iterations=")]
@@ -64,17 +64,10 @@ class Experiment:
     def show(self, *command: str) -> None:
         _log.info("$ %s\n%s", " ".join(command), self.ask(*command))
 
-    def wait_for(self, what: str, condition, seconds: float = 300) -> None:
-        deadline = time.monotonic() + seconds
-        while not condition():
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"waited {seconds} s for {what}")
-            time.sleep(0.2)
-
     def ablation(self) -> None:
         """Table 4's rows, two jobs at once on two cores."""
         process = self.start(*ABLATION, name="ablation")
-        self.wait_for("two jobs to run", lambda: self.ask("squeue", "-h", "-t", "R").count("\n") >= 1)
+        wait_for(lambda: self.ask("squeue", "-h", "-t", "R").count("\n") >= 1, 300, "two jobs to run")
         self.show("squeue")
         self.finish(process, "ablation")
         threads = re.findall(r"threads +(.*)", (self.folder / "ablation" / "0" / "run.log").read_text())
@@ -108,7 +101,7 @@ class Experiment:
         """An operator, or a job of higher priority, takes the job away in the middle."""
         process = self.start(*SLURM, *LONG, "hydra.sweep.dir=requeued", name="requeued")
         log = self.folder / "requeued" / "0" / "run.log"
-        self.wait_for("training", lambda: log.exists() and "GCO is" in log.read_text())
+        wait_for(lambda: log.exists() and "GCO is" in log.read_text(), 300, "training")
         time.sleep(3)
         job = self.ask("squeue", "-h", "-t", "R", "-o", "%i").split()[0]
         self.show("scontrol", "requeue", job)
@@ -121,14 +114,14 @@ class Experiment:
         """As a failing node would: the process is gone without a word, its lock stays, and the job is started again."""
         process = self.start(*SLURM, *LONG, "hydra.sweep.dir=killed", name="killed")
         folder = self.folder / "killed" / "0"
-        self.wait_for("a checkpoint", lambda: list(folder.glob("checkpoints/step_*/manifest.json")))
+        wait_for(lambda: list(folder.glob("checkpoints/step_*/manifest.json")), 300, "a checkpoint")
         job = self.ask("squeue", "-h", "-t", "R", "-o", "%i").split()[0]
         pid = json.loads((folder / "run.lock").read_text())["pid"]
         os.kill(pid, signal.SIGKILL)
-        self.wait_for("the job to end", lambda: not self.ask("squeue", "-h", "-t", "R"))
+        wait_for(lambda: not self.ask("squeue", "-h", "-t", "R"), 300, "the job to end")
         _log.info("$ kill -9 %d\nrun.lock says\n  %s", pid, (folder / "run.lock").read_text())
         self.show("scontrol", "requeue", job)
-        self.wait_for("its second try", lambda: '"slurm_restarts": 1' in _text(folder / "run.lock"))
+        wait_for(lambda: '"slurm_restarts": 1' in _text(folder / "run.lock"), 300, "its second try")
         _log.info("run.lock says\n  %s", _text(folder / "run.lock"))
         self.finish(process, "killed")
         self.compare("killed", expected)

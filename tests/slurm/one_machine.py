@@ -10,12 +10,14 @@ import secrets
 import shutil
 import socket
 import subprocess
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.helpers.command_line import wait_for
+
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "scontrol", "squeue", "scancel", "sinfo")
+LOGS = "the cluster; see daemons.log, slurmctld.log and slurmd.log in its folder"
 
 CONFIG = """\
 ClusterName=throwaway
@@ -84,19 +86,19 @@ def cluster(folder: Path) -> Iterator[dict[str, str]]:
             for command in (munged, ["slurmctld", "-D", "-f", str(config)], ["slurmd", "-D", "-f", str(config)]):
                 daemons.append(subprocess.Popen(command, env=environment, stdout=log, stderr=log))
                 if command is munged:
-                    _wait_until((folder / "munge.socket").exists, 20)
+                    wait_for((folder / "munge.socket").exists, 20, LOGS)
 
         def idle() -> bool:
             command = ["sinfo", "--noheader", "--format=%t"]
             answer = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
             return answer.stdout.strip() == "idle"
 
-        _wait_until(idle, 60)
+        wait_for(idle, 60, LOGS)
         try:
             yield environment
         finally:
             subprocess.run(["scancel", f"--user={user}"], env=environment, check=True)  # what a failure left
-            _wait_until(idle, 60)  # else what ends the last job would look for a controller that is gone
+            wait_for(idle, 60, LOGS)  # else what ends the last job would look for a controller that is gone
     finally:
         for daemon in reversed(daemons):
             daemon.terminate()
@@ -116,13 +118,3 @@ def _free_ports(count: int) -> list[int]:
     finally:
         for s in sockets:
             s.close()
-
-
-def _wait_until(condition, seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > deadline:
-            raise TimeoutError(
-                "the cluster did not come up; see daemons.log, slurmctld.log and slurmd.log in its folder"
-            )
-        time.sleep(0.2)
