@@ -118,7 +118,10 @@ def test_checkpoints_and_later_loops_know_nothing_of_the_rows():
     splats = torch.nn.ParameterDict(host.splats)
     clear = attach(splats, host.optimizers, scene.train, Conductor())
     assert ROWS in splats
-    assert set(splats.state_dict()) == {*host.splats, "detail"}
+    stored = {name: p.clone() + 1 for name, p in splats.state_dict().items()}
+    assert set(stored) == {*host.splats, "detail"}
+    splats.load_state_dict(stored)
+    assert torch.equal(splats["means"], stored["means"])
     clear.remove()
     assert ROWS not in splats
 

@@ -27,9 +27,11 @@ def test_as_many_pass_as_by_the_ordinary_statistic_and_in_the_scores_order(seed,
     assert set((scaled >= 5e-4).nonzero()[:, 0].tolist()) == set(score.argsort(descending=True)[:passing].tolist())
 
 
-def test_none_passes_where_none_passes_by_the_ordinary_statistic():
+def test_none_passes_where_none_passes_by_the_ordinary_statistic_or_has_a_score():
     scaled = ScoreScaler(threshold=1.0)(torch.rand(20) * 100, torch.rand(20) * 0.5, everyone(20))
     assert float(scaled.max()) < 1
+    zeros = torch.zeros(5)
+    assert torch.equal(ScoreScaler(threshold=1.0)(zeros, torch.ones(5) * 2, everyone(5)), zeros)
 
 
 def test_the_factor_follows_recent_views_and_restarts_when_the_number_of_gaussians_changes():
@@ -54,10 +56,6 @@ def test_a_restored_factor_continues():
     ]
     assert torch.equal(*last)
     assert resumed.factor != 1
-
-
-def test_a_score_of_zeros_stays_zero():
-    assert torch.equal(ScoreScaler(threshold=1.0)(torch.zeros(5), torch.ones(5) * 2, everyone(5)), torch.zeros(5))
 
 
 def test_the_ordinary_statistic_is_not_scaled():

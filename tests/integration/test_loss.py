@@ -64,8 +64,7 @@ def test_its_value_is_the_sum_of_the_losses():
 def test_an_extra_view_is_learned_from_in_a_step_of_its_own():
     scene = toy.scene(20)
     host, conductor = Host(scene), Conductor(toy.ShowsDark(), objective=HR_FROM_START)
-    conductor.on_fit_start(3, 0)
-    conductor.on_views(scene.train)
+    conductor.on_fit_start(3, 0, views=scene.train)
     optimizer = torch.optim.Adam(list(host.params.values()), lr=5e-3, eps=1e-15)
     losses = []
     for t in range(1, 25):

@@ -199,10 +199,12 @@ def trained(host, scene, *strategies, threshold=None, monkeypatch=None):
     function = with_absgrad(gsplat_host.rasterization) if isinstance(host, Splatfacto) else gsplat_host.rasterization
     with monkeypatch.context() as patch:
         patch.setattr(gsplat_host, "rasterization", function)
-        return gsplat_host.trained(
-            host, scene, Conductor(*strategies, objective=HR_FROM_START), [scene.train[0].name], function=function,
-            names=getattr(host, "names", None), strategy=threshold and SimpleNamespace(grow_grad2d=threshold),
-        )  # fmt: skip
+        with gsplat_host.attached(
+            host, scene, Conductor(*strategies, objective=HR_FROM_START), function, names=getattr(host, "names", None),
+            strategy=threshold and SimpleNamespace(grow_grad2d=threshold),
+        ) as clear:  # fmt: skip
+            host.train([scene.train[0].name])
+    return clear
 
 
 def test_splatfactos_shapes_give_the_same_gradients_as_gsplats(monkeypatch):
@@ -218,19 +220,12 @@ def test_splatfactos_shapes_give_the_same_gradients_as_gsplats(monkeypatch):
         assert torch.allclose(g.reshape(expected.shape), expected, atol=1e-5 * float(expected.abs().max())), name
 
 
-def test_without_a_score_the_absolute_gradient_is_unchanged(monkeypatch):
-    scene = toy.scene(30)
-    host = Splatfacto(scene)
-    clear = trained(host, scene, GCO(), threshold=1e-9, monkeypatch=monkeypatch)
-    means2d = host.info["means2d"]
-    assert clear.attachment.counts["scores written"] == 0
-    assert torch.equal(means2d.absgrad, 3 * means2d.grad.abs())
-
-
-def test_as_many_pass_by_the_score_as_by_the_absolute_gradient(monkeypatch):
+def test_as_many_pass_by_the_score_as_by_the_absolute_gradient_which_is_unchanged_without_one(monkeypatch):
     scene = toy.scene(30)
     plain = Splatfacto(scene)
-    trained(plain, scene, GCO(), threshold=1.0, monkeypatch=monkeypatch)
+    clear = trained(plain, scene, GCO(), threshold=1.0, monkeypatch=monkeypatch)
+    assert clear.attachment.counts["scores written"] == 0
+    assert torch.equal(plain.info["means2d"].absgrad, 3 * plain.info["means2d"].grad.abs())
     ndc = torch.tensor([24 / 2, 16 / 2])
     own = (plain.info["means2d"].absgrad[0] * ndc).norm(dim=-1)
     threshold = float(own.sort().values[-8] * (1 - 1e-3))  # eight pass

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import DataError
 from clear_strategies.geometry import stereo
 from clear_strategies.geometry.projection import intrinsics
 from integration import HostError
@@ -22,7 +22,7 @@ from integration.gsplat.data import photos_of as photos_of_dataset
 from integration.inria.__main__ import main as inria_main
 from integration.inria.cameras import photo_of
 from integration.inria.from_options import install as install_in_inria
-from integration.points import stereo_points, wants_stereo
+from integration.points import stereo_points
 from integration.views import HostPhoto
 from rasterizers.geometry import SH_C0
 from tests.helpers import toy
@@ -55,12 +55,6 @@ def assert_starts_there(means, sh0):
 
 
 # ---- what hosts share
-
-
-@pytest.mark.parametrize("points", ["sfm", "", "Stereo"])
-def test_other_words_than_own_and_stereo_are_refused(points):
-    with pytest.raises(SettingError, match=rf"points: must be own \(.*\) or stereo \(.*\), got '{points}'"):
-        wants_stereo(points)
 
 
 def test_one_line_says_what_was_found_and_a_large_cloud_is_reduced(monkeypatch, caplog):
@@ -119,19 +113,16 @@ def test_splats_start_at_the_stereo_cloud_and_their_optimizers_have_them(trainer
         assert len(p) == len(expected().means)
 
 
-def test_splats_start_at_the_hosts_own_points_by_default(trainer, tmp_path):
-    own = runner_of(trainer, tmp_path).splats
-    install(trainer)
-    for name, p in runner_of(trainer, tmp_path).splats.items():
+@pytest.mark.parametrize(("init_type", "points"), [("sfm", "own"), ("random", "stereo")])
+def test_splats_start_at_the_hosts_own_points_by_default_and_where_they_are_random(
+    trainer, tmp_path, init_type, points, caplog
+):
+    own = runner_of(trainer, tmp_path, init_type=init_type).splats
+    install(trainer, **({"points": points} if points == "stereo" else {}))
+    for name, p in runner_of(trainer, tmp_path, init_type=init_type).splats.items():
         assert torch.equal(p, own[name])
-
-
-def test_points_have_no_effect_on_random_splats_and_a_warning_says_so(trainer, tmp_path, caplog):
-    own = runner_of(trainer, tmp_path, init_type="random").splats
-    install(trainer, points="stereo")
-    for name, p in runner_of(trainer, tmp_path, init_type="random").splats.items():
-        assert torch.equal(p, own[name])
-    assert "points=stereo has no effect with init_type=random. Set init_type=sfm." in caplog.text
+    warned = "points=stereo has no effect with init_type=random. Set init_type=sfm." in caplog.text
+    assert warned == (points == "stereo")
 
 
 def test_the_hidden_half_of_a_photo_of_the_dataset_gives_no_points(trainer):

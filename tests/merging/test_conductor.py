@@ -201,7 +201,8 @@ def test_a_weight_without_warm_up_is_constant_from_the_first_iteration():
     assert {constant(t) for t in (1, 2, 5_000, 5_001, 9_999, 10_000, 20_000)} == {0.4}
 
 
-def test_routing_weighs_the_high_frequency_gradient_only_by_which_alone_the_detail_feature_moves():
+def test_routing_weighs_the_high_frequency_gradient_only():
+    """By which alone the detail feature moves."""
     field, view, lr, hr = drawn()
     objective, p2g = Objective(lambda_hr=ALWAYS), P2G()
     update = Conductor(p2g, objective=objective).update(field.raw(), lr, hr, view, 5)
