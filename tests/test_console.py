@@ -27,15 +27,15 @@ def logger():
 
 
 @pytest.mark.parametrize(
-    ("verbose", "expected"), [(False, "plan\nwarning: odd\n"), (True, "detail\nplan\nwarning: odd\n")]
+    ("verbose", "shown"), [(False, "plan\nwarning: odd\n"), (True, "detail\nplan\nwarning: odd\n")]
 )
-def test_details_are_for_those_who_ask_and_warnings_have_a_prefix(logger, verbose, expected):
+def test_details_are_for_those_who_ask_and_warnings_have_a_prefix(logger, verbose, shown):
     stream = io.StringIO()
     logger.addHandler(Console(stream, verbose=verbose))
     logger.debug("detail")
     logger.info("plan")
     logger.warning("odd")
-    assert stream.getvalue() == expected
+    assert stream.getvalue() == shown
 
 
 def test_what_chatty_libraries_do_is_not_shown_and_their_warnings_are():

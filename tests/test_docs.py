@@ -155,9 +155,7 @@ def test_the_readmes_loop_prints_the_number_of_its_table(run_block, capsys):
 
 
 def test_the_readmes_blocks_are_as_short_as_promised():
-    loop, gco = (
-        [line for line in block.splitlines() if line.strip()] for block in blocks(ROOT / "README.md", "python")
-    )
+    loop, gco = ([line for line in b.splitlines() if line.strip()] for b in blocks(ROOT / "README.md", "python"))
     assert len(loop) <= 25
     assert len(gco) <= 10
     assert all(len(line) <= 120 for line in loop + gco)

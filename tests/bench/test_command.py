@@ -96,9 +96,7 @@ def test_a_folder_that_cannot_be_made_is_known_before_measuring(tmp_path, caplog
     assert str(tmp_path / "file") in caplog.records[-1].getMessage()
 
 
-@pytest.mark.parametrize(
-    "arguments", [["rasterizers", "--repeats", "0"], ["rasterizers", "--preset", "best"], ["nothing"]]
-)
+@pytest.mark.parametrize("arguments", [["kernels", "--repeats", "0"], ["rasterizers", "--preset", "best"], ["nothing"]])
 def test_bad_arguments_have_exit_code_2(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
@@ -107,9 +105,7 @@ def test_bad_arguments_have_exit_code_2(arguments, capsys):
 
 def test_the_page_links_to_every_published_table_and_a_figure_is_drawn_from_them():
     data = DOCS / "data" / "benchmarks"
-    linked = set(
-        re.findall(r"\(\.\./data/benchmarks/(\w+\.csv)\)", (DOCS / "explanation" / "benchmarks.md").read_text())
-    )
+    linked = set(re.findall(r"\(\.\./data/benchmarks/(\w+\.csv)\)", (DOCS / "explanation/benchmarks.md").read_text()))
     assert linked == {path.name for path in data.glob("*.csv")}
     tables = {path.stem: pd.read_csv(path) for path in data.glob("*.csv")}
     figure = plots.time_against_error(tables["rasterizers_time"], tables["rasterizers_error"])

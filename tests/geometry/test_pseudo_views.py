@@ -86,10 +86,8 @@ def test_a_depth_that_no_photo_vouches_for_gives_no_colour():
     # Seen from camera 0, the nearer surface of photo 1 hides that of photo 0, which does not confirm it.
     view = made[0]
     row, column = torch.nonzero(view.known).unbind(1)
-    points = back_project(
-        view.photo.camera, torch.stack((column, row), 1).double() + 0.5, torch.full((len(row),), 2.0).double()
-    )
-    pixels, _ = project(photos["1.png"].camera, points)
+    centers, depth = torch.stack((column, row), 1).double() + 0.5, torch.full((len(row),), 2.0).double()
+    pixels, _ = project(photos["1.png"].camera, back_project(view.photo.camera, centers, depth))
     error = (sample_colors(photos["1.png"].image, pixels) - view.photo.image[row, column]).abs().amax(1)
     hidden = (pixels[:, 0] > 2) & (pixels[:, 0] < 118)
     assert hidden.any()

@@ -30,8 +30,6 @@ def install(folder: Path, monkeypatch: pytest.MonkeyPatch, does: bytes = b"repea
     (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: ncnn\nVersion: {VERSION}\n")
     monkeypatch.syspath_prepend(folder)
     spec = importlib.util.spec_from_file_location("ncnn", __file__)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "ncnn", module)
     spec.loader.exec_module(module)

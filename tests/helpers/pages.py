@@ -27,8 +27,6 @@ def name(page: Path) -> str:
 def loaded(path: Path) -> ModuleType:
     """A Python file of docs/, which is no package."""
     spec = importlib.util.spec_from_file_location(f"docs_{path.stem}", path)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     sys.path.insert(0, str(path.parent))  # as mkdocs does

@@ -23,7 +23,6 @@ def test_ctrl_c_outside_of_a_job_says_nothing_of_what_was_saved() -> None:
 )
 def test_space_is_a_remedy_of_a_full_disk_alone(number: int, remedy: str) -> None:
     ending = exit_codes.describe(OSError(number, os.strerror(number), "x.ply"))
-    assert ending is not None
     code, message = ending
     assert code == exit_codes.NO_DISK
     assert message.startswith(f"x.ply: {os.strerror(number)}. {remedy}")

@@ -76,7 +76,6 @@ def test_conflict_is_the_ratio_that_training_logs() -> None:
     view = state.views[0]
     found = view_maps(state.field, state.conductor, toy.RASTERIZER, view)
     lr, hr = state.field.render_scales(toy.RASTERIZER, view)
-    assert hr is not None
     (g_lr,) = lr.vjp(OBJECTIVE.lr(lr.image, view.lr.image).cotangents)
     g_base, g_hf = hr.vjp(OBJECTIVE.hr(hr.image, view.hr.image).cotangents)
     assert found.means["conflict"] == pytest.approx(conflict_ratio(g_lr, g_base + g_hf * 0.2)["gaussian"])

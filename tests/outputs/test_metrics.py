@@ -40,7 +40,6 @@ def test_each_view_is_scored_by_method_and_the_mean_is_over_views() -> None:
     assert evaluation.test["b"]["bicubic"] == score(images.upsample(b.lr.image, 4), noise(1, 48, 64))
     assert evaluation.test["b"]["prior"] == score(b.hr.image, noise(1, 48, 64))
     mean = evaluation.mean("test")
-    assert mean is not None
     assert mean.psnr == pytest.approx((PSNR_CAP + evaluation.test["b"]["ours"].psnr) / 2)
     assert evaluation.against == {"test": "HR photos", "train": "HR photos"}
 

@@ -79,7 +79,6 @@ def test_every_file_of_a_run_is_listed(tmp_path: Path, state: TrainState) -> Non
     assert names(tmp_path) == listed() - WRITTEN_BY_OTHERS
     content = json.loads((tmp_path / "metrics.json").read_text())
     mean = evaluation.mean("test")
-    assert mean is not None
     assert content["test"]["mean"]["ours"] == pytest.approx(asdict(mean))
     assert content["baseline"] is None
     assert (content["scene"], content["strategies"], content["config"]) == ("toy", ["gco", "p2g"], {"fit": {"seed": 0}})

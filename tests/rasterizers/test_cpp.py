@@ -56,9 +56,7 @@ def test_bits_do_not_depend_on_the_memory_budget():
 def covering(n):
     """Gaussians that each cover the whole image."""
     splats = scene(n, bands=0, seed=2)
-    return replace(
-        splats, scales=torch.full_like(splats.scales, 50.0), opacities=torch.full_like(splats.opacities, 0.01)
-    )
+    return replace(splats, scales=torch.full_like(splats.scales, 50.0), opacities=torch.full((n,), 0.01))
 
 
 def test_a_row_beyond_the_budget_is_drawn_in_parts():

@@ -22,9 +22,7 @@ def test_runs_that_differ_in_their_seed_share_a_row(tmp_path: Path) -> None:
     assert (line["best"], line["seeds"], line["Gaussians"]) == ("25.00", "0, 1, 2", "1,200 ± 0")
 
 
-@pytest.mark.parametrize(
-    "setting", ["prior=onnx", "strategies.gco.tolerance=0.1", "~strategies.p2g", "fit.iterations=9"]
-)
+@pytest.mark.parametrize("setting", ["prior=onnx", "strategies.gco.tolerance=0.1", "~strategies.p2g", "mip.every=9"])
 def test_runs_that_differ_in_a_setting_have_rows_that_name_it(tmp_path: Path, setting: str) -> None:
     make_run(tmp_path / "0", "+strategy=clear", "data=llff")
     make_run(tmp_path / "1", "+strategy=clear", "data=llff", setting)
@@ -117,7 +115,6 @@ def test_differences_are_paired_by_seed(tmp_path: Path) -> None:
         make_run(tmp_path / f"b{seed}", "+strategy=gco", seed=seed, psnr=second)
     delta = rows_of(tmp_path)["gco"].delta
     # Differences 0.5, 0.25, 1.5: mean 0.75, deviations -0.25, -0.5, 0.75, so √(0.875 / 2) / √3.
-    assert delta is not None
     assert (delta.mean, delta.pairs) == (0.75, 3)
     assert delta.error == pytest.approx((0.875 / 2 / 3) ** 0.5)
     lines = {line["method"]: line for line in cells(table_of(tmp_path))}
@@ -135,7 +132,6 @@ def test_averages_are_means_of_scene_means_with_paired_differences(tmp_path: Pat
     assert [row.method for row in rows] == ["bicubic", "prior", "baseline", "gco"]
     baseline, gco = rows[2:]
     assert baseline.values["psnr"] == [21.0, 24.0]  # each scene counts once, however many seeds it has
-    assert gco.delta is not None
     assert (gco.delta.mean, gco.delta.pairs) == (2.0, 4)  # 1, 1, 1, 5
     assert gco.delta.error == pytest.approx(1.0)  # s = 2
     line = cells(report.layout(rows).markdown)[3]

@@ -23,9 +23,7 @@ def test_a_run_is_named_by_its_strategies_as_given_on_the_command_line(tmp_path:
 
 
 def test_a_later_command_in_its_folder_does_not_rename_a_run(tmp_path: Path) -> None:
-    folder = make_run(
-        tmp_path / "run", "+strategy=clear", "fit.iterations=20", overrides=["+strategy=gco", "fit.seed=3"]
-    )
+    folder = make_run(tmp_path, "+strategy=clear", "fit.iterations=20", overrides=["+strategy=gco", "fit.seed=3"])
     run = report.Run.read(folder)
     assert (run.name, run.settings) == ("gco", ())
 

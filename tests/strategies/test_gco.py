@@ -29,9 +29,7 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
     return (a.double() * b.double()).flatten(1).sum(1) if a.dim() > 1 else a.double() * b.double()
 
 
-@pytest.mark.parametrize(
-    ("q", "omega"), [(None, 0.55 / 0.95), (0.0, 0.55 / 0.95), (0.5, 0.5 * 0.55 / 0.95), (1.0, 0.05)]
-)
+@pytest.mark.parametrize(("q", "omega"), [(None, 0.55 / 0.95), (0.0, 0.55 / 0.95), (0.5, 0.275 / 0.95), (1.0, 0.05)])
 def test_values_worked_out_by_hand_which_reliability_softens_down_to_the_lower_bound(q, omega):
     # l = (1, 0, 0), h = (-3, 4, 0): c = -3/5, d = -3 + 0.05·5 = -2.75, s = (0.6 - 0.05) / 0.95.
     l, h = torch.tensor([1.0, 0, 0]), torch.tensor([-3.0, 4, 0])

@@ -51,9 +51,7 @@ def test_what_the_photos_show_behind_an_object_or_hide_stays_as_it_is():
     ]
     assert prepared(white).background(1) is None
     assert "not transparent" in prepared(white).summary()
-    hiding = [
-        view.hiding(torch.arange(view.lr.camera.width).expand(view.lr.image.shape[:2]) > 3) for view in SCENE.train
-    ]
+    hiding = [v.hiding(torch.arange(v.lr.camera.width).expand(v.lr.image.shape[:2]) > 3) for v in SCENE.train]
     assert prepared(hiding).background(1) is None
 
 

@@ -59,9 +59,8 @@ def both_ways(passes, c: Case, readable, compiled, hr="both"):
 
 def same(a, b):
     assert a.keys() <= b.keys()
-    assert all(
-        math.isnan(b[name]) for name in b.keys() - a.keys()
-    )  # on a device nobody knows that there is nothing to say
+    # On a device nobody knows that there is nothing to say.
+    assert all(math.isnan(b[name]) for name in b.keys() - a.keys())
     for name, value in a.items():
         assert b[name] == pytest.approx(value, rel=1e-6, nan_ok=True), name
 
@@ -207,9 +206,8 @@ def test_rows_and_bands_that_are_left_out_would_not_have_moved(passes, degree, a
         ledgers.append(both[1].work_log.entries)
     assert all(torch.equal(a, b) for a, b in zip(*states, strict=True))
     assert ledgers[0]["optimizer rows"].skipped["gradient, moments and anchor's pull are 0"] > 500
-    assert ledgers[0]["SH bands in the optimizer"].skipped == {
-        "above the active degree": 3 * (15 - (degree + 1) ** 2 + 1)
-    }
+    inactive = 3 * (15 - (degree + 1) ** 2 + 1)
+    assert ledgers[0]["SH bands in the optimizer"].skipped == {"above the active degree": inactive}
     assert "optimizer rows" not in ledgers[1]
 
 

@@ -222,7 +222,6 @@ def test_a_short_run_moves_the_geometry_faster_and_nothing_else():
         assert short.means(t) == pytest.approx(2 * plain.means(t))
     assert replace(short, means=plain.means, scales=plain.scales, quats=plain.quats) == rates
     assert rates.of_run(30_000) == rates.of_run(60_000) == rates
-    assert plain.of_run(1_500) == plain
 
 
 def test_in_the_last_tenth_all_rates_fall_to_zero_but_that_of_the_means_falls_all_along():

@@ -48,7 +48,6 @@ def test_the_lens_and_the_masks_that_a_file_names_are_used(tmp_path: Path) -> No
     capture = blender.read(tmp_path)
     train, test = capture.frames
     assert (train.camera.fx, train.camera.fy, train.camera.cx, train.camera.cy) == (22, 23, 7.5, 6.5)
-    assert train.shown is not None
     assert not train.shown().any()
     assert "1 of 2 photos undistorted" in capture.notes["lens"]
     assert not torch.equal(test.load(), train.load())

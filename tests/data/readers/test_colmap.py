@@ -27,7 +27,6 @@ def test_photos_and_points_are_those_of_the_files(layout: str, tmp_path: Path) -
     for frame in capture.frames:
         assert torch.equal(frame.load(), photo_files.read_image(tmp_path / "images" / frame.name))
     points = capture.points
-    assert points is not None
     assert points.means.tolist() == [list(p) for p in tiny.POINTS]
     torch.testing.assert_close(points.colors, torch.tensor([[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]]))
     pairs = sorted(zip(points.track_point.tolist(), points.track_image.tolist(), strict=True))
@@ -94,8 +93,6 @@ def test_the_mask_of_a_photo_in_a_subfolder_lies_in_one_of_the_same_name(tmp_pat
     for place, grey in (("cam_a/1.png.png", 0.0), ("cam_b/1.png", 1.0)):
         photo_files.write_png(tmp_path / "masks" / place, torch.full((12, 16), grey))
     a, b, c = (frame.shown for frame in colmap.read(tmp_path).frames)
-    assert a is not None
-    assert b is not None
     assert (bool(a().any()), bool(b().all()), c) == (False, True, None)
 
 
@@ -201,7 +198,6 @@ def test_distorted_models_become_pinholes_and_are_noted(model, parameters, tmp_p
 def test_real_points_project_into_the_photos_that_observe_them(scene: str, shared_data: Path) -> None:
     capture = colmap.read(shared_data / scene)
     points = capture.points
-    assert points is not None
     for frame in capture.frames:
         camera = frame.camera
         observed = points.means[points.track_point[points.track_image == frame.sfm_id]].double()

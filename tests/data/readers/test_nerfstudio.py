@@ -101,7 +101,6 @@ def test_points_of_a_ply_have_no_tracks(tmp_path: Path) -> None:
     changed(tmp_path, lambda value: value.update(ply_file_path="points.ply", applied_transform=[[1, 0, 0, 5]]))
     write_points(tmp_path / "points.ply", torch.tensor([[1.0, 2, 3]]), torch.tensor([[1, 0, 0.2]]))
     points = nerfstudio.read(tmp_path).points
-    assert points is not None
     assert points.means.tolist() == [[1, 2, 3]]
     assert points.colors[0].tolist() == pytest.approx([1, 0, 0.2])
     assert len(points.track_point) == len(points.track_image) == 0

@@ -58,9 +58,7 @@ def test_only_unknown_pixels_are_filled_and_never_in_known_free_space() -> None:
     assert len(close) == 400  # within 5 % of what the other photo knows
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("window", 4), ("spacing", 0.5), ("trust", 2), ("sources", 0), ("tolerance", 0)]
-)
+@pytest.mark.parametrize(("name", "value"), [("window", 4), ("spacing", 0.5), ("trust", 2), ("tolerance", 0)])
 def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
     with pytest.raises(SettingError, match=f"^{name}: must "):
         StereoSettings(**{name: value})
