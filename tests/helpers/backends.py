@@ -140,13 +140,10 @@ def balls(*depths: float, opacity=0.6, scale=0.4, color=0.5, dtype=torch.float64
     """Grey balls straight ahead, one behind the other, all as large in the image: with a radius of `scale` at depth 1."""
     n, z = len(depths), torch.tensor(depths, dtype=dtype)
     return Splats(
-        means=torch.stack((0 * z, 0 * z, z), 1),
-        quats=torch.tensor([[1.0, 0, 0, 0]], dtype=dtype).repeat(n, 1),
-        scales=(scale * z)[:, None].repeat(1, 3),
-        opacities=torch.full((n,), opacity, dtype=dtype),
-        sh0=torch.full((n, 1, 3), (color - 0.5) / SH_C0, dtype=dtype),
-        shN=torch.zeros(n, 0, 3, dtype=dtype),
-    )
+        means=torch.stack((0 * z, 0 * z, z), 1), quats=torch.tensor([[1.0, 0, 0, 0]], dtype=dtype).repeat(n, 1),
+        scales=(scale * z)[:, None].repeat(1, 3), opacities=torch.full((n,), opacity, dtype=dtype),
+        sh0=torch.full((n, 1, 3), (color - 0.5) / SH_C0, dtype=dtype), shN=torch.zeros(n, 0, 3, dtype=dtype),
+    )  # fmt: skip
 
 
 def camera(width=65, height=47) -> Camera:

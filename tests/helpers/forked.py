@@ -39,15 +39,9 @@ class Forked:
     """
 
     def __init__(
-        self,
-        *arguments: str,
-        cwd: Path,
-        env: dict[str, str],
-        said: IO[str],
-        errors: IO[str],
-        session: bool = False,
+        self, *arguments: str, cwd: Path, env: dict[str, str], said: IO[str], errors: IO[str], session: bool = False,
         drawn: bool = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         asked = {"arguments": arguments, "cwd": str(cwd), "env": env, "session": session, "drawn": drawn}
         self._ends, its_end = socket.socketpair()
         with its_end:

@@ -48,12 +48,8 @@ def with_depth(scene: Scene, depth: float = 4.0) -> Scene:
 
 
 def start(
-    names: tuple[str, ...],
-    iterations: int = ITERATIONS,
-    *,
-    more: Sequence[Strategy] = (),
-    fused: FusedMode = "auto",
-) -> TrainState:
+    names: tuple[str, ...], iterations: int = ITERATIONS, *, more: Sequence[Strategy] = (), fused: FusedMode = "auto",
+) -> TrainState:  # fmt: skip
     make = {
         "gco": GCO,
         "p2g": P2G,

@@ -45,13 +45,10 @@ def splats(n: int = 40, seed: int = 0, dtype: torch.dtype = torch.float32, bands
         return torch.randn(*shape, generator=g).to(dtype)
 
     return Splats(
-        means=normal(n, 3) * torch.tensor([1.1, 0.7, 0.8], dtype=dtype),
-        quats=normal(n, 4),
-        scales=(normal(n, 3) * 0.5 - 1.8).exp(),
-        opacities=torch.sigmoid(normal(n) + 1),
-        sh0=normal(n, 1, 3),
+        means=normal(n, 3) * torch.tensor([1.1, 0.7, 0.8], dtype=dtype), quats=normal(n, 4),
+        scales=(normal(n, 3) * 0.5 - 1.8).exp(), opacities=torch.sigmoid(normal(n) + 1), sh0=normal(n, 1, 3),
         shN=normal(n, bands, 3) * 0.2,
-    )
+    )  # fmt: skip
 
 
 def scene(n: int = 40, seed: int = 0, train: int = 3, test: int = 1) -> Scene:

@@ -38,11 +38,9 @@ class DataManager:
     """nerfstudio's data manager of the toy scene, as far as it is read. Its first access corrects photos and cameras."""
 
     def __init__(
-        self,
-        kind=lambda image: (image * 255).round().to(torch.uint8),
-        files=("a/0.jpg", "a/1.jpg", "a/2.jpg"),
+        self, kind=lambda image: (image * 255).round().to(torch.uint8), files=("a/0.jpg", "a/1.jpg", "a/2.jpg"),
         **extra,
-    ):
+    ):  # fmt: skip
         photos = [view.lr for view in toy.scene(24).train]
         flip = torch.tensor([1.0, -1, -1, 1])
         Ks = torch.cat([gsplat_host.intrinsics(photo.camera) for photo in photos])

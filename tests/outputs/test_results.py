@@ -49,13 +49,9 @@ def state() -> TrainState:
 
 
 def write(
-    folder: Path,
-    state: TrainState,
-    baseline: Baseline | None = None,
-    *,
-    scene: Scene = SCENE,
+    folder: Path, state: TrainState, baseline: Baseline | None = None, *, scene: Scene = SCENE,
     pictures: Pictures | None = PICTURES,
-) -> Evaluation:
+) -> Evaluation:  # fmt: skip
     return write_results(
         folder, scene, state, toy.RASTERIZER, Chosen(None, ["gco", "p2g"]), backend="torch", down="bicubic",
         painter=Painter(state.field, lambda **_: toy.RASTERIZER), pictures=pictures, seconds=1.5, config={"fit": {"seed": 0}},

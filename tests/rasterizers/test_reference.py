@@ -150,12 +150,10 @@ def test_needles_keep_a_positive_determinant():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"background": (0, 0, 2)}, "background must be"),
-        ({"kernels": 0.1}, "unknown rasterizer setting 'kernels'"),
-        ({"lanes": 0}, "lanes"),
-        ({"preset": "best"}, "unknown preset 'best'; choose one of fast, accurate, exact"),
+        ({"background": (0, 0, 2)}, "background must be"), ({"kernels": 0.1}, "unknown rasterizer setting 'kernels'"),
+        ({"lanes": 0}, "lanes"), ({"preset": "best"}, "unknown preset 'best'; choose one of fast, accurate, exact"),
     ],
-)
+)  # fmt: skip
 def test_settings_outside_their_range_are_refused(settings, message):
     """tests/stress/bad_inputs/settings.py has the others."""
     with pytest.raises(ValueError, match=message):
@@ -186,11 +184,9 @@ def test_float32_gradients_of_huge_footprints_agree_with_float64(pixels, shape):
     camera = Camera(torch.eye(4), 100.0, 100.0, 33.0, 24.0, 65, 47)
     v = torch.randn(1, 47, 65, 3, generator=torch.Generator().manual_seed(0))
     splats = replace(
-        balls(1.0, dtype=torch.float32),
-        means=torch.tensor([[0.05, -0.02, 1.0]]),
-        quats=torch.tensor([[0.8, -0.3, 0.5, 0.2]]),
-        scales=torch.tensor([shape]) * pixels / 100,
-    )
+        balls(1.0, dtype=torch.float32), means=torch.tensor([[0.05, -0.02, 1.0]]),
+        quats=torch.tensor([[0.8, -0.3, 0.5, 0.2]]), scales=torch.tensor([shape]) * pixels / 100,
+    )  # fmt: skip
     found, exact = (ReferenceRasterizer()(s, camera).vjp(v.to(s.means)) for s in (splats, to(splats, torch.float64)))
     for name in ("means", "quats", "scales", "opacities", "sh0", "screen"):
         a, b = getattr(found, name).double(), getattr(exact, name)

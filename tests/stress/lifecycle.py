@@ -234,10 +234,6 @@ def measure(examples: int, *, steps: int = 30) -> Row:
     except Exception as error:
         failure = f"{type(error).__name__}: {error}".split("\n")[0][:120]
     return Row(
-        "lifecycle in random order: an invariant does not hold",
-        "cpu",
-        Lifecycle.rules_run,
-        float(failure != "none"),
-        0,
-        failure,
-    )
+        "lifecycle in random order: an invariant does not hold", "cpu", Lifecycle.rules_run, float(failure != "none"),
+        0, failure,
+    )  # fmt: skip

@@ -35,14 +35,10 @@ def cases(every: int = 1) -> Iterator[tuple[str, Splats]]:
         yield (
             f"scale {scale:g}, depth {depth:g}, logit {logit:g}, norm {norm:g}",
             Splats(
-                means=torch.tensor([[0.05, -0.03, 1.0]]) * depth,
-                quats=_QUATERNION * norm,
-                scales=_SHAPE * scale,
-                opacities=opacity,
-                sh0=torch.tensor([[[0.9, 0.2, -0.5]]]),
-                shN=torch.zeros(1, 0, 3),
+                means=torch.tensor([[0.05, -0.03, 1.0]]) * depth, quats=_QUATERNION * norm, scales=_SHAPE * scale,
+                opacities=opacity, sh0=torch.tensor([[[0.9, 0.2, -0.5]]]), shN=torch.zeros(1, 0, 3),
             ),
-        )
+        )  # fmt: skip
 
 
 def measure(backends: Mapping[str, Rasterizer], *, every: int = 1) -> Iterator[Row]:

@@ -66,10 +66,8 @@ def _tests(folder: Path, isa: str) -> Row:
     build = folder / "build"
     nanobind = _output(sys.executable, "-m", "nanobind", "--cmake_dir")
     configure = [
-        f"-DCLEAR_SANITIZE={_SANITIZERS}",
-        f"-Dnanobind_DIR={nanobind}",
-        f"-DPython_EXECUTABLE={sys.executable}",
-    ]
+        f"-DCLEAR_SANITIZE={_SANITIZERS}", f"-Dnanobind_DIR={nanobind}", f"-DPython_EXECUTABLE={sys.executable}",
+    ]  # fmt: skip
     subprocess.run(["cmake", "-S", str(_ROOT), "-B", str(build), *configure], check=True, stdout=subprocess.DEVNULL)
     for package in _PACKAGES:
         target = f"{package.replace('/', '_')}_{isa}"

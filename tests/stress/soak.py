@@ -47,13 +47,11 @@ def run(iterations: int) -> list[Row]:
         rasterizer, backend = toy.RASTERIZER, "torch"
     svs = scaled(SVS(anchor_strength=0.01), stretch)
     state = TrainState.start(
-        scene,
-        Conductor(GCO(), P2G(), svs, objective=scaled(Objective(), stretch)),
+        scene, Conductor(GCO(), P2G(), svs, objective=scaled(Objective(), stretch)),
         settings=scaled(FitSettings(iterations=iterations), stretch),
         density=scaled(DensitySettings(max_gaussians=400, threshold=1e-4), stretch),
-        rates=scaled(LearningRates(), stretch),
-        mip=scaled(MipFilter(), stretch),
-    )
+        rates=scaled(LearningRates(), stretch), mip=scaled(MipFilter(), stretch),
+    )  # fmt: skip
     memory, files, bad = [], [], 0
     with tempfile.TemporaryDirectory() as folder:
         for t in range(1, iterations + 1):

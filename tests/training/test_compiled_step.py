@@ -280,13 +280,11 @@ def test_thirty_iterations_are_those_of_the_readable_path(passes):
         svs = ANCHORING(dropout=Ramp(full=30), anchor_start=20)
         objective = Objective(lambda_hr=WarmupDecay(start=3, full=10, decay_from=20, end=30))
         states[mode] = TrainState.start(
-            scene,
-            Conductor(GCO(), P2G(), svs, objective=objective, statistics_from=1),
+            scene, Conductor(GCO(), P2G(), svs, objective=objective, statistics_from=1),
             settings=FitSettings(iterations=30, scale_schedule=False, degree_every=6, fused=mode),
             density=DensitySettings(start=1, stop=19, statistics_from=1, every=9, min_gaussians=2, max_gaussians=40),
-            rates=LearningRates(means=LogLinear(end=30), detail_decay=0.01),
-            mip=MipFilter(every=7, last=1),
-        )
+            rates=LearningRates(means=LogLinear(end=30), detail_decay=0.01), mip=MipFilter(every=7, last=1),
+        )  # fmt: skip
         if mode == "auto":
             states[mode].compiled_step = CompiledStep(states[mode].conductor, states[mode].optimizer, passes=passes)
         for _ in range(30):
