@@ -2,8 +2,8 @@
 
 The lock says who holds it, so that messages can, and it outlives a file system without `flock`. A process on this host is
 known to be dead; so is an earlier try of the same Slurm job, because Slurm starts a job again only after it has ended. The
-lock of another host, or of another container, is respected, because nothing is known of its processes. (The `filelock`
-package has no holder's name, and decides by `flock` alone, which network file systems of clusters often lack.)
+lock of another host is respected, because nothing is known of its processes. (The `filelock` package has no holder's name,
+and decides by `flock` alone, which network file systems of clusters often lack.)
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 NAME: Final = "run.lock"
-_INITIAL: Final = "pid:[4026531836]"  # the kernel's name of the PID namespace that a host boots with
 
 
 class HeldError(DataError):
@@ -103,28 +102,19 @@ def _require_stale(path: Path, text: str) -> None:
             path, "lock", f"{name} is at work in this folder {since}", "wait for it, or take another folder"
         )
     if alive is None:
-        problem = f"{name} took this folder {since}; whether it still runs cannot be known from {_host()}"
+        problem = f"{name} took this folder {since}; whether it still runs cannot be known from {socket.gethostname()}"
         raise DataError(path, "lock", problem, "if it does not run any more, remove this file")
     _log.warning("%s: %s ended without releasing it; taken over.", path, name)
 
 
 def _me() -> dict[str, Any]:
     return {
-        "host": _host(),
+        "host": socket.gethostname(),
         "pid": os.getpid(),
         "started": _started(os.getpid()),
         "since": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         **_slurm(),
     }
-
-
-def _host() -> str:
-    """Where process numbers are told apart: the host, and in a container, which may share the host's name, its own space."""
-    try:
-        space = str(Path("/proc/self/ns/pid").readlink())
-    except OSError:  # a system without /proc
-        space = _INITIAL
-    return socket.gethostname() + f" ({space})" * (space != _INITIAL)
 
 
 def _slurm() -> dict[str, Any]:
@@ -138,7 +128,7 @@ def _alive(holder: dict[str, Any]) -> bool | None:
     mine = _slurm()
     if mine and holder.get("slurm_job") == mine["slurm_job"] and holder["slurm_restarts"] < mine["slurm_restarts"]:
         return False
-    if holder.get("host") != _host() or not isinstance(holder.get("pid"), int):
+    if holder.get("host") != socket.gethostname() or not isinstance(holder.get("pid"), int):
         return None
     return holder.get("started") == _started(holder["pid"])
 
