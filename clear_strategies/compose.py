@@ -159,11 +159,7 @@ def composed(overrides: list[str], config: str = "conductor") -> DictConfig:
 
 
 def require_each_once(overrides: Iterable[str]) -> None:
-    """Refuse a strategy that is named twice: Hydra merges the two into one silently.
-
-    Raises:
-        SettingError: one is.
-    """
+    """Raise a SettingError for a strategy that is named twice: Hydra merges the two into one silently."""
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         if override.key_or_group != "strategy" or override.is_sweep_override():
             continue
@@ -208,11 +204,7 @@ class _ReadConf(SearchPathPlugin):
 
 
 def _folder_of(point: EntryPoint) -> str:
-    """The folder of the package that an entry point of `OPTIONS` names.
-
-    Raises:
-        SettingError: there is no such package.
-    """
+    """The folder of the package that an entry point of `OPTIONS` names; a SettingError where there is none."""
     try:
         spec = find_spec(point.value)
     except ModuleNotFoundError:  # the package that it lies in

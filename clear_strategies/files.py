@@ -73,11 +73,7 @@ def require_regular(path: Path, *, most: int = _LARGEST) -> None:
 
 
 def read_bytes(path: Path, *, most: int = _LARGEST) -> bytes:
-    """The content of a regular file.
-
-    Raises:
-        DataError: it cannot be read, or `require_regular` refuses it.
-    """
+    """The content of a regular file; a DataError if it cannot be read, or `require_regular` refuses it."""
     require_regular(path, most=most)
     try:
         return path.read_bytes()

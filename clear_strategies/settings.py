@@ -175,11 +175,7 @@ def _require_buildable(function: Callable[..., Any], target: Any, key: str) -> N
 
 
 def _located(target: Any) -> Callable[..., Any]:
-    """The class or function of a dotted name.
-
-    Raises:
-        ImportError: it is not there.
-    """
+    """The class or function of a dotted name; an ImportError where it is not there."""
     if not isinstance(target, str):
         raise ImportError(f"{target!r} is no dotted name")
     module, _, name = target.rpartition(".")

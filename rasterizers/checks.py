@@ -90,11 +90,7 @@ def _kind(tensor: Tensor) -> str:
 
 
 def require_finite(splats: Splats) -> None:
-    """Refuse NaN and infinity, which would leave holes in the image. Costs one reduction per tensor.
-
-    Raises:
-        ValueError: names the tensor and the first such Gaussian.
-    """
+    """Raise a ValueError for NaN and infinity, which would leave holes in the image. Costs one reduction per tensor."""
     for field in fields(splats):
         value = getattr(splats, field.name)
         if value is None or bool(torch.isfinite(value.sum())):
@@ -106,22 +102,14 @@ def require_finite(splats: Splats) -> None:
 
 
 def require_cotangents(cotangents: Tensor, image: Tensor) -> None:
-    """Refuse cotangents that are not [K, H, W, 3] for an image [H, W, 3].
-
-    Raises:
-        ValueError: they have another shape.
-    """
+    """Raise a ValueError unless the cotangents are [K, H, W, 3] for an image [H, W, 3]."""
     if cotangents.dim() != 4 or cotangents.shape[1:] != image.shape:
         height, width, _ = image.shape
         raise ValueError(f"cotangents must be [K, {height}, {width}, 3], got {tuple(cotangents.shape)}.")
 
 
 def require_depth(rasterizer: Rasterizer) -> None:
-    """Refuse a rasterizer that draws no depth, before it is asked to.
-
-    Raises:
-        ValueError: it lacks the trait.
-    """
+    """Raise a ValueError, before it is asked to, for a rasterizer that draws no depth."""
     if not rasterizer.traits.depth:
         raise ValueError(
             f"{type(rasterizer).__name__} draws no depth (its traits.depth is False); cpp, torch, warp and gsplat do."

@@ -69,11 +69,7 @@ def auc(right: Float[Tensor, " K"], wrong: Float[Tensor, " M"]) -> float:
 
 
 def _errors(prior: Mapping[str, Any]) -> SeededErrors:
-    """The errors of a prior's node.
-
-    Raises:
-        SettingError: it makes none.
-    """
+    """The errors of a prior's node; a SettingError where it makes none."""
     names = [f.name for f in fields(SeededErrors)]
     if not all(name in prior for name in names):
         raise SettingError(

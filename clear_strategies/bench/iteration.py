@@ -135,11 +135,7 @@ def field_of(splats: Splats) -> GaussianField:
 
 
 def view_of(workload: Workload, rasterizer: Rasterizer) -> View:
-    """One view whose photos are a render plus noise.
-
-    Raises:
-        DataError: no LR grid divides the image.
-    """
+    """One view whose photos are a render plus noise; a DataError where no LR grid divides the image."""
     factor, camera = workload.lr_factor, workload.camera
     if factor is None:
         size = f"{camera.width}x{camera.height} is no multiple of 4, 3 or 2"

@@ -130,11 +130,7 @@ def require_device(device: str) -> None:
 
 
 def usable(asked: Sequence[str] | None, device: str, note: Callable[[str], None]) -> list[str]:
-    """The backends that run here, of those asked for.
-
-    Raises:
-        DataError: a name is unknown, or none runs.
-    """
+    """The backends that run here, of those asked for; a DataError where a name is unknown, or none runs."""
     reasons = rasterizers.available()
     for name in asked or ():
         if name not in reasons:

@@ -157,11 +157,7 @@ def garden(path: Path) -> Workload:
 
 
 def from_ply(path: Path) -> Workload:
-    """Gaussians as a run exports them.
-
-    Raises:
-        DataError: the file is no such export.
-    """
+    """Gaussians as a run exports them; a DataError where the file is no such export."""
     g = read_gaussians(path)
     splats = Splats(g.means, g.quats, g.scales.exp(), g.opacities.sigmoid(), g.sh0, g.shN)
     return Workload(path.stem, splats, facing_all(splats))

@@ -105,11 +105,7 @@ def train(folder: Path, overrides: Sequence[str]) -> str | None:
 
 
 def measure(results: Results, request: Request, trainer: Trainer = train) -> None:
-    """Train what is not finished yet, and say when each variant reached the reference.
-
-    Raises:
-        DataError: no reference finished.
-    """
+    """Train what is not finished yet, and say when each variant reached the reference: a DataError if none finished."""
     rows: list[dict[str, Any]] = []
     probes: list[dict[str, Any]] = []
     scenes: Sequence[str | None] = request.scene or [None]

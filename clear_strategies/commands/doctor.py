@@ -37,11 +37,7 @@ EXTRAS: Final = {
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Print the findings.
-
-    Raises:
-        SettingError: a backend that is installed fails, or draws something else than the reference.
-    """
+    """Print the findings; a SettingError if an installed backend fails, or draws something else than the reference."""
     parser = parser_of("doctor", "Say what this machine has, what works, and what is missing.", run=False)
     parser.add_argument("--all", action="store_true", help="test backends as well that compile for a minute first")
     options = parser.parse_args(arguments)

@@ -57,11 +57,7 @@ def main(arguments: list[str]) -> None:
 
 
 def overrides(arguments: Sequence[str]) -> list[str]:
-    """The arguments of the command as Hydra's.
-
-    Raises:
-        SettingError: as `main`.
-    """
+    """The arguments of the command as Hydra's; the SettingErrors as of `main`."""
     if not arguments or arguments[0].startswith(("-", "+", "~")):
         raise SettingError(
             "train needs a folder of photos or a video first: clear-strategies train PHOTOS [setting=value …]."

@@ -54,11 +54,7 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _require_own(host: str) -> None:
-    """The viewer's server would wait for ever for an address of another machine.
-
-    Raises:
-        SettingError: this machine has no such address.
-    """
+    """Raise a SettingError for an address of another machine, for which the viewer's server would wait for ever."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind) as found:

@@ -11,11 +11,7 @@ from rasterizers.interface import Color
 
 
 def require_whole(name: str, value: object, *, least: int, most: int | None = None) -> None:
-    """A whole number of at least `least` and at most `most`; a float such as 2.5 or 4.0 and a bool are none.
-
-    Raises:
-        SettingError: it is not.
-    """
+    """Raise a SettingError unless it is a whole number in [`least`, `most`]; a float such as 2.5 or 4.0 and a bool are none."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         refuse(name, f"must be a whole number of at least {least}", value, f"{name}={max(least, 1)}")
     elif most is not None and value > most:
@@ -31,11 +27,7 @@ def require_number(
     most: float = math.inf,
     below: float = math.inf,
 ) -> None:
-    """A finite number: greater than `above`, or else at least `least`; at most `most` and less than `below`.
-
-    Raises:
-        SettingError: it is not.
-    """
+    """Raise a SettingError unless it is a finite number: > `above`, or else >= `least`; <= `most`, and < `below`."""
     low, opening, sign = (least, "[", ">=") if above is None else (above, "(", ">")
     number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
     if (number > low or (number == low and above is None)) and number <= most and number < below:
@@ -48,22 +40,14 @@ def require_number(
 
 
 def require_choice(name: str, value: object, choices: Collection[object]) -> None:
-    """One of `choices`.
-
-    Raises:
-        SettingError: it is not.
-    """
+    """Raise a SettingError unless it is one of `choices`."""
     if value not in choices:
         listed = ", ".join(str(choice) for choice in choices)
         refuse(name, f"must be one of {listed}", value, f"{name}={next(iter(choices))}")
 
 
 def as_color(name: str, value: object) -> Color:
-    """Three numbers in [0, 1], as a tuple.
-
-    Raises:
-        SettingError: it is something else.
-    """
+    """Three numbers in [0, 1], as a tuple; a SettingError if it is something else."""
     parts = value if isinstance(value, list | tuple) else ()
     if len(parts) != 3 or not all(isinstance(x, int | float) and 0 <= x <= 1 for x in parts):
         refuse(name, "must be three numbers in [0, 1], an RGB colour", value, f"{name}=[1,1,1] is white")
@@ -72,9 +56,5 @@ def as_color(name: str, value: object) -> Color:
 
 
 def refuse(name: str, rule: str, value: object, remedy: str) -> NoReturn:
-    """Raise the error.
-
-    Raises:
-        SettingError: always.
-    """
+    """Raise a SettingError."""
     raise SettingError(f"{name}: {rule}, got {value!r}: {remedy}")

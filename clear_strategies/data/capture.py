@@ -121,11 +121,7 @@ class Capture:
 
 
 def sorted_by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:
-    """Frames in order of names.
-
-    Raises:
-        DataError: two have the same name, or there is none.
-    """
+    """Frames in order of names; a DataError where two have the same name, or there is none."""
     if not frames:
         raise DataError(file, "frames", "there is none", "give a capture with at least one posed photo")
     ordered = tuple(sorted(frames, key=lambda f: f.name))

@@ -34,11 +34,7 @@ class Exif:
 
 
 def read_exif(path: Path) -> Exif:
-    """The block of a photo.
-
-    Raises:
-        DataError: the file is no readable image.
-    """
+    """The block of a photo; a DataError if the file is no readable image."""
     tags = exif_of(path)
     time, f_number, iso = (_positive(tags.get(tag)) for tag in (_EXPOSURE_TIME, _F_NUMBER, _ISO))
     exposure = None

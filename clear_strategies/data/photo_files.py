@@ -104,21 +104,13 @@ def read_image(
 
 
 def image_size(path: Path, *, turn: bool | None = None) -> tuple[int, int]:
-    """(width, height), from the header only; `turn` as for `read_image`.
-
-    Raises:
-        DataError: as `read_image`, as far as the header tells.
-    """
+    """(width, height), from the header only; `turn` and the DataErrors as of `read_image`."""
     with _opened(path, turn) as image:
         return _size(image, turn)
 
 
 def has_alpha(path: Path) -> bool:
-    """Whether the file may have transparent pixels, from the header only.
-
-    Raises:
-        DataError: as `read_image`, as far as the header tells.
-    """
+    """Whether the file may have transparent pixels, from the header only; the DataErrors as of `read_image`."""
     with _opened(path, False) as image:
         return _has_alpha(image)
 
@@ -134,11 +126,7 @@ def orientation_of(image: Image.Image) -> int:
 
 
 def exif_of(path: Path) -> dict[int, Any]:
-    """The tags of an image's EXIF block, those of its photo part included; empty where it cannot be read.
-
-    Raises:
-        DataError: as `image_size`.
-    """
+    """The tags of an EXIF block, its photo part included; empty where it cannot be read. DataErrors as of `read_image`."""
     with _opened(path, False) as image:
         try:
             block = image.getexif()
@@ -269,11 +257,7 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
 
 
 def _is_heif(path: Path) -> bool:
-    """Whether the content is HEIC or HEIF; PIL can then open it.
-
-    Raises:
-        DataError: pillow-heif is not installed.
-    """
+    """Whether the content is HEIC or HEIF, which PIL can then open; a DataError if pillow-heif is not installed."""
     try:
         with path.open("rb") as file:
             head = file.read(12)

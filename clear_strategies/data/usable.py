@@ -21,11 +21,7 @@ _NAMED: Final = 5  # of many, in a message
 
 
 def require_faults(missing: Fault, broken: Fault) -> None:
-    """The two settings of every reader.
-
-    Raises:
-        SettingError: one is neither refuse nor skip.
-    """
+    """Raise a SettingError unless the two settings of every reader are refuse or skip."""
     require_choice("data.missing", missing, get_args(Fault))
     require_choice("data.broken", broken, get_args(Fault))
 

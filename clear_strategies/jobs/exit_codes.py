@@ -65,11 +65,7 @@ def _told_by_libraries() -> tuple[type[Exception], ...]:
 
 
 def require_train() -> None:
-    """Refuse to begin without the trainer's libraries; none is imported.
-
-    Raises:
-        SettingError: one is not installed.
-    """
+    """Raise a SettingError where one of the trainer's libraries is not installed; none is imported."""
     if missing := [name for name in TRAIN if find_spec(name) is None]:
         raise SettingError(
             f"training needs {', '.join(missing)}, which the core does not install: pip install 'clear-strategies[train]'."

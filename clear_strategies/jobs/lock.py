@@ -74,11 +74,7 @@ def _alone_with(path: Path) -> Iterator[TextIO]:
 
 
 def _opened(path: Path) -> TextIO:
-    """The lock file, for reading and writing; a link in its place would lead the lock out of the folder.
-
-    Raises:
-        DataError: it is a link or no regular file.
-    """
+    """The lock file, for reading and writing. A link, which would lead the lock out of the folder, is a DataError."""
     if path.is_symlink() or (path.exists() and not path.is_file()):
         raise DataError(path, "lock", "is a link or no regular file", "remove it, if no other run made it")
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_NOFOLLOW", 0), 0o666)

@@ -79,11 +79,7 @@ PriorSettings = AutoPrior | Callable[..., Any]
 
 
 def require_factor(prior: PriorSettings, factor: int) -> None:
-    """The prior can enlarge by this factor, as far as this is known before it is asked to.
-
-    Raises:
-        SettingError: it cannot.
-    """
+    """Raise a SettingError if the prior cannot enlarge by this factor, as far as this is known before it is asked to."""
     if isinstance(network := network_of(prior), Ncnn):
         network.require_factor(factor)
 
@@ -129,11 +125,7 @@ def read(data: DataSettings, prior: PriorSettings, known: Capture | None = None)
 
 
 def _require_text(capture: Capture) -> None:
-    """Names go into pictures, pages and JSON, which a byte that is no UTF-8 would spoil after training.
-
-    Raises:
-        DataError: the name of the scene or of a photo holds such a byte.
-    """
+    """Raise a DataError for a name that is no UTF-8, which would spoil pictures, pages and JSON after training."""
     for name in (capture.name, *(frame.name for frame in capture.frames), *capture.unplaced):
         if (shown := name.encode(errors="backslashreplace").decode()) != name:
             raise DataError(shown, "name", "must be UTF-8, has another byte", "rename this folder or photo")

@@ -31,11 +31,7 @@ _GROUPS: Final = {
 
 
 def require_tensorboard() -> None:
-    """Refuse to begin without TensorBoard.
-
-    Raises:
-        SettingError: it is not.
-    """
+    """Raise a SettingError where TensorBoard is not installed."""
     if find_spec("tensorboard") is None:
         raise SettingError("fit.log: tensorboard is not installed: pip install 'clear-strategies[log]'.")
 

@@ -235,11 +235,7 @@ class TrainState:
             raise ValueError(f"filter_3d or a statistic has not one number for each of {n} Gaussians")
 
     def require_finite(self) -> None:
-        """Check the parameters and Adam's moments; reads the device.
-
-        Raises:
-            DivergedError: names the tensor and the first such Gaussian.
-        """
+        """Raise a DivergedError for the first parameter or moment of Adam that is not finite; reads the device."""
         first, second = self.optimizer.first, self.optimizer.second
         for kind, table in (("", self.field.raw()), ("first moment of ", first), ("second moment of ", second)):
             for name, value in table.items():

@@ -75,11 +75,7 @@ def write_cameras(folder: Path, scene: Scene) -> None:
 
 
 def read_cameras(path: Path) -> list[SavedCamera]:
-    """The cameras of a run of ours or of Inria's 3DGS.
-
-    Raises:
-        DataError: it is no such file.
-    """
+    """The cameras of a run of ours or of Inria's 3DGS; a DataError if it is no such file."""
     remedy = "give the cameras.json of a run"
     entries = typed(path, strict_json.read(path), list[_Entry], remedy=remedy)
     if not entries:

@@ -58,11 +58,7 @@ class Turns:
 
 
 def require_viewer() -> None:
-    """Check that the viewer's libraries are installed.
-
-    Raises:
-        SettingError: one is not.
-    """
+    """Raise a SettingError where one of the viewer's libraries is not installed."""
     if lacks := [name for name in ("viser", "nerfview", "splines") if find_spec(name) is None]:
         raise SettingError(f"the viewer needs {' and '.join(lacks)}: pip install 'clear-strategies[view]'.")
 

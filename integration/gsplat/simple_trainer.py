@@ -113,11 +113,7 @@ def install(
 
 
 def require_supported(config: Any, processes: int = 1) -> None:
-    """Refuse options of simple_trainer that do not work with two scales.
-
-    Raises:
-        SettingError: one of them is set; the message says why.
-    """
+    """Raise a SettingError, which says why, for an option of simple_trainer that does not work with two scales."""
     for name, (needed, why) in _NEEDED.items():
         found = getattr(config, name, needed)
         if found != needed:

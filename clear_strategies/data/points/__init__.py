@@ -105,11 +105,7 @@ class CloudSettings:
 
 
 def require_source(settings: CloudSettings, sfm: SfmPoints | None) -> None:
-    """Refuse, before any photo is decoded, an `init` whose points do not exist.
-
-    Raises:
-        DataError: they do not.
-    """
+    """Raise a DataError, before any photo is decoded, for an `init` whose points do not exist."""
     if settings.init in ("sfm", "sfm_train") and (sfm is None or len(sfm.means) == 0):
         problem = f"there are none, but init={settings.init} asks for them"
         raise DataError("scene", "points", problem, "use init=triangulated or init=random")

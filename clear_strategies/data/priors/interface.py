@@ -88,21 +88,13 @@ def fingerprint(network: Network) -> str:
 
 
 def require_path(path: object, what: str) -> None:
-    """A path has been given.
-
-    Raises:
-        SettingError: it has not.
-    """
+    """Raise a SettingError unless a path has been given."""
     if not isinstance(path, str) or not path:
         raise SettingError(f"prior.path: must be {what}, got {path!r}: add prior.path=…")
 
 
 def require_file(path: Path, what: str) -> None:
-    """The file exists and can be read.
-
-    Raises:
-        DataError: it does not, or cannot.
-    """
+    """Raise a DataError unless the file exists and can be read."""
     if not path.is_file():
         raise DataError(path, "file", "is not there", f"set prior.path to {what}")
     if not os.access(path, os.R_OK):

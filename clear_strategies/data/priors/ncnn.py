@@ -106,11 +106,7 @@ class Ncnn:
         return _MODELS[self.model].files
 
     def require_factor(self, factor: int) -> None:
-        """The network reaches this factor.
-
-        Raises:
-            SettingError: it does not.
-        """
+        """Raise a SettingError unless the network reaches this factor."""
         if factor not in factors(self.model):
             rule = f"must be {' or '.join(map(str, factors(self.model)))} with {self.model}"
             remedy = f"data.views.sr_scale={max(factors(self.model))}, or another prior"

@@ -54,11 +54,7 @@ def tiled(
 
 
 def require_tiles(tile: int, overlap: int) -> None:
-    """Whole numbers with 0 <= 4 overlap < tile.
-
-    Raises:
-        SettingError: they are not.
-    """
+    """Raise a SettingError unless 0 <= 4 overlap < tile."""
     if not 0 <= 4 * overlap < tile:
         raise SettingError(
             f"prior.tile: 0 <= 4 overlap < tile must hold, got overlap={overlap}, tile={tile}: enlarge prior.tile"

@@ -156,11 +156,7 @@ def _small_frames(path: Path) -> Iterator[Grey]:
 
 
 def _filtered(path: Path, filters: str) -> list[str]:
-    """The command that gives a video's frames, filtered, to what follows it: of the ffmpeg that imageio-ffmpeg brings.
-
-    Raises:
-        DataError: it is not installed.
-    """
+    """The command that gives a video's frames, filtered, by imageio-ffmpeg's ffmpeg; a DataError if that is not installed."""
     try:
         import imageio_ffmpeg
     except ImportError as error:

@@ -25,20 +25,12 @@ def available(device: str = "cuda") -> bool:
 
 @cache
 def require(device: str) -> None:
-    """Check that Warp runs on this device.
-
-    Raises:
-        BackendUnavailable: it does not; the message says why.
-    """
+    """Raise a BackendUnavailable, whose message says why, unless Warp runs on this device."""
     require_warp("kernels=warp", device, "kernels=torch runs here")
 
 
 def loaded(device: str) -> ModuleType:
-    """The module that launches the kernels on this device, with the functions of `losses.cpp`.
-
-    Raises:
-        BackendUnavailable: Warp does not run there.
-    """
+    """The launchers of the kernels on this device, as in `losses.cpp`; a BackendUnavailable where Warp does not run."""
     require(device)
     from clear_strategies.kernels.losses.warp import launches
 
