@@ -31,36 +31,11 @@ if TYPE_CHECKING:
     from clear_strategies.strategies.svs import SVS
 
 __all__ = [
-    "ATTRIBUTES",
-    "CONFLICT_GROUPS",
-    "GCO",
-    "MCMC",
-    "P2G",
-    "SVS",
-    "AnchorError",
-    "ClearError",
-    "Conductor",
-    "DataError",
-    "DepthMap",
-    "Evidence",
-    "ExtraView",
-    "FadingOpacity",
-    "Grads",
-    "Objective",
-    "Photo",
-    "PseudoViews",
-    "RandomBackground",
-    "Run",
-    "ScreenGradients",
-    "Shot",
-    "SplatSuRe",
-    "Step",
-    "Strategy",
-    "StrategyConflict",
-    "Update",
-    "View",
-    "train",
-]
+    "ATTRIBUTES", "CONFLICT_GROUPS", "GCO", "MCMC", "P2G", "SVS", "AnchorError", "ClearError", "Conductor", "DataError",
+    "DepthMap", "Evidence", "ExtraView", "FadingOpacity", "Grads", "Objective", "Photo", "PseudoViews",
+    "RandomBackground", "Run", "ScreenGradients", "Shot", "SplatSuRe", "Step", "Strategy", "StrategyConflict", "Update",
+    "View", "train",
+]  # fmt: skip
 
 _NAMES: Final = {  # by the module of this package that they are defined in
     "core.evidence": ("Evidence",),

@@ -30,21 +30,9 @@ from rasterizers.interface import (
 )
 
 __all__ = [
-    "PRESETS",
-    "BackendUnavailable",
-    "Camera",
-    "RasterSettings",
-    "Rasterizer",
-    "Rendering",
-    "SplatGradients",
-    "Splats",
-    "Traits",
-    "available",
-    "fastest",
-    "for_device",
-    "load",
-    "names",
-]
+    "PRESETS", "BackendUnavailable", "Camera", "RasterSettings", "Rasterizer", "Rendering", "SplatGradients", "Splats",
+    "Traits", "available", "fastest", "for_device", "load", "names",
+]  # fmt: skip
 
 # The module and the class of each backend. A backend imports its library only when it is constructed.
 _BACKENDS: Final[dict[str, tuple[str, str]]] = {

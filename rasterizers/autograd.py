@@ -24,14 +24,8 @@ from rasterizers.interface import Camera, Color, Rasterizer, Rendering, Splats, 
 
 # Arguments of gsplat 1.5 that change its speed, or leave out Gaussians that are too small or too far to matter …
 _WITHOUT_EFFECT: Final = {
-    "sparse_grad",
-    "tile_size",
-    "radius_clip",
-    "far_plane",
-    "channel_chunk",
-    "distributed",
-    "segmented",
-}
+    "sparse_grad", "tile_size", "radius_clip", "far_plane", "channel_chunk", "distributed", "segmented",
+}  # fmt: skip
 # … and of the others, the values that this package draws; None where none is named.
 _SUPPORTED: Final = {"camera_model": "pinhole", "with_ut": False, "with_eval3d": False, "rolling_shutter": "GLOBAL"}
 
