@@ -41,6 +41,10 @@ class DivergedError(ClearError, FloatingPointError):
     """A number is NaN or infinite. The message names the tensor, the Gaussian, the view and the iteration."""
 
 
+class DensityError(ClearError, RuntimeError):
+    """Pruning would leave too few Gaussians to go on."""
+
+
 class AnchorError(ClearError, RuntimeError):
     """The number of Gaussians changed after their anchor was taken (Eq. 16)."""
 

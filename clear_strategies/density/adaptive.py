@@ -16,8 +16,8 @@ from clear_strategies.core.checks import require_choice, require_number, require
 from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Shot
 from clear_strategies.core.seeds import generator_at
-from clear_strategies.density.base import DensityError
 from clear_strategies.density.threshold import count_passing, topk_mask
+from clear_strategies.errors import DensityError
 from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import milestone
 from clear_strategies.training.field import GaussianField

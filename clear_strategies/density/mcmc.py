@@ -22,7 +22,7 @@ from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import Shot
 from clear_strategies.core.seeds import hashed_generator_at
 from clear_strategies.core.view import View
-from clear_strategies.density.base import DensityError
+from clear_strategies.errors import DensityError
 from clear_strategies.geometry.pseudo_views import cut_out
 from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import LogLinear, milestone

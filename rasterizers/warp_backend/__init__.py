@@ -1,10 +1,26 @@
 """The backend "warp": NVIDIA Warp kernels, compiled at first use from one source for CUDA and for the CPU, in float32.
 
-The stages have the names of `rasterizers.reference`: project, bin, blend, and their VJPs. `rasterizer` holds the settings
-and imports Warp only when it is constructed; `frame` launches the kernels; the other files hold the kernels, with VJPs
-written by hand.
+The stages have the names of `rasterizers.reference`: project, bin, blend, and their VJPs. Warp is imported when a rasterizer
+is constructed; `frame` launches the kernels; the other files hold the kernels, with VJPs written by hand.
 
 Deterministic: every sum has a fixed order, and there are no floating-point atomics.
 """
 
-from rasterizers.warp_backend.rasterizer import WarpRasterizer as WarpRasterizer
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rasterizers.interface import Camera, Rendering, Splats
+from rasterizers.warp_backend.settings import WarpSettings
+
+
+@dataclass(frozen=True, slots=True)
+class WarpRasterizer(WarpSettings):
+    """Warp kernels for CUDA; the same kernels run on a CPU, slowly, to check them."""
+
+    def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
+        """Jobs of one pose share colour and depth order."""
+        from rasterizers.warp_backend.frame import Frame
+
+        return [*Frame(self, jobs, depth).draw()]

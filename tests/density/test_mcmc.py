@@ -9,9 +9,8 @@ import torch
 
 from clear_strategies import MCMC, Update
 from clear_strategies.core.gradients import Grads
-from clear_strategies.density.base import DensityError
 from clear_strategies.density.mcmc import Sampler, relocation
-from clear_strategies.errors import DivergedError
+from clear_strategies.errors import DensityError, DivergedError
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training import checkpoint
 from clear_strategies.training.densifier import Densifier

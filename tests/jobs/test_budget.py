@@ -105,7 +105,7 @@ def test_a_run_that_is_late_goes_on_where_the_rates_fall(seconds: float, after: 
 def test_a_late_run_whose_rates_fall_after_its_end_makes_its_last_iteration_and_no_more() -> None:
     state = start(())
     state.skip_policy = SkipPolicy(Skips(plateau_from=8, plateau_to=50))
-    check = Plan(ITERATIONS, 0.1, 0.0, Budget(0.0, 0.0)).hurry(state)
+    check = Plan(ITERATIONS, 0.1, 0.0, Budget(-1.0, 0.0)).hurry(state)
     fit(state, SCENE, RASTERIZER, progress=lambda _: check())
     assert [int(row["t"]) for row in state.history] == [*range(1, 8), ITERATIONS]
 

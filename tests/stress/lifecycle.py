@@ -26,8 +26,7 @@ from hypothesis.stateful import (
 )
 
 from clear_strategies import SVS
-from clear_strategies.density.base import DensityError
-from clear_strategies.errors import DivergedError
+from clear_strategies.errors import DensityError, DivergedError
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT
 from clear_strategies.training.loop import iterate
