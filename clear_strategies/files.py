@@ -72,13 +72,13 @@ def require_regular(path: Path, *, most: int = _LARGEST) -> None:
         raise DataError(path, "size", f"is more than {most >> 20} MiB", "check the path")
 
 
-def read_bytes(path: Path, *, most: int = _LARGEST) -> bytes:
+def read_bytes(path: Path, *, most: int = _LARGEST, remedy: str = "check the path") -> bytes:
     """The content of a regular file; a DataError if it cannot be read, or `require_regular` refuses it."""
     require_regular(path, most=most)
     try:
         return path.read_bytes()
     except OSError as error:
-        raise DataError(path, "file", f"cannot be read ({error.strerror})", "check the path") from error
+        raise DataError(path, "file", f"cannot be read ({error.strerror})", remedy) from error
 
 
 def sweep(folder: Path) -> None:

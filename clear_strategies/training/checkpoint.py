@@ -24,7 +24,7 @@ from torch import Tensor
 
 from clear_strategies.data.strict_json import Count, Positive, typed
 from clear_strategies.errors import DataError
-from clear_strategies.files import partial_of
+from clear_strategies.files import partial_of, read_bytes
 from clear_strategies.training import tensor_file
 
 _log = logging.getLogger(__name__)
@@ -139,7 +139,7 @@ def load(path: Path) -> Checkpoint:
     manifest = _manifest(path)
     files = {}
     for name in (_TENSORS, _HISTORY):
-        files[name] = _read(path / name)
+        files[name] = read_bytes(path / name, remedy=_USE_ANOTHER)
         if hashlib.sha256(files[name]).hexdigest() != manifest["sha256"][name]:
             raise DataError(path / name, "sha256", "is not what the manifest says: the file was altered", _USE_ANOTHER)
     tensors = tensors_of(path / _TENSORS, files[_TENSORS])
@@ -176,7 +176,7 @@ _USE_ANOTHER: Final = "resume from another checkpoint of the run, or start a new
 
 def _manifest(path: Path) -> dict[str, Any]:
     file = path / _MANIFEST
-    data = _read(file)
+    data = read_bytes(file, remedy=_USE_ANOTHER)
     manifest = _json(file, data)
     if not isinstance(manifest, dict):
         raise DataError(file, "json", f"must be an object, got a {type(manifest).__name__}", _USE_ANOTHER)
@@ -194,13 +194,6 @@ def _sealed(manifest: Mapping[str, Any]) -> str:
     """The manifest's text with the hash of its own content. No other text is accepted, so every altered bit is found."""
     digest = hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
     return json.dumps({**manifest, _SEAL: digest}, indent=1)
-
-
-def _read(file: Path) -> bytes:
-    try:
-        return file.read_bytes()
-    except OSError as error:
-        raise DataError(file, "file", f"cannot be read ({error.strerror})", _USE_ANOTHER) from error
 
 
 def _json(file: Path, data: bytes) -> Any:
