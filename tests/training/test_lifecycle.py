@@ -14,7 +14,7 @@ from clear_strategies import SVS, Conductor, Update
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.points import PointCloud
 from clear_strategies.density.adaptive import Density, DensitySettings
-from clear_strategies.density.base import DensityError
+from clear_strategies.errors import DensityError
 from clear_strategies.schedules import scaled
 from clear_strategies.strategies.testing import StubShot
 from clear_strategies.training.densifier import cameras_extent
