@@ -1,30 +1,22 @@
-"""Splits and sizes: the papers' view indices and pixel counts; what is refused before a photo is decoded; SR detail."""
+"""Splits and sizes: the papers' view indices and pixel counts; what is refused before a photo is decoded."""
 
 from __future__ import annotations
 
-import logging
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 
-from clear_strategies.core import images
-from clear_strategies.core.view import DepthMap
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import check_headers, prepare, save_lr
-from clear_strategies.data.priors import BackProjected, Bicubic, Cached, DemoPrior
-from clear_strategies.data.readers import blender, demo
+from clear_strategies.data.priors import Bicubic
 from clear_strategies.data.view_settings import ViewSettings, lr_size, resized, split
 from clear_strategies.errors import DataError, SettingError
-from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.strategies.p2g import P2G
 from rasterizers import Camera
-from tests.helpers import captures as tiny
+from tests.helpers.blank_photos import POINTS, capture, papers
 
 # Training indices among the n photos of each LLFF scene, and the number of test views: the 3-view protocol of RegNeRF,
 # FSGS, CoR-GS and DropGaussian.
@@ -45,18 +37,6 @@ SIZES = {
     "stump": ((4978, 3300), (622, 412), (2488, 1648)),
     "kitchen": ((3115, 2078), (389, 260), (1556, 1040)),
 }
-
-
-POINTS = CloudSettings(init="random", random_points=50)
-
-
-def papers(**settings) -> ViewSettings:
-    """The papers' protocols: conf/protocol/_papers.yaml."""
-    return ViewSettings(**{"train": 3, "test_every": 8, "photos_are": "hr", **settings})
-
-
-def capture(n: int = 3, width: int = 16, height: int = 16, image: torch.Tensor | None = None) -> Capture:
-    return tiny.in_a_row(*[(width, height)] * n, image=image)
 
 
 def indices(frames: list[Frame]) -> list[int]:
@@ -232,147 +212,3 @@ def test_points_that_do_not_exist_are_refused_before_a_photo_is_decoded(init):
 def test_lr_photos_and_an_lr_folder_contradict_each_other():
     with pytest.raises(SettingError, match=r"data\.views\.lr_folder: must be null"):
         ViewSettings(photos_are="lr", lr_folder="here")
-
-
-ROOM = demo.read(width=64, height=48, views=5, train=2)
-
-
-def wrong(**settings) -> DemoPrior:
-    """SR images of the room with errors."""
-    return DemoPrior({f.name: f.load for f in ROOM.frames}, **settings)
-
-
-@pytest.mark.parametrize(("prior", "least", "most"), [(Bicubic(), 0.0, 0.4), (wrong(), 1.0, 255.0)])  # 0.4: rounding
-def test_the_detail_of_sr_images_is_measured_and_its_absence_reported(prior, least, most, caplog):
-    with caplog.at_level(logging.WARNING):
-        scene = prepare(ROOM, papers(train=2), prior, POINTS)
-    assert least <= float(scene.notes["the SR images add"].split()[0]) <= most
-    assert ("there is no detail to route" in caplog.text) == (least == 0)
-
-
-def test_back_projected_sr_images_shrink_to_the_photos():
-    prior = wrong(share=1.0, patch=16)
-
-    def disagreement(rounds: int) -> tuple[float, str | None]:
-        scene = prepare(ROOM, papers(train=2), BackProjected(prior, rounds) if rounds else prior, POINTS)
-        differences = [images.downsample(v.hr.image, v.factor) - v.lr.image for v in (*scene.train, *scene.test)]
-        return max(float(d.abs().mean()) for d in differences), scene.notes.get("back-projection")
-
-    assert disagreement(0)[1] is None
-    moved, said = disagreement(10)
-    assert moved < 0.2 * disagreement(0)[0]
-    assert said.startswith("SR images differed from the LR photos by ")
-
-
-def test_photos_that_are_the_hr_side_are_not_moved():
-    scene = prepare(ROOM, ViewSettings(photos_are="both", train=2), BackProjected(wrong()), POINTS)
-    assert all(view.hr.image is view.truth for view in scene.train)
-    assert "back-projection" not in scene.notes
-
-
-def test_how_far_a_back_projected_sr_image_was_from_its_photo_is_kept():
-    prior = wrong(share=0.5, patch=16)
-    made, moved = (prepare(ROOM, papers(train=2), sr, POINTS).train for sr in (prior, BackProjected(prior)))
-    assert all(view.disagreement is None for view in made)
-    for before, after in zip(made, moved, strict=True):
-        error = (images.downsample(before.hr.image, before.factor) - before.lr.image).abs()
-        assert torch.equal(after.disagreement, error)
-        R = [P2G(patch=4).patch_maps(v).reliability for v in (before, after, replace(after, disagreement=None))]
-        assert torch.equal(R[0], R[1])
-        assert float(R[0].min()) < 0.1  # what was wrong is still known, and would not be without
-        assert float(R[2].min()) > 0.9
-
-
-@pytest.mark.parametrize(
-    ("photos_are", "max_pixels", "windows", "compared"),
-    [
-        ("both", 250_000, [7], (64, 48)),
-        ("both", 1_000, [7], (32, 24)),
-        ("both", 400, [7], (21, 16)),
-        ("both", 200, [5], (16, 12)),
-        ("hr", 250_000, [7, 5], (16, 12)),  # SR images, then the LR photos whose depth they complete
-    ],
-)
-def test_depth_is_that_of_the_hr_side_where_it_is_photos_and_else_of_lr(
-    photos_are, max_pixels, windows, compared, monkeypatch
-):
-    asked = []
-
-    def depth_maps(photos, _, stereo, *__):
-        asked.append(stereo.window)
-        return [DepthMap(torch.full(p.image.shape[:2], 4.0), torch.ones(p.image.shape[:2])) for p in photos]
-
-    monkeypatch.setattr("clear_strategies.data.points.compared.depth_maps", depth_maps)
-    cloud = CloudSettings(init="stereo", stereo=StereoSettings(max_pixels=max_pixels))
-    scene = prepare(ROOM, ViewSettings(photos_are=photos_are, train=2), Bicubic(), cloud)
-    assert asked == windows
-    for view in scene.train:
-        assert tuple(view.depth.depth.shape) == compared[::-1]
-        shown = view.depth_photo
-        factor = round(64 / compared[0])
-        assert (shown.camera.width, shown.camera.fx) == (compared[0], view.hr.camera.fx / factor)
-        of = view.lr.image if compared[0] == 16 else images.area_mean(view.hr.image, factor)
-        assert torch.equal(shown.image, of)
-
-
-@pytest.mark.slow
-def test_equalized_photos_lose_their_casts_at_both_scales_and_test_photos_keep_theirs():
-    known = demo.read(width=160, height=120)
-    names = [f.name for f in known.frames if f.split == "train"]
-    casts = dict(zip(names, torch.tensor([[0.9, 1.0, 1.0], [1.0, 1.0, 0.92], [1.0, 1.05, 1.0]]), strict=True))
-    shown = {f.name: (f.load() * casts.get(f.name, 0.8)).clamp(0, 1) for f in known.frames}
-    frames = tuple(replace(f, load=lambda name=f.name: shown[name]) for f in known.frames)
-    wanted = ViewSettings(photos_are="hr", sr_scale=2, equalize=True)
-    made = prepare(Capture("cast", frames), wanted, Bicubic(), CloudSettings(init="stereo"))
-    common = torch.stack(list(casts.values())).log().mean(0).exp()
-    for view in made.train:
-        before = images.downsample(shown[view.name], 2).mean((0, 1))
-        assert torch.allclose(casts[view.name] * view.lr.image.mean((0, 1)) / before, common, atol=0.01)
-        assert torch.allclose(view.hr.image.mean((0, 1)), view.lr.image.mean((0, 1)), atol=2e-3)
-    assert made.notes["equalized"].startswith("photos times 0.9")
-    assert all(torch.equal(view.truth, shown[view.name]) for view in made.test)
-
-
-def test_without_depth_equalize_says_that_it_has_no_effect(caplog):
-    made = prepare(capture(), ViewSettings(sr_scale=2, equalize=True), Bicubic(), POINTS)
-    assert "data.views.equalize has no effect" in caplog.text
-    assert "equalized" not in made.notes
-
-
-@pytest.mark.parametrize("photos_are", ["hr", "lr", "both"])
-def test_transparent_photos_can_be_shown_before_any_background(tmp_path, photos_are):
-    root = tiny.blender(tmp_path)
-    pixels = np.full((tiny.HEIGHT, tiny.WIDTH, 4), (200, 100, 50, 0), np.uint8)
-    pixels[..., 3] = np.linspace(0, 255, tiny.WIDTH)
-    for photo in (root / "train").glob("*.png"):
-        Image.fromarray(pixels).save(photo)
-    views = ViewSettings(photos_are=photos_are, sr_scale=2)
-    white, black = (
-        prepare(blender.read(root, background=(c, c, c)), views, Bicubic(), POINTS).train for c in (1.0, 0.0)
-    )
-    for mine, expected in zip(white, black, strict=True):
-        for scale in ("lr", "hr"):
-            moved, photo = getattr(mine, scale).over((0.0, 0.0, 0.0), mine.background), getattr(expected, scale)
-            assert moved.transparency.shape == photo.image.shape[:2]
-            torch.testing.assert_close(moved.image, photo.image, atol=2.5 / 255, rtol=0)
-    assert prepare(capture(), replace(views, photos_are="hr"), Bicubic(), POINTS).train[0].lr.transparency is None
-
-
-def test_a_network_enlarges_the_transparency_of_a_photo_once(tmp_path):
-    @dataclass(frozen=True)
-    class Counting:
-        calls: list[str] = field(default_factory=list, compare=False)
-        label, files = "counting", ()
-
-        def __call__(self, name, lr, factor):
-            self.calls.append(name)
-            return images.upsample(lr, factor, "nearest")
-
-    network = Counting()
-    half = torch.full((16, 16), 0.5)
-    frames = [replace(frame, transparency=lambda: half) for frame in capture(1).frames]
-    for _ in range(2):
-        prior = BackProjected(Cached(network, tmp_path))
-        made = prepare(Capture("glass", tuple(frames)), papers(train=1, test_every=0), prior, POINTS).train[0]
-        assert float((made.hr.transparency - 0.5).abs().max()) <= 1 / 255
-    assert network.calls == ["0000.png"] * 2  # the photo and its transparency
