@@ -97,9 +97,11 @@ def voxel_grid(
         both = both[np.lexsort(np.floor((both[:, 2::-1] - origin[::-1]) / edge).T)]
     else:
         cubes = np.floor((points - origin) / edge).astype(np.int64)
-        _, owner, count = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
+        order = np.lexsort(cubes.T[::-1])  # several times as fast as np.unique of rows
+        owner = np.empty(len(points), np.int64)
+        owner[order] = np.cumsum(np.diff(cubes[order], axis=0, prepend=cubes[order[:1]]).any(axis=1))
         columns = np.concatenate((points, shades), axis=1).T
-        both = np.stack([np.bincount(owner.reshape(-1), column) for column in columns], axis=1) / count[:, None]
+        both = np.stack([np.bincount(owner, column) for column in columns], axis=1) / np.bincount(owner)[:, None]
     averages = torch.from_numpy(both)
     return averages[:, :3].to(means), averages[:, 3:].to(colors)
 
