@@ -105,7 +105,8 @@ def test_photos_of_a_video_are_its_frames(clip, monkeypatch):
 
 
 def test_the_scene_has_the_name_of_its_video(clip, monkeypatch):
-    monkeypatch.setattr(photos.sfm, "reconstruct", lambda *_: None)
+    for made in ("reconstruct", "require_placed"):
+        monkeypatch.setattr(photos.sfm, made, lambda *_: None)
     monkeypatch.setattr(photos, "_capture", lambda root, *_: Capture(root.name, (), None))
     assert photos.read(clip, frames=6).name == clip.name
 
