@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import Tensor
@@ -14,6 +15,10 @@ from clear_strategies.core.view import ExtraView
 from clear_strategies.merging.conductor import Conductor
 from integration.autograd_shot import AutogradShot
 from rasterizers.interface import Camera
+
+_log = logging.getLogger(__name__)
+
+_PATIENCE: Final = 10  # iterations with extra views of which none has ever made a step, before a warning
 
 
 class ExtraSteps:
@@ -34,6 +39,7 @@ class ExtraSteps:
         self._gradients: list[Grads] = []
         self._rendered: Mapping[str, Tensor] = {}  # what they are gradients of
         self.stepping = False
+        self._made, self._unused = False, 0  # whether any step was ever made; iterations without one until then
 
     def render(self, extra_views: Sequence[ExtraView], t: int, render: Callable[[Camera], AutogradShot]) -> None:
         """Render the extra views of iteration t, without a gate and without f_det, and take their gradients."""
@@ -72,10 +78,18 @@ class ExtraSteps:
                 optimizer.grad_scale = scale  # type: ignore[attr-defined]
             for p, grad in zip(present, before, strict=True):
                 p.grad = grad
+        self._made = True
         return len(self._gradients) if "means" in mine else 0
 
     def forget(self) -> None:
-        """Before an iteration: drop the gradients of the one before, stepped on or not."""
+        """Before an iteration: drop the gradients of the one before, stepped on or not. Warn where none ever is."""
+        if self._gradients and not self._made:
+            self._unused += 1
+            if self._unused == _PATIENCE:
+                _log.warning(
+                    "extra views have no effect: they were rendered in %d iterations, and no optimizer that was passed stepped "
+                    "on them. Pass those that the loop steps.", _PATIENCE,
+                )  # fmt: skip
         self._gradients, self._rendered = [], {}
 
 

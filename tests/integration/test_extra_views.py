@@ -117,6 +117,19 @@ def test_an_adam_of_all_parameters_makes_one_extra_step():
     assert all(torch.equal(p, one[0][name]) for name, p in each[0].items())
 
 
+def test_extra_views_that_no_optimizer_steps_on_give_a_warning(caplog):
+    scene = toy.scene(20)
+    trainer = Host(scene)
+    known, trainer.optimizers = trainer.optimizers, {"all": torch.optim.Adam(list(trainer.splats.values()))}
+    clear = attach(trainer.splats, known, scene.train, dark(), detail=False)
+    rasterization = clear.wrap(gsplat_host.rasterization)
+    for _ in range(11):
+        gsplat_host.drawn(rasterization, trainer.splats, scene.train[0].lr.camera)[0].mean().backward()
+        trainer.optimizers["all"].step()
+    assert caplog.text.count("extra views have no effect") == 1
+    assert clear.attachment.counts["extra views"] == 0
+
+
 def test_a_scaler_of_losses_leaves_the_extra_step_of_a_fused_adam_as_it_is():
     def fused(splats):
         return {name: torch.optim.Adam([p], eps=1e-15, fused=True) for name, p in splats.items()}
