@@ -15,8 +15,9 @@ import argparse
 import logging
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -34,6 +35,8 @@ from clear_strategies.report.table import Table, aligned, layout, record
 __all__ = ["Row", "Run", "Table", "aligned", "collect", "compare", "layout", "main", "write"]
 
 _log = logging.getLogger(__name__)
+
+_LONGEST: Final = 60  # characters of a scene in the name of a file
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -88,10 +91,9 @@ def write(runs: Sequence[Run], out: Path, *, paper: str | None = None, page_mb: 
     sections = []
     if averages := [row for row in rows if row.is_average]:
         sections.append(page.Section("average over scenes", table(averages)))
-    for scene in dict.fromkeys(run.scene for run in runs):
+    for scene, name in _file_names(run.scene for run in runs).items():
         of_scene = [row for row in rows if row.scene == scene]
         shown = {row.method: row.runs[0] for row in of_scene if not row.is_baseline}  # of several seeds the first
-        name = re.sub(r"\W+", "_", scene).strip("_")
         _compare_renders(out / f"comparison_{name}.png", scene, shown)
         figure = charts.draw_runs({method: history(run.folder) for method, run in shown.items()}, scene)
         save_png(figure, out / f"curves_{name}.png")
@@ -100,6 +102,17 @@ def write(runs: Sequence[Run], out: Path, *, paper: str | None = None, page_mb: 
     size = page.write_page(out / "report.html", sections, budget_mb=page_mb)
     _log.info("report of %d runs: %s (report.html, %.1f MB, opens in any browser)", len(runs), out, size / 1e6)
     return text
+
+
+def _file_names(scenes: Iterable[str]) -> dict[str, str]:
+    """A short word for each scene, no two alike."""
+    words: dict[str, str] = {}
+    for scene in dict.fromkeys(scenes):
+        word = re.sub(r"\W+", "_", scene).strip("_")[:_LONGEST] or "scene"
+        while word in words.values():
+            word += "_"
+        words[scene] = word
+    return words
 
 
 def _compare_renders(path: Path, scene: str, runs: Mapping[str, Run]) -> None:
