@@ -10,7 +10,6 @@ from torch import Tensor
 from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
 from clear_strategies.data.scene import Scene
-from clear_strategies.training.skips import PLATEAU_LOSS
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer
 
@@ -36,13 +35,12 @@ def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int)
             state.history[-1]["psnr_test"] = sum(deferred.read(values)) / len(values)
 
 
-def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> dict[str, Number]:
+def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> Number:
     """Mean loss of training views against what they are trained on, every Gaussian drawn; of the first few views.
 
-    A training loss is no measure of progress: dropout changes it, and so does the order of the views. The name says what is
-    compared, since the loss is another one once HR takes part, and once HR is whole.
+    A training loss is no measure of progress: dropout changes it, and so does the order of the views.
     """
-    objective, losses, coarse = state.conductor.objective, [], state.skip_policy.coarse(state.t)
+    objective, losses = state.conductor.objective, []
     for view in state.views[:_VIEWS_OF_LOSS]:
         if objective.lambda_hr(state.t) > 0:
             shown = state.skip_policy.view(view, state.t).hr
@@ -51,7 +49,7 @@ def loss_of_views(state: TrainState, rasterizer: Rasterizer) -> dict[str, Number
             shown, compare, name = view.lr, objective.lr, "lr"
         image = state.field.render(rasterizer, shown.camera)
         losses.append(compare(image, shown.image, shown.shown).values[name])
-    return {f"{PLATEAU_LOSS}_{'coarse_' if coarse and name == 'base' else ''}{name}": sum(losses) / len(losses)}
+    return sum(losses) / len(losses)
 
 
 def psnr_of(image: Tensor, target: Tensor) -> Number:

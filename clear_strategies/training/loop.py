@@ -25,6 +25,7 @@ from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
 from clear_strategies.training.extra_steps import extra_steps
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
+from clear_strategies.training.skips import PLATEAU_LOSS
 from clear_strategies.training.state import TrainState
 from rasterizers import native
 from rasterizers.interface import Rasterizer, over
@@ -59,7 +60,7 @@ def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     s.history.append(_row(s, u, low, view) | extra)
     if s.skip_policy.measured(t) and not (restructured or s.reset_due(t)):
         with stage("training views drawn whole"):
-            s.history[-1].update(loss_of_views(s, rasterizer))
+            s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
     s.advance()
     return u
 

@@ -8,7 +8,7 @@ skips here change the result a little. Each is a setting whose default was chose
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -22,7 +22,7 @@ from clear_strategies.schedules import milestone
 _log = logging.getLogger(__name__)
 
 PLATEAU_LOSS: Final = "loss_views"
-"""Begins the columns of the history that tell a plateau: the mean loss of training views, every Gaussian drawn."""
+"""The column of the history that tells a plateau: the mean loss of training views, every Gaussian drawn."""
 
 _REDUCED: Final = 2  # the coarse SR image has half the size of the fine one
 
@@ -73,7 +73,7 @@ class SkipPolicy:
 
     def view(self, view: View, t: int) -> View:
         """The view of iteration t: with a coarse SR image at first, where the factor is even."""
-        if not self.coarse(t):
+        if t > self.skips.coarse_until:
             self._coarse.clear()  # no later iteration needs them
             return view
         if view.factor % _REDUCED:
@@ -83,13 +83,9 @@ class SkipPolicy:
             self._coarse[view.name] = replace(view, hr=hr, truth=None)
         return self._coarse[view.name]
 
-    def coarse(self, t: int) -> bool:
-        """Whether SR images are coarse at iteration t."""
-        return t <= self.skips.coarse_until
-
     def coarse_bytes(self, views: Sequence[View], t: int) -> int:
         """Of the coarse SR images that are kept from iteration t on."""
-        if not self.coarse(t):
+        if t > self.skips.coarse_until:
             return 0
         return sum(view.hr.image.nbytes // _REDUCED**2 for view in views if view.factor % _REDUCED == 0)
 
@@ -119,5 +115,11 @@ class SkipPolicy:
             return False
         rows = deferred.resolve(history)
         before, now = rows[t - window - 1], rows[t - 1]
-        alike = [name for name in now if name.startswith(PLATEAU_LOSS) and name in before]
-        return any(now[name] > (1 - self.skips.plateau_gain) * before[name] for name in alike)
+        if PLATEAU_LOSS not in before.keys() & now.keys() or self._compares(before) != self._compares(now):
+            return False
+        return now[PLATEAU_LOSS] > (1 - self.skips.plateau_gain) * before[PLATEAU_LOSS]
+
+    def _compares(self, row: Mapping[str, float]) -> tuple[bool, bool]:
+        """What the measured loss of a row compares: whether HR, and whether HR at half its size."""
+        hr = row["lambda_hr"] > 0
+        return hr, hr and row["t"] <= self.skips.coarse_until

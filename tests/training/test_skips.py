@@ -21,8 +21,8 @@ from tests.helpers import toy
 from tests.helpers.short_run import ITERATIONS, start
 
 
-def loss_rows(*losses: float, column: str = PLATEAU_LOSS) -> list[dict[str, float]]:
-    return [{"t": float(t), column: loss} for t, loss in enumerate(losses, 1)]
+def loss_rows(*losses: float, lambda_hr: float = 0.0) -> list[dict[str, float]]:
+    return [{"t": float(t), "lambda_hr": lambda_hr, PLATEAU_LOSS: loss} for t, loss in enumerate(losses, 1)]
 
 
 def test_nothing_is_left_out_by_default():
@@ -93,12 +93,15 @@ def test_what_raises_the_measured_loss_is_no_plateau():
         Skips(coarse_until=10, plateau_gain=1e-9, plateau_window=1, plateau_from=7, plateau_to=14)
     )
     fit(state, toy.scene(), toy.RASTERIZER)
-    measured = {int(row["t"]): name for row in state.history for name in row if name.startswith(PLATEAU_LOSS)}
-    lr, coarse, whole = (f"{PLATEAU_LOSS}_{kind}" for kind in ("lr", "coarse_base", "base"))
-    assert measured == {7: lr, 8: lr, 9: coarse, 10: coarse, 11: whole, 13: whole}
+    assert [int(row["t"]) for row in state.history if PLATEAU_LOSS in row] == [7, 8, 9, 10, 11, 13]
     assert len(state.history) == ITERATIONS
-    policy = SkipPolicy(Skips(plateau_gain=0.5, plateau_window=4, plateau_from=4))
-    assert not policy.settled([*loss_rows(*[1.0] * 7), *loss_rows(2.0, column=whole)], 8)
+    policy = SkipPolicy(Skips(coarse_until=6, plateau_gain=0.5, plateau_window=4, plateau_from=4))
+    rises = [1.0] * 7 + [2.0]
+    lr, hr = loss_rows(*rises), loss_rows(*rises, lambda_hr=1.0)
+    assert policy.settled(lr, 8)
+    assert not policy.settled([*lr[:7], hr[7]], 8)  # HR sets in
+    assert not policy.settled(hr, 8)  # HR becomes whole
+    assert SkipPolicy(replace(policy.skips, coarse_until=0)).settled(hr, 8)
 
 
 def test_every_milestone_stretches_with_the_run():
