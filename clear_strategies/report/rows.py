@@ -102,7 +102,12 @@ def mean(values: Sequence[float]) -> float:
 
 def shared_settings(runs: Sequence[Run]) -> list[str]:
     """The settings that all runs have."""
-    return [setting for setting in runs[0].settings if all(setting in run.settings for run in runs)]
+    return _in_all([run.settings for run in runs])
+
+
+def _in_all(lists: Sequence[Sequence[str]]) -> list[str]:
+    """What every list holds, in the order of the first."""
+    return [setting for setting in lists[0] if all(setting in of for of in lists)] if lists else []
 
 
 def _baseline_rows(runs: Sequence[Run]) -> list[Row]:
@@ -110,7 +115,7 @@ def _baseline_rows(runs: Sequence[Run]) -> list[Row]:
     rows = []
     for baseline in BASELINES:
         inputs = {run: _inputs(run, baseline) for run in runs if baseline in run.scores}
-        shared = [s for s in next(iter(inputs.values()), ()) if all(s in of for of in inputs.values())]
+        shared = _in_all([*inputs.values()])
         by_input: dict[str, list[Run]] = {}
         for run, of in inputs.items():
             by_input.setdefault(_label(baseline, of, shared), []).append(run)
@@ -151,7 +156,7 @@ def _averages(scenes: Sequence[Sequence[Row]], marks: str) -> list[Row]:
     if left_out:
         _log.info("%s: left out, because not all scenes have it: %s.", title, "; ".join(dict.fromkeys(left_out)))
     methods = [settings for name, settings in common if name not in BASELINES]
-    shared = [s for s in methods[0] if all(s in settings for settings in methods)] if methods else []
+    shared = _in_all(methods)
     averages: list[Row] = []
     first: list[Row] = []  # the first method on each scene
     for identity in common:
