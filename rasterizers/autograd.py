@@ -158,8 +158,8 @@ def rasterization(
     """Stands in for gsplat's `rasterization` with a backend of this package: pinhole cameras, RGB and expected depth.
 
     Args:
-        colors: [N, K, 3] spherical harmonics with `sh_degree` the active degree, or [N, 3] RGB in any
-            range if `sh_degree` is None, e.g. normals.
+        colors: [N, K, 3] spherical harmonics with `sh_degree` the active degree, or [N, 3] RGB in
+            any range, e.g. normals, if `sh_degree` is None.
         render_mode: "RGB", or "RGB+ED" with the expected depth as a fourth channel of the images, to look at: a loss of
             it raises `NotImplementedError` in `backward`.
         packed: has no effect; `info` is always unpacked.
@@ -195,9 +195,7 @@ def rasterization(
         "means2d": means2d, "radii": visible[..., None].expand(-1, -1, 2).int(), "gaussian_ids": None,
         "width": width, "height": height, "n_cameras": len(shots),
     }  # fmt: skip
-    images, alphas = (
-        torch.stack(x) for x in zip(*((shot.image, shot.alpha[..., None]) for shot in shots), strict=True)
-    )
+    images, alphas = torch.stack([s.image for s in shots]), torch.stack([s.alpha for s in shots])[..., None]
     if (low, span) != (0.0, 1.0):
         images = low + span * images
     if behind.requires_grad:  # adds 0, whose gradient is the background's
