@@ -8,7 +8,8 @@ One training iteration:
    parameter becomes the merged gradient. If a strategy has a densification score, the tensor that the densifier reads
    holds it; otherwise the densifier's statistic stays the host's own.
 3. Gradient clipping, unscaling, the optimizer step and densification are the host's, in any order.
-4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view.
+4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view. Then a strategy may densify
+   in place of the host.
 
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
 optimizers other than `torch.optim.Optimizer` work, and so do hosts that densify before the step (3DGS) as well as hosts
@@ -38,6 +39,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients, only
 from integration.errors import HostError
 from integration.extra_steps import ExtraSteps
+from integration.host_field import HostDensity, HostField
 from integration.host_rendering import HostRendering, RenderAt, called_at, random_state_kept
 from integration.host_score import ScoreScaler, write_score
 from integration.views import by_name, enlarged_mask
@@ -61,6 +63,7 @@ class Attachment:
         accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
         masks: [h, w] by the name of a view, what the host multiplies its LR image by; the HR image is multiplied here.
         own_background: the host chooses the colour behind its renderings; `background` then counts for nothing.
+        field: its Gaussians, for a strategy that densifies in place of the host; None: the host densifies by itself.
 
     Attributes:
         t: the current iteration, from 1.
@@ -81,6 +84,7 @@ class Attachment:
         accumulation: int = 1,
         masks: Mapping[str, Tensor] | None = None,
         own_background: bool = True,
+        field: HostField | None = None,
     ) -> None:
         if accumulation < 1:
             raise SettingError(f"accumulation: must be at least 1 backward pass per step, got {accumulation}.")
@@ -115,7 +119,9 @@ class Attachment:
                 "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
                 ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
             )
-        itself = {"densifier": "densifies by"} | ({"background": "chooses its background"} if own_background else {})
+        self._density = None if field is None else HostDensity(conductor, field, views, seed)
+        itself = {"densifier": "densifies by"} if field is None else {}
+        itself |= {"background": "chooses its background"} if own_background else {}
         for hook, does in itself.items():
             if (owner := conductor.owner(hook)) is not None:
                 _log.info("%s has no effect here: the host %s itself.", type(owner).__name__, does)
@@ -140,6 +146,8 @@ class Attachment:
             hr_grads = conductor.hr_gradients(shot, view, t)
         self._step = Step(t, view) if hr_grads is None else hr_grads.step
         if self._passes == 0:  # one step of the host, however many passes it accumulates
+            if self._density is not None:
+                self._density.before_rendering()
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
                 with random_state_kept(means.device):
@@ -150,6 +158,11 @@ class Attachment:
             self._pending = (nth := self.counts["LR renders"]), rendering, hr_grads
             rendering.output.register_hook(called_at(WeakMethod(self._on_backward), nth))  # type: ignore[no-untyped-call]
         return rendering.returned
+
+    @property
+    def densifies(self) -> bool:
+        """Whether a strategy densifies in place of the host, whose own density control must then be off."""
+        return self._density is not None and self._density.acts
 
     @property
     def background(self) -> Color | None:
@@ -174,6 +187,7 @@ class Attachment:
             "t": self.t, "passes": self._passes, "strategies": self.conductor.state_dict(),
             "view": None if self._step is None else self._step.view.name,
             "score": None if self._scaler is None else self._scaler.state_dict(),
+            "density": None if self._density is None else self._density.state_dict(),
         }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -185,6 +199,8 @@ class Attachment:
             self._step = Step(self.t, view)
         if self._scaler is not None and state.get("score") is not None:
             self._scaler.load_state_dict(state["score"])
+        if self._density is not None:
+            self._density.load_state_dict(state.get("density"))
 
     def summary(self) -> str:
         """What was done how often, e.g. for the end of a log."""
@@ -218,9 +234,13 @@ class Attachment:
         self._merges_before_step = merges
 
     def _after_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """The steps on extra views."""
+        """The steps on extra views, and what densifies in place of the host."""
+        if self._extra.stepping:
+            return
         if made := self._extra.step(optimizer):
             self.counts["extra views"] += made
+        if self._density is not None:
+            self._density.after_step(optimizer, self.t)
 
     def _finish_previous_step(self) -> None:
         """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified."""

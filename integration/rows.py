@@ -6,6 +6,7 @@ from collections.abc import Callable, MutableMapping
 from typing import Any, Final
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from integration.errors import HostError
@@ -69,6 +70,11 @@ class RowNumbers:
         change = change_of(rows.detach() - 1, self._numbered)
         self.restart()
         return change
+
+    def take(self, parents: Int[Tensor, " M"]) -> None:
+        """Row i of the parameters now comes from row parents[i]; the numbers follow."""
+        rows = self._entries[ROWS].detach()[parents]
+        self._entries[ROWS] = torch.nn.Parameter(rows, requires_grad=False) if self._as_parameter else rows
 
     def remove(self) -> None:
         """Take the row numbers out of the host."""

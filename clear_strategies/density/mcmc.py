@@ -27,8 +27,7 @@ from clear_strategies.geometry.pseudo_views import cut_out
 from clear_strategies.merging.iteration import Update
 from clear_strategies.schedules import LogLinear, milestone
 from clear_strategies.strategies.base import Strategy
-from clear_strategies.training.field import GaussianField
-from clear_strategies.training.optim import Adam
+from clear_strategies.training.densifier import Gaussians, Moments
 from rasterizers.geometry import rotation_matrix
 from rasterizers.interface import Camera
 
@@ -83,14 +82,14 @@ class MCMC(Strategy):
             require_number(name, getattr(self, name), least=least)
         require_number("dead_opacity", self.dead_opacity, above=0, below=1)
 
-    def densifier(self, field: GaussianField, views: Sequence[View], seed: int) -> Sampler | None:
+    def densifier(self, field: Gaussians, views: Sequence[View], seed: int) -> Sampler | None:
         """None, which a message says, where sampling would be of no use."""
         if self.stop < _SHORT_RUN:
             _log.info(
                 "MCMC has no effect: until t=%d there is less time than sampling needs (%d).", self.stop, _SHORT_RUN
             )
             return None
-        if cut_out((view.lr for view in views), views[0].background):
+        if cut_out((view.lr.to("cpu") for view in views), views[0].background):
             _log.info(
                 "MCMC has no effect: the photos show an object before a plain background, so few Gaussians are held by no photo."
             )
@@ -133,7 +132,7 @@ class Sampler:
     def reset_due(self, t: int) -> bool:
         return False
 
-    def step(self, field: GaussianField, optimizer: Adam, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
+    def step(self, field: Gaussians, optimizer: Moments, t: int, resized: Callable[[Int[Tensor, " M"]], None]) -> bool:
         if t >= self.settings.stop:
             return False
         generator = hashed_generator_at(self.seed, t, field.means.device)
@@ -145,7 +144,7 @@ class Sampler:
         return parents is not None
 
     def _round(
-        self, field: GaussianField, optimizer: Adam, t: int, generator: torch.Generator
+        self, field: Gaussians, optimizer: Moments, t: int, generator: torch.Generator
     ) -> Int[Tensor, " M"] | None:
         """Move the dead and add copies: returns parents[M], or None where nothing changes.
 
@@ -179,7 +178,7 @@ class Sampler:
         _log.debug("t=%d: %d moved, %d added: %d -> %d Gaussians.", t, len(dead), added, n, len(parents))
         return parents
 
-    def _wander(self, field: GaussianField, t: int, generator: torch.Generator) -> None:
+    def _wander(self, field: Gaussians, t: int, generator: torch.Generator) -> None:
         """Add the noise."""
         s, scales = self.settings, field.scales.data.exp()
         gate = torch.sigmoid(_GATE * (s.dead_opacity - field.opacities.data.sigmoid()))
@@ -199,7 +198,7 @@ class Sampler:
         self.cap = int(tensors["cap"])
 
 
-def _spacing(field: GaussianField, cameras: Sequence[Camera]) -> float:
+def _spacing(field: Gaussians, cameras: Sequence[Camera]) -> float:
     """The median distance of initial points, in pixels of the camera that is nearest to each."""
     centers = torch.stack([camera.center.to(field.means.data) for camera in cameras])
     focal = field.means.data.new_tensor([camera.fx for camera in cameras])

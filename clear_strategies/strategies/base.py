@@ -75,11 +75,12 @@ class Strategy:
         raise NotImplementedError
 
     def densifier(self, field: Any, views: Sequence[View], seed: int) -> Any:
-        """Once, before the first iteration of this package's trainer: what clones, moves and prunes Gaussians in place of
-        `density`, a `clear_strategies.training.densifier.Densifier`; None: `density` does. Other trainers densify by themselves.
+        """Once, before the first iteration: what clones, moves and prunes Gaussians in place of the trainer's own density
+        control, a `clear_strategies.training.densifier.Densifier`; None: the trainer does.
 
         Args:
-            field: the initial `clear_strategies.training.field.GaussianField`.
+            field: the initial Gaussians, a `clear_strategies.training.densifier.Gaussians`; in this package's trainer a
+                `clear_strategies.training.field.GaussianField`. Other trainers call `step` alone.
             views: all training views.
         """
         raise NotImplementedError

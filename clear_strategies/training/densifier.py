@@ -6,13 +6,49 @@ from collections.abc import Callable, Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.gradients import Shot
 from clear_strategies.merging.iteration import Update
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import Adam
+
+
+@runtime_checkable
+class Gaussians(Protocol):
+    """Raw parameters, whose rows a densifier gathers and whose values it changes in place: a `GaussianField`, or those of
+    another trainer, which have nothing else.
+    """
+
+    @property
+    def means(self) -> Float[Tensor, "N 3"]: ...
+
+    @property
+    def quats(self) -> Float[Tensor, "N 4"]: ...
+
+    @property
+    def scales(self) -> Float[Tensor, "N 3"]: ...
+
+    @property
+    def opacities(self) -> Float[Tensor, " N"]: ...
+
+    def __len__(self) -> int: ...
+
+    def raw(self) -> Mapping[str, Tensor]: ...
+
+    def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
+        """Row i becomes a copy of row parents[i]."""
+        ...
+
+
+@runtime_checkable
+class Moments(Protocol):
+    """What an optimizer remembers per Gaussian."""
+
+    def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
+        """Gather it, after the Gaussians; fresh rows start without momentum."""
+        ...
 
 
 @runtime_checkable

@@ -21,10 +21,11 @@ from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 from integration.densification import require_end
 from integration.detail import detail_adam, sh0_offset
 from integration.errors import HostError
+from integration.host_field import HostField
 from integration.host_rendering import HostRendering, Target
 from integration.host_score import warn_if_score_is_unused
 from integration.replacing import Replaced
-from integration.rows import RowNumbers
+from integration.rows import ROWS, RowNumbers
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
@@ -41,6 +42,7 @@ class Attached:
         params: gsplat's dict of leaves. optimizers: one for each of them.
         views: all training views. A rendering is that of the view named by `rendering`, else of the one with its pose.
         strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one.
+        own_density: `strategy` densifies, not a strategy of the conductor; None: where there is a `strategy`.
         state: of gsplat 1.4's strategy, in which every change of structure is recorded; later versions record it in `params`.
         detail: add the detail feature f_det as `params["detail"]`, with an Adam of its own. gsplat's strategies clone,
             split and prune it like any other parameter.
@@ -71,13 +73,14 @@ class Attached:
         accumulation: int = 1,
         masks: Mapping[str, Tensor] | None = None,
         own_background: bool = False,
+        own_density: bool | None = None,
     ) -> None:
         if not views:
             raise ValueError(
                 "at least one view is needed; integration.views.view(...) makes one from an image and a camera."
             )
         self._names = {name: name for name in PARAMETERS} | dict(names or {})
-        self._params, self._views = params, tuple(views)
+        self._params, self._optimizers, self._views = params, optimizers, tuple(views)
         if missing := [name for name in self._names.values() if name not in params]:
             raise ValueError(f"params must hold {', '.join(self._names.values())}; {missing[0]} is missing.")
         means = params[self._names["means"]]
@@ -98,8 +101,9 @@ class Attached:
         self.attachment = Attachment(
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=self._poll_parents, threshold=threshold, masks=masks, own_background=own_background,
+            field=None if (strategy is not None if own_density is None else own_density) else self._field(),
         )  # fmt: skip
-        self.attachment.hook([optimizers[name] for name in self._names.values() if name in optimizers])
+        self.attachment.hook(self._of_gaussians())
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
@@ -172,6 +176,23 @@ class Attached:
             replaced.undo()
         self._replaced.clear()
         self._rows.remove()
+
+    def _of_gaussians(self) -> list[torch.optim.Optimizer]:
+        """The optimizers of the Gaussians; others, e.g. of poses, do not count."""
+        return [self._optimizers[name] for name in (*self._names.values(), "detail") if name in self._optimizers]
+
+    def _field(self) -> HostField:
+        """All entries of the parameters, as gsplat's strategies gather them."""
+
+        def put(new: Mapping[str, Tensor], parents: Int[Tensor, " M"]) -> None:
+            for name, tensor in new.items():
+                self._params[name] = tensor
+            self._rows.take(parents)
+
+        entries = self._params
+        return HostField(
+            lambda: {name: p for name, p in entries.items() if name != ROWS}, self._names, self._of_gaussians, put
+        )
 
     def _poll_parents(self) -> Int[Tensor, " M"] | None:
         change = self._rows.poll()

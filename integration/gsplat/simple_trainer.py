@@ -61,7 +61,8 @@ def install(
 
     Args:
         runner_class: simple_trainer's `Runner`. Its Config stretches the schedules (`max_steps`), and
-            `strategy.refine_stop_iter` is lowered to the step at which a strategy ends densification.
+            `strategy.refine_stop_iter` is lowered to the step at which a strategy ends densification, or to 0 where a strategy
+            densifies in place of `DefaultStrategy`.
         strategies: names of conf/strategy, e.g. "gco,svs". overrides: settings, e.g. "strategies.gco.tolerance=0.1".
         sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names.
         factor: HR pixels per LR pixel.
@@ -128,9 +129,13 @@ class _Installed:
     def __init__(self, runner: Any, views: Any, masks: Any, chosen: Any, seed: int) -> None:
         rendering = sys.modules["gsplat.rendering"]
         self.views, self._splats = views, runner.splats
+        strategy = runner.cfg.strategy
+        samples = not hasattr(strategy, "grow_grad2d")  # MCMCStrategy, as the strategy of `best` that densifies
         self.attached = Attached(
-            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=seed, masks=masks
+            runner.splats, runner.optimizers, views, chosen, strategy=strategy, seed=seed, masks=masks, own_density=samples
         )
+        if self.attached.attachment.densifies:
+            strategy.refine_stop_iter = 0
         self.attached.replace_everywhere(rendering.rasterization)
         export = getattr(sys.modules["gsplat"], "export_splats", None)
         if export is not None:

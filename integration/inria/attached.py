@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.merging.conductor import Conductor
 from integration.densification import require_end
 from integration.errors import HostError
 from integration.host_cameras import enlarged_camera
+from integration.host_field import HostField
 from integration.inria.cameras import HostViews
 from integration.inria.rows import CarriedRows
 from integration.model_proxy import AttachedModel, Role
@@ -52,6 +54,7 @@ class Attached:
         threshold: opt.densify_grad_threshold, which scales P2G's score; None: a loop without densification.
         densify_until: opt.densify_until_iter; refused where an anchor would be taken before.
         detail: train the detail feature f_det beside the host's parameters.
+        own_density: the host densifies, not a strategy of the conductor.
 
     Attributes:
         views: the training views, by name and by camera.
@@ -73,6 +76,7 @@ class Attached:
         threshold: float | None = THRESHOLD,
         densify_until: int | None = None,
         detail: bool = True,
+        own_density: bool = True,
         seed: int = 0,
     ) -> None:
         required = (*_ATTRIBUTES.values(), "optimizer")
@@ -89,7 +93,7 @@ class Attached:
         self._rows = CarriedRows(gaussians, self._host_params)
         self._attached = AttachedModel(
             gaussians, _ROLES, self._host_params, self._rows, conductor, self.views.all, detail=detail, densifier=gaussians,
-            threshold=threshold, masks=self.views.masks, seed=seed,
+            threshold=threshold, masks=self.views.masks, seed=seed, field=None if own_density else self._field(),
         )  # fmt: skip
         self.attachment = self._attached.attachment
         self._methods = ReplacedMethods(gaussians, {
@@ -150,6 +154,20 @@ class Attached:
 
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}
+
+    def _field(self) -> HostField:
+        """Every tensor of the model with a row per Gaussian: forks have more than 3DGS, e.g. filter_3D."""
+        model = self._model
+
+        def rows() -> dict[str, Tensor]:
+            n = len(model._xyz)
+            return {name: v for name, v in vars(model).items() if isinstance(v, Tensor) and v.dim() and len(v) == n}
+
+        def put(new: Mapping[str, Tensor], parents: Int[Tensor, " M"]) -> None:
+            vars(model).update(new)
+            self._rows.take(parents)
+
+        return HostField(rows, _ATTRIBUTES, lambda: [model.optimizer], put)
 
     def _training_setup(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """The host starts again with a new optimizer, as `restore` does with the parameters of a checkpoint."""

@@ -8,9 +8,10 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
-from integration.lineage import COMPARED, Change, MatchedRows, are_copies, is_same, nearest_copied
+from integration.lineage import COMPARED, Change, MatchedRows, are_copies, change_of, is_same, nearest_copied
 from integration.replacing import ReplacedMethods
 
 _log = logging.getLogger(__name__)
@@ -61,6 +62,13 @@ class CarriedRows(MatchedRows):
                 "the values of colours and rotations instead.", type(self._model).__name__,
             )  # fmt: skip
         return super().poll()
+
+    def take(self, parents: Int[Tensor, " M"]) -> None:
+        """Row i of the model has been replaced by row parents[i]."""
+        self._carried = True
+        change = change_of(parents, len(self._parents))
+        if change is not None:
+            self._parents, self._fresh = self._parents[parents], self._fresh[parents] | change.fresh
 
     def remove(self) -> None:
         """Give the model its own methods back."""

@@ -11,9 +11,10 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from clear_strategies import GCO, P2G, SVS, AnchorError, Conductor, Objective, SplatSuRe
+from clear_strategies import GCO, MCMC, P2G, SVS, AnchorError, Conductor, Objective, SplatSuRe
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors import Images
+from clear_strategies.density import mcmc
 from clear_strategies.errors import SettingError
 from clear_strategies.schedules import Ramp, scaled
 from clear_strategies.training.loop import iterate
@@ -71,16 +72,20 @@ class InDouble(HostViews):
         return double(super().find(camera), camera)
 
 
-def test_its_steps_equal_those_of_our_own_trainer(inria_host, inria_capture):
+@pytest.mark.parametrize("sampling", [False, True], ids=["", "mcmc"])
+def test_its_steps_equal_those_of_our_own_trainer(sampling, inria_host, inria_capture, monkeypatch):
     """Without spheres, whose rotations have gradients that consist of rounding errors."""
+    monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
+    monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
+    more = [MCMC(start=2, stop=20, every=3, dead_opacity=0.08, min_gaussians=1)] if sampling else []
     conductors = [
-        Conductor(GCO(), P2G(patch=4), svs(), objective=scaled(Objective(), STEPS / 10_000), statistics_from=1)
+        Conductor(GCO(), P2G(patch=4), svs(), *more, objective=scaled(Objective(), STEPS / 10_000), statistics_from=1)
         for _ in range(2)
     ]
     opt = options(inria_host, inria_capture, iterations=STEPS, densify_until_iter=0, sh_interval=1)
     toy_scene = toy.scene(N)
     gaussians, scene = inria_host.setup(opt)
-    clear = attach(gaussians, scene.getTrainCameras(), conductors[0], sr=inria_capture / "sr")
+    clear = attach(gaussians, scene.getTrainCameras(), conductors[0], sr=inria_capture / "sr", own_density=False)
     clear.views = InDouble(scene.cameras, Images(str(inria_capture / "sr")), 4)
     views = tuple(clear.views[view.name] for view in toy_scene.train)
 
@@ -104,6 +109,7 @@ def test_its_steps_equal_those_of_our_own_trainer(inria_host, inria_capture):
     loop(inria_host, clear, opt, gaussians, scene, names=names)
 
     found = clear.params()
+    assert sampling == (len(own.field) > N)
     for name, p in own.field.raw().items():
         difference = float((p.flatten() - found[name].detach().flatten()).norm() / p.norm().clamp_min(1e-12))
         assert difference < 1e-9, name
