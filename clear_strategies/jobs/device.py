@@ -96,6 +96,11 @@ class Drawing:
         """Whether opacities are compensated, see `RasterSettings`."""
         return bool(self.make.keywords.get("antialiased", _SHARED.antialiased))
 
+    @property
+    def near(self) -> float:
+        """The near plane, world units."""
+        return float(self.make.keywords.get("near", _SHARED.near))
+
     def over(self, background: Color) -> Drawing:
         """The same over the data set's background, unless the settings name one."""
         if "background" in self.make.keywords:

@@ -116,6 +116,7 @@ class _Training:
             rates=scaled(settings.optim, stretch).of_run(settings.fit.iterations),
             mip=scaled(settings.mip, stretch),
             skips=scaled(settings.skips, stretch),
+            near=place.drawing.near,
         )
         resume.resume(state, source, self.folder, self.compared)
         return state

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from clear_strategies.core.gradients import ATTRIBUTES, Grads
 from clear_strategies.core.points import PointCloud
 from clear_strategies.core.view import View
-from clear_strategies.training.mip import filter_std
+from clear_strategies.training.mip import NEAR, filter_std
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Rasterizer, Rendering, SplatGradients, Splats
 
@@ -115,9 +115,9 @@ class GaussianField(nn.Module):
         """An image for evaluation: no dropout, f = base + det, not clamped."""
         return rasterizer(self._activate(None).splats(detail=detail), camera).image
 
-    def update_filter(self, cameras: Sequence[Camera], variance: float) -> None:
+    def update_filter(self, cameras: Sequence[Camera], variance: float, near: float = NEAR) -> None:
         """Recompute the 3D filter from the present means."""
-        self.filter_3d = filter_std(self.means.data, cameras, variance)
+        self.filter_3d = filter_std(self.means.data, cameras, variance, near)
 
     def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
         """Change the structure by one gather: row i becomes a copy of row parents[i]."""

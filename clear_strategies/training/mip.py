@@ -19,8 +19,10 @@ from rasterizers.interface import Camera, RasterSettings
 _log = logging.getLogger(__name__)
 
 # A camera samples what it draws, whatever the capture's unit (Mip-Splatting: what is farther than 0.2) …
-_NEAR: Final = RasterSettings().near
-_MARGIN: Final = 0.15  # … and projects into its image enlarged by this share on each side (Mip-Splatting)
+NEAR: Final = RasterSettings().near
+"""… and draws what is farther than this, unless its rasterizer has another near plane."""
+
+_MARGIN: Final = 0.15  # of the image: a centre counts up to this share outside of each side (Mip-Splatting)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +48,16 @@ class MipFilter:
 
 
 @torch.no_grad()
-def filter_std(means: Float[Tensor, "N 3"], cameras: Sequence[Camera], variance: float) -> Float[Tensor, " N"]:
+def filter_std(
+    means: Float[Tensor, "N 3"], cameras: Sequence[Camera], variance: float, near: float = NEAR
+) -> Float[Tensor, " N"]:
     """f_i = √variance · z_min / f_max: the filter's standard deviation in world units.
 
     z_min is the smallest depth among the cameras that see the centre, f_max the largest focal length of all. A
     Gaussian that no camera sees takes the largest z_min of the others; if no Gaussian is seen, there is no filter.
+
+    Args:
+        near: the near plane of the rasterizer, world units.
     """
     if variance == 0 or not len(means):
         return means.new_zeros(len(means))
@@ -61,12 +68,13 @@ def filter_std(means: Float[Tensor, "N 3"], cameras: Sequence[Camera], variance:
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside = (u >= -_MARGIN * camera.width) & (u <= (1 + _MARGIN) * camera.width)
         inside &= (v >= -_MARGIN * camera.height) & (v <= (1 + _MARGIN) * camera.height)
-        z_min = torch.where((z > _NEAR) & inside, torch.minimum(z_min, z), z_min)
+        z_min = torch.where((z > near) & inside, torch.minimum(z_min, z), z_min)
     seen = z_min.isfinite()
     if not bool(seen.any()):
         _log.warning(
-            "no training camera sees a Gaussian farther away than %g world units: the 3D filter is off.", _NEAR
-        )
+            "no training camera sees a Gaussian farther away than rasterizer.near=%g world units: the 3D filter is off. "
+            "Lower rasterizer.near where the scene is that small.", near
+        )  # fmt: skip
         return means.new_zeros(len(means))
     z_min = torch.where(seen, z_min, z_min[seen].max())
     std: Tensor = z_min * (math.sqrt(variance) / max(camera.fx for camera in cameras))

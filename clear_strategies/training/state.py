@@ -24,7 +24,7 @@ from clear_strategies.training.compiled_step import CompiledStep, compiled_step_
 from clear_strategies.training.densifier import Densifier, DensifierSettings, cameras_extent
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.history import History
-from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.mip import NEAR, MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.skips import SkipPolicy, Skips
@@ -38,6 +38,7 @@ class TrainState:
 
     Args:
         t: the iteration to come, from 1.
+        near: the near plane of the rasterizer, world units.
         history: one row per iteration; read it by `history_as_floats`, since on a device its numbers are deferred.
     """
 
@@ -48,6 +49,7 @@ class TrainState:
     settings: FitSettings
     mip: MipFilter
     views: tuple[View, ...]
+    near: float = NEAR
     t: int = 1
     history: History = field(default_factory=History)
     compiled_step: CompiledStep | None = None
@@ -64,12 +66,14 @@ class TrainState:
         rates: LearningRates,
         mip: MipFilter,
         skips: Skips | None = None,
+        near: float = NEAR,
     ) -> TrainState:
         """The state before the first iteration, on the device of the scene's views.
 
         Args:
             settings, density, rates, mip, skips: with milestones already scaled to this run.
             density: replaced where a strategy brings a densifier.
+            near: of the rasterizer that draws.
         """
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
@@ -92,6 +96,7 @@ class TrainState:
             settings,
             mip,
             scene.train,
+            near,
             compiled_step=step,
             skip_policy=SkipPolicy(skips),
         )
@@ -144,7 +149,7 @@ class TrainState:
 
     def refilter(self) -> None:
         cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]
-        self.field.update_filter(cameras, self.mip.variance)
+        self.field.update_filter(cameras, self.mip.variance, self.near)
 
     def resized(self, parents: Int[Tensor, " M"]) -> None:
         """Tell the conductor and the filter that row i now comes from row parents[i]; field and optimizer are done."""

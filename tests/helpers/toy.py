@@ -20,7 +20,7 @@ from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.objective import Objective
 from clear_strategies.strategies.base import Strategy
-from clear_strategies.training.mip import MipFilter
+from clear_strategies.training.mip import NEAR, MipFilter
 from clear_strategies.training.optim import LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
@@ -120,11 +120,15 @@ class Recorder(Strategy):
 
 
 def started(
-    *strategies: Strategy, objective: Objective | None = None, of: Scene | None = None, **settings: object
+    *strategies: Strategy,
+    objective: Objective | None = None,
+    of: Scene | None = None,
+    near: float = NEAR,
+    **settings: object,
 ) -> TrainState:
     """A run on the toy scene, or on another, before its first iteration; the readable path unless `settings` say otherwise."""
     return TrainState.start(
         of or scene(), Conductor(*strategies, objective=objective or Objective(kernels="torch")),
         settings=FitSettings(**{"iterations": 10, "probe_every": 0, "max_degree": 1, "fused": "off", **settings}),
-        density=DensitySettings(), rates=LearningRates(), mip=MipFilter(),
+        density=DensitySettings(), rates=LearningRates(), mip=MipFilter(), near=near,
     )  # fmt: skip

@@ -81,9 +81,9 @@ def test_the_method_says_whether_opacities_are_compensated(chosen: tuple[str, ..
 
 def test_a_rasterizer_of_another_package_is_a_target_with_the_same_settings():
     target = f"rasterizer._target_={__name__}.Theirs"
-    found = settings(target, "rasterizer.kernel=0.3", "+rasterizer.sharpness=2").rasterizer
+    found = settings(target, "rasterizer.kernel=0.3", "rasterizer.near=1e-5", "+rasterizer.sharpness=2").rasterizer
     drawing = device.drawing(found, None).over((1.0, 1.0, 1.0))
-    assert (type(drawing.rasterizer), drawing.name, drawing.kernel) == (Theirs, "Theirs", 0.3)
+    assert (type(drawing.rasterizer), drawing.name, drawing.kernel, drawing.near) == (Theirs, "Theirs", 0.3, 1e-5)
     assert (drawing.rasterizer.sharpness, drawing.rasterizer.background) == (2, (1.0, 1.0, 1.0))
     assert drawing.make().background == (1.0, 1.0, 1.0)
     own = device.drawing(settings(target, "rasterizer.background=[0,0,1]").rasterizer, None).over((1.0, 1.0, 1.0))

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from clear_strategies import SVS, Conductor, Update
 from clear_strategies.core.gradients import Grads
 from clear_strategies.core.points import PointCloud
+from clear_strategies.core.view import Photo
 from clear_strategies.density.adaptive import Density, DensitySettings
 from clear_strategies.errors import DensityError
 from clear_strategies.schedules import scaled
@@ -295,3 +296,19 @@ def test_the_3d_filter_does_not_depend_on_the_unit_of_the_world():
     pose[:3, 3] *= 0.1
     smaller = replace(camera, world_to_camera=pose)
     assert torch.allclose(filter_std(0.1 * means, [smaller], 0.2), 0.1 * filter_std(means, [camera], 0.2))
+
+
+def test_the_3d_filter_counts_what_the_rasterizer_of_the_run_draws():
+    """A capture in kilometres needs a smaller near plane; its filter is that of the same capture in metres."""
+    scene = toy.scene(12)
+
+    def smaller(photo: Photo) -> Photo:
+        pose = photo.camera.world_to_camera.clone()
+        pose[:3, 3] /= 1024
+        return replace(photo, camera=replace(photo.camera, world_to_camera=pose))
+
+    views = tuple(replace(v, lr=smaller(v.lr), hr=smaller(v.hr)) for v in scene.train)
+    tiny = replace(scene, train=views, cloud=replace(scene.cloud, means=scene.cloud.means / 1024))
+    expected = toy.started(of=scene).field.filter_3d / 1024
+    assert torch.allclose(toy.started(of=tiny, near=0.01 / 1024).field.filter_3d, expected)
+    assert not toy.started(of=tiny).field.filter_3d.any()  # the default draws nothing of it
