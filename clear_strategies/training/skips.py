@@ -51,18 +51,6 @@ class Skips:
         require_number("plateau_gain", self.plateau_gain, below=1)
         require_whole("coarse_until", self.coarse_until, least=0)
 
-    def says(self) -> list[str]:
-        """A phrase for each skip that is on, for the plan."""
-        phrases = []
-        if self.coarse_until > 0:
-            phrases.append(f"HR at half its size until iteration {self.coarse_until}")
-        if self.plateau_gain > 0:
-            phrases.append(
-                f"the iterations until {self.plateau_to} once {self.plateau_window} iterations gain less than "
-                f"{self.plateau_gain:.1%}"
-            )
-        return phrases
-
 
 class SkipPolicy:
     """Applies the skips of one run. It holds caches only, so a checkpoint needs nothing of it."""
@@ -71,12 +59,29 @@ class SkipPolicy:
         self.skips = skips if skips is not None else Skips()
         self._coarse: dict[str, View] = {}
 
+    def says(self, views: Sequence[View]) -> list[str]:
+        """A phrase for each skip that is on, for the plan; a warning for one that cannot act."""
+        s, phrases = self.skips, []
+        if s.coarse_until > 0 and not any(map(_halves, views)):
+            _log.warning("skips.coarse_until has no effect: SR images are halved where data.views.sr_scale is even.")
+        elif s.coarse_until > 0:
+            phrases.append(f"HR at half its size until iteration {s.coarse_until}")
+        if s.plateau_gain > 0 and s.plateau_window == 0:
+            _log.warning(
+                "skips.plateau_gain has no effect: plateau_window is less than an iteration of so short a run."
+            )
+        elif s.plateau_gain > 0:
+            phrases.append(
+                f"the iterations until {s.plateau_to} once {s.plateau_window} iterations gain less than {s.plateau_gain:.1%}"
+            )
+        return phrases
+
     def view(self, view: View, t: int) -> View:
         """The view of iteration t: with a coarse SR image at first, where the factor is even."""
         if t > self.skips.coarse_until:
             self._coarse.clear()  # no later iteration needs them
             return view
-        if view.factor % _REDUCED:
+        if not _halves(view):
             return view
         if view.name not in self._coarse:
             hr = view.hr.reduced(_REDUCED)
@@ -87,7 +92,7 @@ class SkipPolicy:
         """Of the coarse SR images that are kept from iteration t on."""
         if t > self.skips.coarse_until:
             return 0
-        return sum(view.hr.image.nbytes // _REDUCED**2 for view in views if view.factor % _REDUCED == 0)
+        return sum(view.hr.image.nbytes // _REDUCED**2 for view in filter(_halves, views))
 
     def lr_due(self, view: View, hr_due: bool, work_log: WorkLog) -> bool:
         """Whether LR is rendered: not where HR at half its size is as large as the photo, for one render then serves both."""
@@ -123,3 +128,8 @@ class SkipPolicy:
         """What the measured loss of a row compares: whether HR, and whether HR at half its size."""
         hr = row["lambda_hr"] > 0
         return hr, hr and row["t"] <= self.skips.coarse_until
+
+
+def _halves(view: View) -> bool:
+    """Whether its SR image has a coarse version that is a whole multiple of the photo."""
+    return view.factor % _REDUCED == 0

@@ -56,6 +56,19 @@ def test_photos_that_sr_does_not_enlarge_keep_their_reference_and_are_rendered_a
     assert not work_log.entries
 
 
+def test_a_skip_that_cannot_act_is_a_warning_and_not_in_the_plan(caplog):
+    view, skips = toy.scene().train[0], Skips(coarse_until=10, plateau_gain=0.01)
+    half, window = SkipPolicy(skips).says([view])
+    assert half == "HR at half its size until iteration 10"
+    assert "500 iterations gain less than 1.0%" in window
+    assert not caplog.records
+    odd = replace(view, hr=view.hr.reduced(4))  # by a factor of 1
+    assert SkipPolicy(replace(skips, plateau_window=0)).says([odd]) == []
+    assert SkipPolicy(skips).says([odd]) == [window]
+    assert "skips.coarse_until has no effect" in caplog.text
+    assert "skips.plateau_gain has no effect" in caplog.text
+
+
 @pytest.mark.parametrize(("now", "ends"), [(0.99, True), (0.97, False), (1.10, True)])
 def test_a_plateau_is_a_window_that_gains_less_than_asked(now, ends):
     skip_policy = SkipPolicy(Skips(plateau_gain=0.02, plateau_window=4, plateau_from=4))
