@@ -176,7 +176,8 @@ class View:
             replace(photo, image=(photo.image * gain).clamp(0, 1), transparency=None) for photo in (self.lr, self.hr)
         )
         truth = hr.image if self.hr_is_photo else None if self.truth is None else (self.truth * gain).clamp(0, 1)
-        return replace(self, lr=lr, hr=hr, truth=truth)
+        disagreement = None if self.disagreement is None else self.disagreement * gain  # a difference of such images
+        return replace(self, lr=lr, hr=hr, truth=truth, disagreement=disagreement)
 
     def to(self, device: torch.device | str) -> View:
         hr = self.hr.to(device)

@@ -8,9 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from clear_strategies.core import images
 from clear_strategies.core.view import DepthMap, Photo, View
 from clear_strategies.geometry import exposure, exposure_gains
-from tests.helpers import planes
+from clear_strategies.strategies.p2g import P2G
+from tests.helpers import planes, toy
 
 DEPTH = 4.0
 NOTHING = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
@@ -66,6 +68,17 @@ def test_a_view_is_brightened_at_both_scales_and_its_photo_stays_its_truth():
     assert made.hr.image[0, 0].tolist() == pytest.approx([0.9, 1.0, 0.3])
     assert made.truth[0, 0].tolist() == pytest.approx([0.75, 1.0, 0.25])
     assert View("v", lr, hr, truth=hr.image).brightened(gain).hr_is_photo
+
+
+def test_the_reliability_of_a_brightened_view_is_that_of_its_brightened_images():
+    """Back-projection stores what the network's image differed by; the other view still has that image."""
+    view = toy.scene().train[0]
+    differed = (images.downsample(view.hr.image, 4) - view.lr.image).abs()
+    moved = replace(view.hr, image=images.back_projected(view.hr.image, view.lr.image, 4, 10))
+    gain = torch.tensor([0.5, 0.6, 0.7])
+    stored = replace(view, hr=moved, disagreement=differed).brightened(gain)
+    found, expected = (P2G(patch=8).patch_maps(v).reliability for v in (stored, view.brightened(gain)))
+    assert torch.allclose(found, expected, atol=0.05)  # up to rounding to 8 bits
 
 
 def test_with_many_photos_only_neighbours_are_compared(monkeypatch):
