@@ -16,7 +16,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.checks import require_choice, require_number
+from clear_strategies.core.checks import refuse, require_choice, require_number
 from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule, GroupReport
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot, row_norm, scale_rows
@@ -60,6 +60,8 @@ class GCO(Strategy):
             raise SettingError(
                 f"0 <= weight_min <= weight_max <= 1 must hold, got {self.weight_min} and {self.weight_max}."
             )
+        if not self.groups:
+            refuse("groups", "must name an attribute, or nothing is corrected", [], f"groups=[{CONFLICT_GROUPS[0]}]")
         for group in self.groups:
             require_choice("groups", group, CONFLICT_GROUPS)
 
@@ -86,6 +88,9 @@ class GCO(Strategy):
         Args:
             lr, hr: attribute -> gradient [N, …], any of `CONFLICT_GROUPS`; what only one of them has is not compared.
             step: gives the reliability of Eq. 11; None: nothing is known of it, and conflicts are corrected in full.
+
+        Raises:
+            ValueError: both have gradients, but none of the same group, so that nothing could be corrected.
         """
         evidence = None if step is None else step.evidence
         corrected, done = Grads(hr), []
@@ -93,6 +98,11 @@ class GCO(Strategy):
             if group in lr and group in hr:
                 corrected[group], correction = self._correct_group(group, lr, hr, evidence)
                 done.append(correction)
+        if lr and hr and not done:
+            raise ValueError(
+                f"GCO compares the groups {', '.join(self.groups)}, and no two gradients are of one: lr has "
+                f"{', '.join(lr)}, hr has {', '.join(hr)}. Name them so."
+            )
         self.report(done, evidence)
         return corrected
 

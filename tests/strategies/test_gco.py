@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from clear_strategies import CONFLICT_GROUPS, GCO, Evidence, Grads
+from clear_strategies.errors import SettingError
 from tests.helpers import toy
 
 WIDTHS = {"means": (3,), "sh0": (1, 3), "shN": (15, 3), "opacities": (), "scales": (3,), "quats": (4,)}
@@ -107,6 +108,14 @@ def test_rotation_noise_of_isotropic_gaussians_is_gated():
     assert torch.equal(found["quats"], hr["quats"])
     assert gco.logs["corrected_quats"] == 0
     assert gco.logs["corrected_scales"] > 0
+
+
+def test_what_could_correct_nothing_is_refused():
+    g = torch.ones(2, 3)
+    with pytest.raises(ValueError, match=r"compares the groups means, .* lr has _xyz, hr has _xyz\. Name them so"):
+        GCO().correct({"_xyz": g}, {"_xyz": -g})
+    with pytest.raises(SettingError, match="groups: must name an attribute"):
+        GCO(groups=())
 
 
 def test_the_detail_feature_is_never_touched():
