@@ -43,6 +43,7 @@ _log = logging.getLogger(__name__)
 _READERS: Final = 4  # photos read at once, at most: each is held at its full size meanwhile
 _WHOLE: Final = 0.99  # of a pixel's mask, for the pixel to be shown
 _SAME_EXPOSURE: Final = 0.01  # photos whose gains are closer to 1 stay as they are
+_BLURRED: Final = 3e-4  # rounding of positions, in distances of the cameras, that is a visible part of an HR pixel
 _ROUNDING: Final = 0.5  # grey levels: the largest difference that rounding to 8 bits makes
 
 
@@ -59,6 +60,7 @@ def prepare(capture: Capture, views: ViewSettings, prior: Prior, cloud: CloudSet
     lr_files = check_headers(train_frames + test_frames, views)
     held_out = len(train_frames) < len(capture.frames)  # so the capture's points may know what training must not
     require_source(cloud, capture.points)
+    _warn_if_far_from_origin([frame.camera for frame in train_frames])
     progress = Progress("photos and their SR images", "photos", len(train_frames) + len(test_frames))
     frames = [*train_frames, *(replace(frame, transparency=None) for frame in test_frames)]  # only training needs it
     found, work_log = list[View](), WorkLog()
@@ -320,6 +322,20 @@ def _added_detail(views: Sequence[View]) -> float:
 def _names(views: Sequence[View]) -> str:
     first = ", ".join(v.name for v in views[:8]) + (", …" if len(views) > 8 else "")
     return f"{len(views)}: {first}" if views else "none"
+
+
+def _warn_if_far_from_origin(cameras: Sequence[Camera]) -> None:
+    """Warn where float32 cannot place Gaussians to a part of a pixel, as in a capture with geographic coordinates."""
+    centers = torch.stack([camera.center.double() for camera in cameras])
+    away = float(torch.linalg.vector_norm(centers.mean(0)))
+    apart = float(torch.linalg.vector_norm(centers - centers.mean(0), dim=1).max())
+    rounded = away * torch.finfo(torch.float32).eps / 2
+    if rounded > _BLURRED * apart > 0:
+        _log.warning(
+            "the cameras lie within %.3g units of their mean but %.3g from the origin, where float32 rounds positions to %.2g: "
+            "stereo and training lose detail. Subtract the same point from all camera centres and points of the capture.",
+            apart, away, rounded,
+        )  # fmt: skip
 
 
 def _size(camera: Camera) -> str:

@@ -212,3 +212,18 @@ def test_points_that_do_not_exist_are_refused_before_a_photo_is_decoded(init):
 def test_lr_photos_and_an_lr_folder_contradict_each_other():
     with pytest.raises(SettingError, match=r"data\.views\.lr_folder: must be null"):
         ViewSettings(photos_are="lr", lr_folder="here")
+
+
+@pytest.mark.parametrize(("away", "warns"), [(0.0, False), (4.5e6, True)])
+def test_geographic_coordinates_give_a_warning(away, warns, caplog):
+    """Cameras within 300 m, and in UTM coordinates, where float32 rounds positions to a quarter of a metre."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[0, 0, 3], poses[:, 1, 3] = 600.0, away
+    photos = undecodable()
+    frames = [
+        replace(frame, camera=replace(frame.camera, world_to_camera=pose))
+        for frame, pose in zip(photos.frames, poses, strict=True)
+    ]
+    with pytest.raises(AssertionError, match="decoded"):
+        prepare(replace(photos, frames=tuple(frames)), ViewSettings(), Bicubic(), CloudSettings())
+    assert ("where float32 rounds positions to 0.27" in caplog.text) == warns
