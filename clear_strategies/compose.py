@@ -6,6 +6,7 @@ conductor("clear", "strategies.gco.tolerance=0.1", iterations=30_000)
 from __future__ import annotations
 
 import difflib
+import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
@@ -37,6 +38,8 @@ from clear_strategies.strategies.base import Strategy
 _PACKAGE: Final = Path(__file__).resolve().parent
 # In a wheel conf/ lies inside the package, in a checkout beside it.
 CONF: Final = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
+
+_LONGEST_NAME: Final = 200  # bytes of a folder's name; most file systems take 255
 
 OPTIONS: Final = "clear_strategies_conf"
 """The group of entry points by which other packages bring options, such as strategies; docs/template is such a package."""
@@ -222,6 +225,18 @@ def _unnamed(*more: str) -> list[str]:
     return [*sorted(CHANGES_NO_RESULT), *more]
 
 
+def _one_folder(name: str) -> str:
+    """`${one_folder:name}` in conf/: the name of a job's folder, one word that every file system takes. A path among the
+    overrides would otherwise lead elsewhere: behind `../..` all jobs share a folder.
+    """
+    flat_name = name.replace("/", "_")
+    if len(flat_name.encode()) <= _LONGEST_NAME:
+        return flat_name
+    told = hashlib.sha256(name.encode()).hexdigest()[:8]
+    return f"{flat_name.encode()[: _LONGEST_NAME - len(told) - 1].decode(errors='ignore')}_{told}"
+
+
 OmegaConf.register_new_resolver("settings_without_result", _unnamed, replace=True)
+OmegaConf.register_new_resolver("one_folder", _one_folder, replace=True)
 Plugins.instance().register(_ConfSource)
 Plugins.instance().register(_ReadConf)

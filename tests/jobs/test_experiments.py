@@ -228,6 +228,24 @@ def test_a_setting_that_changes_no_result_changes_no_folders_name(rows):
     assert composed_job(one).hydra.sweep.subdir == named
 
 
+def test_each_job_has_a_folder_of_its_own_whatever_path_or_number_of_settings_names_it():
+    asked = ["experiment=leave_one_out", "~protocol", "fit.seed=0", "data=llff", "data.path=../../scenes/fern"]
+    asked += [f"objective.lambda_hr.{name}=1.0" for name in ("peak", "final")]
+    for more in (
+        [],
+        [
+            f"density.{name}=100"
+            for name in ("start", "stop", "every", "statistics_from", "reset_every", "max_gaussians")
+        ],
+    ):
+        found, composed_job = jobs(*asked, *more)
+        names = [composed_job(job).hydra.sweep.subdir for job in found]
+        assert len(set(names)) == len(ROWS["leave_one_out"])
+        for job, name in zip(found, names, strict=True):
+            assert name.startswith(f"+strategy={job['+strategy']},data.path=.._.._scenes_fern,")
+            assert len(name.encode()) <= 255
+
+
 def test_settings_that_change_no_result_exist():
     config = composed()
     assert [key for key in CHANGES_NO_RESULT if OmegaConf.select(config, key, default="nothing") == "nothing"] == []
