@@ -128,7 +128,9 @@ def _gradients(
     aside = Conductor(*copy.deepcopy(conductor.strategies), objective=objective)
     lr, hr = (cast(FieldShot, shot) for shot in field.render_scales(rasterizer, view))  # both scales are asked for
     (g_lr,) = lr.vjp(objective.lr(lr.image.detach(), view.lr.image, view.lr.shown).cotangents)
-    merged = aside.merge(field.raw(), g_lr, aside.hr_gradients(hr, view, t=1), t=1)
+    # The field is drawn over the scene's own background, whichever one a strategy would choose.
+    opaque = replace(view, hr=replace(view.hr, transparency=None))
+    merged = aside.merge(field.raw(), g_lr, aside.hr_gradients(hr, opaque, t=1), t=1)
     corrects = aside.owner("correct") is not None
     return g_lr, cast(Grads, merged.hr), merged.corrected if corrects else None
 

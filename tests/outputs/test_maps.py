@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from clear_strategies import GCO, P2G, SVS
+from clear_strategies import GCO, P2G, SVS, Conductor, RandomBackground
 from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads, conflict_ratio
 from clear_strategies.core.view import DepthMap, View
@@ -128,6 +128,16 @@ def test_maps_are_drawn_over_black_whatever_the_background() -> None:
     found = view_maps(state.field, state.conductor, white, state.views[0])
     assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
     assert 0 < float(found.maps["corrected"].max()) < 0.4
+
+
+def test_maps_of_transparent_photos_compare_them_before_the_background_that_is_drawn() -> None:
+    state = trained(GCO(), RandomBackground(until=9_000))
+    view = state.views[0]
+    view = replace(view, hr=replace(view.hr, transparency=torch.ones_like(view.hr.image[..., 0])))
+    assert state.conductor.background(1) is not None
+    found = view_maps(state.field, state.conductor, toy.RASTERIZER, view)
+    expected = view_maps(state.field, Conductor(GCO(), objective=OBJECTIVE), toy.RASTERIZER, view)
+    assert found.means == expected.means
 
 
 def test_a_folder_of_maps_is_complete(tmp_path: Path) -> None:
