@@ -116,10 +116,8 @@ def _baseline_rows(runs: Sequence[Run]) -> list[Row]:
     for baseline in BASELINES:
         inputs = {run: _inputs(run, baseline) for run in runs if baseline in run.scores}
         shared = _in_all([*inputs.values()])
-        by_input: dict[str, list[Run]] = {}
-        for run, of in inputs.items():
-            by_input.setdefault(_label(baseline, of, shared), []).append(run)
-        for label, same in by_input.items():
+        for same in _grouped(inputs, lambda run: frozenset(inputs[run])).values():
+            label = _label(baseline, inputs[same[0]], shared)
             # Runs with the same input have the same baseline, unless the prior depends on the seed.
             values = {m: sorted(set(_known(run.scores[baseline][m] for run in same))) for m in SCORES}
             rows.append(Row(same[0].scene, label, baseline, tuple(same), values))
@@ -130,7 +128,8 @@ def _method_rows(runs: Sequence[Run]) -> list[Row]:
     """Of one scene: one row per name and set of settings."""
     shared = shared_settings(runs)
     rows: list[Row] = []
-    for method, same in _grouped(runs, lambda run: _label(run.name, run.settings, shared)).items():
+    for same in _grouped(runs, lambda run: (run.name, frozenset(run.settings))).values():
+        method = _label(same[0].name, same[0].settings, shared)
         if len(same) > len({run.seed for run in same}):
             _log.warning("%s, %s: a row holds several runs with the same seed.", same[0].scene, method)
         values = {measure: _known(run.scores["ours"][measure] for run in same) for measure in SCORES}

@@ -25,8 +25,8 @@ _HYDRA: Final = ".hydra"
 _SEED: Final = "fit.seed="
 # The overrides that name a run; the others are its settings.
 _METHOD, _STRATEGY = "method=", "strategy="
-# Where the data lie: the scene has a name.
-_PATH: Final = re.compile(r"scene|data\.root|data\.[\w.]*path")
+# Where the photos lie: the scene has a name.
+_PATH: Final = re.compile(r"scene|data\.root|data\.(reader\.)?path")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

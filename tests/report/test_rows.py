@@ -22,7 +22,9 @@ def test_runs_that_differ_in_their_seed_share_a_row(tmp_path: Path) -> None:
     assert (line["best"], line["seeds"], line["Gaussians"]) == ("25.00", "0, 1, 2", "1,200 ± 0")
 
 
-@pytest.mark.parametrize("setting", ["prior=onnx", "strategies.gco.tolerance=0.1", "~strategies.p2g", "mip.every=9"])
+@pytest.mark.parametrize(
+    "setting", ["prior=onnx", "strategies.gco.tolerance=0.1", "~strategies.p2g", "data.cloud.path=dense.ply"]
+)
 def test_runs_that_differ_in_a_setting_have_rows_that_name_it(tmp_path: Path, setting: str) -> None:
     make_run(tmp_path / "0", "+strategy=clear", "data=llff")
     make_run(tmp_path / "1", "+strategy=clear", "data=llff", setting)
@@ -39,6 +41,14 @@ def test_paths_and_scenes_do_not_separate_runs_of_a_method(tmp_path: Path) -> No
     make_run(tmp_path / "0", "+method=srgs", "+scene=fern", strategies=["hr_only"])
     make_run(tmp_path / "1", "+method=srgs", "data.path=elsewhere/fern", "data.reader.path=x", seed=1)
     assert rows_of(tmp_path)["srgs"].seeds == "0, 1"
+
+
+def test_the_order_of_settings_does_not_separate_runs(tmp_path: Path) -> None:
+    settings = ["+strategy=clear", "mip.every=9", "density.every=50"]
+    make_run(tmp_path / "0", *settings)
+    make_run(tmp_path / "1", *reversed(settings), seed=1)
+    make_run(tmp_path / "2", "+strategy=clear")
+    assert rows_of(tmp_path)["clear, mip.every=9, density.every=50"].seeds == "0, 1"
 
 
 def test_several_runs_with_one_seed_in_a_row_give_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
