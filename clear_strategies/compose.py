@@ -162,24 +162,38 @@ def composed(overrides: list[str], config: str = "conductor") -> DictConfig:
 
 
 def require_each_once(overrides: Iterable[str]) -> None:
-    """Raise a SettingError for a strategy that is named twice: Hydra merges the two into one silently."""
+    """Raise a SettingError for a strategy that is named twice, since Hydra merges the two into one silently, and for one before
+    a method that brings more than strategies, which a method does not set aside.
+    """
+    further: str | None = None
     for override in OverridesParser.create().parse_overrides(list(overrides)):
+        if override.key_or_group == "method" and further is not None:
+            raise SettingError(
+                f"+{override.input_line.lstrip('+')}: sets strategies aside, and {further}. Leave it out."
+            )
         if override.key_or_group != "strategy" or override.is_sweep_override():
             continue
         value = override.value()
-        names = [name for entry in (value if isinstance(value, list) else [value]) for name in _members(str(entry))]
+        chosen = [str(entry) for entry in (value if isinstance(value, list) else [value])]
+        for entry in chosen:
+            if more := [part for part in _parts(entry) if part.startswith("/")]:
+                further = f"+strategy={entry} before it brings {', '.join(more)} as well"
+        names = [name for entry in chosen for name in _members(entry)]
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise SettingError(f"+strategy: must name each strategy once, got {twice} twice in {override.input_line}.")
 
 
 def _members(name: str) -> list[str]:
     """The strategies that an option of conf/strategy consists of, those of the options that it names included."""
-    file = CONF / "strategy" / f"{name}.yaml"
-    if not file.is_file():
-        return [name]
-    parts = OmegaConf.to_container(OmegaConf.load(file)).get("defaults", [])  # type: ignore[union-attr]
-    named = [part for part in parts if isinstance(part, str) and not part.startswith(("/", "_"))]
+    named = [part for part in _parts(name) if not part.startswith(("/", "_"))]
     return [member for part in named for member in _members(part)] or [name]
+
+
+def _parts(name: str) -> list[str]:
+    """The options that an option of conf/strategy names, those of other groups with a `/` in front."""
+    file = CONF / "strategy" / f"{name}.yaml"
+    content: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
+    return [part for part in content.get("defaults", []) if isinstance(part, str)]
 
 
 class _ConfSource(FileConfigSource):

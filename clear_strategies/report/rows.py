@@ -116,7 +116,10 @@ def _baseline_rows(runs: Sequence[Run]) -> list[Row]:
     for baseline in BASELINES:
         inputs = {run: _inputs(run, baseline) for run in runs if baseline in run.scores}
         shared = _in_all([*inputs.values()])
-        for same in _grouped(inputs, lambda run: frozenset(inputs[run])).values():
+        by_input: dict[frozenset[str], list[Run]] = {}
+        for run, of in inputs.items():
+            by_input.setdefault(frozenset(of), []).append(run)
+        for same in by_input.values():
             label = _label(baseline, inputs[same[0]], shared)
             # Runs with the same input have the same baseline, unless the prior depends on the seed.
             values = {m: sorted(set(_known(run.scores[baseline][m] for run in same))) for m in SCORES}

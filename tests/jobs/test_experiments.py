@@ -13,7 +13,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from clear_strategies import Conductor
+from clear_strategies.compose import require_each_once
 from clear_strategies.data.view_settings import ViewSettings
+from clear_strategies.errors import SettingError
 from clear_strategies.schedules import scaled
 from clear_strategies.settings import CHANGES_NO_RESULT, build
 from clear_strategies.training.loop import fit, iterate
@@ -126,6 +128,13 @@ def test_a_method_sets_aside_the_strategies_named_before_it():
     assert list(composed("+strategy=clear", "+method=srgs").strategies) == []
     assert list(composed("+strategy=clear", "+method=dropgaussian").strategies) == ["svs"]
     assert list(composed("+method=srgs", "+strategy=gco").strategies) == ["gco"]
+
+
+def test_a_method_is_the_same_whatever_strategies_before_it_brought():
+    """The decorator of best would change the SR images of srgs, the λ_HR of clear_paper train 3dgs_lr on SR images."""
+    assert composed("+strategy=best", "+method=srgs") == composed("+method=srgs")
+    with pytest.raises(SettingError, match=r"\+strategy=clear_paper before it brings /readings/literal"):
+        require_each_once(["+strategy=clear_paper", "+method=3dgs_lr"])
 
 
 SCENES = {
