@@ -32,7 +32,7 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import REFERENCE_ITERATIONS, scaled
-from clear_strategies.settings import CHANGES_NO_RESULT, build, with_defaults
+from clear_strategies.settings import CHANGES_NO_RESULT, TARGET, build, with_defaults
 from clear_strategies.strategies.base import Strategy
 
 _PACKAGE: Final = Path(__file__).resolve().parent
@@ -123,6 +123,12 @@ def tree(config: DictConfig, without: Iterable[str] = ()) -> dict[str, Any]:
         values = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
     except OmegaConfBaseException as error:
         raise SettingError(one_line(error)) from error
+    for name, node in (values.get("strategies") or {}).items():
+        if isinstance(node, dict) and node.get(TARGET) is None:
+            raise SettingError(
+                f"strategies.{name}: has settings ({', '.join(node)}), and takes no part. Add it, +strategy={name}, or leave out "
+                "what sets them; readings=literal sets those of p2g and svs."
+            )
     return {key: value for key, value in values.items() if key not in without}
 
 

@@ -67,6 +67,7 @@ def test_milestones_stretch_to_the_hosts_length():
         (("gco,best",), "gco twice"),
         (("best,svs",), "svs twice"),
         (("gco", "fit.iterations=3"), "fit"),
+        (("gco", "+readings=literal"), r"strategies.p2g: has settings .*\+strategy=p2g"),
     ],
 )
 def test_what_does_not_exist_is_named(said, named):
