@@ -63,7 +63,7 @@ class ViewMaps:
 
 
 def write_maps(
-    folder: Path, views: Sequence[View], field: GaussianField, conductor: Conductor, rasterizer: Rasterizer
+    folder: Path, views: Sequence[View], field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, t: int
 ) -> None:
     """Write maps.json and, for each of the views, a folder of 8-bit grey PNGs (value = 255 × number).
 
@@ -71,7 +71,7 @@ def write_maps(
     """
     means: dict[str, Mapping[str, float]] = {}
     for view in views:
-        found = view_maps(field, conductor, rasterizer, view)
+        found = view_maps(field, conductor, rasterizer, view, t)
         means[view.name] = found.means
         own = folder / file_stem(view.name)
         for name, values in {**found.maps, "lr": view.lr.image, "prior": view.hr.image}.items():
@@ -92,11 +92,11 @@ def write_maps(
     files.write_json(folder / "maps.json", content)
 
 
-def view_maps(field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View) -> ViewMaps:
-    """The maps of one view by the strategies of the run, without dropout."""
+def view_maps(field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int) -> ViewMaps:
+    """The maps of one view by the strategies of the run as they are at iteration t, without dropout."""
     evidence = _evidence(conductor, view)
     patches = {} if evidence is None else _enlarged(evidence[1], view)
-    numbers, compared = _compare(*_gradients(field, conductor, rasterizer, view))
+    numbers, compared = _compare(*_gradients(field, conductor, rasterizer, view, t))
     drawn = _draw(field, rasterizer, view.hr.camera, torch.stack(list(numbers.values()), dim=1))
     maps = {**patches, **{name: drawn[..., k].clamp(0, 1) for k, name in enumerate(numbers)}}
     means = {name: float(patch.mean()) for name, patch in patches.items()}
@@ -121,16 +121,16 @@ def _enlarged(patches: PatchMaps, view: View) -> dict[str, Tensor]:
 
 
 def _gradients(
-    field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View
+    field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int
 ) -> tuple[Grads, Grads, Grads | None]:
-    """g_LR, g_HR before correction, and g̃_HR where a strategy corrects, whatever λ_HR is at the end of the run."""
+    """g_LR, g_HR before correction, and g̃_HR where a strategy corrects at t, whatever λ_HR is then."""
     objective = replace(conductor.objective, lambda_hr=_ALWAYS_ON)
     aside = Conductor(*copy.deepcopy(conductor.strategies), objective=objective)
     lr, hr = (cast(FieldShot, shot) for shot in field.render_scales(rasterizer, view))  # both scales are asked for
     (g_lr,) = lr.vjp(objective.lr(lr.image.detach(), view.lr.image, view.lr.shown).cotangents)
     # The field is drawn over the scene's own background, whichever one a strategy would choose.
     opaque = replace(view, hr=replace(view.hr, transparency=None))
-    merged = aside.merge(field.raw(), g_lr, aside.hr_gradients(hr, opaque, t=1), t=1)
+    merged = aside.merge(field.raw(), g_lr, aside.hr_gradients(hr, opaque, t), t)
     corrects = aside.owner("correct") is not None
     return g_lr, cast(Grads, merged.hr), merged.corrected if corrects else None
 

@@ -50,7 +50,7 @@ def test_making_maps_does_not_change_the_run() -> None:
     before, logs = everything(state), [dict(s.logs) for s in strategies]
     caches, entries = [set(s.cache) for s in strategies], dict(state.conductor.work_log.entries)
     for view in state.views:
-        view_maps(state.field, state.conductor, toy.RASTERIZER, view)
+        view_maps(state.field, state.conductor, toy.RASTERIZER, view, 1)
     after = everything(state)
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
@@ -63,7 +63,7 @@ def test_patch_maps_are_p2gs_evidence_enlarged_to_hr() -> None:
     p2g = P2G(patch=8, reliability_scale=0.02)
     state = trained(p2g)
     view = state.views[0]
-    maps = view_maps(state.field, state.conductor, toy.RASTERIZER, view).maps
+    maps = view_maps(state.field, state.conductor, toy.RASTERIZER, view, 1).maps
     R, A = p2g.patch_evidence(view.lr.image, view.hr.image, 4)
     assert maps["reliability"].shape == (64, 96)
     assert maps["reliability"][31, 32] == R[0, 1]  # patches of 32 HR pixels
@@ -74,7 +74,7 @@ def test_patch_maps_are_p2gs_evidence_enlarged_to_hr() -> None:
 def test_conflict_is_the_ratio_that_training_logs() -> None:
     state = trained()
     view = state.views[0]
-    found = view_maps(state.field, state.conductor, toy.RASTERIZER, view)
+    found = view_maps(state.field, state.conductor, toy.RASTERIZER, view, 1)
     lr, hr = state.field.render_scales(toy.RASTERIZER, view)
     (g_lr,) = lr.vjp(OBJECTIVE.lr(lr.image, view.lr.image).cotangents)
     g_base, g_hf = hr.vjp(OBJECTIVE.hr(hr.image, view.hr.image).cotangents)
@@ -95,7 +95,7 @@ class OwnPatches(Strategy):
 
 def test_any_strategy_can_have_patch_maps(tmp_path: Path) -> None:
     state = trained(OwnPatches())
-    write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER)
+    write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER, 1)
     content = json.loads((tmp_path / "maps.json").read_text())
     assert content["evidence"] == "OwnPatches"
     means = content["views"][state.views[0].name]
@@ -112,7 +112,7 @@ class Halve(Strategy):
 def test_corrected_is_the_share_of_the_hr_gradient_that_was_taken_away() -> None:
     state = trained(Halve())
     state.conductor.objective = replace(OBJECTIVE, lambda_hr=WarmupDecay(peak=0, final=0))  # as it may be at the end
-    found = view_maps(state.field, state.conductor, toy.RASTERIZER, state.views[0])
+    found = view_maps(state.field, state.conductor, toy.RASTERIZER, state.views[0], 1)
     assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
     # Drawn over black: nowhere more than the number itself, and nearly that where Gaussians cover the pixel.
     assert float(found.maps["corrected"].max()) == pytest.approx(0.5, abs=0.1)
@@ -125,9 +125,19 @@ def test_maps_are_drawn_over_black_whatever_the_background() -> None:
     state = trained(Halve())
     white = rasterizers.load("torch", background=(1.0, 1.0, 1.0))
     state.field.opacities.data[:] = -4.0  # little is drawn
-    found = view_maps(state.field, state.conductor, white, state.views[0])
+    found = view_maps(state.field, state.conductor, white, state.views[0], 1)
     assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
     assert 0 < float(found.maps["corrected"].max()) < 0.4
+
+
+def test_maps_show_what_a_strategy_corrects_at_the_end_of_the_run() -> None:
+    class Late(GCO):
+        def correct(self, lr, hr, step=None):
+            return Grads(hr) if step.t < 2 else Grads(hr) * 0.0
+
+    state = trained(Late())
+    shown = [view_maps(state.field, state.conductor, toy.RASTERIZER, state.views[0], t).means for t in (1, 2)]
+    assert [means["corrected"] for means in shown] == pytest.approx([0, 1])
 
 
 def test_maps_of_transparent_photos_compare_them_before_the_background_that_is_drawn() -> None:
@@ -135,14 +145,14 @@ def test_maps_of_transparent_photos_compare_them_before_the_background_that_is_d
     view = state.views[0]
     view = replace(view, hr=replace(view.hr, transparency=torch.ones_like(view.hr.image[..., 0])))
     assert state.conductor.background(1) is not None
-    found = view_maps(state.field, state.conductor, toy.RASTERIZER, view)
-    expected = view_maps(state.field, Conductor(GCO(), objective=OBJECTIVE), toy.RASTERIZER, view)
+    found = view_maps(state.field, state.conductor, toy.RASTERIZER, view, 1)
+    expected = view_maps(state.field, Conductor(GCO(), objective=OBJECTIVE), toy.RASTERIZER, view, 1)
     assert found.means == expected.means
 
 
 def test_a_folder_of_maps_is_complete(tmp_path: Path) -> None:
     state = trained(GCO(), P2G())
-    write_maps(tmp_path, state.views[:2], state.field, state.conductor, toy.RASTERIZER)
+    write_maps(tmp_path, state.views[:2], state.field, state.conductor, toy.RASTERIZER, 1)
     content = json.loads((tmp_path / "maps.json").read_text())
     assert (content["corrector"], content["evidence"]) == ("GCO", "P2G")
     assert set(content["views"]) == {view.name for view in state.views[:2]}
@@ -150,7 +160,7 @@ def test_a_folder_of_maps_is_complete(tmp_path: Path) -> None:
         own = tmp_path / view.name
         assert {path.name for path in own.iterdir()} == {f"{name}.png" for name in (*MAPS, "lr", "prior", "maps")}
         assert set(content["views"][view.name]) == set(MAPS)
-        found = view_maps(state.field, state.conductor, toy.RASTERIZER, view).maps
+        found = view_maps(state.field, state.conductor, toy.RASTERIZER, view, 1).maps
         for name in MAPS:
             assert float((read_image(own / f"{name}.png")[..., 0] - found[name]).abs().max()) <= 0.5 / 255 + 1e-6
 
@@ -165,7 +175,7 @@ def test_views_with_stereo_show_their_depth(tmp_path: Path) -> None:
     nothing = DepthMap(torch.full(shape, torch.nan), torch.zeros(shape))
     for depth_map in (found, nothing):
         views = [replace(view, depth=depth_map), state.views[1]]
-        write_maps(tmp_path, views, state.field, state.conductor, toy.RASTERIZER)
+        write_maps(tmp_path, views, state.field, state.conductor, toy.RASTERIZER, 1)
         assert read_image(tmp_path / view.name / "depth.png").shape[1] > 500
         assert not (tmp_path / state.views[1].name / "depth.png").exists()
 
@@ -173,7 +183,7 @@ def test_views_with_stereo_show_their_depth(tmp_path: Path) -> None:
 def test_without_a_strategy_that_corrects_or_has_evidence_its_maps_are_missing(tmp_path, caplog):
     caplog.set_level("DEBUG")
     state = trained()
-    write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER)
+    write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER, 1)
     content = json.loads((tmp_path / "maps.json").read_text())
     assert (content["corrector"], content["evidence"]) == (None, None)
     assert set(content["views"][state.views[0].name]) == {"conflict"}
