@@ -70,6 +70,8 @@ def _require_known_flags(arguments: Sequence[str]) -> None:
 
 def _no_such_setting(key: str) -> str:
     """The message for an override that names no setting, with the name that was probably meant."""
+    if (CONF / key).is_dir():
+        return f"{key}: no choice of this group is there to be replaced, so it is added: +{key}=…."
     try:
         near = nearest_setting(key, sys.argv[1:])
     except SettingError:  # another override is wrong as well

@@ -101,6 +101,13 @@ def test_settings_lists_groups_choices_and_values(capsys):
 
 
 @pytest.mark.usefixtures("hydra_undone")
+@pytest.mark.parametrize("key", ["strategy", "method", "readings"])
+def test_a_group_that_is_to_be_added_is_told_so(key):
+    with pytest.raises(SettingError, match=rf"^{key}: .* it is added: \+{key}="):
+        hydra_app.main([f"{key}=clear"])
+
+
+@pytest.mark.usefixtures("hydra_undone")
 def test_a_setting_that_is_not_there_is_told_with_where_all_are():
     with pytest.raises(SettingError, match=r"fit\.nothing_like_it: there is no such setting\. clear-strategies se"):
         hydra_app.main(["fit.nothing_like_it=1"])
