@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from clear_strategies.compose import ConductorSettings
 from clear_strategies.core.checks import require_number, require_whole
-from clear_strategies.data.priors import Bicubic
+from clear_strategies.data.priors import Bicubic, Prior
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device, scene
 from clear_strategies.jobs.device import Device, RasterizerSettings
@@ -96,6 +96,10 @@ class JobSettings(ConductorSettings):
     def __post_init__(self) -> None:
         if isinstance(self.prior, functools.partial):
             self.prior(truth={})  # it waits for the photos; its own settings are refused now
+        elif not isinstance(self.prior, scene.AutoPrior | Prior):
+            raise SettingError(
+                f"prior: {type(self.prior).__name__} is no Prior: it needs the property label, and __call__."
+            )
         for decorate in self.decorators.values():
             decorate(Bicubic())  # likewise
         scene.require_factor(self.prior, self.data.views.sr_scale)

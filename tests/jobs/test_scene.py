@@ -135,3 +135,13 @@ def test_a_network_with_errors_added_is_asked_for_its_factors_too(tmp_path: Path
     require_factor(Corrupted(Ncnn()), 2)
     with pytest.raises(SettingError, match="must be 4 with realesrgan, got 2"):
         require_factor(Corrupted(Ncnn("realesrgan")), 2)
+
+
+class Unlabelled:
+    def __call__(self, name, lr, factor):
+        raise NotImplementedError
+
+
+def test_a_prior_without_a_label_is_refused_before_data_is_read():
+    with pytest.raises(SettingError, match="prior: Unlabelled is no Prior: it needs the property label"):
+        settings_of(tree(composed(f"prior._target_={__name__}.Unlabelled")))

@@ -12,7 +12,7 @@ from clear_strategies.core import images
 from clear_strategies.core.checks import require_choice, require_whole
 from clear_strategies.core.images import DownKernel
 from clear_strategies.data.priors.cache import cached
-from clear_strategies.data.priors.interface import Prior, SuperResolved
+from clear_strategies.data.priors.interface import Prior, SuperResolved, super_resolved
 
 _MOST_ROUNDS: Final = 100  # each leaves about half of the difference: after 30, float32 has nothing left to move
 
@@ -51,7 +51,7 @@ class BackProjected:
 
     def super_resolved(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> SuperResolved:
         """The SR image, and how far the prior's own image was from the LR photo."""
-        sr = self.prior(name, lr, factor).to(lr)  # a function may have made it on a GPU
+        sr = super_resolved(self.prior, name, lr, factor).image.to(lr)  # a function may have made it on a GPU
         disagreement = (images.downsample(sr, factor, self.down) - lr).abs()
         moved = images.back_projected(sr, lr, factor, self.rounds, self.down)
         return SuperResolved(images.quantize(moved), disagreement)

@@ -49,11 +49,24 @@ class SuperResolved(NamedTuple):
 
 
 def super_resolved(prior: Any, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> SuperResolved:
-    """What a prior, or any function with its arguments, makes of an LR photo."""
-    if (own := getattr(prior, "super_resolved", None)) is not None:
-        made: SuperResolved = own(name, lr, factor)
-        return made
-    return SuperResolved(prior(name, lr, factor))
+    """What a prior, or any function with its arguments, makes of an LR photo.
+
+    Raises:
+        DataError: it is no float tensor, or not `factor` times as large.
+    """
+    own = getattr(prior, "super_resolved", None)
+    made: SuperResolved = SuperResolved(prior(name, lr, factor)) if own is None else own(name, lr, factor)
+    image, (h, w) = made.image, lr.shape[:2]
+    if not isinstance(image, Tensor) or not image.is_floating_point():
+        found = image.dtype if isinstance(image, Tensor) else f"a {type(image).__name__}"
+        raise DataError(
+            name, "SR image", f"must be a float tensor [H, W, 3] in [0, 1], got {found}", "correct the prior"
+        )
+    if image.shape != (h * factor, w * factor, 3):
+        size = "x".join(map(str, (*image.shape[1::-1], *image.shape[2:]))).removesuffix("x3")
+        problem = f"is {size}, but {factor} times {w}x{h} is {w * factor}x{h * factor}"
+        raise DataError(name, "SR image", problem, "super-resolve the LR images that are trained on")
+    return made
 
 
 @runtime_checkable
