@@ -174,9 +174,7 @@ def require_each_once(overrides: Iterable[str]) -> None:
     further: str | None = None
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         if override.key_or_group == "method" and further is not None:
-            raise SettingError(
-                f"+{override.input_line.lstrip('+')}: sets strategies aside, and {further}. Leave it out."
-            )
+            raise SettingError(f"+method={override.value()}: sets strategies aside, and {further}. Leave it out.")
         if override.key_or_group != "strategy" or override.is_sweep_override():
             continue
         value = override.value()
