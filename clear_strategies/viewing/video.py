@@ -17,6 +17,8 @@ from clear_strategies.errors import SettingError
 GIF_WIDTH: Final = 480  # px, at most
 _GIF_FPS: Final = 15
 _QUALITY: Final = "20"  # x264's CRF: 18 cannot be told from the frames, 23 is its default
+# Without a word in the file, players guess BT.709 for large pictures and BT.601 for small ones; ffmpeg itself makes BT.601.
+_HD: Final = "scale=out_color_matrix=bt709:out_range=tv,setparams=color_primaries=bt709:color_trc=bt709"
 _SMALLER: Final = "fps={fps},scale='min({width},iw)':-2:flags=lanczos,split[a][b]"
 _ONE_PALETTE: Final = "[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=bayer"  # of all colours of the GIF
 
@@ -56,7 +58,7 @@ def _opened(stack: ExitStack, path: Path, width: int, height: int, fps: float) -
 
     if path.suffix == ".mp4":
         codec, pixels = "libx264", "yuv420p"
-        extra = ["-crf", _QUALITY, "-preset", "medium", "-movflags", "+faststart"]
+        extra = ["-vf", _HD, "-crf", _QUALITY, "-preset", "medium", "-movflags", "+faststart"]
     elif path.suffix == ".gif":
         codec, pixels = "gif", "pal8"
         smaller = _SMALLER.format(fps=min(fps, _GIF_FPS), width=GIF_WIDTH)

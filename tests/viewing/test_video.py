@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,13 @@ def test_an_mp4_holds_the_frames(tmp_path):
     found = read(tmp_path / "a.mp4")
     assert found.shape == (10, 32, 48, 3)
     assert np.abs(found.mean((1, 2, 3)) - np.arange(10) * 20).max() < 4
+
+
+def test_an_mp4_says_by_which_matrix_its_colours_are_made(tmp_path):
+    video.write_videos([tmp_path / "a.mp4"], [np.full((32, 48, 3), (30, 180, 30), np.uint8)] * 2, fps=10)
+    told = subprocess.run([ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "a.mp4"], capture_output=True, text=True).stderr
+    assert "bt709" in told
+    assert read(tmp_path / "a.mp4")[0].mean((0, 1)) == pytest.approx((30, 180, 30), abs=4)
 
 
 def test_a_folder_named_by_the_time_of_day_is_no_protocol(tmp_path, monkeypatch):
