@@ -33,6 +33,8 @@ _FEWEST, _MOST = 12, 40  # frames that are chosen by default
 _STILL: Final = 0.002  # of the width: a frame that moves less shows what the one before shows
 _BLURRED: Final = 0.5  # of the median sharpness around it
 _AROUND: Final = 15  # frames before and after that the median is taken of
+# Readers of JPEG files take BT.601 for granted; videos are mostly BT.709, and ffmpeg would leave them so.
+_AS_JPEG: Final = "scale=out_color_matrix=bt601:out_range=full"
 _REMEDY: Final = "name a video of the scene, or the folder of its photos"
 
 Grey = UInt8[np.ndarray, "h w"]
@@ -100,7 +102,8 @@ def _write_chosen(path: Path, count: int | None, folder: Path) -> None:
         made = Path(work) / "frames"
         made.mkdir()
         pattern = str(made / f"{path.stem.replace('%', '_')}_%03d.jpg")
-        command = [*_filtered(path, f"select={_any_of(choice.frames.tolist())}"), "-q:v", "1", pattern]
+        chosen = f"select={_any_of(choice.frames.tolist())},{_AS_JPEG}"
+        command = [*_filtered(path, chosen), "-q:v", "1", pattern]
         ended = subprocess.run(command, check=False, stdin=subprocess.DEVNULL)  # noqa: S603 - ffmpeg, by arguments
         written = len(list(made.iterdir()))
         if ended.returncode != 0 or written != len(choice.frames):
@@ -167,7 +170,7 @@ def _filtered(path: Path, filters: str) -> list[str]:
 
 
 def _key(path: Path, count: int | None) -> str:
-    digest = hashlib.sha256(repr(("all frames by path and sharpness", count, path.stem)).encode())
+    digest = hashlib.sha256(repr(("all frames by path and sharpness, BT.601", count, path.stem)).encode())
     with path.open("rb") as file:
         while block := file.read(1 << 20):
             digest.update(block)

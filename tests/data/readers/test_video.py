@@ -13,6 +13,7 @@ import skimage.data
 
 from clear_strategies.commands.train import overrides
 from clear_strategies.data.capture import Capture
+from clear_strategies.data.photo_files import read_image
 from clear_strategies.data.readers import photos, video
 from clear_strategies.data.readers.video import choose, frames_of
 from clear_strategies.errors import DataError, SettingError
@@ -65,6 +66,14 @@ def test_the_frames_are_files_that_are_made_once(clip):
     before = files[0].stat().st_mtime_ns
     assert frames_of(clip, 5) == folder
     assert files[0].stat().st_mtime_ns == before
+
+
+def test_photos_have_the_colours_of_a_phones_video(tmp_path):
+    wall = np.random.default_rng(0).integers(0, 40, (24, 80, 1)).repeat(4, 0).repeat(4, 1) + (10, 160, 10)
+    frames = [wall[:, 4 * i : 4 * i + 160].astype(np.uint8) for i in range(40)]
+    write_videos([tmp_path / "clip.mp4"], frames, fps=30)  # BT.709, as phones write
+    photo = read_image(next(frames_of(tmp_path / "clip.mp4", 5).glob("*.jpg")))
+    assert photo.mean((0, 1)).mul(255).tolist() == pytest.approx((30, 180, 30), abs=5)
 
 
 def test_a_video_may_be_named_by_the_time_of_its_making(clip, tmp_path, monkeypatch):
