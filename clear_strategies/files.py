@@ -44,6 +44,21 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)  # exists only after an exception or Ctrl-C
 
 
+def install(made: Path, folder: Path, last: str) -> None:
+    """Rename a folder that is complete to `folder`, or leave it where another process has made the same meanwhile.
+
+    Args:
+        last: the file whose presence says that `folder` is complete.
+    """
+    if not (folder / last).is_file():
+        shutil.rmtree(folder, ignore_errors=True)
+    try:
+        made.rename(folder)
+    except OSError:
+        if not (folder / last).is_file():
+            raise
+
+
 def partial_of(path: Path) -> Path:
     """Where one call writes what will be renamed to `path`; each time another."""
     return path.with_name(f".{path.name}.{_unique()}{_PARTIAL}")

@@ -49,7 +49,7 @@ def describe(error: BaseException) -> Ending | None:
     if isinstance(disk, OSError):
         where = one_line(f"{disk.filename or 'output'}: {disk.strerror or disk}")
         remedy = "Free space, or write elsewhere" if disk.errno in _FULL else "Write elsewhere"
-        elsewhere = "hydra.run.dir=FOLDER of a run, --out of a command"
+        elsewhere = "hydra.run.dir=FOLDER of a run, --out of a command, $CLEAR_CACHE of the cache"
         return Ending(NO_DISK, f"{where}. {remedy} ({elsewhere}). Earlier checkpoints are untouched.")
     return None
 

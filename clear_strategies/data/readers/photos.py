@@ -91,7 +91,7 @@ def read(
         image_size(path, turn=True)
     careful = len(paths) <= _FEW if precise == "auto" else precise
     folder = base / _key(paths, max_side, max_features, careful, seed)
-    if (folder / "cameras.bin").is_file():
+    if (folder / sfm.MODEL).is_file():
         _log.debug("%s: poses from the cache %s.", root, folder)
     else:
         settings = sfm.SfmSettings(max_side, max_features, careful, threads, seed)

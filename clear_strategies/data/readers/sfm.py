@@ -32,6 +32,8 @@ _log = logging.getLogger(__name__)
 
 FEWEST: Final = 3
 MORE: Final = "take more photos that overlap by two thirds, with the same camera and zoom, of a scene with texture"
+MODEL: Final = "cameras.bin"
+"""A file of the model: where it is, the model is complete."""
 UNPLACED: Final = "unplaced.json"
 """Beside the model: of each photo without a pose, by the name of its copy, how it was related to the others."""
 _DATABASE: Final = "database.db"
@@ -89,8 +91,8 @@ def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings:
             models[0].write_binary(str(result))
             placed = {image.name for image in models[0].images.values()}
             files.write_json(result / UNPLACED, _unplaced(Path(work) / _DATABASE, placed))
-            result.rename(folder)
-    except (RuntimeError, OSError) as error:
+            files.install(result, folder, MODEL)
+    except RuntimeError as error:
         raise DataError(root, "poses", f"structure-from-motion failed ({error})", MORE) from error
     if len(sizes) > 1:
         groups = ", ".join(map(str, sizes))

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -18,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from clear_strategies import files
 from clear_strategies.core.progress import Progress
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.errors import DataError
@@ -110,8 +110,7 @@ def _write_chosen(path: Path, count: int | None, folder: Path) -> None:
             problem = f"ffmpeg wrote {written} of the {len(choice.frames)} chosen frames (exit code {ended.returncode})"
             raise DataError(path, "video", problem, f"see what it says above, and the space left in {folder.parent}")
         (made / CHOICE).write_text(choice.summary())
-        shutil.rmtree(folder, ignore_errors=True)
-        made.rename(folder)
+        files.install(made, folder, CHOICE)
 
 
 def _any_of(numbers: Sequence[int]) -> str:

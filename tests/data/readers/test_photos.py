@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 import signal
@@ -173,6 +174,35 @@ def test_of_several_models_the_largest_is_kept_and_the_others_are_told(tmp_path,
     sfm.reconstruct(tmp_path, listed, tmp_path / "poses", SfmSettings(1600, 8192, False, threads=1, seed=0))
     assert (tmp_path / "poses/images.bin").read_text() == "3,4,5,6,7"
     assert "groups that nothing connects (5, 3, 2 photos); the largest is used" in caplog.text
+
+
+@pytest.fixture
+def three_photos(tmp_path, monkeypatch):
+    """Estimates the poses of three photos by `sfm._map`, which a test replaces."""
+    monkeypatch.setattr(sfm, "_unplaced", lambda *_: {})
+    listed = {tmp_path / f"{i}.jpg": Exif() for i in range(3)}
+    settings = SfmSettings(1600, 8192, False, threads=1, seed=0)
+    return partial(sfm.reconstruct, tmp_path, listed, tmp_path / "poses", settings)
+
+
+def test_poses_that_another_run_has_estimated_meanwhile_are_kept(tmp_path, monkeypatch, three_photos):
+    def slower(*_):
+        (tmp_path / "poses").mkdir()
+        (tmp_path / "poses/cameras.bin").write_text("of the other run")
+        return [FakeModel("0", "1", "2")]
+
+    monkeypatch.setattr(sfm, "_map", slower)
+    three_photos()
+    assert [(p.name, p.read_text()) for p in tmp_path.glob("poses*/*")] == [("cameras.bin", "of the other run")]
+
+
+def test_a_full_disk_is_not_taken_for_photos_without_overlap(monkeypatch, three_photos):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "00000.jpg")
+
+    monkeypatch.setattr(sfm, "_map", full)
+    with pytest.raises(OSError, match="No space left"):
+        three_photos()
 
 
 @pytest.mark.parametrize("precise", [True, False])

@@ -69,7 +69,7 @@ def test_the_frames_are_files_that_are_made_once(clip):
 
 
 def test_photos_have_the_colours_of_a_phones_video(tmp_path):
-    wall = np.random.default_rng(0).integers(0, 40, (24, 80, 1)).repeat(4, 0).repeat(4, 1) + (10, 160, 10)
+    wall = np.random.default_rng(0).integers(0, 40, (24, 80, 1)).repeat(4, 0).repeat(4, 1) + np.array((10, 160, 10))
     frames = [wall[:, 4 * i : 4 * i + 160].astype(np.uint8) for i in range(40)]
     write_videos([tmp_path / "clip.mp4"], frames, fps=30)  # BT.709, as phones write
     photo = read_image(next(frames_of(tmp_path / "clip.mp4", 5).glob("*.jpg")))
