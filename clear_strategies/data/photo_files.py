@@ -175,9 +175,19 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def images_in(folder: Path, pattern: str = "*") -> list[Path]:
-    """As `list_images`, also where there is none; with the pattern "**/*" those of the folders below, too."""
+    """As `list_images`, also where there is none; with the pattern "**/*" those of the folders below, too.
+
+    Raises:
+        DataError: a name is not UTF-8, so that no file of the run could hold it.
+    """
     found = sorted(p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and p.is_file())
-    return [p for p in found if not any(part.startswith(".") for part in p.relative_to(folder).parts)]
+    found = [p for p in found if not any(part.startswith(".") for part in p.relative_to(folder).parts)]
+    for name in (p.relative_to(folder).as_posix() for p in found):
+        if (shown := name.encode(errors="backslashreplace").decode()) != name:
+            raise DataError(
+                folder, "file name", f"{shown} is not UTF-8, as names of old archives are", "rename the file"
+            )
+    return found
 
 
 def by_stem(paths: Iterable[Path]) -> dict[str, list[Path]]:
