@@ -5,13 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
 from rasterizers.interface import Camera
+
+_PARTNERS: Final = 12  # of a photo, those that it is compared with
+_NEAREST: Final = 8  # of them, those that are nearest
 
 
 def common_box(photos: Sequence[Photo]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
@@ -36,6 +41,21 @@ def common_box(photos: Sequence[Photo]) -> tuple[Float[Tensor, " 3"], Float[Tens
     narrowest = min(math.atan(min(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
     half = distance * math.sin(narrowest)  # the ball touches the sides of the narrowest frustum
     return (middle - half).float(), (middle + half).float()
+
+
+def partners(cameras: Sequence[Camera]) -> list[list[int]]:
+    """For each camera the others that its photo is compared with: all of few, of many the nearest and some that lie ever
+    farther away.
+
+    With all pairs, a hundred photos would take an hour. The nearest alone may be a burst, which shows no depth, or one side of
+    the scene, which tells nothing of the other.
+    """
+    centers, others = torch.stack([camera.center.double() for camera in cameras]), len(cameras) - 1
+    far = np.geomspace(_NEAREST + 1, max(others, _PARTNERS), _PARTNERS - _NEAREST).round().astype(int) - 1
+    ranks = range(others) if others <= _PARTNERS else [*range(_NEAREST), *far]
+    ordered = torch.cdist(centers, centers).argsort(dim=1, stable=True).tolist()
+    rows = ([b for b in row if b != a] for a, row in enumerate(ordered))
+    return [sorted(row[rank] for rank in ranks) for row in rows]
 
 
 def moved(camera: Camera, step: Float[Tensor, " 3"], *, aim: float) -> Camera:

@@ -14,18 +14,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
+from clear_strategies.geometry.cameras import partners
 from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
 
 _TOLERANCE: Final = 0.02  # relative difference of depth up to which two photos show the same surface
 _UNCLIPPED: Final = (0.05, 0.92)  # darker, a ratio is that of noise; lighter, the photo may have been clipped
-_PARTNERS: Final = 12  # of a photo, those with the nearest cameras
 _FEWEST: Final = 100  # shared pixels of a pair, per channel
 
 
 def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float[Tensor, "V 3"]:
     """The gains that bring the photos to their common exposure: photo × gain.
 
-    Each pair of neighbouring photos gives the median ratio of the colours of the surfaces that both show; least squares over
+    Each photo and its `partners` give the median ratio of the colours of the surfaces that both show; least squares over
     all pairs make one gain of each photo of them. Over photos that are connected by pairs, the gains of a channel have the
     geometric mean 1. A photo that shares nothing with another has the gain 1.
 
@@ -33,7 +33,7 @@ def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float
         depths: of the photos, on their pixels.
     """
     device = photos[0].image.device if photos else "cpu"
-    pairs = [(a, b) for a, partners in enumerate(_neighbours(photos)) for b in partners]
+    pairs = [(a, b) for a, partners in enumerate(partners([p.camera for p in photos])) for b in partners]
     if not pairs:
         return torch.ones(len(photos), 3, device=device)
     photos, depths = [photo.to("cpu") for photo in photos], [depth.to("cpu") for depth in depths]
@@ -47,13 +47,6 @@ def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float
         torch.linalg.pinv(root[:, c, None] * difference) @ (root[:, c] * torch.stack(ratios)[:, c]) for c in range(3)
     ]
     return torch.exp(-torch.stack(logs, dim=1)).float().to(device)
-
-
-def _neighbours(photos: Sequence[Photo]) -> list[list[int]]:
-    """The photos from the nearest cameras, for each: with all pairs, a hundred photos would take minutes."""
-    centers = torch.stack([photo.camera.center for photo in photos])
-    nearest = torch.cdist(centers, centers).argsort(dim=1, stable=True).tolist()
-    return [sorted([b for b in row if b != a][:_PARTNERS]) for a, row in enumerate(nearest)]
 
 
 def _ratio(photo: Photo, depth: DepthMap, other: Photo, its_depth: DepthMap) -> tuple[Tensor, Tensor]:

@@ -1,14 +1,13 @@
 """Triangulation of SIFT matches between photos, under their known poses.
 
-SIFT finds features, and each pair of views matches them in both directions. A match is rejected if it violates the
-epipolar geometry of the known poses, or if its triangulated point lies behind a camera, reprojects too far away, or has
-too small an angle between its rays. Matches that share features form a track, which is one point; the pair with the
+SIFT finds features, and each pair of views that are `partners` matches them in both directions. A match is rejected if it
+violates the epipolar geometry of the known poses, or if its triangulated point lies behind a camera, reprojects too far
+away, or has too small an angle between its rays. Matches that share features form a track, which is one point; the pair with the
 widest angle gives its position.
 """
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +21,9 @@ from torch import Tensor
 from clear_strategies.core.checks import require_number, require_whole
 from clear_strategies.core.images import to_bytes
 from clear_strategies.core.points import PointCloud
+from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import Photo
+from clear_strategies.geometry.cameras import partners
 from clear_strategies.geometry.libraries import REMEDY, missing
 from clear_strategies.geometry.projection import project, projection_matrix, sample_colors
 from rasterizers.interface import Camera
@@ -98,7 +99,11 @@ def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None 
     view = torch.repeat_interleave(torch.arange(len(photos)), torch.tensor([len(f.pixels) for f in features]))
     first_of = torch.searchsorted(view, torch.arange(len(photos)))
     found = [Pairs(torch.zeros(0, 3).double(), torch.zeros(0, 2, dtype=torch.long), torch.zeros(0).double())]
-    for i, j in itertools.combinations(range(len(photos)), 2):
+    compared = enumerate(partners([photo.camera for photo in photos]))
+    pairs_of_views = sorted({(min(i, j), max(i, j)) for i, others in compared for j in others})
+    progress = Progress("features that photos have in common", "pairs", len(pairs_of_views))
+    for done, (i, j) in enumerate(pairs_of_views):
+        progress(done)
         index = match(features[i], features[j], settings.ratio)
         x, y = features[i].pixels[index[:, 0]], features[j].pixels[index[:, 1]]
         points, angles, good = triangulate_pair(photos[i].camera, photos[j].camera, x, y, settings)

@@ -1,4 +1,4 @@
-"""What cameras look at: their common box."""
+"""What cameras look at: their common box, and which of them are compared."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clear_strategies.core.view import Photo
-from clear_strategies.geometry.cameras import common_box
+from clear_strategies.geometry.cameras import common_box, partners
 from clear_strategies.geometry.projection import project
 from rasterizers.interface import Camera
-from tests.helpers.planes import photo
+from tests.helpers.planes import camera, photo
 
 
 def test_cameras_around_an_object_have_the_ball_that_they_all_see_in_common() -> None:
@@ -48,3 +48,14 @@ def test_a_common_box_is_finite_and_has_a_volume(count: int, seed: int) -> None:
         photos.append(Photo(Camera(pose, 100.0, 100.0, 20.0, 20.0, 40, 40), torch.zeros(40, 40, 3)))
     low, high = common_box(photos)
     assert bool(low.isfinite().all() and high.isfinite().all() and (high > low).all())
+
+
+def test_few_cameras_are_all_compared_and_of_many_the_nearest_and_some_far_ones() -> None:
+    assert partners([camera(0.0)]) == [[]]
+    assert partners([camera(float(i)) for i in range(13)])[4] == [i for i in range(13) if i != 4]
+    assert partners([camera(float(i)) for i in range(200)])[0] == [1, 2, 3, 4, 5, 6, 7, 8, 9, 25, 71, 199]
+
+
+def test_bursts_are_compared_with_photos_from_other_places() -> None:
+    bursts = [camera(float(i // 15)) for i in range(60)]
+    assert all(len({b // 15 for b in others}) > 1 for others in partners(bursts))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from clear_strategies.core.view import Photo
 from clear_strategies.errors import SettingError
+from clear_strategies.geometry import sift
 from clear_strategies.geometry.projection import project, sample_colors
 from clear_strategies.geometry.sift import (
     Features,
@@ -62,6 +63,16 @@ def test_of_too_many_features_the_strongest_are_taken() -> None:
     assert all(tuple(pixel) in found for pixel in some.pixels.tolist())
     with pytest.raises(SettingError, match="max_features"):
         TriangulationSettings(max_features=0)
+
+
+def test_with_many_photos_each_is_matched_with_a_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The features of all pairs of a hundred photos took an hour."""
+    matched, none = [], Features(torch.zeros(0, 2, dtype=torch.float64), torch.zeros(0, 128))
+    monkeypatch.setattr(sift, "find_features", lambda *_: none)
+    monkeypatch.setattr(sift, "match", lambda *_: matched.append(1) or torch.zeros(0, 2, dtype=torch.long))
+    row = [Photo(camera(float(i), 8, 8), torch.zeros(8, 8, 3)) for i in range(40)]
+    triangulate(row)
+    assert 40 * 6 <= len(matched) <= 40 * 12
 
 
 def test_flat_images_and_one_photo_give_an_empty_cloud() -> None:
