@@ -18,6 +18,7 @@ from clear_strategies.geometry.projection import back_project, inside_of, projec
 from rasterizers.interface import Camera
 
 _FEW: Final = 20  # points in a photo, below which a grid at guessed depths replaces them
+_ASKED: Final = 1000  # points in a photo, at most, by which the others are scored: each is asked of every photo
 _ANGLES: Final = (1.0, 5.0, 20.0, 45.0)  # degrees between rays: useless, best from, best to, too different to compare
 _LEAST_SCORE: Final = 0.05
 _QUANTILES: Final = (0.02, 0.98)
@@ -52,7 +53,7 @@ def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"]) -> list[C
     for i, camera in enumerate(cameras):
         inside, _, _, depth = seen_pixels(camera, points)
         if len(depth) >= _FEW:
-            seen = points[inside].double()
+            seen = points[inside].double()[:: math.ceil(len(depth) / _ASKED)]
             far, near = torch.quantile(1 / depth, torch.tensor(_QUANTILES, dtype=depth.dtype)).tolist()
             far, near = _FARTHER * far, _NEARER * near
         else:

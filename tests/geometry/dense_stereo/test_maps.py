@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from clear_strategies.core.view import Photo
+from clear_strategies.geometry.dense_stereo import sources
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from tests.helpers.planes import same_maps
@@ -29,6 +30,15 @@ def test_depth_of_a_known_surface_is_found_from_the_cameras_alone(surface: Surfa
         assert found.coverage > 0.5
         assert error.median() < 0.012
         assert (error < 0.03).float().mean() > 0.97
+
+
+def test_photos_are_scored_by_some_of_many_points(monkeypatch) -> None:
+    asked = []
+    monkeypatch.setattr(sources, "_score", lambda _, __, points: asked.append(len(points)) or 0.0)
+    points = torch.rand(50_000, 3) * 0.1 + torch.tensor((0.0, 0.0, 4.0))
+    sources.comparisons(photos_of(slanted), points)
+    assert len(asked) == 6
+    assert 500 <= max(asked) <= 1000
 
 
 def test_unknown_is_nan_with_confidence_0_and_confidence_lies_in_0_to_1() -> None:
