@@ -38,7 +38,7 @@ def cameras_of(splat: SavedSplat, options: argparse.Namespace) -> tuple[list[str
     if path not in STILLS:
         found = [cameras.at_most(c, None if options.width is not None else LONGEST) for c in found]
         if len({(c.width, c.height) for c in found}) > 1:
-            found = [resized(c, found[0].width, found[0].height) for c in found]
+            found = [cameras.framed(c, found[0].width, found[0].height) for c in found]
             _log.warning("the cameras have different sizes; all frames have the first one's.")
     return names, found, float(options.fps or fps or FPS)
 

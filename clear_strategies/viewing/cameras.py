@@ -8,7 +8,7 @@ per LR pixel), "split" ("train", "test"), "background" (RGB) and "photo", a smal
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -117,6 +117,16 @@ def at_most(camera: Camera, longest: int | None) -> Camera:
     edge = max(camera.width, camera.height)
     times = 1.0 if longest is None else min(1.0, longest / edge)
     return resized(camera, *(max(2, 2 * round(times * size / 2)) for size in (camera.width, camera.height)))
+
+
+def framed(camera: Camera, width: int, height: int) -> Camera:
+    """The camera with all of its picture, unstretched, in the middle of a frame of this size, which may show more beside it."""
+    times = min(width / camera.width, height / camera.height)
+    cx, cy = (
+        frame / 2 + times * (principal - size / 2)
+        for frame, principal, size in ((width, camera.cx, camera.width), (height, camera.cy, camera.height))
+    )
+    return replace(camera, fx=times * camera.fx, fy=times * camera.fy, cx=cx, cy=cy, width=width, height=height)
 
 
 def _entry(number: int, view: View) -> dict[str, Any]:

@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from clear_strategies.commands import render
+from clear_strategies.commands.path_cameras import cameras_of
 from clear_strategies.data.photo_files import image_size, read_image
 from clear_strategies.errors import SettingError
+from clear_strategies.jobs.saved import open_splat
 from tests.helpers import saved_run
 
 
@@ -62,6 +64,18 @@ def test_a_file_of_cameras_is_a_path(run, tmp_path):
     (tmp_path / "flight.json").write_text(json.dumps(content))
     render.main([str(folder), "--path", str(tmp_path / "flight.json"), "--no-gif", "--out", str(tmp_path)])
     assert files(tmp_path) == ["flight.json", "flight.mp4"]
+
+
+def test_frames_of_portrait_and_landscape_cameras_are_not_stretched(run, tmp_path):
+    folder, _ = run
+    (entry, *_) = json.loads((folder / "cameras.json").read_text())
+    sizes = {"width": 60, "height": 40, "cx": 33, "cy": 20}, {"width": 40, "height": 60, "cx": 20, "cy": 33}
+    (tmp_path / "path.json").write_text(json.dumps([{**entry, **size, "fx": 50, "fy": 50} for size in sizes]))
+    options = render._parser().parse_args([str(folder), "--path", str(tmp_path / "path.json")])
+    _, (landscape, portrait), _ = cameras_of(open_splat(folder), options)
+    assert (landscape.width, landscape.height) == (portrait.width, portrait.height) == (60, 40)
+    assert portrait.fx == portrait.fy == pytest.approx(50 * 40 / 60)  # its whole height, and more at both sides
+    assert (portrait.cx, portrait.cy) == pytest.approx((30, 22))
 
 
 def test_parts_of_a_ply_that_cannot_be_left_out_are_named(run, tmp_path, caplog):
