@@ -175,19 +175,16 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def images_in(folder: Path, pattern: str = "*") -> list[Path]:
-    """As `list_images`, also where there is none; with the pattern "**/*" those of the folders below, too.
-
-    Raises:
-        DataError: a name is not UTF-8, so that no file of the run could hold it.
-    """
+    """As `list_images`, also where there is none; with the pattern "**/*" those of the folders below, too."""
     found = sorted(p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and p.is_file())
-    found = [p for p in found if not any(part.startswith(".") for part in p.relative_to(folder).parts)]
-    for name in (p.relative_to(folder).as_posix() for p in found):
+    return [p for p in found if not any(part.startswith(".") for part in p.relative_to(folder).parts)]
+
+
+def require_text(names: Iterable[str]) -> None:
+    """Raise a DataError for a name that is no UTF-8, which would spoil pictures, pages and JSON after training."""
+    for name in names:
         if (shown := name.encode(errors="backslashreplace").decode()) != name:
-            raise DataError(
-                folder, "file name", f"{shown} is not UTF-8, as names of old archives are", "rename the file"
-            )
-    return found
+            raise DataError(shown, "name", "must be UTF-8, has another byte", "rename this folder or photo")
 
 
 def by_stem(paths: Iterable[Path]) -> dict[str, list[Path]]:

@@ -10,6 +10,7 @@ from typing import Any, Final, cast
 
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.hr_limit import within_limit
+from clear_strategies.data.photo_files import require_text
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import at_hr, prepare
 from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
@@ -17,7 +18,7 @@ from clear_strategies.data.priors.ncnn import factors, missing_packages
 from clear_strategies.data.scene import Scene
 from clear_strategies.data.usable import Fault, require_faults
 from clear_strategies.data.view_settings import ViewSettings, split
-from clear_strategies.errors import DataError, SettingError
+from clear_strategies.errors import SettingError
 from clear_strategies.jobs.budget import Budget
 from clear_strategies.settings import LISTED
 
@@ -119,16 +120,9 @@ def load(
 def read(data: DataSettings, prior: PriorSettings, known: Capture | None = None) -> tuple[Capture, ViewSettings]:
     """The capture as the data set has it, and the settings of its views, both within the limit of the HR images."""
     capture = data.reader() if known is None else known
-    _require_text(capture)
+    require_text((capture.name, *(frame.name for frame in capture.frames), *capture.unplaced))
     auto = isinstance(prior, AutoPrior) and data.save_lr is None
     return within_limit(capture, data.views, reaches=_reach(prior, auto), super_resolve=not auto)
-
-
-def _require_text(capture: Capture) -> None:
-    """Raise a DataError for a name that is no UTF-8, which would spoil pictures, pages and JSON after training."""
-    for name in (capture.name, *(frame.name for frame in capture.frames), *capture.unplaced):
-        if (shown := name.encode(errors="backslashreplace").decode()) != name:
-            raise DataError(shown, "name", "must be UTF-8, has another byte", "rename this folder or photo")
 
 
 def timed(capture: Capture, data: DataSettings, prior: PriorSettings, budget: Budget) -> DataSettings:

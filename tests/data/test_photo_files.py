@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from pathlib import Path
@@ -120,12 +119,6 @@ def test_images_are_listed_by_name_and_by_ending(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     (tmp_path / "folder.png").mkdir()
     assert [p.name for p in photo_files.list_images(tmp_path)] == ["a.png", "b.JPG", "c.tif"]
-
-
-def test_a_name_that_is_no_text_is_refused_in_words_that_can_be_written(tmp_path: Path) -> None:
-    (tmp_path / os.fsdecode(b"caf\xe9.jpg")).write_bytes(b"")
-    with pytest.raises(DataError, match=r"caf\\udce9.jpg is not UTF-8.* rename the file"):
-        photo_files.list_images(tmp_path)
 
 
 def test_the_first_of_the_usual_folders_is_taken_and_named(tmp_path: Path) -> None:

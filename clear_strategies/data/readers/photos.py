@@ -13,7 +13,7 @@ from typing import Final, Literal
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.exif import Exif, read_exif
-from clear_strategies.data.photo_files import image_size, inside, list_images
+from clear_strategies.data.photo_files import image_size, inside, list_images, require_text
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
 from clear_strategies.data.readers.colmap_model import read_model
@@ -84,6 +84,7 @@ def read(
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
     listed = _once_each([inside(root, p.name, file=root, allow_outside=allow_outside) for p in list_images(root)])
     paths = usable(root, listed, lambda path: path, missing=missing, broken=broken)
+    require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", sfm.MORE)
     photos = {path: read_exif(path) for path in paths}  # refuses bad ones before the long work

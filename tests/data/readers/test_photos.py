@@ -78,6 +78,13 @@ def test_photos_that_show_nothing_are_refused_with_what_to_do(tmp_path: Path) ->
     assert list((tmp_path / "cache").iterdir()) == []
 
 
+def test_a_name_that_is_no_text_is_refused_before_the_long_work(tmp_path: Path) -> None:
+    folder = flat_photos(tmp_path / "photos", 3)
+    (folder / "0.png").rename(folder / os.fsdecode(b"caf\xe9.png"))
+    with pytest.raises(DataError, match=r"caf\\udce9.png: name: must be UTF-8.*rename"):
+        photos.read(folder, tmp_path / "cache", threads=1)
+
+
 def test_the_cache_may_not_lie_among_the_photos(tmp_path: Path) -> None:
     folder = flat_photos(tmp_path / "photos", 3)
     with pytest.raises(DataError, match="lies among the photos"):
