@@ -21,6 +21,7 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 _PARTIAL: Final = ".partial"
+_TOLD: Final = 40  # characters of a file's name in that of its part, which may then be as long as names can be
 _LARGEST: Final = 64 << 30
 
 
@@ -36,7 +37,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """The path that a library writes to in place of `path`, with the same suffix; renamed to it afterwards, or removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.{_unique()}{_PARTIAL}{path.suffix}")
+    partial = path.with_name(f".{path.stem[:_TOLD]}.{_unique()}{_PARTIAL}{path.suffix}")
     try:
         yield partial
         partial.replace(path)
@@ -61,7 +62,7 @@ def install(made: Path, folder: Path, last: str) -> None:
 
 def partial_of(path: Path) -> Path:
     """Where one call writes what will be renamed to `path`; each time another."""
-    return path.with_name(f".{path.name}.{_unique()}{_PARTIAL}")
+    return path.with_name(f".{path.name[:_TOLD]}.{_unique()}{_PARTIAL}")
 
 
 def _unique() -> str:

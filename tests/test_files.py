@@ -34,6 +34,12 @@ def test_processes_of_one_number_in_two_containers_do_not_write_into_one_file(tm
     assert list(tmp_path.iterdir()) == [tmp_path / "sr.png"]
 
 
+def test_a_file_may_have_the_longest_name_that_a_disk_takes(tmp_path: Path) -> None:
+    target = tmp_path / f"{'ω' * 125}.png"
+    files.write_text(target, "1")
+    assert list(tmp_path.iterdir()) == [target]
+
+
 def test_missing_folders_are_made_and_an_old_file_is_replaced(tmp_path: Path) -> None:
     target = tmp_path / "a" / "b" / "ω.txt"
     files.write_text(target, "1")
