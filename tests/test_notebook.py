@@ -13,16 +13,15 @@ import torch
 from PIL import Image
 
 import clear_strategies as cs
-from clear_strategies.bench.device import TINY
 from clear_strategies.errors import DataError, SettingError
-from tests.helpers.command_line import ALONE
+from tests.helpers.command_line import TINY
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> cs.Run:
     folder = tmp_path_factory.mktemp("notebook") / "run"
     threads = torch.get_num_threads()
-    made = cs.train(None, *TINY, *ALONE, "fit.checkpoint_every=0", "prior=bicubic", folder=folder)
+    made = cs.train(None, *TINY, "fit.checkpoint_every=0", "prior=bicubic", folder=folder)
     assert torch.get_num_threads() == threads
     return made
 

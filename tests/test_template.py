@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 
 import clear_strategies as cs
-from clear_strategies.bench.device import TINY
 from clear_strategies.compose import OPTIONS, conductor
 from clear_strategies.errors import SettingError
-from tests.helpers.command_line import ALONE
+from tests.helpers.command_line import TINY
 
 TEMPLATE = Path(__file__).resolve().parents[1] / "docs" / "template"
 
@@ -45,7 +44,7 @@ def test_its_own_tests_pass(installed: None) -> None:
 
 def test_it_trains_by_its_name_and_composes_with_others(installed: None, tmp_path: Path) -> None:
     of_veto = ("+strategy=[veto,svs]", "strategies.veto.start=5", "prior=bicubic")
-    run = cs.train(None, *TINY, *ALONE, *of_veto, folder=tmp_path / "run")
+    run = cs.train(None, *TINY, *of_veto, folder=tmp_path / "run")
     assert run.metrics["strategies"] == ["veto", "svs"]
     assert run.metrics["config"]["strategies.veto.start"] == 5
     (veto, _) = conductor("veto,svs", iterations=1_000).strategies

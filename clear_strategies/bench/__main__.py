@@ -1,7 +1,6 @@
 """The benchmark's command line.
 
-Exit codes: 0; 1 if a step of `device` failed; 2 for arguments or input that cannot be used; 130
-after Ctrl-C.
+Exit codes: 0; 2 for arguments or input that cannot be used; 130 after Ctrl-C.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     }
     results = Results(question, _log.info, shown)
     try:
-        if out is not None and question != "device":  # a folder that cannot be made is known before the measuring
+        if out is not None:  # a folder that cannot be made is known before the measuring
             out.mkdir(parents=True, exist_ok=True)
         module: Any = import_module(f"clear_strategies.bench.{question}")
         if hasattr(module, "Request"):
@@ -58,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         _log.error("stopped; no tables were written.")
         return 130
-    return int(results.failed)
+    return 0
 
 
 def parser() -> argparse.ArgumentParser:
@@ -117,22 +116,10 @@ def parser() -> argparse.ArgumentParser:
             "overrides", nargs="*", metavar="OVERRIDE",
             help=f"the data set and its {chosen}, as for a run (default: the demo)",
         )  # fmt: skip
-    _add_checks(questions, common, garden, out)
-    return result
-
-
-def _add_checks(questions: Any, common: Any, garden: Any, out: Any) -> None:
-    """The questions about a finished run, and about a machine with a GPU."""
     ask = questions.add_parser("errors", parents=[common, out], help="where a run's error on its test views lies")
     ask.add_argument("run", type=Path, metavar="RUN", help="the folder of a finished run")
     ask.add_argument("--reference", type=Path, metavar="RUN", help="another run of the same scene, beside it")
-
-    ask = questions.add_parser("device", parents=[common, garden], help="all checks that need a GPU, into a folder")
-    ask.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder for logs, tables and runs")
-    ask.add_argument("--device", default="cuda", choices=["cpu", "cuda"], help="default: cuda")
-    ask.add_argument("--quick", action="store_true", help="tiny scenes, to see that the steps run")
-    ask.add_argument("--data-root", type=Path, metavar="DIR", help="holds LLFF's fern with images_4 and images_2")
-    ask.add_argument("--scene", nargs="+", type=Path, default=[], metavar="PLY", help="more Gaussians to measure")
+    return result
 
 
 def _add_trainings(questions: Any, common: argparse.ArgumentParser) -> None:

@@ -29,7 +29,6 @@ class Results:
         log: prints a line while measuring.
         options: those of the command that a reader must know.
         notes: what was not measured and why, and what else a reader of the tables must know.
-        failed: a step that should work did not.
     """
 
     question: str
@@ -38,7 +37,6 @@ class Results:
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
     figures: dict[str, Figure] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    failed: bool = False
 
     def note(self, line: str) -> None:
         """Log a line and keep it."""

@@ -81,7 +81,6 @@ NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
         (["stereo", "data=nowhere"], "data=nowhere"),
         (["errors", "nowhere"], "has neither a checkpoint nor a point_cloud.ply"),
         pytest.param(["rasterizers", "--device", "cuda"], "no such device", marks=NO_GPU),
-        pytest.param(["device"], "no such device", marks=NO_GPU),
     ],
 )
 def test_unusable_input_is_one_line_and_exit_code_2(arguments, message, caplog, tmp_path):

@@ -12,7 +12,6 @@ import pytest
 
 from clear_strategies.bench import seconds
 from clear_strategies.bench.__main__ import main
-from clear_strategies.bench.device import TINY
 from clear_strategies.bench.results import Results
 from clear_strategies.errors import DataError
 
@@ -110,7 +109,8 @@ def test_settings_of_the_benchmark_are_refused(override):
 def test_the_command_trains_a_tiny_demo_and_writes_its_tables(tmp_path, caplog, monkeypatch):
     monkeypatch.setenv("CLEAR_CACHE", str(tmp_path / "cache"))
     out = tmp_path / "out"
-    asked = ["seconds", *TINY, "--variant", "--variant", "fit.iterations=6", "--seeds", "0", "--probes", "4"]
+    tiny = ["data.reader.width=64", "data.reader.height=48", "data.cloud.init=random", "fit.iterations=12"]
+    asked = ["seconds", *tiny, "--variant", "--variant", "fit.iterations=6", "--seeds", "0", "--probes", "4"]
     assert main([*asked, "--out", str(out), "--threads", "1"]) == 0, caplog.text
     turns = pd.read_csv(out / "seconds_turns.csv").set_index("variant")
     assert dict(turns["iterations"]) == {"defaults": 12, "fit.iterations=6": 6}

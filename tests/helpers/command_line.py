@@ -9,12 +9,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from clear_strategies.bench import device
 from tests.helpers.forked import ROOT, Forked
 
 ALONE = ["fit.baseline=false", "fit.page=0", "fit.video=0", "fit.map_views=0"]
 """A run that writes little beside its field."""
-TINY = [*device.TINY, "skips=none", *ALONE]
+TINY = [
+    "data.reader.width=64", "data.reader.height=48", "data.reader.views=5", "data.reader.train=2", "data.views.train=2",
+    "data.cloud.init=random", "data.cloud.random_points=60", "fit.iterations=12", "fit.max_degree=1", "skips=none", *ALONE,
+]  # fmt: skip
+"""A tiny run of the demo."""
 
 
 def environment(cwd: Path) -> dict[str, str]:
