@@ -107,15 +107,9 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--preset", default="fast", choices=list(PRESETS), help="default: fast")
 
     _add_trainings(questions, common)
-    for name, what, chosen in (
-        ("stereo", "error, coverage and seconds of the depth of the training photos", "settings"),
-        ("evidence", "how well reliability finds the known errors of a corrupted prior", "prior"),
-    ):
-        ask = questions.add_parser(name, parents=[common, out], help=what)
-        ask.add_argument(
-            "overrides", nargs="*", metavar="OVERRIDE",
-            help=f"the data set and its {chosen}, as for a run (default: the demo)",
-        )  # fmt: skip
+    what = "error, coverage and seconds of the depth of the training photos"
+    ask = questions.add_parser("stereo", parents=[common, out], help=what)
+    ask.add_argument("overrides", nargs="*", metavar="OVERRIDE", help="the data set, as for a run (default: the demo)")
     ask = questions.add_parser("errors", parents=[common, out], help="where a run's error on its test views lies")
     ask.add_argument("run", type=Path, metavar="RUN", help="the folder of a finished run")
     ask.add_argument("--reference", type=Path, metavar="RUN", help="another run of the same scene, beside it")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
-from clear_strategies.bench import evidence, plots, rasterizers
+from clear_strategies.bench import plots, rasterizers
 from clear_strategies.bench.__main__ import main
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -45,34 +44,12 @@ def test_stereo_measures_the_demos_depth(tmp_path, capsys):
     assert "depth in" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_evidence_measures_reliability_against_the_demos_known_errors(tmp_path, capsys):
-    smaller = ["prior=demo", "data.reader.width=256", "data.reader.height=192", "prior.share=0.5"]
-    assert main(["evidence", *smaller, "--out", str(tmp_path)]) == 0
-    table = pd.read_csv(tmp_path / "evidence.csv").set_index("errors")
-    assert list(table.index) == ["seeded", "hidden"]
-    assert table.loc["seeded", "auc"] > 0.95
-    assert table.loc["seeded", "R wrong"] < table.loc["hidden", "R wrong"]
-    assert table.loc["hidden", "R wrong"] > 0.9
-    assert table["R right"].between(0, 1).all()
-    assert (tmp_path / "evidence_hidden.png").stat().st_size > 5_000
-    assert "training views" in capsys.readouterr().out
-
-
-def test_auc_is_the_share_of_ordered_pairs():
-    assert evidence.auc(torch.tensor([0.9, 0.8]), torch.tensor([0.1, 0.2, 0.3])) == 1
-    assert evidence.auc(torch.tensor([0.5, 0.2]), torch.tensor([0.5, 0.3])) == pytest.approx((0.5 + 1 + 0 + 0) / 4)
-    assert math.isnan(evidence.auc(torch.zeros(0), torch.ones(1)))
-
-
 NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["evidence", "prior=bicubic"], "prior: must have seeded errors"),
-        (["evidence", "prior=demo", "prior.patch=32"], "prior.patch: must be P2G's patch of 64 HR px"),
         (["rasterizers", "--scene", "nowhere"], "nowhere: is no scene"),
         (["rasterizers", "--scene", "tiny", "--backend", "cuda"], "cuda: is no backend"),
         (["kernels", "--size", "9x9"], "9x9: must be WIDTHxHEIGHT"),

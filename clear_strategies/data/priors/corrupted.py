@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import images
@@ -80,13 +80,6 @@ class SeededErrors:
         if self.hidden:
             result = images.back_projected(result, images.downsample(image, factor), factor, _ROUNDS, where=touched)
         return images.quantize(result)
-
-    def wrong(self, height: int, width: int, factor: int, name: str) -> Bool[Tensor, "ph pw"]:
-        """Which patches of the image called `name` have errors; height and width are its HR pixels."""
-        mask = torch.zeros(-(-height // self.patch), -(-width // self.patch), dtype=torch.bool)
-        for top, left, _, _ in self._drawn(name, height, width, factor)[1]:
-            mask[top // self.patch, left // self.patch] = True
-        return mask
 
     def _drawn(
         self, name: str, height: int, width: int, factor: int
