@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from clear_strategies import console
-from clear_strategies.bench import kernels, rasterizers
+from clear_strategies.bench import rasterizers
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import NAMES
 from clear_strategies.commands.options import positive
@@ -91,16 +91,7 @@ def parser() -> argparse.ArgumentParser:
     ask.add_argument("--preset", nargs="+", default=list(PRESETS), choices=list(PRESETS), help="default: all")
 
     ask = questions.add_parser(
-        "kernels", parents=[common, turns, out], help="time and error of the image losses and the per-Gaussian step"
-    )
-    ask.add_argument("--size", nargs="+", default=list(kernels.SIZES), metavar="WxH", help="sizes of the images")
-    ask.add_argument(
-        "--gaussians", nargs="*", type=positive(int), default=[100_000, 500_000], metavar="N",
-        help="time the per-Gaussian step of N Gaussians (default: 100000 500000)",
-    )  # fmt: skip
-
-    ask = questions.add_parser(
-        "iteration", parents=[common, turns, garden, out], help="one training iteration, stage by stage"
+        "iteration", parents=[common, turns, garden, out], help="time and error of a training iteration, stage by stage"
     )
     ask.add_argument("--scene", default="s100k", metavar="SCENE", help=f"{scenes}; its image is the HR photo")
     ask.add_argument("--backend", metavar="NAME", help="default: the fastest that runs here")

@@ -1,13 +1,8 @@
-"""Errors of images and gradients against float64.
-
-Each contender is compared twice: with float64 at its own cut-offs, which shows the rounding, and
-with float64 without cut-offs, which shows the cut-offs too.
-"""
+"""Errors of images and gradients against float64."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -17,24 +12,29 @@ from torch import Tensor
 
 import rasterizers
 from clear_strategies.bench.scenes import SETTINGS, Workload
+from rasterizers.interface import Rasterizer
 
 ATTRIBUTES: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
 NO_CUT_OFFS: Final = {"alpha_min": 1e-9, "transmittance_min": 0.0}
+REFERENCE: Final = "torch"
+REFERENCE_LIMIT: Final = 10_000  # Gaussians; beyond, the pure-torch reference takes minutes per turn
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
-    """An image and the gradients of one cotangent by attribute, in main memory."""
-
-    image: Float[Tensor, "H W 3"]
-    gradients: Mapping[str, Tensor]
+Drawn = Mapping[str, Tensor]
+"""An image, and the gradients of one cotangent by attribute, in main memory."""
 
 
 def draw(render: Callable[[], Any], cotangent: Float[Tensor, "H W 3"]) -> Drawn:
     """`render` returns an object with `image`, and `vjp` of K cotangents."""
     rendering = render()
     g = rendering.vjp(cotangent[None])
-    return Drawn(rendering.image.detach().cpu(), {name: getattr(g, name)[0].cpu() for name in ATTRIBUTES})
+    return {"image": rendering.image.detach().cpu(), **{name: getattr(g, name)[0].cpu() for name in ATTRIBUTES}}
+
+
+def relative(found: Tensor, truth: Tensor) -> float:
+    """The relative L2 error; the absolute one where the truth is 0."""
+    truth = truth.double()
+    size, error = float(truth.norm()), float((found.to(truth) - truth).norm())
+    return error / size if size > 0 else error
 
 
 def errors(found: Drawn, truth: Drawn) -> dict[str, float]:
@@ -42,38 +42,47 @@ def errors(found: Drawn, truth: Drawn) -> dict[str, float]:
 
     `<attribute>_relative` is over all Gaussians, `<attribute>_median` the median of their own.
     """
-    difference = (found.image.double() - truth.image.double()).abs().numpy()
+    difference = (found["image"].double() - truth["image"].double()).abs().numpy()
     columns = {
         "image_max": float(difference.max()),
         "image_p99.99": float(np.quantile(difference, 0.9999)),
         "image_mean": float(difference.mean()),
     }
     for name in ATTRIBUTES:
-        expected = truth.gradients[name].double().reshape(len(truth.gradients[name]), -1)
-        error = (found.gradients[name].double().reshape(expected.shape) - expected).norm(dim=1)
+        x, expected = (drawn[name].double().reshape(len(truth[name]), -1) for drawn in (found, truth))
         size = expected.norm(dim=1)
-        has_gradient = size > 0
-        any_gradient = bool(has_gradient.any())
-        columns[f"{name}_relative"] = float(error.norm() / size.norm()) if any_gradient else float(error.norm())
-        columns[f"{name}_median"] = float((error / size)[has_gradient].median()) if any_gradient else 0.0
+        own = ((x - expected).norm(dim=1) / size)[size > 0]
+        columns[f"{name}_relative"] = relative(x, expected)
+        columns[f"{name}_median"] = float(own.median()) if len(own) else 0.0
     return columns
 
 
-def truth_backend() -> str | None:
+def affordable(backend: str, workload: Workload, what: str, note: Callable[[str], None]) -> bool:
+    """Whether a backend draws this scene in seconds; a note says that it does not."""
+    affordable = backend != REFERENCE or len(workload.splats) <= REFERENCE_LIMIT
+    if not affordable:
+        note(f"{what}, {workload.name}: the torch reference takes at most {REFERENCE_LIMIT:,} Gaussians here.")
+    return affordable
+
+
+def truth_backend() -> str:
     """The fastest backend here that computes in float64, on any device."""
-    for name, why_not in rasterizers.available().items():
-        if why_not is None and torch.float64 in rasterizers.load(name).traits.dtypes:
-            return name
-    return None
+    runs = (name for name, why_not in rasterizers.available().items() if why_not is None)
+    return next(name for name in runs if torch.float64 in rasterizers.load(name).traits.dtypes)
 
 
-def truth(backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]) -> Drawn:
-    """Draw in float64.
+def in_float64(backend: str, workload: Workload, rules: Mapping[str, Any]) -> tuple[Rasterizer, Workload]:
+    """A rasterizer, and the workload in float64 on a device that it draws on.
 
     Args:
         rules: the cut-offs, and settings that differ from `SETTINGS`.
     """
     rasterizer = rasterizers.load(backend, **{**SETTINGS, **rules})
     device = workload.splats.means.device.type
-    wide = workload.to(device if device in rasterizer.traits.devices else "cpu", torch.float64)
+    return rasterizer, workload.to(device if device in rasterizer.traits.devices else "cpu", torch.float64)
+
+
+def truth(backend: str, workload: Workload, cotangent: Float[Tensor, "H W 3"], rules: Mapping[str, Any]) -> Drawn:
+    """Draw in float64."""
+    rasterizer, wide = in_float64(backend, workload, rules)
     return draw(lambda: rasterizer(wide.splats, wide.camera), cotangent.to(wide.splats.means))

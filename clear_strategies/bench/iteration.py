@@ -1,16 +1,24 @@
-"""One training iteration of CLEAR, stage by stage, and the same without L_HF and without HR."""
+"""Time and error of one training iteration of CLEAR, stage by stage, and the time without L_HF and without HR.
+
+The truth is the same iteration in float64 by the readable path, at the same cut-offs, whose stages get what the measured ones
+were given. Compared is what a stage hands on: images, their cotangents, the gradients of the Gaussians, and the merged gradient,
+as Adam's first moment holds it after a step.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Final
+from types import SimpleNamespace
+from typing import Any, Final
 
 import torch
 from torch import Tensor
 
 import rasterizers
 from clear_strategies.bench import scenes
+from clear_strategies.bench.accuracy import affordable, in_float64, relative, truth_backend
 from clear_strategies.bench.rasterizers import require_device, usable
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import SETTINGS, Workload
@@ -33,14 +41,14 @@ from clear_strategies.training.mip import MipFilter
 from clear_strategies.training.optim import Adam, LearningRates
 from clear_strategies.training.settings import FitSettings
 from clear_strategies.training.state import TrainState
-from rasterizers.interface import Rasterizer, Splats
+from rasterizers.interface import PRESETS, Camera, Rasterizer, Rendering, SplatGradients, Splats
 
 FROZEN: Final = LearningRates(LogLinear(1e-30, 1e-30), *(0.0,) * 6, detail_decay=0.002)
 """Adam does all its work, and the scene stays the same from turn to turn."""
 
 TOTAL, REST = "total", "everything else"
 FULL, WITHOUT_HF, LR_ONLY = "lr_and_hr", "without_l_hf", "lr_only"
-OBJECTIVES: Final[Mapping[str, Objective]] = {
+OBJECTIVES: Final = {
     FULL: Objective(),
     WITHOUT_HF: Objective(lambda_hf=0.0),
     LR_ONLY: Objective(lambda_hr=WarmupDecay(peak=0.0, final=0.0)),
@@ -49,14 +57,25 @@ _PER_TURN: Final = {"cpu": 1, "cuda": 16}  # on CUDA the host launches an iterat
 _NOISE: Final = 0.02  # standard deviation in the photos
 
 
+Stages = dict[str, dict[str, Tensor]]
+"""What the stages of an iteration hand on, by the stage and by name."""
+
+
 class Training:
     """CLEAR after densification: HR at full weight, dropout, correction and evidence are all on."""
 
     def __init__(
-        self, workload: Workload, view: View, rasterizer: Rasterizer, objective: Objective, fused: FusedMode = "auto"
+        self,
+        workload: Workload,
+        view: View,
+        rasterizer: Rasterizer,
+        objective: Objective,
+        *,
+        dropout: bool = True,
+        fused: FusedMode = "auto",
     ) -> None:
         field, device = field_of(workload.splats), workload.splats.means.device
-        conductor = Conductor(GCO(), P2G(), SVS(), objective=objective)
+        conductor = Conductor(GCO(), P2G(), *([SVS()] if dropout else []), objective=objective)
         # Statistics are gathered, although no round of densification follows.
         density = Density(DensitySettings(stop=10_000), len(field), extent=1.0, seed=0, device=device)
         conductor.on_fit_start(1, 0, device)
@@ -112,12 +131,78 @@ def measure(
         turns = interleaved(trainings, repeats, device=device, label=workload.name)
     table = medians(turns).T.add_suffix("_ms")
     order = [stage for stage in table.index if stage not in (REST, TOTAL)] + [REST, TOTAL]
-    results.tables |= {"iteration": table.loc[order].rename_axis("stage").reset_index(), "iteration_turns": turns}
+    table = table.loc[order].rename_axis("stage").reset_index()
+    truth = truth_backend()
+    if affordable(truth, workload, "errors", results.note):
+        table["error"] = table["stage"].map(
+            errors(workload, view, rasterizer, in_float64(truth, workload, PRESETS[preset]))
+        )
+    results.tables |= {"iteration": table, "iteration_turns": turns}
     lr, hr = view.lr.camera, view.hr.camera
     results.note(
         f"{workload.name}: {len(workload.splats):,} Gaussians, LR {lr.width}x{lr.height} and HR {hr.width}x{hr.height}, "
         f"{backend} {preset}. Medians by stage, so they need not add up to the total."
     )
+
+
+def errors(
+    workload: Workload, view: View, rasterizer: Rasterizer, in_float64: tuple[Rasterizer, Workload]
+) -> dict[str, float]:
+    """The largest relative L2 error of a stage's images, or of the attributes of its gradients."""
+    truth, wide = in_float64
+    lr, hr = (replace(photo, image=photo.image.to(wide.splats.means)) for photo in (view.lr, view.hr))
+    found = _handed_on(workload, view, _Watched(rasterizer), "auto")
+    expected = _handed_on(wide, replace(view, lr=lr, hr=hr), _Watched(truth, found), "off")
+    return {
+        # The basis is no gradient, and has any value where a Gaussian is not seen.
+        stage: max(relative(x, expected[stage][name]) for name, x in tensors.items() if name != "basis")
+        for stage, tensors in found.items()
+    }
+
+
+def _handed_on(workload: Workload, view: View, watched: _Watched, fused: FusedMode) -> Stages:
+    """What the stages of an iteration hand on. Nothing is dropped: a device draws masks of its own."""
+    state = Training(workload, view, watched, Objective(), dropout=False, fused=fused).state
+    iterate(state, watched)
+    return watched.seen | dict.fromkeys(("per-Gaussian pass", "optimizer"), state.optimizer.first)
+
+
+class _Watched:
+    """A rasterizer; `seen` keeps what it hands on, and what the losses do.
+
+    Args:
+        given: what the stages of another iteration handed on; each stage of this one gets it in place of its own.
+    """
+
+    def __init__(self, rasterizer: Rasterizer, given: Stages | None = None) -> None:
+        self._rasterizer, self.traits, self._given = rasterizer, rasterizer.traits, given
+        self.seen: Stages = {"render": {}}
+
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
+        return self._rasterizer(splats, camera, depth=depth)
+
+    def render_scales(
+        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
+    ) -> list[Rendering]:
+        lr, hr = self._rasterizer.render_scales(jobs, depth=depth)
+        return [self._watched(lr, "LR"), self._watched(hr, "HR")]
+
+    def _watched(self, r: Rendering, scale: str) -> Any:
+        self.seen["render"][scale] = image = r.image
+        if self._given is not None:
+            image = self._given["render"][scale].to(image)
+
+        def vjp(cotangents: Tensor) -> SplatGradients:
+            self.seen[f"losses {scale}"] = {"cotangents": cotangents.clone()}
+            if self._given is not None:
+                cotangents = self._given[f"losses {scale}"]["cotangents"].to(cotangents)
+            g = r.vjp(cotangents)
+            self.seen[f"backward {scale}"] = {f.name: getattr(g, f.name).clone() for f in fields(g)}
+            if self._given is None:
+                return g
+            return SplatGradients(**{name: x.to(image) for name, x in self._given[f"backward {scale}"].items()})
+
+        return SimpleNamespace(image=image, alpha=r.alpha, depth=r.depth, means2d=r.means2d, visible=r.visible, vjp=vjp)
 
 
 def field_of(splats: Splats) -> GaussianField:

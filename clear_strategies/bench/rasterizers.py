@@ -15,7 +15,7 @@ from torch import Tensor
 
 import rasterizers
 from clear_strategies.bench import accuracy, peers, plots, scenes
-from clear_strategies.bench.accuracy import NO_CUT_OFFS, Drawn
+from clear_strategies.bench.accuracy import NO_CUT_OFFS, Drawn, affordable
 from clear_strategies.bench.peers import Peer
 from clear_strategies.bench.results import Results
 from clear_strategies.bench.scenes import SETTINGS, Workload
@@ -30,9 +30,7 @@ FORWARD, TOGETHER, SEPARATE = "forward", "lr_hr_together", "lr_hr_separate"
 BACKWARD: Final = tuple(f"backward_k{k}" for k in range(1, COTANGENTS + 1))
 SAME, NONE = "same cut-offs", "no cut-offs"
 
-REFERENCE: Final = "torch"
 CPP: Final = "cpp"
-REFERENCE_LIMIT: Final = 10_000  # Gaussians; beyond, the pure-torch reference takes minutes per turn
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,8 +84,6 @@ def measure(
     require_device(device)
     backends = usable(backend, device, results.note)
     truth = accuracy.truth_backend()
-    if truth is None:
-        results.note("errors: no backend here computes in float64.")
     workloads = [scenes.load(name, data).to(device) for name in scene]
     others = peers.found(results.note) if device == "cuda" and peers.PRESET in preset else []
     times: list[dict[str, Any]] = []
@@ -95,10 +91,10 @@ def measure(
     turns: list[pd.DataFrame] = []
     for workload in workloads:
         results.log(f"{workload.name}: {len(workload.splats):,} Gaussians")
-        affordable = [b for b in backends if _affordable(b, workload, b, results.note)]
         contestants = [
             backend_on(workload, b, p, m)
-            for b in affordable
+            for b in backends
+            if affordable(b, workload, b, results.note)
             for m in (isa if isa and b == CPP else [None])
             for p in preset
         ]
@@ -110,7 +106,7 @@ def measure(
         ms = interleaved(contenders, repeats, device=device, label=workload.name)
         turns.append(ms.assign(scene=workload.name))
         times += _time_rows(workload, contestants, medians(ms))
-        if truth is not None and _affordable(truth, workload, "errors", results.note):
+        if affordable(truth, workload, "errors", results.note):
             found_errors += _error_rows(workload, contestants, truth)
     if not times:
         raise DataError("--backend", ", ".join(backends), "measures none of these scenes", "see the lines above")
@@ -171,13 +167,6 @@ def random_cotangents(workload: Workload) -> Float[Tensor, "K H W 3"]:
     camera, generator = workload.camera, torch.Generator().manual_seed(0)
     values = torch.randn(COTANGENTS, camera.height, camera.width, 3, generator=generator)
     return values.to(workload.splats.means.device)
-
-
-def _affordable(backend: str, workload: Workload, what: str, note: Callable[[str], None]) -> bool:
-    affordable = backend != REFERENCE or len(workload.splats) <= REFERENCE_LIMIT
-    if not affordable:
-        note(f"{what}, {workload.name}: the torch reference takes at most {REFERENCE_LIMIT:,} Gaussians here.")
-    return affordable
 
 
 def backend_on(workload: Workload, backend: str, preset: str, isa: str | None = None) -> Contestant:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 import pandas as pd
-import torch
 from tqdm import tqdm
 
 from clear_strategies.core.work_log import WorkLog
@@ -26,18 +25,6 @@ WARM_UPS: Final = {"cpu": 1, "cuda": 3}
 def milliseconds(work_log: WorkLog) -> dict[str, float]:
     """The time of each stage."""
     return {name: 1e3 * entry.seconds for name, entry in work_log.entries.items()}
-
-
-def one_stage(name: str, device: torch.device | str, run: Callable[[], object]) -> Contender:
-    """A contender with a single stage."""
-
-    def turn() -> dict[str, float]:
-        work_log = WorkLog(device)
-        with work_log.stage(name):
-            run()
-        return milliseconds(work_log)
-
-    return turn
 
 
 def interleaved(

@@ -52,7 +52,6 @@ NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
     [
         (["rasterizers", "--scene", "nowhere"], "nowhere: is no scene"),
         (["rasterizers", "--scene", "tiny", "--backend", "cuda"], "cuda: is no backend"),
-        (["kernels", "--size", "9x9"], "9x9: must be WIDTHxHEIGHT"),
         (["iteration", "--scene", "nowhere"], "nowhere: is no scene"),
         (["seconds", "fit.seed=3", "--variant"], "fit.seed=3: is set by the benchmark"),
         (["stereo", "data=nowhere"], "data=nowhere"),
@@ -68,11 +67,13 @@ def test_unusable_input_is_one_line_and_exit_code_2(arguments, message, caplog, 
 
 def test_a_folder_that_cannot_be_made_is_known_before_measuring(tmp_path, caplog):
     (tmp_path / "file").touch()
-    assert main(["kernels", "--out", str(tmp_path / "file")]) == 2
+    assert main(["iteration", "--out", str(tmp_path / "file")]) == 2
     assert str(tmp_path / "file") in caplog.records[-1].getMessage()
 
 
-@pytest.mark.parametrize("arguments", [["kernels", "--repeats", "0"], ["rasterizers", "--preset", "best"], ["nothing"]])
+@pytest.mark.parametrize(
+    "arguments", [["iteration", "--repeats", "0"], ["rasterizers", "--preset", "best"], ["nothing"]]
+)
 def test_bad_arguments_have_exit_code_2(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
