@@ -7,9 +7,7 @@ as Adam's first moment holds it after a step.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import fields, replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
 
@@ -27,7 +25,6 @@ from clear_strategies.core import images
 from clear_strategies.core.view import Photo, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.density.adaptive import Density, DensitySettings
-from clear_strategies.errors import DataError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.objective import Objective
 from clear_strategies.schedules import LogLinear, WarmupDecay
@@ -47,13 +44,13 @@ FROZEN: Final = LearningRates(LogLinear(1e-30, 1e-30), *(0.0,) * 6, detail_decay
 """Adam does all its work, and the scene stays the same from turn to turn."""
 
 TOTAL, REST = "total", "everything else"
-FULL, WITHOUT_HF, LR_ONLY = "lr_and_hr", "without_l_hf", "lr_only"
 OBJECTIVES: Final = {
-    FULL: Objective(),
-    WITHOUT_HF: Objective(lambda_hf=0.0),
-    LR_ONLY: Objective(lambda_hr=WarmupDecay(peak=0.0, final=0.0)),
+    "lr_and_hr": Objective(),
+    "without_l_hf": Objective(lambda_hf=0.0),
+    "lr_only": Objective(lambda_hr=WarmupDecay(peak=0.0, final=0.0)),
 }
 _PER_TURN: Final = {"cpu": 1, "cuda": 16}  # on CUDA the host launches an iteration while the last one is computed
+_PRESET: Final = "fast"
 _NOISE: Final = 0.02  # standard deviation in the photos
 
 
@@ -103,56 +100,42 @@ class Training:
         return {**stages, REST: max(0.0, total - sum(stages.values())), TOTAL: total}
 
 
-def measure(
-    results: Results,
-    *,
-    scene: str,
-    backend: str | None = None,
-    preset: str = "fast",
-    repeats: int,
-    device: str = "cpu",
-    data: Path | None = None,
-) -> None:
+def measure(results: Results, *, scene: str, backend: str | None, repeats: int, device: str) -> None:
     """Measure a full iteration, one without L_HF and one without HR, in turns.
 
     Args:
         backend: None: the fastest that runs here.
 
     Raises:
-        DataError: a name is unknown, the scene has no LR grid, or there is no such device.
+        DataError: a name is unknown, or there is no such device.
     """
     require_device(device)
-    workload = scenes.load(scene, data).to(device)
+    workload = scenes.load(scene).to(device)
     (backend,) = usable([backend or rasterizers.fastest(device)], device, results.note)
-    rasterizer = rasterizers.load(backend, preset=preset, **SETTINGS)
+    rasterizer = rasterizers.load(backend, preset=_PRESET, **SETTINGS)
     view = view_of(workload, rasterizer)
     trainings = {name: Training(workload, view, rasterizer, objective) for name, objective in OBJECTIVES.items()}
-    with kernel_threads(trainings[FULL].state, rasterizer):
+    with kernel_threads(trainings["lr_and_hr"].state, rasterizer):
         turns = interleaved(trainings, repeats, device=device, label=workload.name)
     table = medians(turns).T.add_suffix("_ms")
     order = [stage for stage in table.index if stage not in (REST, TOTAL)] + [REST, TOTAL]
     table = table.loc[order].rename_axis("stage").reset_index()
-    truth = truth_backend()
-    if affordable(truth, workload, "errors", results.note):
-        table["error"] = table["stage"].map(
-            errors(workload, view, rasterizer, in_float64(truth, workload, PRESETS[preset]))
-        )
+    if affordable(truth_backend(), workload, "errors", results.note):
+        table["error"] = table["stage"].map(errors(workload, view, rasterizer))
     results.tables |= {"iteration": table, "iteration_turns": turns}
     lr, hr = view.lr.camera, view.hr.camera
     results.note(
         f"{workload.name}: {len(workload.splats):,} Gaussians, LR {lr.width}x{lr.height} and HR {hr.width}x{hr.height}, "
-        f"{backend} {preset}. Medians by stage, so they need not add up to the total."
+        f"{backend} {_PRESET}. Medians by stage, so they need not add up to the total."
     )
 
 
-def errors(
-    workload: Workload, view: View, rasterizer: Rasterizer, in_float64: tuple[Rasterizer, Workload]
-) -> dict[str, float]:
+def errors(workload: Workload, view: View, rasterizer: Rasterizer) -> dict[str, float]:
     """The largest relative L2 error of a stage's images, or of the attributes of its gradients."""
-    truth, wide = in_float64
+    truth, wide = in_float64(truth_backend(), workload, PRESETS[_PRESET])
     lr, hr = (replace(photo, image=photo.image.to(wide.splats.means)) for photo in (view.lr, view.hr))
-    found = _handed_on(workload, view, _Watched(rasterizer), "auto")
-    expected = _handed_on(wide, replace(view, lr=lr, hr=hr), _Watched(truth, found), "off")
+    found = _handed_on(workload, view, rasterizer, "auto")
+    expected = _handed_on(wide, replace(view, lr=lr, hr=hr), truth, "off", given=found)
     return {
         # The basis is no gradient, and has any value where a Gaussian is not seen.
         stage: max(relative(x, expected[stage][name]) for name, x in tensors.items() if name != "basis")
@@ -160,49 +143,43 @@ def errors(
     }
 
 
-def _handed_on(workload: Workload, view: View, watched: _Watched, fused: FusedMode) -> Stages:
-    """What the stages of an iteration hand on. Nothing is dropped: a device draws masks of its own."""
-    state = Training(workload, view, watched, Objective(), dropout=False, fused=fused).state
-    iterate(state, watched)
-    return watched.seen | dict.fromkeys(("per-Gaussian pass", "optimizer"), state.optimizer.first)
-
-
-class _Watched:
-    """A rasterizer; `seen` keeps what it hands on, and what the losses do.
+def _handed_on(
+    workload: Workload, view: View, rasterizer: Rasterizer, fused: FusedMode, given: Stages | None = None
+) -> Stages:
+    """What the stages of an iteration hand on. Nothing is dropped: a device draws masks of its own.
 
     Args:
-        given: what the stages of another iteration handed on; each stage of this one gets it in place of its own.
+        given: what those of another iteration handed on; each stage gets it in place of what this one makes.
     """
+    seen: Stages = {"render": {}}
 
-    def __init__(self, rasterizer: Rasterizer, given: Stages | None = None) -> None:
-        self._rasterizer, self.traits, self._given = rasterizer, rasterizer.traits, given
-        self.seen: Stages = {"render": {}}
-
-    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Rendering:
-        return self._rasterizer(splats, camera, depth=depth)
-
-    def render_scales(
-        self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
-    ) -> list[Rendering]:
-        lr, hr = self._rasterizer.render_scales(jobs, depth=depth)
-        return [self._watched(lr, "LR"), self._watched(hr, "HR")]
-
-    def _watched(self, r: Rendering, scale: str) -> Any:
-        self.seen["render"][scale] = image = r.image
-        if self._given is not None:
-            image = self._given["render"][scale].to(image)
+    def watched(r: Rendering, scale: str) -> Any:
+        seen["render"][scale] = r.image
+        image = r.image if given is None else given["render"][scale].to(r.image)
 
         def vjp(cotangents: Tensor) -> SplatGradients:
-            self.seen[f"losses {scale}"] = {"cotangents": cotangents.clone()}
-            if self._given is not None:
-                cotangents = self._given[f"losses {scale}"]["cotangents"].to(cotangents)
-            g = r.vjp(cotangents)
-            self.seen[f"backward {scale}"] = {f.name: getattr(g, f.name).clone() for f in fields(g)}
-            if self._given is None:
+            seen[f"losses {scale}"] = {"cotangents": cotangents.clone()}
+            g = r.vjp(cotangents if given is None else given[f"losses {scale}"]["cotangents"].to(image))
+            seen[f"backward {scale}"] = {f.name: getattr(g, f.name).clone() for f in fields(g)}
+            if given is None:
                 return g
-            return SplatGradients(**{name: x.to(image) for name, x in self._given[f"backward {scale}"].items()})
+            return SplatGradients(**{name: x.to(image) for name, x in given[f"backward {scale}"].items()})
 
-        return SimpleNamespace(image=image, alpha=r.alpha, depth=r.depth, means2d=r.means2d, visible=r.visible, vjp=vjp)
+        kept = {name: getattr(r, name) for name in ("alpha", "depth", "means2d", "visible")}
+        return SimpleNamespace(**kept, image=image, vjp=vjp)
+
+    def render_scales(jobs: Any, **options: Any) -> list[Any]:
+        return list(map(watched, rasterizer.render_scales(jobs, **options), ("LR", "HR")))
+
+    watching = _Rasterizer(traits=rasterizer.traits, render_scales=render_scales)
+    state = Training(workload, view, watching, Objective(), dropout=False, fused=fused).state
+    iterate(state, watching)
+    return seen | dict.fromkeys(("per-Gaussian pass", "optimizer"), state.optimizer.first)
+
+
+class _Rasterizer(SimpleNamespace):
+    def __call__(self, splats: Splats, camera: Camera, *, depth: bool = False) -> Any:
+        return self.render_scales([(splats, camera)], depth=[depth])[0]
 
 
 def field_of(splats: Splats) -> GaussianField:
@@ -220,11 +197,8 @@ def field_of(splats: Splats) -> GaussianField:
 
 
 def view_of(workload: Workload, rasterizer: Rasterizer) -> View:
-    """One view whose photos are a render plus noise; a DataError where no LR grid divides the image."""
+    """One view whose photos are a render plus noise."""
     factor, camera = workload.lr_factor, workload.camera
-    if factor is None:
-        size = f"{camera.width}x{camera.height} is no multiple of 4, 3 or 2"
-        raise DataError("--scene", workload.name, size, "take another scene")
     clean = rasterizer(workload.splats, camera).image
     generator = torch.Generator().manual_seed(1)
 

@@ -1,8 +1,4 @@
-"""Other projects' rasterizers on CUDA, called as their users call them.
-
-Only what the benchmark needs is wrapped: an image, and one backward pass per cotangent. Each is
-compared with float64 by its own rules.
-"""
+"""Other projects' rasterizers on CUDA, called as their users call them, and compared with float64 by their own rules."""
 
 from __future__ import annotations
 
@@ -23,9 +19,7 @@ from clear_strategies.bench import scenes
 from clear_strategies.bench.accuracy import ATTRIBUTES
 from clear_strategies.bench.scenes import SETTINGS, Workload
 
-PRESET: Final = "fast"
-"""The cut-offs that all peers have built in: alpha 1/255 and transmittance 1e-4."""
-
+PRESET: Final = "fast"  # the cut-offs that all peers have built in: alpha 1/255 and transmittance 1e-4
 _FAR: Final = 100.0  # the far plane of gswarp's projection matrix; nothing is cut there
 
 Leaves = Mapping[str, Tensor]
@@ -73,12 +67,11 @@ def gsplat(rasterization: Callable[..., Any], name: str) -> Peer:
     def draw(workload: Workload, g: Leaves) -> Tensor:
         camera, like = workload.camera, workload.splats.means
         K = like.new_tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        images, _, _ = rasterization(
+        image: Tensor = rasterization(
             g["means"], g["quats"], g["scales"], g["opacities"], torch.cat((g["sh0"], g["shN"]), 1),
             camera.world_to_camera.to(like)[None], K[None], camera.width, camera.height, near_plane=SETTINGS["near"],
             eps2d=SETTINGS["kernel"], sh_degree=_degree(workload), packed=False, rasterize_mode="antialiased",
-        )  # fmt: skip
-        image: Tensor = images[0]
+        )[0][0]  # fmt: skip
         return image
 
     return Peer(name, _by_autograd(draw), "antialiased, as ours; not deterministic (atomic sums).")
@@ -111,10 +104,7 @@ def gswarp(library: Any, name: str) -> Peer:
 
 
 def _by_autograd(draw: Callable[[Workload, Leaves], Tensor]) -> Callable[[Workload], SimpleNamespace]:
-    """Draws a workload: `image`, and `vjp` of K cotangents, whose attributes are lists of K gradients.
-
-    There is one backward pass per cotangent; the graph is kept for the next.
-    """
+    """Draws a workload: `image`, and `vjp` of K cotangents, one backward pass each, whose attributes are lists of K gradients."""
 
     def render(workload: Workload) -> SimpleNamespace:
         leaves = {name: getattr(workload.splats, name).detach().requires_grad_() for name in ATTRIBUTES}
@@ -122,11 +112,8 @@ def _by_autograd(draw: Callable[[Workload, Leaves], Tensor]) -> Callable[[Worklo
             image = draw(workload, leaves)
 
         def vjp(cotangents: Float[Tensor, "K H W 3"]) -> SimpleNamespace:
-            tensors = list(leaves.values())
-            gradients = [
-                torch.autograd.grad(image, tensors, cotangent, retain_graph=True, materialize_grads=True)
-                for cotangent in cotangents
-            ]
+            keep = {"retain_graph": True, "materialize_grads": True}
+            gradients = [torch.autograd.grad(image, list(leaves.values()), v, **keep) for v in cotangents]
             return SimpleNamespace(**dict(zip(leaves, zip(*gradients, strict=True), strict=True)))
 
         return SimpleNamespace(image=image, vjp=vjp)

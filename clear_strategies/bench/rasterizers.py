@@ -1,16 +1,20 @@
-"""Time, memory and error of every rasterizer at every preset of cut-offs."""
+"""Time, memory and error of every rasterizer at every preset of cut-offs.
+
+Each contender is compared with float64 twice: at its own cut-offs, which shows the rounding, and without cut-offs, which shows
+the cut-offs too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
 import torch
 from jaxtyping import Float
+from matplotlib.figure import Figure
 from torch import Tensor
 
 import rasterizers
@@ -24,13 +28,10 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.errors import DataError
 from rasterizers.interface import PRESETS
 
-SCENES: Final = ("small", "s100k", "s100k-lr", "s500k")
 COTANGENTS: Final = 3
 FORWARD, TOGETHER, SEPARATE = "forward", "lr_hr_together", "lr_hr_separate"
 BACKWARD: Final = tuple(f"backward_k{k}" for k in range(1, COTANGENTS + 1))
 SAME, NONE = "same cut-offs", "no cut-offs"
-
-CPP: Final = "cpp"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,85 +39,68 @@ class Contestant:
     """A backend, or a peer, at a preset on a scene.
 
     Args:
-        module: the instruction set of its kernels, where it has such.
+        names: the columns that say what a row of a table measured.
         render: draws the scene.
         stages: times more stages than forward and backward.
         rules: settings that differ from `SETTINGS`.
     """
 
-    backend: str
-    module: str
-    preset: str
+    names: Mapping[str, str]
     render: Callable[[], Any]
     stages: Callable[[WorkLog], None] = lambda work_log: None
     rules: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
-        return " ".join(filter(None, (self.backend, self.module, self.preset)))
-
-    def names(self, workload: Workload) -> dict[str, Any]:
-        """The columns that say what a row of a table measured."""
-        return {"scene": workload.name, "backend": self.backend, "module": self.module, "preset": self.preset}
+        return " ".join(name for name in list(self.names.values())[1:] if name)
 
 
 def measure(
-    results: Results,
-    *,
-    scene: Sequence[str],
-    backend: Sequence[str] | None = None,
-    isa: Sequence[str] | None = None,
-    preset: Sequence[str] = tuple(PRESETS),
-    repeats: int,
-    device: str = "cpu",
-    data: Path | None = None,
+    results: Results, *, scene: Sequence[str], backend: Sequence[str], preset: Sequence[str], repeats: int, device: str
 ) -> None:
     """Measure the scenes one after the other.
 
     Args:
-        backend: None: all that run here.
-        isa: instruction sets whose compiled modules are compared; None: the fastest of this processor.
+        backend: none: all that run here.
 
     Raises:
-        BackendUnavailable: this processor cannot run one of `isa`.
         DataError: a name is unknown, or nothing that was asked for runs here.
     """
     require_device(device)
-    backends = usable(backend, device, results.note)
-    truth = accuracy.truth_backend()
-    workloads = [scenes.load(name, data).to(device) for name in scene]
+    backends, truth = usable(backend, device, results.note), accuracy.truth_backend()
+    workloads = [scenes.load(name).to(device) for name in scene]
     others = peers.found(results.note) if device == "cuda" and peers.PRESET in preset else []
-    times: list[dict[str, Any]] = []
-    found_errors: list[dict[str, Any]] = []
-    turns: list[pd.DataFrame] = []
+    times, errors, turns = list[dict[str, Any]](), list[dict[str, Any]](), list[pd.DataFrame]()
     for workload in workloads:
         results.log(f"{workload.name}: {len(workload.splats):,} Gaussians")
-        contestants = [
-            backend_on(workload, b, p, m)
-            for b in backends
-            if affordable(b, workload, b, results.note)
-            for m in (isa if isa and b == CPP else [None])
-            for p in preset
-        ]
+        affordable_here = [b for b in backends if affordable(b, workload, b, results.note)]
+        contestants = [backend_on(workload, b, p) for b in affordable_here for p in preset]
         contestants += [peer_on(workload, peer) for peer in others]
         if not contestants:
             continue
-        cotangents = random_cotangents(workload)
-        contenders = {c.label: partial(turn, c, cotangents) for c in contestants}
+        contenders = {c.label: partial(turn, c, random_cotangents(workload)) for c in contestants}
         ms = interleaved(contenders, repeats, device=device, label=workload.name)
         turns.append(ms.assign(scene=workload.name))
         times += _time_rows(workload, contestants, medians(ms))
         if affordable(truth, workload, "errors", results.note):
-            found_errors += _error_rows(workload, contestants, truth)
+            errors += _error_rows(workload, contestants, truth)
     if not times:
         raise DataError("--backend", ", ".join(backends), "measures none of these scenes", "see the lines above")
-    results.tables["rasterizers_time"] = pd.DataFrame(times)
-    results.tables["rasterizers_turns"] = pd.concat(turns)
-    if found_errors:
-        time, error = results.tables["rasterizers_time"], pd.DataFrame(found_errors)
-        results.tables["rasterizers_error"] = error
-        results.figures["time_against_error"] = plots.time_against_error(time, error)
+    results.tables |= {"rasterizers_time": pd.DataFrame(times), "rasterizers_turns": pd.concat(turns)}
+    if errors:
+        results.tables["rasterizers_error"] = pd.DataFrame(errors)
+        results.figures["time_against_error"] = figure(pd.DataFrame(times), pd.DataFrame(errors))
     results.notes += [f"{peer.name}: {peer.differences}" for peer in others]
+
+
+def figure(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
+    """A line per backend through its presets; lower left is better."""
+    rows = time.merge(error[error["truth"] == NONE], on=["scene", "backend", "module", "preset"])
+    rows["name"] = (rows["backend"] + " " + rows["module"].fillna("")).str.strip()  # empty in a CSV
+    rows["forward + backward, ms"] = rows["forward_ms"] + rows["backward_k1_ms"]
+    error_of = "error of the gradient of the means,\nrelative L2, against float64"
+    rows = rows.assign(line="").rename(columns={"preset": "mark", "means_relative": error_of})
+    return plots.lines(rows[[*plots.WHO, "forward + backward, ms", error_of]], log=True)
 
 
 def require_device(device: str) -> None:
@@ -125,27 +109,24 @@ def require_device(device: str) -> None:
         raise DataError("--device", "cuda", "torch sees no such device here", "use --device cpu")
 
 
-def usable(asked: Sequence[str] | None, device: str, note: Callable[[str], None]) -> list[str]:
+def usable(asked: Sequence[str], device: str, note: Callable[[str], None]) -> list[str]:
     """The backends that run here, of those asked for; a DataError where a name is unknown, or none runs."""
     reasons = rasterizers.available()
-    for name in asked or ():
+    for name in asked:
         if name not in reasons:
             raise DataError("--backend", name, "is no backend", f"choose from {', '.join(reasons)}")
-    found = []
     for name in dict.fromkeys(asked or reasons):
-        why_not = reasons[name]
-        if why_not is None and name == "gsplat":
-            why_not = "measured as a peer on CUDA"
-        elif why_not is None and name == "warp" and device == "cpu" and not asked:
-            why_not = "made for CUDA; name it with --backend to measure it on a CPU"
-        elif why_not is None and device not in rasterizers.load(name).traits.devices:
-            why_not = f"it does not run on {device}"
-        if why_not is None:
-            found.append(name)
-        else:
-            note(f"{name}: {why_not}")
+        if reasons[name] is None and name == "gsplat":
+            reasons[name] = "measured as a peer on CUDA"
+        elif reasons[name] is None and name == "warp" and device == "cpu" and not asked:
+            reasons[name] = "made for CUDA; name it with --backend to measure it on a CPU"
+        elif reasons[name] is None and device not in rasterizers.load(name).traits.devices:
+            reasons[name] = f"it does not run on {device}"
+        if reasons[name] is not None:
+            note(f"{name}: {reasons[name]}")
+    found = [name for name in dict.fromkeys(asked or reasons) if reasons[name] is None]
     if not found:
-        raise DataError("--backend", ", ".join(asked or ()), "cannot run here", "see the lines above")
+        raise DataError("--backend", ", ".join(asked), "cannot run here", "see the lines above")
     return found
 
 
@@ -169,27 +150,29 @@ def random_cotangents(workload: Workload) -> Float[Tensor, "K H W 3"]:
     return values.to(workload.splats.means.device)
 
 
-def backend_on(workload: Workload, backend: str, preset: str, isa: str | None = None) -> Contestant:
+def backend_on(workload: Workload, backend: str, preset: str) -> Contestant:
     """One of our backends, with the stages that peers lack: both scales together."""
-    kernels = {"isa": isa} if isa else {}
-    rasterizer = rasterizers.load(backend, preset=preset, **kernels, **SETTINGS)
+    rasterizer = rasterizers.load(backend, preset=preset, **SETTINGS)
     splats, camera = workload.splats, workload.camera
-    lr = camera.scaled(1 / workload.lr_factor) if workload.lr_factor else None
+    lr = camera.scaled(1 / workload.lr_factor)
 
     def stages(work_log: WorkLog) -> None:
-        if lr is not None:
-            with work_log.stage(TOGETHER):
-                rasterizer.render_scales([(splats, lr), (splats, camera)])
-            with work_log.stage(SEPARATE):
-                rasterizer(splats, lr)
-                rasterizer(splats, camera)
+        with work_log.stage(TOGETHER):
+            rasterizer.render_scales([(splats, lr), (splats, camera)])
+        with work_log.stage(SEPARATE):
+            rasterizer(splats, lr)
+            rasterizer(splats, camera)
 
-    module = getattr(rasterizer, "module", "")  # the compiled backend has one
-    return Contestant(backend, module, preset, lambda: rasterizer(splats, camera), stages)
+    module = getattr(rasterizer, "module", "")  # the instruction set of the compiled backend
+    return Contestant(_names(workload, backend, module, preset), lambda: rasterizer(splats, camera), stages)
 
 
 def peer_on(workload: Workload, peer: Peer) -> Contestant:
-    return Contestant(peer.name, "", peers.PRESET, lambda: peer.render(workload), rules=peer.rules)
+    return Contestant(_names(workload, peer.name, "", peers.PRESET), lambda: peer.render(workload), rules=peer.rules)
+
+
+def _names(workload: Workload, backend: str, module: str, preset: str) -> dict[str, str]:
+    return {"scene": workload.name, "backend": backend, "module": module, "preset": preset}
 
 
 def peak_on_cuda(c: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> float:
@@ -207,8 +190,7 @@ def _time_rows(workload: Workload, contestants: Sequence[Contestant], median: pd
     cotangents = random_cotangents(workload)
     for c in contestants:
         ms = median.loc[c.label].dropna().to_dict()
-        row: dict[str, Any] = c.names(workload)
-        row |= {f"{stage}_ms": value for stage, value in ms.items() if stage != SEPARATE}
+        row: dict[str, Any] = {**c.names} | {f"{stage}_ms": value for stage, value in ms.items() if stage != SEPARATE}
         row |= {f"k{k}_over_k1": ms[BACKWARD[k - 1]] / ms[BACKWARD[0]] for k in range(2, COTANGENTS + 1)}
         if SEPARATE in ms:
             row["together_over_separate"] = ms[TOGETHER] / ms[SEPARATE]
@@ -223,9 +205,9 @@ def _error_rows(workload: Workload, contestants: Sequence[Contestant], backend: 
     truths: dict[tuple[Any, ...], Drawn] = {}
     for c in contestants:
         found = accuracy.draw(c.render, cotangent)
-        for against, cut_offs in ((SAME, PRESETS[c.preset]), (NONE, NO_CUT_OFFS)):
+        for against, cut_offs in ((SAME, PRESETS[c.names["preset"]]), (NONE, NO_CUT_OFFS)):
             rules = {**c.rules, **cut_offs}
             key = tuple(sorted(rules.items()))
             if key not in truths:
                 truths[key] = accuracy.truth(backend, workload, cotangent, rules)
-            yield {**c.names(workload), "truth": against, **accuracy.errors(found, truths[key])}
+            yield {**c.names, "truth": against, **accuracy.errors(found, truths[key])}

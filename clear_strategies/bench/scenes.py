@@ -1,10 +1,7 @@
-"""What the benchmark draws: generated scenes of known statistics, a real point cloud, or an
-exported field.
-"""
+"""What the benchmark draws: a generated scene of known statistics, or the field that a run exported."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Final
@@ -12,11 +9,9 @@ from typing import Final
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import DataError
 from rasterizers.geometry import SH_C0
@@ -29,7 +24,6 @@ _BANDS: Final = 15  # SH degree 3
 _FOCAL: Final = 0.8  # in units of the image's width
 
 Array = np.ndarray
-Surface = tuple[Float[Array, "n 3"], Float[Array, "n 3"]]  # points and unit normals
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,16 +35,15 @@ class Workload:
     camera: Camera
 
     @property
-    def lr_factor(self) -> int | None:
-        """The largest of 4, 3 and 2 that divides the image size; None: the image has no LR grid."""
-        sizes = self.camera.width, self.camera.height
-        return next((factor for factor in (4, 3, 2) if not any(size % factor for size in sizes)), None)
+    def lr_factor(self) -> int:
+        """HR pixels per LR pixel: the larger of 4 and 3 that divides the image size."""
+        return 3 if self.camera.width % 4 or self.camera.height % 4 else 4
 
     def to(self, device: str, dtype: torch.dtype = torch.float32) -> Workload:
         """The Gaussians on another device; cameras stay on the CPU."""
         tensors = {f.name: getattr(self.splats, f.name) for f in fields(self.splats)}
         moved = {name: t.to(device, dtype) for name, t in tensors.items() if t is not None}
-        return replace(self, splats=replace(self.splats, **moved))
+        return replace(self, splats=Splats(**moved))
 
 
 def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed: int = 0) -> Workload:
@@ -63,17 +56,7 @@ def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed:
     """
     random = np.random.default_rng(seed)
     focal = _FOCAL * width
-    frustum = _Frustum(random, width, height, focal)
-    counts = [round(n * share) for share in (0.30, 0.25, 0.15, 0.15, 0.10)]
-    parts = [
-        frustum.wall(counts[0]),
-        frustum.ground(counts[1]),
-        frustum.sphere(counts[2], (0.35, 0.45, 4.0), 0.8),
-        frustum.sphere(counts[3], (0.70, 0.50, 3.0), 0.6),
-        frustum.sphere(counts[4], (0.50, 0.65, 2.0), 0.25),
-        frustum.clutter(n - sum(counts)),
-    ]
-    points, normals = (np.concatenate(x) for x in zip(*parts, strict=True))
+    points, normals = _surface(random, n, width, height, focal)
 
     # Two axes of a disc lie in the surface, the third is thin.
     longest = radius / 3 / focal * points[:, 2] * np.exp(random.normal(0, 0.8, n))
@@ -83,77 +66,47 @@ def surfaces(name: str, n: int, width: int, height: int, *, radius: float, seed:
     texture = 0.5 + 0.3 * np.sin(points * (7, 9, 5)) * np.cos(points[:, [1, 2, 0]] * 11)
     colors = texture + random.normal(0, 0.05, (n, 3))
     shuffled = random.permutation(n)  # a trained field has no order
-    splats = _splats(random, points, quats, scales, expit(random.normal(0.8, 2.2, n)), colors)
-    splats = Splats(*(getattr(splats, a)[shuffled] for a in PARAMETERS))
-    return Workload(name, splats, Camera(_pose(), focal, focal, width / 2, height / 2, width, height))
+    parts = [points, quats, scales, expit(random.normal(0.8, 2.2, n)), colors, random.normal(0, 0.02, (n, _BANDS, 3))]
+    tensors = [torch.from_numpy(x[shuffled]).float() for x in parts]
+    tensors[4] = ((tensors[4] - 0.5) / SH_C0)[:, None]
+    return Workload(name, Splats(*tensors), Camera(_pose(), focal, focal, width / 2, height / 2, width, height))
 
 
-class _Frustum:
-    """Samples points on surfaces that the camera sees, with a margin of a tenth of the image around it."""
+def _surface(
+    random: np.random.Generator, n: int, width: int, height: int, focal: float
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    """Points that the camera sees, with a margin of a tenth of the image around it, and their unit normals."""
+    unit = width / 1008  # the relief is given in pixels of a 1008-pixel image
+    counts = [round(n * share) for share in (0.30, 0.25, 0.15, 0.15, 0.10)]
 
-    def __init__(self, random: np.random.Generator, width: int, height: int, focal: float) -> None:
-        self.random, self.width, self.height, self.focal = random, width, height, focal
-        self.unit = width / 1008  # the relief is given in pixels of a 1008-pixel image
+    def at(u: Array, v: Array, z: Array) -> Array:
+        return np.stack(((u - width / 2) / focal * z, (v - height / 2) / focal * z, z), -1)
 
-    def wall(self, n: int) -> Surface:
-        u, v = self._pixels(n)
-        relief = 0.6 * np.sin(u / (90 * self.unit)) * np.cos(v / (70 * self.unit))
-        return self._at(u, v, 8 + relief + self.random.normal(0, 0.02, n)), np.tile((0.0, 0, 1), (n, 1))
+    def pixels(n: int) -> Array:
+        return random.uniform(-0.1, 1.1, (2, n)) * [[width], [height]]
 
-    def ground(self, n: int) -> Surface:
-        u, _ = self._pixels(n)
-        v = self.height * (0.55 + 0.55 * self.random.uniform(0, 1, n))
-        horizon = np.maximum(v - self.height / 2, 20 * self.unit)
-        return self._at(u, v, np.minimum(1.2 * self.focal / horizon, 7.5)), np.tile((0.0, 1, 0), (n, 1))
+    def directions(n: int) -> Array:
+        found = random.normal(size=(n, 3))
+        return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
 
-    def sphere(self, n: int, center: tuple[float, float, float], radius: float) -> Surface:
-        """`center` is a share of the image's width and height, and a depth."""
-        normals = self._directions(n)
-        in_front = np.where(self.random.random(n) < 0.85, -1, 1)
-        normals[:, 2] = in_front * np.abs(normals[:, 2])
-        middle = self._at(np.array(center[0] * self.width), np.array(center[1] * self.height), np.array(center[2]))
-        return middle + radius * normals + self.random.normal(0, 0.01, (n, 3)), normals
-
-    def clutter(self, n: int) -> Surface:
-        u, v = self._pixels(n)
-        return self._at(u, v, self.random.uniform(1.5, 9, n)), self._directions(n)
-
-    def _pixels(self, n: int) -> tuple[Array, Array]:
-        u, v = self.random.uniform(-0.1, 1.1, (2, n))
-        return u * self.width, v * self.height
-
-    def _at(self, u: Array, v: Array, z: Array) -> Float[Array, "*n 3"]:
-        return np.stack(((u - self.width / 2) / self.focal * z, (v - self.height / 2) / self.focal * z, z), -1)
-
-    def _directions(self, n: int) -> Float[Array, "n 3"]:
-        directions = self.random.normal(size=(n, 3))
-        return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
-
-
-def garden(path: Path) -> Workload:
-    """The points of gsplat's test_garden.npz as Gaussians: sizes from the distances to three neighbours.
-
-    Raises:
-        DataError: the file is missing or is not the garden.
-    """
-    try:
-        with np.load(path) as file:
-            points, colors = file["means3d"].astype(np.float64), file["colors"] / 255.0
-            pose, K = file["viewmats"][0], file["Ks"][0]
-            width, height = int(file["width"]), int(file["height"])
-    except (OSError, ValueError, KeyError) as error:
-        raise DataError(
-            path, "content", f"is not the garden ({error})", "give gsplat's test_garden.npz with --data"
-        ) from error
-    random, n = np.random.default_rng(0), len(points)
-    gaps = np.asarray(cKDTree(points).query(points, k=4)[0])[:, 1:]
-    size = np.sqrt(np.square(gaps).mean(1)).clip(1e-4)
-    scales = size[:, None] * np.exp(random.normal(-0.3, 0.5, (n, 3)))
-    opacities = expit(random.normal(0.3, 1.9, n))
-    splats = _splats(random, points, random.normal(size=(n, 4)), scales, opacities, colors)
-    fx, fy, cx, cy = (float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    camera = Camera(torch.from_numpy(pose).float(), fx, fy, cx, cy, width, height)
-    return Workload("garden", splats, camera)
+    u, v = pixels(counts[0])
+    depth = 8 + 0.6 * np.sin(u / (90 * unit)) * np.cos(v / (70 * unit)) + random.normal(0, 0.02, len(u))
+    parts, normals = [at(u, v, depth)], [np.tile((0.0, 0, 1), (len(u), 1))]
+    u, _ = pixels(counts[1])
+    v = height * (0.55 + 0.55 * random.uniform(0, 1, len(u)))
+    parts.append(at(u, v, np.minimum(1.2 * focal / np.maximum(v - height / 2, 20 * unit), 7.5)))
+    normals.append(np.tile((0.0, 1, 0), (len(u), 1)))
+    spheres = ((0.35, 0.45, 4.0, 0.8), (0.70, 0.50, 3.0, 0.6), (0.50, 0.65, 2.0, 0.25))
+    for count, (x, y, z, size) in zip(counts[2:], spheres, strict=True):
+        of_sphere = directions(count)
+        of_sphere[:, 2] = np.where(random.random(count) < 0.85, -1, 1) * np.abs(of_sphere[:, 2])
+        middle = at(np.array(x * width), np.array(y * height), np.array(z))
+        parts.append(middle + size * of_sphere + random.normal(0, 0.01, (count, 3)))
+        normals.append(of_sphere)
+    u, v = pixels(n - sum(counts))
+    parts.append(at(u, v, random.uniform(1.5, 9, len(u))))
+    normals.append(directions(len(u)))
+    return np.concatenate(parts), np.concatenate(normals)
 
 
 def from_ply(path: Path) -> Workload:
@@ -175,47 +128,27 @@ def facing_all(splats: Splats, width: int = 1008, height: int = 756) -> Camera:
 
 
 # Gaussians shrink as their number grows, as under densification: the radius is 5.5 px at 100k.
-_GENERATED: Final[dict[str, Callable[[], Workload]]] = {
-    "tiny": lambda: surfaces("tiny", 600, 96, 72, radius=4.0),
-    "small": lambda: surfaces("small", 5_000, 252, 189, radius=5.5),
-    "s100k": lambda: surfaces("s100k", 100_000, 1008, 756, radius=5.5),
-    "s100k-lr": lambda: _at_lr(_GENERATED["s100k"]()),
-    "s300k-2016": lambda: surfaces("s300k-2016", 300_000, 2016, 1512, radius=2 * 5.5 * 3**-0.3),
-    "s500k": lambda: surfaces("s500k", 500_000, 1008, 756, radius=5.5 * 5**-0.3),
+_GENERATED: Final = {
+    "tiny": (600, 96, 72, 4.0),
+    "small": (5_000, 252, 189, 5.5),
+    "s100k": (100_000, 1008, 756, 5.5),
+    "s500k": (500_000, 1008, 756, 5.5 * 5**-0.3),
 }
-NAMES: Final = (*_GENERATED, "garden")
+_AT_LR: Final = "s100k-lr"  # the same Gaussians at a quarter of the image size
+NAMES: Final = ("tiny", "small", "s100k", _AT_LR, "s500k")
 
 
-def load(name: str, data: Path | None = None) -> Workload:
-    """A scene by name, or a .ply file.
-
-    Args:
-        data: the garden's file.
-
-    Raises:
-        DataError: no scene or file has that name, or the file cannot be used.
-    """
+def load(name: str) -> Workload:
+    """A scene by name, or a .ply file; a DataError where there is none of that name, or the file cannot be used."""
+    if name == _AT_LR:
+        hr = load("s100k")
+        return Workload(name, hr.splats, hr.camera.scaled(1 / 4))
     if name in _GENERATED:
-        return _GENERATED[name]()
-    if name == "garden":
-        if data is None:
-            raise DataError("--scene", name, "has no file", "give gsplat's test_garden.npz with --data")
-        return garden(data)
+        n, width, height, radius = _GENERATED[name]
+        return surfaces(name, n, width, height, radius=radius)
     if Path(name).is_file():
         return from_ply(Path(name))
     raise DataError("--scene", name, "is no scene and no file", f"choose one of {', '.join(NAMES)}, or give a .ply")
-
-
-def _at_lr(workload: Workload) -> Workload:
-    """The same Gaussians at a quarter of the image size."""
-    return Workload(f"{workload.name}-lr", workload.splats, workload.camera.scaled(1 / 4))
-
-
-def _splats(random: np.random.Generator, *parts: Array) -> Splats:
-    """Splats of means, quats, scales, opacities and colours, with a little view dependence."""
-    means, quats, scales, opacities, colors = (torch.from_numpy(x).float().contiguous() for x in parts)
-    higher = torch.from_numpy(random.normal(0, 0.02, (len(means), _BANDS, 3))).float()
-    return Splats(means, quats, scales, opacities, ((colors - 0.5) / SH_C0)[:, None], higher)
 
 
 def _facing(normals: Float[Array, "n 3"], spin: Float[Array, " n"]) -> Float[Array, "n 4"]:

@@ -14,17 +14,17 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
 import torch
+from matplotlib.figure import Figure
 
 from clear_strategies import files
 from clear_strategies.bench import plots
-from clear_strategies.bench.results import Results, environment
+from clear_strategies.bench.results import Results
 from clear_strategies.commands.train import quoted
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
@@ -34,59 +34,17 @@ from clear_strategies.training.clock import PROBE, PROCESSOR, WALL
 
 DEFAULTS: Final = "defaults"
 _COMMAND: Final = "command.json"
-_ALL: Final = 1_000_000  # test views
 
-# Checkpoints, pages and pictures would count as the command's seconds.
+# Every test view is evaluated. Checkpoints, pages and pictures would count as the command's seconds.
 _COMMON: Final = (
-    f"fit.probe_views={_ALL}", "fit.checkpoint_every=0", "fit.map_views=0", "fit.video=0", "fit.page=0",
+    "fit.probe_views=1000000", "fit.checkpoint_every=0", "fit.map_views=0", "fit.video=0", "fit.page=0",
 )  # fmt: skip
 _RESERVED: Final = {
     "scene", "fit.probe_every", "fit.seed", "fit.threads", "fit.resume", "fit.baseline",
     *(override.partition("=")[0] for override in _COMMON),
 }  # fmt: skip
 
-Trainer = Callable[[Path, Sequence[str]], str | None]
-"""Trains into a folder with overrides; returns the line that says why it failed, or None."""
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """The options of the command line. A variant's overrides win over those of all trainings."""
-
-    overrides: Sequence[str]
-    variants: Sequence[Sequence[str]]
-    scene: Sequence[str]
-    seeds: Sequence[int]
-    probes: int
-    out: Path
-
-    def __post_init__(self) -> None:
-        for override in (*self.overrides, *(x for variant in self.variants for x in variant)):
-            key = override.lstrip("+~").partition("=")[0]
-            if key in _RESERVED or key.startswith(("hydra.", "hydra/")):
-                raise DataError("seconds", override, "is set by the benchmark", "leave it out, or use its options")
-        if not 1 <= self.probes <= REFERENCE_ITERATIONS:
-            raise DataError("--probes", str(self.probes), f"lies outside 1 to {REFERENCE_ITERATIONS}", "give fewer")
-
-    def training(self, scene: str | None, variant: Sequence[str], seed: int) -> tuple[Path, list[str]]:
-        """The folder of a training, whose name ends in a hash of its overrides, and these overrides."""
-        threads = f"fit.threads={torch.get_num_threads()}"
-        own = (f"fit.seed={seed}", f"fit.probe_every={REFERENCE_ITERATIONS // self.probes}", threads)
-        of_scene = [] if scene is None else [f"+scene={scene}"]
-        overrides = [*of_scene, *self.overrides, *_COMMON, *own, *variant]
-        digest = hashlib.sha256("\n".join(overrides).encode()).hexdigest()[:10]
-        name = re.sub(r"\W+", "_", f"{scene or 'run'} {name_of(variant)}")[:60]
-        return self.out / f"{name}_seed{seed}_{digest}", overrides
-
-
-def name_of(variant: Sequence[str]) -> str:
-    """A variant's name in the tables: its overrides, without values that name a folder."""
-    return _without_folders(variant) or DEFAULTS
-
-
-def _without_folders(overrides: Sequence[str]) -> str:
-    """The overrides of which published tables may speak."""
-    return " ".join(override for override in overrides if os.sep not in override.partition("=")[2])
+Row = dict[str, Any]
 
 
 def train(folder: Path, overrides: Sequence[str]) -> str | None:
@@ -94,7 +52,7 @@ def train(folder: Path, overrides: Sequence[str]) -> str | None:
     program = [sys.executable, "-m", "clear_strategies.run", "fit.baseline=false"]
     child = subprocess.run(  # noqa: S603 - this interpreter
         [*program, *overrides, f"hydra.run.dir={quoted(str(folder.resolve()))}"],
-        env=environment(), capture_output=True, text=True, errors="replace", check=False,
+        capture_output=True, text=True, errors="replace", check=False,
     )  # fmt: skip
     if child.returncode == 0:
         return None
@@ -104,70 +62,74 @@ def train(folder: Path, overrides: Sequence[str]) -> str | None:
     return (of_hydra or lines[-1:] or [f"its process ended with code {child.returncode}"])[0].strip()
 
 
-def measure(results: Results, request: Request, trainer: Trainer = train) -> None:
-    """Train what is not finished yet, and say when each variant reached the reference: a DataError if none finished."""
-    rows: list[dict[str, Any]] = []
-    probes: list[dict[str, Any]] = []
-    scenes: Sequence[str | None] = request.scene or [None]
-    reference, *others = request.variants
-    for seed, scene in itertools.product(request.seeds, scenes):
-        first = _train(results, request, (scene, reference, seed), trainer)
-        if first is None:
-            continue  # there is nothing to compare with
-        trainings = [first, *(_train(results, request, (scene, variant, seed), trainer) for variant in others)]
-        finished = [training for training in trainings if training is not None]
-        rows += [training.row(first.psnr) for training in finished]
-        probes += [
-            {**training.facts, "t": int(probe["t"]), "training_s": probe[WALL], "psnr": probe["psnr_test"]}
-            for training in finished
-            for probe in training.probes
-        ]
-    if not rows:
-        raise DataError("seconds", "trainings", "no reference finished", "see the lines above")
-    table = pd.DataFrame(rows)
-    curves = pd.DataFrame(probes)
-    results.tables |= {"seconds": summary(table), "seconds_turns": table, "seconds_probes": curves}
-    results.figures["time_against_quality"] = plots.time_against_quality(curves)
-    shared = " ".join(filter(None, (_without_folders(request.overrides), *_COMMON)))
-    results.note(
-        f"the reference is {name_of(reference)!r}; test views are evaluated {request.probes} times a run; all trainings: {shared}"
-    )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Training:
-    """A finished training.
+def measure(
+    results: Results,
+    *,
+    overrides: Sequence[str],
+    variants: Sequence[Sequence[str]],
+    scene: Sequence[str],
+    seeds: Sequence[int],
+    probes: int,
+) -> None:
+    """Train what is not finished yet, and say when each variant reached the reference.
 
     Args:
-        facts: scene, variant and seed.
-        probes: the rows of its history with the PSNR of the test views.
-        command: seconds of the whole command without the evaluations on the way, by the clock's columns.
+        overrides: of all trainings; those of a variant win over them.
+
+    Raises:
+        DataError: an override is the benchmark's own, there are too many probes, or no reference finished.
     """
+    _require_free([*overrides, *itertools.chain(*variants)])
+    if not 1 <= probes <= REFERENCE_ITERATIONS:
+        raise DataError("--probes", str(probes), f"lies outside 1 to {REFERENCE_ITERATIONS}", "give fewer")
+    shared = [*overrides, *_COMMON, f"fit.probe_every={REFERENCE_ITERATIONS // probes}"]
+    rows, curves = list[Row](), list[Row]()
+    for seed, name in itertools.product(seeds, scene or [""]):
+        own = [f"fit.seed={seed}", f"fit.threads={torch.get_num_threads()}"]
+        target: float | None = None
+        for variant in variants:
+            chosen = [*([f"+scene={name}"] if name else []), *shared, *own, *variant]
+            says = f"{name or 'run'}, {name_of(variant)}, seed {seed}"
+            folder = (results.out or Path()) / _name(says, chosen)
+            try:
+                kept = _trained(folder, chosen)
+                row, curve = read(folder, target, variant=name_of(variant), seed=seed)
+            except DataError as error:
+                results.note(f"{says}: {error}".replace(str(folder.resolve()), folder.name))
+                if target is None:
+                    break  # there is nothing to compare with
+                continue
+            target = row["target"]
+            rows.append(row)
+            curves += curve
+            took = f"{row['training_s']:.1f} s, of processors {row['training_processor_s']:.1f}{', kept' * kept}"
+            results.log(f"{says}: {row['psnr']:.2f} dB, {took}")
+    if not rows:
+        raise DataError("seconds", "trainings", "no reference finished", "see the lines above")
+    table, probed = pd.DataFrame(rows), pd.DataFrame(curves)
+    results.tables |= {"seconds": summary(table), "seconds_turns": table, "seconds_probes": probed}
+    results.figures["time_against_quality"] = figure(probed)
+    results.note(f"the reference is {name_of(variants[0])!r}; all trainings: {name_of(shared)}")
 
-    facts: Mapping[str, Any]
-    probes: Sequence[Mapping[str, float]]
-    command: Mapping[str, float]
 
-    @property
-    def psnr(self) -> float:
-        """At the end, dB."""
-        return self.probes[-1]["psnr_test"]
+def figure(curves: pd.DataFrame) -> Figure:
+    """A line per training; upper left is better."""
+    names = {"training_s": "seconds of training", "psnr": "PSNR of the test views, dB", "variant": "name"}
+    ends = ~curves.duplicated(["scene", "variant", "seed"], keep="last")
+    rows = curves.assign(line=curves["seed"], mark=curves["seed"].astype(str).where(ends, "")).rename(columns=names)
+    return plots.lines(rows[[*plots.WHO, names["training_s"], names["psnr"]]])
 
-    def row(self, target: float) -> dict[str, Any]:
-        """Its row in the table. `reached` is the iteration that first has the target, and its seconds; NaN: none has."""
-        end = self.probes[-1]
-        first = next((probe for probe in self.probes if probe["psnr_test"] >= target), {})
-        row = {**self.facts, "iterations": int(end["t"]), "psnr": self.psnr, "target": target}
-        row["reached"] = first.get("t", float("nan"))
-        for clock, suffix in ((WALL, "_s"), (PROCESSOR, "_processor_s")):
-            seconds = first.get(clock, float("nan"))
-            row |= {
-                f"training{suffix}": end[clock],
-                f"reached_training{suffix}": seconds,
-                f"command{suffix}": self.command[clock],
-                f"reached_command{suffix}": self.command[clock] - end[clock] + seconds,
-            }
-        return row
+
+def name_of(variant: Sequence[str]) -> str:
+    """A variant's name in the tables: its overrides, without values that name a folder."""
+    return " ".join(override for override in variant if os.sep not in override.partition("=")[2]) or DEFAULTS
+
+
+def _require_free(overrides: Sequence[str]) -> None:
+    for override in overrides:
+        key = override.lstrip("+~").partition("=")[0]
+        if key in _RESERVED or key.startswith(("hydra.", "hydra/")):
+            raise DataError("seconds", override, "is set by the benchmark", "leave it out, or use its options")
 
 
 def summary(trainings: pd.DataFrame) -> pd.DataFrame:
@@ -178,8 +140,7 @@ def summary(trainings: pd.DataFrame) -> pd.DataFrame:
     the reference. `_low` and `_high` are the extremes over the seeds; a seed that did not reach it is missing in all of them,
     and `seeds_reached` counts the others.
     """
-    reference = trainings.iloc[0]["variant"]
-    base = trainings[trainings["variant"] == reference].set_index(["scene", "seed"])
+    base = trainings[trainings["variant"] == trainings.iloc[0]["variant"]].set_index(["scene", "seed"])
     paired = trainings.join(base.add_suffix("_base"), on=["scene", "seed"])
     paired["psnr_over"] = paired["psnr"] - paired["psnr_base"]
     ratios = ["training", "training_processor", "command", "command_processor"]
@@ -194,29 +155,21 @@ def summary(trainings: pd.DataFrame) -> pd.DataFrame:
     return table.reset_index()
 
 
-def _train(
-    results: Results, request: Request, what: tuple[str | None, Sequence[str], int], trainer: Trainer
-) -> Training | None:
-    """Train, or read what was trained; None if that failed, with a note."""
-    scene, variant, seed = what
-    folder, overrides = request.training(scene, variant, seed)
-    says = f"{scene or 'run'}, {name_of(variant)}, seed {seed}"
-    kept = (folder / _COMMAND).is_file()  # written last
-    try:
-        if not kept:
-            before = _clocks()
-            if (problem := trainer(folder, overrides)) is not None:
-                raise DataError(folder.name, "training", problem, "see its log")
-            files.write_json(folder / _COMMAND, {name: now - before[name] for name, now in _clocks().items()})
-        training = _read(folder, {"variant": name_of(variant), "seed": seed})
-    except DataError as error:
-        results.note(f"{says}: {error}".replace(str(folder.resolve()), folder.name))
-        return None
-    end = training.probes[-1]
-    results.log(
-        f"{says}: {training.psnr:.2f} dB, {end[WALL]:.1f} s, of processors {end[PROCESSOR]:.1f}{', kept' * kept}"
-    )
-    return training
+def _name(says: str, overrides: Sequence[str]) -> str:
+    """The name of a training's folder ends in a hash of its overrides."""
+    digest = hashlib.sha256("\n".join(overrides).encode()).hexdigest()[:10]
+    return re.sub(r"\W+", "_", says)[:60] + f"_{digest}"
+
+
+def _trained(folder: Path, overrides: Sequence[str]) -> bool:
+    """Train into the folder, unless that is done; returns whether it was. A DataError says why it failed."""
+    if (folder / _COMMAND).is_file():  # written last
+        return True
+    before = _clocks()
+    if (problem := train(folder, overrides)) is not None:
+        raise DataError(folder.name, "training", problem, "see its log")
+    files.write_json(folder / _COMMAND, {name: now - before[name] for name, now in _clocks().items()})
+    return False
 
 
 def _clocks() -> dict[str, float]:
@@ -225,14 +178,24 @@ def _clocks() -> dict[str, float]:
     return {WALL: time.perf_counter(), PROCESSOR: times.children_user + times.children_system}
 
 
-def _read(folder: Path, facts: Mapping[str, Any]) -> Training:
+def read(folder: Path, target: float | None, **facts: Any) -> tuple[Row, list[Row]]:
+    """A finished training: its row in the table, and the PSNR of the test views all along.
+
+    `reached` is the iteration that first has the target, and its seconds; NaN: none has. The target is by default its own end.
+    The command's seconds are those without the evaluations on the way.
+    """
     metrics, command, rows = read_object(folder / "metrics.json"), read_object(folder / _COMMAND), history(folder)
     probes = [row for row in rows if "psnr_test" in row]
     if not probes or any(name not in probes[-1] for name in (WALL, PROCESSOR)):
         raise DataError(folder / "history.csv", "psnr_test", "has no value", "give a data set with HR test photos")
-    evaluating = {name: sum(row.get(PROBE + name, 0.0) for row in rows) for name in (WALL, PROCESSOR)}
-    return Training(
-        {"scene": metrics["scene"], **facts, "gaussians": metrics["gaussians"]},
-        probes,
-        {name: float(command[name]) - seconds for name, seconds in evaluating.items()},
-    )
+    end, shared = probes[-1], {"scene": metrics["scene"], **facts, "gaussians": metrics["gaussians"]}
+    target = end["psnr_test"] if target is None else target
+    first = next((probe for probe in probes if probe["psnr_test"] >= target), {})
+    row = {**shared, "iterations": int(end["t"]), "psnr": end["psnr_test"], "target": target}
+    row["reached"] = first.get("t", float("nan"))
+    for clock, suffix in ((WALL, "_s"), (PROCESSOR, "_processor_s")):
+        seconds = first.get(clock, float("nan"))
+        whole = float(command[clock]) - sum(other.get(PROBE + clock, 0.0) for other in rows)
+        row |= {f"training{suffix}": end[clock], f"reached_training{suffix}": seconds}
+        row |= {f"command{suffix}": whole, f"reached_command{suffix}": whole - end[clock] + seconds}
+    return row, [{**shared, "t": int(p["t"]), "training_s": p[WALL], "psnr": p["psnr_test"]} for p in probes]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pandas as pd
 import torch
@@ -31,7 +31,7 @@ from clear_strategies.settings import build
 _CLOSE: Final = (0.03, 0.10)  # relative errors of depth whose shares the table gives
 
 
-def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
+def measure(results: Results, *, overrides: Sequence[str]) -> None:
     """Fill `results` with a row for each training photo, and one for all of them together.
 
     Raises:
@@ -47,15 +47,11 @@ def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
     maps = depth_maps(photos, features.means, data.cloud.stereo, capture.background)
     end = time.perf_counter()
     errors = [_errors(capture, *of_view) for of_view in zip(frames, photos, maps, strict=True)]
-    rows: list[dict[str, Any]] = [
-        {"view": Path(frame.name).stem, "coverage": found.coverage, **_shares(*of_view)}
-        for frame, found, of_view in zip(frames, maps, errors, strict=True)
-    ]
-    known = torch.cat([error for error, _ in errors])
     asked = sum(total for _, total in errors)
-    coverage = sum(m.coverage for m in maps) / len(maps)
-    rows.append({"view": "all", "coverage": coverage, **_shares(known, asked)})
-    results.tables["stereo"] = pd.DataFrame(rows)
+    names, coverage = [Path(frame.name).stem for frame in frames], [m.coverage for m in maps]
+    found = [*errors, (torch.cat([error for error, _ in errors]), asked)]
+    of_views = zip([*names, "all"], [*coverage, sum(coverage) / len(maps)], found, strict=True)
+    results.tables["stereo"] = pd.DataFrame({"view": view, "coverage": c, **_shares(*e)} for view, c, e in of_views)
     size = f"{photos[0].camera.width}x{photos[0].camera.height}"
     results.note(
         f"{capture.name}, {len(photos)} photos, the first of {size}: depth in {end - triangulated:.1f} s after "
@@ -67,10 +63,8 @@ def measure(results: Results, *, overrides: Sequence[str] = ()) -> None:
 
 def _shares(known: Float[Tensor, " K"], asked: int) -> dict[str, float]:
     """Reference points, the share of them where depth is known, and the shares of these within each relative error."""
-    result = {"points": float(asked), "known": len(known) / asked if asked else float("nan")}
-    for limit in _CLOSE:
-        result[f"within {limit:.0%}"] = float((known <= limit).double().mean())
-    return result
+    within = {f"within {limit:.0%}": float((known <= limit).double().mean()) for limit in _CLOSE}
+    return {"points": float(asked), "known": len(known) / asked if asked else float("nan"), **within}
 
 
 def _errors(capture: Capture, frame: Frame, photo: Photo, found: DepthMap) -> tuple[Float[Tensor, " K"], int]:

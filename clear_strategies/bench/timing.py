@@ -27,19 +27,15 @@ def milliseconds(work_log: WorkLog) -> dict[str, float]:
     return {name: 1e3 * entry.seconds for name, entry in work_log.entries.items()}
 
 
-def interleaved(
-    contenders: Mapping[str, Contender], repeats: int, *, device: str = "cpu", label: str = ""
-) -> pd.DataFrame:
+def interleaved(contenders: Mapping[str, Contender], repeats: int, *, device: str, label: str) -> pd.DataFrame:
     """Time the contenders round robin; one row for each stage of each turn."""
-    rows, warm_ups = [], WARM_UPS[device]
-    with tqdm(total=len(contenders) * (warm_ups + repeats), desc=label, unit="turn", leave=False) as progress:
-        for turn in range(-warm_ups, repeats):
-            for name, contender in contenders.items():
-                ms = contender()
-                progress.update()
-                if turn >= 0:
-                    rows += [{"contender": name, "turn": turn, "stage": s, "ms": value} for s, value in ms.items()]
-    return pd.DataFrame(rows, columns=["contender", "turn", "stage", "ms"])
+    rows = [
+        {"contender": name, "turn": turn, "stage": stage, "ms": ms}
+        for turn in tqdm(range(-WARM_UPS[device], repeats), desc=label, unit="turn", leave=False)
+        for name, contender in contenders.items()
+        for stage, ms in contender().items()
+    ]
+    return pd.DataFrame(rows).query("turn >= 0")
 
 
 def medians(turns: pd.DataFrame) -> pd.DataFrame:

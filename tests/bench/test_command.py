@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
-from clear_strategies.bench import plots, rasterizers
+from clear_strategies.bench import rasterizers
 from clear_strategies.bench.__main__ import main
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -28,9 +28,10 @@ def test_rasterizers_writes_every_stage_both_errors_a_figure_and_the_machine(tmp
     assert list(error["truth"]) == [rasterizers.SAME, rasterizers.NONE]
     assert error["means_relative"][0] < 1e-4 < error["means_relative"][1]
     assert (out / "time_against_error.png").stat().st_size > 5_000
-    machine = json.loads((out / "rasterizers.json").read_text())["machine"]
-    assert {"date", "platform", "python", "torch", "nvidia_gpu_models"} <= set(machine)
-    assert str(tmp_path) not in json.dumps(machine)
+    facts = json.loads((out / "rasterizers.json").read_text())
+    assert facts["options"] == {"device": "cpu", "repeats": 1}
+    assert {"date", "platform", "python", "torch", "nvidia_gpu_models"} <= set(facts["machine"])
+    assert str(tmp_path) not in json.dumps(facts)
     assert "forward_ms" in capsys.readouterr().out
 
 
@@ -54,6 +55,7 @@ NO_GPU = pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
         (["rasterizers", "--scene", "tiny", "--backend", "cuda"], "cuda: is no backend"),
         (["iteration", "--scene", "nowhere"], "nowhere: is no scene"),
         (["seconds", "fit.seed=3", "--variant"], "fit.seed=3: is set by the benchmark"),
+        (["seconds", "--probes", "30001", "--variant"], "30001: lies outside 1 to"),
         (["stereo", "data=nowhere"], "data=nowhere"),
         (["errors", "nowhere"], "has neither a checkpoint nor a point_cloud.ply"),
         pytest.param(["rasterizers", "--device", "cuda"], "no such device", marks=NO_GPU),
@@ -84,6 +86,6 @@ def test_the_page_links_to_every_published_table_and_a_figure_is_drawn_from_them
     data = DOCS / "data" / "benchmarks"
     linked = set(re.findall(r"\(\.\./data/benchmarks/(\w+\.csv)\)", (DOCS / "explanation/benchmarks.md").read_text()))
     assert linked == {path.name for path in data.glob("*.csv")}
-    tables = {path.stem: pd.read_csv(path) for path in data.glob("*.csv")}
-    figure = plots.time_against_error(tables["rasterizers_time"], tables["rasterizers_error"])
+    time, error = (pd.read_csv(data / f"rasterizers_{table}.csv") for table in ("time", "error"))
+    figure = rasterizers.figure(time, error)
     assert [axis.get_title() for axis in figure.axes] == ["small", "s100k", "s100k-lr", "garden", "s500k"]

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from clear_strategies.bench.__main__ import main
-from clear_strategies.bench.error_budget import HeldOut, budget, by_view, distance_from_hull, waves
+from clear_strategies.bench.errors import HeldOut, budget, by_view, distance_from_hull, waves
 from clear_strategies.jobs import job
 from tests.helpers.configs import composed
 
@@ -34,7 +34,7 @@ def test_a_constant_error_is_bias_and_the_finest_stripes_are_beyond_the_lr_photo
     stripes[:, ::2] *= -1
     finest = waves(stripes, 4)
     assert finest["under 8 px, beyond LR"] > 0.95 * sum(finest.values())
-    slow = waves((torch.arange(256) / 256 * 2 * math.pi / 1).cos().expand(64, 256)[..., None] * torch.ones(3), 4)
+    slow = waves((torch.arange(256) / 256 * 2 * math.pi).cos().expand(64, 256)[..., None] * torch.ones(3), 4)
     assert slow["over 128 px"] > 0.95 * sum(slow.values())
 
 
@@ -81,5 +81,4 @@ def test_the_command_reads_a_run_and_finds_its_own_psnr(tmp_path, capsys):
     assert views["run: psnr"].mean() == pytest.approx(psnr, abs=1e-3)
     assert views["run: psnr"].equals(views["reference: psnr"])
     assert len(pd.read_csv(tmp_path / "out" / "errors.csv")) == 15
-    assert (tmp_path / "out" / "errors.png").stat().st_size > 5_000
     assert "if perfect" in capsys.readouterr().out

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
 import rasterizers
 from clear_strategies.bench import iteration, scenes
-from clear_strategies.errors import DataError
 from clear_strategies.outputs.formats import export_ply
 from tests.helpers import toy
 
@@ -35,28 +33,6 @@ def test_a_generated_scene_has_its_stated_statistics():
     assert spread == pytest.approx(math.exp(0.8 * 1.2816), rel=0.05)  # lognormal, σ = 0.8
     assert float(splats.opacities.median()) == pytest.approx(1 / (1 + math.exp(-0.8)), abs=0.02)
     assert splats.shN.shape == (20_000, 15, 3)
-
-
-def test_the_lr_scene_holds_the_same_gaussians():
-    hr, lr = scenes.load("s100k"), scenes.load("s100k-lr")
-    assert torch.equal(lr.splats.means, hr.splats.means)
-    assert (lr.camera.width, lr.camera.height) == (252, 189)
-
-
-def test_the_garden_is_made_of_its_points(tmp_path):
-    g = np.random.default_rng(0)
-    file = tmp_path / "test_garden.npz"
-    np.savez(
-        file, means3d=g.normal(size=(50, 3)).astype(np.float32), colors=g.integers(0, 255, (50, 3), np.uint8),
-        viewmats=np.eye(4, dtype=np.float32)[None], Ks=np.eye(3, dtype=np.float32)[None] * 20, width=64, height=48,
-    )  # fmt: skip
-    found = scenes.load("garden", file)
-    assert (len(found.splats), found.camera.width) == (50, 64)
-    file.write_bytes(b"not an archive")
-    with pytest.raises(DataError, match="is not the garden"):
-        scenes.load("garden", file)
-    with pytest.raises(DataError, match="--data"):
-        scenes.load("garden")
 
 
 def test_an_exported_field_is_drawn_as_the_field_draws_itself(tmp_path):
