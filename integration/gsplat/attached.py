@@ -112,7 +112,7 @@ class Attached:
 
     def wrap(self, rasterization: Rasterization) -> Rasterization:
         """`rasterization` that renders training views at both scales, and shows f_det in renderings without gradients."""
-        if hasattr(rasterization, _ATTACHED):
+        if (by := getattr(rasterization, _ATTACHED, None)) is not None and not by.attachment.removed:
             raise HostError("this rasterization is wrapped already; remove() the attachment that wrapped it first.")
         signature = inspect.signature(rasterization)
         var_keyword = [name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD]
