@@ -94,6 +94,7 @@ class Attached:
         self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).to(means)
         self._named: View | None = None  # by `rendering`, if it was called
         self._found_by_pose = True
+        self._colors_are_bands = False  # whether the loop has drawn spherical harmonics; RGB then is something else
         self._replaced: list[Replaced] = []
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
@@ -127,7 +128,7 @@ class Attached:
             call = signature.bind(*args, **kwargs).arguments
             for name in var_keyword:
                 call |= call.pop(name, {})
-            if self.attachment.removed:
+            if self.attachment.removed or not self._draws_colors(call):
                 return rasterization(**call)
             if not torch.is_grad_enabled():
                 return rasterization(**self._with_detail(call, trained=False))
@@ -146,7 +147,7 @@ class Attached:
     @contextmanager
     def rendering(self, view: View | None) -> Iterator[None]:
         """Renderings with gradients are those of this view, whatever their pose (pose optimization, pose noise); None: of no
-        training view, e.g. a second pass for normals.
+        training view, e.g. a second pass for normals, which f_det is then not added to.
         """
         before = self._named, self._found_by_pose
         self._named, self._found_by_pose = view, False
@@ -198,6 +199,15 @@ class Attached:
         change = self._rows.poll()
         return None if change is None else change.parents
 
+    def _draws_colors(self, call: Mapping[str, Any]) -> bool:
+        """Whether a call draws the colours of the scene, and not its depth alone, its normals or other features."""
+        as_bands = call.get("sh_degree") is not None
+        self._colors_are_bands |= as_bands
+        if "RGB" not in call.get("render_mode", "RGB") or call["colors"].shape[-1] != 3:
+            return False
+        of_no_photo = self._named is None and not self._found_by_pose
+        return as_bands or not (self._colors_are_bands or of_no_photo)
+
     def _find_view(self, viewmats: Float[Tensor, "*C 4 4"]) -> View | None:
         poses = viewmats.detach().reshape(-1, 4, 4)
         if len(poses) != 1:
@@ -216,6 +226,11 @@ class Attached:
         self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None
     ) -> HostRendering:  # fmt: skip
         call, params = {**arguments, **self._background(arguments)}, self.params()
+        if len(call["means"]) != len(params["means"]):
+            raise HostError(
+                f"{view.name} is rendered with {len(call['means']):,} of {len(params['means']):,} Gaussians, and it is unknown "
+                "which. Render all of them, or for a pass that shows a part: with clear.rendering(None): …"
+            )
         if gate is not None:
             call["opacities"] = call["opacities"] * gate.to(call["opacities"])
         if target == "hr":

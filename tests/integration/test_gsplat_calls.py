@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-from clear_strategies import Conductor
+import functools
+from contextlib import nullcontext
+
+import pytest
+import torch
+
+from clear_strategies import P2G, Conductor
+from integration import HostError
 from integration.gsplat import attach
+from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
 from tests.helpers.inria import HR_FROM_START
 from tests.integration.test_gsplat import started
@@ -17,3 +25,59 @@ def test_a_function_is_wrapped_again_once_the_attachment_that_wrapped_it_is_remo
     second = attach(host.splats, host.optimizers, scene.train, Conductor(objective=HR_FROM_START))
     gsplat_host.drawn(second.wrap(wrapped), host.splats, scene.train[0].lr.camera)[0].mean().backward()
     assert (first.attachment.counts["merges"], second.attachment.counts["merges"]) == (0, 1)
+
+
+def with_detail():
+    """A wrapped function of a host whose f_det is 0.2, its Gaussians, CLEAR, and the camera of a photo."""
+    host, clear, _ = started((P2G(patch=4),))
+    host.splats["detail"].data += 0.2
+
+    @functools.wraps(autograd.rasterization)
+    def function(*args, render_mode="RGB", **kwargs):
+        image, alpha, info = gsplat_host.rasterization(*args, **kwargs)
+        return (image if "RGB" in render_mode else alpha), alpha, info
+
+    return function, host.splats, clear, toy.scene(20).train[0].lr.camera
+
+
+def features(function, splats, camera, colors):
+    p = splats
+    view = camera.world_to_camera[None], gsplat_host.intrinsics(camera), camera.width, camera.height
+    return function(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), colors, *view)[0]
+
+
+@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("grad", [True, False])
+def test_normals_beside_the_photo_have_no_detail_feature(named, grad):
+    function, splats, clear, camera = with_detail()
+    rasterization = clear.wrap(function)
+    gsplat_host.drawn(rasterization, splats, camera)[0].mean().backward()
+    normals = torch.nn.functional.normalize(splats["means"].detach())
+    with clear.rendering(None) if named else nullcontext(), torch.set_grad_enabled(grad):
+        image = features(rasterization, splats, camera, normals)
+    assert torch.equal(image, features(function, splats, camera, normals))
+    assert clear.attachment.counts["LR renders"] == 1
+
+
+def test_a_depth_pass_of_a_photo_is_part_of_its_step():
+    function, splats, clear, camera = with_detail()
+    rasterization = clear.wrap(function)
+    image = gsplat_host.drawn(rasterization, splats, camera)[0]
+    depth = gsplat_host.drawn(rasterization, splats, camera, render_mode="ED")[0]
+    (image.mean() + depth.mean()).backward()
+    assert clear.attachment.counts["LR renders"] == clear.attachment.counts["merges"] == 1
+
+
+def test_colours_of_a_loop_without_spherical_harmonics_have_the_detail_feature():
+    function, splats, clear, camera = with_detail()
+    rasterization, colors = clear.wrap(function), torch.rand(20, 3)
+    with torch.no_grad():
+        image = features(rasterization, splats, camera, colors)
+    assert torch.equal(image, features(function, splats, camera, colors + splats["detail"]).detach())
+
+
+def test_a_photo_rendered_with_a_part_of_the_gaussians_is_refused():
+    function, splats, clear, camera = with_detail()
+    part = {name: p[:7] for name, p in splats.items()}
+    with pytest.raises(HostError, match="view0 is rendered with 7 of 20 Gaussians"):
+        gsplat_host.drawn(clear.wrap(function), part, camera)
