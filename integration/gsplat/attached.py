@@ -31,6 +31,9 @@ from rasterizers.interface import Camera
 
 _ATTACHED: Final = "clear_attached"  # attribute of a wrapped function: its Attached
 _SAME_POSE: Final = 1e-3  # largest difference between the entries of two poses of one camera
+_CLEARLY: Final = (
+    10  # times as far as the nearest pose must the next be: frames of a slow video lie closer than _SAME_POSE
+)
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
@@ -215,12 +218,13 @@ class Attached:
                 f"only one view per step is supported, got {len(poses)}. Set batch_size=1, or call joint_loss for each view "
                 "and average."
             )
-        distance = (self._poses - poses).abs().amax((1, 2))
-        same = (distance <= _SAME_POSE * max(1.0, float(poses.abs().max()))).nonzero()[:, 0].tolist()
-        if len(same) > 1:
-            names = " and ".join(self._views[i].name for i in same[:2])
+        distances = (self._poses - poses).abs().amax((1, 2)).tolist()
+        tolerance = _SAME_POSE * max(1.0, float(poses.abs().max()))
+        near = sorted((distance, i) for i, distance in enumerate(distances) if distance <= tolerance)
+        if len(near) > 1 and near[1][0] <= _CLEARLY * near[0][0]:
+            names = " and ".join(self._views[i].name for _, i in near[:2])
             raise HostError(f"{names} have the same pose. Say which is rendered: with clear.rendering(view): …")
-        return self._views[same[0]] if same else None
+        return self._views[near[0][1]] if near else None
 
     def _render(
         self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None

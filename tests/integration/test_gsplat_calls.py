@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import functools
 from contextlib import nullcontext
+from dataclasses import replace
 
 import pytest
 import torch
 
 from clear_strategies import P2G, Conductor
+from clear_strategies.core.view import View
 from integration import HostError
 from integration.gsplat import attach
 from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
+from tests.helpers.gsplat_host import Host
 from tests.helpers.inria import HR_FROM_START
 from tests.integration.test_gsplat import started
 
@@ -81,3 +84,21 @@ def test_a_photo_rendered_with_a_part_of_the_gaussians_is_refused():
     part = {name: p[:7] for name, p in splats.items()}
     with pytest.raises(HostError, match="view0 is rendered with 7 of 20 Gaussians"):
         gsplat_host.drawn(clear.wrap(function), part, camera)
+
+
+@pytest.mark.parametrize("origin", [0.0, 3e5], ids=["near the origin", "in coordinates of a map"])
+def test_cameras_that_lie_close_together_are_told_apart(origin):
+    host, scene = Host(toy.scene(20)), toy.scene(20)
+    step = 5e-4 if origin == 0 else 0.5
+    poses = [scene.train[0].lr.camera.world_to_camera.clone() for _ in range(3)]
+    views = []
+    for i, pose in enumerate(poses):
+        pose[0, 3] += origin + i * step
+        at = [
+            replace(p, camera=replace(p.camera, world_to_camera=pose)) for p in (scene.train[0].lr, scene.train[0].hr)
+        ]
+        views.append(View(f"frame{i}", *at))
+    clear = attach(host.splats, host.optimizers, views, Conductor())
+    for view in views:
+        rounded = torch.linalg.inv(torch.linalg.inv(view.lr.camera.world_to_camera))[None]
+        assert clear._find_view(rounded) is view
