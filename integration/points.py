@@ -54,7 +54,7 @@ def stereo_points(photos: Sequence[HostPhoto]) -> PointCloud:
     """
     posed = [photo.posed for photo in photos]
     found = stereo(
-        [photo.image.clamp(0, 1) for photo in posed],
+        [photo.image for photo in posed],
         torch.stack([photo.camera.world_to_camera for photo in posed]) if posed else torch.zeros(0, 4, 4),
         torch.stack([intrinsics(photo.camera) for photo in posed]) if posed else torch.zeros(0, 3, 3),
         masks=[None if photo.mask is None else photo.mask >= 0.5 for photo in photos],

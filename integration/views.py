@@ -71,7 +71,7 @@ class HostPhoto:
         h, w = image.shape[:2]
         (fx, _, cx), (_, fy, cy), _ = self.K.tolist()
         pose = self.world_to_camera.detach().float().cpu()  # cameras stay there, see `Photo.to`
-        return Photo(Camera(pose, fx, fy, cx, cy, w, h), image[..., :3])
+        return Photo(Camera(pose, fx, fy, cx, cy, w, h), image[..., :3].clamp(0, 1))  # reduced photos may overshoot
 
     def view(self, sr: SuperResolve, factor: int) -> View:
         """See `view`."""

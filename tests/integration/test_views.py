@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from clear_strategies import P2G
 from clear_strategies.errors import DataError, SettingError
 from integration.views import by_name, view
 from tests.helpers import toy
@@ -36,6 +37,12 @@ def test_an_sr_image_may_overshoot_but_not_have_other_values():
     assert float(of_host(sr=lambda *a: torch.full((64, 96, 3), 1.03)).hr.image.max()) == 1
     with pytest.raises(DataError, match=r"SR image: must lie in \[0, 1\], has values from 200 to 200"):
         of_host(sr=lambda *a: torch.full((64, 96, 3), 200.0))
+
+
+def test_a_photo_that_overshoots_since_it_was_reduced_is_compared_in_its_range():
+    sharp = of_host(image=1.1 * PHOTO.image - 0.03)
+    assert float(sharp.lr.image.min()) >= 0
+    P2G(patch=4).patch_maps(sharp)
 
 
 @pytest.mark.parametrize(
