@@ -18,8 +18,15 @@ _EPS: Final = 1e-15  # Adam's, as in 3DGS: gradients of mean losses are near 1e-
 
 
 def detail_adam(detail: torch.nn.Parameter, rates: DetailRates) -> torch.optim.Adam:
-    """An Adam for f_det."""
-    return torch.optim.Adam([detail], lr=rates.rate, eps=_EPS)
+    """An Adam for f_det. A loop that tells its optimizers which Gaussians the photo shows (gsplat's SelectiveAdam) may tell this
+    one, too: it steps all of them, since others are visible at HR.
+    """
+    adam = torch.optim.Adam([detail], lr=rates.rate, eps=_EPS)
+    adam.register_step_pre_hook(lambda _, args, kwargs: (
+        tuple(value for value in args if not isinstance(value, Tensor)),
+        {name: value for name, value in kwargs.items() if name != "visibility"},
+    ))  # fmt: skip
+    return adam
 
 
 def sh0_offset(detail: Float[Tensor, "N 3"], sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:

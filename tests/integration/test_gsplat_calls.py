@@ -102,3 +102,12 @@ def test_cameras_that_lie_close_together_are_told_apart(origin):
     for view in views:
         rounded = torch.linalg.inv(torch.linalg.inv(view.lr.camera.world_to_camera))[None]
         assert clear._find_view(rounded) is view
+
+
+@pytest.mark.parametrize("by_name", [False, True])
+def test_the_detail_feature_is_trained_in_a_loop_that_tells_every_optimizer_what_is_visible(by_name):
+    host, _, render = started()
+    render(0).mean().backward()
+    visibility = torch.zeros(20, dtype=torch.bool)
+    host.optimizers["detail"].step(visibility=visibility) if by_name else host.optimizers["detail"].step(visibility)
+    assert float(host.splats["detail"].detach().abs().max()) > 0
