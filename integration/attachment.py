@@ -108,6 +108,7 @@ class Attachment:
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(conductor, params)
         self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
+        self._versions_before: list[tuple[int, int]] = []
         self._logged: dict[str, deferred.Number] = {}
         self._hooks: list[Any] = []
         conductor.on_fit_start(len(views), seed, params()["means"].device, views)
@@ -228,6 +229,9 @@ class Attachment:
                 "the host makes its first optimizer step, but none of its renderings was recognised as that of a training "
                 "view, so that no strategy would take part. Check that the training loop renders with the function that "
                 "was replaced, and with the cameras that were passed."
+                if self._pending is None
+                else "the host makes its first optimizer step, but no backward() has given the Gaussians a gradient, so that no "
+                "strategy would take part. Take the gradients by loss.backward(), not by torch.autograd.grad."
             )
         if merges == self._merges_before_step:
             self.counts["steps of the host alone"] += 1
@@ -280,9 +284,10 @@ class Attachment:
             raise HostError(
                 "one backward pass reaches two renderings of training views, but each is merged by itself. With several views "
                 "for a step, call backward() after each rendering and set accumulation=, or use joint_loss. For a second pass "
-                "over the same view, e.g. for normals: with attached.rendering(None): …"
+                "over the same view, call the function that was wrapped, its __wrapped__."
             )
         self._grads_before = {name: p.grad.clone() for name, p in self.params().items() if p.grad is not None}
+        self._versions_before = self._grad_versions()
         centres = self._pending[1].shot.gradient_slot.tensor
         screen_gradients: list[Tensor] = []
         if centres.requires_grad:
@@ -297,8 +302,11 @@ class Attachment:
 
     @torch.no_grad()
     def _merge(self, screen_gradient: Tensor | None) -> None:
-        """The host's backward pass has ended: replace its gradients by the merged ones."""
-        if self._pending is None:
+        """The host's backward pass has ended: replace its gradients by the merged ones.
+
+        A pass that leaves every `.grad` as it was (`torch.autograd.grad`, `backward(inputs=…)`) asks for something else.
+        """
+        if self._pending is None or ((now := self._grad_versions()) and now == self._versions_before):
             return
         (_, rendering, hr_grads), self._pending = self._pending, None
         grad_scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
@@ -331,6 +339,11 @@ class Attachment:
             now = self.log
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
             _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
+
+    def _grad_versions(self) -> list[tuple[int, int]]:
+        """What changes with every gradient of the Gaussians; empty where all of them are frozen."""
+        trained = [p.grad for name, p in self.params().items() if p.requires_grad and name != "detail"]
+        return [(0, 0) if g is None else (id(g), g._version) for g in trained]
 
     def _grad_of_this_pass(self, name: str, p: Tensor) -> Tensor:
         if p.grad is None or p.grad.is_sparse:

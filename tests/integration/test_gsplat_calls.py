@@ -111,3 +111,35 @@ def test_the_detail_feature_is_trained_in_a_loop_that_tells_every_optimizer_what
     visibility = torch.zeros(20, dtype=torch.bool)
     host.optimizers["detail"].step(visibility=visibility) if by_name else host.optimizers["detail"].step(visibility)
     assert float(host.splats["detail"].detach().abs().max()) > 0
+
+
+def test_gradients_that_a_loop_asks_for_beside_its_backward_pass_leave_the_merge_to_it():
+    merged = []
+    for asks in (False, True):
+        host, clear, render = started()
+        for i in range(2):  # the second with gradients of the first, which are not zeroed
+            image = render(i)
+            if asks:
+                torch.autograd.grad(image.square().mean(), host.splats["means"], retain_graph=True)
+            image.mean().backward()
+        merged.append({name: p.grad for name, p in host.splats.items() if p.grad is not None})
+        assert clear.attachment.counts["merges"] == 2
+    assert all(torch.equal(g, merged[1][name]) for name, g in merged[0].items())
+
+
+def test_a_loop_without_backward_is_refused():
+    host, _, render = started()
+    host.splats["means"].grad = torch.autograd.grad(render(0).mean(), host.splats["means"])[0]
+    with pytest.raises(HostError, match=r"by loss\.backward"):
+        host.optimizers["means"].step()
+
+
+def test_a_second_pass_by_the_function_that_was_wrapped_stands_beside_the_photo():
+    host, clear, _ = started()
+    rasterization, camera = clear.wrap(gsplat_host.rasterization), toy.scene(20).train[0].lr.camera
+    first = gsplat_host.drawn(rasterization, host.splats, camera)[0]
+    with pytest.raises(HostError, match="its __wrapped__"):
+        (first.mean() + gsplat_host.drawn(rasterization, host.splats, camera)[0].mean()).backward()
+    first = gsplat_host.drawn(rasterization, host.splats, camera)[0]
+    (first.mean() + gsplat_host.drawn(rasterization.__wrapped__, host.splats, camera)[0].mean()).backward()
+    assert clear.attachment.counts["merges"] == 1
