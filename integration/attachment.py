@@ -47,6 +47,7 @@ from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 _LOGGED_EVERY: Final = 500  # merges between two lines of the log
+_PATIENCE: Final = 10  # gradients of f_det without a step on any of them, before a warning
 
 
 class Attachment:
@@ -104,6 +105,7 @@ class Attachment:
         self._n = len(params()["means"])
         self._passes = 0  # backward passes of this iteration
         self._merges_before_step = 0  # at the host's last step
+        self._detail_gradients = 0
         self._pending: tuple[int, HostRendering, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(conductor, params)
@@ -324,6 +326,11 @@ class Attachment:
             # Without HR the gradient of f_det is 0 and not None, so that its Adam counts every step.
             g = merged.grads[name] * grad_scale if name in merged.grads else torch.zeros_like(p)
             p.grad = (g + self._grads_before[name] if name in self._grads_before else g).to(p)
+        λ = self.conductor.objective.lambda_hr(self.t)
+        if λ > 0 and "detail" in merged.grads:
+            self._detail_gradients += 1
+            if self._detail_gradients == _PATIENCE * self.accumulation and self.conductor.detail.rate > 0:
+                _warn_if_untrained(trained["detail"])
         if screen_gradient is not None and hr_grads is not None:
             scores = partial(self.conductor.scores, hr=hr_grads, t=self.t)
             if write_score(rendering.shot, screen_gradient / grad_scale, scores, self._scaler, grad_scale):
@@ -331,7 +338,6 @@ class Attachment:
         self._grads_before = {}
         self._passes += 1
         self.counts["merges"] += 1
-        λ = self.conductor.objective.lambda_hr(self.t)
         losses = {} if hr_grads is None else hr_grads.losses
         self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **self.conductor.logs()}
         self._logged |= conflict_columns(merged.conflict)
@@ -352,3 +358,11 @@ class Attachment:
                 "rasterization(sparse_grad=False)."
             )
         return p.grad - self._grads_before[name] if name in self._grads_before else p.grad
+
+
+def _warn_if_untrained(detail: Tensor) -> None:
+    if not bool(detail.any()):
+        _log.warning(
+            "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail; "
+            "attach adds it to the dictionary of optimizers.", _PATIENCE,
+        )  # fmt: skip

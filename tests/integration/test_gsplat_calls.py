@@ -143,3 +143,13 @@ def test_a_second_pass_by_the_function_that_was_wrapped_stands_beside_the_photo(
     first = gsplat_host.drawn(rasterization, host.splats, camera)[0]
     (first.mean() + gsplat_host.drawn(rasterization.__wrapped__, host.splats, camera)[0].mean()).backward()
     assert clear.attachment.counts["merges"] == 1
+
+
+@pytest.mark.parametrize("stepped", [True, False])
+def test_a_detail_feature_that_no_optimizer_steps_on_gives_a_warning(stepped, caplog):
+    host, _, render = started()
+    for i in range(12):
+        render(i % 3).mean().backward()
+        if stepped:
+            host.optimizers["detail"].step()
+    assert caplog.text.count("f_det has no effect") == (0 if stepped else 1)
