@@ -9,6 +9,7 @@ border of a training camera with a wider field: at a small weight, so that what 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -30,7 +31,7 @@ _BORDERS: Final = "borders"
 _KNOWN: Final = "known"
 _SEED: Final = "seed"
 _BORDER_SHARE: Final = 4  # of so many extra views one is a training camera with a wider field
-_TOGETHER: Final = 16_000_000  # pixels of all pseudo views, 16 bytes each
+_TOGETHER: Final = 16_000_000  # pixels of all pseudo views, and of all borders, 16 bytes each
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,8 @@ class PseudoViews(Strategy):
         continued: weight of the pixels that no photo tells, in [0, 1], as a multiple of `weight`: they continue the colours
             around them smoothly. 0: they count nothing, and no border is shown.
         border: width of the training cameras' field, at least 1, where they show the continued border of their photos, as a
-            multiple of the photo's. 1: no border is shown.
+            multiple of the photo's. 1: no border is shown. Of many photos only every second, third … shows its border, so
+            that they have at most 16 million pixels together.
         max_pixels: larger photos are first reduced by a whole factor; bounds the time of an iteration. 250,000: where depth is
             that of HR photos of 504x376 pixels, half of their size costs 0.3 dB.
 
@@ -99,7 +101,9 @@ class PseudoViews(Strategy):
         made = self._moved_aside(views, photos)
         borders = []
         if self.continued > 0 and self.border > 1:
-            borders = border_views(photos.values(), field=self.border, max_pixels=self.max_pixels)
+            fit = max(1, math.floor(_TOGETHER / (self._pixels(photos) * self.border**2)))
+            some = list(photos.values())[:: math.ceil(len(photos) / fit)]
+            borders = border_views(some, field=self.border, max_pixels=self.max_pixels)
         if not made:
             left = "only shows the borders of the photos" if borders else "has no effect"
             _log.warning("PseudoViews %s: stereo finds depth in fewer than two of %d photos.", left, len(photos))
@@ -110,20 +114,20 @@ class PseudoViews(Strategy):
     def _moved_aside(self, views: Sequence[View], photos: dict[str, Photo]) -> list[PseudoView]:
         if len(photos) < 2:
             return []
-        largest = max(
-            photo.camera.width * photo.camera.height // photo.factor_to(self.max_pixels) ** 2
-            for photo in photos.values()
-        )
         return pseudo_views(
             photos,
             _depths(views, photos),
-            count=max(1, min(self.count, _TOGETHER // largest)),
+            count=max(1, min(self.count, _TOGETHER // self._pixels(photos))),
             reach=self.reach,
             tolerance=self.tolerance,
             max_pixels=self.max_pixels,
             background=views[0].background,
             seed=self.cache[_SEED],
         )
+
+    def _pixels(self, photos: dict[str, Photo]) -> int:
+        """Of the largest photo, reduced to `max_pixels`."""
+        return max(p.camera.width * p.camera.height // p.factor_to(self.max_pixels) ** 2 for p in photos.values())
 
     def _target(self, view: PseudoView, background: Color) -> ExtraView:
         weight = torch.where(view.known, 1.0, self.continued if bool(view.known.any()) else 0.0) * self.weight

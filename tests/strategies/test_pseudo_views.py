@@ -28,7 +28,9 @@ def prepared(views, settings=FEW, seed=5):
 def test_large_photos_get_fewer_views_so_that_all_of_them_fit_into_memory(monkeypatch):
     photo = with_depth(SCENE).train[0].lr.camera
     monkeypatch.setattr("clear_strategies.strategies.pseudo_views._TOGETHER", 3 * photo.width * photo.height)
-    assert prepared(with_depth(SCENE).train).summary().startswith("3 beside the training cameras")
+    summary = prepared(with_depth(SCENE).train).summary()
+    assert summary.startswith("3 beside the training cameras")
+    assert "1 with a field 1.3 times as wide" in summary
 
 
 def test_one_comes_every_nth_iteration_and_the_choice_is_a_function_of_seed_and_iteration():
