@@ -113,7 +113,10 @@ class Attached:
 
         @functools.wraps(render)
         def wrapped(viewpoint_camera: Any, pc: Any, *args: Any, **kwargs: Any) -> Any:
-            if self.attachment.removed or pc is not self._model:
+            other_colors = (
+                kwargs.get("override_color") is not None
+            )  # depth or normals in place of the model's: no photo
+            if self.attachment.removed or pc is not self._model or other_colors:
                 return render(viewpoint_camera, pc, *args, **kwargs)
             view = self.views.find(viewpoint_camera) if torch.is_grad_enabled() else None
             if view is None:  # evaluation, a viewer, a camera without a photo

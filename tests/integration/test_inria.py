@@ -122,6 +122,15 @@ def run_once(host, folder, *strategies, **settings):
     return grads, clear
 
 
+def test_other_colours_in_place_of_the_models_are_no_rendering_of_a_photo(inria_attached):
+    clear, gaussians, scene = inria_attached()
+    seen = []
+    wrapped = clear.wrap(lambda camera, pc, override_color=None: seen.append(pc))
+    wrapped(scene.cameras[0], gaussians, override_color=gaussians.get_xyz)
+    assert seen == [gaussians]
+    assert not clear.attachment.counts
+
+
 @pytest.mark.parametrize("step_first", [False, True], ids=["densify, step", "step, densify"])
 def test_everything_follows_the_densifier_before_or_after_the_step(step_first, inria_host, inria_capture):
     strategies = (GCO(), P2G(patch=4), SVS(dropout=Ramp(maximum=0.2, full=30), anchor_start=24, anchor_strength=0.01))
