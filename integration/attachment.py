@@ -37,6 +37,7 @@ from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients, only
+from integration.detail import PATIENCE, warn_if_untrained
 from integration.errors import HostError
 from integration.extra_steps import ExtraSteps
 from integration.host_field import HostDensity, HostField
@@ -47,7 +48,6 @@ from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 _LOGGED_EVERY: Final = 500  # merges between two lines of the log
-_PATIENCE: Final = 10  # gradients of f_det without a step on any of them, before a warning
 
 
 class Attachment:
@@ -93,6 +93,11 @@ class Attachment:
             raise SettingError(
                 "objective: a host renders LR itself, so lambda_lr must be > 0 and lr_from must be lr, got "
                 f"lambda_lr={conductor.objective.lambda_lr}, lr_from={conductor.objective.lr_from!r}."
+            )
+        distributed = torch.distributed
+        if distributed.is_available() and distributed.is_initialized() and (n := distributed.get_world_size()) > 1:
+            raise SettingError(
+                f"CLEAR trains in one process, got {n}. Start the training without torchrun, on one device."
             )
         self._views = by_name(views)
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
@@ -329,8 +334,8 @@ class Attachment:
         λ = self.conductor.objective.lambda_hr(self.t)
         if λ > 0 and "detail" in merged.grads:
             self._detail_gradients += 1
-            if self._detail_gradients == _PATIENCE * self.accumulation and self.conductor.detail.rate > 0:
-                _warn_if_untrained(trained["detail"])
+            if self._detail_gradients == PATIENCE * self.accumulation and self.conductor.detail.rate > 0:
+                warn_if_untrained(trained["detail"])
         if screen_gradient is not None and hr_grads is not None:
             scores = partial(self.conductor.scores, hr=hr_grads, t=self.t)
             if write_score(rendering.shot, screen_gradient / grad_scale, scores, self._scaler, grad_scale):
@@ -358,11 +363,3 @@ class Attachment:
                 "rasterization(sparse_grad=False)."
             )
         return p.grad - self._grads_before[name] if name in self._grads_before else p.grad
-
-
-def _warn_if_untrained(detail: Tensor) -> None:
-    if not bool(detail.any()):
-        _log.warning(
-            "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail; "
-            "attach adds it to the dictionary of optimizers.", _PATIENCE,
-        )  # fmt: skip
