@@ -59,6 +59,7 @@ class Attachment:
         views: all training views. seed: of the strategies.
         poll_parents: called at every iteration. It returns parents[M] if the structure has changed since its last call (row i of
             every parameter now comes from row parents[i]); None: it has not, or the host does not say how.
+        restart_parents: called where the host has loaded other parameters, which come from no earlier ones.
         threshold: the host's densification threshold on the mean ‖∇_u‖ in NDC units; None: the score is not scaled.
         loss_scale: returns the factor of the host's loss (`scaler.get_scale` of an AMP gradient scaler).
         accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
@@ -79,6 +80,7 @@ class Attachment:
         *,
         views: Sequence[View],
         poll_parents: Callable[[], Int[Tensor, " M"] | None],
+        restart_parents: Callable[[], None] = lambda: None,
         seed: int = 0,
         threshold: float | None = None,
         loss_scale: Callable[[], float] | None = None,
@@ -105,7 +107,7 @@ class Attachment:
         self.t = 1
         self.counts: Counter[str] = Counter()
         self.removed = False
-        self._poll_parents, self._loss_scale = poll_parents, loss_scale
+        self._poll_parents, self._restart_parents, self._loss_scale = poll_parents, restart_parents, loss_scale
         self._scaler = None if threshold is None else ScoreScaler(threshold)
         self._n = len(params()["means"])
         self._passes = 0  # backward passes of this iteration
@@ -202,6 +204,7 @@ class Attachment:
         """Continue from a state; the host has loaded its parameters already."""
         self.t, self._passes = int(state["t"]), int(state["passes"])
         self.conductor.load_state_dict(state["strategies"])
+        self._restart_parents()
         self._n = len(self.params()["means"])
         if (view := self._views.get(state.get("view") or "")) is not None:
             self._step = Step(self.t, view)

@@ -104,7 +104,8 @@ class Attached:
         warn_if_score_is_unused(conductor, strategy, threshold)
         self.attachment = Attachment(
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
-            poll_parents=self._poll_parents, threshold=threshold, masks=masks, own_background=own_background,
+            poll_parents=self._poll_parents, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
+            own_background=own_background,
             field=None if (strategy is not None if own_density is None else own_density) else self._field(),
         )  # fmt: skip
         self.attachment.hook(self._of_gaussians())

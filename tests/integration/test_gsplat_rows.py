@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 
-from clear_strategies import GCO, P2G, SVS, Conductor
+from clear_strategies import GCO, P2G, SVS, Conductor, SplatSuRe
 from clear_strategies.errors import SettingError
 from clear_strategies.schedules import Ramp
 from integration import HostError
@@ -149,3 +151,26 @@ def test_a_resumed_loop_takes_the_anchor_as_if_it_had_not_stopped(stopped_at):
     _, resumed = program(range(stopped_at, 4), stored, first.state_dict())
     assert resumed.t == whole.t
     assert set(resumed.conductor.state_dict()) == set(whole.conductor.state_dict()) != set()
+
+
+def test_a_loop_goes_back_to_a_checkpoint_with_another_number_of_gaussians():
+    scene = toy.scene(20)
+    host, recorder = Host(scene), toy.Recorder()
+    clear = attach(host.splats, host.optimizers, scene.train, Conductor(recorder, SplatSuRe(), objective=HR_FROM_START))
+    rasterization = clear.wrap(gsplat_host.rasterization)
+
+    def step(view):
+        gsplat_host.drawn(rasterization, host.splats, view.lr.camera)[0].mean().backward()
+
+    for view in scene.train:
+        step(view)
+    state = copy.deepcopy(clear.attachment.state_dict())
+    stored = {name: p.detach().clone() for name, p in host.splats.items() if name != ROWS}
+    for name, p in host.splats.items():
+        host.splats[name] = torch.nn.Parameter(p.detach()[5:], requires_grad=p.requires_grad)
+    step(scene.train[0])
+    host.splats.update({name: torch.nn.Parameter(p) for name, p in stored.items()})
+    clear.attachment.load_state_dict(state)
+    step(scene.train[1])
+    assert len(recorder.changes) == 1
+    assert {rows.shape for rows in clear.attachment.conductor.state_dict().values()} == {(20,)}
