@@ -316,7 +316,7 @@ class Attachment:
 
         A pass that leaves every `.grad` as it was (`torch.autograd.grad`, `backward(inputs=…)`) asks for something else.
         """
-        if self._pending is None or ((now := self._grad_versions()) and now == self._versions_before):
+        if self._pending is None or ((versions := self._grad_versions()) and versions == self._versions_before):
             return
         (_, rendering, hr_grads), self._pending = self._pending, None
         grad_scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
