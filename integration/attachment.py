@@ -34,7 +34,6 @@ from clear_strategies.core import deferred
 from clear_strategies.core.gradients import Grads, conflict_columns
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
-from clear_strategies.errors import SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients, only
 from integration.detail import PATIENCE, warn_if_untrained
@@ -43,6 +42,7 @@ from integration.extra_steps import ExtraSteps
 from integration.host_field import HostDensity, HostField
 from integration.host_rendering import HostRendering, RenderAt, called_at, random_state_kept
 from integration.host_score import ScoreScaler, write_score
+from integration.start import announce, require_supported
 from integration.views import by_name, enlarged_mask
 from rasterizers.interface import Color
 
@@ -89,18 +89,7 @@ class Attachment:
         own_background: bool = True,
         field: HostField | None = None,
     ) -> None:
-        if accumulation < 1:
-            raise SettingError(f"accumulation: must be at least 1 backward pass per step, got {accumulation}.")
-        if not conductor.wants_lr:
-            raise SettingError(
-                "objective: a host renders LR itself, so lambda_lr must be > 0 and lr_from must be lr, got "
-                f"lambda_lr={conductor.objective.lambda_lr}, lr_from={conductor.objective.lr_from!r}."
-            )
-        distributed = torch.distributed
-        if distributed.is_available() and distributed.is_initialized() and (n := distributed.get_world_size()) > 1:
-            raise SettingError(
-                f"CLEAR trains in one process, got {n}. Start the training without torchrun, on one device."
-            )
+        require_supported(conductor, accumulation)
         self._views = by_name(views)
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
         self._masks, self._own_background = dict(masks or {}), own_background
@@ -121,22 +110,8 @@ class Attachment:
         self._logged: dict[str, deferred.Number] = {}
         self._hooks: list[Any] = []
         conductor.on_fit_start(len(views), seed, params()["means"].device, views)
-        for s in conductor.strategies:
-            if (prepared := s.summary()) is not None:
-                _log.info("%s: %s.", type(s).__name__, prepared)
-        if not conductor.decorated and any(view.factor > 1 for view in views):
-            _log.warning(
-                "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
-                ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
-            )
-        self._density = None if field is None else HostDensity(conductor, field, views, seed)
-        itself = {"densifier": "densifies by"} if field is None else {}
-        itself |= {"background": "chooses its background"} if own_background else {}
-        for hook, does in itself.items():
-            if (owner := conductor.owner(hook)) is not None:
-                _log.info("%s has no effect here: the host %s itself.", type(owner).__name__, does)
-        if not conductor.strategies:
-            _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
+        announce(conductor, views, own_background=own_background, own_density=field is None)
+        self._density = HostDensity(conductor, field, views, seed)
 
     def render_view(self, view: View, render_at: RenderAt) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR."""
@@ -156,8 +131,7 @@ class Attachment:
             hr_grads = conductor.hr_gradients(shot, view, t)
         self._step = Step(t, view) if hr_grads is None else hr_grads.step
         if self._passes == 0:  # one step of the host, however many passes it accumulates
-            if self._density is not None:
-                self._density.before_rendering()
+            self._density.before_rendering()
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
                 with random_state_kept(means.device):
@@ -172,7 +146,7 @@ class Attachment:
     @property
     def densifies(self) -> bool:
         """Whether a strategy densifies in place of the host, whose own density control must then be off."""
-        return self._density is not None and self._density.acts
+        return self._density.acts
 
     @property
     def background(self) -> Color | None:
@@ -197,7 +171,7 @@ class Attachment:
             "t": self.t, "passes": self._passes, "strategies": self.conductor.state_dict(),
             "view": None if self._step is None else self._step.view.name,
             "score": None if self._scaler is None else self._scaler.state_dict(),
-            "density": None if self._density is None else self._density.state_dict(),
+            "density": self._density.state_dict(),
         }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -210,8 +184,7 @@ class Attachment:
             self._step = Step(self.t, view)
         if self._scaler is not None and state.get("score") is not None:
             self._scaler.load_state_dict(state["score"])
-        if self._density is not None:
-            self._density.load_state_dict(state.get("density"))
+        self._density.load_state_dict(state.get("density", {}))
 
     def summary(self) -> str:
         """What was done how often, e.g. for the end of a log."""
@@ -253,8 +226,7 @@ class Attachment:
             return
         if made := self._extra.step(optimizer):
             self.counts["extra views"] += made
-        if self._density is not None:
-            self._density.after_step(optimizer, self.t)
+        self._density.after_step(optimizer, self.t)
 
     def _finish_previous_step(self) -> None:
         """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified."""

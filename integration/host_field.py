@@ -106,29 +106,32 @@ class HostMoments:
 
 def _gathered(tensor: Tensor, parents: Int[Tensor, " M"]) -> Tensor:
     rows = tensor.detach()[parents]
-    return torch.nn.Parameter(rows, requires_grad=tensor.requires_grad) if isinstance(tensor, torch.nn.Parameter) else rows
+    return (
+        torch.nn.Parameter(rows, requires_grad=tensor.requires_grad) if isinstance(tensor, torch.nn.Parameter) else rows
+    )
 
 
 class HostDensity:
-    """A strategy's densifier in place of the host's own. It acts once all optimizers have stepped that
-    step at an iteration.
+    """A strategy's densifier in place of the host's own. It acts once all optimizers have stepped that step at an iteration.
 
     Args:
+        field: the host's Gaussians; None: the host densifies by itself.
         views: all training views. seed: of the run.
 
     Attributes:
         acts: whether a strategy of the conductor densifies; the host's own density control must then be off.
     """
 
-    def __init__(self, conductor: Conductor, field: HostField, views: Sequence[View], seed: int) -> None:
-        self._conductor, self._field = conductor, field
+    def __init__(self, conductor: Conductor, field: HostField | None, views: Sequence[View], seed: int) -> None:
         owner = conductor.owner("densifier")
-        self._densifier: Any = None if owner is None else owner.densifier(field, views, seed)
+        self._densifier: Any = None if owner is None or field is None else owner.densifier(field, views, seed)
         self.acts = self._densifier is not None
-        self._stepped: set[int] = set()  # optimizers by id, since the last rendering
-        self._expected = {id(o) for o in field.moments.optimizers()}  # later those that stepped before it
+        self._conductor, self._field = conductor, field
+        optimizers = [] if field is None else field.moments.optimizers()
+        self._expected = {id(o) for o in optimizers}  # later those that stepped before the last rendering
+        self._stepped: set[int] = set()  # since the last rendering
         self._t = 0  # of the last action
-        if self.acts:
+        if self._densifier is not None:
             marks = ", ".join(f"{mark} {t:,}" for mark, t in self._densifier.marks.items())
             _log.info("%s densifies in place of the host: %s.", self._densifier.name, marks)
 
@@ -140,15 +143,16 @@ class HostDensity:
     def after_step(self, optimizer: torch.optim.Optimizer, t: int) -> None:
         """An optimizer has stepped at t."""
         self._stepped.add(id(optimizer))
-        if not self.acts or t == self._t or self._expected - self._stepped:
+        if self._field is None or self._densifier is None or t == self._t or self._expected - self._stepped:
             return
         self._t = t
         if self._conductor.may_densify(t):
             self._densifier.step(self._field, self._field.moments, t, lambda parents: None)
 
-    def state_dict(self) -> dict[str, Tensor] | None:
-        return self._densifier.state_dict() if self.acts else None
+    def state_dict(self) -> dict[str, Tensor]:
+        """Of the densifier; empty where the host densifies."""
+        return {} if self._densifier is None else self._densifier.state_dict()
 
-    def load_state_dict(self, state: dict[str, Tensor] | None) -> None:
-        if self.acts and state is not None:
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        if self._densifier is not None and state:
             self._densifier.load_state_dict(state)

@@ -129,13 +129,10 @@ class _Installed:
     def __init__(self, runner: Any, views: Any, masks: Any, chosen: Any, seed: int) -> None:
         rendering = sys.modules["gsplat.rendering"]
         self.views, self._splats = views, runner.splats
-        strategy = runner.cfg.strategy
-        samples = not hasattr(strategy, "grow_grad2d")  # MCMCStrategy, as the strategy of `best` that densifies
         self.attached = Attached(
-            runner.splats, runner.optimizers, views, chosen, strategy=strategy, seed=seed, masks=masks, own_density=samples
-        )
-        if self.attached.attachment.densifies:
-            strategy.refine_stop_iter = 0
+            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, replaces_default=True, seed=seed,
+            masks=masks,
+        )  # fmt: skip
         self.attached.replace_everywhere(rendering.rasterization)
         export = getattr(sys.modules["gsplat"], "export_splats", None)
         if export is not None:

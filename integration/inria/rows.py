@@ -63,13 +63,6 @@ class CarriedRows(MatchedRows):
             )  # fmt: skip
         return super().poll()
 
-    def take(self, parents: Int[Tensor, " M"]) -> None:
-        """Row i of the model has been replaced by row parents[i]."""
-        self._carried = True
-        change = change_of(parents, len(self._parents))
-        if change is not None:
-            self._parents, self._fresh = self._parents[parents], self._fresh[parents] | change.fresh
-
     def remove(self) -> None:
         """Give the model its own methods back."""
         self._methods.undo()
@@ -97,6 +90,13 @@ class CarriedRows(MatchedRows):
         parents = self._parents[found.clamp_min(0)] if len(now["means"]) else found
         self._parents = torch.cat((self._parents, torch.where(found < 0, -1, parents)))
         self._fresh = torch.cat((self._fresh, torch.ones_like(found, dtype=torch.bool)))
+
+    def take(self, parents: Int[Tensor, " M"]) -> None:
+        """Row i of the model has been replaced by row parents[i]."""
+        self._carried = True
+        change = change_of(parents, len(self._parents))
+        if change is not None:
+            self._parents, self._fresh = self._parents[parents], self._fresh[parents] | change.fresh
 
 
 def _after(hook: Callable[[Any], None], method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

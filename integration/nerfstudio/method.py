@@ -155,16 +155,13 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
         end_with_strategies(chosen, self.strategy, "refine_stop_iter", first=0)
         for group in host.optimizers.optimizers["detail"].param_groups:
             group["lr"] = chosen.detail.rate
-        attached = attach(
+        return attach(
             self.gauss_params, host.optimizers.optimizers, views_from_datamanager(datamanager, sr, config.factor, self.device),
             chosen,
             strategy=self.strategy, state=self.strategy_state, names=NAMES, seed=trainer.config.machine.seed,
             loss_scale=host.grad_scaler.get_scale, own_background=True,  # splatfacto's is random, too
-            own_density=not hasattr(self.strategy, "grow_grad2d"),  # MCMCStrategy
+            replaces_default=True,
         )  # fmt: skip
-        if attached.attachment.densifies:
-            self.strategy.refine_stop_iter = 0
-        return attached
 
     def _resume(self, step: int) -> None:
         """Continue a resumed training at its iteration."""

@@ -14,6 +14,7 @@ import torch
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import read_gaussians
+from clear_strategies.density import mcmc
 from clear_strategies.errors import SettingError
 from tests.helpers import gsplat_host, toy
 from tests.helpers.host_parts import FROM_START
@@ -63,6 +64,23 @@ def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(trainer, ca
     assert torch.allclose(rendered(splats), evaluated, atol=1e-5)
     stored = read_gaussians(trainer.folder / "cloud.ply")
     assert torch.allclose(stored.sh0.reshape(-1, 3), splats["sh0"].reshape(-1, 3), atol=1e-6)
+
+
+def test_mcmc_densifies_in_place_of_its_default_strategy(trainer, caplog, monkeypatch):
+    monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
+    monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
+    with caplog.at_level(logging.INFO):
+        assert trainer.run([*trainer.sr, *OVERRIDES, "--strategies", "clear,mcmc"]) == 0
+    assert "MCMC densifies in place of the host: densify until 4." in caplog.text
+    assert "3 structure changes" in caplog.text  # at t = 1, 2 and 3, each of 5 % more
+    assert len(torch.load(trainer.folder / "ckpt.pt")["splats"]["means"]) == 27
+    caplog.clear()
+    monkeypatch.setattr(mcmc, "_DENSE", 0)
+    with caplog.at_level(logging.INFO):
+        assert trainer.run([*trainer.sr, *OVERRIDES, "--strategies", "clear,mcmc"]) == 0
+    assert "MCMC has no effect: the initial points lie" in caplog.text  # and the host densifies until SVS ends it
+    assert "refine_stop_iter=3 instead of 7" in caplog.text
+    assert len(torch.load(trainer.folder / "ckpt.pt")["splats"]["means"]) != 27
 
 
 def test_views_are_recognised_by_their_index_when_poses_are_noisy(trainer, caplog):

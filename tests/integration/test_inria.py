@@ -101,6 +101,7 @@ def test_its_steps_equal_those_of_our_own_trainer(sampling, inria_host, inria_ca
         p.data = p.data.double() if name != "scales" else start
     gaussians.optimizer.param_groups[0]["lr"] = 1.6e-4 * own.optimizer.extent
     gaussians.active_sh_degree = -1
+    gaussians.filter_3D = torch.zeros(N, 1)  # as Mip-Splatting has
     for camera in scene.cameras:
         camera.original_image, camera.world_view_transform = (
             camera.original_image.double(),
@@ -110,6 +111,7 @@ def test_its_steps_equal_those_of_our_own_trainer(sampling, inria_host, inria_ca
 
     found = clear.params()
     assert sampling == (len(own.field) > N)
+    assert len(gaussians.filter_3D) == len(own.field)
     for name, p in own.field.raw().items():
         difference = float((p.flatten() - found[name].detach().flatten()).norm() / p.norm().clamp_min(1e-12))
         assert difference < 1e-9, name

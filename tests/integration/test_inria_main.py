@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
+from clear_strategies.density import mcmc
 from integration import HostError
 from integration.inria.__main__ import main
 from integration.inria.from_options import install
@@ -62,6 +63,20 @@ def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture)
     assert conductor.objective.lambda_hr(9) == conductor.objective.lambda_hr.peak  # full at 3,000 of 10,000
     with pytest.raises(HostError, match="has no iterations"):
         install(gaussians, scene, object(), sr=inria_capture / "sr")
+
+
+def test_the_host_no_longer_densifies_where_mcmc_does(inria_host, inria_capture, monkeypatch):
+    monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
+    monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
+    opt = options(inria_host, inria_capture)
+    gaussians, scene = inria_host.setup(opt)
+    clear = install(gaussians, scene, opt, strategies="clear,mcmc", overrides=FROM_START[2:], sr=inria_capture / "sr")
+    assert clear.attachment.densifies
+    assert opt.densify_until_iter == 0
+    state = clear.attachment.state_dict()
+    assert int(state["density"]["cap"]) == 5 * N
+    clear.attachment.load_state_dict(state | {"density": {"cap": torch.tensor(7)}})
+    assert int(clear.attachment.state_dict()["density"]["cap"]) == 7
 
 
 @pytest.mark.parametrize("points", ["own", "stereo"])
