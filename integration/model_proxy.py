@@ -121,7 +121,7 @@ class AttachedModel:
         detail: train f_det.
         densifier, threshold: what densifies in the host, and its threshold on the screen gradient.
         to_pixels: see `host_rendering`.
-        views, masks, seed, field: see `Attachment`.
+        views, masks, seed, field, own_background: see `Attachment`.
 
     Attributes:
         detail: f_det, which follows the host's structure even if it is not trained.
@@ -143,6 +143,7 @@ class AttachedModel:
         seed: int,
         to_pixels: ToPixels = lambda result: None,
         field: HostField | None = None,
+        own_background: bool = True,
     ) -> None:
         warn_if_score_is_unused(conductor, densifier, threshold)
         self._model, self._roles, self._host_params, self._to_pixels = model, roles, params, to_pixels
@@ -151,7 +152,7 @@ class AttachedModel:
         self._warned: set[str] = set()
         self.attachment = Attachment(
             conductor, self.params, views=views, seed=seed, threshold=threshold, masks=masks,
-            poll_parents=lambda: self.detail.poll_parents(conductor.state_dict), field=field,
+            poll_parents=lambda: self.detail.poll_parents(conductor.state_dict), field=field, own_background=own_background,
         )  # fmt: skip
 
     def params(self) -> dict[str, Tensor]:

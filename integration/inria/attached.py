@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import inspect
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -16,11 +18,14 @@ from integration.densification import require_end
 from integration.errors import HostError
 from integration.host_cameras import enlarged_camera
 from integration.host_field import HostField
+from integration.host_rendering import Target
 from integration.inria.cameras import HostViews
 from integration.inria.rows import CarriedRows
 from integration.model_proxy import AttachedModel, Role
 from integration.replacing import Replaced, ReplacedMethods
 from integration.views import SuperResolve, sr_source
+
+_log = logging.getLogger(__name__)
 
 Render = Callable[..., Any]
 
@@ -55,6 +60,8 @@ class Attached:
         densify_until: opt.densify_until_iter; refused where an anchor would be taken before.
         detail: train the detail feature f_det beside the host's parameters.
         own_density: the host densifies, not a strategy of the conductor.
+        own_background: the host chooses the colour behind its renderings (`--random_background`); else the strategies may choose
+            another for `bg_color` where that is black.
 
     Attributes:
         views: the training views, by name and by camera.
@@ -77,6 +84,7 @@ class Attached:
         densify_until: int | None = None,
         detail: bool = True,
         own_density: bool = True,
+        own_background: bool = False,
         seed: int = 0,
     ) -> None:
         required = (*_ATTRIBUTES.values(), "optimizer")
@@ -94,12 +102,14 @@ class Attached:
         self._attached = AttachedModel(
             gaussians, _ROLES, self._host_params, self._rows, conductor, self.views.all, detail=detail, densifier=gaussians,
             threshold=threshold, masks=self.views.masks, seed=seed, field=None if own_density else self._field(),
+            own_background=own_background,
         )  # fmt: skip
         self.attachment = self._attached.attachment
         self._methods = ReplacedMethods(gaussians, {
             **dict.fromkeys(_SAVERS, self._save_with_detail), "compute_3D_filter": self._compute_filter_at_hr,
             "training_setup": self._training_setup,
         })  # fmt: skip
+        self._black: bool | None = None  # the host's background, once it is known
         self._replaced: Replaced | None = None
         self._hooks: list[Any] = []
         self._hook_optimizer()
@@ -110,12 +120,11 @@ class Attached:
 
     def wrap(self, render: Render) -> Render:
         """`render` that renders training cameras at both scales, and shows f_base + f_det anywhere else."""
+        signature = inspect.signature(render)
 
         @functools.wraps(render)
         def wrapped(viewpoint_camera: Any, pc: Any, *args: Any, **kwargs: Any) -> Any:
-            other_colors = (
-                kwargs.get("override_color") is not None
-            )  # depth or normals in place of the model's: no photo
+            other_colors = kwargs.get("override_color") is not None  # depth, normals: no photo
             if self.attachment.removed or pc is not self._model or other_colors:
                 return render(viewpoint_camera, pc, *args, **kwargs)
             view = self.views.find(viewpoint_camera) if torch.is_grad_enabled() else None
@@ -127,9 +136,14 @@ class Attached:
                 )
             if self._model.optimizer is not self._optimizer:
                 self._hook_optimizer()
-            return self._attached.render_view(
-                view, viewpoint_camera, lambda model, camera, _: render(camera, model, *args, **kwargs)
-            )
+            call = signature.bind(viewpoint_camera, pc, *args, **kwargs)
+            own = call.arguments.get("bg_color")
+
+            def draw(model: Any, camera: Any, _: Target) -> Any:
+                call.arguments |= dict(zip(signature.parameters, (camera, model), strict=False)) | self._bg_color(own)
+                return render(*call.args, **call.kwargs)
+
+            return self._attached.render_view(view, viewpoint_camera, draw)
 
         return wrapped
 
@@ -157,6 +171,17 @@ class Attached:
 
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}
+
+    def _bg_color(self, own: Tensor | None) -> dict[str, Tensor]:
+        """The colour that the strategies choose for this iteration, in place of the host's own, which must be black."""
+        color = self.attachment.background
+        if color is None or own is None:
+            return {}
+        if self._black is None:
+            self._black = not bool(own.any())
+            if not self._black:
+                _log.warning("the background stays as it is: strategies choose another only in place of a black one.")
+        return {"bg_color": own.new_tensor(color)} if self._black else {}
 
     def _field(self) -> HostField:
         """Every tensor of the model with a row per Gaussian: forks have more than 3DGS, e.g. filter_3D."""

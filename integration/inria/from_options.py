@@ -63,7 +63,7 @@ def install(
     attached = Attached(
         gaussians, scene.getTrainCameras(), chosen, sr=sr_images(sr, suffix), factor=factor, seed=seed,
         threshold=getattr(opt, "densify_grad_threshold", None), densify_until=getattr(opt, "densify_until_iter", None),
-        own_density=False,
+        own_density=False, own_background=bool(getattr(opt, "random_background", False)),
     )  # fmt: skip
     if attached.attachment.densifies:
         opt.densify_until_iter = 0
