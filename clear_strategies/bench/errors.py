@@ -17,6 +17,9 @@ import numpy as np
 import pandas as pd
 import torch
 from jaxtyping import Float, Int
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from scipy.fft import dctn
 from scipy.optimize import nnls
 from torch import Tensor
@@ -30,11 +33,14 @@ from clear_strategies.jobs.saved import open_splat
 from clear_strategies.jobs.scene import read
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.outputs import metrics
+from clear_strategies.outputs.figures import ERROR_MAX, error_map, spaced
 
 _SOLID: Final = 0.9  # alpha below it counts as a hole
 _OUTSIDE: Final = 0.25  # a camera is outside of others that are further away than this, see `distance_from_hull`
 _SEEN_BY: Final = ("no training view", "one", "several")
 _STEEPEST: Final = 0.2  # the share of a photo's pixels that are its edges
+_PICTURED: Final = 3  # test views, from the worst to the best
+_COLORS: Final = ("#ee6677", "#ccbb44", "#4477aa")  # of _SEEN_BY
 _WAVES: Final = (1, 4, 16)  # the longest wave of each band, in the shortest waves that the LR photos hold
 
 
@@ -59,7 +65,7 @@ class HeldOut:
 
 
 def measure(results: Results, *, run: Path, reference: Path | None = None) -> None:
-    """Fill `results` with the parts of the error, and the views.
+    """Fill `results` with the parts of the error, the views, and a picture of some of them.
 
     `reference` is another run of the same test views; what is seen by how many views is that of `run`.
 
@@ -89,6 +95,7 @@ def measure(results: Results, *, run: Path, reference: Path | None = None) -> No
         for frame, photo in zip(frames, photos_of(frames, view_settings), strict=True)
     ]
     results.tables["errors"], results.tables["errors_views"] = budget(views), by_view(views)
+    results.figures["errors"] = _picture(views)
     for name, splat in splats.items():
         mean = results.tables["errors_views"][f"{name}: psnr"].mean()
         results.note(f"{name}: {splat.source}; mean PSNR of {len(views)} test views {mean:.2f} dB.")
@@ -200,3 +207,24 @@ def by_view(views: Sequence[HeldOut]) -> pd.DataFrame:
 def _psnr(squared_error: Any, pixels: Any) -> Any:
     """Decibels of a sum over pixels and channels; nan where there are none."""
     return -10 * np.log10(np.maximum(squared_error / (3 * pixels), 1e-10))
+
+
+def _picture(views: Sequence[HeldOut]) -> Figure:
+    """Photo, render, error and classes of some views, the worst at the top."""
+    worst_first = sorted(views, key=lambda view: -float((view.images["run"] - view.truth).square().mean()))
+    shown = spaced(worst_first, _PICTURED)
+    height, width = shown[0].alpha.shape
+    figure = Figure(figsize=(13, len(shown) * (3.2 * height / width + 0.3) + 0.3), layout="constrained")
+    for axes, view in zip(figure.subplots(len(shown), 4, squeeze=False), shown, strict=True):
+        truth, image = view.truth.numpy(), view.images["run"].numpy()
+        classes = np.array([to_rgb(color) for color in _COLORS])[view.seen.clamp(max=2).numpy()]
+        classes[(view.alpha < _SOLID).numpy()] *= 0.5
+        columns = {view.name: truth, "render": image, "error": error_map(image, truth), "seen by": classes}
+        for axis, (title, pixels) in zip(axes, columns.items(), strict=True):
+            axis.imshow(pixels, cmap="magma", vmin=0, vmax=ERROR_MAX)
+            axis.set_title(title, fontsize=9)
+            axis.axis("off")
+    legend = [Patch(color=color, label=f"seen by {name}") for color, name in zip(_COLORS, _SEEN_BY, strict=True)]
+    legend.append(Patch(color="#333333", label=f"dark: alpha below {_SOLID}"))
+    figure.legend(handles=legend, loc="outside lower right", ncols=len(legend), fontsize=9)
+    return figure

@@ -81,4 +81,5 @@ def test_the_command_reads_a_run_and_finds_its_own_psnr(tmp_path, capsys):
     assert views["run: psnr"].mean() == pytest.approx(psnr, abs=1e-3)
     assert views["run: psnr"].equals(views["reference: psnr"])
     assert len(pd.read_csv(tmp_path / "out" / "errors.csv")) == 15
+    assert (tmp_path / "out" / "errors.png").stat().st_size > 5_000
     assert "if perfect" in capsys.readouterr().out
