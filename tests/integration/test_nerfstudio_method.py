@@ -31,7 +31,9 @@ from nerfstudio.models import splatfacto
 from nerfstudio.plugins.registry import discover_methods
 
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.density import mcmc
 from clear_strategies.errors import SettingError
+from clear_strategies.strategies import random_background
 from integration.nerfstudio import clear_splatfacto
 from integration.nerfstudio.data import stereo_cloud
 from integration.nerfstudio.datamanager import ClearDatamanager, ClearDatamanagerConfig
@@ -166,9 +168,12 @@ def test_the_configuration_can_be_written_and_read(capture, tmp_path):
     assert yaml.load(yaml.dump(config), Loader=yaml.Loader).pipeline.model == config.pipeline.model  # noqa: S506
 
 
-@pytest.mark.parametrize("clear", ["gco", "p2g", "svs", "clear"])
-def test_nerfstudios_trainer_trains_it(capture, tmp_path, clear):
-    overrides = ("strategies.p2g.patch=4",) if clear in ("p2g", "clear") else ()
+@pytest.mark.parametrize("clear", ["gco", "p2g", "svs", "clear", "clear,mcmc,random_background"])
+def test_nerfstudios_trainer_trains_it(capture, tmp_path, monkeypatch, clear):
+    monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
+    monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
+    monkeypatch.setattr(random_background, "_LONG_RUN", 0)
+    overrides = ("strategies.p2g.patch=4",) if "p2g" in clear or "clear" in clear else ()
     host = trainer(configured(capture, tmp_path, strategies=clear, overrides=overrides, densify_grad_thresh=1e-4))
     model = host.pipeline.model
     attachment, before = model.attached.attachment, {k: p.detach().clone() for k, p in model.gauss_params.items()}
@@ -178,8 +183,9 @@ def test_nerfstudios_trainer_trains_it(capture, tmp_path, clear):
     assert counts["merges"] == counts["LR renders"] == STEPS
     assert STEPS - 5 <= counts["HR renders"] <= STEPS
     assert counts["structure changes"] >= 1
-    assert (counts["scores written"] > 0) == (clear in ("p2g", "clear"))
-    assert model.strategy.refine_stop_iter == (STEPS // 2 - 1 if clear in ("svs", "clear") else 15_000)
+    assert (counts["scores written"] > 0) == bool(overrides)
+    stops = {"svs": STEPS // 2 - 1, "clear": STEPS // 2 - 1, "clear,mcmc,random_background": 0}
+    assert model.strategy.refine_stop_iter == stops.get(clear, 15_000)
     n = model.num_points
     assert n != len(before["means"])
     for name, p in model.gauss_params.items():
