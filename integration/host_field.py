@@ -81,7 +81,7 @@ class HostMoments:
 
     def __init__(self, optimizers: Callable[[], Sequence[torch.optim.Optimizer]]) -> None:
         self.optimizers = optimizers
-        self._moved: list[dict[str, Any]] = []  # states of parameters whose rows were gathered, and theirs were not yet
+        self._moved: list[tuple[dict[str, Any], int]] = []  # states whose rows are still to be gathered, and how many
 
     def move(self, new: Mapping[int, Tensor]) -> None:
         """Let the optimizers step the new parameters, by the id of the old ones."""
@@ -92,13 +92,13 @@ class HostMoments:
                         group["params"][i] = new[id(p)]
                         if (state := optimizer.state.pop(p, None)) is not None:
                             optimizer.state[new[id(p)]] = state
-                            self._moved.append(state)
+                            self._moved.append((state, len(p)))
 
     def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
         """Gather the rows of every moment; fresh ones start at 0."""
-        for state in self._moved:
+        for state, n in self._moved:
             for name, moment in state.items():
-                if isinstance(moment, Tensor) and moment.dim():  # Adam's step count has no rows
+                if isinstance(moment, Tensor) and moment.shape[:1] == (n,):  # Adam's step count has no rows
                     state[name] = moment[parents]
                     state[name][fresh] = 0
         self._moved.clear()
