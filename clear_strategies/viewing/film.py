@@ -41,7 +41,7 @@ class DepthScale:
         return cls.spanning(torch.cat([painter.depth(camera, look).flatten() for camera in some]))
 
     @classmethod
-    def spanning(cls, depth: Float[Tensor, ...]) -> DepthScale:
+    def spanning(cls, depth: Float[Tensor, "*shape"]) -> DepthScale:
         """From depths, of which those that are not finite are unknown; 0 to 1 where none is known."""
         known = depth[depth.isfinite()].cpu().numpy()  # torch's own quantile takes 16 million numbers at most
         if not len(known):

@@ -315,7 +315,7 @@ class Attached:
 attach = Attached
 
 
-def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, ...]:
+def _visible(radii: Tensor, packed: bool) -> Bool[Tensor, "*shape"]:
     """Gaussians with positive radii: one number per Gaussian in gsplat 1.4, two in 1.5."""
     two_radii = radii.dim() == (2 if packed else 3)
     return (radii > 0).all(-1) if two_radii else radii > 0
