@@ -25,7 +25,7 @@ def history(n: int = 100, **columns: float) -> list[dict[str, float]]:
     ],
     ids=["nothing", "one iteration", "LR alone", "zeros and NaN", "everything", "an infinity"],
 )  # fmt: skip
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error", "ignore::DeprecationWarning")
 def test_curves_draw_whatever_was_measured(tmp_path: Path, rows: list[dict[str, float]]) -> None:
     marks = {"HR from": 5, "HR full": 30, "opacity reset": 30, "anchor": 50}
     write_curves(tmp_path / "curves.png", rows, marks, "scene · strategy")
