@@ -31,9 +31,7 @@ from rasterizers.interface import Camera
 
 _ATTACHED: Final = "clear_attached"  # attribute of a wrapped function: its Attached
 _SAME_POSE: Final = 1e-3  # largest difference between the entries of two poses of one camera
-_CLEARLY: Final = (
-    10  # times as far as the nearest pose must the next be: frames of a slow video lie closer than _SAME_POSE
-)
+_CLEARLY: Final = 10  # times as far as the nearest pose must the next be: frames of a video may lie closer than that
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 

@@ -136,11 +136,10 @@ class Attached:
                 )
             if self._model.optimizer is not self._optimizer:
                 self._hook_optimizer()
-            call = signature.bind(viewpoint_camera, pc, *args, **kwargs)
-            own = call.arguments.get("bg_color")
 
             def draw(model: Any, camera: Any, _: Target) -> Any:
-                call.arguments |= dict(zip(signature.parameters, (camera, model), strict=False)) | self._bg_color(own)
+                call = signature.bind(camera, model, *args, **kwargs)
+                call.arguments |= self._bg_color(call.arguments.get("bg_color"))
                 return render(*call.args, **call.kwargs)
 
             return self._attached.render_view(view, viewpoint_camera, draw)
