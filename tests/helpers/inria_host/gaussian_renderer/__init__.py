@@ -28,9 +28,8 @@ def render(viewpoint_camera, pc, pipe, bg_color, scaling_modifier=1.0, columns=3
     scales = pc.get_scaling * scaling_modifier
     opacity = torch.nn.functional.dropout(pc.get_opacity[:, 0], dropout)  # DropGaussian's render does this itself
     splats = Splats(xyz, pc.get_rotation, scales, opacity, features[:, :1], features[:, 1:bands])
-    drawn = autograd.draw(
-        over(RASTERIZER, tuple(bg_color.tolist())), splats, camera, InNdc.apply(dummy, w, h, ABSOLUTE)
-    )
+    behind = None if bg_color is None else tuple(bg_color.tolist())
+    drawn = autograd.draw(over(RASTERIZER, behind), splats, camera, InNdc.apply(dummy, w, h, ABSOLUTE))
     return {
         "render": drawn.image.permute(2, 0, 1),
         "viewspace_points": dummy,
