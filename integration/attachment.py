@@ -144,11 +144,6 @@ class Attachment:
         return rendering.returned
 
     @property
-    def densifies(self) -> bool:
-        """Whether a strategy densifies in place of the host, whose own density control must then be off."""
-        return self._density.acts
-
-    @property
     def background(self) -> Color | None:
         """The colour behind every rendering of this iteration, for hosts that let the strategies choose it; None: their own."""
         return None if self._own_background else self.conductor.background(self.t)

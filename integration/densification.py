@@ -36,7 +36,7 @@ def require_end(conductor: Conductor, until: int | None, name: str, first: int =
     Raises:
         SettingError: a strategy takes an anchor before the structure stops changing.
     """
-    if until is None or (end := _end_of_densification(conductor, until, first)) == until:
+    if until is None or (end := _end_of_densification(conductor, until, first)) >= until:
         return
     if any("anchor" in strategy.marks() for strategy in conductor.strategies):
         raise SettingError(

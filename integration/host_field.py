@@ -105,10 +105,8 @@ class HostMoments:
 
 
 def _gathered(tensor: Tensor, parents: Int[Tensor, " M"]) -> Tensor:
-    rows = tensor.detach()[parents]
-    return (
-        torch.nn.Parameter(rows, requires_grad=tensor.requires_grad) if isinstance(tensor, torch.nn.Parameter) else rows
-    )
+    rows, trained = tensor.detach()[parents], isinstance(tensor, torch.nn.Parameter)
+    return torch.nn.Parameter(rows, requires_grad=tensor.requires_grad) if trained else rows
 
 
 class HostDensity:
@@ -117,15 +115,11 @@ class HostDensity:
     Args:
         field: the host's Gaussians; None: the host densifies by itself.
         views: all training views. seed: of the run.
-
-    Attributes:
-        acts: whether a strategy of the conductor densifies; the host's own density control must then be off.
     """
 
     def __init__(self, conductor: Conductor, field: HostField | None, views: Sequence[View], seed: int) -> None:
         owner = conductor.owner("densifier")
         self._densifier: Any = None if owner is None or field is None else owner.densifier(field, views, seed)
-        self.acts = self._densifier is not None
         self._conductor, self._field = conductor, field
         optimizers = [] if field is None else field.moments.optimizers()
         self._expected = {id(o) for o in optimizers}  # later those that stepped before the last rendering

@@ -43,10 +43,10 @@ def announce(conductor: Conductor, views: Sequence[View], *, own_background: boo
             ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
         )
     for own, hook, does in (
-        (own_density, "densifier", "densifies by"),
-        (own_background, "background", "chooses its background"),
+        (own_density, "densifier", "densifies by itself; where it is told not to, this strategy does"),
+        (own_background, "background", "chooses its background itself"),
     ):
         if own and (owner := conductor.owner(hook)) is not None:
-            _log.info("%s has no effect here: the host %s itself.", type(owner).__name__, does)
+            _log.info("%s has no effect here: the host %s.", type(owner).__name__, does)
     if not conductor.strategies:
         _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")

@@ -42,9 +42,8 @@ class Attached:
     Args:
         params: gsplat's dict of leaves. optimizers: one for each of them.
         views: all training views. A rendering is that of the view named by `rendering`, else of the one with its pose.
-        strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one.
-        replaces_default: a strategy of the conductor may densify in place of `strategy` where that is gsplat's `DefaultStrategy`,
-            whose `refine_stop_iter` is then set to 0. Without a `strategy` it may in any case.
+        strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one. Where there is
+            none, or a `DefaultStrategy` with refine_stop_iter=0, a strategy of the conductor may densify.
         state: of gsplat 1.4's strategy, in which every change of structure is recorded; later versions record it in `params`.
         detail: add the detail feature f_det as `params["detail"]`, with an Adam of its own. gsplat's strategies clone,
             split and prune it like any other parameter.
@@ -75,7 +74,6 @@ class Attached:
         accumulation: int = 1,
         masks: Mapping[str, Tensor] | None = None,
         own_background: bool = False,
-        replaces_default: bool = False,
     ) -> None:
         if not views:
             raise ValueError(
@@ -101,15 +99,13 @@ class Attached:
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
         warn_if_score_is_unused(conductor, strategy, threshold)
-        may_densify = strategy is None or (replaces_default and threshold is not None)
+        densifies = strategy is not None and not (threshold is not None and stop == 0)
         self.attachment = Attachment(
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=self._poll_parents, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
-            own_background=own_background, field=self._field() if may_densify else None,
+            own_background=own_background, field=None if densifies else self._field(),
         )  # fmt: skip
         self.attachment.hook(self._of_gaussians())
-        if self.attachment.densifies and strategy is not None:
-            strategy.refine_stop_iter = 0
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""

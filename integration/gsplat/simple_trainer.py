@@ -61,8 +61,8 @@ def install(
 
     Args:
         runner_class: simple_trainer's `Runner`. Its Config stretches the schedules (`max_steps`), and
-            `strategy.refine_stop_iter` is lowered to the step at which a strategy ends densification, or to 0 where a strategy
-            densifies in place of `DefaultStrategy`.
+            `strategy.refine_stop_iter` is lowered to the step at which a strategy ends densification. With 0, a strategy may
+            densify in place of `DefaultStrategy`.
         strategies: names of conf/strategy, e.g. "gco,svs". overrides: settings, e.g. "strategies.gco.tolerance=0.1".
         sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names.
         factor: HR pixels per LR pixel.
@@ -130,9 +130,8 @@ class _Installed:
         rendering = sys.modules["gsplat.rendering"]
         self.views, self._splats = views, runner.splats
         self.attached = Attached(
-            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, replaces_default=True, seed=seed,
-            masks=masks,
-        )  # fmt: skip
+            runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=seed, masks=masks
+        )
         self.attached.replace_everywhere(rendering.rasterization)
         export = getattr(sys.modules["gsplat"], "export_splats", None)
         if export is not None:

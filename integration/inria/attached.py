@@ -57,9 +57,9 @@ class Attached:
             there are none, for strategies and objectives that do not use HR.
         factor: HR pixels per LR pixel.
         threshold: opt.densify_grad_threshold, which scales P2G's score; None: a loop without densification.
-        densify_until: opt.densify_until_iter; refused where an anchor would be taken before.
+        densify_until: opt.densify_until_iter; refused where an anchor would be taken before. 0: a strategy of the conductor may
+            densify in place of the host.
         detail: train the detail feature f_det beside the host's parameters.
-        own_density: the host densifies, not a strategy of the conductor.
         own_background: the host chooses the colour behind its renderings (`--random_background`); else the strategies may choose
             another for `bg_color` where that is black.
 
@@ -83,7 +83,6 @@ class Attached:
         threshold: float | None = THRESHOLD,
         densify_until: int | None = None,
         detail: bool = True,
-        own_density: bool = True,
         own_background: bool = False,
         seed: int = 0,
     ) -> None:
@@ -101,7 +100,7 @@ class Attached:
         self._rows = CarriedRows(gaussians, self._host_params)
         self._attached = AttachedModel(
             gaussians, _ROLES, self._host_params, self._rows, conductor, self.views.all, detail=detail, densifier=gaussians,
-            threshold=threshold, masks=self.views.masks, seed=seed, field=None if own_density else self._field(),
+            threshold=threshold, masks=self.views.masks, seed=seed, field=self._field() if densify_until == 0 else None,
             own_background=own_background,
         )  # fmt: skip
         self.attachment = self._attached.attachment

@@ -36,7 +36,7 @@ def install(
         scene: the Scene with the training cameras.
         opt: the options that the host passed to `training_setup`. `iterations` stretches the schedules,
             `densify_grad_threshold` scales P2G's score, and `densify_until_iter` is lowered to the iteration at which a
-            strategy ends densification, or to 0 where a strategy densifies in place of the host.
+            strategy ends densification. With 0, a strategy may densify in place of the host.
         strategies: names of conf/strategy: "clear", "gco", "gco,svs" …
         overrides: settings, e.g. "strategies.gco.tolerance=0.1", "objective=lr_only".
         sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names.
@@ -63,10 +63,8 @@ def install(
     attached = Attached(
         gaussians, scene.getTrainCameras(), chosen, sr=sr_images(sr, suffix), factor=factor, seed=seed,
         threshold=getattr(opt, "densify_grad_threshold", None), densify_until=getattr(opt, "densify_until_iter", None),
-        own_density=False, own_background=bool(getattr(opt, "random_background", False)),
+        own_background=bool(getattr(opt, "random_background", False)),
     )  # fmt: skip
-    if attached.attachment.densifies:
-        opt.densify_until_iter = 0
     renderer = sys.modules.get("gaussian_renderer")
     if renderer is None or not hasattr(renderer, "render"):
         attached.remove()

@@ -159,7 +159,7 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
             self.gauss_params, host.optimizers.optimizers, views_from_datamanager(datamanager, sr, config.factor, self.device),
             chosen,
             strategy=self.strategy, state=self.strategy_state, names=NAMES, seed=trainer.config.machine.seed,
-            loss_scale=host.grad_scaler.get_scale, replaces_default=True,
+            loss_scale=host.grad_scaler.get_scale,
         )  # fmt: skip
 
     def _resume(self, step: int) -> None:

@@ -131,5 +131,9 @@ if __name__ == "__main__":
     parser.add_argument("--pose_noise", type=float, default=0.0)
     parser.add_argument("--app_opt", action="store_true")
     parser.add_argument("--init_type", default="sfm")
-    cfg = Config(**vars(parser.parse_args()))
+    parser.add_argument("--refine_stop_iter", type=int, default=7)
+    options = vars(parser.parse_args())
+    stop = options.pop("refine_stop_iter")
+    cfg = Config(**options)
+    cfg.strategy.refine_stop_iter = stop
     cli(main, cfg, verbose=True)

@@ -88,7 +88,7 @@ def test_its_steps_equal_those_of_our_own_trainer(sampling, inria_host, inria_ca
     opt = options(inria_host, inria_capture, iterations=STEPS, densify_until_iter=0, sh_interval=1)
     toy_scene = toy.scene(N)
     gaussians, scene = inria_host.setup(opt)
-    clear = attach(gaussians, scene.getTrainCameras(), conductors[0], sr=inria_capture / "sr", own_density=False)
+    clear = attach(gaussians, scene.getTrainCameras(), conductors[0], sr=inria_capture / "sr", densify_until=0)
     clear.views = InDouble(scene.cameras, Images(str(inria_capture / "sr")), 4)
     views = tuple(clear.views[view.name] for view in toy_scene.train)
 

@@ -65,14 +65,12 @@ def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture)
         install(gaussians, scene, object(), sr=inria_capture / "sr")
 
 
-def test_the_host_no_longer_densifies_where_mcmc_does(inria_host, inria_capture, monkeypatch):
+def test_mcmc_densifies_where_the_host_is_told_not_to(inria_host, inria_capture, monkeypatch):
     monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
     monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
-    opt = options(inria_host, inria_capture)
+    opt = options(inria_host, inria_capture, densify_until_iter=0)
     gaussians, scene = inria_host.setup(opt)
     clear = install(gaussians, scene, opt, strategies="clear,mcmc", overrides=FROM_START[2:], sr=inria_capture / "sr")
-    assert clear.attachment.densifies
-    assert opt.densify_until_iter == 0
     state = clear.attachment.state_dict()
     assert int(state["density"]["cap"]) == 5 * N
     clear.attachment.load_state_dict(state | {"density": {"cap": torch.tensor(7)}})

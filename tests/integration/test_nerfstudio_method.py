@@ -174,7 +174,8 @@ def test_nerfstudios_trainer_trains_it(capture, tmp_path, monkeypatch, clear):
     monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
     monkeypatch.setattr(random_background, "_LONG_RUN", 0)
     overrides = ("strategies.p2g.patch=4",) if "p2g" in clear or "clear" in clear else ()
-    host = trainer(configured(capture, tmp_path, strategies=clear, overrides=overrides, densify_grad_thresh=1e-4))
+    fields = {"densify_grad_thresh": 1e-4} | ({"stop_split_at": 0} if "mcmc" in clear else {})
+    host = trainer(configured(capture, tmp_path, strategies=clear, overrides=overrides, **fields))
     model = host.pipeline.model
     attachment, before = model.attached.attachment, {k: p.detach().clone() for k, p in model.gauss_params.items()}
     assert isinstance(model, ClearSplatfactoModel)
