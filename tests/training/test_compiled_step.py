@@ -67,7 +67,7 @@ def same(a, b):
 
 GCO_SETTINGS = {
     "default": {}, "strict": {"tolerance": 0.0}, "loose": {"tolerance": 0.5, "weight_min": 0.0, "weight_max": 1.0},
-    "two groups": {"groups": ("shN", "means")}, "no groups": {"groups": ()},
+    "two groups": {"groups": ("shN", "means")},
     "nothing": {"weight_min": 0.0, "weight_max": 0.0},
 }  # fmt: skip
 KINDS = ("random", "tiny", "huge", "mixed", "opposite", "parallel", "sparse", "zero", "round")
