@@ -89,7 +89,7 @@ class MCMC(Strategy):
                 "MCMC has no effect: until t=%d there is less time than sampling needs (%d).", self.stop, _SHORT_RUN
             )
             return None
-        if cut_out((view.lr.to("cpu") for view in views), views[0].background):
+        if cut_out((view.lr for view in views), views[0].background):
             _log.info(
                 "MCMC has no effect: the photos show an object before a plain background, so few Gaussians are held by no photo."
             )

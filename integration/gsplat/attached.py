@@ -99,11 +99,11 @@ class Attached:
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
         warn_if_score_is_unused(conductor, strategy, threshold)
-        densifies = strategy is not None and not (threshold is not None and stop == 0)
+        may_densify = strategy is None or (threshold is not None and stop == 0)
         self.attachment = Attachment(
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=self._poll_parents, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
-            own_background=own_background, field=None if densifies else self._field(),
+            own_background=own_background, field=self._field() if may_densify else None,
         )  # fmt: skip
         self.attachment.hook(self._of_gaussians())
 
@@ -187,14 +187,13 @@ class Attached:
         """All entries of the parameters, as gsplat's strategies gather them."""
 
         def put(new: Mapping[str, Tensor], parents: Int[Tensor, " M"]) -> None:
-            for name, tensor in new.items():
-                self._params[name] = tensor
+            self._params.update(new)
             self._rows.take(parents)
 
-        entries = self._params
-        return HostField(
-            lambda: {name: p for name, p in entries.items() if name != ROWS}, self._names, self._of_gaussians, put
-        )
+        def rows() -> dict[str, Tensor]:
+            return {name: p for name, p in self._params.items() if name != ROWS}
+
+        return HostField(rows, self._names, self._of_gaussians, put)
 
     def _poll_parents(self) -> Int[Tensor, " M"] | None:
         change = self._rows.poll()

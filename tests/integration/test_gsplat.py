@@ -13,7 +13,6 @@ import torch
 from clear_strategies import GCO, MCMC, P2G, SVS, Conductor, Objective
 from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.core.view import Photo, View
-from clear_strategies.density import mcmc
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import scaled
 from clear_strategies.training.loop import iterate
@@ -73,10 +72,8 @@ def begun(attached):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SUBSETS)
-def test_fifty_steps_equal_those_of_our_own_trainer(name, attached, monkeypatch):
+def test_fifty_steps_equal_those_of_our_own_trainer(name, attached, mcmc_acts):
     """With a larger ε than that of training, also because of rounding errors."""
-    monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
-    monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
     scene = toy.scene(40)
     scene = replace(scene, train=tuple(map(double, scene.train)))
     own = in_double(scene, conductor(name), STEPS, EPS)

@@ -14,7 +14,6 @@ import torch
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.ply import read_gaussians
-from clear_strategies.density import mcmc
 from clear_strategies.errors import SettingError
 from tests.helpers import gsplat_host, toy
 from tests.helpers.host_parts import FROM_START
@@ -66,9 +65,7 @@ def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(trainer, ca
     assert torch.allclose(stored.sh0.reshape(-1, 3), splats["sh0"].reshape(-1, 3), atol=1e-6)
 
 
-def test_mcmc_densifies_in_place_of_its_default_strategy(trainer, caplog, monkeypatch):
-    monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
-    monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
+def test_mcmc_densifies_in_place_of_its_default_strategy(trainer, caplog, mcmc_acts):
     with caplog.at_level(logging.INFO):
         assert trainer.run([*trainer.sr, *OVERRIDES, "--strategies", "clear,mcmc"], "--refine_stop_iter", "0") == 0
     assert "MCMC densifies in place of the host: densify until 4." in caplog.text

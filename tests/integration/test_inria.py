@@ -14,7 +14,6 @@ from safetensors.torch import load_file
 from clear_strategies import GCO, MCMC, P2G, SVS, AnchorError, Conductor, Objective, RandomBackground, SplatSuRe
 from clear_strategies.core.view import Photo, View
 from clear_strategies.data.priors import Images
-from clear_strategies.density import mcmc
 from clear_strategies.errors import SettingError
 from clear_strategies.schedules import Ramp, scaled
 from clear_strategies.strategies import random_background
@@ -74,10 +73,8 @@ class InDouble(HostViews):
 
 
 @pytest.mark.parametrize("sampling", [False, True], ids=["clear", "clear, mcmc and random_background"])
-def test_its_steps_equal_those_of_our_own_trainer(sampling, inria_host, inria_capture, monkeypatch):
+def test_its_steps_equal_those_of_our_own_trainer(sampling, inria_host, inria_capture, mcmc_acts, monkeypatch):
     """Without spheres, whose rotations have gradients that consist of rounding errors."""
-    monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
-    monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
     monkeypatch.setattr(random_background, "_LONG_RUN", 0)
     sampler = MCMC(start=2, stop=20, every=3, dead_opacity=0.08, min_gaussians=1)
     more = [sampler, RandomBackground(until=20)] if sampling else []

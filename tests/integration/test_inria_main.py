@@ -11,7 +11,6 @@ import torch
 from PIL import Image
 from safetensors.torch import load_file
 
-from clear_strategies.density import mcmc
 from integration import HostError
 from integration.inria.__main__ import main
 from integration.inria.from_options import install
@@ -65,9 +64,7 @@ def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture)
         install(gaussians, scene, object(), sr=inria_capture / "sr")
 
 
-def test_mcmc_densifies_where_the_host_is_told_not_to(inria_host, inria_capture, monkeypatch):
-    monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
-    monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
+def test_mcmc_densifies_where_the_host_is_told_not_to(inria_host, inria_capture, mcmc_acts):
     opt = options(inria_host, inria_capture, densify_until_iter=0)
     gaussians, scene = inria_host.setup(opt)
     clear = install(gaussians, scene, opt, strategies="clear,mcmc", overrides=FROM_START[2:], sr=inria_capture / "sr")

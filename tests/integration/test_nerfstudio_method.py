@@ -31,7 +31,6 @@ from nerfstudio.models import splatfacto
 from nerfstudio.plugins.registry import discover_methods
 
 from clear_strategies.data.photo_files import write_png
-from clear_strategies.density import mcmc
 from clear_strategies.errors import SettingError
 from clear_strategies.strategies import random_background
 from integration.nerfstudio import clear_splatfacto
@@ -169,9 +168,7 @@ def test_the_configuration_can_be_written_and_read(capture, tmp_path):
 
 
 @pytest.mark.parametrize("clear", ["gco", "p2g", "svs", "clear", "clear,mcmc,random_background"])
-def test_nerfstudios_trainer_trains_it(capture, tmp_path, monkeypatch, clear):
-    monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
-    monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
+def test_nerfstudios_trainer_trains_it(capture, tmp_path, mcmc_acts, monkeypatch, clear):
     monkeypatch.setattr(random_background, "_LONG_RUN", 0)
     overrides = ("strategies.p2g.patch=4",) if "p2g" in clear or "clear" in clear else ()
     fields = {"densify_grad_thresh": 1e-4} | ({"stop_split_at": 0} if "mcmc" in clear else {})
