@@ -33,7 +33,7 @@ def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float
         depths: of the photos, on their pixels.
     """
     device = photos[0].image.device if photos else "cpu"
-    pairs = [(a, b) for a, partners in enumerate(partners([p.camera for p in photos])) for b in partners]
+    pairs = [(a, b) for a, others in enumerate(partners([photo.camera for photo in photos])) for b in others]
     if not pairs:
         return torch.ones(len(photos), 3, device=device)
     photos, depths = [photo.to("cpu") for photo in photos], [depth.to("cpu") for depth in depths]
