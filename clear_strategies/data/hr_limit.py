@@ -9,14 +9,15 @@ fits into the limit is taken:
    super-resolved: the photos already hold more detail than the HR images may.
 
 If the user has chosen a prior by name, SR images are always made. In place of 3, the photos are then reduced until `sr_scale`
-times their size fits.
+times their size fits. Where sizes differ, the largest photo decides, and each photo is reduced to the limit by itself: one
+ratio would leave little of a phone's 12 megapixels beside 48.
 """
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Final
@@ -50,7 +51,7 @@ def within_limit(
         The capture and the settings of its views, unchanged where the HR images fit or `photos_are` is not "lr".
     """
     limit, photo = views.max_hr_megapixels, _largest(capture)
-    pixels = photo.width * photo.height / views.shrink**2 / _MEGA
+    pixels = _megapixels(photo, views)
     if views.photos_are != "lr" or limit is None or views.sr_scale**2 * pixels <= limit:
         return capture, views
     size = f"{photo.width // views.shrink}x{photo.height // views.shrink}"
@@ -58,16 +59,22 @@ def within_limit(
     if views.sr_scale > _TWICE and _TWICE**2 * pixels <= limit and reaches(_TWICE):
         return _noted(capture, f"{why}: x{_TWICE} instead"), replace(views, sr_scale=_TWICE)
     factor = views.sr_scale**2 if super_resolve else 1
-    ratio = views.shrink * max(1.0, math.sqrt(factor * pixels / limit))
     multiple = 1 if super_resolve else views.sr_scale
-    if ratio > 1:
-        capture = replace(capture, frames=_reduced(capture.frames, ratio, multiple, views.downsample))
+    ratios = [views.shrink * max(1.0, math.sqrt(factor * _megapixels(f.camera, views) / limit)) for f in capture.frames]
+    if max(ratios) > 1:
+        frames = [_reduced(f, r, multiple, views.downsample) for f, r in zip(capture.frames, ratios, strict=True)]
+        capture = replace(capture, frames=tuple(frames))
         now = _largest(capture)
-        why += f": photos reduced by {ratio:.3g} to {now.width}x{now.height} (PIL {views.downsample})"
+        span = f"{max(ratios):.3g}" if max(ratios) == min(ratios) else f"{min(ratios):.3g} to {max(ratios):.3g}"
+        why += f": photos reduced by {span} to {now.width}x{now.height} (PIL {views.downsample})"
     if super_resolve:
         return _noted(capture, why), replace(views, shrink=1)
     why += "; they are the HR side, no SR image is needed, and LR is made from them"
     return _noted(capture, why), replace(views, shrink=1, photos_are="both")
+
+
+def _megapixels(camera: Camera, views: ViewSettings) -> float:
+    return camera.width * camera.height / views.shrink**2 / _MEGA
 
 
 def _largest(capture: Capture) -> Camera:
@@ -79,14 +86,11 @@ def _noted(capture: Capture, why: str) -> Capture:
     return replace(capture, notes={**capture.notes, "HR side": why})
 
 
-def _reduced(frames: Sequence[Frame], ratio: float, multiple: int, kernel: DownKernel) -> tuple[Frame, ...]:
-    """Frames whose photos are `ratio` times smaller, rounded to sizes that `multiple` divides."""
-    found = []
-    for frame in frames:
-        size = [max(1, round(s / ratio / multiple)) * multiple for s in (frame.camera.width, frame.camera.height)]
-        camera = resized(frame.camera, size[0], size[1])
-        found.append(replace(frame, camera=camera, load=partial(_load, frame, (size[0], size[1]), kernel)))
-    return tuple(found)
+def _reduced(frame: Frame, ratio: float, multiple: int, kernel: DownKernel) -> Frame:
+    """The frame with a photo `ratio` times smaller, rounded to a size that `multiple` divides."""
+    width, height = (max(1, round(s / ratio / multiple)) * multiple for s in (frame.camera.width, frame.camera.height))
+    camera = resized(frame.camera, width, height)
+    return replace(frame, camera=camera, load=partial(_load, frame, (width, height), kernel))
 
 
 def _load(frame: Frame, size: tuple[int, int], kernel: DownKernel) -> Float[Tensor, "H W 3"]:

@@ -67,13 +67,13 @@ def test_without_a_limit_and_under_the_protocols_nothing_changes():
         assert views == ViewSettings(**settings)
 
 
-def test_photos_of_two_sizes_are_reduced_by_one_ratio_and_trained_on_at_both_scales():
+def test_photos_of_two_sizes_are_each_reduced_to_the_limit_and_trained_on_at_both_scales():
     views = ViewSettings(max_hr_megapixels=0.004)
     found, views = within_limit(
         in_a_row((100, 80), (80, 100), (50, 40)), views, reaches=lambda _: True, super_resolve=False
     )
     sizes = [(frame.camera.width, frame.camera.height) for frame in found.frames]
-    assert sizes == [(72, 56), (56, 72), (36, 28)]
+    assert sizes == [(72, 56), (56, 72), (48, 40)]
     scene = prepare(found, views, Bicubic(), CloudSettings(init="random", random_points=20))
     assert len(scene.train) == 3
     for view in scene.train:
