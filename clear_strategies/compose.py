@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -78,11 +78,13 @@ class ConductorSettings:
         )
 
 
-def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERENCE_ITERATIONS) -> Conductor:
+def conductor(
+    strategy: str | Sequence[str] = "clear", *overrides: str, iterations: int = REFERENCE_ITERATIONS
+) -> Conductor:
     """The strategies of conf/, with their objective, for a host's loop.
 
     Args:
-        strategy: as after `+strategy=`: "clear", "gco", "gco,svs", "[gco,svs]", "baseline" …
+        strategy: as after `+strategy=`: "clear", "gco", "gco,svs", "[gco,svs]", "baseline" …, or a list, ["gco", "svs"].
         overrides: as on the command line of `run`: "strategies.gco.tolerance=0.1", "objective=paper", "~strategies.p2g".
         iterations: of the host; every milestone stretches from 10,000 to it.
 
@@ -92,7 +94,7 @@ def conductor(strategy: str = "clear", *overrides: str, iterations: int = REFERE
     """
     if iterations < 1:
         raise SettingError(f"iterations must be at least 1, got {iterations}.")
-    names = strategy.strip()
+    names = strategy.strip() if isinstance(strategy, str) else f"[{','.join(strategy)}]"
     chosen = f"+strategy=[{names}]" if "," in names and not names.startswith("[") else f"+strategy={names}"
     config = composed([chosen, *overrides])
     settings: ConductorSettings = build(tree(config, _TRAINERS))

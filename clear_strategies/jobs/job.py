@@ -222,6 +222,9 @@ def _run(
         if of_baseline != resume.AUTO or resume.finished(baseline.folder, baseline.compared) is None:
             first = baseline.start(place, of_baseline)
     state = ours.start(place, source)
+    idle = [override for override in ours.overrides or () if override.lstrip("+").startswith("density.")]
+    if idle and not isinstance(state.density.settings, type(settings.density)):
+        _log.warning("%s has no effect: %s densifies in place of it.", ", ".join(idle), state.density.name)
     memory.release()
     # In a sweep the console shows one line per job; the rest is in run.log.
     level = logging.DEBUG if _in_sweep() else logging.INFO

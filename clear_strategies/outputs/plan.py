@@ -116,7 +116,8 @@ def _warn_of_idle_strategies(conductor: Conductor, iterations: int) -> None:
     objective = conductor.objective
     largest = max(map(objective.lambda_hr, range(1, iterations + 1)))
     for s in conductor.strategies:
-        if (why := s.without_effect(lambda_lr=objective.lambda_lr, lambda_hr=largest)) is not None:
+        why = s.without_effect(lambda_lr=objective.lambda_lr, lambda_hr=largest, lambda_hf=objective.lambda_hf)
+        if why is not None:
             _log.warning("%s has no effect: %s.", type(s).__name__, why)
 
 

@@ -146,11 +146,12 @@ class Strategy:
         """What the strategy has prepared for this run, a phrase for the plan; None: nothing."""
         return None
 
-    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
         """Why the strategy changes nothing under these loss weights; None where it has an effect.
 
         Args:
             lambda_hr: the largest λ_HR(t) of the run.
+            lambda_hf: the share of the high-frequency loss in it.
         """
         return None
 

@@ -64,5 +64,5 @@ class FadingOpacity(Strategy):
         faded = math.log(1 - rate) - torch.log(rate + torch.exp(-o))
         o.copy_(torch.where(o > _LOWEST, faded, o))
 
-    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
         return "no opacity fades: its rate is 0" if self.rate == 0 else None

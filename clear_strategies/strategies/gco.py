@@ -65,7 +65,7 @@ class GCO(Strategy):
         for group in self.groups:
             require_choice("groups", group, CONFLICT_GROUPS)
 
-    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
         if lambda_lr == 0:
             return "lambda_LR is 0, so nothing can conflict"
         return "lambda_HR is 0 throughout" if lambda_hr == 0 else None

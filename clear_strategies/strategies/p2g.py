@@ -96,8 +96,10 @@ class P2G(Strategy):
             return S
         return screen.ordinary + S * (screen.ordinary.mean() / S.mean().clamp_min(torch.finfo(S.dtype).tiny))
 
-    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
-        return "lambda_HR is 0 throughout" if lambda_hr == 0 else None
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
+        if lambda_hr == 0:
+            return "lambda_HR is 0 throughout"
+        return "lambda_HF is 0, and it routes the high-frequency loss alone" if lambda_hf == 0 else None
 
     def patch_maps(self, view: View) -> PatchMaps:
         """R and A of this view."""

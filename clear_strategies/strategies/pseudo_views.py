@@ -159,7 +159,7 @@ class PseudoViews(Strategy):
         wide = f"{borders} with a field {self.border:g} times as wide, " if borders else ""
         return f"{beside}{wide}one every {self.every} iterations"
 
-    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
         return "it is the LR loss that pseudo views are trained by, and lambda_lr is 0" if lambda_lr == 0 else None
 
 

@@ -62,7 +62,7 @@ class SplatSuRe(Strategy):
                 n_views, self.min_views,
             )  # fmt: skip
 
-    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
         return "lambda_HR is 0 throughout" if lambda_hr == 0 else None
 
     def correct(self, lr: Grads, hr: Grads, step: Step) -> Grads:

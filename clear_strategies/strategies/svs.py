@@ -109,7 +109,7 @@ class SVS(Strategy):
         weights = {name: self.anchor_weights[name] / unit.get(name, 1.0) for name in self.state}
         return Anchor(self.state, {name: strength * weight for name, weight in weights.items()})
 
-    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
         if self.dropout.maximum == 0 and (self.anchor_strength == 0 or not any(self.anchor_weights.values())):
             return f"it drops nothing and anchors nothing, and only ends densification at t={self.anchor_start}"
         return None

@@ -218,3 +218,11 @@ def test_the_jobs_of_a_sweep_train_none(tmp_path, monkeypatch, caplog):
 def test_the_demo_trains_it_and_other_data_do_not():
     trained = {data: composed(f"data={data}").fit.baseline for data in ("demo", "llff", "colmap", "photos")}
     assert trained == {"demo": True, "llff": False, "colmap": False, "photos": False}
+
+
+def test_a_setting_of_density_has_no_effect_beside_a_strategy_that_densifies(tmp_path, caplog):
+    unscaled = ["fit.scale_schedule=false", "fit.baseline=false", "density.every=50"]
+    train(tmp_path / "mcmc", *unscaled, strategy="mcmc")
+    assert caplog.text.count("density.every=50 has no effect: MCMC densifies in place of it.") == 1
+    train(tmp_path / "gco", *unscaled)
+    assert caplog.text.count("has no effect: MCMC") == 1

@@ -44,7 +44,7 @@ class Quiet(Strategy):
     def correct(self, lr: Grads, hr: Grads, evidence: object) -> Grads:
         return hr
 
-    def without_effect(self, *, lambda_lr: float, lambda_hr: float) -> str | None:
+    def without_effect(self, *, lambda_lr: float, lambda_hr: float, lambda_hf: float) -> str | None:
         return f"lambda_HR is at most {lambda_hr:g}" if lambda_hr < 2 else None
 
     def skipped(self) -> Sequence[str]:

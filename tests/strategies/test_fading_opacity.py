@@ -62,8 +62,8 @@ def test_after_nine_tenths_of_the_run_opacities_are_left_alone():
 def test_without_a_rate_it_has_no_effect_and_says_so():
     off = FadingOpacity(rate=0.0)
     assert torch.equal(faded(off)["opacities"], LOGITS)
-    assert "rate is 0" in (off.without_effect(lambda_lr=1.0, lambda_hr=1.0) or "")
-    assert FadingOpacity().without_effect(lambda_lr=1.0, lambda_hr=1.0) is None
+    assert "rate is 0" in (off.without_effect(lambda_lr=1.0, lambda_hr=1.0, lambda_hf=0.2) or "")
+    assert FadingOpacity().without_effect(lambda_lr=1.0, lambda_hr=1.0, lambda_hf=0.2) is None
 
 
 def test_a_run_fades_and_every_row_has_the_bits_of_the_pass_that_skips_some():

@@ -124,3 +124,9 @@ def test_a_flat_image_asks_for_no_detail_on_and_off_the_8_bit_grid(grey, down):
     hr = torch.full((64, 64, 3), grey)
     _, A = P2G(down=down).patch_evidence(torch.full((16, 16, 3), grey), hr, 4)
     assert float(A.max()) < 1e-3
+
+
+def test_without_a_high_frequency_loss_there_is_nothing_to_route():
+    weights = {"lambda_lr": 1.0, "lambda_hr": 1.0}
+    assert P2G().without_effect(**weights, lambda_hf=0.2) is None
+    assert "lambda_HF is 0" in P2G().without_effect(**weights, lambda_hf=0.0)

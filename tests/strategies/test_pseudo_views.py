@@ -124,5 +124,5 @@ def test_an_object_cut_out_of_its_surroundings_needs_none(caplog):
 
 
 def test_without_an_lr_loss_it_has_no_effect():
-    assert "lambda_lr is 0" in (FEW.without_effect(lambda_lr=0.0, lambda_hr=1.0) or "")
-    assert FEW.without_effect(lambda_lr=1.0, lambda_hr=0.0) is None
+    assert "lambda_lr is 0" in (FEW.without_effect(lambda_lr=0.0, lambda_hr=1.0, lambda_hf=0.2) or "")
+    assert FEW.without_effect(lambda_lr=1.0, lambda_hr=0.0, lambda_hf=0.2) is None

@@ -94,8 +94,8 @@ def test_two_views_are_warned_of(caplog):
 
 
 def test_without_hr_there_is_nothing_to_withhold():
-    assert SplatSuRe().without_effect(lambda_lr=1, lambda_hr=0) == "lambda_HR is 0 throughout"
-    assert SplatSuRe().without_effect(lambda_lr=0, lambda_hr=1) is None
+    assert SplatSuRe().without_effect(lambda_lr=1, lambda_hr=0, lambda_hf=0.2) == "lambda_HR is 0 throughout"
+    assert SplatSuRe().without_effect(lambda_lr=0, lambda_hr=1, lambda_hf=0.2) is None
 
 
 @pytest.mark.parametrize("setting", [{"ratio": 0.9}, {"softness": 0.0}, {"min_views": 0}], ids=str)
