@@ -11,7 +11,7 @@ This package does not depend on `clear_strategies`.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import fields
 from typing import Any, Final
 
@@ -34,7 +34,7 @@ __all__ = [
     "Traits", "available", "fastest", "for_device", "load", "names",
 ]  # fmt: skip
 
-# The module and the class of each backend. A backend imports its library only when it is constructed.
+# The module and the class of each backend. A backend imports its library when it is constructed.
 _BACKENDS: Final[dict[str, tuple[str, str]]] = {
     "cpp": ("rasterizers.cpp", "CppRasterizer"),
     "torch": ("rasterizers.reference", "ReferenceRasterizer"),
@@ -42,7 +42,6 @@ _BACKENDS: Final[dict[str, tuple[str, str]]] = {
     "gsplat": ("rasterizers.gsplat_backend", "GsplatRasterizer"),
 }
 _ON_CUDA: Final = ("warp", "gsplat")
-_ON_EITHER: Final = ("warp",)  # draws on a CPU or on CUDA; which of them is said when it is made
 
 
 def load(name: str = "auto", *, preset: str | None = None, **settings: Any) -> Rasterizer:
@@ -84,24 +83,17 @@ def fastest(device: str | None = None) -> str:
     Raises:
         BackendUnavailable: none draws tensors there.
     """
-    for name, backend in _runnable():
-        if device is None or device in backend.traits.devices:
-            return name
+    for name in names():
+        with suppress(BackendUnavailable):
+            backend = load(name)
+            if device is None or device in backend.traits.devices:
+                return name
     raise BackendUnavailable(f"no rasterizer draws tensors on {device!r}; move the splats to 'cpu' or 'cuda'.")
 
 
 def for_device(name: str, device: str) -> dict[str, str]:
-    """The settings by which a backend is made for tensors on this device; none where nothing has to be said."""
-    return {"device": device} if name in _ON_EITHER else {}
-
-
-def _runnable() -> Iterator[tuple[str, Rasterizer]]:
-    """The backends that run on this machine, fastest first; each is loaded when the iterator reaches it."""
-    for name in names():
-        try:
-            yield name, load(name)
-        except BackendUnavailable:
-            continue
+    """The settings of `load` with which a backend draws tensors on this device."""
+    return {"device": device} if name == "warp" else {}  # the only one for a CPU and CUDA that is bound to one of them
 
 
 def available() -> dict[str, str | None]:

@@ -33,7 +33,7 @@ class BackendUnavailable(RuntimeError):
 Color = tuple[float, float, float]
 """RGB in [0, 1]."""
 
-_RIGID: Final = 1e-3  # files keep few digits
+_RIGID: Final = 1e-3  # tolerance of a rigid transform; files keep few digits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,16 +112,17 @@ class Camera:
 
 
 def _is_rigid(world_to_camera: Float[Tensor, "4 4"]) -> bool:
-    rows = world_to_camera.detach().double().tolist()
-    (a, b, c), last = [row[:3] for row in rows[:3]], rows[3]
+    """Whether R Rᵀ = I, det R = 1 and the last row is (0, 0, 0, 1). Without tensors, which would take five times as long."""
+    *rows, last = world_to_camera.detach().double().tolist()
+    a, b, c = (row[:3] for row in rows)
 
     def dot(u: list[float], v: list[float]) -> float:
-        return sum(x * y for x, y in zip(u, v, strict=True))
+        return sum(map(operator.mul, u, v))
 
-    across = [b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]]
-    products = [dot(a, a) - 1, dot(b, b) - 1, dot(c, c) - 1, dot(a, b), dot(a, c), dot(b, c), dot(a, across) - 1]
-    affine = [last[0], last[1], last[2], last[3] - 1]
-    return all(abs(x) <= _RIGID for x in (*products, *affine))
+    b_cross_c = [b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]]
+    zeros = (dot(a, b), dot(a, c), dot(b, c), *last[:3])
+    ones = (dot(a, a), dot(b, b), dot(c, c), dot(a, b_cross_c), last[3])
+    return all(abs(x) <= _RIGID for x in zeros) and all(abs(x - 1) <= _RIGID for x in ones)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
