@@ -1,4 +1,4 @@
-"""Conventions that all backends and the trainer share: rotations from quaternions, and spherical harmonics."""
+"""Conventions that all backends share: rotations from quaternions, spherical harmonics, and where the Jacobian is clamped."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Final
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from rasterizers.interface import Camera
 
 SH_C0: Final = 0.28209479177387814
 """The constant band: rgb = SH_C0 · sh0 + 1/2."""
@@ -66,3 +68,15 @@ def spherical_harmonics(directions: Float[Tensor, "M 3"], bands: int) -> Float[T
             -0.5900435899266435 * x * (xx - 3 * yy),
         ]
     return torch.stack(basis, dim=-1)
+
+
+def tangent_limits(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The ranges (low, high) of x/z and of y/z to which the projection's Jacobian is clamped.
+
+    They extend 0.3 half fields of view beyond the image: farther outside the affine approximation diverges.
+    """
+    margin_x, margin_y = 0.3 * camera.width / (2 * camera.fx), 0.3 * camera.height / (2 * camera.fy)
+    return (
+        (-camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x),
+        (-camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y),
+    )

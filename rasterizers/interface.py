@@ -117,7 +117,7 @@ def _is_rigid(world_to_camera: Float[Tensor, "4 4"]) -> bool:
     a, b, c = (row[:3] for row in rows)
 
     def dot(u: list[float], v: list[float]) -> float:
-        return sum(map(operator.mul, u, v))
+        return float(sum(map(operator.mul, u, v)))
 
     b_cross_c = [b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0]]
     zeros = (dot(a, b), dot(a, c), dot(b, c), *last[:3])

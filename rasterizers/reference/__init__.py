@@ -20,8 +20,8 @@ from torch import Tensor
 from rasterizers.checks import Backend, require_cotangents, require_finite, require_splats
 from rasterizers.interface import Camera, Rendering, SplatGradients, Splats, Traits
 from rasterizers.reference.blend import blend, blend_vjp
-from rasterizers.reference.projection import Projection, project
-from rasterizers.reference.tiles import TileGrid, TileLists, list_tiles
+from rasterizers.reference.projection import project
+from rasterizers.reference.tiles import TileGrid, list_tiles
 
 _TRAITS: Final = Traits(
     devices=frozenset({"cpu", "cuda"}), dtypes=frozenset({torch.float32, torch.float64}), depth=True
@@ -50,28 +50,25 @@ class ReferenceRasterizer(Backend):
 
     def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
         """Jobs share nothing."""
-        return [self._drawn(*job, z) for job, z in zip(jobs, depth, strict=True)]
-
-    def _drawn(self, splats: Splats, camera: Camera, depth: bool) -> Rendering:
-        require_splats(splats, _TRAITS)
-        require_finite(splats)
-        grid = TileGrid(camera.width, camera.height, _TILE)
-        projection = project(splats, camera, self, depth=depth)
-        return ReferenceRendering(self, grid, projection, list_tiles(projection, grid))
+        return [ReferenceRendering(self, *job, depth=z) for job, z in zip(jobs, depth, strict=True)]
 
 
 class ReferenceRendering:
     """The image, and the tile lists that its VJP reads again."""
 
-    def __init__(self, settings: ReferenceRasterizer, grid: TileGrid, projection: Projection, lists: TileLists) -> None:
-        self._settings, self._grid, self._projection = settings, grid, projection
-        n = projection.n_splats
-        self.means2d: Float[Tensor, "N 2"] = projection.scatter(projection.means2d.detach(), n)
-        self.visible: Bool[Tensor, " N"] = projection.scatter(lists.visible, n)
+    def __init__(self, settings: ReferenceRasterizer, splats: Splats, camera: Camera, *, depth: bool) -> None:
+        require_splats(splats, _TRAITS)
+        require_finite(splats)
+        self._settings = settings
+        self._grid = grid = TileGrid(camera.width, camera.height, _TILE)
+        self._projection = projection = project(splats, camera, settings, depth=depth)
+        lists = list_tiles(projection, grid)
+        self.means2d: Float[Tensor, "N 2"] = projection.scatter(projection.means2d.detach())
+        self.visible: Bool[Tensor, " N"] = projection.scatter(lists.visible)
         tiles, transmittance, self._passes = blend(projection.table(), lists, grid, settings, settings.lanes)
         pixels = grid.to_image(tiles)
         self.image: Float[Tensor, "H W 3"] = pixels[..., :3].contiguous()
-        self.depth: Float[Tensor, "H W"] | None = pixels[..., 3] if projection.draws_depth else None
+        self.depth: Float[Tensor, "H W"] | None = pixels[..., 3] if depth else None
         self.alpha: Float[Tensor, "H W"] = 1 - grid.to_image(transmittance[..., None])[..., 0]
 
     def vjp(self, cotangents: Float[Tensor, "K H W 3"]) -> SplatGradients:

@@ -13,11 +13,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rasterizers.geometry import BLACK, rotation_matrix, spherical_harmonics
+from rasterizers.geometry import BLACK, rotation_matrix, spherical_harmonics, tangent_limits
 from rasterizers.interface import Camera, RasterSettings, SplatGradients, Splats
-
-# The Jacobian is clamped beyond this share of the half field of view outside the image.
-_FRUSTUM_MARGIN = 0.3
 
 # Columns of the table that blending reads, one row per projected Gaussian; the last one is there if depth is drawn.
 MEAN, CONIC, OPACITY, RGB, DEPTH = slice(0, 2), slice(2, 5), slice(5, 6), slice(6, 9), slice(9, 10)
@@ -58,9 +55,9 @@ class Projection:
         table = torch.column_stack([x.detach() for x in ((*columns, self.depths) if self.draws_depth else columns)])
         return torch.cat((table, table.new_zeros(1, table.shape[1])))
 
-    def scatter(self, values: Tensor, n: int) -> Tensor:
+    def scatter(self, values: Tensor) -> Tensor:
         """The values at their rows among all N splats; zeros (or False) elsewhere."""
-        out = values.new_zeros(n, *values.shape[1:])
+        out = values.new_zeros(self.n_splats, *values.shape[1:])
         out[self.rows] = values
         return out
 
@@ -75,12 +72,9 @@ class Projection:
             gradients = torch.autograd.grad(outputs, inputs, cotangents, retain_graph=True, materialize_grads=True)
             by_cotangent.append([*gradients, g[:, MEAN]])
         means, quats, scales, opacities, rgb, screen = (
-            torch.stack([self.scatter(g, self.n_splats) for g in attribute])
-            for attribute in zip(*by_cotangent, strict=True)
+            torch.stack([self.scatter(g) for g in attribute]) for attribute in zip(*by_cotangent, strict=True)
         )
-        return SplatGradients(
-            means, quats, scales, opacities, screen, rgb, basis=self.scatter(self.basis, self.n_splats)
-        )
+        return SplatGradients(means, quats, scales, opacities, screen, rgb, basis=self.scatter(self.basis))
 
 
 def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: bool) -> Projection:
@@ -99,7 +93,8 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: 
 
         # T = J W R(q) diag(s): the two rows of a 2 x 3 factor of Σ'.
         axes = pose[:3, :3] @ (rotation_matrix(quats) * scales[:, None, :])
-        jx, jy = _jacobian(x / z, y / z, camera)
+        limits_x, limits_y = tangent_limits(camera)
+        jx, jy = -camera.fx * (x / z).clamp(*limits_x), -camera.fy * (y / z).clamp(*limits_y)  # times z
         row_x = (camera.fx * axes[:, 0] + jx[:, None] * axes[:, 2]) / z[:, None]
         row_y = (camera.fy * axes[:, 1] + jy[:, None] * axes[:, 2]) / z[:, None]
 
@@ -115,7 +110,9 @@ def project(splats: Splats, camera: Camera, settings: RasterSettings, *, depth: 
         if settings.antialiased:
             opacities = opacities * _compensation(area, blur)
 
-        basis = spherical_harmonics(_directions(means, camera.center.to(means)), splats.shN.shape[1])
+        offset = means - camera.center.to(means)
+        direction = offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+        basis = spherical_harmonics(direction, splats.shN.shape[1])
         coefficients = torch.cat((splats.sh0.detach()[rows], splats.shN.detach()[rows]), dim=1)
         raw_rgb = (basis[:, :, None] * coefficients).sum(1) + 0.5
         if splats.rgb_offset is not None:
@@ -150,18 +147,3 @@ def _compensation(area: Float[Tensor, " M"], blur: Float[Tensor, " M"]) -> Float
     large = area * area > blur
     share = blur / torch.where(large, area, 1.0).square()
     return torch.where(large, torch.rsqrt(1 + share), area * torch.rsqrt(torch.where(large, 1.0, area * area + blur)))
-
-
-def _jacobian(tan_x: Tensor, tan_y: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """The off-axis entries of J, times z. Clamped far outside the image, where the affine approximation diverges."""
-    margin_x = _FRUSTUM_MARGIN * camera.width / (2 * camera.fx)
-    margin_y = _FRUSTUM_MARGIN * camera.height / (2 * camera.fy)
-    left, right = -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x
-    top, bottom = -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y
-    return -camera.fx * tan_x.clamp(left, right), -camera.fy * tan_y.clamp(top, bottom)
-
-
-def _directions(means: Float[Tensor, "M 3"], center: Float[Tensor, " 3"]) -> Float[Tensor, "M 3"]:
-    offset = means - center
-    length: Tensor = torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
-    return offset / length

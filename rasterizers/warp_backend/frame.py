@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rasterizers.checks import packed_rows, require_cotangents, require_finite, require_splats
+from rasterizers.geometry import tangent_limits
 from rasterizers.interface import Camera, SplatGradients, Splats
 from rasterizers.warp_backend import types
 from rasterizers.warp_backend.bins import find_tiles, list_pairs
@@ -32,7 +33,6 @@ from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, Warp
 from rasterizers.warp_runtime import array, on_stream
 
 _ROW: Final = 14
-_MARGIN: Final = 0.3  # the Jacobian is clamped beyond this share of the half field of view outside the image
 DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
 """Whether the host reads the number of pairs only when an image is accessed."""
 LANES: Final = {"cuda": 32, "cpu": 1}
@@ -321,10 +321,8 @@ def _grid_struct(camera: Camera, columns: int, rows: int) -> Any:
     grid.exact_focal, grid.exact_principal = wp.vec2d(camera.fx, camera.fy), wp.vec2d(camera.cx, camera.cy)
     grid.focal = wp.vec2(camera.fx, camera.fy)
     grid.size, grid.tiles = wp.vec2i(camera.width, camera.height), wp.vec2i(columns, rows)
-    margin_x, margin_y = _MARGIN * camera.width / (2 * camera.fx), _MARGIN * camera.height / (2 * camera.fy)
-    grid.low = wp.vec2(-camera.cx / camera.fx - margin_x, -camera.cy / camera.fy - margin_y)
-    right, bottom = (camera.width - camera.cx) / camera.fx, (camera.height - camera.cy) / camera.fy
-    grid.high = wp.vec2(right + margin_x, bottom + margin_y)
+    (left, right), (top, bottom) = tangent_limits(camera)
+    grid.low, grid.high = wp.vec2(left, top), wp.vec2(right, bottom)
     return grid
 
 
