@@ -6,8 +6,8 @@ that a loop written for gsplat runs on a CPU. Each backward pass handles one cot
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from enum import Enum
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
@@ -22,16 +22,16 @@ from rasterizers.checks import require_depth
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera, Color, Rasterizer, Rendering, Splats, over
 
-# Arguments of gsplat 1.5 that change its speed, or leave out Gaussians that are too small or too far to matter …
+# Arguments of gsplat 1.5 that change its speed, or leave out Gaussians that are too small or too far to matter.
 _WITHOUT_EFFECT: Final = {
     "sparse_grad", "tile_size", "radius_clip", "far_plane", "channel_chunk", "distributed", "segmented",
 }  # fmt: skip
-# … and of the others, the values that this package draws; None where none is named.
+# The only value that this package draws of each other argument; None for one that is not listed.
 _SUPPORTED: Final = {"camera_model": "pinhole", "with_ut": False, "with_eval3d": False, "rolling_shutter": "GLOBAL"}
 
 
 class Drawn(NamedTuple):
-    """An image, and its depth if it was asked for, in the autograd graph of their splats.
+    """An image, and its depth if `draw` had `depth=True`, in the autograd graph of their splats.
 
     Args:
         depth: the expected depth, see `rasterizers.interface.Rendering.depth`. A loss must not depend on it.
@@ -58,7 +58,7 @@ def draw(
         depth: also draw the expected depth.
 
     Raises:
-        ValueError: depth is asked of a rasterizer without the trait, or the pose should learn.
+        ValueError: the rasterizer lacks the trait `depth` that `depth=True` needs, or the pose requires a gradient.
         NotImplementedError: in `backward`, if the loss depends on the depth.
         RuntimeError: in `backward`, if the loss depends on these gradients, e.g. by a gradient penalty.
     """
@@ -71,30 +71,20 @@ def draw(
         )
     if means2d is None:
         means2d = splats.means.new_zeros(len(splats), 2).requires_grad_()
-    tensors = (splats.means, splats.quats, splats.scales, splats.opacities, splats.sh0, splats.shN)
-    image, alpha, visible, expected = _Draw.apply(  # type: ignore[no-untyped-call]
-        rasterizer, camera, depth, means2d, splats.rgb_offset, *tensors
-    )
+    tensors = [getattr(splats, field.name) for field in fields(Splats)]
+    image, alpha, visible, expected = _Draw.apply(rasterizer, camera, depth, means2d, *tensors)  # type: ignore[no-untyped-call]
     return Drawn(image, alpha, means2d, visible, expected)
 
 
 class _Draw(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        rasterizer: Rasterizer,
-        camera: Camera,
-        depth: bool,
-        means2d: Tensor,
-        offset: Tensor | None,
-        *tensors: Tensor,
+        ctx: Any, rasterizer: Rasterizer, camera: Camera, depth: bool, means2d: Tensor, *tensors: Tensor | None
     ) -> Any:
         ctx.rasterizer, ctx.camera = rasterizer, camera
-        ctx.save_for_backward(*tensors, *([] if offset is None else [offset]))
-        detached = Splats(*(x.detach() for x in tensors))
-        if offset is not None:
-            detached = replace(detached, rgb_offset=offset.detach())
-        ctx.rendering = rasterizer(detached, camera, depth=True) if depth else rasterizer(detached, camera)
+        ctx.save_for_backward(*tensors)
+        splats = _detached(tensors)
+        ctx.rendering = rasterizer(splats, camera, depth=True) if depth else rasterizer(splats, camera)
         means2d.data.copy_(ctx.rendering.means2d)
         ctx.mark_non_differentiable(visible := ctx.rendering.visible.data)
         ctx.set_materialize_grads(False)
@@ -104,33 +94,38 @@ class _Draw(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable  # a second derivative would silently be 0
-    def backward(ctx: Any, of_image: Tensor | None, of_alpha: Tensor | None, _: None, of_depth: Tensor | None) -> Any:
-        if of_depth is not None and bool(of_depth.any()):  # silence would leave out a part of the loss
+    def backward(ctx: Any, d_image: Tensor | None, d_alpha: Tensor | None, _: None, d_depth: Tensor | None) -> Any:
+        if d_depth is not None and bool(d_depth.any()):  # silence would leave out a part of the loss
             raise NotImplementedError(
                 "the loss depends on a rendered depth, which has no gradient in this package; detach it, or draw with "
                 "gsplat's own rasterization on a GPU."
             )
-        saved = [x.detach() for x in ctx.saved_tensors]  # raises if one was changed in place since it was drawn
-        cotangent = torch.zeros_like(ctx.rendering.image) if of_image is None else of_image
-        if of_alpha is None or not bool(of_alpha.any()):
-            total = _gradients(ctx.rendering, cotangent)
+        splats = _detached(ctx.saved_tensors)  # raises if one was changed in place since it was drawn
+        if d_image is None:
+            d_image = torch.zeros_like(ctx.rendering.image)
+        if d_alpha is None or not bool(d_alpha.any()):
+            gradients = _gradients(ctx.rendering, d_image)
         else:
             # With C the colour and T = 1 - alpha, I(b) = C + T b. The difference of two backgrounds has the gradient of T.
             b = ctx.rasterizer.background
             other = (0.0 if b[0] > 0.5 else 1.0, *b[1:])
-            of_red = torch.zeros_like(cotangent)
-            of_red[..., 0] = of_alpha / (other[0] - b[0])
-            splats = Splats(*saved[:6], *saved[6:])
+            d_red = torch.zeros_like(d_image)
+            d_red[..., 0] = d_alpha / (other[0] - b[0])
             over_other = over(ctx.rasterizer, other)(splats, ctx.camera)
-            pairs = zip(_gradients(ctx.rendering, cotangent + of_red), _gradients(over_other, -of_red), strict=True)
-            total = [g + h for g, h in pairs]
-        screen, rgb, *gradients = total
-        return None, None, None, screen, rgb if len(saved) > 6 else None, *gradients
+            both = _gradients(ctx.rendering, d_image + d_red), _gradients(over_other, -d_red)
+            gradients = [g + h for g, h in zip(*both, strict=True)]
+        *others, rgb = gradients
+        return None, None, None, *others, None if splats.rgb_offset is None else rgb
+
+
+def _detached(tensors: Sequence[Tensor | None]) -> Splats:
+    return Splats(*(x if x is None else x.detach() for x in tensors))  # type: ignore[arg-type]
 
 
 def _gradients(rendering: Rendering, cotangent: Float[Tensor, "H W 3"]) -> list[Tensor]:
+    """The gradients of the tensors that `_Draw` takes, in their order."""
     g = rendering.vjp(cotangent[None])
-    return [x[0] for x in (g.screen, g.rgb, g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN)]
+    return [x[0] for x in (g.screen, g.means, g.quats, g.scales, g.opacities, g.sh0, g.shN, g.rgb)]
 
 
 def rasterization(
@@ -143,7 +138,7 @@ def rasterization(
     Ks: Float[Tensor, "C 3 3"],
     width: int,
     height: int,
-    *,  # the order of gsplat's others is not ours
+    *,  # gsplat has its other arguments in another order
     near_plane: float = 0.01,
     eps2d: float = 0.3,
     sh_degree: int | None = None,
@@ -153,7 +148,7 @@ def rasterization(
     absgrad: bool = False,
     rasterize_mode: str = "classic",
     backend: str = "auto",
-    **others: Any,
+    **more: Any,
 ) -> tuple[Float[Tensor, "C H W D"], Float[Tensor, "C H W 1"], dict[str, Any]]:
     """Stands in for gsplat's `rasterization` with a backend of this package: pinhole cameras, RGB and expected depth.
 
@@ -163,7 +158,7 @@ def rasterization(
         render_mode: "RGB", or "RGB+ED" with the expected depth as a fourth channel of the images, to look at: a loss of
             it raises `NotImplementedError` in `backward`.
         packed: has no effect; `info` is always unpacked.
-        others: gsplat's other arguments. Those that change only how it computes (sparse_grad, tile_size …) have no effect.
+        more: gsplat's other arguments. Those that change only how it computes (sparse_grad, tile_size …) have no effect.
         backend: a name of `rasterizers.load`.
 
     Returns:
@@ -174,33 +169,34 @@ def rasterization(
         ValueError: a mode or an argument that only gsplat supports, poses that require a gradient, or a wrong shape.
         TypeError: an argument after `height` is given by position.
     """
-    _require_supported(render_mode, rasterize_mode, absgrad, others)
+    _require_supported(render_mode, rasterize_mode, absgrad, more)
     _require_shapes(len(means), colors, viewmats, Ks, backgrounds, sh_degree)
-    behind = colors.new_zeros(len(viewmats), 3) if backgrounds is None else backgrounds
-    low, span = (0.0, 1.0) if sh_degree is not None else _low_and_span(colors, behind)
+    if backgrounds is None:
+        backgrounds = colors.new_zeros(len(viewmats), 3)
+    low, span = (0.0, 1.0) if sh_degree is not None else _low_and_span(colors, backgrounds)
     if sh_degree is None:
         colors, sh_degree = ((colors - low) / span - 0.5)[:, None] / SH_C0, 0
     splats = Splats(means, quats, scales, opacities, colors[:, :1], colors[:, 1 : (sh_degree + 1) ** 2])
     means2d = means.new_zeros(len(viewmats), len(means), 2).requires_grad_()
-    shots = []
+    views = []
     for i, (pose, K) in enumerate(zip(viewmats, Ks, strict=True)):
-        background = tuple((x - low) / span for x in behind[i].tolist())
+        background = tuple((x - low) / span for x in backgrounds[i].tolist())
         antialiased = rasterize_mode == "antialiased"
         rasterizer = _loaded(backend, means.device.type, near_plane, eps2d, antialiased, background)
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
         camera = Camera(pose, fx, fy, cx, cy, width, height)
-        shots.append(draw(rasterizer, splats, camera, means2d[i], depth=render_mode == "RGB+ED"))
-    visible = torch.stack([shot.visible for shot in shots])
+        views.append(draw(rasterizer, splats, camera, means2d[i], depth=render_mode == "RGB+ED"))
+    visible = torch.stack([view.visible for view in views])
     info = {
         "means2d": means2d, "radii": visible[..., None].expand(-1, -1, 2).int(), "gaussian_ids": None,
-        "width": width, "height": height, "n_cameras": len(shots),
+        "width": width, "height": height, "n_cameras": len(views),
     }  # fmt: skip
-    images, alphas = torch.stack([s.image for s in shots]), torch.stack([s.alpha for s in shots])[..., None]
+    images, alphas = torch.stack([view.image for view in views]), torch.stack([view.alpha for view in views])[..., None]
     if (low, span) != (0.0, 1.0):
         images = low + span * images
-    if behind.requires_grad:  # adds 0, whose gradient is the background's
-        images = images + (1 - alphas.detach()) * (behind - behind.detach())[:, None, None]
-    depths = [shot.depth for shot in shots if shot.depth is not None]
+    if backgrounds.requires_grad:  # adds 0, whose gradient is the background's
+        images = images + (1 - alphas.detach()) * (backgrounds - backgrounds.detach())[:, None, None]
+    depths = [view.depth for view in views if view.depth is not None]
     return torch.cat((images, torch.stack(depths)[..., None]), -1) if depths else images, alphas, info
 
 
@@ -209,7 +205,7 @@ def _low_and_span(colors: Float[Tensor, "N 3"], backgrounds: Float[Tensor, "C 3"
 
     The weights of a pixel's colours and background sum to 1, so the image is low + span times what is drawn.
     """
-    finite = torch.cat((colors, backgrounds)).detach().nan_to_num(0, 0, 0)  # the rasterizer says which is not
+    finite = torch.cat((colors, backgrounds)).detach().nan_to_num(0, 0, 0)  # NaN is refused by the rasterizer
     low = min(0.0, float(finite.min()))
     return low, max(1.0, float(finite[len(colors) :].max()) - low)
 
@@ -239,10 +235,10 @@ def _require_shapes(
         )
 
 
-def _require_supported(render_mode: str, rasterize_mode: str, absgrad: bool, others: Mapping[str, Any]) -> None:
+def _require_supported(render_mode: str, rasterize_mode: str, absgrad: bool, more: Mapping[str, Any]) -> None:
     refused = []
-    for name in others.keys() - _WITHOUT_EFFECT:
-        value, supported = others[name], _SUPPORTED.get(name)
+    for name in more.keys() - _WITHOUT_EFFECT:
+        value, supported = more[name], _SUPPORTED.get(name)
         value = value.name if isinstance(value, Enum) else value
         if value is not supported and not (isinstance(value, str | bool) and value == supported):
             refused.append(f"{name}={value!r}" if isinstance(value, str | bool | int | float) else name)
