@@ -1,4 +1,4 @@
-"""What the backends of this package share: what they draw together, and how they refuse bad input."""
+"""What the backends of this package share: a base class, and the checks of their input."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from torch import Tensor
 
 from rasterizers.interface import Camera, Rasterizer, RasterSettings, Rendering, Splats, Traits
 
-_SHAPES: Final = {
-    "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": (None, 3), "rgb_offset": (3,),
+_SHAPES: Final = {  # of a row; B is the number of higher bands
+    "means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3), "shN": ("B", 3), "rgb_offset": (3,),
 }  # fmt: skip
-_BANDS: Final = (0, 3, 8, 15)
 
 
 class Backend(RasterSettings):
@@ -33,26 +32,22 @@ class Backend(RasterSettings):
     def render_scales(
         self, jobs: Sequence[tuple[Splats, Camera]], *, depth: Sequence[bool] | None = None
     ) -> list[Rendering]:
-        """See `Rasterizer.render_scales`. Jobs that share nothing are drawn one by one."""
+        """See `Rasterizer.render_scales`. Jobs of different poses or tensor objects are drawn one by one."""
         depths = depth or [False] * len(jobs)
-        if all(_same_gaussians_and_pose(jobs[0], job) for job in jobs[1:]):
+        first, pose = jobs[0][0], jobs[0][1].world_to_camera
+        if all(
+            torch.equal(camera.world_to_camera, pose)
+            and all(
+                getattr(splats, name) is getattr(first, name) for name in ("means", "quats", "scales", "sh0", "shN")
+            )
+            for splats, camera in jobs[1:]
+        ):
             return self.draw(jobs, depths)
         return [self(*job, depth=z) for job, z in zip(jobs, depths, strict=True)]
 
 
-def _same_gaussians_and_pose(first: tuple[Splats, Camera], other: tuple[Splats, Camera]) -> bool:
-    """Whether two jobs draw the same tensor objects from the same pose; opacities and offsets may differ."""
-    (a, from_a), (b, from_b) = first, other
-    same = all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
-    return same and torch.equal(from_a.world_to_camera, from_b.world_to_camera)
-
-
 def require_device(device: str) -> None:
-    """Refuse what is no type of a device: CUDA's tensors are drawn on the device that they are on.
-
-    Raises:
-        ValueError: it is neither "cpu" nor "cuda".
-    """
+    """Raise a ValueError unless it is "cpu" or "cuda". A number is refused, too: splats are drawn on the device they are on."""
     if device not in ("cpu", "cuda"):
         raise ValueError(f"device must be cpu or cuda, got {device!r}.")
 
@@ -62,30 +57,33 @@ def require_splats(splats: Splats, traits: Traits) -> None:
 
     Raises:
         TypeError: a tensor's dtype or device is not the backend's, or is not that of the means.
-        ValueError: a tensor has another shape than `Splats` says.
+        ValueError: a tensor has another shape than in `Splats`.
     """
     means = splats.means
     if means.dtype not in traits.dtypes or means.device.type not in traits.devices:
         drawn = " and ".join(sorted(str(dtype).removeprefix("torch.") for dtype in traits.dtypes))
         raise TypeError(
             f"this rasterizer draws {drawn} tensors on {' or '.join(sorted(traits.devices))}, "
-            f"got splats.means of {_kind(means)}; move the splats there, or load another backend."
+            f"got splats.means of {_dtype_and_device(means)}; move the splats there, or load another backend."
         )
     for name, row in _SHAPES.items():
         value = getattr(splats, name)
         if value is None:
             continue
         if value.dtype != means.dtype or value.device != means.device:
-            raise TypeError(f"splats.{name} must be {_kind(means)}, as splats.means is, got {_kind(value)}.")
-        shape, expected = tuple(value.shape), (len(means), *row)
-        if len(shape) != len(expected) or any(e is not None and s != e for s, e in zip(shape, expected, strict=True)):
-            written = ", ".join("B" if size is None else str(size) for size in expected)
-            raise ValueError(f"splats.{name} must have the shape [{written}], got {list(shape)}.")
-    if (bands := splats.shN.shape[1]) not in _BANDS:
+            raise TypeError(
+                f"splats.{name} must be {_dtype_and_device(means)}, as splats.means is, got {_dtype_and_device(value)}."
+            )
+        expected = (len(means), *row)
+        if value.dim() != len(expected) or any(e not in ("B", s) for s, e in zip(value.shape, expected, strict=True)):
+            raise ValueError(
+                f"splats.{name} must have the shape [{', '.join(map(str, expected))}], got {list(value.shape)}."
+            )
+    if (bands := splats.shN.shape[1]) not in (0, 3, 8, 15):
         raise ValueError(f"splats.shN must hold 0, 3, 8 or 15 bands, got {bands}.")
 
 
-def _kind(tensor: Tensor) -> str:
+def _dtype_and_device(tensor: Tensor) -> str:
     return f"{str(tensor.dtype).removeprefix('torch.')} on {tensor.device}"
 
 
@@ -109,7 +107,7 @@ def require_cotangents(cotangents: Tensor, image: Tensor) -> None:
 
 
 def require_depth(rasterizer: Rasterizer) -> None:
-    """Raise a ValueError, before it is asked to, for a rasterizer that draws no depth."""
+    """Raise a ValueError for a rasterizer that draws no depth."""
     if not rasterizer.traits.depth:
         raise ValueError(
             f"{type(rasterizer).__name__} draws no depth (its traits.depth is False); cpp, torch, warp and gsplat do."

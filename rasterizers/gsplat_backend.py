@@ -33,8 +33,8 @@ def _gsplat_rasterization() -> Callable[..., Any]:
         raise BackendUnavailable(
             f"the gsplat rasterizer needs gsplat, which cannot be imported ({error}); pip install 'clear-strategies[gsplat]'."
         ) from error
-    found: Callable[..., Any] = rasterization
-    return found
+    function: Callable[..., Any] = rasterization
+    return function
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,16 +94,16 @@ class GsplatRasterizer(Backend):
                 rasterize_mode="antialiased" if self.antialiased else "classic",
                 **({"render_mode": "RGB+ED"} if depth else {}),
             )  # fmt: skip
-            drawn = images[..., :3]
+            colors = images[..., :3]
         radii = info["radii"][0]
         visible = (radii > 0).all(-1) if radii.dim() == 2 else radii > 0
-        pixels = images[0].detach()
+        depths = images[0, ..., 3].detach() if depth else None
         direction = torch.nn.functional.normalize(splats.means.detach() - camera.center.to(splats.means), dim=-1)
         basis = spherical_harmonics(direction, splats.shN.shape[1])
         return GsplatRendering(
-            pixels[..., :3].contiguous(), alphas[0, ..., 0].detach(), pixels[..., 3] if depth else None,
+            colors[0].detach().contiguous(), alphas[0, ..., 0].detach(), depths,
             info["means2d"].detach()[0], visible,
-            drawn, {**leaves, "screen": info["means2d"]}, basis,
+            colors, {**leaves, "screen": info["means2d"]}, basis,
         )  # fmt: skip
 
 
@@ -112,7 +112,7 @@ class GsplatRendering:
     """An image, and its VJP through gsplat's autograd graph.
 
     Args:
-        drawn: the image, in the graph of `leaves`.
+        colors: the image, in the graph of `leaves`.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -120,7 +120,7 @@ class GsplatRendering:
     depth: Float[Tensor, "H W"] | None
     means2d: Float[Tensor, "N 2"]
     visible: Bool[Tensor, " N"]
-    drawn: Float[Tensor, "1 H W 3"]
+    colors: Float[Tensor, "1 H W 3"]
     leaves: dict[str, Tensor]
     basis: Float[Tensor, "N B1"]
 
@@ -128,7 +128,7 @@ class GsplatRendering:
         require_cotangents(cotangents, self.image)
         leaves = list(self.leaves.values())
         by_cotangent = [
-            torch.autograd.grad(self.drawn, leaves, cotangent[None], retain_graph=True, materialize_grads=True)
+            torch.autograd.grad(self.colors, leaves, cotangent[None], retain_graph=True, materialize_grads=True)
             for cotangent in cotangents
         ]
         g = dict(zip(self.leaves, map(torch.stack, zip(*by_cotangent, strict=True)), strict=True))

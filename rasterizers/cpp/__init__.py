@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
-from dataclasses import dataclass
-from types import ModuleType
+from dataclasses import dataclass, fields
 from typing import Final
 
 import torch
@@ -19,13 +18,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from rasterizers.checks import Backend, packed_rows, require_cotangents, require_finite, require_splats
-from rasterizers.interface import Camera, Rendering, SplatGradients, Splats, Traits
+from rasterizers.interface import Camera, RasterSettings, Rendering, SplatGradients, Splats, Traits
 from rasterizers.native import load_kernels, threads
 
 _TRAITS: Final = Traits(
     devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32, torch.float64}), native_threads=True, depth=True
 )
 _LONGEST_SIDE: Final = 32 << 15  # px: bins of 32 px are numbered in 16 bits
+_PAIR_BYTES: Final = 16  # its Gaussian, its place, and the blocks of its bin that the ellipse reaches
+_SUMS_BYTES: Final = 128  # a pair's sums for two or three cotangents
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,22 +76,6 @@ class CppRasterizer(Backend):
         return [CppRendering(frame, i, depth=z) for i, z in enumerate(depth)]
 
 
-_PAIR_BYTES: Final = 16  # its Gaussian, its place, and the blocks of its bin that the ellipse reaches
-_SUMS_BYTES: Final = 128  # a pair's sums for two or three cotangents
-
-
-def _require_side(camera: Camera) -> None:
-    if max(camera.width, camera.height) > _LONGEST_SIDE:
-        raise ValueError(
-            f"the cpp rasterizer draws images of up to {_LONGEST_SIDE} px a side, got {camera.width}x{camera.height}."
-        )
-
-
-def _kernels(dtype: torch.dtype, isa: str | None) -> ModuleType:
-    """The module for the instruction set; in float64, which is for checks, one module serves all processors."""
-    return load_kernels(__name__, isa) if dtype == torch.float32 else importlib.import_module(f"{__name__}._float64")
-
-
 class _Frame:
     """One projection for several pixel grids: the native frame, and the tensors that its VJP reads again."""
 
@@ -98,9 +83,11 @@ class _Frame:
         splats, camera = jobs[0]
         for job, view in jobs:
             require_splats(job, _TRAITS)
-            _require_side(view)
+            if max(view.width, view.height) > _LONGEST_SIDE:
+                raise ValueError(
+                    f"the cpp rasterizer draws images of up to {_LONGEST_SIDE} px a side, got {view.width}x{view.height}."
+                )
         n = len(splats)
-        self.settings = settings
         self.threads = settings.threads if settings.threads is not None else threads()
         self.cameras = [camera for _, camera in jobs]
         shared = (splats.means, splats.quats, splats.scales, splats.sh0)
@@ -108,14 +95,10 @@ class _Frame:
         # Referenced here because the native frame does not keep them alive.
         self.opacities = [job.opacities.detach().contiguous() for job, _ in jobs]
         self.offsets = [None if job.rgb_offset is None else job.rgb_offset.detach().contiguous() for job, _ in jobs]
-        self.native = _kernels(splats.means.dtype, settings.isa).Frame(
-            kernel=settings.kernel,
-            near=settings.near,
-            alpha_min=settings.alpha_min,
-            alpha_max=settings.alpha_max,
-            transmittance_min=settings.transmittance_min,
-            background=list(settings.background),
-            antialiased=settings.antialiased,
+        double = splats.means.dtype == torch.float64  # for checks: one module serves all processors
+        kernels = importlib.import_module(f"{__name__}._float64") if double else load_kernels(__name__, settings.isa)
+        self.native = kernels.Frame(
+            **{field.name: getattr(settings, field.name) for field in fields(RasterSettings)},
             world_to_camera=camera.world_to_camera.double().flatten().tolist(),
             budget=settings.memory << 20,
         )
@@ -131,8 +114,8 @@ class _Frame:
 
     def empty(self, *shape: int) -> Tensor:
         """An uninitialised tensor in recycled memory, because fresh pages cost more than filling them."""
-        fresh: Tensor = self.native.empty(shape)
-        return fresh
+        uninitialised: Tensor = self.native.empty(shape)
+        return uninitialised
 
     def basis(self) -> Float[Tensor, "N B1"]:
         """Y of this pose's directions, computed once for all grids."""

@@ -1,4 +1,4 @@
-"""What the compiled packages share: loading the module for this processor's instruction set, and the number of threads.
+"""Loading of the compiled module for this processor's instruction set, and the number of threads of its kernels.
 
 `src/` holds the C++ headers that both packages (`rasterizers.cpp` and `clear_strategies.kernels`) include.
 """
@@ -21,7 +21,7 @@ from rasterizers.interface import BackendUnavailable
 _log = logging.getLogger(__name__)
 
 _ISAS: Final = ("avx512", "avx2", "baseline")  # fastest first
-_OVERRIDE: Final = "CLEAR_ISA"  # environment variable for tests and comparisons
+_VARIABLE: Final = "CLEAR_ISA"  # of the environment, for tests and comparisons
 
 _scopes: list[int] = []  # thread counts of the active `kernel_threads` scopes, innermost last
 
@@ -56,7 +56,7 @@ def load_kernels(package: str, isa: str | None = None) -> ModuleType:
         isa: the instruction set; None: what `CLEAR_ISA` names, else the fastest that this processor can run.
 
     Raises:
-        BackendUnavailable: none was compiled, or this processor cannot run the one that is asked for.
+        BackendUnavailable: none was compiled, or this processor cannot run the requested one.
     """
     try:
         baseline = importlib.import_module(f"{package}._baseline")
@@ -66,12 +66,11 @@ def load_kernels(package: str, isa: str | None = None) -> ModuleType:
             "times slower on a CPU: install a C++20 compiler (Debian: apt install g++; macOS: xcode-select --install) and "
             "install clear-strategies again."
         ) from error
-    runs_here = [*baseline.instruction_sets(), "baseline"]
-    wanted = isa or os.environ.get(_OVERRIDE)
-    if wanted and wanted not in runs_here:
-        source = "isa" if isa else _OVERRIDE
-        raise BackendUnavailable(f"{source}={wanted} cannot run here; this processor has {', '.join(runs_here)}.")
-    for name in [wanted] if wanted else [name for name in _ISAS if name in runs_here]:
+    supported = [*baseline.instruction_sets(), "baseline"]
+    requested, source = isa or os.environ.get(_VARIABLE), "isa" if isa else _VARIABLE
+    if requested and requested not in supported:
+        raise BackendUnavailable(f"{source}={requested} cannot run here; this processor has {', '.join(supported)}.")
+    for name in [requested] if requested else [name for name in _ISAS if name in supported]:
         try:
             module = importlib.import_module(f"{package}._{name}")
         except ImportError as error:
@@ -79,4 +78,4 @@ def load_kernels(package: str, isa: str | None = None) -> ModuleType:
             continue
         _log.debug("%s: kernels for %s.", package, name)
         return module
-    raise BackendUnavailable(f"{package} was not compiled for {wanted}; unset {'isa' if isa else _OVERRIDE}.")
+    raise BackendUnavailable(f"{package} was not compiled for {requested}; unset {source}.")
