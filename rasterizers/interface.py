@@ -181,7 +181,7 @@ class SplatGradients:
 
 @runtime_checkable
 class Rendering(Protocol):
-    """An image, its depth if it was asked for, and the VJP that maps gradients of the image to those of the splats."""
+    """An image, its depth if drawn with `depth=True`, and the VJP that maps gradients of the image to those of the splats."""
 
     @property
     def image(self) -> Float[Tensor, "H W 3"]: ...
@@ -191,7 +191,7 @@ class Rendering(Protocol):
 
     @property
     def depth(self) -> Float[Tensor, "H W"] | None:
-        """The expected depth of each pixel, world units; None if it was not asked for.
+        """The expected depth of each pixel, world units; None unless drawn with `depth=True`.
 
         E = Σ wᵢ zᵢ / Σ wᵢ with the blending weights wᵢ = Tᵢ αᵢ and the depths zᵢ of the centres along the camera's axis: "ED"
         in gsplat's terms, the accumulated depth "D" divided by alpha. It is 0 where nothing is drawn. Where alpha is small it
@@ -261,7 +261,7 @@ class Rasterizer(Protocol):
 
 @runtime_checkable
 class CountsLists(Protocol):
-    """A rasterizer that says how much memory its lists will take, for the prediction of a run's peak."""
+    """A rasterizer that predicts the memory of its lists, for the prediction of a run's peak."""
 
     @property
     def memory(self) -> int:

@@ -128,12 +128,12 @@ def check_nothing_to_draw(make: Make, *, depth: bool = False) -> None:
 
 
 def check_scales_together_equal_one_by_one(make: Make, *, depth: bool = False) -> None:
-    """`render_scales` draws each job as if alone; depth is asked of one of two."""
+    """`render_scales` draws each job as if alone, with depth one of two."""
     rasterizer = make()
     splats, camera = scene(60, dtype=_widest(rasterizer)), _camera(48, 33)
     jobs = [(splats, camera.scaled(1 / 3)), (splats, camera)]
     low, high = rasterizer.render_scales(jobs, depth=[False, True]) if depth else rasterizer.render_scales(jobs)
-    _require(low.depth is None, "an image has a depth that was not asked for")
+    _require(low.depth is None, "an image has a depth without depth=True")
     _close(low.image, rasterizer(*jobs[0]).image, 1e-6, "an image drawn together with a larger one")
     _close(
         pixels_of(high),
@@ -229,8 +229,8 @@ def select(splats: Splats, rows: Tensor) -> Splats:
 
 def gradient_of(gradients: SplatGradients, name: str) -> Tensor:
     """The gradient of an attribute by name; that of `rgb_offset` is the colour's."""
-    found: Tensor = getattr(gradients, "rgb" if name == "rgb_offset" else name)
-    return found
+    gradient: Tensor = getattr(gradients, "rgb" if name == "rgb_offset" else name)
+    return gradient
 
 
 def pixels_of(rendering: Rendering) -> Tensor:
@@ -245,12 +245,12 @@ def magnitude(exact: Rendering) -> Tensor:
     """
     if exact.depth is None:
         return torch.ones_like(exact.image)
-    of_depth = (exact.depth / exact.alpha).where(exact.alpha > 0, math.inf)
-    return torch.cat((torch.ones_like(exact.image), of_depth[..., None]), -1)
+    depths = (exact.depth / exact.alpha).where(exact.alpha > 0, math.inf)
+    return torch.cat((torch.ones_like(exact.image), depths[..., None]), -1)
 
 
 def _drawing(rasterizer: Rasterizer, depth: bool) -> Callable[..., Rendering]:
-    """The rasterizer; the argument is given only if depth is asked for, because without the trait it may be unknown."""
+    """The rasterizer, called with `depth=True` if depth is True: without the trait it may not have the argument."""
     return functools.partial(rasterizer, depth=True) if depth else rasterizer
 
 

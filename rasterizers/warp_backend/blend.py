@@ -2,7 +2,7 @@
 
     α_i = min(α_max, o_i exp(…)),   T_i = Π_{j<i} (1 - α_j),   I = Σ T_i α_i c_i + T_end · background
 
-Expected depth, if it is asked for, is E = Σ T_i α_i z_i / Σ T_i α_i.
+Expected depth, where it is drawn, is E = Σ T_i α_i z_i / Σ T_i α_i.
 
 A Gaussian with α_i < α_min is skipped; a pixel ends before the Gaussian that would take its T below transmittance_min.
 The final T is stored, because 1 - alpha would lose its digits.
@@ -108,15 +108,15 @@ def blend(depth: bool) -> Any:
 def blend_vjp(K: int, lanes: int) -> Any:
     """The VJP kernel for K cotangents, with `lanes` threads per tile.
 
-    Each lane has `64 / lanes` pixels. For every pair it sums over its pixels, the lanes' sums are reduced, and the result is
+    Each lane has `per_lane` pixels. For every pair it sums over its pixels, the lanes' sums are reduced, and the result is
     stored at the pair's place: no atomics, a fixed order. A GPU uses a warp per tile, a CPU one thread.
     """
-    own, W = PIXELS // lanes, SUMS + 3
+    per_lane, W = PIXELS // lanes, SUMS + 3
     PairSums = wp.types.vector(length=W * K, dtype=wp.float32)
-    Pixels = wp.types.vector(length=own, dtype=wp.float32)
-    Ends = wp.types.vector(length=own, dtype=wp.int32)
-    Behind = wp.types.matrix(shape=(own, K), dtype=wp.float32)
-    Cotangents = wp.types.matrix(shape=(own * K, 3), dtype=wp.float32)
+    Pixels = wp.types.vector(length=per_lane, dtype=wp.float32)
+    Ends = wp.types.vector(length=per_lane, dtype=wp.int32)
+    Behind = wp.types.matrix(shape=(per_lane, K), dtype=wp.float32)
+    Cotangents = wp.types.matrix(shape=(per_lane * K, 3), dtype=wp.float32)
 
     @wp.kernel(module="unique", enable_backward=False)
     def blend_vjp(
@@ -136,7 +136,7 @@ def blend_vjp(K: int, lanes: int) -> Any:
         tile, lane = wp.tid()
         begin, last = starts[tile], wp.max(starts[tile], reached[tile])
         through, stop, behind, v = Pixels(), Ends(), Behind(), Cotangents()
-        for j in range(own):
+        for j in range(per_lane):
             pixel = pixel_of(tile, j * lanes + lane, grid)
             if inside(pixel, grid):
                 through[j] = transmittance[pixel[1], pixel[0]]
@@ -151,7 +151,7 @@ def blend_vjp(K: int, lanes: int) -> Any:
             at = last - 1 - back
             ellipse = ellipse_of(rows[listed[at]])
             part = PairSums()
-            for j in range(own):
+            for j in range(per_lane):
                 d = offset_of(pixel_of(tile, j * lanes + lane, grid), ellipse)
                 free = ellipse.opacity * wp.exp(-exponent(ellipse, d[0], d[1]))
                 if at < stop[j] and free >= cuts.alpha_min:

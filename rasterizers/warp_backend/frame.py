@@ -32,7 +32,7 @@ from rasterizers.warp_backend.project import project, project_vjp
 from rasterizers.warp_backend.settings import PAIR_BYTES, SUMS_BYTES, TILE, WarpSettings, mebibytes, padded
 from rasterizers.warp_runtime import array, on_stream
 
-_ROW: Final = 14
+_ROW: Final = len(types.Row())
 DEFERRED_COUNTS: Final = {"cuda": True, "cpu": False}
 """Whether the host reads the number of pairs only when an image is accessed."""
 LANES: Final = {"cuda": 32, "cpu": 1}
@@ -301,8 +301,8 @@ def _read_deferred(numbers: Tensor) -> Any:
 
     def wait() -> list[int]:
         copied.synchronize()
-        found: list[int] = host.tolist()
-        return found
+        read: list[int] = host.tolist()
+        return read
 
     return wait
 

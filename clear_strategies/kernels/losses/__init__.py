@@ -17,8 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.errors import SettingError
-from clear_strategies.kernels.losses import cpp, warp
-from clear_strategies.kernels.losses import reference as reference
+from clear_strategies.kernels.losses import cpp, reference, warp
 from clear_strategies.kernels.losses.images import DEVICES, image_pair, supported
 from clear_strategies.kernels.losses.reference import LossAndGradient
 
@@ -34,9 +33,9 @@ def running_on(device: str = "cpu") -> list[Choice]:
 
     Warp's kernels on a CPU are for checks, and are not listed.
     """
-    fastest: Choice = "warp" if device == "cuda" else "cpp"
-    runs = warp.available() if device == "cuda" else cpp.available()
-    return [fastest, "torch"] if runs else ["torch"]
+    compiled: Choice = "warp" if device == "cuda" else "cpp"
+    available = warp.available() if device == "cuda" else cpp.available()
+    return [compiled, "torch"] if available else ["torch"]
 
 
 def require(kernels: Choice) -> None:
@@ -100,9 +99,8 @@ def _chosen(kernels: Choice, x: Tensor, y: Tensor) -> Choice:
 
 
 def _fastest(x: Tensor, y: Tensor) -> Choice:
-    if x.device.type == "cpu":
-        return "cpp" if supported(DEVICES["cpp"], x, y) and cpp.available() else "torch"
-    return "warp" if supported(DEVICES["warp"], x, y) and warp.available() else "torch"
+    fastest = running_on(x.device.type)[0]
+    return fastest if fastest != "torch" and supported(DEVICES[fastest], x, y) else "torch"
 
 
 def _compiled(kernels: Choice, x: Tensor) -> ModuleType:

@@ -6,7 +6,6 @@ the same bits for any number of threads. Gradients are written to `images.gradie
 
 from __future__ import annotations
 
-from functools import cache
 from types import ModuleType
 
 import torch
@@ -27,7 +26,6 @@ def available() -> bool:
     return True
 
 
-@cache
 def native() -> ModuleType:
     """The compiled module for this processor's instruction set."""
     return load_kernels("clear_strategies.kernels")

@@ -62,10 +62,10 @@ class WarpGaussianStep:
         inputs = {"scales": 3, "filtered": 3, "filter": 1, "sigmoid": 1, "factor": 1, "route": 1}
         widths = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "rgb": 3, "basis": self._bases}
         self._gradients = (
-            self._structure("activation", raw_gradients.Activation, activation, inputs, optional=("route",)),
-            self._structure("lr", raw_gradients.Gradient, lr, widths),
-            raw_gradients.Gradient() if base is None else self._structure("base", raw_gradients.Gradient, base, widths),
-            raw_gradients.Gradient() if hf is None else self._structure("hf", raw_gradients.Gradient, hf, widths),
+            self._rows("activation", raw_gradients.Activation, activation, inputs, optional=("route",)),
+            self._rows("lr", raw_gradients.Gradient, lr, widths),
+            raw_gradients.Gradient() if base is None else self._rows("base", raw_gradients.Gradient, base, widths),
+            raw_gradients.Gradient() if hf is None else self._rows("hf", raw_gradients.Gradient, hf, widths),
             view,
         )
 
@@ -84,10 +84,10 @@ class WarpGaussianStep:
             raise ValueError("there is no HR gradient to correct.")
         parameters = {name: self._attribute(name, attributes[name], width) for name, width in _WIDTHS.items()}
         bands = self._attribute("shN", attributes["shN"], math.prod(attributes["shN"].p.shape[1:]))
-        if settings.width % 3 or not 3 * (self._bases - 1) <= settings.width <= min(bands.width, 45):
+        least, most = 3 * (self._bases - 1), min(bands.width, 45)
+        if settings.width % 3 or not least <= settings.width <= most:
             raise ValueError(
-                "width must be a multiple of 3 between the active bands' numbers and an shN row's, got "
-                f"{settings.width} beside {3 * (self._bases - 1)} and {bands.width}."
+                f"width must be a multiple of 3 from {least}, the active bands, to {most}, a row of shN; got {settings.width}."
             )
         colours = self._like.new_empty(1 if self._one_basis else 2, self._n, 3)
         moving = self._like.new_empty(self._n, dtype=torch.bool)
@@ -130,7 +130,7 @@ class WarpGaussianStep:
     def _attribute(self, name: str, a: Attribute, width: int) -> Any:
         tensors = {"p": a.p, "m": a.m, "v": a.v, "anchor": a.anchor, "merged": a.merged}
         widths = dict.fromkeys(tensors, width)
-        out = self._structure(name, adam.Attribute, tensors, widths, optional=("anchor", "merged"))
+        out = self._rows(name, adam.Attribute, tensors, widths, optional=("anchor", "merged"))
         out.width, out.anchored, out.merges = width, a.anchor is not None, a.merged is not None
         out.bounded = a.keep != 1 or a.limit != math.inf
         out.stiffness, out.rate, out.keep, out.limit = a.stiffness, -a.rate, a.keep, a.limit
@@ -147,7 +147,7 @@ class WarpGaussianStep:
             self._required("reliability", q, 1)
         return out
 
-    def _structure(
+    def _rows(
         self,
         owner: str,
         kind: Any,
@@ -155,7 +155,7 @@ class WarpGaussianStep:
         widths: Mapping[str, int],
         optional: Sequence[str] = (),
     ) -> Any:
-        """A structure of `kind` over tensors of n rows with `widths` numbers each."""
+        """A structure of type `kind` over tensors of n rows with `widths` numbers each, for which it checks them."""
         fields = tuple(
             (name, self._required(name, tensors[name], width).data_ptr(), self._n * width)
             for name, width in widths.items()

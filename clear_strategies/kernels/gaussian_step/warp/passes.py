@@ -61,17 +61,17 @@ def compare(
     """One thread per Gaussian: whether its gradients are comparable and opposed."""
     block, lane = wp.tid()
     i = block * wp.block_dim() + lane
-    found = Counts()
+    conflicts = Counts()
     if i < view.n:
         g_lr, g_hr, _ = load(activation, lr, base, hf, view, i)
         p = group_products(g_lr, g_hr, lr, base, view, i)
         for k in range(GROUPS + 1):
             comparable = p.l2[k] > wp.float64(0.0) and p.h2[k] > wp.float64(0.0)
             if comparable:
-                found[k] = 1
+                conflicts[k] = 1
                 if p.dot[k] < wp.float64(0.0):
-                    found[GROUPS + 1 + k] = 1
-    wp.tile_store(counts, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(block,))
+                    conflicts[GROUPS + 1 + k] = 1
+    wp.tile_store(counts, wp.tile_sum(wp.tile(conflicts, preserve_type=True)), offset=(block,))
 
 
 @wp.kernel
@@ -126,15 +126,15 @@ def step(
     if not view.one_basis:
         rgb_lr, rgb_hr = corrected3(g_lr.rgb, g_lr.rgb, change.multiple[SHN] * wp.float64(λ)), g_hr.rgb * λ
 
-    found, omega = Counts(), Six()
+    tally, omega = Counts(), Six()
     if at < view.n:
         omega = change.omega
         for k in range(GROUPS):
-            found[k] = (change.rows >> k) & 1
-            found[GROUPS + k] = (change.at_lower_bound >> k) & 1
+            tally[k] = (change.rows >> k) & 1
+            tally[GROUPS + k] = (change.at_lower_bound >> k) & 1
         if still:
-            found[2 * GROUPS] = 1
-    wp.tile_store(counts, wp.tile_sum(wp.tile(found, preserve_type=True)), offset=(block,))
+            tally[2 * GROUPS] = 1
+    wp.tile_store(counts, wp.tile_sum(wp.tile(tally, preserve_type=True)), offset=(block,))
     wp.tile_store(omegas, wp.tile_sum(wp.tile(omega, preserve_type=True)), offset=(block,))
     if at >= view.n:
         return

@@ -52,12 +52,12 @@ def haar_l1(images: ImagePair, levels: int) -> Float[Tensor, ""]:
             pyramid.append(low)
         rows = [-(-level.shape[0] // 2) for level in pyramid]  # of blocks
         parts, above = _parts(x, sum(rows)), None
-        for level, own in zip(reversed(pyramid), reversed(torch.split(parts, rows)), strict=True):
+        for level, level_parts in zip(reversed(pyramid), reversed(torch.split(parts, rows)), strict=True):
             gradient = out if level is x else torch.empty_like(level)
-            weight = 1 / (9 * len(own) * -(-level.shape[1] // 2) * levels)  # three details of three channels
+            weight = 1 / (9 * len(level_parts) * -(-level.shape[1] // 2) * levels)  # three details of three channels
             _launch(
-                haar.details, [len(own)], x.device, array(level, wp.vec3), array(y, wp.vec3), level is x,
-                array(above, wp.vec3), above is None, weight, array(gradient, wp.vec3), array(own),
+                haar.details, [len(level_parts)], x.device, array(level, wp.vec3), array(y, wp.vec3), level is x,
+                array(above, wp.vec3), above is None, weight, array(gradient, wp.vec3), array(level_parts),
             )  # fmt: skip
             above = gradient
         return _total(parts)

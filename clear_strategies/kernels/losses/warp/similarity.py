@@ -117,12 +117,12 @@ def similarity(lanes: int) -> Any:
                 y0, d0 = mean_y[r, at], mean_d[r, at]
                 my, md, cxy, vd = wp.float32(0.0), wp.float32(0.0), wp.float32(0.0), wp.float32(0.0)
                 for k in range(TAPS):
-                    beside = at + (k - REACH) * 3
-                    dy, dd = mean_y[r, beside] - y0, mean_d[r, beside] - d0
+                    neighbour = at + (k - REACH) * 3
+                    dy, dd = mean_y[r, neighbour] - y0, mean_d[r, neighbour] - d0
                     my += WINDOW[k] * dy
                     md += WINDOW[k] * dd
-                    cxy += WINDOW[k] * (cov_xy[r, beside] + (dy - dd) * dy)
-                    vd += WINDOW[k] * (var_d[r, beside] + dd * dd)
+                    cxy += WINDOW[k] * (cov_xy[r, neighbour] + (dy - dd) * dy)
+                    vd += WINDOW[k] * (var_d[r, neighbour] + dd * dd)
                 cxy -= (my - md) * my
                 vd -= md * md
                 my += y0
@@ -191,9 +191,11 @@ def gradient(lanes: int) -> Any:
                 pair = pair_at(x, y, top + r, left + at)
                 g = wp.float32(0.0)
                 for k in range(TAPS):
-                    beside = at + (k - REACH) * 3
-                    about = pair - wp.vec2(origin_y[beside], origin_d[beside])
-                    g += WINDOW[k] * (sum_a[r, beside] + sum_b[r, beside] * about[0] + sum_c[r, beside] * about[1])
+                    neighbour = at + (k - REACH) * 3
+                    about = pair - wp.vec2(origin_y[neighbour], origin_d[neighbour])
+                    g += WINDOW[k] * (
+                        sum_a[r, neighbour] + sum_b[r, neighbour] * about[0] + sum_c[r, neighbour] * about[1]
+                    )
                 out[top + r, left + at] = ssim_step * g - l1_step * sign(pair[1])
                 total += wp.float64(wp.abs(pair[1]))
         total *= l1_weight
