@@ -1,5 +1,5 @@
 // Checks of the kernels that need no Python, for processors that are emulated: lanes and rows against plain loops, and a
-// frame in float32 against float64. Prints the first failure and returns 1. test_arm64.py compiles and runs it.
+// frame in float32 against float64. Prints the first failure and returns 1. test_toolchains.py compiles and runs it.
 #include <cmath>
 #include <cstdio>
 #include <memory>

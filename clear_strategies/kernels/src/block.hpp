@@ -30,7 +30,7 @@ CLEAR_INLINE Floats load_some(const float* values, int count) {
   return Floats::load(a);
 }
 
-// Prefetches the rows [row, end). There are more tensors here than a processor follows by itself.
+// Prefetches the rows [row, end). There are more tensors here than the hardware prefetches.
 CLEAR_INLINE void fetch_rows(const float* tensor, std::int64_t row, std::int64_t end, int width) {
   if (!tensor) return;
   for (const float *p = tensor + row * width, *last = tensor + end * width; p < last; p += kLanes) __builtin_prefetch(p, 0, 2);

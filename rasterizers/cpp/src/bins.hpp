@@ -16,7 +16,7 @@ struct BinRange {
   std::int16_t x0 = 0, x1 = -1, y0 = 0, y1 = -1;
   std::int64_t count() const { return std::int64_t(x1 + 1 - x0) * std::int64_t(y1 + 1 - y0); }
 
-  // Calls visit(x, y) for each bin, row by row: one loop, because the ends of two are harder for a processor to foresee.
+  // Calls visit(x, y) for each bin, row by row: one loop, because the ends of two are predicted worse.
   template <class Visit>
   void each(Visit&& visit) const {
     std::int64_t left = count();
@@ -50,7 +50,7 @@ struct Bins {
 };
 
 // How many rectangles cover each bin of a band. Sums of differences along both axes: adding a rectangle is no loop over its
-// bins, whose length a processor cannot foresee.
+// bins, whose end would be mispredicted.
 class Coverage {
  public:
   explicit Coverage(const Band& band) : band_(band), width_(band.columns() + 1), steps_(width_ * (band.y1 - band.y0 + 1), 0) {}

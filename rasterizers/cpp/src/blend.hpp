@@ -25,7 +25,7 @@ struct PixelCentres {
     for (int i = 0; i < kLanes; ++i) px[i] = T(X + i % kBlock) + T(0.5), py[i] = T(Y + i / kBlock) + T(0.5);
     x = Lanes<T>::load(px), y = Lanes<T>::load(py);
     if constexpr (Native<T>::width % kBlock == 0)
-      for (auto& same : x.r) same = x.r[0];  // whole rows of pixels: says that dx is one register, too
+      for (auto& same : x.r) same = x.r[0];  // whole rows of pixels: the compiler keeps one register of dx, too
   }
 };
 
@@ -150,7 +150,7 @@ struct BlockSums {
   }
 
  private:
-  // Where sixteen rows do not fit the registers, transposing them would go through memory again and again.
+  // Where sixteen rows do not fit the registers, each transpose would go through memory.
   static constexpr bool kByQuads = sizeof(T) == 4 && Lanes<T>::registers > 1;
 
   // A sum over pixels is the sum of a register's quads, four sums at a time.

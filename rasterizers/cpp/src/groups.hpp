@@ -34,7 +34,7 @@ class Drawn {
     counts_.assign(chunks_of(n), 0);
   }
   std::int64_t chunks() const { return std::int64_t(counts_.size()); }
-  // Where the chunk's numbers are written; `close` says how many there are.
+  // Where the chunk's numbers are written; `close` sets their count.
   std::uint32_t* open(std::int64_t chunk) { return numbers_.data() + chunk * kChunk; }
   void close(std::int64_t chunk, std::int64_t count) { counts_[chunk] = count; }
   const std::uint32_t* begin(std::int64_t chunk) const { return numbers_.data() + chunk * kChunk; }

@@ -96,7 +96,7 @@ CLEAR_INLINE void add_times_zero(const Lanes<T>* columns, int count, Lanes<T>& p
   for (int i = 0; i < count; ++i) poison += columns[i] * Lanes<T>(T(0));
 }
 
-// Prefetches a group's rows. They are consecutive, but there are more streams here than the processor foresees.
+// Prefetches a group's rows. They are consecutive, but in more streams than the hardware prefetches.
 template <class T>
 CLEAR_INLINE void fetch_group(const Splats<T>& splats, std::int64_t first) {
   auto fetch = [&](const T* rows, int width) {

@@ -30,7 +30,7 @@ CLEAR_INLINE void add_pair_sums(const Bins& bins, const Group& group, const Sums
 }
 
 // Prefetches them for Gaussians that follow later: their addresses are scattered. One loop over the pairs of all, because the
-// Gaussians between them have none, and a processor foresees one loop's end better than sixteen.
+// Gaussians between them have none, and one loop's end is predicted better than sixteen.
 template <class Sums>
 CLEAR_INLINE void fetch_pair_sums(const Bins& bins, const std::uint32_t* number, const std::uint32_t* end,
                                   const Sums* pair_sums) {
