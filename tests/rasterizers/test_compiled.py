@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import cache
 
 import pytest
 import torch
 
-from rasterizers import Camera, SplatGradients, Splats
+from rasterizers import Camera, Splats
 from rasterizers.geometry import SH_C0
 from rasterizers.reference import ReferenceRasterizer
 from rasterizers.testing import CHECKS, gradient_of, magnitude, pixels_of, scene, select, to
@@ -17,7 +16,6 @@ from tests.helpers.agreement import require_gradient, require_image, require_sam
 from tests.helpers.backends import (
     ATTRIBUTES,
     CLEAN,
-    Backend,
     backends,
     balls,
     camera,
@@ -73,19 +71,13 @@ def test_float32_agrees_with_float64_at_the_same_cut_offs(backend, depth):
     require_image(pixels_of(found) / magnitude(expected), pixels_of(expected) / magnitude(expected))
 
 
-@cache
-def dense_gradients(backend: Backend) -> tuple[SplatGradients, SplatGradients]:
-    """Found and exact gradients, without cut-offs that rounding may flip."""
+@backends(dtype=torch.float32)
+def test_gradients_agree_without_cut_offs(backend):
     splats, view = dense_scene()
     v = cotangents(1, 97, 130)
-    return backend(**CLEAN)(splats, view).vjp(v), exact(splats, view, **CLEAN).vjp(v.double())
-
-
-@pytest.mark.parametrize("name", ATTRIBUTES)
-@backends(dtype=torch.float32)
-def test_gradients_agree_without_cut_offs(backend, name):
-    found, expected = dense_gradients(backend)
-    require_gradient(name, gradient_of(found, name)[0], gradient_of(expected, name)[0])
+    found, expected = backend(**CLEAN)(splats, view).vjp(v), exact(splats, view, **CLEAN).vjp(v.double())
+    for name in ATTRIBUTES:
+        require_gradient(name, gradient_of(found, name)[0], gradient_of(expected, name)[0])
 
 
 @backends(dtype=torch.float32)
@@ -152,6 +144,8 @@ def test_lists_beyond_the_memory_budget_are_refused(backend):
     huge = replace(splats, scales=splats.scales * 1e3)
     with pytest.raises(MemoryError, match=r"Gaussian.* MiB.*largest Gaussian is number \d+"):
         backend(memory=1)(huge, camera(2000, 64))
+    with pytest.raises(ValueError, match="at least 1 MiB"):
+        backend(memory=0)
 
 
 @pytest.mark.parametrize("factor", [2, 3, 4, 5, 6, 7, 8])  # 1/3, 1/5, 1/6 and 1/7 are rounded
@@ -211,29 +205,21 @@ def test_any_image_size(backend, size):
     assert torch.equal(found.visible, expected.visible)
 
 
+LAYOUTS = {
+    "transposed": lambda x: x.movedim(0, -1).contiguous().movedim(-1, 0),
+    "rows apart": lambda x: torch.stack((x, x), 1)[:, 0],  # as a view of the active bands
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
 @backends()
-def test_a_view_of_the_active_bands_is_drawn_like_a_copy(backend):
+def test_tensors_of_any_layout_are_drawn_like_copies(backend, layout):
     splats, view = scene(60, bands=15), camera()
-    active = replace(splats, shN=splats.shN[:, :3])  # a view whose rows are 45 numbers apart
-    assert not active.shN.is_contiguous()
-    packed = replace(splats, shN=splats.shN[:, :3].contiguous())
     v = cotangents(1, view.height, view.width)
-    require_same_bits(everything(backend()(active, view), v), everything(backend()(packed, view), v))
-
-
-@pytest.mark.parametrize("name", [name for name in ATTRIBUTES if name != "screen"])
-@backends()
-def test_a_tensor_of_any_layout_is_drawn_like_a_copy(backend, name):
-    splats, view = scene(60, bands=15), camera()
-    v, copy = cotangents(1, view.height, view.width), getattr(splats, name)
-    transposed = replace(splats, **{name: copy.movedim(0, -1).contiguous().movedim(-1, 0)})
-    require_same_bits(everything(backend()(transposed, view), v), everything(backend()(splats, view), v))
-
-
-@backends()
-def test_a_budget_of_no_memory_is_refused(backend):
-    with pytest.raises(ValueError, match="at least 1 MiB"):
-        backend(memory=0)
+    expected = everything(backend()(splats, view), v)
+    for name in (name for name in ATTRIBUTES if name != "screen"):
+        other = replace(splats, **{name: layout(getattr(splats, name))})
+        require_same_bits(everything(backend()(other, view), v), expected)
 
 
 @backends()

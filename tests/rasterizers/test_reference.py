@@ -73,7 +73,8 @@ def test_batches_do_not_change_the_picture(lanes):
     assert torch.allclose(found.vjp(v).means, expected.vjp(v).means, rtol=1e-9, atol=1e-12)
 
 
-def test_where_no_rasterizer_draws_the_error_says_so():
+def test_the_reference_is_available_and_where_no_rasterizer_draws_the_error_says_so():
+    assert rasterizers.available()["torch"] is None
     with pytest.raises(rasterizers.BackendUnavailable, match="no rasterizer draws tensors on 'mps'; move the splats"):
         rasterizers.fastest("mps")
 
@@ -152,12 +153,13 @@ def test_needles_keep_a_positive_determinant():
     [
         ({"background": (0, 0, 2)}, "background must be"), ({"kernels": 0.1}, "unknown rasterizer setting 'kernels'"),
         ({"lanes": 0}, "lanes"), ({"preset": "best"}, "unknown preset 'best'; choose one of fast, accurate, exact"),
+        ({"name": "cuda"}, "unknown rasterizer 'cuda'; choose one of auto, .*torch"),
     ],
 )  # fmt: skip
 def test_settings_outside_their_range_are_refused(settings, message):
     """tests/stress/bad_inputs/settings.py has the others."""
     with pytest.raises(ValueError, match=message):
-        rasterizers.load("torch", **settings)
+        rasterizers.load(**{"name": "torch", **settings})
 
 
 def test_a_preset_sets_the_cut_offs_and_settings_override_it():
@@ -169,12 +171,6 @@ def test_a_preset_sets_the_cut_offs_and_settings_override_it():
         assert cuts[-1] == (preset["alpha_min"], preset["transmittance_min"])
         assert rasterizers.load("torch", preset=name, alpha_min=1 / 64) == replace(rasterizer, alpha_min=1 / 64)
     assert cuts == sorted(cuts, reverse=True)  # coarsest first
-
-
-def test_an_unknown_backend_is_refused():
-    with pytest.raises(ValueError, match=r"choose one of auto, .*torch"):
-        rasterizers.load("cuda")
-    assert rasterizers.available()["torch"] is None
 
 
 @pytest.mark.parametrize("pixels", [1e3, 1e5, 1e7, 1e9])

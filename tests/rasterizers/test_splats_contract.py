@@ -29,35 +29,31 @@ def changed(name: str, change) -> Splats:
     return splats
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_a_tensor_of_another_dtype_is_refused(draw, name):
-    with pytest.raises(TypeError, match=f"^splats.{name} must be float32 on .*, as splats.means is, got float64"):
-        draw(changed(name, torch.Tensor.double), camera())
+WRONG = [
+    *((n, torch.Tensor.double, TypeError, "must be float32 on .*, as splats.means is, got float64") for n in OTHERS),
+    *((n, lambda x: x[:-1], ValueError, r"must have the shape \[20.*, got \[19.*$") for n in OTHERS),
+    ("scales", lambda x: x.to("meta"), TypeError, r"must be float32 on (cpu|cuda:0), .* got float32 on meta"),
+    ("shN", lambda x: x.new_zeros(20, 5, 3), ValueError, "must hold 0, 3, 8 or 15 bands, got 5"),
+]
 
 
-def test_a_tensor_of_another_dtype_in_a_second_job_is_refused(draw):
-    splats = scene(20)
-    other = replace(splats, opacities=splats.opacities.double())
-    jobs = [(splats, camera()), (other, camera().scaled(1))]
-    with pytest.raises(TypeError, match=r"splats.opacities must be float32"):
-        draw.render_scales(jobs)
-
-
-@pytest.mark.parametrize("name", OTHERS)
-def test_a_tensor_with_another_number_of_rows_is_refused(draw, name):
-    with pytest.raises(ValueError, match=rf"^splats.{name} must have the shape \[20.*, got \[19.*$"):
-        draw(changed(name, lambda x: x[:-1]), camera())
-
-
-def test_a_tensor_on_another_device_is_refused(draw):
-    with pytest.raises(TypeError, match=r"splats.scales must be float32 on (cpu|cuda:0), .* got float32 on meta"):
-        draw(changed("scales", lambda x: x.to("meta")), camera())
+@pytest.mark.parametrize(("name", "change", "error", "message"), WRONG)
+def test_a_tensor_of_another_dtype_device_or_shape_is_refused(draw, name, change, error, message):
+    with pytest.raises(error, match=f"^splats.{name} {message}"):
+        draw(changed(name, change), camera())
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.int64])
 def test_a_dtype_that_no_backend_draws_is_refused(draw, dtype):
     with pytest.raises(TypeError, match=r"draws float32.* got splats.means of "):
         draw(changed("means", lambda x: x.to(dtype)), camera())
+
+
+def test_a_tensor_of_another_dtype_in_a_second_job_is_refused(draw):
+    splats = scene(20)
+    other = replace(splats, opacities=splats.opacities.double())
+    with pytest.raises(TypeError, match=r"splats.opacities must be float32"):
+        draw.render_scales([(splats, camera()), (other, camera().scaled(1))])
 
 
 @pytest.mark.parametrize("name", ["means", *OTHERS])
@@ -68,11 +64,6 @@ def test_a_number_that_is_not_finite_is_refused(draw, name, bad):
     getattr(splats, name)[visible].view(-1)[-1] = bad
     with pytest.raises(ValueError, match=f"splats.{name} must be finite; Gaussian {visible}"):
         draw(splats, camera())
-
-
-def test_bands_that_no_degree_has_are_refused(draw):
-    with pytest.raises(ValueError, match=r"splats.shN must hold 0, 3, 8 or 15 bands, got 5"):
-        draw(changed("shN", lambda x: x.new_zeros(20, 5, 3)), camera())
 
 
 @pytest.fixture
