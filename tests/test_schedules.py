@@ -1,0 +1,38 @@
+"""λ_HR and the learning rate over the iterations, and the milestones that stretch with a run."""
+
+from __future__ import annotations
+
+import pytest
+
+from clear_strategies.merging.objective import Objective
+from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay, milestones, scaled
+
+
+def test_lambda_hr_by_the_papers_milestones():
+    schedule = WarmupDecay(final=0.1)
+    expected = {1: 0, 500: 0, 501: 1 / 2500, 1750: 0.5, 3000: 1, 5000: 1, 7500: 0.55, 10_000: 0.1, 20_000: 0.1}
+    for t, value in expected.items():
+        assert schedule(t) == pytest.approx(value), t
+    assert WarmupDecay(final=0.1, decay="cosine")(7500) == pytest.approx(0.55)
+    assert WarmupDecay(final=0.1, decay="exponential")(7500) == pytest.approx(0.1**0.5)
+
+
+def test_position_rate_falls_log_linearly():
+    rate = LogLinear()
+    assert [rate(0), rate(5000), rate(10_000)] == pytest.approx([1.6e-4, 1.6e-5, 1.6e-6])
+
+
+def test_milestones_stretch_with_the_run_and_nothing_else_does():
+    short = scaled(Objective(lambda_hr=WarmupDecay(final=0.1)), 0.1)
+    assert milestones(short) == {
+        "lambda_hr.start": 50, "lambda_hr.full": 300, "lambda_hr.decay_from": 500, "lambda_hr.end": 1000,
+    }  # fmt: skip
+    assert (short.lambda_hf, short.lambda_hr.final) == (0.2, 0.1)
+    assert [short.lambda_hr(t // 10) for t in (500, 1750, 7500)] == pytest.approx([0, 0.5, 0.55])
+    assert scaled(Ramp(), 0.5).full == 5000
+
+
+def test_an_exponential_decay_to_zero_is_refused():
+    """tests/stress/bad_inputs/settings.py has the other settings outside their range."""
+    with pytest.raises(ValueError, match="exponential"):
+        WarmupDecay(decay="exponential", final=0.0)
