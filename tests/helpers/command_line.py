@@ -27,19 +27,19 @@ def environment(cwd: Path) -> dict[str, str]:
 def run(
     *arguments: str, cwd: Path, module: str = "clear_strategies.run", drawn: bool = False
 ) -> subprocess.CompletedProcess[str]:
-    """A run to its end, as subprocess.run; without pictures, where they are not asked for."""
-    with tempfile.TemporaryFile("w+") as said, tempfile.TemporaryFile("w+") as errors:
-        process = Forked("-m", module, *arguments, cwd=cwd, env=environment(cwd), said=said, errors=errors, drawn=drawn)
-        code = process.wait()
-        for file in (said, errors):
+    """A run to its end, as subprocess.run; with pictures only if `drawn`."""
+    with tempfile.TemporaryFile("w+") as stdout, tempfile.TemporaryFile("w+") as stderr:
+        command = ["-m", module, *arguments]
+        code = Forked(*command, cwd=cwd, env=environment(cwd), stdout=stdout, stderr=stderr, drawn=drawn).wait()
+        for file in (stdout, stderr):
             file.seek(0)
-        return subprocess.CompletedProcess([module, *arguments], code, said.read(), errors.read())
+        return subprocess.CompletedProcess(command, code, stdout.read(), stderr.read())
 
 
 def started(*arguments: str, said: Path, cwd: Path, session: bool = False) -> Forked:
-    """A run that goes on; what it says goes to a file. `arguments` begin with those of python, `-c …` or `-m …`."""
+    """A run that goes on; its output goes to the file `said`. `arguments` begin with those of python, `-c …` or `-m …`."""
     with said.open("w") as file:
-        return Forked(*arguments, cwd=cwd, env=environment(cwd), said=file, errors=file, session=session)
+        return Forked(*arguments, cwd=cwd, env=environment(cwd), stdout=file, stderr=file, session=session)
 
 
 def stopped_by(*signals: int, after: int) -> str:

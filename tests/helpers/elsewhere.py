@@ -15,28 +15,28 @@ NAME: Final = "elsewhere"
 _COPIES: Final = {torch.ops.aten.copy_.default, torch.ops.aten._to_copy.default}
 
 
-class There(torch.Tensor):
-    """A tensor of the other device."""
+class OtherTensor(torch.Tensor):
+    """A tensor on the other device."""
 
-    here: torch.Tensor
+    on_cpu: torch.Tensor
 
     @staticmethod
-    def __new__(cls, here: torch.Tensor) -> There:
-        options = {"dtype": here.dtype, "device": f"{NAME}:0", "requires_grad": here.requires_grad}
-        made = torch.Tensor._make_wrapper_subclass(
-            cls, here.size(), strides=here.stride(), storage_offset=here.storage_offset(), **options
+    def __new__(cls, on_cpu: torch.Tensor) -> OtherTensor:
+        options = {"dtype": on_cpu.dtype, "device": f"{NAME}:0", "requires_grad": on_cpu.requires_grad}
+        tensor = torch.Tensor._make_wrapper_subclass(
+            cls, on_cpu.size(), strides=on_cpu.stride(), storage_offset=on_cpu.storage_offset(), **options
         )
-        made.here = here
-        return made
+        tensor.on_cpu = on_cpu
+        return tensor
 
     def __repr__(self, **_: Any) -> str:
-        return f"There({self.here!r})"
+        return f"OtherTensor({self.on_cpu!r})"
 
     def tolist(self) -> Any:
-        return self.here.tolist()
+        return self.on_cpu.tolist()
 
-    def new_tensor(self, data: Any, **options: Any) -> There:
-        return There(self.here.new_tensor(data, **options))
+    def new_tensor(self, data: Any, **options: Any) -> OtherTensor:
+        return OtherTensor(self.on_cpu.new_tensor(data, **options))
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
@@ -59,17 +59,19 @@ class Elsewhere(TorchDispatchMode):
 
 def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, torch.Tensor)]
-    there = any(isinstance(x, There) for x in tensors)
-    mixed = there and any(not isinstance(x, There) and x.dim() > 0 for x in tensors)
+    on_other = any(isinstance(x, OtherTensor) for x in tensors)
+    mixed = on_other and any(not isinstance(x, OtherTensor) and x.dim() > 0 for x in tensors)
     if mixed and func not in _COPIES and func is not torch.ops.aten.index.Tensor:
         raise RuntimeError(f"Expected all tensors to be on the same device, but {func} found at least two devices.")
-    args, kwargs = (tree_map(lambda x: x.here if isinstance(x, There) else x, x) for x in (args, kwargs))
+    args, kwargs = (tree_map(lambda x: x.on_cpu if isinstance(x, OtherTensor) else x, x) for x in (args, kwargs))
     if kwargs.get("device") is not None:
-        there = torch.device(kwargs["device"]).type == NAME
+        on_other = torch.device(kwargs["device"]).type == NAME
         kwargs["device"] = "cpu"
-    known = {id(x.here): x for x in tensors if isinstance(x, There)}  # what is changed in place is returned itself
+    known = {
+        id(x.on_cpu): x for x in tensors if isinstance(x, OtherTensor)
+    }  # what is changed in place is returned itself
 
     def sent(x: Any) -> Any:
-        return known.get(id(x), There(x)) if there and isinstance(x, torch.Tensor) else x
+        return known.get(id(x), OtherTensor(x)) if on_other and isinstance(x, torch.Tensor) else x
 
     return tree_map(sent, func(*args, **kwargs))

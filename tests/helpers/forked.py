@@ -31,29 +31,29 @@ _IMPORTED = (
 
 
 class Forked:
-    """A program that runs, with the methods of subprocess.Popen that tests use.
+    """A running program, with the methods of subprocess.Popen that tests use.
 
     Args:
-        arguments: of python: `-m MODULE …` or `-c CODE …`. said: what it prints goes there, what it warns of to `errors`.
+        arguments: of python: `-m MODULE …` or `-c CODE …`.
         session: whether it leads a process group. drawn: whether a run draws its pictures.
     """
 
     def __init__(
-        self, *arguments: str, cwd: Path, env: dict[str, str], said: IO[str], errors: IO[str], session: bool = False,
+        self, *arguments: str, cwd: Path, env: dict[str, str], stdout: IO[str], stderr: IO[str], session: bool = False,
         drawn: bool = False,
     ) -> None:  # fmt: skip
-        asked = {"arguments": arguments, "cwd": str(cwd), "env": env, "session": session, "drawn": drawn}
-        self._ends, its_end = socket.socketpair()
-        with its_end:
-            socket.send_fds(_forks(), [b"."], [said.fileno(), errors.fileno(), its_end.fileno()])
-        _forks().sendall(f"{json.dumps(asked)}\n".encode())
-        self.pid, self.returncode = _received(self._ends), None
+        request = {"arguments": arguments, "cwd": str(cwd), "env": env, "session": session, "drawn": drawn}
+        self._status, child_end = socket.socketpair()
+        with child_end:
+            socket.send_fds(_server(), [b"."], [stdout.fileno(), stderr.fileno(), child_end.fileno()])
+        _server().sendall(f"{json.dumps(request)}\n".encode())
+        self.pid, self.returncode = _received(self._status), None
 
     def wait(self, timeout: float = 600) -> int:
         if self.returncode is None:
-            self._ends.settimeout(timeout)
-            with self._ends:
-                self.returncode = _received(self._ends)
+            self._status.settimeout(timeout)
+            with self._status:
+                self.returncode = _received(self._status)
         return self.returncode
 
     def send_signal(self, number: int) -> None:
@@ -66,85 +66,85 @@ class Forked:
         self.send_signal(signal.SIGKILL)
 
 
-def _received(ends: socket.socket) -> int:
-    if len(told := ends.recv(8, socket.MSG_WAITALL)) < 8:
+def _received(status: socket.socket) -> int:
+    if len(data := status.recv(8, socket.MSG_WAITALL)) < 8:
         raise RuntimeError("the process that forks has ended")
-    return int.from_bytes(told, "big", signed=True)
+    return int.from_bytes(data, "big", signed=True)
 
 
-def _send(ends: socket.socket, number: int) -> None:
-    ends.sendall(number.to_bytes(8, "big", signed=True))
+def _send(status: socket.socket, number: int) -> None:
+    status.sendall(number.to_bytes(8, "big", signed=True))
 
 
 @cache
-def _forks() -> socket.socket:
-    """Asks the process that forks, which ends with this one."""
-    ours, its = socket.socketpair()
+def _server() -> socket.socket:
+    """Sends requests to the process that forks, which ends with this one."""
+    requests, server_end = socket.socketpair()
     env = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "tests.helpers.forked", str(its.fileno())]
-    with its:
-        process = subprocess.Popen(command, cwd=ROOT, env=env, pass_fds=[its.fileno()])
+    command = [sys.executable, "-m", "tests.helpers.forked", str(server_end.fileno())]
+    with server_end:
+        process = subprocess.Popen(command, cwd=ROOT, env=env, pass_fds=[server_end.fileno()])
 
     @atexit.register
     def end() -> None:
-        ours.close()
+        requests.close()
         process.wait()
 
-    return ours
+    return requests
 
 
-def _serve(asks: socket.socket) -> dict[str, Any] | None:
-    """Fork for each that asks. Returns what was asked in the fork, and None at the end."""
+def _serve(requests: socket.socket) -> dict[str, Any] | None:
+    """Fork for each request. Returns the request in the fork, and None at the end."""
     while True:
-        _, received, *_ = socket.recv_fds(asks, 1, 3)
+        _, received, *_ = socket.recv_fds(requests, 1, 3)
         with suppress(ChildProcessError):
             while os.waitpid(-1, os.WNOHANG if received else 0)[0]:
                 pass
         if not received:
             return None
-        with asks.makefile() as lines:
-            asked = json.loads(lines.readline())
+        with requests.makefile() as lines:
+            request = json.loads(lines.readline())
         if os.fork() == 0:
-            _become(asked, *received)
-            return asked
+            _become(request, *received)
+            return request
         for file in received:
             os.close(file)
 
 
-def _become(asked: dict[str, Any], said: int, errors: int, ends: int) -> None:
-    """Make this process the one that was asked for; its parent waits for it and tells how it ended."""
-    with socket.socket(fileno=ends) as told:
+def _become(request: dict[str, Any], stdout: int, stderr: int, status_file: int) -> None:
+    """Make this process the requested one; its parent waits for it and sends its exit code."""
+    with socket.socket(fileno=status_file) as status:
         if pid := os.fork():
-            _send(told, pid)
-            _send(told, os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+            _send(status, pid)
+            _send(status, os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
             os._exit(0)
-    if asked["session"]:
+    if request["session"]:
         os.setsid()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-    os.chdir(asked["cwd"])
+    os.chdir(request["cwd"])
     os.environ.clear()
-    os.environ.update(asked["env"])
-    os.dup2(said, 1)
-    os.dup2(errors, 2)
-    sys.path[0] = asked["cwd"]
+    os.environ.update(request["env"])
+    os.dup2(stdout, 1)
+    os.dup2(stderr, 2)
+    sys.path[0] = request["cwd"]
 
 
 def main() -> None:
     """What `python -m tests.helpers.forked FILENO` does."""
     for name in _IMPORTED:
         importlib.import_module(name)
-    with socket.socket(fileno=int(sys.argv[1])) as asks:
-        asked = _serve(asks)
-    if asked is None:
+    with socket.socket(fileno=int(sys.argv[1])) as requests:
+        request = _serve(requests)
+    if request is None:
         return
-    kind, what, *arguments = asked["arguments"]
+    kind, program, *arguments = request["arguments"]
     sys.argv = ["-c", *arguments]
-    with nullcontext() if asked["drawn"] else pictures.not_drawn():
+    with nullcontext() if request["drawn"] else pictures.not_drawn():
         if kind == "-c":
-            exec(what, {"__name__": "__main__"})  # noqa: S102 - a test's own
+            exec(program, {"__name__": "__main__"})  # noqa: S102 - a test's own
         else:
-            sys.modules.pop(what, None)
-            runpy.run_module(what, run_name="__main__", alter_sys=True)
+            sys.modules.pop(program, None)
+            runpy.run_module(program, run_name="__main__", alter_sys=True)
 
 
 if __name__ == "__main__":
