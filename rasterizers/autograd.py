@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 import rasterizers
 from rasterizers.checks import require_depth
 from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera, Color, Rasterizer, Rendering, Splats, over
+from rasterizers.interface import Camera, Rasterizer, Rendering, Splats, over
 
 # Arguments of gsplat 1.5 that change its speed, or leave out Gaussians that are too small or too far to matter.
 _WITHOUT_EFFECT: Final = {
@@ -181,8 +181,9 @@ def rasterization(
     views = []
     for i, (pose, K) in enumerate(zip(viewmats, Ks, strict=True)):
         background = tuple((x - low) / span for x in backgrounds[i].tolist())
-        antialiased = rasterize_mode == "antialiased"
-        rasterizer = _loaded(backend, means.device.type, near_plane, eps2d, antialiased, background)
+        rasterizer = over(
+            _loaded(backend, means.device.type, near_plane, eps2d, rasterize_mode == "antialiased"), background
+        )
         (fx, _, cx), (_, fy, cy), _ = K.tolist()
         camera = Camera(pose, fx, fy, cx, cy, width, height)
         views.append(draw(rasterizer, splats, camera, means2d[i], depth=render_mode == "RGB+ED"))
@@ -254,6 +255,6 @@ def _require_supported(render_mode: str, rasterize_mode: str, absgrad: bool, mor
 
 
 @lru_cache(maxsize=8)
-def _loaded(name: str, device: str, near: float, kernel: float, antialiased: bool, background: Color) -> Rasterizer:
+def _loaded(name: str, device: str, near: float, kernel: float, antialiased: bool) -> Rasterizer:
     name = rasterizers.fastest(device) if name == "auto" else name
-    return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased, background=background)
+    return rasterizers.load(name, near=near, kernel=kernel, antialiased=antialiased)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
+from itertools import pairwise
 from typing import Final
 
 import torch
@@ -34,13 +35,10 @@ class Backend(RasterSettings):
     ) -> list[Rendering]:
         """See `Rasterizer.render_scales`. Jobs of different poses or tensor objects are drawn one by one."""
         depths = depth or [False] * len(jobs)
-        first, pose = jobs[0][0], jobs[0][1].world_to_camera
         if all(
-            torch.equal(camera.world_to_camera, pose)
-            and all(
-                getattr(splats, name) is getattr(first, name) for name in ("means", "quats", "scales", "sh0", "shN")
-            )
-            for splats, camera in jobs[1:]
+            torch.equal(from_a.world_to_camera, from_b.world_to_camera)
+            and all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "scales", "sh0", "shN"))
+            for (a, from_a), (b, from_b) in pairwise(jobs)
         ):
             return self.draw(jobs, depths)
         return [self(*job, depth=z) for job, z in zip(jobs, depths, strict=True)]

@@ -19,7 +19,7 @@ import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Final, Protocol, runtime_checkable
+from typing import Final, Protocol, cast, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -313,6 +313,10 @@ class RasterSettings:
         if len(self.background) != 3 or not all(0 <= c <= 1 for c in self.background):
             raise ValueError(f"background must be three numbers in [0, 1], got {self.background}.")
 
+    def with_background(self, background: Color) -> RasterSettings:
+        """A copy with another background. A backend that adapts to its images overrides this, so that the copy adapts, too."""
+        return replace(self, background=background)
+
 
 def over(rasterizer: Rasterizer, background: Color | None) -> Rasterizer:
     """The rasterizer with another background, RGB in [0, 1]; itself for None.
@@ -326,7 +330,7 @@ def over(rasterizer: Rasterizer, background: Color | None) -> Rasterizer:
         raise TypeError(
             f"{type(rasterizer).__name__} has no background that could change; derive it from RasterSettings."
         )
-    return replace(rasterizer, background=background)
+    return cast(Rasterizer, rasterizer.with_background(background))
 
 
 PRESETS: Final[Mapping[str, Mapping[str, float]]] = MappingProxyType(

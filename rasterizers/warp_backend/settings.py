@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import torch
 
 from rasterizers.checks import Backend, require_device
-from rasterizers.interface import Camera, Traits
+from rasterizers.interface import Camera, Color, Traits
 from rasterizers.warp_runtime import require_warp
 
 TILE: Final = 8
@@ -23,7 +23,7 @@ def _default_device() -> str:
 
 @dataclass(frozen=True, slots=True)
 class WarpSettings(Backend):
-    """The settings of `WarpRasterizer`.
+    """The settings of `WarpRasterizer`, apart from its class, because `frame` needs them and that class needs `frame`.
 
     Args:
         memory: MiB that one image's lists may take, together with the sums that their pairs send back.
@@ -49,6 +49,12 @@ class WarpSettings(Backend):
     @property
     def traits(self) -> Traits:
         return Traits(devices=frozenset({self.device}), dtypes=frozenset({torch.float32}), depth=True)
+
+    def with_background(self, background: Color) -> WarpSettings:
+        """A copy with another background and the same `capacities`: the number of pairs does not depend on the background."""
+        copied = replace(self, background=background)
+        object.__setattr__(copied, "capacities", self.capacities)
+        return copied
 
     def capacity(self, camera: Camera) -> int:
         """The number of pairs to allocate for an image of this size before they are counted; -1: it is the first one."""

@@ -12,6 +12,7 @@ import torch
 
 import rasterizers
 from rasterizers import BackendUnavailable
+from rasterizers.interface import over
 from rasterizers.testing import gradient_of
 from tests.helpers.agreement import require_same_bits
 from tests.helpers.backends import CLEAN, camera, cotangents, dense_scene, everything, needs
@@ -177,6 +178,17 @@ def test_the_capacity_follows_the_images(deferred):
         capacities.append(rasterizer.capacity(view))
     assert capacities[0] == many * 63 // 64
     assert capacities[-1] == capacities[-2] < many / 2
+
+
+@installed
+def test_a_copy_over_another_background_has_the_capacities(deferred):
+    """Random backgrounds make one in every iteration; without them the host waited for the device each time."""
+    splats, view = dense_scene(200)
+    rasterizer = rasterizers.load("warp", device="cpu")
+    copied = over(rasterizer, (0.2, 0.4, 0.6))
+    copied(splats, view).image  # noqa: B018
+    assert copied.background == (0.2, 0.4, 0.6)
+    assert rasterizer.capacity(view) == copied.capacity(view) > 0
 
 
 @installed
