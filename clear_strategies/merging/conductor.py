@@ -60,7 +60,7 @@ class Conductor:
         self.decorators, self.detail = tuple(decorators), detail if detail is not None else DetailRates()
         self.decorated = not self.decorators
         self.work_log = WorkLog()
-        self._one: dict[str, Strategy] = {}
+        self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # whose hooks return the answer of nobody
         for hook in _ONE_ANSWER:
             owners = [s for s in strategies if overrides(s, hook)]
             if len(owners) > 1:
@@ -70,9 +70,8 @@ class Conductor:
                     "strategy that combines them."
                 )
             if owners:
-                self._one[hook] = owners[0]
+                self._owner[hook] = owners[0]
         self._regularizers = [s for s in strategies if overrides(s, "regularize")]
-        self._showing = [s for s in strategies if overrides(s, "extra_views")]
         others = ("regularize", "extra_views", "may_densify", "after_step")
         for s in strategies:
             if not any(overrides(s, hook) for hook in (*_ONE_ANSWER, *others)):
@@ -108,21 +107,21 @@ class Conductor:
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """zᵗ, before render; None: every Gaussian takes part."""
-        z: Float[Tensor, " N"] | None = self._ask("gate", None, t, n)
-        if z is None and "gate" in self._one:
+        z = self._owner["gate"].gate(t, n)
+        if z is None and self.owner("gate") is not None:
             self.work_log.skip("gate", "no Gaussian is dropped at this rate")
         return z
 
     def background(self, t: int) -> Color | None:
         """The colour behind every rendering of iteration t; None: the scene's own."""
-        return self._one["background"].background(t) if "background" in self._one else None
+        return self._owner["background"].background(t)
 
     def wants_hr(self, t: int) -> bool:
         """Whether the HR render has any use at t: λ_HR > 0, Î_LR is made of it, or a densification score needs it."""
         if self.objective.lambda_hr(t) > 0 or not self.wants_lr:
             return True
         collecting = self.statistics_from is not None and t > self.statistics_from
-        if "score" in self._one and collecting and self.may_densify(t):
+        if self.owner("score") is not None and collecting and self.may_densify(t):
             return True
         self.work_log.skip("render LR + HR", "lambda_HR = 0")
         return False
@@ -165,7 +164,7 @@ class Conductor:
         with stage("losses LR"):
             low, photo = rendered.image.detach(), view.lr.over(self.background(t), view.background)
             l_lr = o.lr(images.area_mean(low, view.factor) if reduced else low, photo.image, photo.shown)  # Eq. 4
-        where = f"t={t}, view {view.name}"
+        where = _where(view, t)
         require_finite_losses(where, l_lr.values, {"the LR photo": photo.image, "the LR render": low})
         g_lr: Any = None
         from_hr: HrGradients[Any] | None = None
@@ -177,7 +176,7 @@ class Conductor:
         else:
             # Where Î_LR is the area mean of Î_HR, the cotangent of L_LR passes through the same HR render.
             through_mean = images.area_mean_transposed(l_lr.cotangents, view.factor) if reduced else None
-            g_mean, from_hr = self._backward_hr(hr, Step(t, view, hr.visible), vjp, where, through_mean)
+            g_mean, from_hr = self._backward_hr(hr, Step(t, view, hr.visible), vjp, through_mean)
             g_lr = g_mean if reduced else g_lr
         step = Step(t, view) if from_hr is None else from_hr.step
         with stage("strategies" if stepper is None else stepper.stage):
@@ -194,13 +193,13 @@ class Conductor:
 
     def hr_gradients(self, hr: Shot, view: View, t: int) -> HrGradients[Grads]:
         """Compare Î_HR with the SR image, backpropagate both losses in one pass, and ask for the evidence."""
-        return self._backward_hr(hr, Step(t, view, hr.visible), _vjp, f"t={t}, view {view.name}")[1]
+        return self._backward_hr(hr, Step(t, view, hr.visible), _vjp)[1]
 
     def extra_views(self, t: int) -> list[ExtraView]:
         """What the strategies want the field to match at t besides the view; each gets a step on `extra_loss`."""
-        if not self._showing or self.objective.lambda_lr == 0:
+        if self.objective.lambda_lr == 0:
             return []
-        return [extra for s in self._showing for extra in s.extra_views(t)]
+        return [extra for s in self.strategies for extra in s.extra_views(t)]
 
     def extra_loss(self, image: Float[Tensor, "h w 3"], extra: ExtraView, t: int) -> Losses:
         """The LR loss of a render of `extra`, weighted by pixel: its value and its cotangent [1, h, w, 3].  Eq. 4
@@ -212,9 +211,9 @@ class Conductor:
         """
         weight = extra.weight[..., None]
         target = torch.where(weight > 0, extra.photo.over(self.background(t), extra.background).image, 0.0)
-        found = self.objective.lr(torch.where(weight > 0, image.detach(), 0.0), target)
-        require_finite_losses(f"t={t}, an extra view", found.values, {"it": target, "the render": image})
-        return found._replace(cotangents=found.cotangents * weight)
+        loss = self.objective.lr(torch.where(weight > 0, image.detach(), 0.0), target)
+        require_finite_losses(f"t={t}, an extra view", loss.values, {"it": target, "the render": image})
+        return loss._replace(cotangents=loss.cotangents * weight)
 
     def merge(self, params: Mapping[str, Tensor], g_lr: Grads, hr: HrGradients[Grads] | None, t: int) -> Merged:
         """The merge: g_LR + λ_HR ĝ_HR + λ∇L_stab.
@@ -232,7 +231,7 @@ class Conductor:
         corrected = g_hr
         if λ > 0:
             conflict = conflict_ratio(g_lr, g_hr)  # before correction
-            corrected = self._ask("correct", g_hr, g_lr, g_hr, hr.step)  # ĝ^HR           Eq. 6, 7, 11
+            corrected = self._owner["correct"].correct(g_lr, g_hr, hr.step)  # ĝ^HR           Eq. 6, 7, 11
         g = g_lr + corrected * λ  # Eq. 8
         if g_hf is not None and "detail" in g_hf:
             g["detail"] = g_hf["detail"] * λ  # f_det: never corrected, never from L_base
@@ -254,7 +253,7 @@ class Conductor:
                 hf = screen_in_ndc(hr.hf, hr.size)
                 total = total + λ * self.objective.lambda_hf * hf
         screen = ScreenGradients(screen_lr, base, hf, screen_norm(total))
-        score = None if hr is None else self._ask("score", None, hr.step, screen)
+        score = None if hr is None else self._owner["score"].score(hr.step, screen)
         return screen.ordinary if score is None else score, screen.ordinary
 
     def after_step(self, params: Mapping[str, Tensor], step: Step) -> None:
@@ -291,8 +290,9 @@ class Conductor:
             by_name[owner].state[name] = rows.to(by_name[owner].device, copy=True)
 
     def owner(self, hook: str) -> Strategy | None:
-        """The strategy that answers a hook which only one may answer."""
-        return self._one.get(hook)
+        """The strategy that answers a hook which only one may answer; None: no strategy does."""
+        s = self._owner[hook]
+        return s if overrides(s, hook) else None
 
     def logs(self) -> dict[str, Number]:
         """The scalars that the strategies logged in the last iteration."""
@@ -308,7 +308,6 @@ class Conductor:
         hr: Shot,
         step: Step,
         vjp: Callable[..., Sequence[Any]],
-        where: str,
         lr_cotangents: Tensor | None = None,
     ) -> tuple[Any | None, HrGradients[Any]]:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
@@ -316,20 +315,18 @@ class Conductor:
         with stage("losses HR"):
             sr = step.view.hr.over(self.background(step.t), step.view.background)
             losses = self.objective.hr(hr.image.detach(), sr.image, sr.shown)  # Eq. 5
-        require_finite_losses(where, losses.values, {"the SR image": sr.image, "the HR render": hr.image})
+        require_finite_losses(
+            _where(step.view, step.t), losses.values, {"the SR image": sr.image, "the HR render": hr.image}
+        )
         with stage("backward HR"):  # one pass for all cotangents
             both = losses.cotangents if lr_cotangents is None else torch.cat((lr_cotangents, losses.cotangents))
             gradients = list(vjp(hr, both))
         g_lr = None if lr_cotangents is None else gradients.pop(0)
         base, hf = gradients if len(gradients) > 1 else (gradients[0], None)
         with stage("evidence"):
-            step = replace(step, evidence=self._ask("observe", None, step, hr))  # q, a, w        Eq. 9, 10
-            m = 1.0 if hf is None else self._ask("route", 1.0, step)  # m              Eq. 12
+            step = replace(step, evidence=self._owner["observe"].observe(step, hr))  # q, a, w        Eq. 9, 10
+            m = 1.0 if hf is None else self._owner["route"].route(step)  # m              Eq. 12
         return g_lr, HrGradients(base, hf, _size(hr.image), step, m, losses.values)
-
-    def _ask(self, hook: str, unanswered: Any, *arguments: Any) -> Any:
-        owner = self._one.get(hook)
-        return unanswered if owner is None else getattr(owner, hook)(*arguments)
 
     def _regularize(self, params: Mapping[str, Tensor], t: int) -> Grads:
         total = Grads()
@@ -344,6 +341,10 @@ class Conductor:
 
 def _vjp(shot: Shot, cotangents: Float[Tensor, "K H W 3"]) -> Sequence[Grads]:
     return shot.vjp(cotangents)
+
+
+def _where(view: View, t: int) -> str:
+    return f"t={t}, view {view.name}"
 
 
 def _size(image: Float[Tensor, "H W 3"]) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """The contract of a strategy. A strategy answers questions about one training iteration; it knows no rasterizer.
 
-The hooks are phases of an iteration, so their order needs no configuration. A hook that no strategy overrides is never
-called. At most one strategy may override each of the hooks with a single answer: densifier, background, gate, observe, route,
+The hooks are phases of an iteration, so their order needs no configuration. `Strategy` answers each as if there were no
+strategy. At most one strategy may override each of the hooks with a single answer: densifier, background, gate, observe, route,
 correct, score.
 """
 
@@ -72,7 +72,6 @@ class Strategy:
         Args:
             views: on the device of the field; empty where the training loop does not have them all at the start.
         """
-        raise NotImplementedError
 
     def densifier(self, field: Any, views: Sequence[View], seed: int) -> Any:
         """Once, before the first iteration: what clones, moves and prunes Gaussians in place of the trainer's own density
@@ -83,15 +82,15 @@ class Strategy:
                 `clear_strategies.training.field.GaussianField`. Other trainers call `step` alone.
             views: all training views.
         """
-        raise NotImplementedError
+        return None
 
     def gate(self, t: int, n: int) -> Float[Tensor, " N"] | None:
         """Before render: which Gaussians take part? z >= 0 multiplies the opacity; None: all of them.  Eq. 15"""
-        raise NotImplementedError
+        return None
 
     def background(self, t: int) -> Color | None:
         """Before render: over which colour are both scales and the extra views rendered? None: the scene's own."""
-        raise NotImplementedError
+        return None
 
     def observe(self, step: Step, hr: Shot) -> Evidence | None:
         """After render: what does I_HR tell about each Gaussian?  Eq. 9, 10
@@ -99,23 +98,23 @@ class Strategy:
         Args:
             hr: the HR render of `step.view`.
         """
-        raise NotImplementedError
+        return None
 
-    def route(self, step: Step) -> Float[Tensor, " N"]:
-        """How much of its high-frequency gradient does each Gaussian get? m >= 0.  Eq. 12"""
-        raise NotImplementedError
+    def route(self, step: Step) -> float | Float[Tensor, " N"]:
+        """How much of its high-frequency gradient does each Gaussian get? m >= 0; 1: all of it.  Eq. 12"""
+        return 1.0
 
     def correct(self, lr: Grads, hr: Grads, step: Step) -> Grads:
         """How to reconcile the two gradients? Returns the corrected g_HR; g_LR is never changed.  Eq. 6, 7, 11"""
-        raise NotImplementedError
+        return hr
 
     def regularize(self, params: Mapping[str, Tensor], t: int) -> Grads | None:
         """Before the optimizer step: a gradient to add. Several strategies may answer.  Eq. 16"""
-        raise NotImplementedError
+        return None
 
     def score(self, step: Step, screen: ScreenGradients) -> Float[Tensor, " N"] | None:
         """For densification: where is more structure needed? None: the ordinary statistic.  Eq. 14"""
-        raise NotImplementedError
+        return None
 
     def extra_views(self, t: int) -> Sequence[ExtraView]:
         """Which other pictures should the field match at t? Several strategies may answer.
@@ -123,7 +122,7 @@ class Strategy:
         Each of them is rendered once, without dropout and f_det, and gets an optimizer step of its own on the LR loss, after
         the step of the iteration's view. It takes no part in evidence, conflicts, densification or regularization.
         """
-        raise NotImplementedError
+        return ()
 
     def may_densify(self, t: int) -> bool:
         """May the structure change at t? All strategies must agree."""
