@@ -26,7 +26,7 @@ _LARGEST_CELL: Final = np.iinfo(np.int32).max  # Open3D counts voxels along an a
 
 
 def without_outliers(cloud: PointCloud, neighbours: int, ratio: float) -> PointCloud:
-    """The cloud without the points that `remove_outliers` removes; all of it where `neighbours` is 0 or too few points are there.
+    """The cloud without the points that `remove_outliers` removes; all of it if `neighbours` is 0 or there are too few points.
 
     Args:
         neighbours: 0, or at least 2.

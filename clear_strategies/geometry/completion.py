@@ -1,4 +1,4 @@
-"""Depth where nothing tells it: smooth surfaces through what is known, which end at the edges of the photo.
+"""Depth where it is unknown: smooth surfaces through what is known, which end at the edges of the photo.
 
 On a plane, inverse depth is linear in the pixels: its second differences are 0 there, and large where a surface ends, which is
 mostly where colours change. The completed inverse depth u minimises, with d what is known of it,
@@ -21,7 +21,7 @@ _EDGE: Final = 0.025  # difference of colours, of 1, at which an edge of the pho
 _LEVEL: Final = 3e-3  # weight of the first differences
 _BEND: Final = 0.01  # second difference from which it counts by its size in place of its square; in medians of d
 _OUTLIER: Final = 0.05  # distance from d at which ρ' begins to fall; in medians of d
-_HELD: Final = 1e-9  # weight of the median of d, where nothing else tells
+_HELD: Final = 1e-9  # weight of the median of d, where nothing else decides
 _ROUNDS: Final = 6  # of reweighted least squares
 
 
@@ -44,10 +44,10 @@ def completed(
 
     (h, w), colors = known.shape, image.double().cpu().numpy()
     d = known.double().cpu().numpy().ravel()
-    told = np.isfinite(d)
-    scale = np.median(d[told])
-    d = np.where(told, d / scale, 0.0)
-    c = np.where(told, confidence.double().cpu().numpy().ravel(), 0.0)
+    is_known = np.isfinite(d)
+    scale = np.median(d[is_known])
+    d = np.where(is_known, d / scale, 0.0)
+    c = np.where(is_known, confidence.double().cpu().numpy().ravel(), 0.0)
     across, down = (np.exp(-np.abs(np.diff(colors, axis=axis)).mean(-1) / _EDGE) for axis in (1, 0))
     dx, dy = sp.kron(sp.eye(h), difference(w)), sp.kron(difference(h), sp.eye(w))
     dxx, dyy = sp.kron(sp.eye(h), difference(w - 1)) @ dx, sp.kron(difference(h - 1), sp.eye(w)) @ dy

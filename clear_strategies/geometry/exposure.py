@@ -42,27 +42,27 @@ def exposure_gains(photos: Sequence[Photo], depths: Sequence[DepthMap]) -> Float
     for row, (a, b) in enumerate(pairs):
         difference[row, a], difference[row, b] = 1, -1
     root = torch.stack(weights).sqrt()  # [pairs, 3]
-    # The pseudo-inverse has the least norm: of what no pair tells, the mean of the logarithms, it says 0.
+    # The pseudo-inverse has the least norm: the mean of the logarithms, which no pair determines, is 0.
     logs = [
         torch.linalg.pinv(root[:, c, None] * difference) @ (root[:, c] * torch.stack(ratios)[:, c]) for c in range(3)
     ]
     return torch.exp(-torch.stack(logs, dim=1)).float().to(device)
 
 
-def _ratio(photo: Photo, depth: DepthMap, other: Photo, its_depth: DepthMap) -> tuple[Tensor, Tensor]:
+def _ratio(photo: Photo, depth: DepthMap, other: Photo, other_depth: DepthMap) -> tuple[Tensor, Tensor]:
     """The median of log(photo / other) over the surfaces that both show, and how many pixels show one, by channel."""
     rows, columns = torch.nonzero(depth.known, as_tuple=True)
     surface = back_project(photo.camera, torch.stack((columns, rows), dim=1) + 0.5, depth.depth[rows, columns])
     pixels, z = project(other.camera, surface)
     shared = inside_of(other.camera, pixels, z)
     column, row = torch.where(shared[:, None], pixels, 0.0).long().unbind(dim=1)
-    shared &= (its_depth.depth[row, column] / z - 1).abs() <= _TOLERANCE  # False where it is unknown
-    mine, theirs = photo.image[rows[shared], columns[shared]], sample_colors(other.image, pixels[shared])
+    shared &= (other_depth.depth[row, column] / z - 1).abs() <= _TOLERANCE  # False where it is unknown
+    colors, other_colors = photo.image[rows[shared], columns[shared]], sample_colors(other.image, pixels[shared])
     low, high = _UNCLIPPED
-    usable = (mine > low) & (mine < high) & (theirs > low) & (theirs < high)
-    found, counts = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    usable = (colors > low) & (colors < high) & (other_colors > low) & (other_colors < high)
+    medians, counts = torch.zeros(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     for channel in range(3):
-        log = (mine / theirs).double().log()[usable[:, channel], channel]
+        log = (colors / other_colors).double().log()[usable[:, channel], channel]
         if len(log) >= _FEWEST:
-            found[channel], counts[channel] = log.median(), len(log)
-    return found, counts
+            medians[channel], counts[channel] = log.median(), len(log)
+    return medians, counts

@@ -73,8 +73,8 @@ def grid_points(
         if background is not None:
             surface = ~is_background(shade, background)
             grid, shade = grid[surface], shade[surface]
-        found = None if maps is None else maps[i]
-        inverse_depth = _completed(means, photo, grid, 2 * stride, found) if len(grid) else None
+        depth_map = None if maps is None else maps[i]
+        inverse_depth = _completed(means, photo, grid, 2 * stride, depth_map) if len(grid) else None
         if inverse_depth is None:
             continue
         points = back_project(photo.camera, grid, 1 / inverse_depth)
@@ -94,15 +94,15 @@ def pixel_grid(photo: Photo, stride: int) -> Float[Tensor, "G 2"]:
     return torch.cartesian_prod(x, y)
 
 
-def _floats(points: Float[Tensor, "N 3"], photo: Photo, found: DepthMap) -> Bool[Tensor, " N"]:
+def _floats(points: Float[Tensor, "N 3"], photo: Photo, depth_map: DepthMap) -> Bool[Tensor, " N"]:
     """Whether the photo looks through the point at a surface behind it."""
     inside, row, column, depth = seen_pixels(photo.camera, points)
-    inside[inside.clone()] = depth < _NEARER * found.depth.cpu()[row, column].double()
+    inside[inside.clone()] = depth < _NEARER * depth_map.depth.cpu()[row, column].double()
     return inside
 
 
 def _completed(
-    means: Float[Tensor, "N 3"], photo: Photo, at: Float[Tensor, "G 2"], cell: int, found: DepthMap | None
+    means: Float[Tensor, "N 3"], photo: Photo, at: Float[Tensor, "G 2"], cell: int, depth_map: DepthMap | None
 ) -> Float[Tensor, " G"] | None:
     """Inverse depth at these pixels, from the photo's own depth and the points; None where fewer than 4 are known.
 
@@ -116,9 +116,9 @@ def _completed(
     known = torch.full((photo.camera.height, photo.camera.width), torch.nan, dtype=torch.float64)
     confidence = torch.full_like(known, _OF_POINTS)
     known[row[nearest], column[nearest]] = 1 / depth[nearest]
-    if found is not None:
-        own = found.known.cpu()
-        known[own], confidence[own] = 1 / found.depth.cpu()[own].double(), 1.0
+    if depth_map is not None:
+        matched = depth_map.known.cpu()
+        known[matched], confidence[matched] = 1 / depth_map.depth.cpu()[matched].double(), 1.0
     count = int(known.isfinite().sum())
     if count < _FEWEST_SAMPLES:
         _log.warning("depth of a view cannot be completed: only %d points project into it.", count)

@@ -12,10 +12,10 @@ REMEDY: Final = "pip install 'clear-strategies[train]'"
 
 def missing(*modules: str) -> str:
     """The packages of those modules that cannot be imported, joined by commas; empty where all can."""
-    lacking = []
+    packages = []
     for module in modules:
         try:
             importlib.import_module(module)
         except (ImportError, OSError):  # not installed, or its system libraries are missing
-            lacking.append(_PACKAGES[module])
-    return ", ".join(lacking)
+            packages.append(_PACKAGES[module])
+    return ", ".join(packages)

@@ -1,8 +1,8 @@
-"""Pseudo views: what cameras beside the training cameras would see, as far as stereo depth and the LR photos tell.
+"""Pseudo views: what cameras beside the training cameras would see, made from stereo depth and the LR photos.
 
-Each pseudo view is a training camera moved aside. Its depth is that of the nearest photos' surfaces, its colours are those of
-the photos that see the same surface; where no photo does, nothing is known. A border view is a training camera with a wider
-field: it knows its photo, and nothing around it. `clear_strategies.strategies.pseudo_views` says what they are for.
+Each pseudo view has a training camera moved aside. Its depth is that of the nearest photos' surfaces, its colours are those of
+the photos that see the same surface; where no photo does, the colour is unknown. A border view has a training camera with a
+wider field: its photo is known, the border around it is not. `clear_strategies.strategies.pseudo_views` trains on them.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -32,7 +33,7 @@ class PseudoView:
 
     Args:
         photo: the colours, 0 where unknown, and the camera.
-        known: where photos tell the colour.
+        known: where a photo shows the colour.
     """
 
     photo: Photo
@@ -41,7 +42,7 @@ class PseudoView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Source:
-    """A photo with depth: the points it shows, and the depth that vouches for them, 0 where it cannot."""
+    """A photo with depth: its points, and the depth up to which its colours are used, 0 where they are not."""
 
     photo: Photo
     points: Float[Tensor, "N 3"]
@@ -72,17 +73,17 @@ def pseudo_views(
     sources = []
     for name, photo in photos.items():
         factor = photo.factor_to(max_pixels)
-        if name in depths and bool((found := depths[name].reduced(factor)).known.any()):
-            sources.append(_source(photo.reduced(factor), found, background))
+        if name in depths and bool((depth_map := depths[name].reduced(factor)).known.any()):
+            sources.append(_source(photo.reduced(factor), depth_map, background))
     if len(sources) < 2:
         return []
     generator = torch.Generator().manual_seed(seed)
-    made = []
+    views = []
     for i in range(count):
         source = sources[i % len(sources)]
         camera = moved_aside(source.photo.camera, source.median, reach, generator)
-        made.append(_warped(camera, sources, tolerance))
-    return made
+        views.append(_warped(camera, sources, tolerance))
+    return views
 
 
 def border_views(photos: Iterable[Photo], *, field: float, max_pixels: int) -> list[PseudoView]:
@@ -92,18 +93,18 @@ def border_views(photos: Iterable[Photo], *, field: float, max_pixels: int) -> l
         field: at least 1.
         max_pixels: larger photos are reduced by a whole factor first.
     """
-    made = []
+    views = []
     for photo in (photo.reduced(photo.factor_to(max_pixels)) for photo in photos):
         c = photo.camera
         x, y = (round(n * (field - 1) / 2) for n in (c.width, c.height))
         wide = replace(c, cx=c.cx + x, cy=c.cy + y, width=c.width + 2 * x, height=c.height + 2 * y)
         known = torch.zeros(wide.height, wide.width, dtype=torch.bool)
         known[y : y + c.height, x : x + c.width] = True if photo.shown is None else photo.shown
-        image = torch.nn.functional.pad(photo.image, (0, 0, x, x, y, y))
+        image = F.pad(photo.image, (0, 0, x, x, y, y))
         through = photo.transparency
-        through = None if through is None else torch.nn.functional.pad(through, (x, x, y, y))
-        made.append(PseudoView(Photo(wide, image, transparency=through), known))
-    return made
+        through = None if through is None else F.pad(through, (x, x, y, y))
+        views.append(PseudoView(Photo(wide, image, transparency=through), known))
+    return views
 
 
 def cut_out(photos: Iterable[Photo], background: Color) -> bool:
@@ -122,14 +123,12 @@ def moved_aside(camera: Camera, distance: float, reach: float, generator: torch.
     return moved(camera, direction * reach * distance, aim=distance)
 
 
-def _source(photo: Photo, found: DepthMap, background: Color) -> _Source:
-    """Pixels beside the background are mixed with it: they give points but no colour."""
-    known, depth = found.known, torch.nan_to_num(found.depth)
+def _source(photo: Photo, depth_map: DepthMap, background: Color) -> _Source:
+    """Pixels at the border of the background are mixed with it: they give points but no colour."""
+    known, depth = depth_map.known, torch.nan_to_num(depth_map.depth)
     points = back_project(photo.camera, _centres(photo.camera)[known], depth[known].double())
-    beside = (
-        torch.nn.functional.max_pool2d(is_background(photo.image, background)[None, None].float(), 3, 1, 1)[0, 0] > 0
-    )
-    return _Source(photo, points, torch.where(known & ~beside, depth, 0.0), float(depth[known].median()))
+    mixed = F.max_pool2d(is_background(photo.image, background)[None, None].float(), 3, 1, 1)[0, 0] > 0
+    return _Source(photo, points, torch.where(known & ~mixed, depth, 0.0), float(depth[known].median()))
 
 
 def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> PseudoView:
@@ -143,14 +142,14 @@ def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Pse
         pixels, z = project(s.photo.camera, points)
         inside = inside_of(s.photo.camera, pixels, z)
         column, row = torch.where(inside[:, None], pixels, 0.0).long().unbind(dim=1)
-        sees = inside & ((s.depth[row, column] / z - 1).abs() <= tolerance)
-        w = sees / (s.photo.camera.center - camera.center).square().sum().clamp_min(1e-12)  # the nearest tells most
+        shows = inside & ((s.depth[row, column] / z - 1).abs() <= tolerance)
+        w = shows / (s.photo.camera.center - camera.center).square().sum().clamp_min(1e-12)  # the nearest counts most
         color += w[:, None] * sample_colors(s.photo.image, pixels)
         weight += w
     image = torch.zeros(camera.height, camera.width, 3)
     image[known] = color / weight.clamp_min(torch.finfo(weight.dtype).tiny)[:, None]
     known[known.clone()] = weight > 0
-    around = 9 * torch.nn.functional.avg_pool2d(known[None, None].float(), 3, 1, 1)[0, 0]
+    around = 9 * F.avg_pool2d(known[None, None].float(), 3, 1, 1)[0, 0]
     known &= around >= _NEIGHBOURS - 0.5
     return PseudoView(Photo(camera, torch.where(known[..., None], image, 0.0).clamp(0, 1)), known)
 
@@ -171,3 +170,34 @@ def _front(camera: Camera, points: Float[Tensor, "N 3"]) -> Float[Tensor, "h w"]
 def _centres(camera: Camera) -> Float[Tensor, "h w 2"]:
     row, column = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
     return torch.stack((column, row), dim=-1).double() + 0.5
+
+
+def continued(image: Float[Tensor, "h w 3"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w 3"]:
+    """`image` where it is known, elsewhere a smooth continuation of the colours around; `image` itself if nothing is known.
+
+    A pyramid of means: each level halves the one before, and its pixels are known where one of the four below is. From the
+    coarsest level down, each unknown pixel takes the colour of the coarser level, so that colours become smoother the further
+    away known pixels are.
+
+    Args:
+        known: where `image` shows something; its other pixels are not read.
+    """
+    if not bool(known.any()):
+        return image
+    mask = known[None, None].to(image)
+    colors = torch.where(known[..., None], image, 0.0).permute(2, 0, 1)[None]
+    return _filled(colors, mask)[0].permute(1, 2, 0).clamp(0, 1)
+
+
+def _filled(colors: Float[Tensor, "1 3 h w"], mask: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 3 h w"]:
+    """
+    Args:
+        colors: 0 where `mask` is 0. mask: 1 where known, at one pixel at least.
+    """
+    if bool(mask.all()):
+        return colors
+    sums, share = (F.avg_pool2d(x, 2, ceil_mode=True) for x in (colors, mask))  # of each block of four
+    coarse = _filled(sums / share.clamp_min(torch.finfo(share.dtype).tiny), (share > 0).to(mask))
+    height, width = mask.shape[2:]
+    finer = F.interpolate(coarse, scale_factor=2, mode="bilinear", align_corners=False)[..., :height, :width]
+    return torch.where(mask > 0, colors, finer)

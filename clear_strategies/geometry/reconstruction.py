@@ -70,7 +70,7 @@ def stereo(
         settings: of the comparison; None: `StereoSettings()`.
         fill: add points at completed depth where a photo's depth is unknown. Needs SciPy.
         features: (means [N, 3] in world units, colors [N, 3] in [0, 1]) of points that are known already, e.g. COLMAP's.
-            They give the range of depth, judge the maps, and are part of the cloud where no map knows depth. None:
+            They give the range of depth, check the maps, and are part of the cloud where depth is unknown. None:
             features of the photos are triangulated, which needs OpenCV, kornia and SciPy; without them, the cameras give
             the range.
 
@@ -140,16 +140,16 @@ def _masks(masks: Sequence[Tensor | None], photos: Sequence[Photo]) -> list[Bool
         _refuse(
             "masks", f"must be one for each of {len(photos)} photos, got {len(masks)}", "give None where none hides"
         )
-    found = []
+    shown = []
     for i, (mask, photo) in enumerate(zip(masks, photos, strict=True)):
         shape = photo.image.shape[:2]
         if mask is not None and mask.shape != shape:
             _refuse(
                 f"masks[{i}]", f"must have shape {tuple(shape)}, got {tuple(mask.shape)}", "give [h, w] of the photo"
             )
-        every = torch.ones(shape, dtype=torch.bool, device=photo.image.device)
-        found.append(every if mask is None else mask.detach().to(photo.image.device) > 0)
-    return found
+        ones = torch.ones(shape, dtype=torch.bool, device=photo.image.device)
+        shown.append(ones if mask is None else mask.detach().to(photo.image.device) > 0)
+    return shown
 
 
 def _unhidden(
@@ -180,8 +180,8 @@ def _camera(i: int, pose: Tensor, K: Tensor, image: Tensor) -> Camera:
 def _features(means: Tensor, colors: Tensor) -> PointCloud:
     means, colors = (x.detach().cpu().float() for x in (means, colors))
     if means.ndim != 2 or means.shape[1] != 3 or means.shape != colors.shape:
-        found = f"{tuple(means.shape)} and {tuple(colors.shape)}"
-        _refuse("features", f"must be positions [N, 3] and colours [N, 3], got {found}", "give a pair (means, colors)")
+        shapes = f"{tuple(means.shape)} and {tuple(colors.shape)}"
+        _refuse("features", f"must be positions [N, 3] and colours [N, 3], got {shapes}", "give a pair (means, colors)")
     if not bool(means.isfinite().all()):
         _refuse("features", "must have finite positions", "remove the others")
     if not bool(((colors >= 0) & (colors <= 1)).all()):

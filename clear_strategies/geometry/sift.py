@@ -86,9 +86,9 @@ class Pairs:
 
 def features_of(photos: Sequence[Photo]) -> PointCloud:
     """The points of `triangulate`; none without OpenCV, kornia or SciPy, and the log and the cloud's `source` say so."""
-    if lacking := missing("cv2", "kornia", "scipy"):
-        _log.warning("no features are triangulated without %s: %s", lacking, REMEDY)
-        return PointCloud(torch.zeros(0, 3), torch.zeros(0, 3), f"no triangulated features without {lacking}")
+    if packages := missing("cv2", "kornia", "scipy"):
+        _log.warning("no features are triangulated without %s: %s", packages, REMEDY)
+        return PointCloud(torch.zeros(0, 3), torch.zeros(0, 3), f"no triangulated features without {packages}")
     return triangulate(photos)
 
 
@@ -98,7 +98,7 @@ def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None 
     features = [find_features(photo, settings) for photo in photos]
     view = torch.repeat_interleave(torch.arange(len(photos)), torch.tensor([len(f.pixels) for f in features]))
     first_of = torch.searchsorted(view, torch.arange(len(photos)))
-    found = [Pairs(torch.zeros(0, 3).double(), torch.zeros(0, 2, dtype=torch.long), torch.zeros(0).double())]
+    per_pair = [Pairs(torch.zeros(0, 3).double(), torch.zeros(0, 2, dtype=torch.long), torch.zeros(0).double())]
     compared = enumerate(partners([photo.camera for photo in photos]))
     pairs_of_views = sorted({(min(i, j), max(i, j)) for i, others in compared for j in others})
     progress = Progress("features that photos have in common", "pairs", len(pairs_of_views))
@@ -107,9 +107,9 @@ def triangulate(photos: Sequence[Photo], settings: TriangulationSettings | None 
         index = match(features[i], features[j], settings.ratio)
         x, y = features[i].pixels[index[:, 0]], features[j].pixels[index[:, 1]]
         points, angles, good = triangulate_pair(photos[i].camera, photos[j].camera, x, y, settings)
-        found.append(Pairs(points[good], index[good] + first_of[[i, j]], angles[good]))
+        per_pair.append(Pairs(points[good], index[good] + first_of[[i, j]], angles[good]))
         _log.debug("views %d and %d: %d matches, %d points.", i, j, len(index), int(good.sum()))
-    pairs = Pairs(*(torch.cat([getattr(p, name) for p in found]) for name in ("means", "features", "angles")))
+    pairs = Pairs(*(torch.cat([getattr(p, name) for p in per_pair]) for name in ("means", "features", "angles")))
     chosen = one_per_track(pairs, view)
 
     sampled = [sample_colors(photo.image, f.pixels) for photo, f in zip(photos, features, strict=True)]
@@ -150,10 +150,10 @@ def match(a: Features, b: Features, ratio: float) -> Int[Tensor, "M 2"]:
         )
     )
     distance = (2 - 2 * similarity).clamp_min(0).sqrt()  # |x - y|² = 2 - 2 x·y: descriptors have length 1
-    here = torch.nonzero(distance[:, 0] < ratio * distance[:, 1])[:, 0]
-    there = candidate[here, 0]
-    mutual = (b.descriptors[there] @ a.descriptors.T).argmax(dim=1) == here
-    return torch.stack((here[mutual], there[mutual]), dim=1)
+    first = torch.nonzero(distance[:, 0] < ratio * distance[:, 1])[:, 0]
+    second = candidate[first, 0]
+    mutual = (b.descriptors[second] @ a.descriptors.T).argmax(dim=1) == first
+    return torch.stack((first[mutual], second[mutual]), dim=1)
 
 
 def triangulate_pair(

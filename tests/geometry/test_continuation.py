@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from clear_strategies.geometry.continuation import continued
+from clear_strategies.geometry.pseudo_views import continued
 
 
 def picture(height: int = 37, width: int = 50) -> torch.Tensor:

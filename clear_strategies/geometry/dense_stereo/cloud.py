@@ -34,7 +34,7 @@ def stereo_cloud(
     outlier_neighbours: int = OUTLIER_NEIGHBOURS,
     outlier_ratio: float = OUTLIER_RATIO,
 ) -> PointCloud | None:
-    """The points of the depth maps, features where no map knows depth, and what fills the rest; None: no depth.
+    """The points of the depth maps, features where depth is unknown, and points that fill the rest; None: no depth is known.
 
     Without SciPy no outlier is removed and nothing is filled; the log and the cloud's `source` say so.
 
@@ -45,23 +45,23 @@ def stereo_cloud(
         fill: add a grid of `stride` px at completed depth where a photo's depth is unknown.
         outlier_neighbours, outlier_ratio: see `without_outliers`.
     """
-    if not any(found.coverage > 0 for found in maps):
+    if not any(depth_map.coverage > 0 for depth_map in maps):
         return None
     means, colors = points_of(photos, maps, settings.spacing, settings.tolerance)
     known = torch.zeros(len(features), dtype=torch.bool)
-    for photo, found in zip(photos, maps, strict=True):
+    for photo, depth_map in zip(photos, maps, strict=True):
         inside, row, column, _ = seen_pixels(photo.camera, features.means)
-        known[inside] |= found.known.cpu()[row, column]
+        known[inside] |= depth_map.known.cpu()[row, column]
     means = torch.cat((means, features.means[~known]))
     colors = torch.cat((colors, features.colors[~known]))
-    shares = ", ".join(f"{found.coverage:.0%}" for found in maps)
-    silent = sum(found.coverage == 0 for found in maps)
+    shares = ", ".join(f"{depth_map.coverage:.0%}" for depth_map in maps)
+    uncovered = sum(depth_map.coverage == 0 for depth_map in maps)
     source = f"{len(means):,} points of dense stereo between the {len(photos)} photos (depth known at {shares})"
-    if (fill or outlier_neighbours) and (lacking := missing("scipy")):
-        _log.warning("no outlier is removed and nothing is filled without %s: %s", lacking, REMEDY)
-        return PointCloud(means, colors, f"{source}, neither cleaned nor filled without {lacking}")
-    if silent and fill:
-        source += f", {silent} of them completed alone"
+    if (fill or outlier_neighbours) and (packages := missing("scipy")):
+        _log.warning("no outlier is removed and nothing is filled without %s: %s", packages, REMEDY)
+        return PointCloud(means, colors, f"{source}, neither cleaned nor filled without {packages}")
+    if uncovered and fill:
+        source += f", {uncovered} of them completed alone"
     cloud = without_outliers(PointCloud(means, colors, source), outlier_neighbours, outlier_ratio)
     if not fill:
         return cloud
@@ -83,27 +83,27 @@ def points_of(
         tolerance: relative difference of depth up to which a point lies on the surface.
     """
     means, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
-    for photo, found in zip(photos, maps, strict=True):
-        pixel = _best_per_square(photo, found, torch.cat(means), spacing, tolerance)
+    for photo, depth_map in zip(photos, maps, strict=True):
+        pixel = _best_per_square(photo, depth_map, torch.cat(means), spacing, tolerance)
         row, column = pixel // photo.camera.width, pixel % photo.camera.width
         centre = torch.stack((column, row), dim=1).double() + 0.5
-        means.append(back_project(photo.camera, centre, found.depth.cpu().reshape(-1)[pixel].double()))
+        means.append(back_project(photo.camera, centre, depth_map.depth.cpu().reshape(-1)[pixel].double()))
         colors.append(photo.image.cpu().reshape(-1, 3)[pixel])
     return torch.cat(means), torch.cat(colors)
 
 
 def _best_per_square(
-    photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"], spacing: float, tolerance: float
+    photo: Photo, depth_map: DepthMap, points: Float[Tensor, "N 3"], spacing: float, tolerance: float
 ) -> Int[Tensor, " K"]:
     """The pixel of highest confidence in each square that has depth, unless a point on the surface projects into it."""
-    height, width = found.depth.shape
+    height, width = depth_map.depth.shape
     x, y = (((torch.arange(n) + 0.5) / spacing).long() for n in (width, height))
     squares = y[:, None] * (int(x[-1]) + 1) + x
     covered = torch.zeros(int(squares.max()) + 1, dtype=torch.bool)
     _, row, column, depth = seen_pixels(photo.camera, points)
-    same = (found.depth.cpu()[row, column] / depth - 1).abs() <= tolerance
+    same = (depth_map.depth.cpu()[row, column] / depth - 1).abs() <= tolerance
     covered[squares[row[same], column[same]]] = True
-    square, confidence = squares.reshape(-1), found.confidence.cpu().reshape(-1)
+    square, confidence = squares.reshape(-1), depth_map.confidence.cpu().reshape(-1)
     free = torch.nonzero((confidence > 0) & ~covered[square])[:, 0]
     order = free[torch.argsort(confidence[free], descending=True, stable=True)]
     order = order[torch.argsort(square[order], stable=True)]

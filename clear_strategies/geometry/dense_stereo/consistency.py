@@ -1,37 +1,39 @@
-"""Which depths other photos confirm."""
+"""Which depths hold: those that other photos confirm, and that are not alone among their neighbours."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.geometry.dense_stereo.depth import Estimate
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
+from clear_strategies.geometry.libraries import missing
 
 
 def confirm(
-    mine: Estimate, others: Sequence[Estimate], settings: StereoSettings
+    estimate: Estimate, others: Sequence[Estimate], settings: StereoSettings
 ) -> tuple[Int[Tensor, "H W"], Float[Tensor, "H W"]]:
-    """(how many of the others agree at each pixel, mean inverse depth of all that agree, the photo's own included).
+    """(how many of the others agree at each pixel, mean inverse depth of all that agree, the photo itself included).
 
     Each pixel's point is looked up in the depth of the others, and the point found there is brought back.
     Another photo agrees if that depth differs by at most `tolerance`, relatively, and if the point comes back to within
     `reprojection` pixels.
     """
-    height, width = mine.inverse_depth.shape
-    agreeing = torch.zeros(height, width, dtype=torch.long, device=mine.inverse_depth.device)
-    total = mine.inverse_depth.double()
+    height, width = estimate.inverse_depth.shape
+    agreeing = torch.zeros(height, width, dtype=torch.long, device=estimate.inverse_depth.device)
+    total = estimate.inverse_depth.double()
     column = torch.arange(width, device=total.device) + 0.5
     row = (torch.arange(height, device=total.device) + 0.5)[:, None]
     for other in others:
-        u, v, depth, seen = carry(mine, other, mine.inverse_depth)
+        u, v, depth, seen = carry(estimate, other, estimate.inverse_depth)
         x, y = u.long(), v.long()
-        found = other.inverse_depth[y, x]
-        u, v, back, ahead = carry(other, mine, found, (y, x))
-        same = (depth * found - 1).abs() <= settings.tolerance
+        other_inverse = other.inverse_depth[y, x]
+        u, v, back, ahead = carry(other, estimate, other_inverse, (y, x))
+        same = (depth * other_inverse - 1).abs() <= settings.tolerance
         near = (u - column).square() + (v - row).square() <= settings.reprojection**2
         agrees = seen & ahead & same & near
         agreeing += agrees
@@ -40,19 +42,19 @@ def confirm(
 
 
 def carry(
-    mine: Estimate,
+    estimate: Estimate,
     other: Estimate,
     inverse_depth: Float[Tensor, "H W"],
     at: tuple[Tensor, Tensor] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(column, row, depth, whether inside) in the other photo of the points at these inverse depths.
+    """(column, row, depth, whether inside) in the other estimate of the points at these inverse depths.
 
     Columns and rows are in pixels and clamped into the other photo.
 
     Args:
         at: (rows, columns) of the pixels; None: every pixel.
     """
-    rotated, shift = mine.image.towards(other.image)
+    rotated, shift = estimate.image.towards(other.image)
     if at is not None:
         rotated = rotated[at]
     x, y, z = (rotated[..., k] + shift[k] * inverse_depth for k in range(3))
@@ -63,3 +65,29 @@ def carry(
     depth = torch.where(ahead, z / inverse_depth, torch.inf)
     u, v = (torch.where(ahead, c, 0.0).clamp(0, size - 1e-3) for c, size in ((u, width), (v, height)))
     return u, v, depth, seen
+
+
+def speckles(depth: Float[Tensor, "h w"], fewest: int, tolerance: float) -> Bool[Tensor, "h w"]:
+    """Where known depth belongs to fewer than `fewest` connected pixels: mostly chance matches. Nowhere without SciPy.
+
+    Two pixels are connected if they share an edge, and their depths differ by at most `tolerance`, relatively.
+
+    Args:
+        depth: NaN where unknown.
+    """
+    if fewest <= 1 or missing("scipy"):
+        return torch.zeros_like(depth, dtype=torch.bool)
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    values = depth.double().cpu().numpy()
+    pixel = np.arange(values.size).reshape(values.shape)
+    edges = []
+    for left, right in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        alike = np.abs(values[left] / values[right] - 1) <= tolerance  # False beside NaN
+        edges.append((pixel[left][alike], pixel[right][alike]))
+    rows, columns = (np.concatenate(ends) for ends in zip(*edges, strict=True))
+    graph = coo_array((np.ones(len(rows), bool), (rows, columns)), shape=(values.size, values.size))
+    _, island = connected_components(graph, directed=False)
+    small = (np.bincount(island)[island] < fewest).reshape(values.shape)
+    return (torch.from_numpy(small) & depth.cpu().isfinite()).to(depth.device)

@@ -17,7 +17,7 @@ from clear_strategies.geometry.dense_stereo.sources import Comparison, plane_cou
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """One photo's own estimate, before others are asked.
+    """The depth of one photo, before it is compared with that of others.
 
     Args:
         inverse_depth: 1 / z, 1 / world units.
@@ -29,8 +29,8 @@ class Estimate:
     correlation: Float[Tensor, "H W"]
 
 
-def estimate(image: Grey, others: list[Grey], comparison: Comparison, settings: StereoSettings) -> Estimate:
-    """Plane sweep: planes uniform in inverse depth, the smoothed cost's minimum, and a parabola through its neighbours."""
+def plane_sweep(image: Grey, others: list[Grey], comparison: Comparison, settings: StereoSettings) -> Estimate:
+    """Planes uniform in inverse depth, the minimum of the smoothed cost, and a parabola through its neighbours."""
     count = plane_count(image.camera, [other.camera for other in others], comparison, settings)
     planes = torch.linspace(comparison.far, comparison.near, count, dtype=torch.float64)
     cost = cost_volume(image, others, planes.to(image.image), settings.window)

@@ -1,4 +1,4 @@
-"""The depth map of each photo: swept, smoothed, confirmed, judged."""
+"""The depth map of each photo: plane sweep, smoothing, confirmation by other photos, checks."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from torch import Tensor
 
 from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.geometry.dense_stereo.consistency import confirm
-from clear_strategies.geometry.dense_stereo.depth import Estimate, estimate
+from clear_strategies.geometry.dense_stereo.consistency import confirm, speckles
+from clear_strategies.geometry.dense_stereo.depth import Estimate, plane_sweep
 from clear_strategies.geometry.dense_stereo.image import Grey, grey
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.dense_stereo.sources import Comparison, comparisons
-from clear_strategies.geometry.dense_stereo.speckles import speckles
 from clear_strategies.geometry.projection import is_background, seen_pixels
 from clear_strategies.geometry.sift import features_of
 from rasterizers.interface import Color
@@ -25,8 +24,8 @@ from rasterizers.interface import Color
 _log = logging.getLogger(__name__)
 
 _MANY_PHOTOS = 12  # from here on, two others must agree
-_ASKED = 8  # the most photos that are asked to confirm one
-_FEW_POINTS = 10  # triangulated points in a photo below which they do not judge its depth
+_ASKED = 8  # the most photos by which one is confirmed
+_FEW_POINTS = 10  # triangulated points in a photo, below which its depth is not checked by them
 _LIKE = 0.05  # relative difference of depth up to which neighbouring pixels show one surface
 _CLOSE = 0.1  # relative error up to which depth agrees with a triangulated point
 
@@ -42,7 +41,7 @@ def depth_maps(
 
     Args:
         photos: posed, of any sizes, on one device.
-        points: of the surfaces, world units: they give the range of depth and judge the result. There may be
+        points: of the surfaces, world units: they give the range of depth, and the result is checked by them. There may be
             none; then the cameras give the range. None: features are triangulated where OpenCV, kornia and SciPy are
             installed.
         background: the colour of pixels without a surface, RGB in [0, 1].
@@ -59,75 +58,75 @@ def depth_maps(
     estimates = _estimates(photos, compared, settings)
     needed = settings.agreeing or (2 if len(photos) >= _MANY_PHOTOS else 1)
     maps = []
-    for i, (photo, mine) in enumerate(zip(photos, estimates, strict=True)):
-        if mine is None:
+    for i, (photo, estimate) in enumerate(zip(photos, estimates, strict=True)):
+        if estimate is None:
             maps.append(_unknown(photo, "no other photo sees the same surfaces from 1 to 45 degrees aside"))
             continue
         others = [e for j in compared[i].others[:_ASKED] if (e := estimates[j]) is not None]
-        agreeing, inverse_depth = confirm(mine, others, settings)
+        agreeing, inverse_depth = confirm(estimate, others, settings)
         good = agreeing >= min(needed, len(others))
-        good &= (mine.correlation >= settings.min_correlation) & (agreeing > 0)
+        good &= (estimate.correlation >= settings.min_correlation) & (agreeing > 0)
         if background is not None:
             good &= ~is_background(photo.image, background)
         if masks is not None:
             good &= masks[i].to(good.device)
-        confidence = mine.correlation.clamp(0, 1) * (agreeing.float() / 2).clamp(max=1)
+        confidence = estimate.correlation.clamp(0, 1) * (agreeing.float() / 2).clamp(max=1)
         depth = torch.where(good, 1 / inverse_depth, torch.nan)
         good &= ~speckles(depth, settings.speckle, _LIKE)
-        found = DepthMap(torch.where(good, depth, torch.nan), torch.where(good, confidence, 0.0))
-        maps.append(_judged(photo, found, points, settings))
+        depth_map = DepthMap(torch.where(good, depth, torch.nan), torch.where(good, confidence, 0.0))
+        maps.append(_checked(photo, depth_map, points, settings))
     return maps
 
 
 def _estimates(
     photos: Sequence[Photo], compared: Sequence[Comparison], settings: StereoSettings
 ) -> list[Estimate | None]:
-    """Each photo's own depth on the grid of its LR pixels; None without photos to compare it with."""
+    """The depth of each photo at its pixels, from its own plane sweep; None without photos to compare it with."""
     greys = [grey(photo, settings.enlarge, settings.max_pixels) for photo in photos]
-    found: list[Estimate | None] = []
+    estimates: list[Estimate | None] = []
     progress = Progress("depth by stereo", "photos", len(photos))
     for i, (photo, comparison) in enumerate(zip(photos, compared, strict=True)):
         others = [greys[j] for j in comparison.others[: settings.sources]]
         if not others:
-            found.append(None)
+            estimates.append(None)
             continue
-        found.append(_on_photo(estimate(greys[i], others, comparison, settings), photo))
+        estimates.append(_on_photo(plane_sweep(greys[i], others, comparison, settings), photo))
         _log.debug("stereo: photo %d against %s.", i, comparison.others[: settings.sources])
         progress(i + 1)
-    return found
+    return estimates
 
 
-def _on_photo(found: Estimate, photo: Photo) -> Estimate:
+def _on_photo(estimate: Estimate, photo: Photo) -> Estimate:
     """The estimate of an enlarged or reduced image at the photo's pixels: the best correlated of those it covers."""
-    camera, here = photo.camera, found.image.camera
+    camera, swept = photo.camera, estimate.image.camera
     image = Grey(camera, photo.image.new_zeros(camera.height, camera.width))
-    if (camera.height, camera.width) == tuple(found.inverse_depth.shape):
-        return replace(found, image=image)
-    if here.width > camera.width:
-        k = here.width // camera.width
-        best = torch.nn.functional.max_pool2d(found.correlation[None, None], k, return_indices=True)[1][0, 0]
-        return Estimate(image, *(x.reshape(-1)[best] for x in (found.inverse_depth, found.correlation)))
+    if (camera.height, camera.width) == tuple(estimate.inverse_depth.shape):
+        return replace(estimate, image=image)
+    if swept.width > camera.width:
+        k = swept.width // camera.width
+        best = torch.nn.functional.max_pool2d(estimate.correlation[None, None], k, return_indices=True)[1][0, 0]
+        return Estimate(image, *(x.reshape(-1)[best] for x in (estimate.inverse_depth, estimate.correlation)))
     row, column = (
         ((torch.arange(full) + 0.5) * (f / g)).long().clamp(max=last - 1)
         for full, f, g, last in (
-            (camera.height, here.fy, camera.fy, here.height), (camera.width, here.fx, camera.fx, here.width),
+            (camera.height, swept.fy, camera.fy, swept.height), (camera.width, swept.fx, camera.fx, swept.width),
         )
     )  # fmt: skip
-    return Estimate(image, *(x[row[:, None], column] for x in (found.inverse_depth, found.correlation)))
+    return Estimate(image, *(x[row[:, None], column] for x in (estimate.inverse_depth, estimate.correlation)))
 
 
-def _judged(photo: Photo, found: DepthMap, points: Float[Tensor, "N 3"], settings: StereoSettings) -> DepthMap:
+def _checked(photo: Photo, depth_map: DepthMap, points: Float[Tensor, "N 3"], settings: StereoSettings) -> DepthMap:
     """The depth map, or an unknown one where it covers too little or contradicts the triangulated points."""
-    if found.coverage < settings.trust:
-        return _unknown(photo, f"its depth is confirmed at only {found.coverage:.1%} of the pixels")
+    if depth_map.coverage < settings.trust:
+        return _unknown(photo, f"its depth is confirmed at only {depth_map.coverage:.1%} of the pixels")
     _, row, column, depth = seen_pixels(photo.camera, points)
-    # An occluded point says nothing, so only points in front of the surface contradict it.
-    ratio = found.depth.cpu()[row, column] / depth
+    # A point behind the surface may be occluded, so only points in front of it contradict the depth.
+    ratio = depth_map.depth.cpu()[row, column] / depth
     ratio = ratio[ratio.isfinite()]
     contradictions = float((ratio > 1 + _CLOSE).float().mean()) if len(ratio) >= _FEW_POINTS else 0.0
     if contradictions > 0.5:
         return _unknown(photo, f"{contradictions:.0%} of the triangulated points lie in front of its depth")
-    return found
+    return depth_map
 
 
 def _unknown(photo: Photo, reason: str) -> DepthMap:

@@ -18,7 +18,7 @@ from clear_strategies.geometry.projection import back_project, inside_of, projec
 from rasterizers.interface import Camera
 
 _FEW: Final = 20  # points in a photo, below which a grid at guessed depths replaces them
-_ASKED: Final = 1000  # points in a photo, at most, by which the others are scored: each is asked of every photo
+_SAMPLED: Final = 1000  # points in a photo, at most, by which the others are scored
 _ANGLES: Final = (1.0, 5.0, 20.0, 45.0)  # degrees between rays: useless, best from, best to, too different to compare
 _LEAST_SCORE: Final = 0.05
 _QUANTILES: Final = (0.02, 0.98)
@@ -41,7 +41,7 @@ class Comparison:
 
 
 def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"]) -> list[Comparison]:
-    """For each photo, the others that see the same surfaces from an angle that tells depth, and the range of depth.
+    """For each photo, the others that see the same surfaces at a useful angle, and the range of depth.
 
     Args:
         points: of the surfaces, world units; where a photo sees few, depths are guessed from the cameras.
@@ -49,11 +49,11 @@ def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"]) -> list[C
     cameras = [photo.camera for photo in photos]
     low, high = common_box(photos)
     middle = (low + high)[None] / 2
-    found = []
+    compared = []
     for i, camera in enumerate(cameras):
         inside, _, _, depth = seen_pixels(camera, points)
         if len(depth) >= _FEW:
-            seen = points[inside].double()[:: math.ceil(len(depth) / _ASKED)]
+            seen = points[inside].double()[:: math.ceil(len(depth) / _SAMPLED)]
             far, near = torch.quantile(1 / depth, torch.tensor(_QUANTILES, dtype=depth.dtype)).tolist()
             far, near = _FARTHER * far, _NEARER * near
         else:
@@ -62,8 +62,8 @@ def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"]) -> list[C
             seen, far, near = _grid(camera, distance), _GUESS_FAR / distance, _GUESS_NEAR / distance
         scores = {j: _score(camera, other, seen) for j, other in enumerate(cameras) if j != i}
         others = sorted((j for j in scores if scores[j] >= _LEAST_SCORE), key=lambda j: (-scores[j], j))
-        found.append(Comparison(tuple(others), far, near))
-    return found
+        compared.append(Comparison(tuple(others), far, near))
+    return compared
 
 
 def plane_count(camera: Camera, others: Sequence[Camera], comparison: Comparison, settings: StereoSettings) -> int:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from clear_strategies.geometry.dense_stereo import speckles as module
-from clear_strategies.geometry.dense_stereo.speckles import speckles
+from clear_strategies.geometry.dense_stereo import consistency as module
+from clear_strategies.geometry.dense_stereo.consistency import speckles
 
 
 def map_with_islands() -> torch.Tensor:
