@@ -49,9 +49,9 @@ class AnchorError(ClearError, RuntimeError):
     """The number of Gaussians changed after their anchor was taken (Eq. 16)."""
 
 
-def one_line(told: object) -> str:
-    """A text, or the message of an error, without its line breaks."""
-    return " ".join(str(told).split())
+def one_line(text: object) -> str:
+    """A text, or the message of an error, in one line."""
+    return " ".join(str(text).split())
 
 
 _NO_OPTION: Final = re.compile(
@@ -61,10 +61,10 @@ _NO_OPTION: Final = re.compile(
 
 def of_hydra(error: Exception) -> str:
     """The message of an error of Hydra's, in one line: of an option that is not there, the nearest one and all others."""
-    if (found := _NO_OPTION.search(str(error))) is None:
+    if (match := _NO_OPTION.search(str(error))) is None:
         return one_line(error)
-    group, name, listed = found.groups()
+    group, name, listed = match.groups()
     options = [option for option in listed.split() if not option.startswith("_")]
     near = difflib.get_close_matches(name, options, 1)
-    meant = f" Did you mean {near[0]}?" if near else ""
-    return f"{group}={name}: there is no such option.{meant} There are {', '.join(options)}."
+    suggestion = f" Did you mean {near[0]}?" if near else ""
+    return f"{group}={name}: there is no such option.{suggestion} There are {', '.join(options)}."

@@ -44,14 +44,14 @@ def scaled(settings: Settings, factor: float) -> Settings:
 
 def milestones(settings: Any) -> dict[str, int]:
     """Every milestone of a settings dataclass, with dotted names for those inside it; for the printed plan."""
-    found: dict[str, int] = {}
+    named: dict[str, int] = {}
     for f in fields(settings):
         value = getattr(settings, f.name)
         if _MILESTONE in f.metadata:
-            found[f.name] = value
+            named[f.name] = value
         elif f.init and is_dataclass(value) and not isinstance(value, type):
-            found |= {f"{f.name}.{name}": t for name, t in milestones(value).items()}
-    return found
+            named |= {f"{f.name}.{name}": t for name, t in milestones(value).items()}
+    return named
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,17 +107,15 @@ def conflict_ratio(lr: Grads, hr: Grads) -> dict[str, Number]:
     "gaussian" is one decision per Gaussian over its concatenated groups. NaN where nothing could be compared.
     """
     shares: dict[str, Number] = {}
-    dot: Tensor | float = 0.0
-    norms: list[Tensor | float] = [0.0, 0.0]
+    totals: list[Tensor] = []  # over the groups, as if they were one vector
     for group in CONFLICT_GROUPS:
         if group in lr and group in hr:
             g_lr, g_hr = lr[group], hr[group]
-            group_dot, group_norms = row_dot(g_lr, g_hr), (row_dot(g_lr, g_lr), row_dot(g_hr, g_hr))
-            shares[group] = _share_below_zero(group_dot, *group_norms)
-            dot = dot + group_dot
-            norms = [total + part for total, part in zip(norms, group_norms, strict=True)]
-    if isinstance(dot, Tensor) and all(isinstance(norm, Tensor) for norm in norms):
-        shares["gaussian"] = _share_below_zero(dot, *norms)  # type: ignore[arg-type]
+            products = [row_dot(a, b) for a, b in ((g_lr, g_hr), (g_lr, g_lr), (g_hr, g_hr))]
+            shares[group] = _share_below_zero(*products)
+            totals = [a + b for a, b in zip(totals, products, strict=True)] if totals else products
+    if totals:
+        shares["gaussian"] = _share_below_zero(*totals)
     return shares
 
 

@@ -1,4 +1,4 @@
-"""How far long work is, said now and then: a user who waits sees that something happens."""
+"""Log lines about the progress of long work."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ EVERY: Final = 10.0  # seconds between two lines
 
 
 class Progress:
-    """Counts what is done; work that takes less than `EVERY` seconds says nothing.
+    """Logs how much is done, at most every `EVERY` seconds.
 
     Args:
-        what: is being done. unit: of what is counted, in the plural.
+        what: the work. unit: what is counted, in the plural.
     """
 
     def __init__(self, what: str, unit: str, total: int) -> None:
         self.what, self.unit, self.total = what, unit, total
-        self._said, self._done = time.monotonic(), 0
+        self._logged_at, self._done = time.monotonic(), 0
 
     def __call__(self, done: int) -> None:
-        """So many are done: say so, if the last line is old enough and something has happened since."""
-        if time.monotonic() - self._said >= EVERY and self._done < done < self.total:
+        """Log that `done` of `total` are done, if the last line is old enough and `done` has grown since."""
+        if time.monotonic() - self._logged_at >= EVERY and self._done < done < self.total:
             _log.info("%s: %d of %d %s", self.what, done, self.total, self.unit)
-            self._said, self._done = time.monotonic(), done
+            self._logged_at, self._done = time.monotonic(), done

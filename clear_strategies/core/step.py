@@ -31,6 +31,5 @@ class Step:
         """The same step after the structure changed: row i of everything per Gaussian comes from row parents[i]."""
         visible = None if self.visible is None else self.visible[parents]
         e = self.evidence
-        return replace(
-            self, visible=visible, evidence=None if e is None else Evidence(e.reliability[parents], e.demand[parents])
-        )
+        evidence = None if e is None else Evidence(e.reliability[parents], e.demand[parents])
+        return replace(self, visible=visible, evidence=evidence)

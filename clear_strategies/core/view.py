@@ -31,15 +31,15 @@ class Photo:
     transparency: Float[Tensor, "H W"] | None = None
 
     def __post_init__(self) -> None:
-        found = tuple(self.image.shape)
-        if found != (self.camera.height, self.camera.width, 3):
+        shape = tuple(self.image.shape)
+        if shape != (self.camera.height, self.camera.width, 3):
             raise ValueError(
                 f"an image of {self.camera.width}x{self.camera.height} pixels has shape "
-                f"({self.camera.height}, {self.camera.width}, 3), got {found}."
+                f"({self.camera.height}, {self.camera.width}, 3), got {shape}."
             )
         for name in ("shown", "transparency"):
-            if (layer := getattr(self, name)) is not None and layer.shape != found[:2]:
-                raise ValueError(f"{name} must be {found[:2]}, one value for each pixel, got {tuple(layer.shape)}.")
+            if (layer := getattr(self, name)) is not None and layer.shape != shape[:2]:
+                raise ValueError(f"{name} must be {shape[:2]}, one value for each pixel, got {tuple(layer.shape)}.")
 
     def to(self, device: torch.device | str) -> Photo:
         """The same photo with its image on `device`. The camera stays on the CPU, where kernels read its numbers."""

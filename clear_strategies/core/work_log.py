@@ -49,8 +49,8 @@ class WorkLog:
         self._read_stamps(wait=True)
         counted, self._counted = self._counted, {}
         for (name, reason), count in counted.items():
-            if (found := int(count)) > 0:  # a count on the device may turn out to be 0
-                self._add(name, reason, found)
+            if (skips := int(count)) > 0:  # a count on the device may turn out to be 0
+                self._add(name, reason, skips)
         return self._entries
 
     @contextmanager

@@ -83,25 +83,20 @@ class MCMC(Strategy):
         require_number("dead_opacity", self.dead_opacity, above=0, below=1)
 
     def densifier(self, field: Gaussians, views: Sequence[View], seed: int) -> Sampler | None:
-        """None, which a message says, where sampling would be of no use."""
+        """The sampler; None, and a message with the reason, where sampling would be of no use."""
         if self.stop < _SHORT_RUN:
-            _log.info(
-                "MCMC has no effect: until t=%d there is less time than sampling needs (%d).", self.stop, _SHORT_RUN
+            reason = f"until t={self.stop} there is less time than sampling needs ({_SHORT_RUN})"
+        elif cut_out((view.lr for view in views), views[0].background):
+            reason = "the photos show an object before a plain background, so few Gaussians are held by no photo"
+        elif (spacing := _spacing(field, [view.lr.camera for view in views])) > _DENSE:
+            reason = (
+                f"the initial points lie {spacing:.1f} LR px apart, more than {_DENSE:g}. Dense ones come from stereo "
+                "(data.cloud.init=stereo)"
             )
-            return None
-        if cut_out((view.lr for view in views), views[0].background):
-            _log.info(
-                "MCMC has no effect: the photos show an object before a plain background, so few Gaussians are held by no photo."
-            )
-            return None
-        spacing = _spacing(field, [view.lr.camera for view in views])
-        if spacing > _DENSE:
-            _log.info(
-                "MCMC has no effect: the initial points lie %.1f LR px apart, more than %g. Dense ones come from stereo "
-                "(data.cloud.init=stereo).", spacing, _DENSE,
-            )  # fmt: skip
-            return None
-        return Sampler(self, len(field), seed=seed)
+        else:
+            return Sampler(self, len(field), seed=seed)
+        _log.info("MCMC has no effect: %s.", reason)
+        return None
 
 
 class Sampler:

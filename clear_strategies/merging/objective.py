@@ -86,7 +86,7 @@ class Objective:
             shown: where False the target counts as equal to the image, and the cotangent is 0.
         """
         compared = self._clamped(image)
-        target = _beside_hidden(target, compared, shown)
+        target = _where_shown(target, compared, shown)
         cotangents = compared.new_empty(1, *compared.shape)
         loss = kernels.photometric(compared, target, self.lambda_ssim, kernels=self.kernels, out=cotangents[0])  # Eq. 4
         if self.lambda_lr != 1:
@@ -98,7 +98,7 @@ class Objective:
     ) -> Losses:
         """L_base and L_HF, two cotangents; L_base alone where λ_HF = 0. `shown` as for `lr`."""
         compared, use = self._clamped(image), self.kernels
-        target = _beside_hidden(target, compared, shown)
+        target = _where_shown(target, compared, shown)
         cotangents = compared.new_empty(2 if self.lambda_hf > 0 else 1, *compared.shape)
         base = kernels.photometric(compared, target, self.lambda_ssim_hr, kernels=use, out=cotangents[0])  # Eq. 5
         losses = {"base": base}
@@ -123,7 +123,8 @@ class Objective:
         return Losses({name: deferred.scalar(loss.value) for name, loss in losses.items()}, cotangents)
 
 
-def _beside_hidden(
+def _where_shown(
     target: Float[Tensor, "H W 3"], image: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None
 ) -> Float[Tensor, "H W 3"]:
+    """The target, and the image itself where the target is hidden."""
     return target if shown is None else torch.where(shown[..., None], target, image)

@@ -29,6 +29,7 @@ _log = logging.getLogger(__name__)
 # ω at its lower bound in this share of the corrections means that the prior agrees with LR and GCO does nothing.
 _INACTIVE_SHARE: Final = 0.9
 _AT_LOWER_BOUND: Final = "omega_at_lower_bound"  # the column of that share
+_TINY: Final = torch.finfo(torch.float64).tiny
 
 
 @dataclass(frozen=True)
@@ -93,17 +94,17 @@ class GCO(Strategy):
             ValueError: both have gradients, but none of the same group, so that nothing could be corrected.
         """
         evidence = None if step is None else step.evidence
-        corrected, done = Grads(hr), []
+        corrected, reports = Grads(hr), []
         for group in self.groups:
             if group in lr and group in hr:
-                corrected[group], correction = self._correct_group(group, lr, hr, evidence)
-                done.append(correction)
-        if lr and hr and not done:
+                corrected[group], report = self._correct_group(group, lr, hr, evidence)
+                reports.append(report)
+        if lr and hr and not reports:
             raise ValueError(
                 f"GCO compares the groups {', '.join(self.groups)}, and no two gradients are of one: lr has "
                 f"{', '.join(lr)}, hr has {', '.join(hr)}. Name them so."
             )
-        self.report(done, evidence)
+        self.report(reports, evidence)
         return corrected
 
     def _correct_group(
@@ -111,7 +112,7 @@ class GCO(Strategy):
     ) -> tuple[Tensor, GroupReport]:
         g_lr, g_hr = lr[group], hr[group]
         dot, n_lr, n_hr = row_dot(g_lr, g_hr), row_norm(g_lr), row_norm(g_hr)
-        both = (n_lr > 0) & (n_hr > 0)
+        comparable = (n_lr > 0) & (n_hr > 0)
         n = n_lr * n_hr
         c = torch.where(n > 0, dot / n.clamp_min(_TINY), 0.0)  # Eq. 6
         conflict = c < -self.tolerance
@@ -121,36 +122,34 @@ class GCO(Strategy):
         # Only the rows in conflict change; every other row keeps its bits. On the CPU these rows are gathered. On a device
         # gathering would wait for their number, so all rows are corrected and the others restored.
         i = conflict.nonzero()[:, 0] if deferred.is_immediate(conflict) else slice(None)
-        hit = conflict[i]
+        conflicting = conflict[i]
         q = evidence.reliability[i].double() if evidence is not None else 0.0
         s = ((-c[i] - self.tolerance) / (1 - self.tolerance)).clamp(0, 1)
         omega = (s * (1 - q)).clamp(self.weight_min, self.weight_max)  # Eq. 11
         d = dot[i] + self.tolerance * n[i]
-        step = omega * (d / n_lr[i].square())
+        multiple = omega * (d / n_lr[i].square())
         corrected = g_hr.clone()
-        moved = (g_hr[i].double() - scale_rows(g_lr[i].double(), step)).to(g_hr.dtype)  # Eq. 7
-        corrected[i] = torch.where(hit.view(-1, *[1] * (moved.dim() - 1)), moved, corrected[i])
-        at_bound = hit & (omega <= self.weight_min)
-        compared, touched, bound = (deferred.scalar(rows.sum()) for rows in (both, conflict, at_bound))
-        return corrected, GroupReport(group, compared, touched, deferred.total(omega, hit), bound)
+        moved = (g_hr[i].double() - scale_rows(g_lr[i].double(), multiple)).to(g_hr.dtype)  # Eq. 7
+        corrected[i] = torch.where(conflicting.view(-1, *[1] * (moved.dim() - 1)), moved, corrected[i])
+        at_bound = conflicting & (omega <= self.weight_min)
+        compared, touched, bound = (deferred.scalar(rows.sum()) for rows in (comparable, conflict, at_bound))
+        return corrected, GroupReport(group, compared, touched, deferred.total(omega, conflicting), bound)
 
-    def report(self, done: Sequence[GroupReport], evidence: Evidence | None) -> None:
+    def report(self, reports: Sequence[GroupReport], evidence: Evidence | None) -> None:
         compared, corrected, omega, at_bound = (
-            deferred.defer(deferred.added, *(getattr(c, name) for c in done))
+            deferred.defer(deferred.added, *(getattr(c, name) for c in reports))
             for name in ("compared", "corrected", "omega", "at_lower_bound")
         )
         self.log("corrected", deferred.defer(deferred.ratio, corrected, compared))
         self.log("mean_omega", deferred.defer(deferred.ratio, omega, corrected))
-        for c in done:
+        for c in reports:
             self.log(f"corrected_{c.group}", deferred.defer(deferred.ratio, c.corrected, c.compared))
         if corrected != 0 and evidence is not None and self.weight_min > 0:
             self.log(_AT_LOWER_BOUND, deferred.defer(deferred.ratio, at_bound, corrected))
 
 
-_TINY: Final = torch.finfo(torch.float64).tiny
-
-
 def _turns_nothing(g: Mapping[str, Tensor]) -> Bool[Tensor, " N"]:
+    """Whether a gradient of the rotation is rounding noise, see `ROTATION_NOISE`."""
     if "scales" not in g:
         return torch.zeros_like(g["quats"][:, 0], dtype=torch.bool)
     return row_norm(g["quats"]) <= ROTATION_NOISE * row_norm(g["scales"])

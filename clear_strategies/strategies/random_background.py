@@ -45,19 +45,19 @@ class RandomBackground(Strategy):
 
     def on_fit_start(self, n_views: int, seed: int) -> None:
         super().on_fit_start(n_views, seed)
-        self.cache["seed"], self.cache["kept"] = seed, self._kept(n_views)
+        self.cache["seed"], self.cache["reason"] = seed, self._reason_to_keep(n_views)
 
     def summary(self) -> str | None:
-        kept: str = self.cache.get("kept", "")
-        return f"none, {kept}" if kept else f"another colour in each of the first {self.until:,} iterations"
+        reason: str = self.cache.get("reason", "")
+        return f"none, {reason}" if reason else f"another colour in each of the first {self.until:,} iterations"
 
     def wants_views(self) -> bool:
         return True
 
     def on_views(self, views: Sequence[View]) -> None:
-        self.cache["kept"] = self._kept(len(views), views)
+        self.cache["reason"] = self._reason_to_keep(len(views), views)
 
-    def _kept(self, n_views: int, views: Sequence[View] = ()) -> str:
+    def _reason_to_keep(self, n_views: int, views: Sequence[View] = ()) -> str:
         """Why the background stays as it is; empty where it changes."""
         if self.until < _LONG_RUN:
             return f"because the run has fewer than {_LONG_RUN:,} iterations for it"
@@ -70,7 +70,7 @@ class RandomBackground(Strategy):
 
     def background(self, t: int) -> Color | None:
         """RGB, uniform in [0, 1]: a function of (seed, t)."""
-        if t > self.until or self.cache.get("kept"):
+        if t > self.until or self.cache.get("reason"):
             return None
         r, g, b = torch.rand(3, generator=generator_at(self.cache.get("seed", 0), t)).tolist()
         return r, g, b

@@ -145,11 +145,11 @@ class SVS(Strategy):
             self.cache["extent"] = max(float(distances.kthvalue(rank).values), torch.finfo(means.dtype).tiny ** 0.5)
         return float(self.cache["extent"])
 
-    def _require_same_number(self, now: int) -> None:
-        then = next(iter(self.state.values())).shape[0]
-        if now != then:
+    def _require_same_number(self, n: int) -> None:
+        anchored = next(iter(self.state.values())).shape[0]
+        if n != anchored:
             raise AnchorError(
-                f"the anchor was taken at t={self.anchor_start} for {then:,} Gaussians, now there are {now:,}. Stop "
+                f"the anchor was taken at t={self.anchor_start} for {anchored:,} Gaussians, now there are {n:,}. Stop "
                 "densification at t_a (gsplat: refine_stop_iter; Inria: densify_until_iter) or raise "
                 "strategies.svs.anchor_start."
             )

@@ -221,7 +221,7 @@ def _conductor(make: Make, *, lambda_hf: float = 0.2) -> Conductor:
 
 
 def _trace(conductor: Conductor, start: int, stop: int) -> Any:
-    """Everything a conductor says from iteration `start` to before `stop`."""
+    """All answers of a conductor in the iterations from `start` to before `stop`."""
     for t in range(start, stop):
         lr, hr, view, params = _situation(100 + t)
         z = conductor.gate(t, _N)
