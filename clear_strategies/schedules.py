@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import Any, Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar, get_args
 
-from clear_strategies.errors import SettingError
+from clear_strategies.core.checks import refuse, require_choice, require_number
 
 REFERENCE_ITERATIONS: Final = 10_000
 _MILESTONE: Final = "milestone"
@@ -19,6 +19,8 @@ LARGEST_RATE: Final = 100.0
 """The largest learning rate: a step changes a logit or a log scale by about the rate, and all of their range is 40."""
 
 Settings = TypeVar("Settings")
+Decay = Literal["linear", "cosine", "exponential"]
+Shape = Literal["linear", "constant"]
 
 
 def milestone(default: int, *, least: int = 0) -> Any:
@@ -72,24 +74,21 @@ class WarmupDecay:
 
     peak: float = 1.0
     final: float = 1.0
-    decay: Literal["linear", "cosine", "exponential"] = "linear"
+    decay: Decay = "linear"
     start: int = milestone(500)
     full: int = milestone(3_000)
     decay_from: int = milestone(5_000)
     end: int = milestone(10_000)
 
     def __post_init__(self) -> None:
-        if not self.start <= self.full <= self.decay_from <= self.end:
-            raise SettingError(
-                "start <= full <= decay_from <= end must hold, got "
-                f"{self.start}, {self.full}, {self.decay_from}, {self.end}."
-            )
-        if not (0 <= self.peak < math.inf and 0 <= self.final < math.inf):
-            raise SettingError(f"weights must be >= 0 and finite, got peak={self.peak}, final={self.final}.")
-        if self.decay not in ("linear", "cosine", "exponential"):
-            raise SettingError(f"decay must be linear, cosine or exponential, got {self.decay!r}.")
-        if self.decay == "exponential" and not (self.final > 0 and self.peak > 0):
-            raise SettingError(f"exponential decay needs peak and final > 0, got {self.peak}, {self.final}.")
+        order = (self.start, self.full, self.decay_from, self.end)
+        if list(order) != sorted(order):
+            refuse("start", "start <= full <= decay_from <= end must hold", order, "put them in this order")
+        require_choice("decay", self.decay, get_args(Decay))
+        for name in ("peak", "final"):
+            require_number(name, getattr(self, name))
+            if self.decay == "exponential" and getattr(self, name) == 0:
+                refuse(name, "must be above 0 for an exponential decay", 0, "decay=linear ends at 0")
 
     def __call__(self, t: int) -> float:
         if t <= self.start:
@@ -122,14 +121,12 @@ class Ramp:
     """
 
     maximum: float = 0.2
-    shape: Literal["linear", "constant"] = "linear"
+    shape: Shape = "linear"
     full: int = milestone(10_000)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.maximum < 1:
-            raise SettingError(f"a dropout rate must lie in [0, 1), got {self.maximum}.")
-        if self.shape not in ("linear", "constant"):
-            raise SettingError(f"shape must be linear or constant, got {self.shape!r}.")
+        require_number("maximum", self.maximum, below=1)
+        require_choice("shape", self.shape, get_args(Shape))
 
     def __call__(self, t: int) -> float:
         if self.shape == "constant" or t >= self.full:
@@ -152,10 +149,8 @@ class LogLinear:
     end: int = milestone(10_000)
 
     def __post_init__(self) -> None:
-        if not (0 < self.initial <= LARGEST_RATE and 0 < self.final <= LARGEST_RATE):
-            raise SettingError(
-                f"learning rates must lie in (0, {LARGEST_RATE:g}], got {self.initial} and {self.final}."
-            )
+        for name in ("initial", "final"):
+            require_number(name, getattr(self, name), above=0, most=LARGEST_RATE)
 
     def __call__(self, t: int) -> float:
         share = min(max(t / max(self.end, 1), 0.0), 1.0)

@@ -21,7 +21,6 @@ from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule,
 from clear_strategies.core.evidence import Evidence
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot, row_norm, scale_rows
 from clear_strategies.core.step import Step
-from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import Strategy
 
 _log = logging.getLogger(__name__)
@@ -58,8 +57,9 @@ class GCO(Strategy):
         object.__setattr__(self, "groups", tuple(self.groups))
         require_number("tolerance", self.tolerance, below=1)
         if not 0 <= self.weight_min <= self.weight_max <= 1:
-            raise SettingError(
-                f"0 <= weight_min <= weight_max <= 1 must hold, got {self.weight_min} and {self.weight_max}."
+            bounds = (self.weight_min, self.weight_max)
+            refuse(
+                "weight_min", "0 <= weight_min <= weight_max <= 1 must hold", bounds, "weight_min=0.05 weight_max=0.75"
             )
         if not self.groups:
             refuse("groups", "must name an attribute, or nothing is corrected", [], f"groups=[{CONFLICT_GROUPS[0]}]")

@@ -17,13 +17,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
-from clear_strategies.core.checks import require_choice, require_number, require_whole
+from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.evidence import Evidence, PatchMaps, lift
 from clear_strategies.core.gradients import Shot, screen_norm
 from clear_strategies.core.images import DownKernel, downsample, patch_means, quantize, upsample
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
-from clear_strategies.errors import SettingError
 from clear_strategies.strategies.base import ScreenGradients, Strategy
 
 _log = logging.getLogger(__name__)
@@ -162,5 +161,5 @@ def _tau_r(scale: float | str, mean: float) -> float:
     except ValueError:
         value = math.nan
     if kind not in ("", "relative") or not 0 < value < math.inf:
-        raise SettingError(f'reliability_scale must be a number > 0 or "relative:<number > 0>", got {scale!r}.')
+        refuse("reliability_scale", 'must be a number > 0, or "relative:<number > 0>"', scale, "reliability_scale=0.01")
     return value * max(mean, _ROUNDING) if kind else value

@@ -8,9 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from clear_strategies import GCO, P2G, SplatSuRe
 from clear_strategies.core.checks import as_color, require_choice, require_number, require_whole
 from clear_strategies.data.readers import blender, colmap, demo, llff, nerfstudio, photos
 from clear_strategies.errors import SettingError
+from clear_strategies.geometry import StereoSettings
+from clear_strategies.geometry.sift import TriangulationSettings
+from clear_strategies.schedules import LogLinear, Ramp, WarmupDecay
 
 
 @pytest.mark.parametrize("value", [2.5, 4.0, True, None, "4", math.nan, 0])
@@ -69,3 +73,28 @@ def test_colours_are_three_numbers_between_0_and_1(value: object) -> None:
 def test_readers_refuse_their_arguments_before_files(read: Callable[[], object], named: str) -> None:
     with pytest.raises(SettingError, match=rf"^data\.reader\.{named}: "):
         read()
+
+
+REFUSED: dict[Callable[..., object], dict[str, object]] = {
+    StereoSettings: {"window": 4, "spacing": 0.5, "trust": 2, "tolerance": 0},
+    TriangulationSettings: {
+        "enlarge": 0, "max_features": 0, "contrast": 0.0, "ratio": 1.1, "epipolar": -1.0, "reprojection": math.nan, "angle": 0.0,
+    },
+    SplatSuRe: {"ratio": 0.9, "softness": 0.0, "min_views": 0},
+    GCO: {"groups": (), "weight_min": 0.9},
+    P2G: {"reliability_scale": "relative:0"},
+    WarmupDecay: {"start": 4_000, "peak": -1.0, "decay": "steep"},
+    Ramp: {"maximum": 1.0, "shape": "steep"},
+    LogLinear: {"initial": 0.0, "final": 101.0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("made", "field"), [(made, field) for made, fields in REFUSED.items() for field in fields])
+def test_a_class_names_the_field_the_rule_the_value_and_a_remedy(made: Callable[..., object], field: str) -> None:
+    with pytest.raises(SettingError, match=f"^{field}: .*must .*, got .*: .+"):
+        made(**{field: REFUSED[made][field]})
+
+
+def test_an_exponential_decay_ends_above_0() -> None:
+    with pytest.raises(SettingError, match=r"^final: must be above 0 for an exponential decay, got 0: decay=linear"):
+        WarmupDecay(decay="exponential", final=0.0)
