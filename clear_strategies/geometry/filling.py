@@ -28,7 +28,7 @@ _FEWEST_SAMPLES: Final = 4  # pixels of known depth from which a view's depth is
 _OF_POINTS: Final = 0.3  # confidence in a point that projects into a photo, which may hide it; its own depth has 1
 _MAX_PIXELS: Final = 16_000  # a larger photo is reduced first: 0.5 s of CPU time each
 _BEYOND: Final = 2.0  # no depth is completed further than this factor of those that are known
-_NEARER: Final = 0.95  # a point in front of this share of another photo's depth floats in free space
+_NEARER: Final = 0.95  # share of another photo's depth, in front of which a point floats in free space
 
 
 def densify(cloud: PointCloud, photos: Sequence[Photo], stride: int, background: Color | None = None) -> PointCloud:
@@ -81,7 +81,8 @@ def grid_points(
         kept = torch.ones(len(points), dtype=torch.bool)
         for j, other in enumerate(maps or ()):
             if j != i:
-                kept &= ~_floats(points, photos[j], other)
+                inside, row, column, depth = seen_pixels(photos[j].camera, points)
+                kept[inside] &= ~(depth < _NEARER * other.depth.cpu()[row, column].double())  # True where it is unknown
         added.append(points[kept])
         colors.append(shade[kept])
     return torch.cat(added), torch.cat(colors)
@@ -92,13 +93,6 @@ def pixel_grid(photo: Photo, stride: int) -> Float[Tensor, "G 2"]:
     x = torch.arange(stride / 2, photo.camera.width, stride, dtype=torch.float64)
     y = torch.arange(stride / 2, photo.camera.height, stride, dtype=torch.float64)
     return torch.cartesian_prod(x, y)
-
-
-def _floats(points: Float[Tensor, "N 3"], photo: Photo, depth_map: DepthMap) -> Bool[Tensor, " N"]:
-    """Whether the photo looks through the point at a surface behind it."""
-    inside, row, column, depth = seen_pixels(photo.camera, points)
-    inside[inside.clone()] = depth < _NEARER * depth_map.depth.cpu()[row, column].double()
-    return inside
 
 
 def _completed(

@@ -113,10 +113,8 @@ def _photos(images: Sequence[Tensor] | Tensor, world_to_camera: Tensor, Ks: Tens
             )
     device = images[0].device
     poses, intrinsics = world_to_camera.detach().cpu(), Ks.detach().cpu().double()
-    return [
-        Photo(_camera(i, poses[i], intrinsics[i], image), image.to(device))
-        for i, image in enumerate(_image(i, image) for i, image in enumerate(images))
-    ]
+    colors = [_image(i, image) for i, image in enumerate(images)]
+    return [Photo(_camera(i, poses[i], intrinsics[i], color), color.to(device)) for i, color in enumerate(colors)]
 
 
 def _image(i: int, image: Tensor) -> Float[Tensor, "h w 3"]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.geometry.projection import back_project, seen_pixels
@@ -34,19 +34,13 @@ def seen_by(
 def times_seen(
     points: Float[Tensor, "N 3"], cameras: Sequence[tuple[Camera, Float[Tensor, "h w"]]]
 ) -> Int[Tensor, " N"]:
-    """In how many cameras each point is inside the image and not hidden; `sees` for several cameras."""
-    count = torch.zeros(len(points), dtype=torch.long)
-    for camera, depth in cameras:
-        count += sees(camera, depth, points).long()
-    return count
-
-
-def sees(camera: Camera, depth: Float[Tensor, "h w"], points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
-    """Whether each point is inside the camera's image and not hidden.
+    """In how many cameras each point is inside the image and not hidden.
 
     Args:
-        depth: of the camera, nan where there is no surface, so that no point is seen there.
+        cameras: each with its depth, nan where there is no surface, so that no point is seen there.
     """
-    seen, row, column, z = seen_pixels(camera, points)
-    seen[seen.clone()] = z <= depth[row, column] * (1 + _TOLERANCE)  # False where it has none
-    return seen
+    count = torch.zeros(len(points), dtype=torch.long)
+    for camera, depth in cameras:
+        inside, row, column, z = seen_pixels(camera, points)
+        count[inside] += z <= depth[row, column] * (1 + _TOLERANCE)
+    return count
