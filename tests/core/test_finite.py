@@ -31,10 +31,11 @@ def without_a_pixel(bad: float, scale: str):
     return replace(SCENE, train=tuple(spoil(view) for view in SCENE.train))
 
 
-def begun(fused: str):
-    """A run at its sixth iteration, in which HR takes part, and what it holds."""
+@pytest.fixture(scope="module", params=["compiled", "readable"])
+def begun(request):
+    """A run at its sixth iteration, in which HR takes part, and what it holds; a refused step changes neither."""
     state = start(NAMES)
-    if fused == "readable":
+    if request.param == "readable":
         state.compiled_step = None
     for _ in range(5):
         iterate(state, toy.RASTERIZER)
@@ -54,11 +55,10 @@ def test_a_sum_that_overflows_is_finite_where_its_numbers_are():
 
 
 @pytest.mark.parametrize("bad", BAD)
-@pytest.mark.parametrize("fused", ["compiled", "readable"])
 @pytest.mark.parametrize("scale", ["lr", "hr"])
-def test_a_pixel_that_is_not_finite_is_named_before_the_step(scale, fused, bad):
-    state, before = begun(fused)
-    state.views = without_a_pixel(bad, scale).train
+def test_a_pixel_that_is_not_finite_is_named_before_the_step(begun, scale, bad, monkeypatch):
+    state, before = begun
+    monkeypatch.setattr(state, "views", without_a_pixel(bad, scale).train)
     photo = {"lr": "the LR photo", "hr": "the SR image"}[scale]
     with pytest.raises(DivergedError, match=rf"^t=6, view view\d: the loss .*{photo} is not finite.*pixel \(5, 3\)"):
         iterate(state, toy.RASTERIZER)
@@ -68,9 +68,8 @@ def test_a_pixel_that_is_not_finite_is_named_before_the_step(scale, fused, bad):
 
 @pytest.mark.parametrize("bad", BAD)
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "rgb"])
-@pytest.mark.parametrize("fused", ["compiled", "readable"])
-def test_a_gradient_that_is_not_finite_is_named_before_the_step(fused, name, bad, monkeypatch):
-    state, before = begun(fused)
+def test_a_gradient_that_is_not_finite_is_named_before_the_step(begun, name, bad, monkeypatch):
+    state, before = begun
     init = FieldShot.__init__
 
     def spoiled(self, *arguments, **options):

@@ -1,4 +1,4 @@
-"""Pseudo views of a plane are exact; what is hidden, seen by no photo or beside the background stays unknown."""
+"""Pseudo views of a plane are exact; what no photo shows stays unknown, and is continued smoothly."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.projection import back_project, project, sample_colors
-from clear_strategies.geometry.pseudo_views import PseudoView, border_views, moved_aside, pseudo_views
+from clear_strategies.geometry.pseudo_views import PseudoView, border_views, continued, moved_aside, pseudo_views
 from tests.helpers import planes
 
 DEPTH = 4.0
@@ -21,14 +21,15 @@ def depth_of(photo: Photo, depth: float | Tensor = DEPTH) -> DepthMap:
     return DepthMap(values, values.isfinite().float())
 
 
-def of_planes(
-    count: int = 3, depths: dict[str, DepthMap] | None = None, **settings
-) -> tuple[dict[str, Photo], list[PseudoView]]:
-    photos = {f"{i}.png": photo for i, photo in enumerate(planes.plane_photos(count))}
+def plane(count: int = 3) -> dict[str, Photo]:
+    return {f"{i}.png": photo for i, photo in enumerate(planes.plane_photos(count))}
+
+
+def views_of(photos: dict[str, Photo], depths: dict[str, DepthMap] | None = None, **settings) -> list[PseudoView]:
     if depths is None:
         depths = {name: depth_of(photo) for name, photo in photos.items()}
     chosen = {"count": 6, "reach": 0.2, "tolerance": 0.02, "max_pixels": 10**6, "background": (0.0,) * 3, "seed": 0}
-    return photos, pseudo_views(photos, depths, **{**chosen, **settings})
+    return pseudo_views(photos, depths, **{**chosen, **settings})
 
 
 @pytest.mark.parametrize("reach", [0.1, 1.2])
@@ -49,9 +50,10 @@ def test_a_camera_moved_aside_keeps_its_middle_in_the_middle_and_stays_within_re
 
 
 def test_a_plane_is_seen_as_its_photos_show_it():
-    photos, made = of_planes()
-    assert len(made) == 6
-    for view in made:
+    photos = plane()
+    views = views_of(photos)
+    assert len(views) == 6
+    for view in views:
         assert view.known.float().mean() > 0.5
         camera = view.photo.camera
         rays = torch.nonzero(view.known)
@@ -67,24 +69,22 @@ def test_a_plane_is_seen_as_its_photos_show_it():
 
 
 def test_the_same_seed_makes_the_same_views_and_another_seed_others():
-    first, same, other = (of_planes(seed=seed)[1] for seed in (0, 0, 1))
+    first, same, other = (views_of(plane(), seed=seed) for seed in (0, 0, 1))
     assert all(torch.equal(a.photo.image, b.photo.image) for a, b in zip(first, same, strict=True))
     assert not torch.equal(first[0].photo.image, other[0].photo.image)
 
 
 def test_without_two_photos_with_depth_there_are_none():
-    photos = {f"{i}.png": photo for i, photo in enumerate(planes.plane_photos(2))}
+    photos = plane(2)
     one = {"0.png": depth_of(photos["0.png"]), "1.png": depth_of(photos["1.png"], torch.nan)}
-    assert of_planes(2, one)[1] == []
-    assert of_planes(2, {})[1] == []
+    assert views_of(photos, one) == views_of(photos, {}) == []
 
 
 def test_a_depth_that_no_photo_vouches_for_gives_no_colour():
-    photos = {f"{i}.png": photo for i, photo in enumerate(planes.plane_photos(2))}
+    photos = plane(2)
     apart = {"0.png": depth_of(photos["0.png"], 4.0), "1.png": depth_of(photos["1.png"], 2.0)}
-    made = of_planes(2, apart, reach=1e-6)[1]
+    view = views_of(photos, apart, reach=1e-6)[0]
     # Seen from camera 0, the nearer surface of photo 1 hides that of photo 0, which does not confirm it.
-    view = made[0]
     row, column = torch.nonzero(view.known).unbind(1)
     centers, depth = torch.stack((column, row), 1).double() + 0.5, torch.full((len(row),), 2.0).double()
     pixels, _ = project(photos["1.png"].camera, back_project(view.photo.camera, centers, depth))
@@ -95,46 +95,78 @@ def test_a_depth_that_no_photo_vouches_for_gives_no_colour():
 
 
 def test_pixels_beside_the_background_give_no_colour():
-    photos = {f"{i}.png": photo for i, photo in enumerate(planes.plane_photos(2))}
-    white = {
-        name: Photo(p.camera, torch.where(torch.arange(120)[None, :, None] < 60, p.image, 1.0))
-        for name, p in photos.items()
-    }
-    chosen = {"count": 2, "reach": 1e-6, "tolerance": 0.02, "max_pixels": 10**6, "seed": 0}
-    depths = {name: depth_of(p) for name, p in white.items()}
-    kept = pseudo_views(white, depths, background=(1.0, 1.0, 1.0), **chosen)
-    assert not kept[0].known[:, 71:].any()  # photo 1 stands 10 px aside and shows the surface up to there
-    assert kept[0].known[:, 5:45].float().mean() > 0.9
-    assert pseudo_views(white, depths, background=(0.0, 0.0, 0.0), **chosen)[0].known[5:-5, 65:110].all()
+    right = torch.arange(120)[None, :, None] >= 60
+    white = {name: Photo(p.camera, torch.where(right, 1.0, p.image)) for name, p in plane(2).items()}
+    known, on_black = (views_of(white, reach=1e-6, background=color)[0].known for color in ((1.0,) * 3, (0.0,) * 3))
+    assert not known[:, 71:].any()  # photo 1 stands 10 px aside and shows the surface up to there
+    assert known[:, 5:45].float().mean() > 0.9
+    assert on_black[5:-5, 65:110].all()
 
 
 def test_large_photos_are_reduced_and_still_show_the_plane():
-    _, made = of_planes(max_pixels=3_000)
-    camera = made[0].photo.camera
+    view = views_of(plane(), max_pixels=3_000)[0]
+    camera = view.photo.camera
     assert (camera.width, camera.height, camera.fx) == (60, 45, 50.0)
-    assert made[0].known.float().mean() > 0.5
+    assert view.known.float().mean() > 0.5
 
 
 @pytest.mark.parametrize("max_pixels", [10**6, 3_000])
 def test_a_border_view_shows_its_photo_in_the_middle_of_a_wider_field(max_pixels):
     photo = planes.plane_photos(1)[0]
+    photo = replace(photo, transparency=torch.rand(photo.image.shape[:2], generator=torch.Generator().manual_seed(0)))
     (wide,) = border_views([photo], field=1.3, max_pixels=max_pixels)
     c, (column, row) = wide.photo.camera, (int(wide.known.any(0).sum()), int(wide.known.any(1).sum()))
     assert (c.width, c.height) == (pytest.approx(1.3 * column, abs=2), pytest.approx(1.3 * row, abs=2))
     assert bool(wide.known.sum() == column * row)
     if max_pixels == 10**6:
         assert torch.equal(wide.photo.image[wide.known], photo.image.reshape(-1, 3))
+        assert torch.equal(wide.photo.transparency[wide.known], photo.transparency.flatten())
     assert not wide.photo.image[~wide.known].any()
+    assert not wide.photo.transparency[~wide.known].any()
     point = torch.tensor([[0.3, -0.2, DEPTH]], dtype=torch.float64)
-    (there,), (here,) = (project(camera, point)[0] for camera in (c, photo.camera))
+    (in_wide,), (in_photo,) = (project(camera, point)[0] for camera in (c, photo.camera))
     y, x = (int(axis.nonzero()[0]) for axis in (wide.known.any(1), wide.known.any(0)))
     scale = column / photo.camera.width
-    assert there.tolist() == pytest.approx((here * scale + torch.tensor([x, y])).tolist(), abs=1e-4)
+    assert in_wide.tolist() == pytest.approx((in_photo * scale + torch.tensor([x, y])).tolist(), abs=1e-4)
 
 
-def test_a_border_view_is_as_transparent_as_its_photo():
-    photo = planes.plane_photos(1)[0]
-    photo = replace(photo, transparency=torch.rand(photo.image.shape[:2], generator=torch.Generator().manual_seed(0)))
-    (wide,) = border_views([photo], field=1.3, max_pixels=10**6)
-    assert torch.equal(wide.photo.transparency[wide.known], photo.transparency.flatten())
-    assert not wide.photo.transparency[~wide.known].any()
+def picture(height: int = 37, width: int = 50) -> torch.Tensor:
+    return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(0))
+
+
+def test_known_pixels_stay_and_unknown_ones_are_not_read():
+    image = picture()
+    for known in (torch.ones(37, 50, dtype=torch.bool), torch.zeros(37, 50, dtype=torch.bool)):
+        assert torch.equal(continued(image, known), image)
+    known = torch.rand(image.shape[:2], generator=torch.Generator().manual_seed(1)) > 0.6
+    filled = continued(image, known)
+    assert torch.equal(filled[known], image[known])
+    assert torch.equal(continued(torch.where(known[..., None], image, torch.nan), known), filled)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1), (2, 3), (37, 50), (64, 64)])
+def test_one_known_pixel_fills_a_picture_of_any_size_with_its_colour(shape):
+    known = torch.zeros(shape, dtype=torch.bool)
+    known[shape[0] // 2, shape[1] // 2] = True
+    image = picture(*shape)
+    assert torch.allclose(continued(image, known), image[known].expand(*shape, 3), atol=1e-6)
+
+
+def test_a_hole_has_colours_between_those_around_it_without_an_edge():
+    ramp = torch.linspace(0, 1, 64)[None, :, None].expand(64, 64, 3)
+    known = torch.ones(64, 64, dtype=torch.bool)
+    known[20:44, 20:44] = False
+    filled = continued(ramp, known)
+    inside = filled[20:44, 20:44]
+    assert inside.min() >= ramp[0, 18, 0]
+    assert inside.max() <= ramp[0, 45, 0]
+    assert (inside - ramp[20:44, 20:44]).abs().max() < 0.15
+    assert (filled[:, 1:] - filled[:, :-1]).abs().max() < 0.1
+
+
+def test_far_from_what_is_known_nothing_is_sharp():
+    noise = picture(64, 128)
+    known = torch.arange(128).expand(64, 128) < 64
+    filled = continued(noise, known)
+    near, far = (filled[:, a:b].std(dim=0).mean() for a, b in ((64, 66), (110, 128)))
+    assert far < 0.3 * near

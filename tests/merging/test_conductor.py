@@ -20,7 +20,6 @@ from clear_strategies import (
     PseudoViews,
     RandomBackground,
     SplatSuRe,
-    Step,
     Strategy,
     StrategyConflict,
 )
@@ -106,10 +105,18 @@ def field_and_view(dtype=torch.float64, degree=1):
     return field.to(dtype), replace(view, lr=lr, hr=hr)
 
 
+@pytest.fixture(scope="module")
 def drawn():
     """A field, a view, and both scales of it."""
     field, view = field_and_view()
     return field, view, *field.render_scales(toy.RASTERIZER, view)
+
+
+def updated(drawn, *strategies, **objective):
+    field, view, lr, hr = drawn
+    return Conductor(*strategies, objective=Objective(lambda_hr=ALWAYS, **objective)).update(
+        field.raw(), lr, hr, view, 5
+    )
 
 
 def autograd_of_the_summed_loss(field: GaussianField, view, objective: Objective, λ: float) -> Grads:
@@ -165,9 +172,9 @@ def test_without_strategies_it_is_autograd_of_the_summed_loss(hf, lambda_lr, lr_
         assert torch.allclose(found[name], expected[name], atol=1e-9 * scale, rtol=1e-7), name
 
 
-def test_a_reduced_lr_image_counts_for_densification_in_ndc_as_a_drawn_one_does():
+def test_a_reduced_lr_image_counts_for_densification_in_ndc_as_a_drawn_one_does(drawn):
     """∇_u in NDC does not depend on the pixels that it was pulled through: two routes to one blurred picture agree."""
-    field, view, lr, hr = drawn()
+    field, view, lr, hr = drawn
     seen = {}
     for lr_from in ("lr", "hr"):
         conductor = Conductor(objective=Objective(lambda_hr=WarmupDecay(peak=0, final=0), lr_from=lr_from))
@@ -176,8 +183,8 @@ def test_a_reduced_lr_image_counts_for_densification_in_ndc_as_a_drawn_one_does(
     assert 0.5 < float(ratio) < 2  # in pixels of their own image it would be 4 times off
 
 
-def test_without_lr_photos_only_the_reference_moves_gaussians():
-    field, view, _, hr = drawn()
+def test_without_lr_photos_only_the_reference_moves_gaussians(drawn):
+    field, view, _, hr = drawn
     conductor = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0, lambda_lr=0.0))
     update = conductor.update(field.raw(), None, hr, view, 5)
     (g_base,) = hr.vjp(conductor.objective.hr(hr.image, view.hr.image).cotangents)
@@ -186,8 +193,8 @@ def test_without_lr_photos_only_the_reference_moves_gaussians():
     assert update.losses["lr"] > 0  # measured, for the log
 
 
-def test_a_scale_that_the_objective_needs_is_asked_for():
-    field, view, lr, hr = drawn()
+def test_a_scale_that_the_objective_needs_is_asked_for(drawn):
+    field, view, lr, hr = drawn
     with pytest.raises(ValueError, match="needs the HR scale"):
         Conductor(objective=Objective(lr_from="hr")).update(field.raw(), lr, None, view, 5)
     with pytest.raises(ValueError, match="needs the LR scale"):
@@ -201,21 +208,20 @@ def test_a_weight_without_warm_up_is_constant_from_the_first_iteration():
     assert {constant(t) for t in (1, 2, 5_000, 5_001, 9_999, 10_000, 20_000)} == {0.4}
 
 
-def test_routing_weighs_the_high_frequency_gradient_only():
+def test_routing_weighs_the_high_frequency_gradient_only(drawn):
     """By which alone the detail feature moves."""
-    field, view, lr, hr = drawn()
+    _, view, lr, hr = drawn
     objective, p2g = Objective(lambda_hr=ALWAYS), P2G()
-    update = Conductor(p2g, objective=objective).update(field.raw(), lr, hr, view, 5)
+    update = updated(drawn, p2g)
     (g_lr,) = lr.vjp(objective.lr(lr.image, view.lr.image).cotangents)
     g_base, g_hf = hr.vjp(objective.hr(hr.image, view.hr.image).cotangents)
     m = p2g.route(update.step)[:, None]
     expected = g_lr["means"] + g_base["means"] + 0.2 * m * g_hf["means"]
     assert torch.allclose(update.grads["means"], expected, rtol=1e-6, atol=1e-15)
     for strategies in ((p2g,), (GCO(), p2g)):
-        moved = Conductor(*strategies, objective=objective).update(field.raw(), lr, hr, view, 5).grads["detail"]
+        moved = updated(drawn, *strategies).grads["detail"]
         assert torch.allclose(moved, 0.2 * m * g_hf["detail"], rtol=1e-6, atol=1e-15)
-    without = Conductor(objective=Objective(lambda_hr=ALWAYS, lambda_hf=0.0))
-    assert "detail" not in without.update(field.raw(), lr, hr, view, 5).grads
+    assert "detail" not in updated(drawn, lambda_hf=0.0).grads
 
 
 def test_two_owners_of_one_question_are_refused():
@@ -223,12 +229,8 @@ def test_two_owners_of_one_question_are_refused():
         Conductor(GCO(), Halve())
 
 
-def test_the_order_of_strategies_does_not_matter():
-    field, view, lr, hr = drawn()
-    one, other = (
-        Conductor(*strategies, objective=Objective(lambda_hr=ALWAYS)).update(field.raw(), lr, hr, view, 5).grads
-        for strategies in ((GCO(), P2G(), SVS()), (SVS(), P2G(), GCO()))
-    )
+def test_the_order_of_strategies_does_not_matter(drawn):
+    one, other = (updated(drawn, *s).grads for s in ((GCO(), P2G(), SVS()), (SVS(), P2G(), GCO())))
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 
@@ -242,12 +244,8 @@ def test_hr_is_wanted_only_while_it_has_a_use():
     assert not any(never.wants_hr(t) for t in range(0, 10_000, 100))
 
 
-def test_conflict_is_measured_before_correction_and_for_the_baseline_too():
-    field, view, lr, hr = drawn()
-    plain, corrected = (
-        Conductor(*strategies, objective=Objective(lambda_hr=ALWAYS)).update(field.raw(), lr, hr, view, 5).conflict
-        for strategies in ((), (GCO(),))
-    )
+def test_conflict_is_measured_before_correction_and_for_the_baseline_too(drawn):
+    plain, corrected = (updated(drawn, *strategies).conflict for strategies in ((), (GCO(),)))
     assert plain == corrected
     assert set(plain) == {"means", "sh0", "shN", "opacities", "scales", "quats", "gaussian"}
     assert 0 < max(plain.values()) < 1
@@ -274,14 +272,14 @@ def test_two_strategies_of_one_class_keep_their_states_apart():
             self.state["kept"] = torch.full((3,), self.value)
 
     first = Conductor(Remember(1.0), Remember(2.0))
-    first.after_step({}, Step(1, field_and_view()[1]))
+    first.after_step({}, toy.step())
     second = Conductor(Remember(1.0), Remember(2.0))
     second.load_state_dict(first.state_dict())
     assert [s.state["kept"][0].item() for s in second.strategies] == [1.0, 2.0]
 
 
-def test_what_a_strategy_logged_belongs_to_its_iteration():
-    field, view, lr, hr = drawn()
+def test_what_a_strategy_logged_belongs_to_its_iteration(drawn):
+    field, view, lr, hr = drawn
     conductor = Conductor(P2G(), objective=Objective(lambda_hr=ALWAYS))
     assert "mean_q" in conductor.update(field.raw(), lr, hr, view, 5).logs
     assert not conductor.update(field.raw(), lr, None, view, 6).logs

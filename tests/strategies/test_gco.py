@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from clear_strategies import CONFLICT_GROUPS, GCO, Evidence, Grads
-from clear_strategies.errors import SettingError
 from tests.helpers import toy
 
 WIDTHS = {"means": (3,), "sh0": (1, 3), "shN": (15, 3), "opacities": (), "scales": (3,), "quats": (4,)}
@@ -51,17 +50,17 @@ def test_full_correction_lands_on_the_margin(seed, tolerance):
     lr, hr = random_pair(seed)
     whole = GCO(tolerance=tolerance, weight_min=1.0, weight_max=1.0).correct(lr, hr, None)
     for group in CONFLICT_GROUPS:
-        n = dot(lr[group], lr[group]).sqrt() * dot(hr[group], hr[group]).sqrt()
-        conflict = dot(lr[group], hr[group]) < -(tolerance + 1e-9) * n
         if group == "quats":
             continue
+        n = dot(lr[group], lr[group]).sqrt() * dot(hr[group], hr[group]).sqrt()
+        conflict = dot(lr[group], hr[group]) < -(tolerance + 1e-9) * n
         after = dot(lr[group], whole[group])
         assert torch.allclose(after[conflict], -tolerance * n[conflict], rtol=1e-5, atol=float(n.max()) * 1e-6)
 
 
 @given(seed=st.integers(0, 10_000))
 @settings(max_examples=30, deadline=None)
-def test_rows_without_conflict_are_bitwise_untouched_and_lr_always_is(seed):
+def test_only_conflicts_change_and_then_help_lr_without_lengthening_the_gradient(seed):
     lr, hr = random_pair(seed)
     before = {name: value.clone() for name, value in lr.items()}
     found = GCO().correct(lr, hr, None)
@@ -70,14 +69,6 @@ def test_rows_without_conflict_are_bitwise_untouched_and_lr_always_is(seed):
         calm = c >= -0.05 + 1e-9
         assert torch.equal(found[group][calm], hr[group][calm])
         assert torch.equal(lr[group], before[group])
-
-
-@given(seed=st.integers(0, 1_000))
-@settings(max_examples=20, deadline=None)
-def test_correction_helps_lr_and_never_lengthens_more_than_the_gradient(seed):
-    lr, hr = random_pair(seed)
-    found = GCO().correct(lr, hr, None)
-    for group in CONFLICT_GROUPS:
         assert (dot(found[group], lr[group]) >= dot(hr[group], lr[group]) - 1e-6).all()
         assert (dot(found[group], found[group]) <= dot(hr[group], hr[group]) * (1 + 1e-6)).all()
 
@@ -114,8 +105,6 @@ def test_what_could_correct_nothing_is_refused():
     g = torch.ones(2, 3)
     with pytest.raises(ValueError, match=r"compares the groups means, .* lr has _xyz, hr has _xyz\. Name them so"):
         GCO().correct({"_xyz": g}, {"_xyz": -g})
-    with pytest.raises(SettingError, match="groups: must name an attribute"):
-        GCO(groups=())
 
 
 def test_the_detail_feature_is_never_touched():

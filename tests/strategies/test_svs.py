@@ -49,6 +49,16 @@ def test_dropout_ramps_linearly_and_costs_nothing_at_rate_zero():
     assert SVS(dropout=Ramp(maximum=0.0)).gate(5, 10) is None
 
 
+def started(n_views=3, **settings):
+    svs = SVS(**settings)
+    svs.on_fit_start(n_views, 0)
+    return svs
+
+
+def kept_share(svs, t):
+    return float((svs.gate(t, 100_000) > 0).float().mean())
+
+
 def params(n=20, seed=0):
     g = torch.Generator().manual_seed(seed)
     return {
@@ -58,25 +68,19 @@ def params(n=20, seed=0):
 
 
 def test_a_short_run_that_does_not_know_its_views_counts_one():
-    svs = SVS(Ramp(0.2, "constant", full=400), looks=1_000)
-    svs.on_fit_start(0, 0)
-    assert float((svs.gate(400, 100_000) > 0).float().mean()) == pytest.approx(1 - 0.08, abs=4e-3)
+    svs = started(0, dropout=Ramp(0.2, "constant", full=400), looks=1_000)
+    assert kept_share(svs, 400) == pytest.approx(1 - 0.08, abs=4e-3)
 
 
 @pytest.mark.parametrize(("n_views", "rate"), [(2, 0.2), (4, 0.2), (8, 0.1), (80, 0.01)])
 def test_the_rate_falls_with_the_looks_at_each_view(n_views, rate):
-    svs = SVS(Ramp(0.2, full=4_000), looks=1_000)
-    svs.on_fit_start(n_views, 0)
-    kept = svs.gate(4_000, 100_000) > 0
-    assert float(kept.float().mean()) == pytest.approx(1 - rate, abs=4e-3)
-    as_published = SVS(Ramp(0.2, full=4_000), looks=0)
-    as_published.on_fit_start(n_views, 0)
-    assert float((as_published.gate(4_000, 100_000) > 0).float().mean()) == pytest.approx(0.8, abs=4e-3)
+    for looks, expected in ((1_000, 1 - rate), (0, 0.8)):  # 0: as published
+        svs = started(n_views, dropout=Ramp(0.2, full=4_000), looks=looks)
+        assert kept_share(svs, 4_000) == pytest.approx(expected, abs=4e-3)
 
 
 def test_anchor_pulls_back_with_twice_the_weighted_distance():
-    svs = SVS(anchor_start=10, anchor_strength=0.01, anchor_weights={"scales": 0.5, "opacities": 0.1})
-    svs.on_fit_start(3, 0)
+    svs = started(anchor_start=10, anchor_strength=0.01, anchor_weights={"scales": 0.5, "opacities": 0.1})
     theta = params()
     svs.after_step(theta, toy.step(9))
     assert svs.regularize(theta, 10) is None
@@ -91,8 +95,7 @@ def test_anchor_pulls_back_with_twice_the_weighted_distance():
 
 def test_anchored_positions_do_not_depend_on_the_unit_of_the_world():
     for unit in (1.0, 1000.0):
-        svs = SVS(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS)
-        svs.on_fit_start(3, 0)
+        svs = started(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS)
         theta = params()
         theta["means"] = theta["means"] * unit
         svs.after_step(theta, toy.step(1))
@@ -106,8 +109,7 @@ def test_anchored_positions_do_not_depend_on_the_unit_of_the_world():
 def test_the_mean_reading_divides_by_the_number_of_gaussians():
     pulls = []
     for reduction in ("sum", "mean"):
-        svs = SVS(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS, reduction=reduction)
-        svs.on_fit_start(3, 0)
+        svs = started(anchor_start=1, anchor_strength=0.01, anchor_weights=PAPER_WEIGHTS, reduction=reduction)
         theta = params()
         svs.after_step(theta, toy.step(1))
         theta["scales"] = theta["scales"] + 1
@@ -116,14 +118,11 @@ def test_the_mean_reading_divides_by_the_number_of_gaussians():
 
 
 def test_densification_ends_when_the_anchor_is_taken():
-    svs = SVS(anchor_start=10, anchor_strength=0.01)
-    assert svs.may_densify(9)
-    assert not svs.may_densify(10)
+    assert [SVS(anchor_start=10).may_densify(t) for t in (9, 10)] == [True, False]
 
 
 def test_a_changed_number_of_gaussians_under_an_anchor_is_an_error():
-    svs = SVS(anchor_start=5, anchor_strength=0.01)
-    svs.on_fit_start(3, 0)
+    svs = started(anchor_start=5, anchor_strength=0.01)
     svs.after_step(params(), toy.step(5))
     with pytest.raises(AnchorError, match="t=5 for 20 Gaussians, now there are 21"):
         svs.regularize(params(21), 6)
@@ -132,8 +131,7 @@ def test_a_changed_number_of_gaussians_under_an_anchor_is_an_error():
 
 
 def test_an_iteration_that_a_skip_jumped_over_takes_the_anchor_once():
-    svs = SVS(anchor_start=5, anchor_strength=0.01)
-    svs.on_fit_start(3, 0)
+    svs = started(anchor_start=5, anchor_strength=0.01)
     svs.after_step(params(), toy.step(4))
     assert not svs.state
     at_seven = params()

@@ -6,9 +6,7 @@ import pytest
 import torch
 
 from clear_strategies.core.view import DepthMap, Photo
-from clear_strategies.errors import SettingError
 from clear_strategies.geometry.dense_stereo.cloud import points_of
-from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.geometry.filling import grid_points
 from tests.helpers.planes import photo
 
@@ -56,9 +54,3 @@ def test_only_unknown_pixels_are_filled_and_never_in_known_free_space() -> None:
     assert len(floating) < 100
     close = grid_points(samples, views, 2, maps=[unknown(views[0]), flat(views[1], 3.1)])[0]
     assert len(close) == 400  # within 5 % of what the other photo knows
-
-
-@pytest.mark.parametrize(("name", "value"), [("window", 4), ("spacing", 0.5), ("trust", 2), ("tolerance", 0)])
-def test_settings_out_of_range_are_refused(name: str, value: float) -> None:
-    with pytest.raises(SettingError, match=f"^{name}: must "):
-        StereoSettings(**{name: value})

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from clear_strategies.core.view import Photo
-from clear_strategies.geometry.dense_stereo import sources
+from clear_strategies.geometry.dense_stereo import consistency, sources
+from clear_strategies.geometry.dense_stereo.consistency import speckles
 from clear_strategies.geometry.dense_stereo.maps import depth_maps
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from tests.helpers.planes import same_maps
@@ -27,6 +28,8 @@ def test_depth_of_a_known_surface_is_found_from_the_cameras_alone(surface: Surfa
     for i, found in enumerate(depth_maps(photos_of(surface), NONE, QUICK)):
         exact = cast(surface, camera(0.4 * i - 0.4, 4 * (i - 1)))[1]
         error = (found.depth / exact - 1).abs()[found.known]
+        assert torch.equal(found.depth.isnan(), ~found.known)
+        assert 0 <= float(found.confidence.min()) <= float(found.confidence.max()) <= 1
         assert found.coverage > 0.5
         assert error.median() < 0.012
         assert (error < 0.03).float().mean() > 0.97
@@ -39,18 +42,6 @@ def test_photos_are_scored_by_some_of_many_points(monkeypatch) -> None:
     sources.comparisons(photos_of(slanted), points)
     assert len(asked) == 6
     assert 500 <= max(asked) <= 1000
-
-
-def test_unknown_is_nan_with_confidence_0_and_confidence_lies_in_0_to_1() -> None:
-    for found in depth_maps(photos_of(slanted), NONE, QUICK):
-        assert torch.equal(found.depth.isnan(), ~found.known)
-        assert float(found.confidence.min()) >= 0
-        assert float(found.confidence.max()) <= 1
-        assert (found.depth[found.known] > 0).all()
-
-
-def test_two_views_are_enough() -> None:
-    assert all(found.coverage > 0.4 for found in depth_maps(photos_of(slanted, 2), NONE, QUICK))
 
 
 @pytest.mark.slow
@@ -125,16 +116,31 @@ def test_depth_behind_most_triangulated_points_is_not_trusted(caplog: pytest.Log
     assert "triangulated points lie in front of its depth" in caplog.text
 
 
-def test_pixels_of_the_background_have_no_depth() -> None:
-    photos = photos_of(slanted)
-    images = [p.image.clone() for p in photos]
-    for image in images:
-        image[:10] = 1.0
-    found = depth_maps([replace(p, image=i) for p, i in zip(photos, images, strict=True)], NONE, QUICK, (1.0, 1.0, 1.0))
-    assert all(not m.known[:10].any() for m in found)
-    assert all(m.coverage > 0.3 for m in found)
-
-
 def test_photos_of_a_few_pixels_do_not_fail() -> None:
     tiny = [cast(slanted, camera(0.3 * i, 0, (3, 2)))[0] for i in range(2)]
     assert [m.depth.shape for m in depth_maps(tiny, NONE, QUICK)] == [(2, 3), (2, 3)]
+
+
+def map_with_islands() -> torch.Tensor:
+    depth = torch.full((12, 16), torch.nan)
+    depth[:, :8] = torch.linspace(2.0, 2.6, 8)  # a slanted surface: neighbours differ by 4 %
+    depth[4:6, 3:5] = 5.0  # an island of four in it
+    depth[8, 12] = 2.0  # one of its own
+    return depth
+
+
+@pytest.mark.parametrize(("fewest", "count"), [(0, 0), (1, 0), (2, 1), (4, 1), (5, 5), (1000, 97)])
+def test_islands_of_fewer_pixels_are_found(fewest: int, count: int) -> None:
+    found = speckles(map_with_islands(), fewest, 0.05)
+    assert int(found.sum()) == count
+
+
+def test_what_is_alike_depends_on_the_ratio_of_depths_alone() -> None:
+    depth = map_with_islands()
+    assert torch.equal(speckles(depth, 5, 0.05), speckles(1e-6 * depth, 5, 0.05))
+    assert int(speckles(depth, 13, 0.02).sum()) == 97  # each column is an island of twelve
+
+
+def test_without_scipy_every_depth_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(consistency, "missing", lambda *_: "scipy")
+    assert not speckles(map_with_islands(), 5, 0.05).any()
