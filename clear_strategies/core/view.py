@@ -113,7 +113,7 @@ class DepthMap:
         return DepthMap(torch.where(enough, depth.nanmedian(dim=-1).values, torch.nan), torch.where(enough, mean, 0.0))
 
     def completed_by(self, other: DepthMap) -> DepthMap:
-        """This map, and where it knows nothing, `other`, a map of the same photo."""
+        """This map, and `other`, a map of the same photo, where depth is unknown."""
         depth = torch.where(self.known, self.depth, other.depth)
         return DepthMap(depth, torch.where(self.known, self.confidence, other.confidence))
 
@@ -130,10 +130,10 @@ class View:
         hr: the super-resolved (SR) image of the prior; the truth only where photos train at both scales.
         truth: the real photo at HR, for evaluation only; training never uses it.
         sr_source: the prior's label, e.g. "onnx span_x4.onnx".
-        depth: of the photo's surfaces, from stereo, on the pixels of `depth_photo`; None where nobody asked for it, e.g. in
+        depth: of the photo's surfaces, from stereo, on the pixels of `depth_photo`; None where nothing needs it, e.g. in
             test views.
         disagreement: |D(I) - I_LR|, where I is the SR image as the network made it and `hr` is I after back-projection, which
-            removes that difference. P2G judges the network by it. None where `hr` is I itself.
+            removes that difference. P2G measures the reliability by it. None where `hr` is I itself.
         background: RGB in [0, 1] behind the scene; pixels of this colour belong to no surface.
     """
 

@@ -37,7 +37,7 @@ _MOST_COPIES: Final = 51  # the paper's bound on how many Gaussians one becomes 
 _BINOMIALS: Final = torch.tensor(
     [[math.comb(n, j) for j in range(_MOST_COPIES + 1)] for n in range(_MOST_COPIES + 1)], dtype=torch.float64
 )
-_DENSE: Final = 4.0  # LR px between initial points, up to which their number tells how much surface there is
+_DENSE: Final = 4.0  # LR px between initial points, up to which their number is a measure of the surface
 _SHORT_RUN: Final = 750  # the least `stop`, that of 1,500 iterations; shorter runs gain more by density control
 _GATE: Final = 100.0  # slope of the noise's gate σ(100 (dead_opacity - o))
 _STILL: Final = 1e-4  # of the gate: below it, at opacities above 0.1, a Gaussian stays where it is
@@ -117,7 +117,7 @@ class Sampler:
         return {"densify until": self.settings.stop}
 
     def accumulate(self, update: Update, shot: Shot, t: int) -> None:
-        """Nothing: opacity alone tells which Gaussians are needed."""
+        """Nothing: rounds use the opacity alone."""
 
     def due(self, t: int) -> bool:
         """Whether a round falls on t."""

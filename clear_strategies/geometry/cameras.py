@@ -48,7 +48,7 @@ def partners(cameras: Sequence[Camera]) -> list[list[int]]:
     farther away.
 
     With all pairs, a hundred photos would take an hour. The nearest alone may be a burst, which shows no depth, or one side of
-    the scene, which tells nothing of the other.
+    the scene, which shows nothing of the other.
     """
     centers, others = torch.stack([camera.center.double() for camera in cameras]), len(cameras) - 1
     far = np.geomspace(_NEAREST + 1, max(others, _PARTNERS), _PARTNERS - _NEAREST).round().astype(int) - 1

@@ -172,7 +172,7 @@ def triangulate_pair(
     (u, depth_a), (v, depth_b) = project(a, points), project(b, points)
     error = torch.maximum(torch.linalg.vector_norm(u - x, dim=-1), torch.linalg.vector_norm(v - y, dim=-1))
     rays = points - a.center.double(), points - b.center.double()
-    # The tangent, because a cosine cannot tell small angles from zero.
+    # The tangent, because the cosine of a small angle rounds to 1.
     sine = torch.linalg.vector_norm(torch.linalg.cross(*rays), dim=-1)
     angle = torch.rad2deg(torch.atan2(sine, (rays[0] * rays[1]).sum(-1)))
 

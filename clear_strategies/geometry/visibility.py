@@ -21,7 +21,7 @@ def seen_by(
     """In how many other cameras the surface behind each pixel is inside the image and not hidden.
 
     Args:
-        depth: z in world units, nan where there is no surface, which nobody sees.
+        depth: z in world units, nan where there is no surface; the count is 0 there.
         others: cameras, each with its own depth.
     """
     rows, columns = torch.nonzero(depth.isfinite(), as_tuple=True)

@@ -1,4 +1,4 @@
-"""The conductor asks the strategies in the paper's order and merges the gradients, in every host.  Eq. 8, 13"""
+"""The conductor calls the strategies in the paper's order and merges the gradients, in every host.  Eq. 8, 13"""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _ONE_ANSWER: Final = ("densifier", "background", "gate", "observe", "route", "co
 
 
 class Conductor:
-    """Asks strategies and merges gradients.
+    """Calls strategies and merges gradients.
 
     Args:
-        strategies: in any order; the hook decides when each is asked. None at all is the paper's baseline.
+        strategies: in any order, which has no effect. None at all is the paper's baseline.
         objective: the losses and their weights.
         statistics_from: iteration from which densification statistics need the HR render although λ_HR = 0; None:
             as soon as λ_HR > 0 (F11).
@@ -44,7 +44,7 @@ class Conductor:
         detail: the rates of f_det, for hosts.
 
     Attributes:
-        decorated: whether `prior` has been asked, or has nothing to do.
+        decorated: whether `prior` has been called, or there are no decorators.
 
     Raises:
         StrategyConflict: two strategies answer a question that only one may.
@@ -60,7 +60,7 @@ class Conductor:
         self.decorators, self.detail = tuple(decorators), detail if detail is not None else DetailRates()
         self.decorated = not self.decorators
         self.work_log = WorkLog()
-        self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # whose hooks return the answer of nobody
+        self._owner = dict.fromkeys(_ONE_ANSWER, Strategy())  # its hooks hold where no strategy overrides them
         for hook in _ONE_ANSWER:
             owners = [s for s in strategies if overrides(s, hook)]
             if len(owners) > 1:
@@ -196,7 +196,7 @@ class Conductor:
         return self._backward_hr(hr, Step(t, view, hr.visible), _vjp)[1]
 
     def extra_views(self, t: int) -> list[ExtraView]:
-        """What the strategies want the field to match at t besides the view; each gets a step on `extra_loss`."""
+        """The pictures that the field should match at t besides the view; each gets a step on `extra_loss`."""
         if self.objective.lambda_lr == 0:
             return []
         return [extra for s in self.strategies for extra in s.extra_views(t)]

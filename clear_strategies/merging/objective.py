@@ -1,4 +1,4 @@
-"""The losses. Images in, losses and image-space cotangents out; the objective knows no Gaussian.  Eq. 4, 5"""
+"""The losses. Images in, losses and image-space cotangents out; Gaussians play no part.  Eq. 4, 5"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contract of a strategy. A strategy answers questions about one training iteration; it knows no rasterizer.
+"""The contract of a strategy. A strategy answers questions about one training iteration, whatever rasterizer draws.
 
 The hooks are phases of an iteration, so their order needs no configuration. `Strategy` answers each as if there were no
 strategy. At most one strategy may override each of the hooks with a single answer: densifier, background, gate, observe, route,
@@ -93,7 +93,7 @@ class Strategy:
         return None
 
     def observe(self, step: Step, hr: Shot) -> Evidence | None:
-        """After render: what does I_HR tell about each Gaussian?  Eq. 9, 10
+        """After render: what is I_HR worth for each Gaussian?  Eq. 9, 10
 
         Args:
             hr: the HR render of `step.view`.
