@@ -33,7 +33,8 @@ def require_number(
     if (number > low or (number == low and above is None)) and number <= most and number < below:
         return
     if math.isfinite(most):
-        refuse(name, f"must lie in {opening}{low:g}, {most:g}]", value, f"{name}={most:g}")
+        nearest = most if number > most else low if above is None else min(most, low + 1)
+        refuse(name, f"must lie in {opening}{low:g}, {most:g}]", value, f"{name}={nearest:g}")
     if math.isfinite(below):
         refuse(name, f"must lie in {opening}{low:g}, {below:g})", value, f"{name}={(low + below) / 2:g}")
     refuse(name, f"must be a finite number {sign} {low:g}", value, f"{name}={low + 1:g}")

@@ -44,6 +44,12 @@ def test_numbers_are_finite_and_in_range(limits: dict[str, float], rule: str, re
         require_number("a.b", value, **limits)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("value", "nearest"), [(-1, 0), (101, 100)])
+def test_the_remedy_is_the_nearest_number_in_range(value: float, nearest: int) -> None:
+    with pytest.raises(SettingError, match=rf"^a\.b: must lie in \[0, 100\], got {value}: a\.b={nearest}$"):
+        require_number("a.b", value, most=100)
+
+
 def test_choices_are_listed() -> None:
     require_choice("a.b", "x", ("x", "y"))
     with pytest.raises(SettingError, match=r"^a\.b: must be one of x, y, got 'z': a\.b=x$"):
