@@ -85,8 +85,7 @@ class Objective:
         Args:
             shown: where False the target counts as equal to the image, and the cotangent is 0.
         """
-        compared = self._clamped(image)
-        target = _where_shown(target, compared, shown)
+        compared, target = self._compared(image, target, shown)
         cotangents = compared.new_empty(1, *compared.shape)
         loss = kernels.photometric(compared, target, self.lambda_ssim, kernels=self.kernels, out=cotangents[0])  # Eq. 4
         if self.lambda_lr != 1:
@@ -97,8 +96,7 @@ class Objective:
         self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None = None
     ) -> Losses:
         """L_base and L_HF, two cotangents; L_base alone where λ_HF = 0. `shown` as for `lr`."""
-        compared, use = self._clamped(image), self.kernels
-        target = _where_shown(target, compared, shown)
+        (compared, target), use = self._compared(image, target, shown), self.kernels
         cotangents = compared.new_empty(2 if self.lambda_hf > 0 else 1, *compared.shape)
         base = kernels.photometric(compared, target, self.lambda_ssim_hr, kernels=use, out=cotangents[0])  # Eq. 5
         losses = {"base": base}
@@ -106,8 +104,12 @@ class Objective:
             losses["hf"] = kernels.haar_l1(compared, target, self.haar_levels, kernels=use, out=cotangents[1])  # Eq. 5
         return self._losses(losses, image, cotangents, shown)
 
-    def _clamped(self, image: Float[Tensor, "H W 3"]) -> Float[Tensor, "H W 3"]:
-        return image.clamp(0, 1) if self.clamp_render else image
+    def _compared(
+        self, image: Float[Tensor, "H W 3"], target: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None
+    ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
+        """Both images as the losses compare them: equal where the target is hidden."""
+        image = image.clamp(0, 1) if self.clamp_render else image
+        return image, target if shown is None else torch.where(shown[..., None], target, image)
 
     def _losses(
         self,
@@ -121,10 +123,3 @@ class Objective:
         if self.clamp_render:
             cotangents *= (image >= 0) & (image <= 1)
         return Losses({name: deferred.scalar(loss.value) for name, loss in losses.items()}, cotangents)
-
-
-def _where_shown(
-    target: Float[Tensor, "H W 3"], image: Float[Tensor, "H W 3"], shown: Bool[Tensor, "H W"] | None
-) -> Float[Tensor, "H W 3"]:
-    """The target, and the image itself where the target is hidden."""
-    return target if shown is None else torch.where(shown[..., None], target, image)
