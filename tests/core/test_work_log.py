@@ -1,8 +1,10 @@
-"""The work_log on a device: stamps instead of clocks, nothing waited for while there is work, nothing lost."""
+"""The work log on a device: events instead of clocks, no wait while there is work, nothing lost."""
 
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -15,17 +17,17 @@ from clear_strategies.core.work_log import WorkLog
 class Device:
     """A clock that a test moves, ms: what is recorded now is passed once the device has come so far."""
 
-    def __init__(self) -> None:
-        self.queued, self.reached, self.waits = 0.0, 0.0, 0
+    queued, reached, waits = 0.0, 0.0, 0
 
     def event(self, *, enable_timing: bool) -> Event:
         assert enable_timing
         return Event(self)
 
 
+@dataclass
 class Event:
-    def __init__(self, device: Device) -> None:
-        self.device, self.at = device, None
+    device: Device
+    at: float = math.nan
 
     def record(self) -> None:
         self.at = self.device.queued
@@ -128,7 +130,7 @@ def test_on_a_cpu_no_event_is_made(monkeypatch):
     assert work_log.entries["render"].skipped == {"nothing to see": 1}
 
 
-def test_a_run_tells_its_ledger_where_it_trains():
+def test_the_work_log_of_a_run_is_on_its_device():
     conductor = Conductor()
     assert conductor.work_log.device.type == "cpu"
     conductor.on_fit_start(1, 0, "cuda")

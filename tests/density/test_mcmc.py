@@ -136,15 +136,6 @@ def test_rounds_fall_between_start_and_stop():
     assert not any(densifier.reset_due(t) for t in range(60))
 
 
-def test_the_same_seed_and_iteration_do_the_same():
-    fields = []
-    for _ in range(2):
-        theta, optimizer, densifier = made(noise=5.0, opacity=-4.0)
-        step(theta, optimizer, densifier, 7)
-        fields.append(theta.raw())
-    assert all(torch.equal(fields[0][name], fields[1][name]) for name in fields[0])
-
-
 def test_noise_moves_the_faint_until_stop_and_leaves_the_opaque():
     theta, optimizer, densifier = made(noise=100.0, start=9)
     theta.opacities.data[:20] = -6.0

@@ -68,12 +68,6 @@ def test_a_plane_is_seen_as_its_photos_show_it():
         assert error[inside.any(0)].median() < 0.02
 
 
-def test_the_same_seed_makes_the_same_views_and_another_seed_others():
-    first, same, other = (views_of(plane(), seed=seed) for seed in (0, 0, 1))
-    assert all(torch.equal(a.photo.image, b.photo.image) for a, b in zip(first, same, strict=True))
-    assert not torch.equal(first[0].photo.image, other[0].photo.image)
-
-
 def test_without_two_photos_with_depth_there_are_none():
     photos = plane(2)
     one = {"0.png": depth_of(photos["0.png"]), "1.png": depth_of(photos["1.png"], torch.nan)}

@@ -46,12 +46,6 @@ def test_a_point_seen_by_three_views_is_one_point() -> None:
     assert len(triangulate(plane_photos(3))) < pairwise
 
 
-def test_the_same_photos_give_the_same_cloud() -> None:
-    one, two = triangulate(plane_photos(2)), triangulate(plane_photos(2))
-    assert torch.equal(one.means, two.means)
-    assert torch.equal(one.colors, two.colors)
-
-
 def test_of_too_many_features_the_strongest_are_taken() -> None:
     photo = plane_photos(1)[0]
     every = find_features(photo, TriangulationSettings(max_features=None))

@@ -107,13 +107,6 @@ def test_what_could_correct_nothing_is_refused():
         GCO().correct({"_xyz": g}, {"_xyz": -g})
 
 
-def test_the_detail_feature_is_never_touched():
-    lr, hr = random_pair(6)
-    hr["detail"] = torch.randn(200, 3)
-    lr["detail"] = -hr["detail"]
-    assert torch.equal(GCO().correct(lr, hr, None)["detail"], hr["detail"])
-
-
 def test_a_prior_that_agrees_with_lr_makes_it_inactive_and_the_end_of_the_run_says_so():
     lr, hr = random_pair(8)
     gco = GCO()

@@ -21,15 +21,12 @@ def prepared(views=SCENE.train, seed=5, until=1_350):
     return strategy
 
 
-def test_every_iteration_has_its_own_colour_a_function_of_the_seed():
+def test_every_iteration_has_its_own_colour_a_function_of_the_seed_and_the_last_ones_that_of_the_scene():
     colors = [prepared().background(t) for t in range(1, 41)]
     assert len(set(colors)) == 40
     assert colors == [prepared().background(t) for t in range(1, 41)]
     assert colors[0] != prepared(seed=6).background(1)
     assert torch.tensor(colors).mean(0).sub(0.5).abs().max() < 0.2
-
-
-def test_the_run_ends_on_the_background_of_the_scene():
     assert prepared().background(1_351) is None
 
 
