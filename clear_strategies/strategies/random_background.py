@@ -55,7 +55,8 @@ class RandomBackground(Strategy):
         return True
 
     def on_views(self, views: Sequence[View]) -> None:
-        self.cache["reason"] = self._reason_to_keep(len(views), views)
+        if views:  # else the answer for their number stays
+            self.cache["reason"] = self._reason_to_keep(len(views), views)
 
     def _reason_to_keep(self, n_views: int, views: Sequence[View] = ()) -> str:
         """Why the background stays as it is; empty where it changes."""

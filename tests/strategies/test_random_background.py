@@ -38,6 +38,10 @@ def test_many_views_and_short_runs_keep_the_background_and_say_so(views, until, 
     kept = prepared(views, until=until)
     assert kept.background(1) is None
     assert why in kept.summary()
+    without_views = RandomBackground(until=until)
+    without_views.on_fit_start(len(views), 5)
+    without_views.on_views(())  # this loop does not have them at the start
+    assert without_views.summary() == kept.summary()
     assert "another colour in each of the first 1,350" in prepared().summary()
 
 
