@@ -212,7 +212,7 @@ class Conductor:
         weight = extra.weight[..., None]
         target = torch.where(weight > 0, extra.photo.over(self.background(t), extra.background).image, 0.0)
         loss = self.objective.lr(torch.where(weight > 0, image.detach(), 0.0), target)
-        require_finite_losses(f"t={t}, an extra view", loss.values, {"it": target, "the render": image})
+        require_finite_losses(f"t={t}, an extra view", loss.values, {"its picture": target, "the render": image})
         return loss._replace(cotangents=loss.cotangents * weight)
 
     def merge(self, params: Mapping[str, Tensor], g_lr: Grads, hr: HrGradients[Grads] | None, t: int) -> Merged:
