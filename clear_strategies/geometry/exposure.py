@@ -15,7 +15,8 @@ from torch import Tensor
 
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cameras import partners
-from clear_strategies.geometry.projection import back_project, inside_of, project, sample_colors
+from clear_strategies.geometry.projection import back_project, sample_colors
+from clear_strategies.geometry.visibility import on_surface
 
 _TOLERANCE: Final = 0.02  # relative difference of depth up to which two photos show the same surface
 _UNCLIPPED: Final = (0.05, 0.92)  # darker, a ratio is that of noise; lighter, the photo may have been clipped
@@ -53,10 +54,7 @@ def _ratio(photo: Photo, depth: DepthMap, other: Photo, other_depth: DepthMap) -
     """The median of log(photo / other) over the surfaces that both show, and how many pixels show one, by channel."""
     rows, columns = torch.nonzero(depth.known, as_tuple=True)
     surface = back_project(photo.camera, torch.stack((columns, rows), dim=1) + 0.5, depth.depth[rows, columns])
-    pixels, z = project(other.camera, surface)
-    shared = inside_of(other.camera, pixels, z)
-    column, row = torch.where(shared[:, None], pixels, 0.0).long().unbind(dim=1)
-    shared &= (other_depth.depth[row, column] / z - 1).abs() <= _TOLERANCE  # False where it is unknown
+    shared, pixels = on_surface(other.camera, other_depth.depth, surface, _TOLERANCE)
     colors, other_colors = photo.image[rows[shared], columns[shared]], sample_colors(other.image, pixels[shared])
     low, high = _UNCLIPPED
     usable = (colors > low) & (colors < high) & (other_colors > low) & (other_colors < high)

@@ -54,6 +54,15 @@ def back_project(camera: Camera, pixels: Float[Tensor, "G 2"], depth: Float[Tens
     return ((torch.stack((x, y, depth), dim=1) - pose[:3, 3]) @ pose[:3, :3]).float()
 
 
+def ray_angles(a: Camera, b: Camera, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+    """Angles at these points (float64) between the rays from two cameras, degrees."""
+    x, y = points - a.center.double(), points - b.center.double()
+    sine = torch.linalg.vector_norm(torch.linalg.cross(x, y), dim=-1)
+    return torch.rad2deg(
+        torch.atan2(sine, (x * y).sum(-1))
+    )  # not from the cosine alone: that of a small angle rounds to 1
+
+
 def sample_colors(image: Float[Tensor, "H W 3"], pixels: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
     """Bilinear samples; outside the centres of the border pixels, the border's colour."""
     height, width = image.shape[:2]

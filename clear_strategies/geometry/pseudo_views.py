@@ -19,6 +19,7 @@ from torch import Tensor
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.geometry.cameras import moved
 from clear_strategies.geometry.projection import back_project, inside_of, is_background, project, sample_colors
+from clear_strategies.geometry.visibility import on_surface
 from rasterizers.interface import Camera, Color
 
 _SOURCES: Final = 4  # the nearest photos that a pseudo view is made of
@@ -139,10 +140,7 @@ def _warped(camera: Camera, sources: Sequence[_Source], tolerance: float) -> Pse
     points = back_project(camera, _centres(camera)[known], depth[known])
     color, weight = torch.zeros(len(points), 3), torch.zeros(len(points))
     for s in nearest:
-        pixels, z = project(s.photo.camera, points)
-        inside = inside_of(s.photo.camera, pixels, z)
-        column, row = torch.where(inside[:, None], pixels, 0.0).long().unbind(dim=1)
-        shows = inside & ((s.depth[row, column] / z - 1).abs() <= tolerance)
+        shows, pixels = on_surface(s.photo.camera, s.depth, points, tolerance)
         w = shows / (s.photo.camera.center - camera.center).square().sum().clamp_min(1e-12)  # the nearest counts most
         color += w[:, None] * sample_colors(s.photo.image, pixels)
         weight += w

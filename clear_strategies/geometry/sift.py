@@ -25,7 +25,7 @@ from clear_strategies.core.progress import Progress
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry.cameras import partners
 from clear_strategies.geometry.libraries import REMEDY, missing
-from clear_strategies.geometry.projection import project, projection_matrix, sample_colors
+from clear_strategies.geometry.projection import project, projection_matrix, ray_angles, sample_colors
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -171,11 +171,7 @@ def triangulate_pair(
 
     (u, depth_a), (v, depth_b) = project(a, points), project(b, points)
     error = torch.maximum(torch.linalg.vector_norm(u - x, dim=-1), torch.linalg.vector_norm(v - y, dim=-1))
-    rays = points - a.center.double(), points - b.center.double()
-    # The tangent, because the cosine of a small angle rounds to 1.
-    sine = torch.linalg.vector_norm(torch.linalg.cross(*rays), dim=-1)
-    angle = torch.rad2deg(torch.atan2(sine, (rays[0] * rays[1]).sum(-1)))
-
+    angle = ray_angles(a, b, points)
     good = points.isfinite().all(-1) & (depth_a > 0) & (depth_b > 0)
     good &= (squares / 2).sqrt() <= settings.epipolar
     good &= (error <= settings.reprojection) & (angle >= settings.angle)

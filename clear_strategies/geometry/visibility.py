@@ -1,4 +1,4 @@
-"""Which cameras see a surface."""
+"""Which cameras see a surface, and which points lie on it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from clear_strategies.geometry.projection import back_project, seen_pixels
+from clear_strategies.geometry.projection import back_project, inside_of, project, seen_pixels
 from rasterizers.interface import Camera
 
 _TOLERANCE: Final = 0.03  # a camera sees a point whose depth there exceeds the camera's own by at most this share of it
@@ -44,3 +44,18 @@ def times_seen(
         inside, row, column, z = seen_pixels(camera, points)
         count[inside] += z <= depth[row, column] * (1 + _TOLERANCE)
     return count
+
+
+def on_surface(
+    camera: Camera, depth: Float[Tensor, "h w"], points: Float[Tensor, "N 3"], tolerance: float
+) -> tuple[Bool[Tensor, " N"], Float[Tensor, "N 2"]]:
+    """(whether each point lies on the surface at the pixel that it projects to, these pixels).
+
+    Args:
+        depth: of the camera, nan or 0 where it is unknown, so that no point lies there.
+        tolerance: relative difference of depth up to which a point lies on the surface.
+    """
+    pixels, z = project(camera, points)
+    inside = inside_of(camera, pixels, z)
+    column, row = torch.where(inside[:, None], pixels, 0.0).long().unbind(dim=1)
+    return inside & ((depth[row, column] / z - 1).abs() <= tolerance), pixels

@@ -14,7 +14,7 @@ from torch import Tensor
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry.cameras import common_box
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.projection import back_project, inside_of, project, seen_pixels
+from clear_strategies.geometry.projection import back_project, inside_of, project, ray_angles, seen_pixels
 from rasterizers.interface import Camera
 
 _FEW: Final = 20  # points in a photo, below which a grid at guessed depths replaces them
@@ -88,9 +88,7 @@ def _score(camera: Camera, other: Camera, points: Float[Tensor, "M 3"]) -> float
     """The share of the points that both see, each weighted by how well its angle and its scales suit a comparison."""
     pixels, depth = project(other, points)
     inside = inside_of(other, pixels, depth)
-    a, b = points - camera.center.double(), points - other.center.double()
-    sine = torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=-1)
-    angle = torch.rad2deg(torch.atan2(sine, (a * b).sum(-1)))
+    angle = ray_angles(camera, other, points)
     none, best, until, different = _ANGLES
     suits = torch.minimum((angle - none) / (best - none), (different - angle) / (different - until)).clamp(0, 1)
     scale = (project(camera, points)[1] / camera.fx) / (depth / other.fx)  # of the same surface in the two photos
