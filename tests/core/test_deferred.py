@@ -68,13 +68,13 @@ def test_rows_before_one_that_was_read_are_not_looked_at(monkeypatch):
     assert looked == [9, 8, 7, 6]
 
 
-def test_a_recipe_may_say_what_it_finds_and_says_it_once(on_a_device):
-    said = []
-    row = {"x": deferred.defer(lambda x: said.append(x) or x, torch.tensor(7.0))}
-    assert not said
+def test_a_recipe_may_have_an_effect_and_runs_once(on_a_device):
+    calls = []
+    row = {"x": deferred.defer(lambda x: calls.append(x) or x, torch.tensor(7.0))}
+    assert not calls
     deferred.resolve([row])
     deferred.resolve([row])
-    assert said == [7.0]
+    assert calls == [7.0]
 
 
 @pytest.mark.parametrize("chosen", [[True, False, True, True], [False] * 4, [False, True, False, True]])
@@ -85,6 +85,6 @@ def test_statistics_of_chosen_rows_are_the_same_without_counting_them(statistic,
     expected = statistic(values, chosen)
     monkeypatch.setattr(deferred, "is_immediate", lambda x: False)
     with Reads() as reads:
-        found = statistic(values, chosen)
+        result = statistic(values, chosen)
     assert reads.count == 0
-    assert deferred.read([found]) == pytest.approx([expected], nan_ok=True)
+    assert deferred.read([result]) == pytest.approx([expected], nan_ok=True)

@@ -24,7 +24,7 @@ EVERY = MCMC(start=0, stop=100, every=1, noise=0.0)
 DEAD = -8.0  # logit of an opacity of 3e-4
 
 
-def made(settings: MCMC = EVERY, opacity: float = 0.0, **changes):
+def start_of_run(settings: MCMC = EVERY, opacity: float = 0.0, **changes):
     """(field, optimizer, densifier); every moment is 1."""
     theta = GaussianField.from_cloud(toy.cloud(N))
     theta.opacities.data[:] = opacity
@@ -99,7 +99,7 @@ def test_copies_look_as_the_one_that_they_replace(opacity):
 
 
 def test_dead_gaussians_move_to_live_ones_and_start_without_momentum():
-    theta, optimizer, densifier = made(growth=0.0)
+    theta, optimizer, densifier = start_of_run(growth=0.0)
     theta.opacities.data[:20] = DEAD
     means = theta.means.data.clone()
     parents = step(theta, optimizer, densifier)
@@ -116,7 +116,7 @@ def test_dead_gaussians_move_to_live_ones_and_start_without_momentum():
 
 
 def test_the_field_grows_to_a_multiple_of_its_points():
-    theta, optimizer, densifier = made(growth=0.5, per_point=2.0)
+    theta, optimizer, densifier = start_of_run(growth=0.5, per_point=2.0)
     sizes = []
     for t in range(1, 5):
         step(theta, optimizer, densifier, t)
@@ -125,11 +125,11 @@ def test_the_field_grows_to_a_multiple_of_its_points():
     before = {name: p.clone() for name, p in theta.raw().items()}
     assert step(theta, optimizer, densifier, 5) is None  # nothing is dead and the cap is reached
     assert all(torch.equal(p, before[name]) for name, p in theta.raw().items())
-    assert made(per_point=2.0, max_gaussians=70)[2].cap == 70
+    assert start_of_run(per_point=2.0, max_gaussians=70)[2].cap == 70
 
 
 def test_rounds_fall_between_start_and_stop():
-    densifier = made(start=10, stop=40, every=10)[2]
+    densifier = start_of_run(start=10, stop=40, every=10)[2]
     assert isinstance(densifier, Densifier)
     assert [t for t in range(60) if densifier.due(t)] == [20, 30]
     assert dict(densifier.marks) == {"densify until": 40}
@@ -137,7 +137,7 @@ def test_rounds_fall_between_start_and_stop():
 
 
 def test_noise_moves_the_faint_until_stop_and_leaves_the_opaque():
-    theta, optimizer, densifier = made(noise=100.0, start=9)
+    theta, optimizer, densifier = start_of_run(noise=100.0, start=9)
     theta.opacities.data[:20] = -6.0
     moved = displacement(theta, optimizer, densifier).norm(dim=1)
     assert float(moved[:20].min()) > 0
@@ -148,7 +148,7 @@ def test_noise_moves_the_faint_until_stop_and_leaves_the_opaque():
 def test_noise_is_as_large_as_the_scene():
     offsets = []
     for size in (1.0, 8.0):
-        theta, optimizer, densifier = made(noise=100.0, start=9, opacity=-6.0)
+        theta, optimizer, densifier = start_of_run(noise=100.0, start=9, opacity=-6.0)
         theta.means.data *= size
         theta.scales.data += torch.tensor(size).log()
         offsets.append(displacement(theta, optimizer, densifier) / size)
@@ -156,7 +156,7 @@ def test_noise_is_as_large_as_the_scene():
 
 
 def test_noise_lies_along_the_covariance():
-    theta, optimizer, densifier = made(noise=1e3, start=9, opacity=-6.0)
+    theta, optimizer, densifier = start_of_run(noise=1e3, start=9, opacity=-6.0)
     theta.scales.data[:] = torch.tensor([0.0, -20.0, -20.0])  # needles along their first axis
     half = 0.5**0.5
     theta.quats.data[:] = torch.tensor([half, 0, 0, half])  # which a turn about z by 90 degrees lays along y
@@ -184,12 +184,12 @@ def test_a_run_resumes_to_the_bit_and_to_the_same_cap(tmp_path, monkeypatch):
     while resumed.t < 13:
         iterate(resumed, toy.RASTERIZER)
     assert resumed.density.cap == whole.density.cap == 2 * n
-    expected, found = tensors(whole), tensors(resumed)
-    assert not [name for name in expected if not torch.equal(found[name], expected[name])]
+    expected, result = tensors(whole), tensors(resumed)
+    assert not [name for name in expected if not torch.equal(result[name], expected[name])]
 
 
 def test_too_few_live_gaussians_and_numbers_that_are_not_finite_are_errors():
-    theta, optimizer, densifier = made(opacity=DEAD, min_gaussians=5)
+    theta, optimizer, densifier = start_of_run(opacity=DEAD, min_gaussians=5)
     theta.opacities.data[:3] = 0
     with pytest.raises(DensityError, match=r"3 of 60 Gaussians .* fewer than min_gaussians=5"):
         step(theta, optimizer, densifier)

@@ -16,7 +16,7 @@ def grey(values: Tensor) -> Tensor:
     return values[..., None].expand(-1, -1, 3).float()
 
 
-def of(known: Tensor, image: Tensor | None = None) -> Tensor:
+def complete(known: Tensor, image: Tensor | None = None) -> Tensor:
     return completed(known, torch.ones(H, W), grey(torch.full((H, W), 0.5)) if image is None else image)
 
 
@@ -24,7 +24,7 @@ def test_a_plane_is_completed_inside_and_continued_outside() -> None:
     known = PLANE.clone()
     known[8:16, 10:20] = torch.nan
     known[:, 26:] = torch.nan
-    error = (of(known) / PLANE - 1).abs()
+    error = (complete(known) / PLANE - 1).abs()
     assert error[:, :26].max() < 1e-3
     assert error.max() < 0.03
 
@@ -34,9 +34,9 @@ def test_two_surfaces_meet_where_the_colour_changes() -> None:
     image = grey(right.double())
     known = torch.where(right, 1.0, 0.2).double()
     known[:, 6:26] = torch.nan  # the edge itself is not known
-    found = of(known, image)
-    assert (found[:, :17] - 0.2).abs().max() < 0.01
-    assert (found[:, 19:] - 1.0).abs().max() < 0.01
+    result = complete(known, image)
+    assert (result[:, :17] - 0.2).abs().max() < 0.01
+    assert (result[:, 19:] - 1.0).abs().max() < 0.01
 
 
 def test_an_outlier_does_not_count() -> None:
@@ -44,12 +44,12 @@ def test_an_outlier_does_not_count() -> None:
     known[U % 3 > 0] = torch.nan
     wrong = known.clone()
     wrong[12, 15] = 3.0
-    assert (of(wrong) - of(known)).abs().max() < 0.01
+    assert (complete(wrong) - complete(known)).abs().max() < 0.01
 
 
 def test_one_known_pixel_is_the_depth_of_all_of_a_photo_of_any_size() -> None:
     for h, w in ((1, 1), (1, 2), (2, 2), (2, 5), (H, W)):
         known = torch.full((h, w), torch.nan, dtype=torch.float64)
         known[h // 2, w // 2] = 0.25
-        found = completed(known, torch.ones(h, w), torch.rand(h, w, 3))
-        assert torch.allclose(found, torch.tensor(0.25, dtype=torch.float64), rtol=1e-6)
+        result = completed(known, torch.ones(h, w), torch.rand(h, w, 3))
+        assert torch.allclose(result, torch.tensor(0.25, dtype=torch.float64), rtol=1e-6)

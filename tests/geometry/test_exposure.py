@@ -77,8 +77,8 @@ def test_the_reliability_of_a_brightened_view_is_that_of_its_brightened_images()
     moved = replace(view.hr, image=images.back_projected(view.hr.image, view.lr.image, 4, 10))
     gain = torch.tensor([0.5, 0.6, 0.7])
     stored = replace(view, hr=moved, disagreement=differed).brightened(gain)
-    found, expected = (P2G(patch=8).patch_maps(v).reliability for v in (stored, view.brightened(gain)))
-    assert torch.allclose(found, expected, atol=0.05)  # up to rounding to 8 bits
+    result, expected = (P2G(patch=8).patch_maps(v).reliability for v in (stored, view.brightened(gain)))
+    assert torch.allclose(result, expected, atol=0.05)  # up to rounding to 8 bits
 
 
 def test_with_many_photos_each_is_compared_with_twelve(monkeypatch):

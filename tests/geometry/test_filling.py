@@ -48,22 +48,16 @@ def test_points_hidden_behind_a_surface_do_not_bend_it() -> None:
     assert torch.allclose(new[:, 2], torch.tensor(5.0), atol=1e-4)
 
 
-def test_the_background_gets_no_points() -> None:
-    view = photo()
-    image = view.image.clone()
-    image[:, :30] = 1.0
+def test_the_background_and_what_a_mask_hides_get_no_points() -> None:
+    view, left = photo(), torch.arange(40).expand(40, 40) < 30
+    white = replace(view, image=torch.where(left[..., None], 1.0, view.image))
+    hiding = replace(view, shown=~left)
     points = cloud_of(torch.randn(200, 3) * 0.4 + torch.tensor([0, 0, 5.0]))
-    new = densify(points, [replace(view, image=image)], 1, background=(1.0, 1.0, 1.0)).means[200:]
-    assert len(new) == 10 * 40
-    assert bool((project(view.camera, new)[0][:, 0] > 30).all())
-
-
-def test_what_a_mask_hides_gets_no_points() -> None:
-    view = replace(photo(), shown=torch.arange(40).expand(40, 40) >= 30)
-    points = cloud_of(torch.randn(200, 3) * 0.4 + torch.tensor([0, 0, 5.0]))
-    new = densify(points, [view, photo()], 1).means[200:]
-    assert len(new) == 10 * 40 + 40 * 40
-    assert bool((project(view.camera, new[:400])[0][:, 0] > 30).all())
+    for seen, background in ((white, (1.0, 1.0, 1.0)), (hiding, None)):
+        new = densify(points, [seen], 1, background).means[200:]
+        assert len(new) == 10 * 40
+        assert bool((project(view.camera, new)[0][:, 0] > 30).all())
+    assert len(densify(points, [hiding, view], 1)) == 200 + 10 * 40 + 40 * 40
 
 
 def test_points_on_a_line_are_enough() -> None:

@@ -20,7 +20,7 @@ from tests.helpers.planes import plane_photos, same_maps
 QUICK = StereoSettings(enlarge=1, max_planes=32)
 
 
-def of(photos: Sequence[Photo], **settings: Any) -> Stereo:
+def reconstruct(photos: Sequence[Photo], **settings: Any) -> Stereo:
     return stereo(**{**arguments(photos), **settings})
 
 
@@ -39,8 +39,8 @@ def same(a: Stereo, b: Stereo) -> bool:
 
 
 @pytest.fixture(scope="module")
-def found() -> Stereo:
-    return of(plane_photos(3, 64, 48))
+def plane() -> Stereo:
+    return reconstruct(plane_photos(3, 64, 48))
 
 
 def without(monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
@@ -54,31 +54,32 @@ def test_the_cloud_of_the_demo_is_the_trainers_to_the_bit(fill: bool) -> None:
     photos = [Photo(frame.camera, frame.load()) for frame in frames]
     trained = initial_points(CloudSettings(init="stereo", densify=fill), photos)
     assert same(
-        of(photos, settings=None, fill=fill), Stereo(trained.depths, trained.cloud.means, trained.cloud.colors, "")
+        reconstruct(photos, settings=None, fill=fill),
+        Stereo(trained.depths, trained.cloud.means, trained.cloud.colors, ""),
     )
 
 
-def test_means_lie_on_the_plane_and_the_summary_says_how_much_is_known(found: Stereo) -> None:
-    assert ((found.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.9
-    assert found.colors.min() >= 0
-    assert found.colors.max() <= 1
-    shares = ", ".join(f"{depth.coverage:.0%}" for depth in found.depths)
-    assert found.summary.startswith(f"{len(found.means):,} points in all: ")
-    assert f"between the 3 photos (depth known at {shares}), filled by " in found.summary
-    assert "without" not in found.summary
+def test_means_lie_on_the_plane_and_the_summary_says_how_much_is_known(plane: Stereo) -> None:
+    assert ((plane.means[:, 2] / 4 - 1).abs() < 0.03).float().mean() > 0.9
+    assert plane.colors.min() >= 0
+    assert plane.colors.max() <= 1
+    shares = ", ".join(f"{depth.coverage:.0%}" for depth in plane.depths)
+    assert plane.summary.startswith(f"{len(plane.means):,} points in all: ")
+    assert f"between the 3 photos (depth known at {shares}), filled by " in plane.summary
+    assert "without" not in plane.summary
 
 
 def test_one_tensor_is_a_list_of_photos_and_uint8_is_divided_by_255() -> None:
     photos = plane_photos(2, 64, 48)
     eight = [(photo.image * 255).round().to(torch.uint8) for photo in photos]
-    listed = of(photos, images=[image.float() / 255 for image in eight])
-    assert same(of(photos, images=torch.stack(eight)), listed)
-    assert same(of(photos, images=eight), listed)
+    listed = reconstruct(photos, images=[image.float() / 255 for image in eight])
+    assert same(reconstruct(photos, images=torch.stack(eight)), listed)
+    assert same(reconstruct(photos, images=eight), listed)
 
 
 def test_given_features_take_the_place_of_triangulated_ones() -> None:
     behind = torch.rand(30, 3, generator=torch.Generator().manual_seed(0)) * 0.1 - torch.tensor([0.0, 0, 5])
-    given = of(plane_photos(3, 64, 48), features=(behind, torch.ones(30, 3)), fill=False)
+    given = reconstruct(plane_photos(3, 64, 48), features=(behind, torch.ones(30, 3)), fill=False)
     kept = (given.means[:, 2] < 0).nonzero()[:, 0]  # no photo sees them, so they stay
     assert len(kept) > 20
     assert (given.colors[kept] == 1).all()
@@ -89,7 +90,7 @@ def test_pixels_of_the_background_get_no_points() -> None:
     photos = plane_photos(3, 64, 48)
     for photo in photos:
         photo.image[:10] = 1.0
-    assert not any(depth.known[:10].any() for depth in of(photos, background=(1, 1, 1)).depths)
+    assert not any(depth.known[:10].any() for depth in reconstruct(photos, background=(1, 1, 1)).depths)
 
 
 @pytest.mark.parametrize("fill", [True, False])
@@ -97,16 +98,16 @@ def test_hidden_pixels_give_no_points_and_their_colours_do_not_matter(fill: bool
     photos = plane_photos(3, 64, 48)
     masks = [torch.ones(48, 64), None, torch.ones(48, 64)]
     masks[0][:, :32] = masks[2][20:] = 0
-    found = of(photos, masks=masks, fill=fill)
-    assert not found.depths[0].known[:, :32].any()
-    assert not found.depths[2].known[20:].any()
-    assert found.depths[0].known[:, 32:].any()
+    result = reconstruct(photos, masks=masks, fill=fill)
+    assert not result.depths[0].known[:, :32].any()
+    assert not result.depths[2].known[20:].any()
+    assert result.depths[0].known[:, 32:].any()
     photos[0].image[:, :32], photos[2].image[20:] = 0.3, torch.rand(28, 64, 3)
-    assert same(of(photos, masks=masks, fill=fill), found)
-    everywhere = of(photos, masks=[None] * 3, fill=fill)
-    assert same(everywhere, of(photos, fill=fill))
+    assert same(reconstruct(photos, masks=masks, fill=fill), result)
+    everywhere = reconstruct(photos, masks=[None] * 3, fill=fill)
+    assert same(everywhere, reconstruct(photos, fill=fill))
     with pytest.raises(DataError, match="confirms no depth"):
-        of(photos, masks=[torch.zeros(48, 64)] * 3, fill=fill)
+        reconstruct(photos, masks=[torch.zeros(48, 64)] * 3, fill=fill)
 
 
 def test_no_filled_point_is_hidden_in_the_only_photo_that_sees_it() -> None:
@@ -114,33 +115,33 @@ def test_no_filled_point_is_hidden_in_the_only_photo_that_sees_it() -> None:
     masks = [torch.ones(48, 64, dtype=torch.bool) for _ in photos]
     for mask in masks:
         mask[30:] = False
-    found = of(photos, masks=masks)
-    rows = found.means[:, 1] / found.means[:, 2] * photos[0].camera.fy + photos[0].camera.cy
-    assert "filled by" in found.summary
+    result = reconstruct(photos, masks=masks)
+    rows = result.means[:, 1] / result.means[:, 2] * photos[0].camera.fy + photos[0].camera.cy
+    assert "filled by" in result.summary
     assert float(rows.max()) <= 30
-    assert float(of(photos).means[:, 1].max()) > float(found.means[:, 1].max())
+    assert float(reconstruct(photos).means[:, 1].max()) > float(result.means[:, 1].max())
 
 
 def test_without_opencv_and_kornia_the_cameras_give_the_range(monkeypatch, caplog):
     without(monkeypatch, "cv2", "kornia")
-    found = of(plane_photos(3, 64, 48))
-    assert all(depth.coverage > 0.4 for depth in found.depths)
-    assert "no triangulated features without opencv-contrib-python-headless, kornia" in found.summary
+    result = reconstruct(plane_photos(3, 64, 48))
+    assert all(depth.coverage > 0.4 for depth in result.depths)
+    assert "no triangulated features without opencv-contrib-python-headless, kornia" in result.summary
     (line,) = [record.message for record in caplog.records if "features" in record.message]
     assert line.endswith("pip install 'clear-strategies[train]'")
 
 
 def test_without_scipy_nothing_is_filled_or_removed(monkeypatch, caplog):
     without(monkeypatch, "scipy")
-    found = of(plane_photos(3, 64, 48))
-    assert len(found.means) > 500
-    assert "neither cleaned nor filled without scipy" in found.summary
+    result = reconstruct(plane_photos(3, 64, 48))
+    assert len(result.means) > 500
+    assert "neither cleaned nor filled without scipy" in result.summary
     assert sum("nothing is filled without scipy" in record.message for record in caplog.records) == 1
 
 
-def test_depth_maps_alone_are_those_of_stereo(found: Stereo) -> None:
+def test_depth_maps_alone_are_those_of_stereo(plane: Stereo) -> None:
     maps = depth_maps(plane_photos(3, 64, 48), settings=QUICK)
-    assert same(found, Stereo(tuple(maps), found.means, found.colors, ""))
+    assert same(plane, Stereo(tuple(maps), plane.means, plane.colors, ""))
 
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
@@ -173,9 +174,9 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 def test_what_cannot_be_used_is_refused_with_a_remedy(case: str) -> None:
     changed, message = REFUSED[case]
     with pytest.raises(DataError, match=message):
-        of(plane_photos(2, 64, 48), **changed)
+        reconstruct(plane_photos(2, 64, 48), **changed)
 
 
 def test_a_background_must_be_a_colour() -> None:
     with pytest.raises(SettingError, match="background: must be three numbers"):
-        of(plane_photos(2, 64, 48), background=(255, 255, 255))
+        reconstruct(plane_photos(2, 64, 48), background=(255, 255, 255))

@@ -52,8 +52,8 @@ def test_of_too_many_features_the_strongest_are_taken() -> None:
     some = find_features(photo, TriangulationSettings(max_features=50))
     assert 50 <= len(some.pixels) < len(every.pixels)  # OpenCV keeps all that are as strong as the last
     assert len(some.pixels) < 60
-    found = {tuple(pixel) for pixel in every.pixels.tolist()}
-    assert all(tuple(pixel) in found for pixel in some.pixels.tolist())
+    result = {tuple(pixel) for pixel in every.pixels.tolist()}
+    assert all(tuple(pixel) in result for pixel in some.pixels.tolist())
 
 
 def test_with_many_photos_each_is_matched_with_a_few(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,8 +120,8 @@ def test_triangulation_inverts_projection(point: tuple[float, float, float], tur
     a, b = camera(0), Camera(turned, 90.0, 110.0, 40.0, 60.0, 100, 100)
     world = torch.tensor([point], dtype=torch.float64)
     (x, _), (y, _) = project(a, world), project(b, world)
-    found, _, _ = triangulate_pair(a, b, x, y, TriangulationSettings())
-    assert torch.allclose(found, world, atol=1e-5)
+    result, _, _ = triangulate_pair(a, b, x, y, TriangulationSettings())
+    assert torch.allclose(result, world, atol=1e-5)
 
 
 @pytest.mark.parametrize("center", [(30.5, 20.5), (31.0, 22.0), (40.3, 30.7)])
@@ -131,8 +131,8 @@ def test_a_blob_is_found_at_its_centre(center: tuple[float, float], enlarge: int
     y, x = torch.meshgrid(torch.arange(60) + 0.5, torch.arange(80) + 0.5, indexing="ij")
     blob = torch.exp(-((x - center[0]) ** 2 + (y - center[1]) ** 2) / 8)
     view = Photo(camera(0, 80, 60), blob[..., None].expand(60, 80, 3))
-    found = find_features(view, TriangulationSettings(enlarge=enlarge)).pixels
-    assert torch.linalg.vector_norm(found - torch.tensor(center), dim=1).min() < 0.05
+    result = find_features(view, TriangulationSettings(enlarge=enlarge)).pixels
+    assert torch.linalg.vector_norm(result - torch.tensor(center), dim=1).min() < 0.05
 
 
 def features(*descriptors: tuple[float, ...]) -> Features:

@@ -165,11 +165,11 @@ def test_without_strategies_it_is_autograd_of_the_summed_loss(hf, lambda_lr, lr_
     conductor = Conductor(objective=objective)
     lr, hr = field.render_scales(toy.RASTERIZER, view, lr=conductor.wants_lr, hr=conductor.wants_hr(5))
     assert (lr is None) == (lr_from == "hr" or lambda_lr == 0)
-    found = conductor.update(field.raw(), lr, hr, view, 5).grads
+    result = conductor.update(field.raw(), lr, hr, view, 5).grads
     expected = autograd_of_the_summed_loss(field, view, objective, 1.0)
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         scale = float(expected[name].abs().max())
-        assert torch.allclose(found[name], expected[name], atol=1e-9 * scale, rtol=1e-7), name
+        assert torch.allclose(result[name], expected[name], atol=1e-9 * scale, rtol=1e-7), name
 
 
 def test_a_reduced_lr_image_counts_for_densification_in_ndc_as_a_drawn_one_does(drawn):

@@ -34,14 +34,14 @@ def test_values_worked_out_by_hand_which_reliability_softens_down_to_the_lower_b
     # l = (1, 0, 0), h = (-3, 4, 0): c = -3/5, d = -3 + 0.05·5 = -2.75, s = (0.6 - 0.05) / 0.95.
     l, h = torch.tensor([1.0, 0, 0]), torch.tensor([-3.0, 4, 0])
     step = None if q is None else toy.step(evidence=Evidence(torch.tensor([q]), torch.tensor([1.0])))
-    found = GCO().correct(grads("means", l), grads("means", h), step)["means"][0]
-    assert found.tolist() == pytest.approx([-3 + omega * 2.75, 4, 0], rel=1e-6)
+    result = GCO().correct(grads("means", l), grads("means", h), step)["means"][0]
+    assert result.tolist() == pytest.approx([-3 + omega * 2.75, 4, 0], rel=1e-6)
 
 
 def test_opposite_gradients_are_corrected_up_to_the_upper_bound():
-    found = GCO().correct(Grads({"opacities": torch.tensor([2.0])}), Grads({"opacities": torch.tensor([-1.0])}), None)
+    result = GCO().correct(Grads({"opacities": torch.tensor([2.0])}), Grads({"opacities": torch.tensor([-1.0])}), None)
     # c = -1, s = 1 -> ω = 0.75; d = -2 + 0.05·2 = -1.9; -1 + 0.75·1.9/4·2
-    assert float(found["opacities"]) == pytest.approx(-1 + 0.75 * 1.9 / 2, rel=1e-6)
+    assert float(result["opacities"]) == pytest.approx(-1 + 0.75 * 1.9 / 2, rel=1e-6)
 
 
 @given(seed=st.integers(0, 10_000), tolerance=st.floats(0, 0.9))
@@ -63,40 +63,40 @@ def test_full_correction_lands_on_the_margin(seed, tolerance):
 def test_only_conflicts_change_and_then_help_lr_without_lengthening_the_gradient(seed):
     lr, hr = random_pair(seed)
     before = {name: value.clone() for name, value in lr.items()}
-    found = GCO().correct(lr, hr, None)
+    result = GCO().correct(lr, hr, None)
     for group in CONFLICT_GROUPS:
         c = dot(lr[group], hr[group]) / (dot(lr[group], lr[group]).sqrt() * dot(hr[group], hr[group]).sqrt())
         calm = c >= -0.05 + 1e-9
-        assert torch.equal(found[group][calm], hr[group][calm])
+        assert torch.equal(result[group][calm], hr[group][calm])
         assert torch.equal(lr[group], before[group])
-        assert (dot(found[group], lr[group]) >= dot(hr[group], lr[group]) - 1e-6).all()
-        assert (dot(found[group], found[group]) <= dot(hr[group], hr[group]) * (1 + 1e-6)).all()
+        assert (dot(result[group], lr[group]) >= dot(hr[group], lr[group]) - 1e-6).all()
+        assert (dot(result[group], result[group]) <= dot(hr[group], hr[group]) * (1 + 1e-6)).all()
 
 
 @given(seed=st.integers(0, 1_000), i=st.integers(-60, 60), j=st.integers(-60, 60))
 @settings(max_examples=60, deadline=None)
 def test_decisions_do_not_change_when_a_loss_is_scaled_by_a_power_of_two(seed, i, j):
     lr, hr = random_pair(seed, n=50)
-    found = GCO().correct(lr, hr, None)
+    result = GCO().correct(lr, hr, None)
     scaled = GCO().correct(lr * 2.0**i, hr * 2.0**j, None)
     for group in CONFLICT_GROUPS:
-        assert torch.equal(scaled[group], found[group] * 2.0**j), group
+        assert torch.equal(scaled[group], result[group] * 2.0**j), group
 
 
 def test_zero_gradients_are_no_conflict():
     zero, some = torch.zeros(3), torch.tensor([1.0, 2, 3])
     for l, h in ((zero, some), (some, zero), (zero, zero)):
-        found = GCO().correct(grads("means", l), grads("means", h), None)["means"]
-        assert torch.equal(found[0], h)
-        assert found.isfinite().all()
+        result = GCO().correct(grads("means", l), grads("means", h), None)["means"]
+        assert torch.equal(result[0], h)
+        assert result.isfinite().all()
 
 
 def test_rotation_noise_of_isotropic_gaussians_is_gated():
     lr, hr = random_pair(5, norm_lr=1e-6, norm_hr=1e-6)
     lr["quats"], hr["quats"] = lr["quats"] * 1e-7, hr["quats"] * 1e-7
     gco = GCO()
-    found = gco.correct(lr, hr, None)
-    assert torch.equal(found["quats"], hr["quats"])
+    result = gco.correct(lr, hr, None)
+    assert torch.equal(result["quats"], hr["quats"])
     assert gco.logs["corrected_quats"] == 0
     assert gco.logs["corrected_scales"] > 0
 

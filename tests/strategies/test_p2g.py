@@ -64,9 +64,9 @@ def test_lifting_takes_the_patch_of_the_centre_and_the_border_outside():
     patches = torch.tensor([[[0.1, 0.2], [0.3, 0.4]], [[1.0, 2.0], [3.0, 4.0]]])
     u = torch.tensor([[0.0, 0.0], [15.9, 15.9], [16.0, 0.0], [3.0, 20.0], [-50.0, 40.0], [99.0, 99.0], [20.0, 20.0]])
     visible = torch.tensor([True] * 6 + [False])
-    found, second = lift(patches, u, visible, 16)
-    assert second.tolist() == pytest.approx([10 * value for value in found.tolist()])
-    assert found.tolist() == pytest.approx([0.1, 0.1, 0.2, 0.3, 0.3, 0.4, 0.0])
+    result, second = lift(patches, u, visible, 16)
+    assert second.tolist() == pytest.approx([10 * value for value in result.tolist()])
+    assert result.tolist() == pytest.approx([0.1, 0.1, 0.2, 0.3, 0.3, 0.4, 0.0])
 
 
 @given(q=st.floats(0, 1, width=32), a=st.floats(0, 1, width=32), floor=st.floats(0, 1))

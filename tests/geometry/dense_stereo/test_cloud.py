@@ -38,11 +38,11 @@ def test_what_two_photos_see_gets_its_points_once() -> None:
 
 def test_the_most_confident_pixel_of_a_square_is_taken() -> None:
     view = photo()
-    found = flat(view, 5.0)
-    found.confidence[:] = 0.5
-    found.depth[1::2, 1::2] = 7.0
-    found.confidence[1::2, 1::2] = 0.6
-    assert (points_of([view], [found], 2.0, 0.02)[0][:, 2] == 7).all()
+    result = flat(view, 5.0)
+    result.confidence[:] = 0.5
+    result.depth[1::2, 1::2] = 7.0
+    result.confidence[1::2, 1::2] = 0.6
+    assert (points_of([view], [result], 2.0, 0.02)[0][:, 2] == 7).all()
 
 
 def test_only_unknown_pixels_are_filled_and_never_in_known_free_space() -> None:

@@ -25,12 +25,12 @@ def photos_of(surface: Surface, count: int = 3, size: tuple[int, int] = (64, 48)
 
 @pytest.mark.parametrize("surface", [slanted, bump])
 def test_depth_of_a_known_surface_is_found_from_the_cameras_alone(surface: Surface) -> None:
-    for i, found in enumerate(depth_maps(photos_of(surface), NONE, QUICK)):
+    for i, result in enumerate(depth_maps(photos_of(surface), NONE, QUICK)):
         exact = cast(surface, camera(0.4 * i - 0.4, 4 * (i - 1)))[1]
-        error = (found.depth / exact - 1).abs()[found.known]
-        assert torch.equal(found.depth.isnan(), ~found.known)
-        assert 0 <= float(found.confidence.min()) <= float(found.confidence.max()) <= 1
-        assert found.coverage > 0.5
+        error = (result.depth / exact - 1).abs()[result.known]
+        assert torch.equal(result.depth.isnan(), ~result.known)
+        assert 0 <= float(result.confidence.min()) <= float(result.confidence.max()) <= 1
+        assert result.coverage > 0.5
         assert error.median() < 0.012
         assert (error < 0.03).float().mean() > 0.97
 
@@ -48,33 +48,33 @@ def test_photos_are_scored_by_some_of_many_points(monkeypatch) -> None:
 def test_the_bits_do_not_depend_on_the_number_of_threads() -> None:
     photos, threads = photos_of(bump, 2, (200, 170)), torch.get_num_threads()
     settings = StereoSettings(max_planes=8, speckle=0)  # so few planes give speckles alone
-    found = []
+    result = []
     try:
         for count in (1, 2):
             torch.set_num_threads(count)
-            found.append(depth_maps(photos, NONE, settings))
+            result.append(depth_maps(photos, NONE, settings))
     finally:
         torch.set_num_threads(threads)
-    assert found[0][0].coverage > 0
-    assert same_maps(*found)
+    assert result[0][0].coverage > 0
+    assert same_maps(*result)
 
 
 def test_photos_may_have_different_odd_sizes() -> None:
     sizes = [(64, 48), (51, 37), (90, 75)]
     photos = [cast(slanted, camera(0.4 * i - 0.4, 4 * (i - 1), size))[0] for i, size in enumerate(sizes)]
-    for photo, found in zip(photos, depth_maps(photos, NONE, QUICK), strict=True):
-        assert found.depth.shape == photo.image.shape[:2]
-        assert found.coverage > 0.3
+    for photo, result in zip(photos, depth_maps(photos, NONE, QUICK), strict=True):
+        assert result.depth.shape == photo.image.shape[:2]
+        assert result.coverage > 0.3
 
 
 @pytest.mark.parametrize("changed", [{"enlarge": 2, "max_planes": 48}, {"max_pixels": 800}])
 def test_compared_images_may_be_larger_or_smaller_than_the_photos(changed: dict[str, int]) -> None:
     photos = photos_of(slanted, size=(65, 49))
-    for i, found in enumerate(depth_maps(photos, NONE, StereoSettings(**changed))):
+    for i, result in enumerate(depth_maps(photos, NONE, StereoSettings(**changed))):
         exact = cast(slanted, camera(0.4 * i - 0.4, 4 * (i - 1), (65, 49)))[1]
-        assert found.depth.shape == exact.shape
-        assert found.coverage > 0.3
-        assert (found.depth / exact - 1).abs()[found.known].median() < 0.02
+        assert result.depth.shape == exact.shape
+        assert result.coverage > 0.3
+        assert (result.depth / exact - 1).abs()[result.known].median() < 0.02
 
 
 FLAT = [replace(p, image=torch.full_like(p.image, 0.5)) for p in photos_of(slanted)]
@@ -94,7 +94,7 @@ SEEN_BY_BOTH = torch.rand(50, 3) * 0.2 + torch.tensor([-0.1, -0.1, 3.9])
 )
 def test_photos_that_tell_no_depth_have_none_and_the_log_says_why(photos, points, reason, caplog):
     caplog.set_level("DEBUG")
-    assert all(found.coverage == 0 for found in depth_maps(photos, points, QUICK))
+    assert all(result.coverage == 0 for result in depth_maps(photos, points, QUICK))
     assert reason in caplog.text
 
 
@@ -131,8 +131,8 @@ def map_with_islands() -> torch.Tensor:
 
 @pytest.mark.parametrize(("fewest", "count"), [(0, 0), (1, 0), (2, 1), (4, 1), (5, 5), (1000, 97)])
 def test_islands_of_fewer_pixels_are_found(fewest: int, count: int) -> None:
-    found = speckles(map_with_islands(), fewest, 0.05)
-    assert int(found.sum()) == count
+    result = speckles(map_with_islands(), fewest, 0.05)
+    assert int(result.sum()) == count
 
 
 def test_what_is_alike_depends_on_the_ratio_of_depths_alone() -> None:
