@@ -89,8 +89,8 @@ REFUSED: dict[Callable[..., object], dict[str, object]] = {
     SplatSuRe: {"ratio": 0.9, "softness": 0.0, "min_views": 0},
     GCO: {"groups": (), "weight_min": 0.9},
     P2G: {"reliability_scale": "relative:0"},
-    WarmupDecay: {"start": 4_000, "peak": -1.0, "decay": "steep"},
-    Ramp: {"maximum": 1.0, "shape": "steep"},
+    WarmupDecay: {"start": 4_000, "peak": -1.0},
+    Ramp: {"maximum": 1.0},
     LogLinear: {"initial": 0.0, "final": 101.0},
 }  # fmt: skip
 
