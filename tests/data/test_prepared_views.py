@@ -79,7 +79,7 @@ def test_how_far_a_back_projected_sr_image_was_from_its_photo_is_kept():
         ("both", 1_000, [7], (32, 24)),
         ("both", 400, [7], (21, 16)),
         ("both", 200, [5], (16, 12)),
-        ("hr", 250_000, [7, 5], (16, 12)),  # SR images, then the LR photos whose depth they complete
+        ("hr", 250_000, [5, 7], (16, 12)),  # the LR photos, then the SR images that complete their depth
     ],
 )
 def test_depth_is_that_of_the_hr_side_where_it_is_photos_and_else_of_lr(

@@ -1,6 +1,6 @@
-"""The initial cloud: the points that training starts from. `CloudSettings` lists the choices, `initial_points` makes it.
+"""The initial cloud: the points that training starts from. `CloudSettings` has the choices, `initial_points` makes the cloud.
 
-Every cloud says where its points came from, and whether test views were used for them.
+`PointCloud.source` and `PointCloud.uses_test_views` record where the points come from.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from clear_strategies.core.checks import refuse, require_choice, require_number,
 from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.core.view import DepthMap, Photo
 from clear_strategies.data.capture import SfmPoints
-from clear_strategies.data.points.compared import blackened, compared_at
+from clear_strategies.data.points.compared import blackened, compared_at, shown_pixels
 from clear_strategies.data.points.sources import from_ply, from_sfm, from_tracks, random_cloud
 from clear_strategies.errors import DataError
 from clear_strategies.geometry.cleaning import OUTLIER_NEIGHBOURS, OUTLIER_RATIO, voxel_grid, without_outliers
@@ -115,11 +115,7 @@ def require_source(settings: CloudSettings, sfm: SfmPoints | None) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InitialPoints:
-    """The initial cloud, and the depth maps that it was made of.
-
-    Args:
-        depths: one for each photo, or none where stereo was not asked.
-    """
+    """The initial cloud, and the depth maps that stereo made it from, one for each photo; without stereo none."""
 
     cloud: PointCloud
     depths: tuple[DepthMap, ...] = ()
@@ -137,124 +133,117 @@ def initial_points(
     background: Color | None = None,
     seed: int = 0,
 ) -> InitialPoints:
-    """The cloud a run starts from.
+    """The cloud that training starts from.
 
     Args:
         photos: the training views at LR.
-        hr: the same at HR, see `CloudSettings.compare`; none: stereo compares `photos`.
-        hr_is_photo: these are photos, not SR images.
-        sfm: the scene's SfM points, if it has some.
+        hr: the same views at HR, see `CloudSettings.compare`; empty: stereo compares `photos`.
+        hr_is_photo: the HR images are photos, not SR images.
+        sfm: the scene's SfM points; None: it has none.
         train_ids: their ids of the training frames.
-        sfm_is_train: every photo of the capture trains, so that init=auto may use the SfM points in place of triangulating.
+        sfm_is_train: every photo of the capture is a training view, so init=auto may take the SfM points as features.
         background: the colour of pixels without a surface (Blender's white), RGB in [0, 1].
 
     Raises:
         DataError: the scene cannot give this cloud.
     """
     require_source(settings, sfm)
-    depths: tuple[DepthMap, ...] = ()
+    initial: InitialPoints | None = None
     match settings.init:
-        case "random":
-            cloud = None
         case "ply":
-            cloud = _cleaned(settings, from_ply(Path(str(settings.path))), photos, background)
+            initial = _cleaned(settings, from_ply(Path(str(settings.path))), photos, background)
         case "sfm" if sfm is not None:
-            cloud = _cleaned(settings, from_sfm(sfm), photos, background)
+            initial = _cleaned(settings, from_sfm(sfm), photos, background)
         case "sfm_train" if sfm is not None:
-            cloud = _cleaned(settings, from_tracks(sfm, train_ids, settings.min_views), photos, background)
-        case _:
-            known = _of_training_alone(settings, sfm, train_ids) if sfm_is_train else None
-            cloud, depths = _from_photos(settings, photos, hr, hr_is_photo, sfm, known, background)
-    if cloud is None:
-        cloud = random_cloud(photos, settings.random_points, seed, settings.box)
+            initial = _cleaned(settings, from_tracks(sfm, train_ids, settings.min_views), photos, background)
+        case "triangulated":
+            visible = [blackened(photo) for photo in photos]
+            features = triangulate(visible, settings.triangulation)
+            if len(features) == 0:
+                problem = f"none could be triangulated from the {len(photos)} training LR images"
+                raise DataError("scene", "points", problem, "use init=random, or more or closer views")
+            initial = _cleaned(settings, features, visible, background)
+        case "stereo" | "auto":
+            known = _sfm_of_training_views(settings, sfm, train_ids) if sfm_is_train else None
+            if settings.init == "auto" and sfm is not None and known is None:
+                _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
+            initial = _from_depth(settings, photos, hr, hr_is_photo, known, background)
+    cloud = random_cloud(photos, settings.random_points, seed, settings.box) if initial is None else initial.cloud
     if settings.voxel is not None:
         means, colors = voxel_grid(cloud.means, cloud.colors, settings.voxel)
         cloud = replace(cloud, means=means, colors=colors, source=f"{cloud.source}, in voxels of {settings.voxel:g}")
     if len(cloud) > settings.max_points:
         _log.debug("%d of %d points chosen at random (max_points).", settings.max_points, len(cloud))
-    return InitialPoints(cloud.at_most(settings.max_points, seed), depths)
+    return InitialPoints(cloud.at_most(settings.max_points, seed), () if initial is None else initial.depths)
 
 
-def _of_training_alone(settings: CloudSettings, sfm: SfmPoints | None, train_ids: Sequence[int]) -> PointCloud | None:
-    """For init=auto, the SfM points of a capture that has no other photos than the training views; None: too few."""
+def _sfm_of_training_views(
+    settings: CloudSettings, sfm: SfmPoints | None, train_ids: Sequence[int]
+) -> PointCloud | None:
+    """For init=auto, the SfM points of a capture whose photos are all training views; None: fewer than `settings.enough`."""
     if settings.init != "auto" or sfm is None or len(sfm.means) == 0:
         return None
     try:
         cloud = from_tracks(sfm, train_ids, settings.min_views) if len(sfm.track_point) else from_sfm(sfm)
-    except DataError:  # none of them has two observers
+    except DataError:  # no point is observed by `min_views` frames
         return None
     return replace(cloud, uses_test_views="no") if len(cloud) >= settings.enough else None
 
 
-def _from_photos(
+def _from_depth(
     settings: CloudSettings,
     photos: Sequence[Photo],
     hr: Sequence[Photo],
     hr_is_photo: bool,
-    sfm: SfmPoints | None,
-    known: PointCloud | None,
+    features: PointCloud | None,
     background: Color | None,
-) -> tuple[PointCloud | None, tuple[DepthMap, ...]]:
-    """Points from the training LR images, and their depth maps; None where init=auto finds too few.
+) -> InitialPoints | None:
+    """init=stereo and auto: points of depth maps; where there is no depth, auto takes features, or None if these are too few.
 
     Args:
-        known: SfM points of the training views alone; with them nothing is triangulated.
+        features: points on the surfaces; None: they are triangulated.
     """
-    auto = settings.init == "auto"
     photos, hr = [blackened(photo) for photo in photos], [blackened(photo) for photo in hr]
-    if auto and sfm is not None and known is None:
-        _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
-    features = triangulate(photos, settings.triangulation) if known is None else known
-    if settings.init != "triangulated":
-        few = hr_is_photo or len(photos) <= _FEW_PHOTOS
-        compares_hr = settings.compare == "hr" or (settings.compare == "auto" and few)
-        compared = compared_at(
-            photos,
-            hr if compares_hr else (),
-            hr_is_photo=hr_is_photo,
-            settings=settings.stereo,
-            background=background or (0.0, 0.0, 0.0),
-        )
-        maps = compared.depth_maps(features.means, background)
-        cloud = stereo_cloud(
-            features,
-            compared.photos,
-            maps,
-            compared.settings,
-            background=background,
-            masks=compared.masks(compared.photos),
-            fill=settings.densify is not False,
-            stride=round(compared.finer * settings.stride),  # guessed points stay as few as at LR
-            outlier_neighbours=settings.outlier_neighbours,
-            outlier_ratio=settings.outlier_ratio,
-        )
-        if cloud is not None:
-            if auto:
-                _log.debug("init: auto chose %s.", cloud.source)
-            return cloud, tuple(maps)
-        if not auto:
-            problem = f"stereo confirms no depth in any of the {len(photos)} training LR images"
-            raise DataError("scene", "points", problem, "use init=triangulated or random, or closer views")
-        _log.debug("init: stereo confirms no depth in any of the %d training LR images.", len(photos))
-    elif len(features) == 0:
-        problem = f"none could be triangulated from the {len(photos)} training LR images"
-        raise DataError("scene", "points", problem, "use init=random, or more or closer views")
-    if auto and len(features) < settings.enough:
-        message = "init: auto chose random points: the training LR images give only %d (data.cloud.enough: %d)."
-        _log.warning(message, len(features), settings.enough)
-        return None, ()
-    if auto:
-        _log.debug("init: auto chose %s.", features.source)
-    return _cleaned(settings, features, photos, background), ()
+    features = triangulate(photos, settings.triangulation) if features is None else features
+    compares_hr = settings.compare == "hr" or (
+        settings.compare == "auto" and (hr_is_photo or len(photos) <= _FEW_PHOTOS)
+    )
+    compared = compared_at(
+        photos, hr if compares_hr else (), hr_is_photo=hr_is_photo, settings=settings.stereo,
+        background=background or (0.0, 0.0, 0.0),
+    )  # fmt: skip
+    maps = compared.depth_maps(features.means, background)
+    cloud = stereo_cloud(
+        features, compared.photos, maps, compared.settings, background=background, masks=shown_pixels(compared.photos),
+        fill=settings.densify is not False,
+        stride=round(compared.finer * settings.stride),  # completed points stay as few as at LR
+        outlier_neighbours=settings.outlier_neighbours, outlier_ratio=settings.outlier_ratio,
+    )  # fmt: skip
+    none = f"stereo confirms no depth in any of the {len(photos)} training LR images"
+    if cloud is not None:
+        initial = InitialPoints(cloud, maps)
+    elif settings.init == "stereo":
+        raise DataError("scene", "points", none, "use init=triangulated or random, or closer views")
+    else:
+        _log.debug("init: %s.", none)
+        if len(features) < settings.enough:
+            message = "init: auto chose random points: the training LR images give only %d (data.cloud.enough: %d)."
+            _log.warning(message, len(features), settings.enough)
+            return None
+        initial = _cleaned(settings, features, photos, background)
+    if settings.init == "auto":
+        _log.debug("init: auto chose %s.", initial.cloud.source)
+    return initial
 
 
 def _cleaned(
     settings: CloudSettings, cloud: PointCloud, photos: Sequence[Photo], background: Color | None
-) -> PointCloud:
-    """Without outliers, and densified where `settings.densify` asks for it."""
+) -> InitialPoints:
+    """The cloud without outliers, densified where `settings.densify` asks for it."""
     cloud = without_outliers(cloud, settings.outlier_neighbours, settings.outlier_ratio)
     grid = sum(len(pixel_grid(photo, settings.stride)) for photo in photos)
     if settings.densify == "auto" and len(cloud) >= grid:
         _log.debug("densify: auto adds nothing: the cloud has %d points, the views' grids %d.", len(cloud), grid)
-        return cloud
-    return densify(cloud, photos, settings.stride, background) if settings.densify else cloud
+    elif settings.densify:
+        cloud = densify(cloud, photos, settings.stride, background)
+    return InitialPoints(cloud)

@@ -72,7 +72,7 @@ def test_sr_images_of_few_photos_only_are_compared(monkeypatch) -> None:
     monkeypatch.setattr("clear_strategies.data.points.compared.depth_maps", recorded)
     for n in (5, 6):
         initial_points(CloudSettings(init="stereo", densify=False), lr[:n], hr=hr[:n])
-    assert compared == [64, 32, 32]
+    assert compared == [32, 64, 32]
 
 
 def test_sr_images_beyond_the_limit_are_compared_at_a_whole_part_of_their_size() -> None:
