@@ -29,7 +29,7 @@ from clear_strategies.data import ply
 from clear_strategies.data.cameras import Lens
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.data.readers import colmap, colmap_binary, colmap_records, colmap_text, llff, nerfstudio
+from clear_strategies.data.readers import colmap, colmap_files, colmap_model, llff, nerfstudio
 from clear_strategies.errors import DataError
 from clear_strategies.training import checkpoint
 from tests.helpers.captures import GOOD
@@ -96,9 +96,9 @@ def binary(folder: Path) -> dict[str, Target]:
         _require(bool((found.tensors["field/means"] == 1.0).all()) and found.t == 100)
 
     return {
-        "COLMAP cameras.bin": ([cameras], lambda: _require_lenses(colmap_binary.cameras(cameras).values())),
-        "COLMAP images.bin": ([images], lambda: _require_images(colmap_binary.images(images))),
-        "COLMAP points3D.bin": ([points], lambda: _require_points(colmap_binary.points(points))),
+        "COLMAP cameras.bin": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras).values())),
+        "COLMAP images.bin": ([images], lambda: _require_images(colmap_model.read_images(images))),
+        "COLMAP points3D.bin": ([points], lambda: _require_points(colmap_model.read_points(points))),
         "poses_bounds.npy": ([bounds], lambda: _require(bool(np.isfinite(llff.read_bounds(bounds)).all()))),
         "PLY": ([cloud], read_gaussians),
         "checkpoint manifest": ([manifest], read_checkpoint),
@@ -119,9 +119,9 @@ def text(folder: Path) -> dict[str, Target]:
         _require(image.dim() == 3 and bool(image.isfinite().all()))
 
     return {
-        "COLMAP cameras.txt": ([cameras], lambda: _require_lenses(colmap_text.cameras(cameras).values())),
-        "COLMAP images.txt": ([images], lambda: _require_images(colmap_text.images(images))),
-        "COLMAP points3D.txt": ([points], lambda: _require_points(colmap_text.points(points))),
+        "COLMAP cameras.txt": ([cameras], lambda: _require_lenses(colmap_model.read_cameras(cameras).values())),
+        "COLMAP images.txt": ([images], lambda: _require_images(colmap_model.read_images(images))),
+        "COLMAP points3D.txt": ([points], lambda: _require_points(colmap_model.read_points(points))),
         "transforms.json": ([shared / "transforms.json"], lambda: _require_capture(nerfstudio.read(shared))),
         "PNG": ([photo], read_photo),
     }
@@ -154,13 +154,13 @@ def _require_lenses(lenses: Iterable[Lens]) -> None:
         _require(all(map(math.isfinite, (lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion))))
 
 
-def _require_images(images: Sequence[colmap_records.Image]) -> None:
+def _require_images(images: Sequence[colmap_files.Image]) -> None:
     for image in images:
         _require(all(map(math.isfinite, image.translation)) and 0.5 < math.hypot(*image.quat) < 2)
     _require(len({image.id for image in images}) == len(images))
 
 
-def _require_points(points: colmap_records.Points) -> None:
+def _require_points(points: colmap_model.Points) -> None:
     n = len(points.means)
     _require(bool(np.isfinite(points.means).all()) and len(points.colors) == n)
     _require(not len(points.track) or 0 <= points.track[:, 0].min() <= points.track[:, 0].max() < n)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -54,8 +54,7 @@ def read(
     model = read_model(find_model(root))
     folder = image_folder(root, images)
     listing = model.folder / f"images{model.ending}"
-    listed = cache(lambda parent: by_stem(images_in(parent)))
-    paths = {image.name: _photo(folder, image.name, listing, allow_outside, listed) for image in model.images}
+    paths = _photos(folder, [image.name for image in model.images], listing, allow_outside)
     if not any(path.is_file() for path in paths.values()):
         first = model.images[0].name
         remedy = "set data.reader.images to the folder that the model was made from"
@@ -96,11 +95,10 @@ def capture(
         "poses": f"COLMAP {_label(root, model)} ({model.ending[1:]}), {len(frames)}{some_of} images",
         "photos": folder_note(folder),
     }
-    nested = any(path.parent != folder for path in paths.values())
+    pattern = "**/*" if any(path.parent != folder for path in paths.values()) else "*"
     posed = set(paths.values())
-    if unposed := [
-        p.relative_to(folder).as_posix() for p in images_in(folder, "**/*" if nested else "*") if p not in posed
-    ]:
+    unposed = [path.relative_to(folder).as_posix() for path in images_in(folder, pattern) if path not in posed]
+    if unposed:
         notes["without pose"] = f"{len(unposed)} photos, not used: {', '.join(unposed[:8])}"
         _log.debug("%s: %d photos have no pose and are not used: %s.", root, len(unposed), ", ".join(unposed[:8]))
     notes |= lens_notes([model.lenses[image.camera] for image in kept], frames)
@@ -134,26 +132,19 @@ def _label(root: Path, model: Model) -> str:
     return model.folder.relative_to(root).as_posix() if model.folder.is_relative_to(root) else model.folder.name
 
 
-def _photo(
-    folder: Path,
-    name: str,
-    listing: Path,
-    allow_outside: bool,
-    listed: Callable[[Path], Mapping[str, Sequence[Path]]],
-) -> Path:
-    """The photo of this name, else the only one of the same stem: images_4 often holds PNG files for JPG names.
+def _photos(folder: Path, names: Sequence[str], listing: Path, allow_outside: bool) -> dict[str, Path]:
+    """The photo of each name, else the only one of the same stem: images_4 often holds PNG files for JPG names.
 
     The path of a missing photo leads to no file.
-
-    Args:
-        listed: the images of a folder by their stems.
     """
-    path = inside(folder, name, file=listing, allow_outside=allow_outside)
-    if path.is_file():
-        return path
-    twins = listed(path.parent).get(path.stem, ())
-    if len(twins) != 1:
-        return path
-    if not allow_outside:
-        inside(folder, twins[0].relative_to(folder).as_posix(), file=listing)
-    return twins[0]
+    by_stem_in = cache(lambda parent: by_stem(images_in(parent)))
+    paths = {}
+    for name in names:
+        path = inside(folder, name, file=listing, allow_outside=allow_outside)
+        twins = [] if path.is_file() else by_stem_in(path.parent).get(path.stem, [])
+        if len(twins) == 1:
+            path = twins[0]
+            if not allow_outside:
+                inside(folder, path.relative_to(folder).as_posix(), file=listing)
+        paths[name] = path
+    return paths
