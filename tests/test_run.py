@@ -120,7 +120,7 @@ def test_lr_images_are_written_for_an_external_model_whose_results_come_back(tmp
     """data.save_lr writes and stops; whatever enlarges those files is then a prior."""
     from PIL import Image
 
-    from clear_strategies.data.photo_files import list_images
+    from clear_strategies.data.photo_folders import list_images
 
     written = run("data.save_lr=lr", *TINY, cwd=tmp_path)
     assert written.returncode == 0, written.stderr

@@ -1,18 +1,19 @@
-"""Image files, read and written. What cannot be read exactly is refused, with a remedy.
+"""Image files, read and written, and their EXIF blocks. An image that cannot be read exactly is refused.
 
-The content of a file decides its kind. A truncated file is an error, not an image with a grey bottom. 16 bits stay 16
-bits. Alpha is composited over a stated background. Whether a photo is turned as its EXIF block says is for the caller to
-decide, because programs disagree on whether a camera's pose includes the turn.
+The content of a file decides its format. A truncated file is an error, not an image with a grey bottom. 16 bits stay 16 bits.
+Alpha is composited over a given background. The caller decides whether a photo is turned as its EXIF block says, because
+programs disagree on whether a camera's pose includes the turn.
 """
 
 from __future__ import annotations
 
 import io
 import logging
-import os
+import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,13 +35,16 @@ SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".heic", "
 _FORMATS: Final = ("PNG", "JPEG", "WEBP", "TIFF")
 _HEIF_BRANDS: Final = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")  # bytes 8 to 12, behind "ftyp"
 _MAX_PIXELS: Final = 100_000_000
-_FOLDERS: Final = ("images", "images_2", "images_4", "images_8")
-_LONGEST_NAME: Final = 1024
 _LARGE: Final = 1 << 24  # pixels; smaller images may be drawings, which compress without limit
 _BOMB: Final = 200
 PNG_LEVEL: Final = 3  # a third of the time of zlib's default, for 5 % more bytes
 _EXIF_ORIENTATION: Final = 0x0112
 _EXIF_PHOTO: Final = 0x8769
+_EXPOSURE_TIME: Final = 0x829A  # s
+_F_NUMBER: Final = 0x829D
+_ISO: Final = 0x8827
+_FOCAL_35MM: Final = 0xA405
+_DIAGONAL_35MM: Final = math.hypot(36, 24)  # mm
 # What makes [H, W, C] pixels upright, by their EXIF orientation.
 _TURNS: Final[dict[int, Callable[[np.ndarray], np.ndarray]]] = {
     1: lambda a: a,
@@ -69,7 +73,7 @@ def read_image(
     Args:
         background: RGB in [0, 1] behind (straight) alpha: rgb · alpha + background · (1 - alpha). None: black, logged.
         expect: (width, height) the image must have.
-        turn: an image that its EXIF block says is stored turned: True turns it upright, False keeps the stored pixels, None
+        turn: of an image that is stored turned by its EXIF block: True turns it upright, False keeps the stored pixels, None
             refuses it.
 
     Raises:
@@ -82,7 +86,7 @@ def read_image(
         if expect is not None and size != expect:
             problem = f"is {size[0]}x{size[1]} where {expect[0]}x{expect[1]} is expected"
             raise DataError(path, "size", problem, "use images of the size the cameras were made for")
-        undone = orientation_of(image) if image.format == "TIFF" else 1  # PIL and OpenCV decode TIFF upright
+        undone = _orientation_of(image) if image.format == "TIFF" else 1  # PIL and OpenCV decode TIFF upright
         try:
             image.load()
         except Exception as error:  # PIL's decoders raise many types of error on damaged bytes
@@ -92,7 +96,7 @@ def read_image(
             _refuse_turned(path, image)
         pixels = _to_float(path, image, sixteen_bits)
         if turn and image.format != "TIFF":
-            pixels = _TURNS[orientation_of(image)](pixels)
+            pixels = _TURNS[_orientation_of(image)](pixels)
         elif not turn:
             pixels = _TURNS[_BACK.get(undone, undone)](pixels)
     rgb, alpha = pixels[..., :3], pixels[..., 3:]
@@ -115,84 +119,46 @@ def has_alpha(path: Path) -> bool:
         return _has_alpha(image)
 
 
-def orientation_of(image: Image.Image) -> int:
-    """The EXIF orientation of an opened image, 1 to 8; 1, upright, where there is none or it cannot be read."""
-    try:
-        orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
-    except Exception as error:  # PIL raises many types of error on damaged blocks
-        _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", image.filename, error)  # type: ignore[attr-defined]
-        return 1
-    return orientation if orientation in _TURNS else 1
+@dataclass(frozen=True, slots=True)
+class Exif:
+    """Of one photo; None where its block does not say.
+
+    Args:
+        focal35: focal length on 35 mm film of the same diagonal, mm.
+        exposure: how much light the photo took of the same scene, in stops (powers of two), from an arbitrary zero.
+    """
+
+    focal35: float | None = None
+    exposure: float | None = None
+
+    def focal_pixels(self, width: int, height: int) -> float | None:
+        """The focal length of an image of this size, pixels."""
+        return None if self.focal35 is None else self.focal35 / _DIAGONAL_35MM * math.hypot(width, height)
 
 
-def exif_of(path: Path) -> dict[int, Any]:
-    """The tags of an EXIF block, its photo part included; empty where it cannot be read. DataErrors as of `read_image`."""
+def read_exif(path: Path) -> Exif:
+    """The lens and the exposure of a photo; the DataErrors as of `read_image`."""
     with _opened(path, False) as image:
         try:
             block = image.getexif()
-            return {**block, **block.get_ifd(_EXIF_PHOTO)}
-        except Exception as error:  # as above
+            tags = {**block, **block.get_ifd(_EXIF_PHOTO)}
+        except Exception as error:  # PIL raises many types of error on damaged blocks
             _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", path.name, error)
-            return {}
+            return Exif()
+    time, f_number, iso = (_positive(tags.get(tag)) for tag in (_EXPOSURE_TIME, _F_NUMBER, _ISO))
+    exposure = None
+    if time is not None and f_number is not None:
+        exposure = math.log2(time * (iso or 100) / f_number**2)
+    return Exif(_positive(tags.get(_FOCAL_35MM)), exposure)
 
 
-def image_folder(root: Path, name: str | None = None) -> Path:
-    """The folder of photos in `root`; without a name, the first of images, images_2, images_4, images_8.
-
-    Raises:
-        DataError: it is not there.
-    """
-    present = [folder for folder in _FOLDERS if (root / folder).is_dir()]
-    if not root.is_dir():
-        raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
-    if name is not None:
-        if not (root / name).is_dir():
-            there = f"choose one of {', '.join(present)}" if present else "check the path"
-            raise DataError(root / name, "images", "is no folder", there)
-        return root / name
-    if not present:
-        raise DataError(root, "images", f"has none of the folders {', '.join(_FOLDERS)}", "name the folder of photos")
-    return root / present[0]
-
-
-def folder_note(folder: Path) -> str:
-    """The folder's name, and which others there are, for the plan."""
-    others = [name for name in _FOLDERS if name != folder.name and (folder.parent / name).is_dir()]
-    return f"{folder.name} (there are also {', '.join(others)})" if others else folder.name
-
-
-def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder, by their suffix, in order of names. Other files and hidden ones are ignored.
-
-    Raises:
-        DataError: the folder is not there, or holds no image.
-    """
-    if not folder.is_dir():
-        raise DataError(folder, "folder", "is not there", "check the path")
-    if not (found := images_in(folder)):
-        raise DataError(folder, "images", f"holds no image ({', '.join(SUFFIXES)})", "check the path")
-    return found
-
-
-def images_in(folder: Path, pattern: str = "*") -> list[Path]:
-    """As `list_images`, also where there is none; with the pattern "**/*" those of the folders below, too."""
-    found = sorted(p for p in folder.glob(pattern) if p.suffix.lower() in SUFFIXES and p.is_file())
-    return [p for p in found if not any(part.startswith(".") for part in p.relative_to(folder).parts)]
-
-
-def require_text(names: Iterable[str]) -> None:
-    """Raise a DataError for a name that is no UTF-8, which would spoil pictures, pages and JSON after training."""
-    for name in names:
-        if (shown := name.encode(errors="backslashreplace").decode()) != name:
-            raise DataError(shown, "name", "must be UTF-8, has another byte", "rename this folder or photo")
-
-
-def by_stem(paths: Iterable[Path]) -> dict[str, list[Path]]:
-    """The files by their names without endings."""
-    found: dict[str, list[Path]] = {}
-    for path in paths:
-        found.setdefault(path.stem, []).append(path)
-    return found
+def _positive(value: Any) -> float | None:
+    """A finite number above 0; cameras also write 0, 0/0, text and tuples."""
+    try:
+        number = float(value[0] if isinstance(value, tuple) else value)
+    except (TypeError, ValueError, ZeroDivisionError, IndexError):
+        return None
+    return number if math.isfinite(number) and number > 0 else None
 
 
 def write_png(path: Path, image: Float[Tensor, "H W 3"] | Float[Tensor, "H W"]) -> None:
@@ -207,34 +173,6 @@ def jpeg(image: Float[Tensor, "H W 3"], quality: int = 90) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(to_bytes(image)).save(buffer, format="JPEG", quality=quality, subsampling=0)
     return buffer.getvalue()
-
-
-def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) -> Path:
-    """`root / name`, if that is inside `root` once symbolic links are resolved.
-
-    Args:
-        file: where the name was read, for the message.
-        allow_outside: accept absolute names and links out of `root`, for trusted data sets.
-
-    Raises:
-        DataError: the name is absolute or leads out of `root`.
-    """
-    parts = name.replace("\\", "/").split("/")
-    if not 0 < len(name) <= _LONGEST_NAME or "\0" in name or max(len(p.encode(errors="replace")) for p in parts) > 255:
-        raise DataError(
-            file, "file name", f"{name[:80]!r} is no file name", "name an image inside the data set's folder"
-        )
-    if allow_outside:
-        return root / name
-    try:
-        within = not os.path.isabs(name) and (root / name).resolve().is_relative_to(root.resolve())  # noqa: PTH117
-    except (OSError, RuntimeError, ValueError) as error:  # circular links, names that no system allows
-        problem = f"{name[:80]!r} cannot be resolved ({type(error).__name__})"
-        raise DataError(file, "file name", problem, "rename the file") from error
-    if not within:
-        remedy = "keep the images inside the data set's folder, or follow it: data.reader.allow_outside=true"
-        raise DataError(file, "file name", f"{name!r} leads out of {root}", remedy)
-    return root / name
 
 
 @contextmanager
@@ -281,8 +219,18 @@ def _is_heif(path: Path) -> bool:
     return True
 
 
+def _orientation_of(image: Image.Image) -> int:
+    """The EXIF orientation of an opened image, 1 to 8; 1, upright, where there is none or it cannot be read."""
+    try:
+        orientation = image.getexif().get(_EXIF_ORIENTATION, 1)
+    except Exception as error:  # PIL raises many types of error on damaged blocks
+        _log.debug("%s: its EXIF block cannot be read (%s) and is not used.", image.filename, error)  # type: ignore[attr-defined]
+        return 1
+    return orientation if orientation in _TURNS else 1
+
+
 def _refuse_turned(path: Path, image: Image.Image) -> None:
-    if (orientation := orientation_of(image)) != 1:
+    if (orientation := _orientation_of(image)) != 1:
         problem = f"is {orientation}: the photo is stored turned, and its pose may not include that"
         remedy = "turn the pixels first (e.g. with `mogrify -auto-orient`), then estimate poses from the result"
         raise DataError(path, "EXIF orientation", problem, remedy)
@@ -291,7 +239,7 @@ def _refuse_turned(path: Path, image: Image.Image) -> None:
 def _size(image: Image.Image, turn: bool | None) -> tuple[int, int]:
     """(width, height) of an image that is not decoded yet. Of a turned TIFF some versions of PIL say the upright size."""
     width, height = (image.tag_v2[tag] for tag in _TIFF_SIZE) if isinstance(image, TiffImageFile) else image.size
-    return (height, width) if turn and orientation_of(image) in _ON_THE_SIDE else (width, height)
+    return (height, width) if turn and _orientation_of(image) in _ON_THE_SIDE else (width, height)
 
 
 def _to_float(path: Path, image: Image.Image, sixteen_bits: bool) -> Float[np.ndarray, "H W C"]:

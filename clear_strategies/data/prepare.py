@@ -26,7 +26,8 @@ from clear_strategies.core.view import Photo, View
 from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.cameras import forget_maps
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.photo_files import image_size, inside, read_image
+from clear_strategies.data.photo_files import image_size, read_image
+from clear_strategies.data.photo_folders import inside
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
 from clear_strategies.data.priors import Bicubic, Prior, fingerprint, network_of, super_resolved
 from clear_strategies.data.priors.cache import kept_network_of

@@ -10,7 +10,8 @@ from typing import Any, Final
 import msgspec
 
 from clear_strategies.data.cameras import Lens
-from clear_strategies.data.photo_files import image_size, inside
+from clear_strategies.data.photo_files import image_size
+from clear_strategies.data.photo_folders import inside
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.errors import DataError
 

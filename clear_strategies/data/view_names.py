@@ -9,7 +9,8 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.data.photo_files import SUFFIXES, by_stem, list_images, write_png
+from clear_strategies.data.photo_files import SUFFIXES, write_png
+from clear_strategies.data.photo_folders import by_stem, list_images
 from clear_strategies.errors import DataError
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image, ImageOps
 
-from clear_strategies.data import photo_files
+from clear_strategies.data import photo_files, photo_folders
 from clear_strategies.errors import DataError
 
 ENDINGS = (".png", ".jpg", ".webp", ".tiff")
@@ -118,19 +118,19 @@ def test_images_are_listed_by_name_and_by_ending(tmp_path: Path) -> None:
     for name in ("b.JPG", "a.png", "notes.txt", "c.tif"):
         (tmp_path / name).touch()
     (tmp_path / "folder.png").mkdir()
-    assert [p.name for p in photo_files.list_images(tmp_path)] == ["a.png", "b.JPG", "c.tif"]
+    assert [p.name for p in photo_folders.list_images(tmp_path)] == ["a.png", "b.JPG", "c.tif"]
 
 
 def test_the_first_of_the_usual_folders_is_taken_and_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="has none of the folders"):
-        photo_files.image_folder(tmp_path)
+        photo_folders.image_folder(tmp_path)
     (tmp_path / "images_8").mkdir()
     (tmp_path / "images_4").mkdir()
-    found = photo_files.image_folder(tmp_path)
-    assert photo_files.folder_note(found) == "images_4 (there are also images_8)"
-    assert photo_files.image_folder(tmp_path, "images_8").name == "images_8"
+    found = photo_folders.image_folder(tmp_path)
+    assert photo_folders.folder_note(found) == "images_4 (there are also images_8)"
+    assert photo_folders.image_folder(tmp_path, "images_8").name == "images_8"
     with pytest.raises(DataError, match="choose one of images_4, images_8"):
-        photo_files.image_folder(tmp_path, "images")
+        photo_folders.image_folder(tmp_path, "images")
 
 
 @pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/../../x", "", "a\0b", "\ud800", "link/x"])
@@ -139,12 +139,12 @@ def test_names_that_lead_out_are_refused(name: str, tmp_path: Path) -> None:
     root.mkdir()
     (root / "link").symlink_to(tmp_path)
     with pytest.raises(DataError, match="file name"):
-        photo_files.inside(root, name, file=root / "list.txt")
+        photo_folders.inside(root, name, file=root / "list.txt")
 
 
 def test_names_inside_are_kept_and_outside_ones_can_be_allowed(tmp_path: Path) -> None:
-    assert photo_files.inside(tmp_path, "a/../b.png", file=tmp_path) == tmp_path / "a/../b.png"
-    assert photo_files.inside(tmp_path, "/x.png", file=tmp_path, allow_outside=True) == Path("/x.png")
+    assert photo_folders.inside(tmp_path, "a/../b.png", file=tmp_path) == tmp_path / "a/../b.png"
+    assert photo_folders.inside(tmp_path, "/x.png", file=tmp_path, allow_outside=True) == Path("/x.png")
 
 
 def test_a_drawing_that_compresses_well_is_no_bomb(tmp_path: Path) -> None:

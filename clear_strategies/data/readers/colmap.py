@@ -14,9 +14,8 @@ import torch
 
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
-from clear_strategies.data.photo_files import by_stem, folder_note, image_folder, images_in, inside
+from clear_strategies.data.photo_folders import Fault, by_stem, folder_note, image_folder, images_in, inside, usable
 from clear_strategies.data.readers.colmap_model import Model, find_model, pose_of, read_model
-from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 

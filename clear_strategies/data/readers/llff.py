@@ -15,10 +15,9 @@ from numpy.lib import format as npy_format
 from clear_strategies.core.checks import as_color, require_choice
 from clear_strategies.data.cameras import Lens, rigid_inverse
 from clear_strategies.data.capture import Capture, Frame, lens_notes, sorted_by_name
-from clear_strategies.data.photo_files import folder_note, image_folder, inside, list_images
+from clear_strategies.data.photo_folders import Fault, folder_note, image_folder, inside, list_images, usable
 from clear_strategies.data.readers import colmap
 from clear_strategies.data.readers.colmap_model import Model, find_model, read_model
-from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 from clear_strategies.files import read_bytes
 from rasterizers.interface import Color

@@ -14,11 +14,11 @@ import torch
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.cameras import pose_from_opengl
 from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
-from clear_strategies.data.photo_files import SUFFIXES, inside
+from clear_strategies.data.photo_files import SUFFIXES
+from clear_strategies.data.photo_folders import Fault, inside, usable
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.strict_json import read_object, typed
 from clear_strategies.data.transforms import require_paths, transforms_of
-from clear_strategies.data.usable import Fault, usable
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 

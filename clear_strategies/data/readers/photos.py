@@ -12,14 +12,13 @@ from typing import Final, Literal
 
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import Capture
-from clear_strategies.data.exif import Exif, read_exif
-from clear_strategies.data.photo_files import image_size, inside, list_images, require_text
+from clear_strategies.data.photo_files import Exif, image_size, read_exif
+from clear_strategies.data.photo_folders import Fault, inside, list_images, require_text, some, usable
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
 from clear_strategies.data.readers.colmap_model import read_model
 from clear_strategies.data.readers.video import CHOICE, frames_of
 from clear_strategies.data.strict_json import read_object
-from clear_strategies.data.usable import Fault, some, usable
 from clear_strategies.errors import DataError, SettingError
 
 _log = logging.getLogger(__name__)

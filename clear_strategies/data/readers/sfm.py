@@ -24,8 +24,7 @@ from PIL import Image as Picture
 from clear_strategies import files
 from clear_strategies.core.images import to_bytes
 from clear_strategies.core.progress import EVERY, Progress
-from clear_strategies.data.exif import Exif
-from clear_strategies.data.photo_files import read_image
+from clear_strategies.data.photo_files import Exif, read_image
 from clear_strategies.errors import DataError
 
 _log = logging.getLogger(__name__)

@@ -20,7 +20,7 @@ import pytest
 import torch
 from PIL import Image
 
-from clear_strategies.data.exif import Exif
+from clear_strategies.data.photo_files import Exif
 from clear_strategies.data.readers import colmap, photos, sfm
 from clear_strategies.data.readers.sfm import SfmSettings
 from clear_strategies.errors import DataError

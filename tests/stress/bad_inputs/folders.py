@@ -8,7 +8,7 @@ import socket
 from collections.abc import Callable
 from pathlib import Path
 
-from clear_strategies.data.photo_files import image_folder, inside, list_images
+from clear_strategies.data.photo_folders import image_folder, inside, list_images
 from clear_strategies.data.readers import colmap
 from clear_strategies.jobs import resume
 from clear_strategies.jobs.lock import NAME, hold
