@@ -32,6 +32,7 @@ class Frame:
         load: decodes the image, float32 [H, W, 3] in [0, 1]. Readers never call it; the size is in `camera`.
         split: "train" or "test" where the data set itself defines the split (Blender), else None.
         sfm_id: the frame's id in `SfmPoints.track_image`, or None.
+        lens: as the data set gives it, before it was fitted to the photo and undistorted; None: the camera was exact.
         shown: decodes the photo's mask at the photo's own size, False at hidden pixels; None: there is no mask.
         transparency: decodes 1 - alpha at the photo's own size; None: its file has no alpha.
     """
@@ -41,6 +42,7 @@ class Frame:
     load: Callable[[], Float[Tensor, "H W 3"]]
     split: str | None = None
     sfm_id: int | None = None
+    lens: Lens | None = None
     shown: Callable[[], Bool[Tensor, "H W"]] | None = None
     transparency: Callable[[], Float[Tensor, "H W"]] | None = None
 
@@ -82,7 +84,7 @@ class Frame:
         mask = mask or _mask_of(path, photos or path.parent)
         shown = None if mask is None else partial(_load_mask, mask, fitted, pinhole, turn)
         through = partial(_load_transparency, path, fitted, pinhole, turn) if has_alpha(path) else None
-        return Frame(name, camera, load, split=split, sfm_id=sfm_id, shown=shown, transparency=through)
+        return Frame(name, camera, load, split=split, sfm_id=sfm_id, lens=lens, shown=shown, transparency=through)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,20 +123,24 @@ class Capture:
 
 
 def sorted_by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:
-    """Frames in order of names; a DataError where two have the same name, or there is none."""
+    """Frames in order of names; the DataErrors of `require_names`."""
+    require_names(frames, file)
+    return tuple(sorted(frames, key=lambda frame: frame.name))
+
+
+def require_names(frames: Sequence[Frame], file: Path) -> None:
+    """Raise a DataError where two frames have the same name, or there is no frame."""
     if not frames:
         raise DataError(file, "frames", "there is none", "give a capture with at least one posed photo")
-    ordered = tuple(sorted(frames, key=lambda f: f.name))
-    for frame, following in itertools.pairwise(ordered):
-        if frame.name == following.name:
-            raise DataError(file, "file name", f"{frame.name!r} belongs to two frames", "give each photo one pose")
-    return ordered
+    for name, following in itertools.pairwise(sorted(frame.name for frame in frames)):
+        if name == following:
+            raise DataError(file, "file name", f"{name!r} belongs to two frames", "give each photo one pose")
 
 
-def lens_notes(lenses: Sequence[Lens], frames: Sequence[Frame]) -> dict[str, str]:
-    """How each frame's lens was changed, for the printed plan."""
+def lens_notes(frames: Sequence[Frame]) -> dict[str, str]:
+    """How lenses became the frames' cameras, for the printed plan."""
     notes = {}
-    pairs = [(lens, frame.camera) for lens, frame in zip(lenses, frames, strict=True)]
+    pairs = [(frame.lens, frame.camera) for frame in frames if frame.lens is not None]
     scaled = [(a, b) for a, b in pairs if (a.width, a.height) != (b.width, b.height)]
     if scaled:
         lens, camera = scaled[0]

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
-from clear_strategies.data.cameras import Lens
+from clear_strategies.data.cameras import Lens, pose_from_opengl
+from clear_strategies.data.capture import Frame
 from clear_strategies.data.photo_files import image_size
-from clear_strategies.data.photo_folders import inside
+from clear_strategies.data.photo_folders import Fault, inside, usable
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.errors import DataError
+from rasterizers.interface import Color
 
 # Distortion keys of each model, in OpenCV's order. nerfstudio's OPENCV has a k4 that OpenCV's polynomial lacks.
 _MODELS: Final = {
@@ -107,11 +109,41 @@ def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
     return [typed(path, {**shared, **frame}, Transform, where=f"frames[{i}]") for i, frame in enumerate(frames)]
 
 
-def require_paths(path: Path, frames: list[Transform]) -> None:
-    """Refuse frames that name no image."""
-    for i, frame in enumerate(frames):
-        if not frame.file_path:
+def photo_transforms(path: Path, content: Mapping[str, Any]) -> list[Transform]:
+    """As `transforms_of`, for a file whose frames must name their images."""
+    transforms = transforms_of(path, content)
+    for i, transform in enumerate(transforms):
+        if not transform.file_path:
             raise DataError(path, f"frames[{i}].file_path", "is missing", "name the frame's image")
+    return transforms
+
+
+def frames_of(
+    file: Path,
+    transforms: Sequence[Transform],
+    photos: Sequence[tuple[str, Path, str | None]],
+    *,
+    background: Color | None,
+    allow_outside: bool,
+    missing: Fault,
+    broken: Fault,
+    folder: Path | None = None,
+) -> list[Frame]:
+    """The frames of a file whose photos can be used.
+
+    Args:
+        photos: name, file and split of each of `transforms`.
+        folder: the folder that all photos are in or below; None: the photo's own. Masks lie beside it.
+    """
+    frames = []
+    for i in usable(file, range(len(photos)), lambda i: photos[i][1], missing=missing, broken=broken):
+        where, transform, (name, path, split) = f"frames[{i}]", transforms[i], photos[i]
+        pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
+        lens, mask = transform.lens(file, where, path), transform.mask(file, allow_outside)
+        frames.append(
+            Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=mask, photos=folder)
+        )
+    return frames
 
 
 def focal_of(path: Path, where: str, angle: float, size: float) -> float:

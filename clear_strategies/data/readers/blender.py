@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Final
 
 from clear_strategies.core.checks import as_color
-from clear_strategies.data.cameras import Lens, pose_from_opengl
-from clear_strategies.data.capture import Capture, Frame, lens_notes, sorted_by_name
+from clear_strategies.data.capture import Capture, Frame, lens_notes, require_names
 from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.data.photo_folders import Fault, inside, usable
+from clear_strategies.data.photo_folders import Fault, inside
 from clear_strategies.data.strict_json import read_object
-from clear_strategies.data.transforms import require_paths, transforms_of
+from clear_strategies.data.transforms import frames_of, photo_transforms
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
@@ -48,39 +45,26 @@ def read(
     root, background = Path(root), as_color("data.reader.background", background)
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
-    faults = partial(usable, path_of=lambda entry: entry[0], missing=missing, broken=broken)
-    found = _frames(root, root / "transforms_train.json", "train", background, allow_outside, faults)
-    files = ["transforms_train.json"]
+    files, frames = [root / "transforms_train.json"], list[Frame]()
     if (root / "transforms_test.json").exists():
-        found += _frames(root, root / "transforms_test.json", "test", background, allow_outside, faults)
-        files.append("transforms_test.json")
+        files.append(root / "transforms_test.json")
     else:
         _log.warning("%s has no transforms_test.json: there are no test views.", root)
-    lenses, frames = [lens for lens, _ in found], [frame for _, frame in found]
-    sorted_by_name(frames, root)  # only to refuse two frames of one name
+    for file, split in zip(files, ("train", "test"), strict=False):
+        transforms, photos = photo_transforms(file, read_object(file)), []
+        for transform in transforms:
+            ending = "" if transform.file_path.lower().endswith(SUFFIXES) else ".png"
+            path = inside(root, transform.file_path + ending, file=file, allow_outside=allow_outside)
+            photos.append((path.stem if split == "train" else f"test/{path.stem}", path, split))
+        frames += frames_of(
+            file, transforms, photos, background=background, allow_outside=allow_outside, missing=missing, broken=broken
+        )
+    require_names(frames, root)
     color = "white" if background == _WHITE else f"RGB {background}"
-    notes = {"poses": ", ".join(files), "order": "of the files", "background": f"{color} behind transparent pixels"}
-    notes |= lens_notes(lenses, frames)
+    notes = {
+        "poses": ", ".join(file.name for file in files),
+        "order": "of the files",
+        "background": f"{color} behind transparent pixels",
+        **lens_notes(frames),
+    }
     return Capture(root.resolve().name, tuple(frames), None, background, notes)
-
-
-def _frames(
-    root: Path,
-    file: Path,
-    split: str,
-    background: Color,
-    allow_outside: bool,
-    faults: Callable[[Path, list[tuple[Path, int]]], list[tuple[Path, int]]],
-) -> list[tuple[Lens, Frame]]:
-    transforms, photos = transforms_of(file, read_object(file)), []
-    require_paths(file, transforms)
-    for i, transform in enumerate(transforms):
-        ending = "" if transform.file_path.lower().endswith(SUFFIXES) else ".png"
-        photos.append((inside(root, transform.file_path + ending, file=file, allow_outside=allow_outside), i))
-    found = []
-    for path, i in faults(file, photos):
-        pose = pose_from_opengl(file, f"frames[{i}].transform_matrix", transforms[i].transform_matrix)
-        lens, mask = transforms[i].lens(file, f"frames[{i}]", path), transforms[i].mask(file, allow_outside)
-        label = path.stem if split == "train" else f"{split}/{path.stem}"
-        found.append((lens, Frame.of_photo(label, path, lens, pose, background=background, split=split, mask=mask)))
-    return found

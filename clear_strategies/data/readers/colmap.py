@@ -100,7 +100,7 @@ def capture(
     if unposed:
         notes["without pose"] = f"{len(unposed)} photos, not used: {', '.join(unposed[:8])}"
         _log.debug("%s: %d photos have no pose and are not used: %s.", root, len(unposed), ", ".join(unposed[:8]))
-    notes |= lens_notes([model.lenses[image.camera] for image in kept], frames)
+    notes |= lens_notes(frames)
     uneven = sum(abs(math.hypot(*image.quat) - 1) > _UNEVEN for image in model.images)
     if uneven:
         notes["rotations"] = f"{uneven} quaternions were not of length 1 and were normalised"

@@ -95,7 +95,7 @@ def _from_bounds(
         raise DataError(file, "rows", problem, "give one row an image")
     model = read_model(find_model(root)) if has_model else None
     ids = _ids_by_order(model, len(paths))
-    frames, lenses = [], []
+    frames = []
     kept = usable(folder, range(len(paths)), lambda i: paths[i], missing="refuse", broken=broken)
     for i in kept:
         row, path = table[i], paths[i]
@@ -106,7 +106,6 @@ def _from_bounds(
         lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2).check(file, f"row {i}")
         world_to_camera = rigid_inverse(file, f"row {i}", rotation, pose[:, 3])
         inside(folder, path.name, file=folder, allow_outside=allow_outside)
-        lenses.append(lens)
         frames.append(Frame.of_photo(path.name, path, lens, world_to_camera, background=background, sfm_id=ids[i]))
     near, far = table[:, 15].min(), table[:, 16].max()
     if not 0 < near < far:
@@ -115,7 +114,7 @@ def _from_bounds(
         "poses": f"poses_bounds.npy, {len(frames)} images",
         "photos": folder_note(folder),
         "depths": f"{near:.4g} to {far:.4g} world units, from poses_bounds.npy",
-        **lens_notes(lenses, frames),
+        **lens_notes(frames),
     }
     points = None
     if model is not None and ids[0] is not None:  # LLFF's poses are in the coordinates of this model

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Final
@@ -12,22 +13,21 @@ import msgspec
 import torch
 
 from clear_strategies.core.checks import as_color
-from clear_strategies.data.cameras import pose_from_opengl
 from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.data.photo_folders import Fault, inside, usable
+from clear_strategies.data.photo_folders import Fault, inside
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.strict_json import read_object, typed
-from clear_strategies.data.transforms import require_paths, transforms_of
+from clear_strategies.data.transforms import frames_of, photo_transforms
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
-_SPLITS: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
+_SIDES: Final = {"train_filenames": "train", "val_filenames": "test", "test_filenames": "test"}
 
 
-class _Listed(msgspec.Struct):
+class _Lists(msgspec.Struct):
     """The files that transforms.json names besides its frames."""
 
     train_filenames: list[str] = []
@@ -58,34 +58,31 @@ def read(
     """
     if background is not None:
         background = as_color("data.reader.background", background)
-    given = Path(root)
-    file = given if given.suffix == ".json" else given / "transforms.json"
-    folder = file.parent
-    content = read_object(file)
-    transforms = transforms_of(file, content)
-    require_paths(file, transforms)
-    listed, names = typed(file, content, _Listed), [transform.file_path for transform in transforms]
-    splits = _splits(file, listed)
+    root = Path(root)
+    file = root if root.suffix == ".json" else root / "transforms.json"
+    folder, content = file.parent, read_object(file)
+    transforms = photo_transforms(file, content)
+    lists = typed(file, content, _Lists)
+    names = [transform.file_path for transform in transforms]
+    splits = _splits(file, lists)
     parts = [PurePosixPath(name).parts for name in names]
     shared = _shared_folders(parts)
-    photos = folder.joinpath(*parts[0][:shared]) if shared else None
-    lenses, frames = [], []
-    paths = [_photo(folder, name, file, allow_outside) for name in names]
-    kept = usable(file, range(len(transforms)), lambda i: paths[i], missing=missing, broken=broken)
-    for i in kept:
-        where, transform, path = f"frames[{i}]", transforms[i], paths[i]
-        pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
-        lens, mask = transform.lens(file, where, path), transform.mask(file, allow_outside)
-        lenses.append(lens)
-        short, split = "/".join(parts[i][shared:]), splits.get(names[i])
-        frames.append(
-            Frame.of_photo(short, path, lens, pose, background=background, split=split, mask=mask, photos=photos)
-        )
-    notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(lenses, frames)}
+    photos = [
+        ("/".join(part[shared:]), _photo(folder, name, file, allow_outside), splits.get(name))
+        for name, part in zip(names, parts, strict=True)
+    ]
+    frames = frames_of(
+        file, transforms, photos, background=background, allow_outside=allow_outside, missing=missing, broken=broken,
+        folder=folder.joinpath(*parts[0][:shared]) if shared else None,
+    )  # fmt: skip
+    notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(frames)}
     if splits:
-        notes["split"] = _split_note(file, names, [names[i] for i in kept], splits)
+        if strangers := sorted(splits.keys() - set(names)):
+            problem = f"lists {strangers[0]!r}, which is no frame's file_path"
+            raise DataError(file, "split", problem, "correct the lists")
+        notes["split"] = _split_note(file, frames)
     points = None
-    if (name := listed.ply_file_path) is not None:
+    if (name := lists.ply_file_path) is not None:
         cloud = read_points(inside(folder, name, file=file, allow_outside=allow_outside))
         none = torch.zeros(0, dtype=torch.long)
         points = SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")
@@ -106,25 +103,22 @@ def _photo(folder: Path, name: str, file: Path, allow_outside: bool) -> Path:
     return inside(folder, f"{name}.png", file=file, allow_outside=allow_outside)
 
 
-def _splits(file: Path, listed: _Listed) -> dict[str, str]:
+def _splits(file: Path, lists: _Lists) -> dict[str, str]:
+    """The side of each photo in the file's lists, "train" or "test"."""
     splits: dict[str, str] = {}
-    for key, split in _SPLITS.items():
-        names = getattr(listed, key)
-        both = sorted(name for name in names if splits.get(name, split) != split)
+    for key, side in _SIDES.items():
+        names = getattr(lists, key)
+        both = sorted(name for name in names if splits.get(name, side) != side)
         if both:
             raise DataError(file, key, f"{both[0]!r} is for training, too", "list each photo once")
-        splits |= dict.fromkeys(names, split)
+        splits |= dict.fromkeys(names, side)
     return splits
 
 
-def _split_note(file: Path, names: Sequence[str], kept: Sequence[str], splits: Mapping[str, str]) -> str:
-    """How many of the frames `kept` the file's own lists assign to each side. Frames in none of them are logged."""
-    missing = sorted(set(splits) - set(names))
-    if missing:
-        raise DataError(file, "split", f"lists {missing[0]!r}, which is no frame's file_path", "correct the lists")
-    counts = {side: sum(splits.get(name) == side for name in kept) for side in ("train", "test")}
-    neither = len(kept) - sum(counts.values())
-    if neither:
+def _split_note(file: Path, frames: Sequence[Frame]) -> str:
+    """How many frames the file's own lists assign to each side. Frames in none of them are logged."""
+    counts = Counter(frame.split for frame in frames)
+    if counts[None]:
         message = "%s: %d frames are in none of its split lists and are not used; data.views.own_split=false uses them."
-        _log.warning(message, file, neither)
-    return f"the file's own: {counts['train']} train, {counts['test']} test, {neither} in neither"
+        _log.warning(message, file, counts[None])
+    return f"the file's own: {counts['train']} train, {counts['test']} test, {counts[None]} in neither"
