@@ -43,15 +43,14 @@ def cache(tmp_path_factory, monkeypatch):
 
 
 def test_the_chosen_frames_are_sharp_and_lie_evenly_along_the_path(clip):
-    sharpness, movement = video._judged(clip)
+    sharpness, movement = video._scores(clip)
     assert len(sharpness) == 80
     assert movement[1:20] == pytest.approx(4 / 320, abs=1e-3)
-    choice = choose(sharpness, movement, 12)
-    assert choice.blurred == len(BLURRED)
-    assert len(STILL) - 1 <= choice.still <= len(STILL)
-    assert len(choice.frames) == 12
-    assert not set(choice.frames) & set(BLURRED)
-    steps = np.diff(np.cumsum(movement)[choice.frames])
+    frames, summary = choose(sharpness, movement, 12)
+    assert re.fullmatch(r"12 of 80 frames \(4 blurred, [78] without movement\)", summary)
+    assert len(frames) == 12
+    assert not set(frames) & set(BLURRED)
+    steps = np.diff(np.cumsum(movement)[frames])
     part = movement.sum() / 12
     assert (steps > 0).all()
     assert steps.max() <= 2 * part
@@ -85,14 +84,14 @@ def test_a_video_may_be_named_by_the_time_of_its_making(clip, tmp_path, monkeypa
 def test_hundreds_of_frames_can_be_chosen(tmp_path, monkeypatch):
     long = tmp_path / "long.mp4"
     write_videos([long], (np.full((32, 32, 3), i, np.uint8) for i in range(250)), fps=30)
-    monkeypatch.setattr(video, "_judged", lambda _: (np.ones(250), np.ones(250)))
+    monkeypatch.setattr(video, "_scores", lambda _: (np.ones(250), np.ones(250)))
     files = sorted(frames_of(long, 240).glob("*.jpg"))
     assert len(files) == 240
     assert cv2.imread(str(files[-1])).mean() == pytest.approx(249, abs=4)
 
 
 def test_a_choice_that_ffmpeg_did_not_write_whole_is_refused_and_not_kept(clip, monkeypatch):
-    monkeypatch.setattr(video, "_judged", lambda _: (np.ones(120), np.ones(120)))  # the clip has 80 frames
+    monkeypatch.setattr(video, "_scores", lambda _: (np.ones(120), np.ones(120)))  # the clip has 80 frames
     for _ in range(2):
         with pytest.raises(DataError, match=r"ffmpeg wrote 6 of the 8 chosen frames.*space left in"):
             frames_of(clip, 8)
@@ -100,9 +99,8 @@ def test_a_choice_that_ffmpeg_did_not_write_whole_is_refused_and_not_kept(clip, 
 
 def test_the_number_of_frames_follows_the_path():
     steady = np.ones(1000)
-    assert len(choose(steady, np.full(1000, 0.003), None).frames) == 25  # three widths
-    assert len(choose(steady, np.full(1000, 0.03), None).frames) == 40
-    assert len(choose(steady, np.full(1000, 0.0003), None).frames) == 12
+    for movement, count in ((0.003, 25), (0.03, 40), (0.0003, 12)):  # of the width for each frame
+        assert len(choose(steady, np.full(1000, movement), None)[0]) == count
 
 
 def test_photos_of_a_video_are_its_frames(clip, monkeypatch):
