@@ -15,8 +15,7 @@ from clear_strategies.core import images
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.readers import demo
 from clear_strategies.data.readers.demo.room import room
-from clear_strategies.data.readers.demo.surfaces import Ball, Finish, Panel
-from clear_strategies.data.readers.demo.textures import Texture
+from clear_strategies.data.readers.demo.surfaces import Ball, Finish, Panel, Texture
 from clear_strategies.errors import SettingError
 
 WIDTH, HEIGHT, FACTOR = 128, 96, 4

@@ -20,8 +20,7 @@ from clear_strategies.core.checks import require_whole
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.priors.corrupted import DemoPrior
 from clear_strategies.data.readers.demo.room import LAMP, light_on, room
-from clear_strategies.data.readers.demo.surfaces import Array, Rays, Surface, f32, unit
-from clear_strategies.data.readers.demo.textures import photograph
+from clear_strategies.data.readers.demo.surfaces import Array, Rays, Surface, f32, photograph, unit
 from clear_strategies.errors import SettingError
 from rasterizers.interface import Camera
 

@@ -9,8 +9,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float
 
-from clear_strategies.data.readers.demo.surfaces import Array, Ball, Finish, Panel, Surface, Vector
-from clear_strategies.data.readers.demo.textures import Texture, photograph
+from clear_strategies.data.readers.demo.surfaces import Array, Ball, Finish, Panel, Surface, Texture, Vector, photograph
 
 _FLOOR: Final = 1.35  # y; y points down
 _WALL: Final = 7.5  # z
