@@ -32,7 +32,8 @@ class Lens:
     """Intrinsics in pixels of a width × height image whose first pixel is centred at (0.5, 0.5).
 
     Args:
-        distortion: OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), or (k1, k2, k3, k4) with `fisheye`; empty: a pinhole.
+        distortion: the first of OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), or with `fisheye` of (k1, k2, k3, k4); empty: a
+            pinhole.
     """
 
     width: int
@@ -66,6 +67,11 @@ class Lens:
     @property
     def distorts(self) -> bool:
         return self.fisheye or any(k != 0 for k in self.distortion)
+
+    @property
+    def coefficients(self) -> Float[np.ndarray, " k"]:
+        """The distortion for OpenCV, which takes at least four numbers."""
+        return np.array([*self.distortion, *[0.0] * (4 - len(self.distortion))])
 
     def resized(self, width: int, height: int, file: Path) -> Lens:
         """The same lens for an image scaled to another size, each axis by its own factor.
@@ -155,7 +161,7 @@ def rigid_inverse(file: Path, where: str, rotation: np.ndarray, center: np.ndarr
 def _filled_pinhole(lens: Lens) -> Lens | None:
     import cv2
 
-    size, K, bend = (lens.width, lens.height), lens.matrix(), np.array(lens.distortion)
+    size, K, bend = (lens.width, lens.height), lens.matrix(), lens.coefficients
     try:
         if lens.fisheye:
             new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, bend, size, np.eye(3), balance=0.0)
@@ -178,7 +184,7 @@ def _covers(lens: Lens, pinhole: Lens) -> bool:
     zero, one = np.zeros_like(t), np.ones_like(t)
     border = np.concatenate([np.stack(side, 1) for side in ((t, zero), (t, one), (zero, t), (one, t))])
     rays = (border * [lens.width, lens.height] - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
-    bend = np.array(lens.distortion)
+    bend = lens.coefficients
     if lens.fisheye:
         pixels = cv2.fisheye.distortPoints(rays[:, None], lens.matrix(), bend)[:, 0]
     else:
@@ -194,8 +200,8 @@ def _sampling_maps(lens: Lens, pinhole: Lens) -> tuple[Float[np.ndarray, "H W"],
     import cv2
 
     maps = cv2.fisheye.initUndistortRectifyMap if lens.fisheye else cv2.initUndistortRectifyMap
-    size, bend = (lens.width, lens.height), np.array(lens.distortion)
-    x, y = maps(lens.matrix(), bend, np.eye(3), pinhole.matrix(), size, cv2.CV_32FC1)
+    size = (lens.width, lens.height)
+    x, y = maps(lens.matrix(), lens.coefficients, np.eye(3), pinhole.matrix(), size, cv2.CV_32FC1)
     return x, y
 
 

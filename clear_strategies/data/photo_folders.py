@@ -5,12 +5,14 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeVar, get_args
 
-from clear_strategies.core.checks import require_choice
+from clear_strategies.core.checks import as_color, require_choice
 from clear_strategies.data.photo_files import SUFFIXES, read_image
 from clear_strategies.errors import DataError
+from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
@@ -116,30 +118,56 @@ def require_faults(missing: Fault, broken: Fault) -> None:
     require_choice("data.broken", broken, get_args(Fault))
 
 
-def usable(
-    file: Path, entries: Sequence[_Entry], path_of: Callable[[_Entry], Path], *, missing: Fault, broken: Fault
-) -> list[_Entry]:
-    """The entries whose photos can be used, in their order.
+@dataclass(frozen=True, slots=True)
+class PhotoRules:
+    """The arguments that readers share.
 
     Args:
-        file: the file or folder that lists the photos, for messages.
-        missing: "refuse" or "skip" entries whose photo does not exist.
-        broken: "skip" decodes every photo and leaves out those that fail; "refuse" decodes none, so that they fail when loaded.
+        background: RGB in [0, 1] behind transparent pixels; None: black.
+        allow_outside: follow file names and links that lead out of the folder.
+        missing: photos that do not exist: "refuse" or "skip".
+        broken: photos that cannot be decoded. "skip" decodes every photo and leaves these out; "refuse" decodes none, so that
+            they fail when they are loaded.
 
     Raises:
-        DataError: a photo is missing and refused, or none is left.
+        SettingError: a value is none of these.
     """
-    require_faults(missing, broken)
-    absent = [path_of(entry).name for entry in entries if not path_of(entry).is_file()]
-    if absent:
-        problem = f"{len(absent)} of {len(entries)} are not there: {some(absent)}"
-        if missing == "refuse":
-            raise DataError(file, "photos", problem, "put them back, or train without them: data.missing=skip")
-        _log.warning("%s: %s. They are skipped.", file, problem)
-    kept = [entry for entry in entries if path_of(entry).is_file() and (broken == "refuse" or _decodes(path_of(entry)))]
-    if entries and not kept:
-        raise DataError(file, "photos", f"none of {len(entries)} can be used", "check the path")
-    return kept
+
+    background: Color | None = None
+    allow_outside: bool = False
+    missing: Fault = "refuse"
+    broken: Fault = "refuse"
+
+    def __post_init__(self) -> None:
+        require_faults(self.missing, self.broken)
+        if self.background is not None:
+            object.__setattr__(self, "background", as_color("data.reader.background", self.background))
+
+    def inside(self, root: Path, name: str, *, file: Path) -> Path:
+        """The file of this name, which is inside `root` unless `allow_outside`; see the function `inside`."""
+        return inside(root, name, file=file, allow_outside=self.allow_outside)
+
+    def usable(self, file: Path, entries: Sequence[_Entry], path_of: Callable[[_Entry], Path]) -> list[_Entry]:
+        """The entries whose photos can be used, in their order.
+
+        Args:
+            file: the file or folder that lists the photos, for messages.
+
+        Raises:
+            DataError: a photo is missing and refused, or none is left.
+        """
+        absent = [path_of(entry).name for entry in entries if not path_of(entry).is_file()]
+        if absent:
+            problem = f"{len(absent)} of {len(entries)} are not there: {some(absent)}"
+            if self.missing == "refuse":
+                raise DataError(file, "photos", problem, "put them back, or train without them: data.missing=skip")
+            _log.warning("%s: %s. They are skipped.", file, problem)
+        kept = [entry for entry in entries if path_of(entry).is_file()]
+        if self.broken == "skip":
+            kept = [entry for entry in kept if _decodes(path_of(entry))]
+        if entries and not kept:
+            raise DataError(file, "photos", f"none of {len(entries)} can be used", "check the path")
+        return kept
 
 
 def some(names: Sequence[str]) -> str:

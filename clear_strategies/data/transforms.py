@@ -12,10 +12,9 @@ import msgspec
 from clear_strategies.data.cameras import Lens, pose_from_opengl
 from clear_strategies.data.capture import Frame
 from clear_strategies.data.photo_files import image_size
-from clear_strategies.data.photo_folders import Fault, inside, usable
+from clear_strategies.data.photo_folders import PhotoRules
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.errors import DataError
-from rasterizers.interface import Color
 
 # Distortion keys of each model, in OpenCV's order. nerfstudio's OPENCV has a k4 that OpenCV's polynomial lacks.
 _MODELS: Final = {
@@ -90,14 +89,9 @@ class Transform(msgspec.Struct):
                 path, f"{where}.{unused[0]}", f"is not 0, but {model} has no such term that OpenCV could undistort",
                 "set camera_model to what the coefficients belong to, or undistort the images first",
             )  # fmt: skip
-        bend = tuple(getattr(self, key) for key in keys)
-        distortion = (*bend, *[0.0] * (4 - len(bend))) if bend else ()
+        distortion = tuple(getattr(self, key) for key in keys)
         fisheye = model == "OPENCV_FISHEYE"
         return Lens(round(width), round(height), fx, fy, cx, cy, distortion, fisheye).check(path, where)
-
-    def mask(self, path: Path, allow_outside: bool) -> Path | None:
-        """The file of the mask that the frame names, inside the folder of the frame's file."""
-        return inside(path.parent, self.mask_path, file=path, allow_outside=allow_outside) if self.mask_path else None
 
 
 def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
@@ -122,11 +116,7 @@ def frames_of(
     file: Path,
     transforms: Sequence[Transform],
     photos: Sequence[tuple[str, Path, str | None]],
-    *,
-    background: Color | None,
-    allow_outside: bool,
-    missing: Fault,
-    broken: Fault,
+    rules: PhotoRules,
     folder: Path | None = None,
 ) -> list[Frame]:
     """The frames of a file whose photos can be used.
@@ -136,12 +126,13 @@ def frames_of(
         folder: the folder that all photos are in or below; None: the photo's own. Masks lie beside it.
     """
     frames = []
-    for i in usable(file, range(len(photos)), lambda i: photos[i][1], missing=missing, broken=broken):
+    for i in rules.usable(file, range(len(photos)), lambda i: photos[i][1]):
         where, transform, (name, path, split) = f"frames[{i}]", transforms[i], photos[i]
         pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
-        lens, mask = transform.lens(file, where, path), transform.mask(file, allow_outside)
+        lens = transform.lens(file, where, path)
+        mask = rules.inside(file.parent, transform.mask_path, file=file) if transform.mask_path else None
         frames.append(
-            Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=mask, photos=folder)
+            Frame.of_photo(name, path, lens, pose, background=rules.background, split=split, mask=mask, photos=folder)
         )
     return frames
 

@@ -9,7 +9,7 @@ from typing import Final
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, Frame, lens_notes, require_names
 from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.data.photo_folders import Fault, inside
+from clear_strategies.data.photo_folders import Fault, PhotoRules
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.data.transforms import frames_of, photo_transforms
 from clear_strategies.errors import DataError
@@ -43,6 +43,7 @@ def read(
         DataError: something is missing or not what it should be.
     """
     root, background = Path(root), as_color("data.reader.background", background)
+    rules = PhotoRules(background, allow_outside, missing, broken)
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     files, frames = [root / "transforms_train.json"], list[Frame]()
@@ -54,11 +55,9 @@ def read(
         transforms, photos = photo_transforms(file, read_object(file)), []
         for transform in transforms:
             ending = "" if transform.file_path.lower().endswith(SUFFIXES) else ".png"
-            path = inside(root, transform.file_path + ending, file=file, allow_outside=allow_outside)
+            path = rules.inside(root, transform.file_path + ending, file=file)
             photos.append((path.stem if split == "train" else f"test/{path.stem}", path, split))
-        frames += frames_of(
-            file, transforms, photos, background=background, allow_outside=allow_outside, missing=missing, broken=broken
-        )
+        frames += frames_of(file, transforms, photos, rules)
     require_names(frames, root)
     color = "white" if background == _WHITE else f"RGB {background}"
     notes = {

@@ -12,9 +12,8 @@ from typing import Final
 import numpy as np
 import torch
 
-from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
-from clear_strategies.data.photo_folders import Fault, by_stem, folder_note, image_folder, images_in, inside, usable
+from clear_strategies.data.photo_folders import Fault, PhotoRules, by_stem, folder_note, image_folder, images_in
 from clear_strategies.data.readers.colmap_model import Model, find_model, pose_of, read_model
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
@@ -47,30 +46,20 @@ def read(
         SettingError: the background is no colour.
         DataError: the model or an image cannot be used.
     """
-    root = Path(root)
-    if background is not None:
-        background = as_color("data.reader.background", background)
+    root, rules = Path(root), PhotoRules(background, allow_outside, missing, broken)
     model = read_model(find_model(root))
     folder = image_folder(root, images)
     listing = model.folder / f"images{model.ending}"
-    paths = _photos(folder, [image.name for image in model.images], listing, allow_outside)
+    paths = _photos(folder, [image.name for image in model.images], listing, rules)
     if not any(path.is_file() for path in paths.values()):
         first = model.images[0].name
         remedy = "set data.reader.images to the folder that the model was made from"
         raise DataError(listing, first, f"is not in {folder}, and no other photo is", remedy)
-    return capture(root, model, folder, paths, background=background, missing=missing, broken=broken)
+    return capture(root, model, folder, paths, rules)
 
 
 def capture(
-    root: Path,
-    model: Model,
-    folder: Path,
-    paths: Mapping[str, Path],
-    *,
-    background: Color | None = None,
-    upright: bool | None = None,
-    missing: Fault = "refuse",
-    broken: Fault = "refuse",
+    root: Path, model: Model, folder: Path, paths: Mapping[str, Path], rules: PhotoRules, *, upright: bool | None = None
 ) -> Capture:
     """The capture of a model and its photos: `paths` by the model's names, below `folder`.
 
@@ -81,11 +70,11 @@ def capture(
         DataError: an image cannot be used.
     """
     listing = model.folder / f"images{model.ending}"
-    kept = usable(listing, model.images, lambda image: paths[image.name], missing=missing, broken=broken)
+    kept = rules.usable(listing, model.images, lambda image: paths[image.name])
     frames = [
         Frame.of_photo(
             paths[image.name].relative_to(folder).as_posix(), paths[image.name], model.lenses[image.camera],
-            pose_of(image), upright=upright, background=background, sfm_id=image.id, photos=folder,
+            pose_of(image), upright=upright, background=rules.background, sfm_id=image.id, photos=folder,
         )
         for image in kept
     ]  # fmt: skip
@@ -108,7 +97,7 @@ def capture(
     if points is None:
         notes["points"] = "the model has none"
     return Capture(
-        root.resolve().name, sorted_by_name(frames, model.folder), points, background or (0.0, 0.0, 0.0), notes
+        root.resolve().name, sorted_by_name(frames, model.folder), points, rules.background or (0.0, 0.0, 0.0), notes
     )
 
 
@@ -131,7 +120,7 @@ def _label(root: Path, model: Model) -> str:
     return model.folder.relative_to(root).as_posix() if model.folder.is_relative_to(root) else model.folder.name
 
 
-def _photos(folder: Path, names: Sequence[str], listing: Path, allow_outside: bool) -> dict[str, Path]:
+def _photos(folder: Path, names: Sequence[str], listing: Path, rules: PhotoRules) -> dict[str, Path]:
     """The photo of each name, else the only one of the same stem: images_4 often holds PNG files for JPG names.
 
     The path of a missing photo leads to no file.
@@ -139,11 +128,11 @@ def _photos(folder: Path, names: Sequence[str], listing: Path, allow_outside: bo
     by_stem_in = cache(lambda parent: by_stem(images_in(parent)))
     paths = {}
     for name in names:
-        path = inside(folder, name, file=listing, allow_outside=allow_outside)
+        path = rules.inside(folder, name, file=listing)
         twins = [] if path.is_file() else by_stem_in(path.parent).get(path.stem, [])
         if len(twins) == 1:
             path = twins[0]
-            if not allow_outside:
-                inside(folder, path.relative_to(folder).as_posix(), file=listing)
+            if not rules.allow_outside:
+                rules.inside(folder, path.relative_to(folder).as_posix(), file=listing)
         paths[name] = path
     return paths

@@ -161,8 +161,8 @@ def _lens(camera: Camera) -> Lens:
     if camera.model in ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"):
         fx, fy, cx, cy, *distortion = camera.parameters
     else:
-        fx, cx, cy, *radial = camera.parameters  # one focal length, and k1, k2 if the model has them
-        fy, distortion = fx, [*radial, *[0.0] * (4 - len(radial))] if radial else []
+        fx, cx, cy, *distortion = camera.parameters  # one focal length, and k1, k2 if the model has them
+        fy = fx
     return Lens(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion), fisheye)
 
 

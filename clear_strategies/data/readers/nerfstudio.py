@@ -12,10 +12,9 @@ from typing import Final
 import msgspec
 import torch
 
-from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.data.photo_folders import Fault, inside
+from clear_strategies.data.photo_folders import Fault, PhotoRules
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.strict_json import read_object, typed
 from clear_strategies.data.transforms import frames_of, photo_transforms
@@ -56,9 +55,7 @@ def read(
         SettingError: the background is no colour.
         DataError: something is missing or not what it should be.
     """
-    if background is not None:
-        background = as_color("data.reader.background", background)
-    root = Path(root)
+    root, rules = Path(root), PhotoRules(background, allow_outside, missing, broken)
     file = root if root.suffix == ".json" else root / "transforms.json"
     folder, content = file.parent, read_object(file)
     transforms = photo_transforms(file, content)
@@ -68,13 +65,10 @@ def read(
     parts = [PurePosixPath(name).parts for name in names]
     shared = _shared_folders(parts)
     photos = [
-        ("/".join(part[shared:]), _photo(folder, name, file, allow_outside), splits.get(name))
+        ("/".join(part[shared:]), _photo(folder, name, file, rules), splits.get(name))
         for name, part in zip(names, parts, strict=True)
     ]
-    frames = frames_of(
-        file, transforms, photos, background=background, allow_outside=allow_outside, missing=missing, broken=broken,
-        folder=folder.joinpath(*parts[0][:shared]) if shared else None,
-    )  # fmt: skip
+    frames = frames_of(file, transforms, photos, rules, folder.joinpath(*parts[0][:shared]) if shared else None)
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(frames)}
     if splits:
         if strangers := sorted(splits.keys() - set(names)):
@@ -83,10 +77,12 @@ def read(
         notes["split"] = _split_note(file, frames)
     points = None
     if (name := lists.ply_file_path) is not None:
-        cloud = read_points(inside(folder, name, file=file, allow_outside=allow_outside))
+        cloud = read_points(rules.inside(folder, name, file=file))
         none = torch.zeros(0, dtype=torch.long)
         points = SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")
-    return Capture(folder.resolve().name, sorted_by_name(frames, file), points, background or (0.0, 0.0, 0.0), notes)
+    return Capture(
+        folder.resolve().name, sorted_by_name(frames, file), points, rules.background or (0.0, 0.0, 0.0), notes
+    )
 
 
 def _shared_folders(parts: Sequence[tuple[str, ...]]) -> int:
@@ -95,12 +91,12 @@ def _shared_folders(parts: Sequence[tuple[str, ...]]) -> int:
     return len(list(takewhile(lambda pair: pair[0] == pair[1], zip(first, last, strict=False))))
 
 
-def _photo(folder: Path, name: str, file: Path, allow_outside: bool) -> Path:
+def _photo(folder: Path, name: str, file: Path, rules: PhotoRules) -> Path:
     """The photo of this name; instant-ngp omits the ending .png."""
-    path = inside(folder, name, file=file, allow_outside=allow_outside)
+    path = rules.inside(folder, name, file=file)
     if name.lower().endswith(SUFFIXES) or path.is_file():
         return path
-    return inside(folder, f"{name}.png", file=file, allow_outside=allow_outside)
+    return rules.inside(folder, f"{name}.png", file=file)
 
 
 def _splits(file: Path, lists: _Lists) -> dict[str, str]:

@@ -13,7 +13,7 @@ from typing import Final, Literal
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import Exif, image_size, read_exif
-from clear_strategies.data.photo_folders import Fault, inside, list_images, require_text, some, usable
+from clear_strategies.data.photo_folders import Fault, PhotoRules, list_images, require_text, some
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
 from clear_strategies.data.readers.colmap_model import read_model
@@ -70,6 +70,7 @@ def read(
     require_whole("data.reader.threads", threads, least=-1)
     require_whole("data.reader.seed", seed, least=0)
     root, name, notes = Path(root), Path(root).resolve().name, {}
+    rules = PhotoRules(None, allow_outside, missing, broken)
     if frames is not None:
         require_whole("data.reader.frames", frames, least=sfm.FEWEST)
     if root.is_file():
@@ -81,8 +82,8 @@ def read(
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
-    listed = _once_each([inside(root, p.name, file=root, allow_outside=allow_outside) for p in list_images(root)])
-    paths = usable(root, listed, lambda path: path, missing=missing, broken=broken)
+    listed = _once_each([rules.inside(root, p.name, file=root) for p in list_images(root)])
+    paths = rules.usable(root, listed, lambda path: path)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", sfm.MORE)
@@ -103,9 +104,10 @@ def read(
 
 def _capture(root: Path, paths: Sequence[Path], photos: Mapping[Path, Exif], folder: Path) -> Capture:
     """The photos with their poses, of the model in `folder`, which knows them by their numbers."""
-    model, by_copy = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(paths)}
-    found = colmap.capture(root, model, root, {image.name: by_copy[image.name] for image in model.images}, upright=True)
-    placed, names = len(found.frames), {copy: path.name for copy, path in by_copy.items()}
+    model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(paths)}
+    posed = {image.name: photo_of[image.name] for image in model.images}
+    found = colmap.capture(root, model, root, posed, PhotoRules(), upright=True)
+    placed, names = len(found.frames), {copy: path.name for copy, path in photo_of.items()}
     reasons = read_object(folder / sfm.UNPLACED)
     unplaced = {names[copy]: sfm.why_unplaced(facts, names) for copy, facts in reasons.items()}
     sfm.unplaced_warning(root, unplaced, len(paths))
