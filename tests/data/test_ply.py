@@ -33,7 +33,6 @@ def header(*lines: str, form: str = "binary_little_endian") -> bytes:
 
 
 XYZ = ("property float x", "property float y", "property float z")
-POINT = struct.pack("<3f", 1, 2, 3)
 
 
 def test_gaussians_are_written_byte_for_byte_in_the_standard_layout(tmp_path: Path) -> None:
@@ -59,9 +58,6 @@ def test_points_are_written_byte_for_byte_as_3dgs_reads_them(tmp_path: Path) -> 
     text += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
     text += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     assert (tmp_path / "p.ply").read_bytes() == text.encode() + struct.pack("<6f3B", 1, 2, 3, 0, 0, 0, 0, 128, 255)
-    read = read_points(tmp_path / "p.ply")
-    assert read.means.tolist() == [[1, 2, 3]]
-    assert (read.colors - torch.tensor([[0.0, 0.5, 1]])).abs().max() <= 0.5 / 255 + 1e-6
 
 
 @pytest.mark.parametrize(
@@ -88,47 +84,33 @@ def test_gaussians_survive_a_roundtrip_bitwise(tmp_path: Path, n: int, bands: in
         assert torch.equal(getattr(again, name).view(torch.int32), getattr(g, name).contiguous().view(torch.int32))
 
 
-@_ROUNDTRIP
-@given(
-    hnp.arrays(np.float32, (4, 3), elements=_NUMBERS),
-    hnp.arrays(np.uint8, (4, 3)),
-)
-def test_points_are_read_bitwise(tmp_path: Path, means: np.ndarray, shades: np.ndarray) -> None:
-    rows = b"".join(struct.pack("<3f3B", *xyz, *rgb) for xyz, rgb in zip(means, shades.tolist(), strict=True))
-    rgb = tuple(f"property uchar {name}" for name in ("red", "green", "blue"))
-    (tmp_path / "p.ply").write_bytes(header("element vertex 4", *XYZ, *rgb) + rows)
-    cloud = read_points(tmp_path / "p.ply")
-    assert torch.equal(cloud.means, torch.from_numpy(means))
-    assert torch.equal(cloud.colors, torch.from_numpy(shades).float() / 255)
-    assert cloud.uses_test_views == "unknown"
-
-
-_ROW = ("element vertex 2", *XYZ, "property uchar red", "property uchar green", "property uchar blue")
+RGB = tuple(f"property uchar {name}" for name in ("red", "green", "blue"))
+POINT = ("element vertex 1", *XYZ, *RGB)
+DOUBLES = ("element vertex 1", *(line.replace("float", "double") for line in XYZ), "property float nx",
+           *(line.replace("uchar", "ushort") for line in RGB))  # fmt: skip
+AROUND = ("element camera 2", "property short id", *POINT, "element face 1", "property list uchar int vertex_indices")
 
 
 @pytest.mark.parametrize(
-    ("form", "body"),
+    ("form", "lines", "body"),
     [
-        ("binary_little_endian", struct.pack("<3f3B3f3B", 1, 2, 3, 255, 0, 51, 4, 5, 6, 0, 255, 0)),
-        ("binary_big_endian", struct.pack(">3f3B3f3B", 1, 2, 3, 255, 0, 51, 4, 5, 6, 0, 255, 0)),
-        ("ascii", b"1 2 3 255 0 51\n4 5 6 0 255 0\n"),
+        ("binary_little_endian", POINT, struct.pack("<3f3B", 1, 2, 3, 255, 0, 51)),
+        ("binary_big_endian", POINT, struct.pack(">3f3B", 1, 2, 3, 255, 0, 51)),
+        ("ascii", POINT, b"1 2 3 255 0 51\n"),
+        ("binary_little_endian", DOUBLES, struct.pack("<3df3H", 1, 2, 3, 9, 65535, 0, 13107)),
+        ("binary_little_endian", AROUND, struct.pack("<2h3f3BB3i", 8, 9, 1, 2, 3, 255, 0, 51, 3, 0, 0, 0)),
+        ("ascii", AROUND, b"8\n9\n1 2 3 255 0 51\n3 0 0 0\n"),
     ],
+    ids=["little endian", "big endian", "ascii", "doubles and 16 bits", "other elements", "other elements in ascii"],
 )
-def test_each_format_reads_the_same(tmp_path: Path, form: str, body: bytes) -> None:
-    file = tmp_path / "p.ply"
-    file.write_bytes(header(*_ROW, form=form).replace(b"\n", b"\r\n") + body)
-    cloud = read_points(file)
-    assert cloud.means.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert torch.allclose(cloud.colors, torch.tensor([[1, 0, 0.2], [0, 1, 0]]))
-
-
-def test_doubles_normals_and_16_bit_colours_are_understood(tmp_path: Path) -> None:
-    lines = ["element vertex 1", *(f"property double {c}" for c in "xyz"), "property float nx"]
-    lines += [f"property ushort {c}" for c in ("red", "green", "blue")]
-    (tmp_path / "p.ply").write_bytes(header(*lines) + struct.pack("<3df3H", 1, 2, 3, 9, 65535, 0, 13107))
+def test_a_point_is_read_from_every_layout(tmp_path, form, lines, body):
+    (tmp_path / "p.ply").write_bytes(header(*lines, form=form).replace(b"\n", b"\r\n") + body)
     cloud = read_points(tmp_path / "p.ply")
     assert cloud.means.tolist() == [[1, 2, 3]]
-    assert torch.allclose(cloud.colors, torch.tensor([[1, 0, 0.2]]))
+    torch.testing.assert_close(cloud.colors, torch.tensor([[1, 0, 0.2]]))
+    (tmp_path / "p.ply").write_bytes(header(*lines, form=form).replace(b"vertex 1", b"vertex 0"))
+    if lines is POINT:
+        assert len(read_points(tmp_path / "p.ply")) == 0
 
 
 def test_a_gaussian_files_colours_are_its_constant_band(tmp_path: Path) -> None:
@@ -139,25 +121,10 @@ def test_a_gaussian_files_colours_are_its_constant_band(tmp_path: Path) -> None:
     assert torch.allclose(read_points(tmp_path / "g.ply").colors, torch.tensor([[0.5, 0.7820948, 0.0]]))
 
 
-def test_points_without_colours_are_grey_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    (tmp_path / "p.ply").write_bytes(header("element vertex 1", *XYZ) + POINT)
+def test_points_without_colours_are_grey_with_a_warning(tmp_path, caplog):
+    (tmp_path / "p.ply").write_bytes(header("element vertex 1", *XYZ) + struct.pack("<3f", 1, 2, 3))
     assert read_points(tmp_path / "p.ply").colors.tolist() == [[0.5, 0.5, 0.5]]
     assert "no colours, so its points are grey" in caplog.text
-
-
-def test_an_ascii_file_without_vertices_is_read(tmp_path: Path) -> None:
-    (tmp_path / "p.ply").write_bytes(header("element vertex 0", *XYZ, form="ascii"))
-    assert len(read_points(tmp_path / "p.ply")) == 0
-
-
-def test_elements_before_and_after_the_vertices_are_skipped(tmp_path: Path) -> None:
-    lines = ["element camera 2", "property short id", "element vertex 1", *XYZ]
-    lines += ["element face 1", "property list uchar int vertex_indices"]
-    faces = struct.pack("<B3i", 3, 0, 0, 0)
-    (tmp_path / "p.ply").write_bytes(header(*lines) + struct.pack("<2h", 8, 9) + POINT + faces)
-    assert read_points(tmp_path / "p.ply").means.tolist() == [[1, 2, 3]]
-    (tmp_path / "a.ply").write_bytes(header(*lines, form="ascii") + b"8\n9\n1 2 3\n3 0 0 0\n")
-    assert read_points(tmp_path / "a.ply").means.tolist() == [[1, 2, 3]]
 
 
 def test_properties_outside_the_gaussian_layout_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
