@@ -1,7 +1,6 @@
 """Posed photos, as readers return them: frames, the capture that holds them, and its structure-from-motion points.
 
-Readers know files. They know nothing of splits, scales or training, nor of priors unless the data set has one of its own (the
-demo); `prepare.py` makes a `Scene` of a capture.
+Readers only read files. `prepare.py` splits a capture, makes its photos at both scales, and returns a `Scene`.
 """
 
 from __future__ import annotations
@@ -65,12 +64,12 @@ class Frame:
         Args:
             lens: for the photo at any size.
             pose: world to camera, OpenCV axes.
-            upright: the lens is that of the photo as its EXIF block turns it; None: the shape of a photo on its side tells
-                whether its lens is, and other turned photos are refused.
+            upright: the lens is that of the photo as its EXIF block turns it. None: for a photo on its side, the lens's shape
+                decides this; other turned photos are refused.
             background: behind transparent pixels; None: black, logged.
-            mask: an image of the photo's size, black where it hides; None: masks/STEM.png or masks/NAME.png (COLMAP's way) beside
-                the folder of the photos, if one is there.
-            photos: that folder, where the photo may lie in one below it, as its mask then does; None: the photo's own.
+            mask: an image of the photo's size, black where it hides; None: masks/STEM.png or masks/NAME.png (as for COLMAP)
+                beside the folder of the photos, if there is one.
+            photos: the folder of the photos; the mask lies in the subfolder that the photo is in. None: the photo's folder.
 
         Raises:
             DataError: the photo is not there, or has another aspect ratio than the lens.

@@ -44,7 +44,7 @@ def within_limit(
     """Reduce the photos and choose the factor so that the HR images fit into `views.max_hr_megapixels`.
 
     Args:
-        reaches: takes a factor; returns whether the prior can enlarge by it.
+        reaches: whether the prior can enlarge by a factor.
         super_resolve: the HR images must come from the prior, even if the photos are large enough.
 
     Returns:

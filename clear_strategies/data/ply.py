@@ -61,9 +61,8 @@ class GaussianPly:
             raise ValueError(f"shN must have 0, 3, 8 or 15 bands, got {bands}.")
         shapes = {"means": (n, 3), "sh0": (n, 1, 3), "shN": (n, bands, 3), "opacities": (n,)}
         for name, shape in {**shapes, "scales": (n, 3), "quats": (n, 4)}.items():
-            found = tuple(getattr(self, name).shape)
-            if found != shape:
-                raise ValueError(f"{name} must have shape {shape}, got {found}.")
+            if (given := tuple(getattr(self, name).shape)) != shape:
+                raise ValueError(f"{name} must have shape {shape}, got {given}.")
 
     def __len__(self) -> int:
         return self.means.shape[0]

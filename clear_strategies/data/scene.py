@@ -1,4 +1,4 @@
-"""A scene as training takes it: views at two scales, the initial points, and where each came from."""
+"""The input of training: views at two scales, the initial points, and notes on where each came from."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Scene:
 
     Args:
         background: the colour behind the Gaussians, RGB in [0, 1].
-        synthetic_prior: the SR images contain errors made on purpose, or the truth (the demo); reports say so.
+        synthetic_prior: the SR images contain seeded errors, or the truth (the demo); reports mark such runs.
         notes: label -> fact, in the order in which the plan prints them and the provenance keeps them.
         unplaced: photos without a pose, which train nothing, and why.
         work_log: how long the views and the initial points took.

@@ -1,4 +1,4 @@
-"""JSON files read strictly, and what they must hold as msgspec types, which ignore keys that they lack:
+"""JSON files, read strictly and checked against msgspec types, which ignore keys that they do not have:
 
     class Run(msgspec.Struct):
         iterations: Count
@@ -6,7 +6,7 @@
 
     run = typed(path, read_object(path), Run, remedy="train the run again")
 
-A value that does not fit is refused with its place in the file.
+A value of another type is refused with its place in the file.
 """
 
 from __future__ import annotations
@@ -77,21 +77,21 @@ def read_object(path: Path) -> dict[str, Any]:
 def typed(
     path: Path, content: Any, kind: Callable[..., _T], *, where: str = "", remedy: str = "correct the field"
 ) -> _T:
-    """The content as `kind`; of an object, keys that a struct lacks are ignored.
+    """The content as `kind`.
 
     Args:
         kind: a struct, or a list or dict of such.
         where: of the content in the file.
 
     Raises:
-        DataError: it is no such thing. The message has the place, e.g. `frames[1].fl_x`.
+        DataError: a value has another type. The message has its place, e.g. `frames[1].fl_x`.
     """
     try:
-        made: _T = msgspec.convert(content, kind)
-        return made
+        value: _T = msgspec.convert(content, kind)
+        return value
     except msgspec.ValidationError as error:
         problem, _, place = str(error).partition(" - at `$")
         missing = re.fullmatch(r"Object missing required field `(.*)`", problem)
         parts = (where, place.strip("`."), missing[1] if missing else "")
-        told = "is missing" if missing else problem.replace("Expected", "must be")
-        raise DataError(path, ".".join(filter(None, parts)).replace(".[", "[") or "json", told, remedy) from error
+        rule = "is missing" if missing else problem.replace("Expected", "must be")
+        raise DataError(path, ".".join(filter(None, parts)).replace(".[", "[") or "json", rule, remedy) from error

@@ -1,4 +1,4 @@
-"""A view's name, and the names of files that are made of it. Views of several cameras may have equal file names."""
+"""The names of views, and of the files that belong to them. Photos in different folders may have the same file name."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ def bare(name: str) -> str:
 
 
 def file_stem(name: str) -> str:
-    """The stem of a file that is made of the view, one of its own in a flat folder: "cam1_0001" of "cam1/0001.png"."""
+    """The stem of the view's files in a flat folder, unique as the view's name is: "cam1_0001" of "cam1/0001.png"."""
     return bare(name).replace("/", "_")
 
 
-def named(names: Sequence[str], wanted: str) -> list[str]:
-    """Those of the views' names that `wanted` may stand for: the one that it is, with or without suffix, else by file name."""
+def matching(names: Sequence[str], wanted: str) -> list[str]:
+    """The names that are `wanted`, with or without suffix; if there is none, those whose file name is."""
     return [n for n in names if wanted in (n, bare(n))] or [n for n in names if wanted in (_file(n), _file(bare(n)))]
 
 
 def write_pngs(folder: Path, images: Iterable[tuple[str, Float[Tensor, "h w 3"]]]) -> int:
-    """Write images by their views' names, and return how many. `ViewFiles` finds those that are made of them.
+    """Write images by their views' names, and return how many. `ViewFiles` finds files of the same names.
 
     Raises:
         DataError: two views would have the same file.
@@ -40,9 +40,8 @@ def write_pngs(folder: Path, images: Iterable[tuple[str, Float[Tensor, "h w 3"]]
     for name, image in images:
         file = folder / f"{bare(name)}.png"
         if file in written:
-            raise DataError(
-                file, "file name", "is that of two photos", "give every photo its own name, without its ending"
-            )
+            remedy = "give every photo its own name, without its ending"
+            raise DataError(file, "file name", "is that of two photos", remedy)
         write_png(file, image)
         written.add(file)
     return len(written)
@@ -53,8 +52,9 @@ class ViewFiles:
     """A folder with one image per view, see `clear_strategies.data.priors.Images`.
 
     Args:
-        what: the images are, for messages.
-        remedy: of a missing file.
+        what: a noun for one of the images, for messages.
+        remedy: for a missing file.
+        suffix: of the files' stems.
     """
 
     folder: Path
@@ -75,18 +75,17 @@ class ViewFiles:
         folder = below if below.is_dir() else self.folder
         if stem not in self._listed.get(folder, {}):
             self._listed[folder] = by_stem(list_images(folder))
-        found = self._listed[folder].get(stem, [])
-        if not found:
+        files = self._listed[folder].get(stem, [])
+        if not files:
             raise DataError(folder, _file(view), f"has no {self.what} {stem} ({', '.join(SUFFIXES)})", self.remedy)
-        if len(found) > 1:
-            twins = " and ".join(file.name for file in found)
+        if len(files) > 1:
+            twins = " and ".join(file.name for file in files)
             raise DataError(folder, _file(view), f"has {twins} for one view", "keep one of them")
-        if (other := self._view_of.setdefault(found[0], view)) != view:
+        if (other := self._view_of.setdefault(files[0], view)) != view:
             problem = f"would be that of two views, {other} and {view}"
-            raise DataError(
-                found[0], self.what, problem, f"put the {self.what}s into subfolders like those of the photos"
-            )
-        return found[0]
+            remedy = f"put the {self.what}s into subfolders like those of the photos"
+            raise DataError(files[0], self.what, problem, remedy)
+        return files[0]
 
 
 def _file(name: str) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from clear_strategies.core.checks import refuse, require_choice, require_number, require_whole
 from clear_strategies.core.images import DownKernel
 from clear_strategies.data.capture import Capture, Frame
-from clear_strategies.data.view_names import bare, named
+from clear_strategies.data.view_names import bare, matching
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera
 
@@ -123,7 +123,7 @@ def split(capture: Capture, views: ViewSettings) -> tuple[list[Frame], list[Fram
 
 
 def lr_size(camera: Camera, views: ViewSettings) -> tuple[int, int]:
-    """(width, height) of the LR photo of a camera whose photo has its own size."""
+    """(width, height) of the LR photo that is made from the photo of this camera."""
     step = views.shrink * (1 if views.photos_are == "lr" else views.sr_scale)
     width, height = (round(s / step) if views.sizes == "round" else s // step for s in (camera.width, camera.height))
     return width, height
@@ -138,15 +138,15 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 
 
 def _only(capture: Capture, names: Sequence[str], wanted: str) -> str:
-    """The one view that a name in `train_names` stands for."""
-    found = named(names, wanted)
-    if not found:
+    """The name of the only view that `wanted`, a name in `train_names`, matches."""
+    matches = matching(names, wanted)
+    if not matches:
         remedy = f"choose among {', '.join(map(bare, names))}"
         raise DataError(capture.name, "train_names", f"there is no view {wanted!r}", remedy)
-    if len(found) > 1:
-        problem = f"{wanted!r} may be {' or '.join(map(repr, found))}"
+    if len(matches) > 1:
+        problem = f"{wanted!r} may be {' or '.join(map(repr, matches))}"
         raise DataError(capture.name, "train_names", problem, "give the whole name of one of them")
-    return found[0]
+    return matches[0]
 
 
 def _evenly_spaced(frames: Sequence[Frame], count: int) -> list[Frame]:

@@ -31,7 +31,7 @@ def from_sfm(sfm: SfmPoints) -> PointCloud:
 def from_tracks(sfm: SfmPoints, train_ids: Sequence[int], min_views: int) -> PointCloud:
     """The scene's SfM points that at least `min_views` of the frames `train_ids` observe.
 
-    Their positions still come from all views, test views included: no filter changes that, and the cloud says so.
+    Their positions still come from all views, test views included, so `uses_test_views` is "yes".
 
     Raises:
         DataError: there is no such point, or the points have no tracks.

@@ -46,10 +46,10 @@ class Images:
     def __call__(self, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> Float[Tensor, "H W 3"]:
         file = self._files.file(name)
         expected = (lr.shape[1] * factor, lr.shape[0] * factor)
-        found = image_size(file)
-        if found != expected:
+        size = image_size(file)
+        if size != expected:
             raise DataError(
-                file, "size", f"is {found[0]}x{found[1]}, but {factor} times the LR image is {expected[0]}x{expected[1]}",
+                file, "size", f"is {size[0]}x{size[1]}, but {factor} times the LR image is {expected[0]}x{expected[1]}",
                 "super-resolve the very LR images that this run trains on (data.save_lr writes them)",
             )  # fmt: skip
         result = images.quantize(read_image(file)).to(lr)

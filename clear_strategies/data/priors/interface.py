@@ -1,4 +1,4 @@
-"""What a prior is: the source of the super-resolved image (SR image) of each view, and the checks that priors share."""
+"""The interface of priors, which make the super-resolved (SR) image of each view, and the checks that priors share."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class SuperResolved(NamedTuple):
 
     Args:
         image: `factor` times as large as the LR photo, in [0, 1].
-        disagreement: see `View.disagreement`; None where the image is the network's own.
+        disagreement: see `View.disagreement`; None unless the network's image was changed.
     """
 
     image: Float[Tensor, "H W 3"]
@@ -49,24 +49,25 @@ class SuperResolved(NamedTuple):
 
 
 def super_resolved(prior: Any, name: str, lr: Float[Tensor, "h w 3"], factor: int) -> SuperResolved:
-    """What a prior, or any function with its arguments, makes of an LR photo.
+    """The SR image that a prior, or any function with its arguments, makes from an LR photo.
 
     Raises:
         DataError: it is no float tensor, or not `factor` times as large.
     """
-    own = getattr(prior, "super_resolved", None)
-    made: SuperResolved = SuperResolved(prior(name, lr, factor)) if own is None else own(name, lr, factor)
-    image, (h, w) = made.image, lr.shape[:2]
+    if hasattr(prior, "super_resolved"):
+        result: SuperResolved = prior.super_resolved(name, lr, factor)
+    else:
+        result = SuperResolved(prior(name, lr, factor))
+    image, (h, w) = result.image, lr.shape[:2]
     if not isinstance(image, Tensor) or not image.is_floating_point():
-        found = image.dtype if isinstance(image, Tensor) else f"a {type(image).__name__}"
-        raise DataError(
-            name, "SR image", f"must be a float tensor [H, W, 3] in [0, 1], got {found}", "correct the prior"
-        )
+        kind = image.dtype if isinstance(image, Tensor) else f"a {type(image).__name__}"
+        problem = f"must be a float tensor [H, W, 3] in [0, 1], got {kind}"
+        raise DataError(name, "SR image", problem, "correct the prior")
     if image.shape != (h * factor, w * factor, 3):
         size = "x".join(map(str, (*image.shape[1::-1], *image.shape[2:]))).removesuffix("x3")
         problem = f"is {size}, but {factor} times {w}x{h} is {w * factor}x{h * factor}"
         raise DataError(name, "SR image", problem, "super-resolve the LR images that are trained on")
-    return made
+    return result
 
 
 @runtime_checkable
@@ -78,19 +79,19 @@ class Network(Prior, Protocol):
 
 
 def network_of(prior: object) -> Network | None:
-    """The network behind a prior, which may be cached or have errors added; None where there is none."""
+    """The network that a prior decorates or is; None if there is none."""
     return next((inner for inner in layers(prior) if isinstance(inner, Network)), None)
 
 
 def layers(prior: object) -> Iterator[object]:
-    """A prior, what it decorates, and so on."""
+    """A prior, the prior that it decorates, and so on."""
     while prior is not None:
         yield prior
         prior = getattr(prior, "prior", None)
 
 
 def passes_of(prior: object) -> int:
-    """How often a prior runs the network behind it for one photo."""
+    """How many times a prior runs its network for one photo."""
     return math.prod(getattr(inner, "passes", 1) for inner in layers(prior))
 
 
@@ -139,9 +140,10 @@ def warn_if_far_from_lr(
 def finished(
     name: str, label: str, sr: Float[Tensor, "H W 3"], lr: Float[Tensor, "h w 3"], factor: int, began: float
 ) -> Float[Tensor, "H W 3"]:
-    """What a network made, on 8-bit steps and the device of its LR image, compared with that one.
+    """A network's result `sr`, on 8-bit steps and the device of `lr`. Logs a warning if the two differ.
 
-    Its size and the seconds since `began` (time.perf_counter) are logged.
+    Args:
+        began: time.perf_counter() before the network ran.
     """
     seconds = time.perf_counter() - began
     _log.debug("%s: %s made %dx%d in %.1f s.", name, label, sr.shape[1], sr.shape[0], seconds)

@@ -163,8 +163,8 @@ def _once(network: Any, model: _Model, image: _Planes, scale: int) -> _Planes:
     padded = np.ascontiguousarray(np.pad(image, ((0, 0), edge, edge), mode="reflect"))
     extractor = network.create_extractor()
     extractor.input(network.input_names()[0], ncnn.Mat(padded).clone())  # a Mat alone would borrow its array
-    status, found = extractor.extract(network.output_names()[0])
-    out = np.array(found)
+    status, result = extractor.extract(network.output_names()[0])
+    out = np.array(result)
     height, width = scale * image.shape[1], scale * image.shape[2]
     if status or out.ndim != 3 or out.shape[0] != 3 or out.shape[1] < height or out.shape[2] < width:
         raise model.damaged(f"gives {out.shape} where (3, {height}, {width}) is expected")

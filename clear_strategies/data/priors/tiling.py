@@ -27,7 +27,7 @@ def tiled(
     The tiles' shares partition the image. A tile contributes `overlap` LR pixels beyond its share on each side, blended
     with its neighbour, and its input reaches `overlap` further. The result equals that of the whole image if `overlap`
     is at least the network's receptive radius. It has no edges even if that is unbounded (global pooling).
-    `require_tiles` says which tiles there may be.
+    `tile` and `overlap` are as `require_tiles` allows.
     """
     height, width = lr.shape[:2]
     if max(height, width) <= tile:

@@ -23,8 +23,9 @@ from clear_strategies.errors import DataError, SettingError
 
 _log = logging.getLogger(__name__)
 
-_FEW: Final = 30  # photos for which time does not count as much as the exactness of their poses
-_STOPS: Final = 0.5  # differences of exposure above this are said
+_HEIC: Final = (".heic", ".heif")
+_FEW: Final = 30  # photos, up to which precise=auto is true
+_STOPS: Final = 0.5  # larger differences of exposure give a warning
 
 
 def read(
@@ -69,14 +70,13 @@ def read(
     require_number("data.reader.least_placed", least_placed, above=0, most=1)
     require_whole("data.reader.threads", threads, least=-1)
     require_whole("data.reader.seed", seed, least=0)
-    root, name, notes = Path(root), Path(root).resolve().name, {}
-    rules = PhotoRules(None, allow_outside, missing, broken)
     if frames is not None:
         require_whole("data.reader.frames", frames, least=sfm.FEWEST)
+    rules = PhotoRules(None, allow_outside, missing, broken)
+    root, name, video_note = Path(root), Path(root).resolve().name, {}
     if root.is_file():
-        video = root
-        root = frames_of(video, frames)
-        notes["photos"] = f"{video.name}: {(root / CHOICE).read_text()}"
+        video, root = root, frames_of(root, frames)
+        video_note["photos"] = f"{video.name}: {(root / CHOICE).read_text()}"
     elif frames is not None:
         raise SettingError(f"data.reader.frames: {root} is no video. Leave frames out.")
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
@@ -86,46 +86,45 @@ def read(
     paths = rules.usable(root, listed, lambda path: path)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
-        raise DataError(root, "images", f"there are {len(paths)}, poses need at least {sfm.FEWEST}", sfm.MORE)
-    photos = {path: read_exif(path) for path in paths}  # refuses bad ones before the long work
+        problem = f"there are {len(paths)}, poses need at least {sfm.FEWEST}"
+        raise DataError(root, "images", problem, sfm.MORE_PHOTOS)
+    photos = {path: read_exif(path) for path in paths}  # unreadable photos are refused before the long work
     for path in paths:
         image_size(path, turn=True)
-    careful = len(paths) <= _FEW if precise == "auto" else precise
-    folder = base / _key(paths, max_side, max_features, careful, seed)
+    precise = len(paths) <= _FEW if precise == "auto" else precise
+    folder = base / _key(paths, max_side, max_features, precise, seed)
     if (folder / sfm.MODEL).is_file():
         _log.debug("%s: poses from the cache %s.", root, folder)
     else:
-        settings = sfm.SfmSettings(max_side, max_features, careful, threads, seed)
-        sfm.reconstruct(root, photos, folder, settings)
-    found = _capture(root, paths, photos, folder)
-    sfm.require_placed(root, len(found.frames), len(paths), least_placed)
-    return replace(found, name=name, notes={**found.notes, **notes})
+        sfm.reconstruct(root, photos, folder, sfm.SfmSettings(max_side, max_features, precise, threads, seed))
+    capture = _capture(root, photos, folder)
+    sfm.require_placed(root, len(capture.frames), len(paths), least_placed)
+    return replace(capture, name=name, notes={**capture.notes, **video_note})
 
 
-def _capture(root: Path, paths: Sequence[Path], photos: Mapping[Path, Exif], folder: Path) -> Capture:
-    """The photos with their poses, of the model in `folder`, which knows them by their numbers."""
-    model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(paths)}
+def _capture(root: Path, photos: Mapping[Path, Exif], folder: Path) -> Capture:
+    """The photos that have poses in the model in `folder`, whose images are named by `sfm.copy_name`."""
+    model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(photos)}
     posed = {image.name: photo_of[image.name] for image in model.images}
-    found = colmap.capture(root, model, root, posed, PhotoRules(), upright=True)
-    placed, names = len(found.frames), {copy: path.name for copy, path in photo_of.items()}
-    reasons = read_object(folder / sfm.UNPLACED)
-    unplaced = {names[copy]: sfm.why_unplaced(facts, names) for copy, facts in reasons.items()}
-    sfm.unplaced_warning(root, unplaced, len(paths))
+    capture = colmap.capture(root, model, root, posed, PhotoRules(), upright=True)
+    names = {copy: path.name for copy, path in photo_of.items()}
+    entries = read_object(folder / sfm.UNPLACED)
+    unplaced = {names[copy]: sfm.why_unplaced(entry, names) for copy, entry in entries.items()}
+    sfm.warn_unplaced(root, unplaced, len(photos))
     notes = {
-        **found.notes,
-        "poses": f"estimated by pycolmap from all {len(paths)} photos, {placed} could be placed",
+        **capture.notes,
+        "poses": f"estimated by pycolmap from all {len(photos)} photos, {len(capture.frames)} could be placed",
         "photos": root.name,
         **_exposure(photos),
     }
     points = colmap.sfm_points(model, "estimated here by pycolmap")
-    return replace(found, points=points, notes=notes, unplaced=unplaced)
+    return replace(capture, points=points, notes=notes, unplaced=unplaced)
 
 
 def _once_each(paths: Sequence[Path]) -> list[Path]:
-    """Without the second file of a photo that a phone has saved twice, as HEIC and as JPEG."""
-    others = [path for path in paths if path.suffix.lower() not in (".heic", ".heif")]
-    stems = {path.stem for path in others}
-    twice = [path.name for path in paths if path not in others and path.stem in stems]
+    """Without the HEIC file of a photo that a phone has saved as JPEG, too."""
+    stems = {path.stem for path in paths if path.suffix.lower() not in _HEIC}
+    twice = [path.name for path in paths if path.suffix.lower() in _HEIC and path.stem in stems]
     if twice:
         _log.info("%d photos are there twice; their HEIC files are not used: %s.", len(twice), some(twice))
     kept = [path for path in paths if path.name not in twice]
@@ -136,7 +135,7 @@ def _once_each(paths: Sequence[Path]) -> list[Path]:
 
 
 def _exposure(photos: Mapping[Path, Exif]) -> dict[str, str]:
-    """A note where EXIF says that exposures differ; `ViewSettings.equalize` corrects that."""
+    """A note where the exposures in EXIF differ; `ViewSettings.equalize` corrects that."""
     known = {path.name: exif.exposure for path, exif in photos.items() if exif.exposure is not None}
     if len(known) < 2:
         return {}

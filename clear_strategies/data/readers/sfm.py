@@ -1,7 +1,7 @@
 """Structure from motion on the CPU through pycolmap: a sparse model from photos alone, with bounded memory and progress.
 
-COLMAP reads copies of the photos: upright, of any format that we read, and no larger than needed. A camera is shared by the
-photos of one size and one focal length in EXIF, which is where its own starts.
+COLMAP reads copies of the photos: upright JPEG files, no larger than needed. Photos of the same size and the same focal length in
+EXIF share a camera, whose estimate starts at that focal length.
 """
 
 from __future__ import annotations
@@ -30,15 +30,17 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 FEWEST: Final = 3
-MORE: Final = "take more photos that overlap by two thirds, with the same camera and zoom, of a scene with texture"
+MORE_PHOTOS: Final = (
+    "take more photos that overlap by two thirds, with the same camera and zoom, of a scene with texture"
+)
 MODEL: Final = "cameras.bin"
-"""A file of the model: where it is, the model is complete."""
+"""The file of a model that exists only if the model is complete."""
 UNPLACED: Final = "unplaced.json"
-"""Beside the model: of each photo without a pose, by the name of its copy, how it was related to the others."""
+"""A file in the model's folder: for each photo without a pose, by the name of its copy, how it is related to the others."""
 _DATABASE: Final = "database.db"
-_PAIR: Final = 2147483647  # COLMAP's number of a pair of images is the first's times this, plus the second's
-_FEW_FEATURES: Final = 200  # of a photo that shows too little
-_TOLD: Final = 3  # photos without a pose whose reasons are told on the console
+_PAIR: Final = 2147483647  # COLMAP's id of a pair of images is this times the first id, plus the second
+_FEW_FEATURES: Final = 200  # a photo with fewer shows too little
+_LISTED: Final = 3  # photos without a pose in the warning, at most
 _MEGA: Final = 1 << 20
 _DISTANCES: Final = 4  # bytes of each pair of features that are compared
 _MEMORY: Final = 4 << 30  # bytes that all threads together may take in matching
@@ -56,18 +58,18 @@ class SfmSettings:
 
     @property
     def matchers(self) -> int:
-        """Threads that match at once: as many as `_MEMORY` lasts for."""
+        """Threads that match at the same time: as many as fit into `_MEMORY`."""
         asked = self.threads if self.threads > 0 else os.cpu_count() or 1
         return max(1, min(asked, _MEMORY // self.memory))
 
     @property
     def memory(self) -> int:
-        """Bytes that a thread takes to match two photos: each feature is compared with each, guided once more."""
+        """Bytes that a thread takes to match two photos: every feature is compared with every other, once more if `precise`."""
         return (3 if self.precise else 2) * _DISTANCES * self.max_features**2
 
 
 def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings: SfmSettings) -> None:
-    """Estimate the poses of these photos and write the model with most of them to `folder`, under their numbers' names.
+    """Estimate the poses of these photos, and write the model with most of them to `folder`. Its images have `copy_name`s.
 
     Raises:
         DataError: pycolmap is not installed, or too few photos can be placed.
@@ -92,7 +94,7 @@ def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings:
             files.write_json(result / UNPLACED, _unplaced(Path(work) / _DATABASE, placed))
             files.install(result, folder, MODEL)
     except RuntimeError as error:
-        raise DataError(root, "poses", f"structure-from-motion failed ({error})", MORE) from error
+        raise DataError(root, "poses", f"structure-from-motion failed ({error})", MORE_PHOTOS) from error
     if len(sizes) > 1:
         groups = ", ".join(map(str, sizes))
         _log.warning(
@@ -101,7 +103,7 @@ def reconstruct(root: Path, photos: Mapping[Path, Exif], folder: Path, settings:
 
 
 def copy_name(index: int) -> str:
-    """The name under which COLMAP knows the photo of this number."""
+    """The file name of the copy of photo `index`, which is its name in the model."""
     return f"{index:05d}.jpg"
 
 
@@ -116,19 +118,19 @@ def require_placed(root: Path, placed: int, count: int, least: float = 0.0) -> N
     """
     if placed >= FEWEST and placed / count >= least:
         return
-    remedy = MORE
+    remedy = MORE_PHOTOS
     if placed >= FEWEST:
         share = 1000 * placed // count / 1000  # rounded up, it would be refused again
         remedy += f"; or go on with the {placed}: data.reader.least_placed={share}"
-    found = f"only {placed}" if placed else "none"
-    raise DataError(root, "poses", f"{found} of the {count} photos could be related to each other", remedy)
+    some = f"only {placed}" if placed else "none"
+    raise DataError(root, "poses", f"{some} of the {count} photos could be related to each other", remedy)
 
 
 def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSettings) -> list[Any]:
-    """COLMAP's incremental pipeline: features, all pairs, mapping. Every model that it finds."""
+    """The models that COLMAP's incremental pipeline finds: features, matching of all pairs, mapping."""
     copies, database, count = work / "copies", work / _DATABASE, len(photos)
     level = pycolmap.logging.minloglevel
-    # Its progress is hundreds of lines, and `estimate` tells its errors.
+    # COLMAP's progress is hundreds of lines, and its errors are raised.
     pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
     try:
         pycolmap.set_random_seed(settings.seed)
@@ -157,7 +159,7 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
         # COLMAP's thresholds are for hundreds of photos. Of ten photos around a table these place six where those place four.
         mapping.mapper.init_min_num_inliers, mapping.mapper.init_min_tri_angle = 50, 8.0
         mapping.mapper.abs_pose_min_num_inliers = 15
-        # Of few photos most points are seen by two alone. With them those six stand four times more exactly.
+        # Most points of few photos are seen by two photos only. With these points those six poses are four times more exact.
         mapping.triangulation.ignore_two_view_tracks = False
         _log.debug("placing the photos.")
         models = pycolmap.incremental_mapping(
@@ -169,9 +171,9 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
 
 
 def _keep_coarsest(database: Path, most: int) -> None:
-    """Leave each photo that many features. COLMAP counts points, and a point with several orientations is several features.
+    """Leave each photo at most that many features, those of the coarsest scales, which COLMAP writes first.
 
-    COLMAP writes the features of coarse scales first.
+    COLMAP's own limit counts points, and a point with several orientations is several features.
     """
     with contextlib.closing(sqlite3.connect(database)) as connection, connection:
         for table in ("keypoints", "descriptors"):
@@ -203,14 +205,14 @@ def _write_copies(
 
 
 def _placing(count: int) -> Callable[[], None]:
-    """Counts the photos that COLMAP places. It may begin anew with other photos, so the count is of attempts."""
-    placed, progress = itertools.count(3), Progress("placing the photos", "photos", count)  # it starts from a pair
+    """Logs how many photos COLMAP has placed. It may start again from another pair, so attempts are counted."""
+    placed, progress = itertools.count(3), Progress("placing the photos", "photos", count)  # the first follows a pair
     return lambda: progress(next(placed))
 
 
 @contextlib.contextmanager
 def _progress(database: Path, table: str, what: str, unit: str, total: int) -> Iterator[None]:
-    """Log every few seconds how many rows a table of COLMAP's database has: its calls return only at their end."""
+    """Log every few seconds how many rows a table of COLMAP's database has, because its calls return only at their end."""
     done, progress = threading.Event(), Progress(what, unit, total)
 
     def watch() -> None:
@@ -232,25 +234,25 @@ def _progress(database: Path, table: str, what: str, unit: str, total: int) -> I
 
 
 def _pycolmap() -> Any:
-    terminated = signal.getsignal(signal.SIGTERM)
+    handler = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
     except ImportError as error:
         raise DataError(
             "data=photos", "pycolmap", f"cannot be imported ({error})", "pip install 'clear-strategies[colmap]'"
         ) from error
-    if terminated is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, terminated)  # the import sets one that prints a stack trace
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)  # the import sets one that prints a stack trace
     return pycolmap
 
 
 def _unplaced(database: Path, placed: Set[str]) -> dict[str, dict[str, Any]]:
-    """Of each photo without a pose: its features, its most matches with a placed photo, and that photo's name."""
+    """For each photo without a pose: its features, the most matches with any placed photo, and that photo's name."""
     with contextlib.closing(sqlite3.connect(database)) as connection:
         names = dict(connection.execute("SELECT image_id, name FROM images"))
         features = dict(connection.execute("SELECT image_id, rows FROM keypoints"))
         pairs = connection.execute("SELECT pair_id, rows FROM two_view_geometries").fetchall()
-    found = {
+    unplaced = {
         name: {"features": features.get(i, 0), "matches": 0, "with": ""}
         for i, name in names.items()
         if name not in placed
@@ -258,33 +260,31 @@ def _unplaced(database: Path, placed: Set[str]) -> dict[str, dict[str, Any]]:
     for pair, matches in pairs:
         two = [names[i] for i in divmod(pair, _PAIR)]
         for name, other in (two, two[::-1]):
-            if name in found and other in placed and matches > found[name]["matches"]:
-                found[name] |= {"matches": matches, "with": other}
-    return found
+            if name in unplaced and other in placed and matches > unplaced[name]["matches"]:
+                unplaced[name] |= {"matches": matches, "with": other}
+    return unplaced
 
 
-def why_unplaced(found: Mapping[str, Any], names: Mapping[str, str]) -> str:
-    """Why a photo has no pose, in words.
+def why_unplaced(entry: Mapping[str, Any], names: Mapping[str, str]) -> str:
+    """Why a photo has no pose.
 
     Args:
-        found: its entry in `UNPLACED`.
-        names: of the photos, by those of COLMAP's copies.
+        entry: of the photo in `UNPLACED`.
+        names: the photos' names, by those of their copies.
     """
-    if found["features"] < _FEW_FEATURES:
-        return f"{found['features']} features: blurred, dark, or without texture"
-    if not found["matches"]:
+    if entry["features"] < _FEW_FEATURES:
+        return f"{entry['features']} features: blurred, dark, or without texture"
+    if not entry["matches"]:
         return "shares nothing with the placed photos: overlap by two thirds"
-    return (
-        f"{found['matches']} features in common with {names[found['with']]}, less with every other photo: more overlap"
-    )
+    other = names[entry["with"]]
+    return f"{entry['matches']} features in common with {other}, less with every other photo: more overlap"
 
 
-def unplaced_warning(root: Path, missing: Mapping[str, str], count: int) -> None:
-    """Say which photos the model leaves out, and why."""
-    if missing:
-        told = "; ".join(f"{name} ({why})" for name, why in list(missing.items())[:_TOLD])
-        more = f"; and {len(missing) - _TOLD} more" if len(missing) > _TOLD else ""
-        _log.warning(
-            "%s: %d of %d photos could be placed (%.0f%%). Without a pose: %s%s.",
-            root, count - len(missing), count, 100 * (count - len(missing)) / count, told, more,
-        )  # fmt: skip
+def warn_unplaced(root: Path, unplaced: Mapping[str, str], count: int) -> None:
+    """Log which of `count` photos have no pose, and why."""
+    if unplaced:
+        placed = count - len(unplaced)
+        listed = "; ".join(f"{name} ({why})" for name, why in list(unplaced.items())[:_LISTED])
+        more = f"; and {len(unplaced) - _LISTED} more" if len(unplaced) > _LISTED else ""
+        message = "%s: %d of %d photos could be placed (%.0f%%). Without a pose: %s%s."
+        _log.warning(message, root, placed, count, 100 * placed / count, listed, more)
