@@ -35,6 +35,10 @@ def save(path: Path, pixels: np.ndarray, **options: object) -> Path:
 def test_eight_bits_become_their_share_of_255(tmp_path: Path, pixels, background, expected) -> None:
     path = save(tmp_path / "a.png", np.array(pixels, np.uint8))
     torch.testing.assert_close(photo_files.read_image(path, background=background), torch.tensor(expected))
+    with Image.open(path) as image:
+        image.convert("RGB").quantize(8).save(tmp_path / "palette.png")
+        rgb = torch.tensor(np.asarray(image.convert("RGB"), np.float32)) / 255
+    torch.testing.assert_close(photo_files.read_image(tmp_path / "palette.png"), rgb)
 
 
 @pytest.mark.parametrize("turn", [None, True])
@@ -65,11 +69,6 @@ def test_without_a_background_alpha_is_composited_over_black_and_logged(tmp_path
     with caplog.at_level("DEBUG"):
         torch.testing.assert_close(photo_files.read_image(path), torch.tensor([[[0.2, 0.0, 0.0]]]))
     assert "a.png has transparent pixels" in caplog.text
-
-
-def test_a_palette_becomes_rgb(tmp_path: Path) -> None:
-    Image.new("RGB", (1, 1), (0, 51, 255)).quantize(2).save(tmp_path / "palette.png")
-    torch.testing.assert_close(photo_files.read_image(tmp_path / "palette.png"), torch.tensor([[[0.0, 0.2, 1.0]]]))
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -134,17 +133,15 @@ def test_the_first_of_the_usual_folders_is_taken_and_named(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/../../x", "", "a\0b", "\ud800", "link/x"])
-def test_names_that_lead_out_are_refused(name: str, tmp_path: Path) -> None:
+def test_names_that_lead_out_are_refused_unless_that_is_allowed(name: str, tmp_path: Path) -> None:
     root = tmp_path / "root"
     root.mkdir()
     (root / "link").symlink_to(tmp_path)
     with pytest.raises(DataError, match="file name"):
         photo_folders.inside(root, name, file=root / "list.txt")
-
-
-def test_names_inside_are_kept_and_outside_ones_can_be_allowed(tmp_path: Path) -> None:
-    assert photo_folders.inside(tmp_path, "a/../b.png", file=tmp_path) == tmp_path / "a/../b.png"
-    assert photo_folders.inside(tmp_path, "/x.png", file=tmp_path, allow_outside=True) == Path("/x.png")
+    assert photo_folders.inside(root, "a/../b.png", file=root) == root / "a/../b.png"
+    if name in ("/etc/passwd", "link/x"):
+        assert photo_folders.inside(root, name, file=root, allow_outside=True) == root / name
 
 
 def test_a_drawing_that_compresses_well_is_no_bomb(tmp_path: Path) -> None:

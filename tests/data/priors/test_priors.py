@@ -30,6 +30,16 @@ def test_a_model_that_is_not_there_is_refused(prior: type[Onnx | DnnSuperres], t
             prior(str(path))("view", photo(8, 12), 4)
 
 
+def test_dnn_superres_refuses_what_is_not_its_kind_of_network(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=r"prior\.model: must be one of edsr, espcn, fsrcnn, lapsrn, got 'srgan'"):
+        DnnSuperres("x.pb", model="srgan")
+    path = tmp_path / "garbage.pb"
+    path.write_bytes(b"not a graph")
+    with pytest.raises(DataError, match=r"garbage\.pb: network: cannot be run as espcn x4") as error:
+        DnnSuperres(str(path))("view", photo(8, 12), 4)
+    assert "\n" not in str(error.value)
+
+
 def test_real_networks_do_on_fern_what_is_known_of_them(shared_data: Path, caplog: pytest.LogCaptureFixture) -> None:
     """504x376 from 126x94, a training view. ONNX comes after dnn_superres: in one process they must not disturb each other."""
     weights, photos = shared_data / "sr_weights", sorted((shared_data / "fern" / "images_4").iterdir())
@@ -45,6 +55,8 @@ def test_real_networks_do_on_fern_what_is_known_of_them(shared_data: Path, caplo
     found = {prior: psnr(prior("fern", lr, 4), hr) for prior in expected}
     assert found == pytest.approx(expected, abs=0.03)
     assert not [record for record in caplog.records if record.levelno > logging.INFO]
+    with pytest.raises(DataError, match=r"ESPCN_x4\.pb: network: "):  # another scale
+        DnnSuperres(str(weights / "ESPCN_x4.pb"))("view", photo(8, 12), 3)
 
 
 @pytest.mark.parametrize(

@@ -65,11 +65,6 @@ def test_a_folder_is_listed_once_however_many_endings_differ(tmp_path: Path, mon
     assert listed.count(photos) <= 2  # for the endings, and for photos without a pose
 
 
-def test_photos_without_a_pose_are_noted(tmp_path: Path) -> None:
-    shutil.copy(tiny.colmap_bin(tmp_path) / "images/a.png", tmp_path / "images/d.png")
-    assert colmap.read(tmp_path).notes["without pose"] == "1 photos, not used: d.png"
-
-
 def rig(root: Path) -> Path:
     """A model whose photos lie in a folder for each camera."""
     listing = tiny.colmap_txt(root) / "sparse/0/images.txt"
@@ -108,17 +103,13 @@ def test_of_several_models_the_one_with_most_photos_is_read(tmp_path: Path, capl
     assert "The largest, 1 with 3 photos, is used; the others are not: 0 with 2." in caplog.text
 
 
-def test_a_model_without_points_is_a_capture_without_points(tmp_path: Path) -> None:
-    (tiny.colmap_bin(tmp_path) / "sparse/0/points3D.bin").unlink()
+def test_a_missing_file_of_points_and_a_quaternion_of_another_length_are_noted(tmp_path: Path) -> None:
+    file = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
+    file.write_text(file.read_text().replace("1 1.0 0.0 0.0 0.0", "1 1.5 0.0 0.0 0.0"))
+    (tmp_path / "sparse/0/points3D.txt").unlink()
     capture = colmap.read(tmp_path)
     assert capture.points is None
     assert capture.notes["points"] == "the model has none"
-
-
-def test_a_quaternion_of_another_length_is_normalised_and_noted(tmp_path: Path) -> None:
-    file = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
-    file.write_text(file.read_text().replace("1 1.0 0.0 0.0 0.0", "1 1.5 0.0 0.0 0.0"))
-    capture = colmap.read(tmp_path)
     np.testing.assert_allclose(capture.frames[0].camera.world_to_camera.numpy(), tiny.world_to_camera(0))
     assert capture.notes["rotations"].startswith("1 quaternions")
 

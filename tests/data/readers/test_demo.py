@@ -27,9 +27,7 @@ def capture() -> Capture:
 
 
 def test_three_of_twelve_views_train_and_lie_inside_the_arc() -> None:
-    splits = [frame.split for frame in capture().frames]
-    assert [i for i, split in enumerate(splits) if split == "train"] == [2, 6, 10]
-    assert splits.count("test") == 9
+    assert [i for i, frame in enumerate(capture().frames) if frame.split == "train"] == [2, 6, 10]
 
 
 @given(train=st.integers(2, 7), more=st.integers(1, 9))
@@ -58,7 +56,7 @@ def test_photos_fit_their_cameras_are_eight_bit_and_fill_the_picture() -> None:
 
 
 def test_a_photo_is_cast_once_and_is_the_same_whenever_it_is_cast() -> None:
-    frame = capture().frames[3]
+    frame = demo.read(width=32, height=24).frames[3]
     assert frame.load() is frame.load()
     assert torch.equal(frame.load(), demo.render(frame.camera))
 
@@ -116,16 +114,6 @@ def test_photos_are_free_of_aliasing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert rms(aliased) > 5 * rms(photo)
 
 
-def test_depths_span_near_and_far_and_parallax_shows_at_lr() -> None:
-    first, last = capture().frames[0], capture().frames[-1]
-    depth = demo.depth(first.camera)
-    near, far = float(depth.quantile(0.02)), float(depth.quantile(0.98))
-    assert far > 1.6 * near
-    # The same baseline moves near things further, by more than two LR pixels.
-    baseline = float((first.camera.center - last.camera.center).norm())
-    assert baseline * first.camera.fx / FACTOR * (1 / near - 1 / far) > 2
-
-
 def test_lr_has_features_that_triangulate_onto_the_surfaces() -> None:
     import cv2
 
@@ -149,13 +137,12 @@ def test_lr_has_features_that_triangulate_onto_the_surfaces() -> None:
     assert np.median(np.abs(z / true - 1)) < 0.05
 
 
-@pytest.mark.parametrize("k", range(19))
-def test_charts_invert_and_normals_have_unit_length(k: int) -> None:
-    surface = room()[k]
-    at = np.random.default_rng(k).uniform(0.05, 0.95, (50, 2))
-    points = surface.points(at)
-    assert np.allclose(surface.chart(points), at, atol=1e-4)
-    assert np.allclose(np.linalg.norm(surface.normal(points), axis=-1), 1)
+def test_charts_invert_and_normals_have_unit_length() -> None:
+    for k, surface in enumerate(room()):
+        at = np.random.default_rng(k).uniform(0.05, 0.95, (50, 2))
+        points = surface.points(at)
+        assert np.allclose(surface.chart(points), at, atol=1e-4)
+        assert np.allclose(np.linalg.norm(surface.normal(points), axis=-1), 1)
 
 
 def test_shadows_fall_behind_what_stands_in_the_light() -> None:

@@ -47,13 +47,6 @@ def test_instant_ngp_gives_angles_and_leaves_out_endings(tmp_path: Path) -> None
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((20, 20, 8, 6))
 
 
-def test_sizes_that_differ_from_the_photos_rescale_the_cameras(tmp_path: Path) -> None:
-    double = {"w": 32, "h": 24, "fl_x": 40.0, "fl_y": 40.0, "cx": 16.0, "cy": 12.0}
-    capture = nerfstudio.read(changed(tmp_path, lambda value: value.update(double)))
-    assert (capture.frames[0].camera.fx, capture.frames[0].camera.cy) == (20, 6)
-    assert "32x24 to 16x12" in capture.notes["cameras"]
-
-
 @pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "SIMPLE_RADIAL"])
 def test_distortion_is_removed_and_noted(model: str, tmp_path: Path) -> None:
     capture = nerfstudio.read(changed(tmp_path, lambda value: value.update(camera_model=model, k1=0.05)))

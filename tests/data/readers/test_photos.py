@@ -78,23 +78,16 @@ def test_photos_that_show_nothing_are_refused_with_what_to_do(tmp_path: Path) ->
     assert list((tmp_path / "cache").iterdir()) == []
 
 
-def test_a_name_that_is_no_text_is_refused_before_the_long_work(tmp_path: Path) -> None:
-    folder = flat_photos(tmp_path / "photos", 3)
-    (folder / "0.png").rename(folder / os.fsdecode(b"caf\xe9.png"))
-    with pytest.raises(DataError, match=r"caf\\udce9.png: name: must be UTF-8.*rename"):
-        photos.read(folder, tmp_path / "cache", threads=1)
-
-
-def test_the_cache_may_not_lie_among_the_photos(tmp_path: Path) -> None:
+def test_what_can_be_known_is_refused_before_the_long_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = flat_photos(tmp_path / "photos", 3)
     with pytest.raises(DataError, match="lies among the photos"):
         photos.read(folder, folder / "cache")
-
-
-def test_without_pycolmap_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(DataError, match=r"clear-strategies\[colmap\]"):
-        photos.read(flat_photos(tmp_path / "photos", 3), tmp_path / "cache")
+        photos.read(folder, tmp_path / "cache")
+    (folder / "0.png").rename(folder / os.fsdecode(b"caf\xe9.png"))
+    with pytest.raises(DataError, match=r"caf\\udce9.png: name: must be UTF-8.*rename"):
+        photos.read(folder, tmp_path / "cache")
 
 
 def test_a_run_that_is_terminated_while_it_reads_photos_ends_without_a_stack_trace() -> None:
@@ -114,9 +107,8 @@ def test_a_photo_without_a_pose_is_told_with_the_placed_photo_that_it_has_most_i
         connection.execute("CREATE TABLE two_view_geometries (pair_id, rows)")
         pairs = [(1 * first + 2, 300), (1 * first + 3, 9), (2 * first + 3, 14), (3 * first + 4, 80)]
         connection.executemany("INSERT INTO two_view_geometries VALUES (?, ?)", pairs)
-    found = photos.sfm._unplaced(database, {"1.jpg", "2.jpg"})
-    told = {name: photos.sfm.why_unplaced(facts, {"2.jpg": "b.png"}) for name, facts in found.items()}
-    assert told == {
+    entries = sfm._unplaced(database, {"1.jpg", "2.jpg"})
+    assert {name: sfm.why_unplaced(entry, {"2.jpg": "b.png"}) for name, entry in entries.items()} == {
         "3.jpg": "14 features in common with b.png, less with every other photo: more overlap",
         "4.jpg": "shares nothing with the placed photos: overlap by two thirds",
     }
@@ -132,9 +124,7 @@ def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_take
     sfm.require_placed(Path("mine"), 6, 10, 0.5)
 
 
-def test_poses_of_the_cache_are_refused_and_taken_as_those_just_estimated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poses_of_the_cache_are_refused_and_taken_as_those_just_estimated(tmp_path, monkeypatch):
     estimated = []
 
     def reconstruct(root: Path, listed: Any, folder: Path, settings: SfmSettings) -> None:
@@ -150,13 +140,10 @@ def test_poses_of_the_cache_are_refused_and_taken_as_those_just_estimated(
     captures.write_photos(tmp_path / "photos")
     for i in range(4):
         Image.new("RGB", (captures.WIDTH, captures.HEIGHT)).save(tmp_path / "photos" / f"z{i}.png")
-    for least in (0.4, 0.5):
-        read = partial(photos.read, tmp_path / "photos", tmp_path / "cache", least_placed=least)
-        if least == 0.4:
-            assert len(read().frames) == 3
-        else:
-            with pytest.raises(DataError, match=r"only 3 of the 7 photos .*data\.reader\.least_placed=0\.428"):
-                read()
+    read = partial(photos.read, tmp_path / "photos", tmp_path / "cache")
+    assert len(read(least_placed=0.4).frames) == 3
+    with pytest.raises(DataError, match=r"only 3 of the 7 photos .*data\.reader\.least_placed=0\.428"):
+        read(least_placed=0.5)
     assert len(estimated) == 1
 
 
@@ -173,43 +160,41 @@ class FakeModel:
         (Path(folder) / "images.bin").write_text(",".join(image.name for image in self.images.values()))
 
 
-def test_of_several_models_the_largest_is_kept_and_the_others_are_told(tmp_path, monkeypatch, caplog):
-    models = [FakeModel("0", "1", "2"), FakeModel("3", "4", "5", "6", "7"), FakeModel("8", "9")]
-    monkeypatch.setattr(sfm, "_map", lambda *_: models)
-    monkeypatch.setattr(sfm, "_unplaced", lambda _, placed: {"all": sorted(placed)})
-    listed = {tmp_path / f"{i}.jpg": Exif() for i in range(10)}
-    sfm.reconstruct(tmp_path, listed, tmp_path / "poses", SfmSettings(1600, 8192, False, threads=1, seed=0))
+@pytest.fixture
+def estimate(tmp_path, monkeypatch):
+    """Estimates the poses of ten photos, with a function in place of COLMAP's pipeline."""
+    monkeypatch.setattr(sfm, "_unplaced", lambda *_: {})
+    photos = {tmp_path / f"{i}.jpg": Exif() for i in range(10)}
+
+    def run(mapping):
+        monkeypatch.setattr(sfm, "_map", mapping)
+        sfm.reconstruct(tmp_path, photos, tmp_path / "poses", SfmSettings(1600, 8192, False, threads=1, seed=0))
+
+    return run
+
+
+def test_of_several_models_the_largest_is_kept_and_the_others_are_told(tmp_path, estimate, caplog):
+    estimate(lambda *_: [FakeModel("0", "1", "2"), FakeModel("3", "4", "5", "6", "7"), FakeModel("8", "9")])
     assert (tmp_path / "poses/images.bin").read_text() == "3,4,5,6,7"
     assert "groups that nothing connects (5, 3, 2 photos); the largest is used" in caplog.text
 
 
-@pytest.fixture
-def three_photos(tmp_path, monkeypatch):
-    """Estimates the poses of three photos by `sfm._map`, which a test replaces."""
-    monkeypatch.setattr(sfm, "_unplaced", lambda *_: {})
-    listed = {tmp_path / f"{i}.jpg": Exif() for i in range(3)}
-    settings = SfmSettings(1600, 8192, False, threads=1, seed=0)
-    return partial(sfm.reconstruct, tmp_path, listed, tmp_path / "poses", settings)
-
-
-def test_poses_that_another_run_has_estimated_meanwhile_are_kept(tmp_path, monkeypatch, three_photos):
+def test_poses_that_another_run_has_estimated_meanwhile_are_kept(tmp_path, estimate):
     def slower(*_):
         (tmp_path / "poses").mkdir()
         (tmp_path / "poses/cameras.bin").write_text("of the other run")
         return [FakeModel("0", "1", "2")]
 
-    monkeypatch.setattr(sfm, "_map", slower)
-    three_photos()
+    estimate(slower)
     assert [(p.name, p.read_text()) for p in tmp_path.glob("poses*/*")] == [("cameras.bin", "of the other run")]
 
 
-def test_a_full_disk_is_not_taken_for_photos_without_overlap(monkeypatch, three_photos):
+def test_a_full_disk_is_not_taken_for_photos_without_overlap(estimate):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "00000.jpg")
 
-    monkeypatch.setattr(sfm, "_map", full)
     with pytest.raises(OSError, match="No space left"):
-        three_photos()
+        estimate(full)
 
 
 @pytest.mark.parametrize("precise", [True, False])

@@ -1,4 +1,4 @@
-"""Captures with poses as they are downloaded: each ends well, or with one line that names file and cure.
+"""Captures with poses: what all readers do alike, with tidy files and with those that people have.
 
 Folders of photos without poses are in test_untidy_photos.py.
 """
@@ -9,21 +9,17 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from clear_strategies.data.capture import Capture
-from clear_strategies.data.readers import blender, colmap, llff, nerfstudio
 from clear_strategies.errors import DataError
 from tests.helpers import captures
-from tests.helpers.captures import HEIGHT, NAMES, WIDTH
+from tests.helpers.captures import GOOD, HEIGHT, NAMES, WIDTH
+from tests.stress.bad_inputs.scenes import READERS
 
-READERS = {
-    "colmap": (captures.colmap_bin, colmap.read, "images"),
-    "nerfstudio": (captures.nerfstudio, nerfstudio.read, "images"),
-    "blender": (captures.blender, blender.read, "train"),
-    "llff": (captures.llff, llff.read, "images_4"),
-}
+PHOTOS = {"colmap": "images", "nerfstudio": "images", "blender": "train", "llff": "images_4"}
 # What happens to photos, what the refusal says, the setting that goes on without them, and the photos that are then used.
 DEFECTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], dict[str, object], str]] = {
     "missing": (lambda f: (f / "b.png").unlink(), ("1 of ", "b.png", "data.missing=skip"), {"missing": "skip"}, "ac"),
@@ -32,14 +28,13 @@ DEFECTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], dict[str, ob
                {"allow_outside": True}, "abc"),
 }  # fmt: skip
 # LLFF's table has rows without names: a missing photo is not known.
-CASES = [(defect, reader) for defect in DEFECTS for reader in READERS if (defect, reader) != ("missing", "llff")]
+CASES = [(defect, reader) for defect in DEFECTS for reader in PHOTOS if (defect, reader) != ("missing", "llff")]
 
 
 def built(tmp_path: Path, reader: str) -> tuple[Path, Path, Callable[..., Capture]]:
     """(root, folder of the photos, read) of a tidy capture."""
-    write, read, folder = READERS[reader]
-    root = write(tmp_path / "capture")
-    return root, root / folder, read
+    root = GOOD[reader](tmp_path / "capture")
+    return root, root / PHOTOS[reader], READERS[reader]
 
 
 @pytest.mark.parametrize(("defect", "reader"), CASES)
@@ -72,3 +67,25 @@ def test_a_photo_on_its_side_is_turned_where_the_camera_is_not_that_of_the_store
     frame = read(root).frames[1]
     assert (frame.camera.width, frame.camera.height) == (WIDTH, HEIGHT)
     assert torch.equal((frame.load() * 255).round().to(torch.uint8), torch.from_numpy(expected))
+
+
+@pytest.mark.parametrize("kind", GOOD)
+def test_cameras_are_opencv_at_the_size_of_the_photos(kind: str, tmp_path: Path) -> None:
+    frames = READERS[kind.removesuffix("_txt")](GOOD[kind](tmp_path)).frames
+    assert len(frames) == 3
+    for i, frame in enumerate(frames):
+        camera = frame.camera
+        np.testing.assert_allclose(camera.world_to_camera.numpy(), captures.world_to_camera(i), atol=1e-12)
+        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+        assert intrinsics == pytest.approx((20, 20, 8, 6, 16, 12))
+
+
+@pytest.mark.parametrize("kind", GOOD)
+def test_reading_poses_decodes_no_photo(kind: str, tmp_path: Path) -> None:
+    """Truncated photos still have their headers: they are read, and refused when they are loaded."""
+    root = GOOD[kind](tmp_path)
+    for path in root.rglob("*.png"):
+        path.write_bytes(path.read_bytes()[:-60])
+    for frame in READERS[kind.removesuffix("_txt")](root).frames:
+        with pytest.raises(DataError, match="pixels: cannot be decoded"):
+            frame.load()
