@@ -18,14 +18,6 @@ from tests.stress.bad_inputs import BadInput, at
 from tests.stress.bad_inputs.scenes import READERS
 
 
-def _absent(read: Callable[[Path], object]) -> Callable[[Path], object]:
-    return at("none", read)
-
-
-def _a_file(read: Callable[[Path], object]) -> Callable[[Path], object]:
-    return at("file", read, b"no folder")
-
-
 def _held(lock: bytes | Callable[[Path], object]) -> Callable[[Path], object]:
     """Of a folder whose lock is there already."""
 
@@ -64,14 +56,14 @@ def _hidden_photos_only(folder: Path) -> None:
 
 _ELSEWHERE = {"host": socket.gethostname() + "-another", "pid": 1, "started": "1", "since": "2026-01-01"}
 _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
-    **{f"{kind} at a path that is absent": (_absent(read), "none") for kind, read in READERS.items()},
-    **{f"{kind} at a path that is a file": (_a_file(read), "file") for kind, read in READERS.items()},
+    **{f"{kind} at a path that is absent": (at("none", read), "none") for kind, read in READERS.items()},
+    **{f"{kind} at a path that is a file": (at("file", read, b"no folder"), "file") for kind, read in READERS.items()},
     **{f"{kind} in an empty folder": (read, ": ") for kind, read in READERS.items()},
     "photos in a folder of another name": (at("", colmap.read, _photos_renamed), "images: is no folder|has none of"),
     "no photo of the model is there": (at("", colmap.read, _photos_gone), "is not in .*, and no other photo is"),
     "no folder of photos": (image_folder, "images: has none of the folders images, images_2"),
     "folder of photos by a name that is not there": (lambda folder: image_folder(folder, "images_16"), "is no folder"),
-    "photos at a path that is absent": (_absent(list_images), "folder: is not there"),
+    "photos at a path that is absent": (at("none", list_images), "folder: is not there"),
     "folder without images": (at("", list_images, _hidden_photos_only), "images: holds no image"),
     "name of a photo that is empty": (lambda folder: inside(folder, "", file=folder), "'' is no file name"),
     "name of a photo with a zero": (lambda folder: inside(folder, "a\0.png", file=folder), "is no file name"),
@@ -88,9 +80,9 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
         _held(lambda path: path.symlink_to(path.with_name("canary"))),
         "lock: is a link or no regular file",
     ),
-    "run that is absent": (_absent(open_splat), "none"),
+    "run that is absent": (at("none", open_splat), "none"),
     "run that is an empty folder": (open_splat, ": "),
-    "run that is a text": (_a_file(open_splat), "file"),
+    "run that is a text": (at("file", open_splat, b"no folder"), "file"),
     "metrics.json that is empty": (_finished(""), "metrics.json: "),
     "metrics.json that is a list": (_finished([]), "metrics.json: "),
     "metrics.json without scores": (_finished({"config": {}}), "metrics.json: "),
