@@ -47,39 +47,29 @@ class _Element:
         return self.count * (len(self.row or {}) if ascii_ else self.dtype.itemsize)
 
 
-@dataclass(frozen=True, slots=True)
-class _Header:
-    """A file's header: elements before the vertices (all of fixed length), the vertices, elements after them.
-
-    Args:
-        body: offset of the first byte after the header.
-    """
-
-    form: str
-    before: tuple[_Element, ...]
-    vertex: _Element
-    after: tuple[_Element, ...]
-    body: int
-
-
 def read_vertices(path: Path) -> np.ndarray:
     """The vertex element as a structured array."""
     data = read_bytes(path)
-    header = _parse_header(path, data[:_LONGEST_HEADER])
-    vertex, ascii_ = header.vertex, header.form == "ascii"
+    form, elements, start = _parse_header(path, data[:_LONGEST_HEADER])
+    at = next((i for i, e in enumerate(elements) if e.name == "vertex"), len(elements))
+    if at == len(elements) or not elements[at].row:
+        raise DataError(path, "element vertex", "is missing or has no properties", "give a file of points")
+    if any(e.row is None for e in elements[:at]):
+        raise DataError(path, "element vertex", "comes after an element with lists", "write the vertices first")
+    vertex, ascii_ = elements[at], form == "ascii"
     # Line breaks in ASCII files have no meaning, so values are counted.
-    body: Any = data[header.body :].split() if ascii_ else data[header.body :]
-    before, after = (sum(e.size(ascii_) for e in elements) for elements in (header.before, header.after))
+    body: Any = data[start:].split() if ascii_ else data[start:]
+    before, after = (sum(e.size(ascii_) for e in part) for part in (elements[:at], elements[at + 1 :]))
     needed, left, unit = before + vertex.size(ascii_), len(body), "values" if ascii_ else "bytes"
     if needed > left:
         problem = f"has a count of {vertex.count}, which needs {needed} {unit}, but {left} are left"
         raise DataError(path, "element vertex", problem, "the file is truncated; write it again")
-    if all(e.row is not None for e in header.after) and needed + after != left:
+    if all(e.row is not None for e in elements) and needed + after != left:
         problem = f"needs {needed + after} {unit} after it, but {left} follow"
         raise DataError(path, "header", problem, "the file is damaged; write it again")
     if ascii_:
         return _of_words(path, vertex, body[before:needed])
-    row = vertex.dtype.newbyteorder("<" if header.form == "binary_little_endian" else ">")
+    row = vertex.dtype.newbyteorder("<" if form == "binary_little_endian" else ">")
     return np.frombuffer(body, row, vertex.count, before)
 
 
@@ -102,7 +92,8 @@ def _of_words(path: Path, vertex: _Element, words: Sequence[bytes]) -> np.ndarra
     return table
 
 
-def _parse_header(path: Path, head: bytes) -> _Header:
+def _parse_header(path: Path, head: bytes) -> tuple[str, list[_Element], int]:
+    """(format, elements, offset of the first byte after the header)."""
     lines, body = _header_lines(path, head)
     form, elements = "", list[_Element]()
     for line in lines:
@@ -121,13 +112,7 @@ def _parse_header(path: Path, head: bytes) -> _Header:
             case _:
                 problem = f"has a line that is not understood there: {line[:80]!r}"
                 raise DataError(path, "header", problem, "export it again, with plain numbers in the vertices")
-    at = next((i for i, e in enumerate(elements) if e.name == "vertex"), None)
-    if at is None or not elements[at].row:
-        raise DataError(path, "element vertex", "is missing or has no properties", "give a file of points")
-    before, vertex, after = tuple(elements[:at]), elements[at], tuple(elements[at + 1 :])
-    if any(e.row is None for e in before):
-        raise DataError(path, "element vertex", "comes after an element with lists", "write the vertices first")
-    return _Header(form, before, vertex, after, body)
+    return form, elements, body
 
 
 def _header_lines(path: Path, head: bytes) -> tuple[list[str], int]:
