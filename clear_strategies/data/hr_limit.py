@@ -67,10 +67,10 @@ def within_limit(
         now = _largest(capture)
         span = f"{max(ratios):.3g}" if max(ratios) == min(ratios) else f"{min(ratios):.3g} to {max(ratios):.3g}"
         why += f": photos reduced by {span} to {now.width}x{now.height} (PIL {views.downsample})"
-    if super_resolve:
-        return _noted(capture, why), replace(views, shrink=1)
-    why += "; they are the HR side, no SR image is needed, and LR is made from them"
-    return _noted(capture, why), replace(views, shrink=1, photos_are="both")
+    if not super_resolve:
+        why += "; they are the HR side, no SR image is needed, and LR is made from them"
+        views = replace(views, photos_are="both")
+    return _noted(capture, why), replace(views, shrink=1)
 
 
 def _megapixels(camera: Camera, views: ViewSettings) -> float:

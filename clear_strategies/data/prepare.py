@@ -136,11 +136,11 @@ def photos_of(frames: Sequence[Frame], views: ViewSettings) -> Iterator[Photo]:
 
 def at_hr(capture: Capture, views: ViewSettings) -> Capture:
     """The capture with photos that load as `photos_of` gives them, for priors that use the truth."""
-    frames = (replace(frame, shown=None, transparency=None) for frame in capture.frames)
-    return replace(
-        capture,
-        frames=tuple(replace(frame, load=lambda frame=frame: _reduced(frame, views).image) for frame in frames),
-    )
+    return replace(capture, frames=tuple(replace(f, load=partial(_pixels, f, views)) for f in capture.frames))
+
+
+def _pixels(frame: Frame, views: ViewSettings) -> Float[Tensor, "H W 3"]:
+    return _reduced(replace(frame, shown=None, transparency=None), views).image
 
 
 def _lr(frame: Frame, photo: Photo, capture: Capture, views: ViewSettings, lr_files: Mapping[str, Path]) -> Photo:
@@ -184,9 +184,7 @@ def _view(
     view = View(
         frame.name, lr, hr, truth=truth, sr_source=sr_source, disagreement=disagreement, background=capture.background
     )
-    if photo.shown is None:
-        return view
-    shown = photo.reduced(photo.camera.width // lr.camera.width).shown
+    shown = None if photo.shown is None else photo.reduced(photo.camera.width // lr.camera.width).shown
     return view if shown is None else view.hiding(shown)
 
 
