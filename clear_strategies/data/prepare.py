@@ -25,7 +25,6 @@ from clear_strategies.core.work_log import WorkLog
 from clear_strategies.data.cameras import forget_maps
 from clear_strategies.data.capture import Capture, Frame
 from clear_strategies.data.photo_files import image_size, read_image
-from clear_strategies.data.photo_folders import inside
 from clear_strategies.data.points import CloudSettings, initial_points, require_source
 from clear_strategies.data.priors import Bicubic, Prior, SuperResolved, super_resolved
 from clear_strategies.data.priors.cache import kept_network_of
@@ -107,12 +106,10 @@ def check_headers(frames: Sequence[Frame], views: ViewSettings) -> dict[str, Pat
             refuse("data.views.shrink", rule, views.shrink, "lower data.views.shrink")
     if views.lr_folder is None:
         return {}
-    folder = Path(views.lr_folder)
-    files, lr_files = ViewFiles(folder, "LR image", "name the LR images like the photos"), {}
+    files, lr_files = ViewFiles(Path(views.lr_folder), "LR image", "name the LR images like the photos"), {}
     for frame in frames:
         width, height = lr_size(frame.camera, views)
-        name = files.file(frame.name).relative_to(folder).as_posix()
-        file = lr_files[frame.name] = inside(folder, name, file=folder)
+        file = lr_files[frame.name] = files.file(frame.name)
         size = image_size(file)
         if size != (width, height):
             problem = f"is {size[0]}x{size[1]} where {width}x{height} is expected"
