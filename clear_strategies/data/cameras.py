@@ -161,12 +161,12 @@ def rigid_inverse(file: Path, where: str, rotation: np.ndarray, center: np.ndarr
 def _filled_pinhole(lens: Lens) -> Lens | None:
     import cv2
 
-    size, K, bend = (lens.width, lens.height), lens.matrix(), lens.coefficients
+    size, K, coefficients = (lens.width, lens.height), lens.matrix(), lens.coefficients
     try:
         if lens.fisheye:
-            new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, bend, size, np.eye(3), balance=0.0)
+            new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(K, coefficients, size, np.eye(3), balance=0.0)
         else:
-            new, _ = cv2.getOptimalNewCameraMatrix(K, bend, size, alpha=0)
+            new, _ = cv2.getOptimalNewCameraMatrix(K, coefficients, size, alpha=0)
     except cv2.error:
         return None
     fx, fy, cx, cy = (float(x) for x in (new[0, 0], new[1, 1], new[0, 2] + 0.5, new[1, 2] + 0.5))
@@ -184,12 +184,11 @@ def _covers(lens: Lens, pinhole: Lens) -> bool:
     zero, one = np.zeros_like(t), np.ones_like(t)
     border = np.concatenate([np.stack(side, 1) for side in ((t, zero), (t, one), (zero, t), (one, t))])
     rays = (border * [lens.width, lens.height] - [pinhole.cx, pinhole.cy]) / [pinhole.fx, pinhole.fy]
-    bend = lens.coefficients
     if lens.fisheye:
-        pixels = cv2.fisheye.distortPoints(rays[:, None], lens.matrix(), bend)[:, 0]
+        pixels = cv2.fisheye.distortPoints(rays[:, None], lens.matrix(), lens.coefficients)[:, 0]
     else:
         homogeneous = np.column_stack((rays, np.ones(len(rays))))
-        pixels = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), lens.matrix(), bend)[0][:, 0]
+        pixels = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), lens.matrix(), lens.coefficients)[0][:, 0]
     slack = 1 + 0.01 * max(lens.width, lens.height)
     return bool(((pixels >= -slack) & (pixels <= np.array([lens.width, lens.height]) + slack)).all())
 

@@ -103,12 +103,12 @@ class Capture:
 
     Args:
         background: the colour behind the scene (white for Blender's RGBA).
-        notes: label -> fact for the printed plan (where poses came from, what was undistorted …).
-        own_prior: makes the prior that belongs to this capture, from what loads each photo, by the frame's name;
-            `prior=auto` takes it. None: the capture has none, as every capture of real photos.
+        notes: label -> fact for the printed plan (the source of the poses, what was undistorted …).
+        own_prior: builds the prior of `prior=auto` from the functions that load the photos, by the frames' names; None: the
+            capture has no prior of its own, as every capture of real photos.
         depth: the exact depth (z) through each pixel's centre of a camera, float32 [H, W], infinite where there is no
             surface; None: unknown.
-        unplaced: photos whose pose could not be estimated, and why.
+        unplaced: why the pose could not be estimated, by the names of such photos.
     """
 
     name: str

@@ -21,7 +21,7 @@ class Scene:
         background: the colour behind the Gaussians, RGB in [0, 1].
         synthetic_prior: the SR images contain seeded errors, or the truth (the demo); reports mark such runs.
         notes: label -> fact, in the order in which the plan prints them and the provenance keeps them.
-        unplaced: photos without a pose, which train nothing, and why.
+        unplaced: see `Capture.unplaced`; such photos are not used.
         work_log: how long the views and the initial points took.
     """
 

@@ -31,17 +31,17 @@ class ViewSettings:
         own_split: keep to the data set's own split, if it has one; false: all of its views are alike.
         test_limit: at most this many test views, evenly spaced; None: all.
         sr_scale: HR pixels per LR pixel, at most: see `max_hr_megapixels`.
-        max_hr_megapixels: of a view at HR, with photos_are=lr. Larger ones are trained at twice the photos instead, or with
-            the photos, reduced to it, as the HR side: `clear_strategies.data.hr_limit`. None: no limit.
+        max_hr_megapixels: the largest HR image with photos_are=lr. Above it, HR is twice as large as the photos, or the photos
+            themselves, reduced to this size, are the HR side: `clear_strategies.data.hr_limit`. None: no limit.
         shrink: the photos are first reduced by this whole factor (LLFF at 1/8 and 1/2 of its full size: 2).
         sizes: what happens to photos whose sizes are no multiples of shrink · sr_scale. "crop": they lose a few pixels
             at the right and the bottom. "round": they are resized to sr_scale · round(size / (shrink · sr_scale)).
         photos_are: "lr": the photos are the LR observations, and HR is unknown. "hr": they are the truth at HR, which
-            training never sees, and LR is made from them, as in the papers. "both": they are trained on at HR, in place of
-            SR images, and LR is made from them.
+            training never uses, and LR is made from them, as in the papers. "both": they are the HR images in place of SR
+            images, and LR is made from them.
         downsample: D, the operator that makes LR.
         lr_folder: ready-made LR images by the photos' names, as prior=images finds them, instead of making them.
-        equalize: bring the training photos to their common exposure and white balance, by a gain for each photo and channel
+        equalize: scale the training photos to a common exposure and white balance, by a gain for each photo and channel
             (`clear_strategies.geometry.exposure_gains`); needs the depth of data.cloud.init=stereo or auto. Test photos stay as
             they are.
 

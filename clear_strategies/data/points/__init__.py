@@ -49,7 +49,7 @@ class CloudSettings:
         path: the PLY file for init=ply.
         min_views: training views that must observe a point, for init=sfm_train.
         enough: the fewest triangulated points that init=auto takes.
-        densify: add points between those found, at completed depth, one every `stride` LR px of each view;
+        densify: add points between those of `init`, at completed depth, one every `stride` LR px of each view;
             "auto": if the cloud has fewer points than those grids. With stereo, true and auto add points only where
             there is no depth and no other view looks through them. Random points are never densified.
         stride: see `densify`, LR px.
@@ -61,8 +61,8 @@ class CloudSettings:
         voxel: points are averaged in cubes of this edge, world units; None: they are not.
         compare: the images that stereo compares. "hr": those at HR, up to `stereo.max_pixels`. Where these are photos, maps and
             points are made at their size; where a prior made them, their depth completes that of the LR photos, except before a
-            plain background. "lr": the LR photos. "auto": as "hr", but SR images of at most five photos only: of more
-            photos, the LR photos tell as much, in a fraction of the time.
+            plain background. "lr": the LR photos. "auto": as "hr", but SR images of at most five photos only: with more
+            photos, the LR photos give the same depth in a fraction of the time.
         max_points: a larger cloud is reduced to this many points, chosen at random.
         triangulation: for init=stereo, triangulated and auto.
         stereo: for init=stereo and auto.
