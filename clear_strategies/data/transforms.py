@@ -61,10 +61,10 @@ class Transform(msgspec.Struct):
             if self.camera_angle_x is None:
                 remedy = "give it or camera_angle_x"
                 raise DataError(path, f"{where}.fl_x", "is missing, for the frame and for all", remedy)
-            fx = focal_of(path, f"{where}.camera_angle_x", self.camera_angle_x, width)
+            fx = _focal(path, f"{where}.camera_angle_x", self.camera_angle_x, width)
         if fy is None:
             angle = self.camera_angle_y
-            fy = fx if angle is None else focal_of(path, f"{where}.camera_angle_y", angle, height)
+            fy = fx if angle is None else _focal(path, f"{where}.camera_angle_y", angle, height)
         return fx, fy, width / 2 if self.cx is None else self.cx, height / 2 if self.cy is None else self.cy
 
     def lens(self, path: Path, where: str, image: Path) -> Lens:
@@ -137,8 +137,8 @@ def frames_of(
     return frames
 
 
-def focal_of(path: Path, where: str, angle: float, size: float) -> float:
-    """The focal length of an image that is so many pixels wide or high, from the angle in radians that it spans."""
+def _focal(path: Path, where: str, angle: float, size: float) -> float:
+    """The focal length, pixels, of an image that spans `angle` radians along its `size` pixels."""
     if not 0 < angle < math.pi:
         raise DataError(path, where, f"is {angle:g}; it must lie in (0, pi) radians", "correct the field")
     return size / (2 * math.tan(angle / 2))

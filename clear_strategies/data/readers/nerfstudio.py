@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections import Counter
 from collections.abc import Sequence
-from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Final
 
@@ -63,12 +63,12 @@ def read(
     names = [transform.file_path for transform in transforms]
     splits = _splits(file, lists)
     parts = [PurePosixPath(name).parts for name in names]
-    shared = _shared_folders(parts)
+    shared = os.path.commonprefix([part[:-1] for part in parts])  # noqa: RUF071 - compares tuples of folders
     photos = [
-        ("/".join(part[shared:]), _photo(folder, name, file, rules), splits.get(name))
+        ("/".join(part[len(shared) :]), _photo(folder, name, file, rules), splits.get(name))
         for name, part in zip(names, parts, strict=True)
     ]
-    frames = frames_of(file, transforms, photos, rules, folder.joinpath(*parts[0][:shared]) if shared else None)
+    frames = frames_of(file, transforms, photos, rules, folder.joinpath(*shared) if shared else None)
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(frames)}
     if splits:
         if strangers := sorted(splits.keys() - set(names)):
@@ -83,12 +83,6 @@ def read(
     return Capture(
         folder.resolve().name, sorted_by_name(frames, file), points, rules.background or (0.0, 0.0, 0.0), notes
     )
-
-
-def _shared_folders(parts: Sequence[tuple[str, ...]]) -> int:
-    """How many folders all of these paths share; names of frames are without them."""
-    first, last = min(part[:-1] for part in parts), max(part[:-1] for part in parts)  # all share what these two share
-    return len(list(takewhile(lambda pair: pair[0] == pair[1], zip(first, last, strict=False))))
 
 
 def _photo(folder: Path, name: str, file: Path, rules: PhotoRules) -> Path:

@@ -14,7 +14,7 @@ import signal
 import sqlite3
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Mapping, Set
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -162,8 +162,10 @@ def _map(pycolmap: Any, photos: Mapping[Path, Exif], work: Path, settings: SfmSe
         # Most points of few photos are seen by two photos only. With these points those six poses are four times more exact.
         mapping.triangulation.ignore_two_view_tracks = False
         _log.debug("placing the photos.")
+        # COLMAP may start again from another pair, so attempts are counted; the first call follows a pair.
+        placed, progress = itertools.count(3), Progress("placing the photos", "photos", count)
         models = pycolmap.incremental_mapping(
-            database, copies, work, options=mapping, next_image_callback=_placing(count)
+            database, copies, work, options=mapping, next_image_callback=lambda: progress(next(placed))
         )
     finally:
         pycolmap.logging.minloglevel = level
@@ -202,12 +204,6 @@ def _write_copies(
     known = sum(len(names) for (_, _, focal), names in groups.items() if focal is not None)
     _log.debug("%d cameras; the focal length of %d of %d photos is in EXIF.", len(groups), known, len(photos))
     return groups
-
-
-def _placing(count: int) -> Callable[[], None]:
-    """Logs how many photos COLMAP has placed. It may start again from another pair, so attempts are counted."""
-    placed, progress = itertools.count(3), Progress("placing the photos", "photos", count)  # the first follows a pair
-    return lambda: progress(next(placed))
 
 
 @contextlib.contextmanager

@@ -96,7 +96,7 @@ class Panel:
     def depth(self, rays: Rays) -> Float[Array, "h w"]:
         """Along each ray; infinite if the ray misses the shape."""
         offset = rays.origin - np.asarray(self.center)
-        right, down = dual(self.right), dual(self.down)
+        right, down = _dual(self.right), _dual(self.down)
         normal = self._normal
         facing = rays.dot(normal)
         # A ray parallel to the plane divides by zero, and misses.
@@ -108,7 +108,7 @@ class Panel:
         return np.asarray(np.where(inside, t, np.float32(np.inf)))
 
     def chart(self, points: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
-        basis = np.stack((dual(self.right), dual(self.down)), -1)
+        basis = np.stack((_dual(self.right), _dual(self.down)), -1)
         return np.asarray((points - f32(self.center)) @ f32(basis) / 2 + np.float32(0.5))
 
     def points(self, chart: Float[Array, "n 2"]) -> Float[Array, "n 3"]:
@@ -228,7 +228,7 @@ def unit(vectors: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-def dual(side: Vector) -> Float[Array, " 3"]:
+def _dual(side: Vector) -> Float[Array, " 3"]:
     """The vector whose dot product with `side` is one."""
     return np.asarray(np.asarray(side) / np.dot(side, side))
 
