@@ -29,8 +29,9 @@ def save(path: Path, pixels: np.ndarray, **options: object) -> Path:
         ([[[0, 51, 255], [102, 204, 1]]], None, [[[0.0, 0.2, 1.0], [0.4, 0.8, 1 / 255]]]),
         ([[51]], None, [[[0.2, 0.2, 0.2]]]),
         ([[[255, 0, 0, 51], [9, 9, 9, 0]]], (1.0, 1.0, 0.5), [[[1.0, 0.8, 0.4], [1.0, 1.0, 0.5]]]),
+        ([[[255, 0, 0, 51]]], None, [[[0.2, 0.0, 0.0]]]),
     ],
-    ids=["RGB", "grey", "straight alpha over a background"],
+    ids=["RGB", "grey", "straight alpha over a background", "alpha over black"],
 )
 def test_eight_bits_become_their_share_of_255(tmp_path: Path, pixels, background, expected) -> None:
     path = save(tmp_path / "a.png", np.array(pixels, np.uint8))
@@ -62,13 +63,6 @@ def test_sixteen_bit_grey_with_alpha_is_composited(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + pixels + chunk(b"IEND", b""))
     torch.testing.assert_close(photo_files.read_image(path), torch.full((1, 1, 3), 0.2))
-
-
-def test_without_a_background_alpha_is_composited_over_black_and_logged(tmp_path, caplog):
-    path = save(tmp_path / "a.png", np.array([[[255, 0, 0, 51]]], np.uint8))
-    with caplog.at_level("DEBUG"):
-        torch.testing.assert_close(photo_files.read_image(path), torch.tensor([[[0.2, 0.0, 0.0]]]))
-    assert "a.png has transparent pixels" in caplog.text
 
 
 @pytest.mark.parametrize("ending", ENDINGS)

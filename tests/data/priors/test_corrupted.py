@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from functools import cache
 
@@ -66,18 +67,16 @@ def test_a_network_inside_is_cached_and_the_config_builds_it(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "value"),
-    [
-        ("share", 1.5), ("share", -0.1), ("share", math.nan), ("strength", -1.0), ("strength", math.nan), ("patch", 0),
-        ("patch", 2.5), ("seed", -1),
-    ],
-)  # fmt: skip
-@pytest.mark.parametrize("kind", [Corrupted, DemoPrior])
-def test_settings_out_of_range_are_refused_by_name(kind, wrong, value):
-    prior = Corrupted(Sharp()) if kind is Corrupted else DemoPrior({})
-    object.__setattr__(prior, wrong, value)  # past the type checks, which only tests have
-    with pytest.raises(SettingError, match=rf"prior\.{wrong}: must .*, got "):
-        prior.__post_init__()
+    ("wrong", "values"),
+    [("share", (1.5, -0.1, math.nan)), ("strength", (-1.0, math.nan)), ("patch", (0, 2.5)), ("seed", (-1,))],
+)
+@pytest.mark.parametrize("prior", [Corrupted(Sharp()), DemoPrior({})], ids=["Corrupted", "DemoPrior"])
+def test_settings_out_of_range_are_refused_by_name(prior, wrong, values):
+    for value in values:
+        changed = copy.copy(prior)
+        object.__setattr__(changed, wrong, value)  # past the type checks, which only tests have
+        with pytest.raises(SettingError, match=rf"prior\.{wrong}: must .*, got "):
+            changed.__post_init__()
 
 
 # --- the demo's prior ------------------------------------------------------------------------------------------------

@@ -36,14 +36,6 @@ def test_onnx_computes_what_torch_computes(network: Path) -> None:
     assert torch.equal(sr, images.quantize(sr))
 
 
-def test_onnx_in_tiles_equals_onnx_at_once(network: Path) -> None:
-    lr = photo(50, 61)
-    whole = Onnx(str(network), tile=100)("view", lr, 4)
-    parts = Onnx(str(network), tile=24, overlap=4)("view", lr, 4)
-    assert (whole - parts).abs().max() <= 1.001 / 255
-    assert ((whole - parts) != 0).float().mean() < 1e-3
-
-
 def test_a_network_with_another_channel_order_gives_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "bgr.onnx"
     path.write_bytes(onnx_bytes(upscaling_weight().flip(1)))

@@ -65,29 +65,21 @@ def test_a_folder_is_listed_once_however_many_endings_differ(tmp_path: Path, mon
     assert listed.count(photos) <= 2  # for the endings, and for photos without a pose
 
 
-def rig(root: Path) -> Path:
-    """A model whose photos lie in a folder for each camera."""
-    listing = tiny.colmap_txt(root) / "sparse/0/images.txt"
+def test_photos_may_all_lie_in_subfolders_with_masks_in_subfolders_of_the_same_names(tmp_path: Path) -> None:
+    listing = tiny.colmap_txt(tmp_path) / "sparse/0/images.txt"
     text = listing.read_text()
     for name in tiny.NAMES:
-        (root / f"images/cam_{name[0]}").mkdir()
-        (root / "images" / name).rename(root / f"images/cam_{name[0]}/1.png")
+        (tmp_path / f"images/cam_{name[0]}").mkdir()
+        (tmp_path / "images" / name).rename(tmp_path / f"images/cam_{name[0]}/1.png")
         text = text.replace(f" {name}\n", f" cam_{name[0]}/1.png\n")
     listing.write_text(text)
-    return root
-
-
-def test_photos_may_all_lie_in_subfolders(tmp_path: Path) -> None:
-    assert [frame.name for frame in colmap.read(rig(tmp_path)).frames] == ["cam_a/1.png", "cam_b/1.png", "cam_c/1.png"]
-    shutil.copytree(tmp_path / "images/cam_a", tmp_path / "images/cam_d")
-    assert colmap.read(tmp_path).notes["without pose"] == "1 photos, not used: cam_d/1.png"
-
-
-def test_the_mask_of_a_photo_in_a_subfolder_lies_in_one_of_the_same_name(tmp_path: Path) -> None:
-    rig(tmp_path)
     for place, grey in (("cam_a/1.png.png", 0.0), ("cam_b/1.png", 1.0)):
         photo_files.write_png(tmp_path / "masks" / place, torch.full((12, 16), grey))
-    a, b, c = (frame.shown for frame in colmap.read(tmp_path).frames)
+    shutil.copytree(tmp_path / "images/cam_a", tmp_path / "images/cam_d")
+    capture = colmap.read(tmp_path)
+    assert [frame.name for frame in capture.frames] == ["cam_a/1.png", "cam_b/1.png", "cam_c/1.png"]
+    assert capture.notes["without pose"] == "1 photos, not used: cam_d/1.png"
+    a, b, c = (frame.shown for frame in capture.frames)
     assert (bool(a().any()), bool(b().all()), c) == (False, True, None)
 
 
@@ -130,22 +122,12 @@ LENSES = [
 
 
 def distorted(lens: Lens, rays: np.ndarray) -> np.ndarray:
-    """Where the lens images rays (x, y, 1), by the formulas of OpenCV's manual."""
-    x, y = rays[..., 0], rays[..., 1]
-    r = np.hypot(x, y)
+    """Where OpenCV's lens images the rays (x, y, 1)."""
+    K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
     if lens.fisheye:
-        k1, k2, k3, k4 = lens.distortion
-        theta = np.arctan(r)
-        scale = theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8) / np.maximum(r, 1e-12)
-        x, y = x * scale, y * scale
-    else:
-        k1, k2, p1, p2 = lens.distortion
-        radial = 1 + k1 * r**2 + k2 * r**4
-        x, y = (
-            x * radial + 2 * p1 * x * y + p2 * (r**2 + 2 * x**2),
-            y * radial + p1 * (r**2 + 2 * y**2) + 2 * p2 * x * y,
-        )
-    return np.stack((x * lens.fx + lens.cx, y * lens.fy + lens.cy), -1)
+        return cv2.fisheye.distortPoints(rays, K, np.array(lens.distortion))
+    points = np.concatenate((rays, np.ones_like(rays[..., :1])), -1).reshape(-1, 3)
+    return cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array(lens.distortion))[0].reshape(rays.shape)
 
 
 @pytest.mark.parametrize("lens", LENSES, ids=["opencv", "radial", "fisheye"])

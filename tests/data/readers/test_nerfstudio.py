@@ -75,18 +75,16 @@ def test_the_masks_it_names_hide_their_black_pixels_and_are_undistorted_with_the
         assert found[:, 6:].all()
 
 
-def test_masks_lie_in_subfolders_like_those_of_their_photos(tmp_path: Path) -> None:
+def test_photos_of_one_name_keep_their_subfolders_and_masks_lie_in_the_same(tmp_path: Path) -> None:
     def rig(value: dict[str, Any]) -> None:
-        for folder, frame in zip(("left", "right", "right"), value["frames"], strict=True):
-            photo = tmp_path / frame["file_path"]
-            moved = photo.parent / folder / photo.name
-            moved.parent.mkdir(exist_ok=True)
-            photo.rename(moved)
-            write_png(tmp_path / "masks" / folder / photo.name, torch.zeros(12, 16))
-            frame["file_path"] = f"images/{folder}/{photo.name}"
+        for folder, frame in zip(("back", "left", "right"), value["frames"], strict=True):
+            (tmp_path / "images" / folder).mkdir()
+            (tmp_path / frame["file_path"]).rename(tmp_path / "images" / folder / "1.png")
+            write_png(tmp_path / "masks" / folder / "1.png", torch.zeros(12, 16))
+            frame["file_path"] = f"images/{folder}/1.png"
 
     frames = nerfstudio.read(changed(tmp_path, rig)).frames
-    assert [frame.name for frame in frames] == ["left/a.png", "right/b.png", "right/c.png"]
+    assert [frame.name for frame in frames] == ["back/1.png", "left/1.png", "right/1.png"]
     assert all(frame.shown is not None and not frame.shown().any() for frame in frames)
 
 
@@ -98,12 +96,3 @@ def test_points_of_a_ply_have_no_tracks(tmp_path: Path) -> None:
     assert points.colors[0].tolist() == pytest.approx([1, 0, 0.2])
     assert len(points.track_point) == len(points.track_image) == 0
     assert points.source == "points.ply, 1 points without tracks"
-
-
-def test_names_keep_the_folders_that_tell_them_apart(tmp_path: Path) -> None:
-    tiny.nerfstudio(tmp_path)
-    for side in ("left", "right"):
-        tiny.write_photos(tmp_path / "images" / side)
-    frames = [{"file_path": f"images/{s}/a.png", "transform_matrix": tiny.opengl(0)} for s in ("left", "right")]
-    tiny.write_json(tmp_path / "transforms.json", {"fl_x": 20.0, "frames": frames})
-    assert [frame.name for frame in nerfstudio.read(tmp_path).frames] == ["left/a.png", "right/a.png"]
