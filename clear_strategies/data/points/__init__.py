@@ -165,7 +165,7 @@ def initial_points(
             initial = _cleaned(settings, features, visible, background)
         case "stereo" | "auto":
             known = _sfm_of_training_views(settings, sfm, train_ids) if sfm_is_train else None
-            if settings.init == "auto" and sfm is not None and known is None:
+            if settings.init == "auto" and sfm is not None and not sfm_is_train:
                 _log.debug("init: auto does not use the scene's own points, because test views were used for them.")
             initial = _from_depth(settings, photos, hr, hr_is_photo, known, background)
     cloud = random_cloud(photos, settings.random_points, seed, settings.box) if initial is None else initial.cloud
