@@ -18,6 +18,7 @@ _log = logging.getLogger(__name__)
 
 _FOLDERS: Final = ("images", "images_2", "images_4", "images_8")
 _LONGEST_NAME: Final = 1024
+_LONGEST_PART: Final = 255  # bytes
 _LISTED: Final = 5  # names in a message, at most
 
 Fault = Literal["refuse", "skip"]
@@ -85,33 +86,6 @@ def by_stem(paths: Iterable[Path]) -> dict[str, list[Path]]:
     return stems
 
 
-def inside(root: Path, name: str, *, file: Path, allow_outside: bool = False) -> Path:
-    """`root / name`, if that is inside `root` once symbolic links are resolved.
-
-    Args:
-        file: the file that has the name, for messages.
-        allow_outside: accept absolute names and links out of `root`, for trusted data sets.
-
-    Raises:
-        DataError: the name is absolute or leads out of `root`.
-    """
-    parts = name.replace("\\", "/").split("/")
-    if not 0 < len(name) <= _LONGEST_NAME or "\0" in name or max(len(p.encode(errors="replace")) for p in parts) > 255:
-        problem = f"{name[:80]!r} is no file name"
-        raise DataError(file, "file name", problem, "name an image inside the data set's folder")
-    if allow_outside:
-        return root / name
-    try:
-        within = not os.path.isabs(name) and (root / name).resolve().is_relative_to(root.resolve())  # noqa: PTH117
-    except (OSError, RuntimeError, ValueError) as error:  # circular links, names that no system allows
-        problem = f"{name[:80]!r} cannot be resolved ({type(error).__name__})"
-        raise DataError(file, "file name", problem, "rename the file") from error
-    if not within:
-        remedy = "keep the images inside the data set's folder, or follow it: data.reader.allow_outside=true"
-        raise DataError(file, "file name", f"{name!r} leads out of {root}", remedy)
-    return root / name
-
-
 def require_faults(missing: Fault, broken: Fault) -> None:
     """Raise a SettingError unless both are "refuse" or "skip"."""
     require_choice("data.missing", missing, get_args(Fault))
@@ -144,8 +118,29 @@ class PhotoRules:
             object.__setattr__(self, "background", as_color("data.reader.background", self.background))
 
     def inside(self, root: Path, name: str, *, file: Path) -> Path:
-        """The file of this name, which is inside `root` unless `allow_outside`; see the function `inside`."""
-        return inside(root, name, file=file, allow_outside=self.allow_outside)
+        """`root / name`, which must be inside `root` once symbolic links are resolved, unless `allow_outside`.
+
+        Args:
+            file: the file that has the name, for messages.
+
+        Raises:
+            DataError: the name is absolute or leads out of `root`, or is no file name.
+        """
+        longest = max(len(part.encode(errors="replace")) for part in name.replace("\\", "/").split("/"))
+        if not 0 < len(name) <= _LONGEST_NAME or "\0" in name or longest > _LONGEST_PART:
+            problem = f"{name[:80]!r} is no file name"
+            raise DataError(file, "file name", problem, "name an image inside the data set's folder")
+        if self.allow_outside:
+            return root / name
+        try:
+            within = not os.path.isabs(name) and (root / name).resolve().is_relative_to(root.resolve())  # noqa: PTH117
+        except (OSError, RuntimeError, ValueError) as error:  # circular links, names that no system allows
+            problem = f"{name[:80]!r} cannot be resolved ({type(error).__name__})"
+            raise DataError(file, "file name", problem, "rename the file") from error
+        if not within:
+            remedy = "keep the images inside the data set's folder, or follow it: data.reader.allow_outside=true"
+            raise DataError(file, "file name", f"{name!r} leads out of {root}", remedy)
+        return root / name
 
     def usable(self, file: Path, entries: Sequence[_Entry], path_of: Callable[[_Entry], Path]) -> list[_Entry]:
         """The entries whose photos can be used, in their order.

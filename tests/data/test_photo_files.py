@@ -132,10 +132,10 @@ def test_names_that_lead_out_are_refused_unless_that_is_allowed(name: str, tmp_p
     root.mkdir()
     (root / "link").symlink_to(tmp_path)
     with pytest.raises(DataError, match="file name"):
-        photo_folders.inside(root, name, file=root / "list.txt")
-    assert photo_folders.inside(root, "a/../b.png", file=root) == root / "a/../b.png"
+        photo_folders.PhotoRules().inside(root, name, file=root / "list.txt")
+    assert photo_folders.PhotoRules().inside(root, "a/../b.png", file=root) == root / "a/../b.png"
     if name in ("/etc/passwd", "link/x"):
-        assert photo_folders.inside(root, name, file=root, allow_outside=True) == root / name
+        assert photo_folders.PhotoRules(allow_outside=True).inside(root, name, file=root) == root / name
 
 
 def test_a_drawing_that_compresses_well_is_no_bomb(tmp_path: Path) -> None:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +21,6 @@ from clear_strategies.data.photo_files import Exif
 from clear_strategies.data.readers import colmap, photos, sfm
 from clear_strategies.data.readers.sfm import SfmSettings
 from clear_strategies.errors import DataError
-from tests.helpers import captures
 from tests.helpers.captures import largest_turn
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -122,29 +118,6 @@ def test_too_few_placed_photos_are_refused_with_advice_and_the_setting_that_take
     assert least == pytest.approx(placed / count, abs=1e-3)
     sfm.require_placed(Path("mine"), placed, count, least)
     sfm.require_placed(Path("mine"), 6, 10, 0.5)
-
-
-def test_poses_of_the_cache_are_refused_and_taken_as_those_just_estimated(tmp_path, monkeypatch):
-    estimated = []
-
-    def reconstruct(root: Path, listed: Any, folder: Path, settings: SfmSettings) -> None:
-        estimated.append(folder)
-        shutil.copytree(captures.colmap_bin(tmp_path / "scene") / "sparse/0", folder)
-        images = (folder / "images.bin").read_bytes()
-        for i, name in enumerate(captures.NAMES):
-            images = images.replace(name.encode(), sfm.copy_name(i).encode())
-        (folder / "images.bin").write_bytes(images)
-        (folder / sfm.UNPLACED).write_text("{}")
-
-    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
-    captures.write_photos(tmp_path / "photos")
-    for i in range(4):
-        Image.new("RGB", (captures.WIDTH, captures.HEIGHT)).save(tmp_path / "photos" / f"z{i}.png")
-    read = partial(photos.read, tmp_path / "photos", tmp_path / "cache")
-    assert len(read(least_placed=0.4).frames) == 3
-    with pytest.raises(DataError, match=r"only 3 of the 7 photos .*data\.reader\.least_placed=0\.428"):
-        read(least_placed=0.5)
-    assert len(estimated) == 1
 
 
 class FakeModel:

@@ -151,6 +151,15 @@ def test_photos_turned_by_exif_are_upright(of_photos):
         assert torch.equal((read().frames[1].load() * 255).round().to(torch.uint8), torch.from_numpy(upright))
 
 
+def test_poses_of_the_cache_are_refused_and_taken_as_those_just_estimated(of_photos):
+    folder, read = of_photos  # estimating twice would fail: the model is there already
+    for i in range(4):
+        Image.new("RGB", (captures.WIDTH, captures.HEIGHT)).save(folder / f"z{i}.png")
+    assert len(read(least_placed=0.4).frames) == 3
+    with pytest.raises(DataError, match=r"only 3 of the 7 photos .*data\.reader\.least_placed=0\.428"):
+        read(least_placed=0.5)
+
+
 def test_heic_without_its_library_is_named_with_the_extra(of_photos, monkeypatch):
     folder, read = of_photos
     (folder / "b.png").unlink()
