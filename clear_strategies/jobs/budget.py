@@ -62,8 +62,8 @@ class Budget:
         photo = frames[0].load()[:_CROP, :_CROP]
         network("a crop, to load the network", photo[:_LOADED, :_LOADED], factor)
         began = time.perf_counter()
-        made = network("a crop, to measure the time", photo, factor)
-        each = passes_of(prior) * (time.perf_counter() - began) / (made.shape[0] * made.shape[1])
+        height, width, _ = network("a crop, to measure the time", photo, factor).shape
+        each = passes_of(prior) * (time.perf_counter() - began) / (height * width)
         return max(_LEAST_MEGAPIXELS, _SR * self.left / (len(frames) * each * 1e6))
 
     def iterations(self, state: TrainState, rasterizer: Rasterizer, *, trainings: int, maps: int, frames: int) -> Plan:
@@ -85,18 +85,15 @@ class Budget:
         began = time.perf_counter()
         state.field.render(rasterizer, state.views[0].hr.camera)
         render = time.perf_counter() - began
-        files = (
-            render * (frames + _RENDERS_OF_VIEW * len(state.views) + _RENDERS)
-            + maps * _ITERATIONS_OF_MAP * each
-            + _REST
-        )
-        found = min(most, max(_LEAST, int((self.left - files) / (trainings * each))))
-        return Plan(found, each, files, self)
+        renders = frames + _RENDERS_OF_VIEW * len(state.views) + _RENDERS
+        files = renders * render + maps * _ITERATIONS_OF_MAP * each + _REST
+        iterations = min(most, max(_LEAST, int((self.left - files) / (trainings * each))))
+        return Plan(iterations, each, files, self)
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What was decided.
+    """How a run keeps to its budget.
 
     Args:
         each: seconds of an iteration.
@@ -108,18 +105,18 @@ class Plan:
     files: float
     budget: Budget
 
-    def says(self) -> str:
-        """For the plan of the run."""
+    def description(self) -> str:
+        """A line of the run's printed plan."""
         spent, whole = self.budget.seconds - self.budget.left, self.budget.seconds
-        said = (
+        line = (
             f"{whole / 60:g} minutes: {spent:.0f} s until now, {self.iterations} iterations of {self.each:.2f} s, "
             f"{self.files:.0f} s for pictures and files"
         )
         late = spent + self.iterations * self.each + self.files - whole
-        return said if late < 0.2 * whole else f"{said}; this takes {late:.0f} s longer than asked for"
+        return line if late < 0.2 * whole else f"{line}; this takes {late:.0f} s longer than asked for"
 
     def hurry(self, state: TrainState) -> Callable[[], None]:
-        """What a run calls after each iteration: when the rest takes longer than is left, it goes on where the rates fall."""
+        """A function to call after each iteration. When the rest takes longer than is left, it skips to where the rates fall."""
         skips, ticks = state.skip_policy.skips, [time.perf_counter()]
 
         def check() -> None:
@@ -127,10 +124,8 @@ class Plan:
             recent = ticks[-_PACE - 1 :]
             pace = (recent[-1] - recent[0]) / (len(recent) - 1)
             to = min(skips.plateau_to, state.settings.iterations - 1)  # the last one is trained and evaluated
-            if (
-                skips.plateau_from <= state.t < to
-                and (state.settings.iterations - to) * pace > self.budget.left - self.files
-            ):
-                state.go_on_after(to, "the time that is left would not last (fit.minutes)")
+            late = (state.settings.iterations - to) * pace > self.budget.left - self.files
+            if late and skips.plateau_from <= state.t < to:
+                state.skip_until(to, "the time that is left would not last (fit.minutes)")
 
         return check

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final, overload
 
 from clear_strategies.core.deferred import Number
@@ -56,6 +56,3 @@ class History(Sequence[dict[str, Number]]):
             return self._loose[at - packed]
         end, names = self._ends[at], self._names[self._kinds[at]]
         return dict(zip(names, self._numbers[end - len(names) : end], strict=True))
-
-    def __iter__(self) -> Iterator[dict[str, Number]]:
-        return (self[i] for i in range(len(self)))

@@ -6,63 +6,119 @@ functions of (seed, t), so a resumed run has the same bits as one that was never
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+import torch
 from torch import Tensor
 
 from clear_strategies.core import deferred, images
 from clear_strategies.core.deferred import Number
+from clear_strategies.core.finite import require_finite
 from clear_strategies.core.gradients import conflict_columns
-from clear_strategies.core.view import View
+from clear_strategies.core.seeds import generator_at
+from clear_strategies.core.view import ExtraView, View
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DivergedError
 from clear_strategies.merging.iteration import Update
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import Clock
 from clear_strategies.training.evaluation import evaluate, loss_of_views, psnr_of
-from clear_strategies.training.extra_steps import extra_steps
 from clear_strategies.training.signals import Interrupted, deferred_signals, foremost
 from clear_strategies.training.skips import PLATEAU_LOSS
 from clear_strategies.training.state import TrainState
 from rasterizers import native
 from rasterizers.interface import Rasterizer, over
 
+EXTRA_LOSS: Final = "loss_extra"
+"""The column of the history: the LR loss of the iteration's last extra view."""
+
 
 def iterate(s: TrainState, rasterizer: Rasterizer) -> Update:
     """One iteration, in the paper's order."""
-    t, θ, ask, stage = s.t, s.field, s.conductor, s.conductor.work_log.stage
+    t, θ, conductor, stage = s.t, s.field, s.conductor, s.conductor.work_log.stage
     θ.degree = min(s.settings.max_degree, (t - 1) // max(1, s.settings.degree_every))
-    view = s.skip_policy.view(s.view(), t)
-    hr_due = ask.wants_hr(t)
-    scales = {"lr": ask.wants_lr and s.skip_policy.lr_due(view, hr_due, ask.work_log), "hr": hr_due}
-    before_color = over(rasterizer, ask.background(t))
-    z = ask.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
+    view = s.skip_policy.view(view_at(s), t)
+    hr_due = conductor.wants_hr(t)
+    scales = {"lr": conductor.wants_lr and s.skip_policy.lr_due(view, hr_due, conductor.work_log), "hr": hr_due}
+    over_color = over(rasterizer, conductor.background(t))
+    z = conductor.gate(t, len(θ))  # zᵗ             Eq. 15       SVS
     with stage(f"render {' + '.join(scale.upper() for scale, wanted in scales.items() if wanted)}"):
-        lr, hr = θ.render_scales(before_color, view, gate=z, **scales)  # Î_LR, Î_HR     Eq. 2, 3
-    drawn = [shot for shot in (lr, hr) if shot is not None]
-    u = ask.update(θ.raw(), lr, hr, view, t, s.compiled_step)
+        lr, hr = θ.render_scales(over_color, view, gate=z, **scales)  # Î_LR, Î_HR     Eq. 2, 3
+    u = conductor.update(θ.raw(), lr, hr, view, t, s.compiled_step)
     if u.grads is not None:  # else the compiled step has made the step
         with stage("optimizer"):
             s.optimizer.step(θ.raw(), u.grads)
             θ.constrain()
-    extra = extra_steps(s, before_color, ask.extra_views(t))
-    ask.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
-    s.density.accumulate(u, drawn[-1], t)  # S^dens         Eq. 14
+    extra = extra_steps(s, over_color, conductor.extra_views(t))
+    conductor.after_step(θ.raw(), u.step)  # θᵃ at t = t_a  Eq. 16       SVS
+    *_, finest = (shot for shot in (lr, hr) if shot is not None)
+    s.density.accumulate(u, finest, t)  # S^dens         Eq. 14
     with stage("density and filter"):
         # clone · split · prune = parents[M]
-        restructured = ask.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
+        restructured = conductor.may_densify(t) and s.density.step(θ, s.optimizer, t, s.resized)
         if s.filter_due() and not restructured:  # the means have not moved since
             s.refilter()
-    low = images.area_mean(drawn[-1].image, view.factor) if lr is None else lr.image
+    low = images.area_mean(finest.image, view.factor) if lr is None else lr.image
     s.history.append(_row(s, u, low, view) | extra)
     if s.skip_policy.measured(t) and not (restructured or s.reset_due(t)):
         with stage("training views drawn whole"):
             s.history[-1][PLATEAU_LOSS] = loss_of_views(s, rasterizer)
     s.advance()
     return u
+
+
+def view_at(s: TrainState) -> View:
+    """The view of iteration t: every view once, in random order, then again in another."""
+    epoch, position = divmod(s.t - 1, len(s.views))
+    generator = generator_at(s.settings.seed, epoch)
+    order = torch.randperm(len(s.views), generator=generator, device=generator.device)
+    return s.views[int(order[position])]
+
+
+def extra_steps(s: TrainState, rasterizer: Rasterizer, extra_views: Sequence[ExtraView]) -> dict[str, Number]:
+    """One step of the optimizer on the LR loss of each extra view: a picture that a strategy wants the field to match besides
+    the iteration's own view.
+
+    Returns:
+        The column `EXTRA_LOSS` of the history; nothing without extra views.
+
+    Raises:
+        DivergedError: a loss or a gradient is not finite; that step was not made.
+    """
+    row: dict[str, Number] = {}
+    θ, steps, where = s.field, s.optimizer.steps, f"t={s.t}, an extra view: the gradient"
+    for extra in extra_views:
+        with s.conductor.work_log.stage("extra views"):
+            shot = θ.shot(rasterizer, extra.photo.camera)
+            losses = s.conductor.extra_loss(shot.image, extra, s.t)
+            if s.compiled_step is not None:
+                (g,) = s.compiled_step.vjp(shot, losses.cotangents)
+                require_finite(where, g.table())
+                s.compiled_step.step_extra(θ.raw(), g, s.t)
+            else:
+                (grads,) = shot.vjp(losses.cotangents)
+                require_finite(where, grads)
+                s.optimizer.step(θ.raw(), grads)
+                θ.constrain()
+            s.optimizer.steps = steps  # the learning rates follow the iteration
+            row[EXTRA_LOSS] = losses.values["lr"]
+    return row
+
+
+def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Number]:
+    photo = view.lr.over(s.conductor.background(s.t), view.background)
+    row: dict[str, Number] = {
+        "t": float(s.t),
+        "lambda_hr": s.conductor.objective.lambda_hr(s.t),
+        "psnr_train_lr": psnr_of(lr_image, photo.image),
+        "n_gaussians": float(len(s.field)),
+        "detail_abs": deferred.scalar(s.field.detail.data.abs().mean()),
+    }
+    row |= {f"loss_{name}": value for name, value in u.losses.items()}
+    return row | conflict_columns(u.conflict) | dict(u.logs)
 
 
 def kernel_threads(state: TrainState, rasterizer: Rasterizer) -> AbstractContextManager[None]:
@@ -103,8 +159,7 @@ def fit(
 
     clock = Clock(state.history_as_floats()[-1] if state.history else {})
     with deferred_signals() as pending, kernel_threads(state, rasterizer):
-        ended = state.ended
-        while not ended:
+        while not state.ended:
             done = state.t
             try:
                 iterate(state, rasterizer)
@@ -127,16 +182,3 @@ def fit(
     save()
     state.history_as_floats()
     return state
-
-
-def _row(s: TrainState, u: Update, lr_image: Tensor, view: View) -> dict[str, Number]:
-    photo = view.lr.over(s.conductor.background(s.t), view.background)
-    row: dict[str, Number] = {
-        "t": float(s.t),
-        "lambda_hr": s.conductor.objective.lambda_hr(s.t),
-        "psnr_train_lr": psnr_of(lr_image, photo.image),
-        "n_gaussians": float(len(s.field)),
-        "detail_abs": deferred.scalar(s.field.detail.data.abs().mean()),
-    }
-    row |= {f"loss_{name}": value for name, value in u.losses.items()}
-    return row | conflict_columns(u.conflict) | dict(u.logs)

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.finite import is_finite, rows_not_finite
-from clear_strategies.core.seeds import generator_at
 from clear_strategies.core.view import View
 from clear_strategies.data.scene import Scene
 from clear_strategies.errors import DataError, DivergedError
@@ -78,37 +77,20 @@ class TrainState:
         device = scene.device
         theta = GaussianField.from_cloud(scene.cloud, max_degree=settings.max_degree).to(device)
         extent = cameras_extent(torch.stack([view.hr.camera.center.float() for view in scene.train]))
-        white = all(c == 1.0 for c in scene.background)
-        bringer = conductor.owner("densifier")
-        control = None if bringer is None else bringer.densifier(theta, scene.train, settings.seed)
-        if control is None:
-            control = density.densifier(
+        owner = conductor.owner("densifier")
+        densifier = None if owner is None else owner.densifier(theta, scene.train, settings.seed)
+        if densifier is None:
+            white = all(c == 1.0 for c in scene.background)
+            densifier = density.densifier(
                 len(theta), extent=extent, seed=settings.seed, white_background=white, device=device
             )
         optimizer = Adam(theta.raw(), rates, extent)
         conductor.on_fit_start(len(scene.train), settings.seed, device, scene.train)
-        step = compiled_step_for(conductor, optimizer, settings.fused)
-        state = cls(
-            theta,
-            conductor,
-            optimizer,
-            control,
-            settings,
-            mip,
-            scene.train,
-            near,
-            compiled_step=step,
-            skip_policy=SkipPolicy(skips),
-        )
+        state = cls(theta, conductor, optimizer, densifier, settings, mip, scene.train, near)
+        state.compiled_step = compiled_step_for(conductor, optimizer, settings.fused)
+        state.skip_policy = SkipPolicy(skips)
         state.refilter()
         return state
-
-    def view(self) -> View:
-        """The view of this iteration: every view once, in random order, then again in another."""
-        epoch, position = divmod(self.t - 1, len(self.views))
-        generator = generator_at(self.settings.seed, epoch)
-        order = torch.randperm(len(self.views), generator=generator, device=generator.device)
-        return self.views[int(order[position])]
 
     @property
     def device(self) -> torch.device:
@@ -133,31 +115,31 @@ class TrainState:
         done, self.t = self.t, self.t + 1
         if not self.skip_policy.settled(self.history, done):
             return
-        skips = self.skip_policy.skips
-        gained = (
-            f"the training views' loss fell by less than {skips.plateau_gain:.1%} in {skips.plateau_window} iterations"
-        )
-        self.go_on_after(min(skips.plateau_to, self.settings.iterations), gained)
+        s = self.skip_policy.skips
+        reason = f"the training views' loss fell by less than {s.plateau_gain:.1%} in {s.plateau_window} iterations"
+        self.skip_until(min(s.plateau_to, self.settings.iterations), reason)
 
-    def go_on_after(self, last: int, why: str) -> None:
+    def skip_until(self, last: int, reason: str) -> None:
         """Leave out the iterations from the next one to `last`."""
-        left_out, before = last + 1 - self.t, self.t - 1
+        done, left_out = self.t - 1, last + 1 - self.t
         self.t = last + 1
         self.optimizer.steps += left_out  # the learning rates follow the iteration
-        self.conductor.work_log.skip("iterations", why, left_out)
-        _log.info("t=%d: %s; training goes on at t=%d.", before, why, self.t)
+        self.conductor.work_log.skip("iterations", reason, left_out)
+        _log.info("t=%d: %s; training goes on at t=%d.", done, reason, self.t)
 
     def refilter(self) -> None:
         cameras = [(v.hr if self.mip.cameras == "hr" else v.lr).camera for v in self.views]
         self.field.update_filter(cameras, self.mip.variance, self.near)
 
     def resized(self, parents: Int[Tensor, " M"]) -> None:
-        """Tell the conductor and the filter that row i now comes from row parents[i]; field and optimizer are done."""
+        """Gather what strategies keep per Gaussian, and recompute the filter, after a change of structure: row i comes from row
+        parents[i]. Field and optimizer have been gathered.
+        """
         self.conductor.on_resize(parents)
         self.refilter()
 
     def reset_due(self, t: int) -> bool:
-        """Whether opacities are lowered at t; renders right after that say nothing about the field."""
+        """Whether opacities are lowered at t, see `Densifier.reset_due`."""
         return self.conductor.may_densify(t) and self.density.reset_due(t)
 
     def filter_due(self) -> bool:
@@ -168,7 +150,7 @@ class TrainState:
         """What a run needs to continue.
 
         Raises:
-            DivergedError: a parameter or moment is not finite, so that nobody saves it.
+            DivergedError: a parameter or moment is not finite.
         """
         self.require_finite()
         tensors: dict[str, Tensor] = {}
@@ -180,18 +162,11 @@ class TrainState:
         ):
             tensors |= {f"{prefix}/{name}": value for name, value in table.items()}
         facts = {"optimizer_steps": float(self.optimizer.steps), "degree": float(self.field.degree)}
-        return Checkpoint(
-            self.t,
-            tensors,
-            config,
-            facts,
-            self.history_as_floats(),
-            self.conductor.work_log.state_dict(),
-            self.device.type,
-        )
+        history, work_log = self.history_as_floats(), self.conductor.work_log.state_dict()
+        return Checkpoint(self.t, tensors, config, facts, history, work_log, self.device.type)
 
     def restore(self, saved: Checkpoint, source: Path) -> None:
-        """Go on from a checkpoint, whatever device it was made on.
+        """Continue from a checkpoint, which may come from another device.
 
         Raises:
             DataError: its tensors do not belong to this run.
@@ -217,7 +192,7 @@ class TrainState:
         self.history = History(dict(row) for row in saved.history)
 
     def _require_rows(self, tables: Mapping[str, Mapping[str, Tensor]], saved: Checkpoint) -> None:
-        """Check what is restored: as many rows everywhere as there are means, each as wide as here, of the same type.
+        """Check that all restored tensors have a row for each Gaussian, and the width and type that this run has.
 
         Raises:
             ValueError, KeyError: it is not.
@@ -241,8 +216,8 @@ class TrainState:
 
     def require_finite(self) -> None:
         """Raise a DivergedError for the first parameter or moment of Adam that is not finite; reads the device."""
-        first, second = self.optimizer.first, self.optimizer.second
-        for kind, table in (("", self.field.raw()), ("first moment of ", first), ("second moment of ", second)):
+        moments = ("first moment of ", self.optimizer.first), ("second moment of ", self.optimizer.second)
+        for kind, table in (("", self.field.raw()), *moments):
             for name, value in table.items():
                 if not is_finite(value):
                     raise DivergedError(

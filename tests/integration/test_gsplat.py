@@ -15,7 +15,7 @@ from clear_strategies.compose import conductor as composed_conductor
 from clear_strategies.core.view import Photo, View
 from clear_strategies.merging.detail import DetailRates
 from clear_strategies.schedules import scaled
-from clear_strategies.training.loop import iterate
+from clear_strategies.training.loop import iterate, view_at
 from clear_strategies.training.optim import LearningRates
 from integration import HostError
 from integration.gsplat import attach
@@ -84,7 +84,7 @@ def test_fifty_steps_equal_those_of_our_own_trainer(name, attached, mcmc_acts):
     host.optimizers["detail"].param_groups[0]["eps"] = EPS
     views = []
     for _ in range(STEPS):
-        views.append(own.view().name)
+        views.append(view_at(own).name)
         iterate(own, RASTERIZER)
     host.train(views)
 

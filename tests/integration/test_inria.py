@@ -17,7 +17,7 @@ from clear_strategies.data.priors import Images
 from clear_strategies.errors import SettingError
 from clear_strategies.schedules import Ramp, scaled
 from clear_strategies.strategies import random_background
-from clear_strategies.training.loop import iterate
+from clear_strategies.training.loop import iterate, view_at
 from integration.inria import attach
 from integration.inria.cameras import HostViews
 from tests.helpers import toy
@@ -94,7 +94,7 @@ def test_its_steps_equal_those_of_our_own_trainer(sampling, inria_host, inria_ca
     start = own.field.scales.data.clone()
     names = []
     for _ in range(STEPS):
-        names.append(own.view().name.removesuffix(".png"))
+        names.append(view_at(own).name.removesuffix(".png"))
         iterate(own, RASTERIZER)
 
     for name, p in clear.params().items():

@@ -65,8 +65,8 @@ def test_there_are_no_more_than_asked_for_and_never_too_few_to_look_at() -> None
     assert planned(1e6, iterations=30).iterations == 30
     short = planned(1.0)
     assert short.iterations == budgets._LEAST
-    assert "longer than asked for" in short.says()
-    assert "longer" not in planned(20.0).says()
+    assert "longer than asked for" in short.description()
+    assert "longer" not in planned(20.0).description()
 
 
 def test_sr_images_get_no_larger_than_a_fifth_of_the_time_allows(clock: Clock) -> None:
@@ -110,15 +110,12 @@ def test_a_late_run_whose_rates_fall_after_its_end_makes_its_last_iteration_and_
     assert [int(row["t"]) for row in state.history] == [*range(1, 8), ITERATIONS]
 
 
-def test_a_resumed_run_takes_no_minutes() -> None:
-    with pytest.raises(SettingError, match="exclude each other"):
-        RunSettings(minutes=1.0, resume="auto")
-
-
-def test_a_run_of_some_seconds_says_what_was_chosen_and_keeps_the_number(tmp_path: Path) -> None:
+def test_a_run_of_some_seconds_logs_what_was_chosen_and_keeps_the_number(tmp_path: Path) -> None:
     settings = [*command_line.TINY, "fit.iterations=40", "fit.minutes=0.001", "+strategy=gco", "hydra.run.dir=run"]
     ended = command_line.run("data=demo", *settings, cwd=tmp_path)
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert "0.001 minutes: " in ended.stdout
     saved = metrics.read(tmp_path / "run" / "metrics.json", "")
     assert (saved.iterations, saved.config["fit.iterations"], saved.config["fit.minutes"]) == (40, 40, None)
+    with pytest.raises(SettingError, match="exclude each other"):
+        RunSettings(minutes=1.0, resume="auto")

@@ -9,7 +9,7 @@ import torch
 
 from clear_strategies import RandomBackground
 from clear_strategies.core.view import Photo
-from clear_strategies.training.loop import iterate
+from clear_strategies.training.loop import iterate, view_at
 from tests.helpers.short_run import SCENE, start
 from tests.helpers.toy import RASTERIZER
 
@@ -72,7 +72,7 @@ def test_an_object_before_transparency_gets_other_backgrounds_however_many_views
 def test_the_trainer_renders_over_it_and_evaluates_over_the_background_of_the_scene():
     state = start((), more=[RandomBackground(until=1_350)])
     state.field.opacities.data.fill_(-15.0)  # the background is all that is seen
-    view = state.view()
+    view = view_at(state)
     iterate(state, RASTERIZER)
     color = torch.tensor(state.conductor.background(1))
     psnr = -10 * float((color - view.lr.image).square().mean().log10())

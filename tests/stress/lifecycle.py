@@ -29,7 +29,7 @@ from clear_strategies import SVS
 from clear_strategies.errors import DensityError, DivergedError
 from clear_strategies.training import checkpoint
 from clear_strategies.training.field import LOG_SCALE_LIMIT, LOGIT_LIMIT
-from clear_strategies.training.loop import iterate
+from clear_strategies.training.loop import iterate, view_at
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 from tests.helpers.short_run import ITERATIONS, SUBSETS, start, tensors
@@ -148,7 +148,7 @@ class Lifecycle(RuleBasedStateMachine):
 
     @rule(scale=st.sampled_from(["lr", "hr"]), row=st.integers(0, 15), column=st.integers(0, 23), value=_NOT_FINITE)
     def damage_a_photo(self, scale, row, column, value) -> None:
-        view, before = self.state.view(), tensors(self.state)
+        view, before = view_at(self.state), tensors(self.state)
         image = getattr(view, scale).image
         good = image[row, column].clone()
         image[row, column] = value

@@ -10,8 +10,7 @@ import torch
 from clear_strategies import SVS, Conductor, ExtraView, Objective, Photo, Strategy
 from clear_strategies.core import deferred
 from clear_strategies.errors import DivergedError
-from clear_strategies.training.extra_steps import LOSS, extra_steps
-from clear_strategies.training.loop import iterate
+from clear_strategies.training.loop import EXTRA_LOSS, extra_steps, iterate
 from clear_strategies.training.state import TrainState
 from tests.helpers import toy
 from tests.helpers.short_run import ITERATIONS, start
@@ -47,27 +46,28 @@ def test_they_come_when_a_strategy_says_so_and_their_loss_is_in_the_history():
     for _ in range(ITERATIONS):
         iterate(state, toy.RASTERIZER)
     rows = state.history_as_floats()
-    assert [int(row["t"]) for row in rows if LOSS in row] == list(range(2, ITERATIONS + 1, 2))
-    assert all(row[LOSS] > 0 for row in rows if LOSS in row)
+    assert [int(row["t"]) for row in rows if EXTRA_LOSS in row] == list(range(2, ITERATIONS + 1, 2))
+    assert all(row[EXTRA_LOSS] > 0 for row in rows if EXTRA_LOSS in row)
     assert state.conductor.work_log.entries["extra views"].runs == ITERATIONS // 2
 
 
-def test_several_strategies_may_answer_and_each_view_has_its_own_step():
-    state = start((), more=[Dark(), Dark(every=3)])
-    state.t = 6
-    assert len(state.conductor.extra_views(6)) == 2
-    extra_steps(state, toy.RASTERIZER, state.conductor.extra_views(6))
-    assert state.conductor.work_log.entries["extra views"].runs == 2
+def test_every_strategy_is_asked_unless_there_is_no_lr_loss():
+    conductor = start((), more=[Dark(), Dark(every=3)]).conductor
+    assert len(conductor.extra_views(6)) == 2
+    object.__setattr__(conductor.objective, "lambda_lr", 0.0)
+    assert conductor.extra_views(6) == []
 
 
 @pytest.mark.parametrize("fused", ["auto", "off"])
-def test_only_weighted_pixels_teach_and_the_learning_rates_follow_the_iteration(fused):
-    state = start((), fused=fused)
+def test_only_weighted_pixels_teach_no_anchor_pulls_and_the_learning_rates_follow_the_iteration(fused):
+    state = start((), more=[SVS(anchor_strength=0.1, anchor_weights={"scales": 1.0}, anchor_start=1)], fused=fused)
+    state.conductor.strategies[0].state["scales"] = state.field.scales.data + 1.0
     before, steps = parameters(state), state.optimizer.steps
     row = extra_steps(state, toy.RASTERIZER, [black(weight=0.0)])
-    assert deferred.resolve([row])[0][LOSS] == 0
+    assert deferred.resolve([row])[0][EXTRA_LOSS] == 0
     assert all(torch.equal(value, before[name]) for name, value in state.field.raw().items())
-    extra_steps(state, toy.RASTERIZER, [black()])
+    extra_steps(state, toy.RASTERIZER, [black(), black()])
+    assert state.conductor.work_log.entries["extra views"].runs == 3
     moved = {name for name, value in state.field.raw().items() if not torch.equal(value, before[name])}
     assert {"means", "scales", "opacities", "sh0"} <= moved
     assert "detail" not in moved
@@ -92,22 +92,6 @@ def test_the_readable_and_the_compiled_step_agree():
         ends.append(parameters(state))
     for name in ("means", "scales", "opacities", "sh0"):  # quats of round Gaussians have gradients of rounding noise
         assert torch.allclose(ends[0][name], ends[1][name], rtol=1e-3, atol=1e-5), name
-
-
-@pytest.mark.parametrize("fused", ["auto", "off"])
-def test_the_anchor_does_not_pull_a_second_time(fused):
-    state = start((), more=[SVS(anchor_strength=0.1, anchor_weights={"scales": 1.0}, anchor_start=1)], fused=fused)
-    svs = state.conductor.strategies[0]
-    svs.state["scales"] = state.field.scales.data + 1.0
-    before = parameters(state)
-    extra_steps(state, toy.RASTERIZER, [black(weight=0.0)])
-    assert all(torch.equal(value, before[name]) for name, value in state.field.raw().items())
-
-
-def test_without_an_lr_loss_no_strategy_is_asked():
-    state = start((), more=[Dark()])
-    object.__setattr__(state.conductor.objective, "lambda_lr", 0.0)
-    assert state.conductor.extra_views(2) == []
 
 
 @pytest.mark.parametrize("fused", ["auto", "off"])

@@ -16,7 +16,7 @@ def rows(n: int) -> list[dict[str, float]]:
     return [{"t": float(t), "loss": 1 / (t + 1)} | ({"psnr": math.nan} if t % 7 == 0 else {}) for t in range(n)]
 
 
-def test_rows_come_back_as_they_were_by_any_index():
+def test_rows_come_back_as_they_were_by_any_index_and_the_newest_may_change():
     written, history = rows(500), History(rows(500))
     assert len(history) == 500
     assert json.dumps(list(history)) == json.dumps(written)
@@ -26,12 +26,7 @@ def test_rows_come_back_as_they_were_by_any_index():
     for beyond in (500, -501):
         with pytest.raises(IndexError):
             history[beyond]
-
-
-def test_the_newest_rows_may_change():
-    history = History(rows(500))
-    history[-1]["seconds"] = 3.0
-    history[-60]["loss"] = 9.0
+    history[-1]["seconds"], history[-60]["loss"] = 3.0, 9.0
     assert (history[499]["seconds"], history[440]["loss"]) == (3.0, 9.0)
 
 
