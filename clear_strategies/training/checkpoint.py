@@ -3,6 +3,9 @@
 A checkpoint is a folder: `tensors.safetensors`, `history.json`, and `manifest.json` with the SHA-256 of both and of itself.
 It is written under another name, flushed, then renamed; older checkpoints beyond `keep`, and an earlier one of the same
 iteration, are removed only after that. Nothing is unpickled.
+
+The tensors are written here one by one, since safetensors itself holds all of them in memory twice more while it writes.
+https://github.com/huggingface/safetensors#format: the header's length in 8 bytes, the header as JSON, the tensors' bytes.
 """
 
 from __future__ import annotations
@@ -19,20 +22,31 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
+import torch
 from msgspec import Meta
 from torch import Tensor
 
 from clear_strategies.data.strict_json import Count, Positive, typed
 from clear_strategies.errors import DataError
 from clear_strategies.files import partial_of, read_bytes
-from clear_strategies.training import tensor_file
 
 _log = logging.getLogger(__name__)
 
 FORMAT: Final = 2
 _TENSORS, _HISTORY, _MANIFEST = "tensors.safetensors", "history.json", "manifest.json"
+CHECKPOINTS: Final = "checkpoints"
+"""The folder of a run's checkpoints."""
 _PREFIX: Final = "step_"
 _SEAL: Final = "sha256_of_manifest"
+_STATED: Final = ("t", "config", "facts", "work_log", "device")  # the fields of `Checkpoint` in the manifest
+_USE_ANOTHER: Final = "resume from another checkpoint of the run, or start a new run"
+
+# In the order in which the library writes them: wide types first, so that every tensor is aligned.
+_TYPES: Final = {
+    torch.int64: "I64", torch.float64: "F64", torch.float32: "F32", torch.int32: "I32", torch.bfloat16: "BF16",
+    torch.float16: "F16", torch.int16: "I16", torch.int8: "I8", torch.uint8: "U8", torch.bool: "BOOL",
+}  # fmt: skip
+_ALIGNMENT: Final = 8  # bytes; of the header, so that the first tensor is aligned
 
 
 class _Facts(msgspec.Struct):
@@ -91,11 +105,9 @@ def save(folder: Path, checkpoint: Checkpoint, *, keep: int = 3) -> Path:
     # Where the name is taken, by the same step before a resume, another that sorts right after it.
     names = itertools.chain([step], (f"{step}_{n}" for n in itertools.count(2)))
     target = next(path for name in names if not (path := folder / name).exists())
-    contents = {_TENSORS: tensor_file.parts(checkpoint.tensors), _HISTORY: _rows(checkpoint.history)}
-    facts = ("t", "config", "facts", "work_log", "device")
-    manifest: dict[str, Any] = {"format": FORMAT, **{name: getattr(checkpoint, name) for name in facts}}
+    contents = {_TENSORS: tensor_parts(checkpoint.tensors), _HISTORY: _rows(checkpoint.history)}
+    manifest: dict[str, Any] = {"format": FORMAT, **{name: getattr(checkpoint, name) for name in _STATED}}
     partial = partial_of(target)
-    shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir()
         manifest["sha256"] = {name: _write_durably(partial / name, parts) for name, parts in contents.items()}
@@ -145,15 +157,27 @@ def load(path: Path) -> Checkpoint:
     tensors = tensors_of(path / _TENSORS, files[_TENSORS])
     history = _json(path / _HISTORY, files[_HISTORY])
     typed(path / _HISTORY, history, list[dict[str, float]], remedy=_USE_ANOTHER)
-    return Checkpoint(
-        t=int(manifest["t"]),
-        tensors=tensors,
-        config=manifest["config"],
-        facts=manifest["facts"],
-        history=history,
-        work_log=manifest["work_log"],
-        device=manifest["device"],
-    )
+    return Checkpoint(tensors=tensors, history=history, **{name: manifest[name] for name in _STATED})
+
+
+def tensor_parts(tensors: Mapping[str, Tensor]) -> Iterator[bytes | memoryview]:
+    """The pieces of tensors.safetensors in their order; a tensor's is a view of its memory. Tensors on a device are copied one
+    by one.
+
+    Raises:
+        ValueError: a tensor's type has no name in the format.
+    """
+    types = list(_TYPES)
+    order = sorted(tensors.items(), key=lambda item: (types.index(item[1].dtype), item[0]))
+    header, end = dict[str, object](), 0
+    for name, x in order:
+        start, end = end, end + x.nbytes
+        header[name] = {"dtype": _TYPES[x.dtype], "shape": list(x.shape), "data_offsets": [start, end]}
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % _ALIGNMENT)
+    yield len(text).to_bytes(8, "little") + text
+    for _, x in order:
+        yield x.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data
 
 
 def tensors_of(file: Path, data: bytes) -> dict[str, Tensor]:
@@ -169,9 +193,6 @@ def tensors_of(file: Path, data: bytes) -> dict[str, Tensor]:
         return from_bytes(data)
     except (SafetensorError, ValueError, KeyError, AttributeError, RuntimeError) as error:
         raise DataError(file, "tensors", f"are no safetensors ({error})", _USE_ANOTHER) from error
-
-
-_USE_ANOTHER: Final = "resume from another checkpoint of the run, or start a new run"
 
 
 def _manifest(path: Path) -> dict[str, Any]:
@@ -206,9 +227,9 @@ def _json(file: Path, data: bytes) -> Any:
 def _newest(path: Path) -> Path:
     if (path / _MANIFEST).is_file():
         return path
-    for folder in (path, path / "checkpoints"):
-        if found := saved(folder):
-            return found[-1]
+    for folder in (path, path / CHECKPOINTS):
+        if checkpoints := saved(folder):
+            return checkpoints[-1]
     raise DataError(path, "checkpoint", "no checkpoint is here", "give a run's folder or one of its checkpoints/step_*")
 
 

@@ -8,7 +8,6 @@ import logging
 import pytest
 import torch
 
-from clear_strategies import DataError
 from clear_strategies.training import checkpoint
 from clear_strategies.training.clock import WALL
 from clear_strategies.training.loop import fit, iterate
@@ -94,14 +93,3 @@ def test_nobody_looks_at_the_test_views_when_opacities_were_just_reset():
     looks = state.conductor.work_log.entries["probe test views"]
     assert looks.runs == 3
     assert looks.skipped == {"opacities were reset in this iteration": 2}
-
-
-def test_the_last_few_are_kept_and_the_newest_is_found(tmp_path):
-    state = start(())
-    for t in (1, 2, 3, 4, 5):
-        state.t = t
-        checkpoint.save(tmp_path / "checkpoints", state.checkpoint({}), keep=2)
-    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["step_0000004", "step_0000005"]
-    assert checkpoint.load(tmp_path).t == 5
-    with pytest.raises(DataError, match="no checkpoint is here"):
-        checkpoint.load(tmp_path / "elsewhere")
