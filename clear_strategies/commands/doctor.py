@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import logging
-import os
 import shutil
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any, Final
 
 from clear_strategies import console
 from clear_strategies.commands.options import parser_of
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs.exit_codes import TRAIN
+from clear_strategies.jobs.sweep import cores
 from clear_strategies.outputs.provenance import origin
-
-_log = logging.getLogger(__name__)
 
 # An extra of pyproject.toml: the modules that show that it is installed, and what it is for.
 EXTRAS: Final = {
@@ -73,10 +69,14 @@ def _versions(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 def _machine(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "processor", facts["platform"]
-    yield "cores", f"{len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else os.cpu_count()}"
-    yield "memory", _memory()
+    yield "cores", str(cores())
     yield "disk", f"{shutil.disk_usage('.').free / 1e9:.0f} GB free in this folder"
     import torch
+
+    from clear_strategies.training.memory import system_bytes
+
+    free, total = (system_bytes("/proc/meminfo", name) or 0 for name in ("MemAvailable", "MemTotal"))
+    yield "memory", f"{free / 2**30:.1f} of {total / 2**30:.1f} GiB free" if total else "unknown"
 
     yield "instruction set", f"{torch.backends.cpu.get_cpu_capability()} (torch)"
     if torch.cuda.is_available():
@@ -86,15 +86,6 @@ def _machine(facts: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     else:
         why = "torch is built without CUDA" if torch.version.cuda is None else "no driver or no device"
         yield "cuda", f"none: {why}. Training runs on the CPU"
-
-
-def _memory() -> str:
-    try:
-        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        free, total = (int(lines[key].split()[0]) / 2**20 for key in ("MemAvailable", "MemTotal"))
-    except (OSError, KeyError, ValueError):
-        return "unknown"
-    return f"{free:.1f} of {total:.1f} GiB free"
 
 
 def _missing() -> Iterator[tuple[str, str]]:

@@ -109,7 +109,7 @@ def _skipped(state: TrainState) -> list[str]:
     if state.mip.variance == 0:
         skipped.append("3D filter (variance 0)")
     skipped += [phrase for s in conductor.strategies for phrase in s.skipped()]
-    return skipped + state.skip_policy.says(state.views)
+    return skipped + state.skip_policy.descriptions(state.views)
 
 
 def _warn_of_idle_strategies(conductor: Conductor, iterations: int) -> None:

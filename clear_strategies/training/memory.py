@@ -1,7 +1,7 @@
 """The peak of memory that training needs, predicted before the first iteration, and the budget it is compared with.
 
-What is there already, the photos and what loading them took, is measured. What training adds is counted per Gaussian and per
-pixel, in `Needs`, which is the only place that knows these numbers:
+What the process holds already, the photos and what loading them took, is measured. What training adds is counted per Gaussian
+and per pixel, in `Needs` alone:
 
     peak(n) = max(peak so far, memory now + what n Gaussians add)
 
@@ -14,6 +14,7 @@ import ctypes
 import gc
 import logging
 import sys
+from bisect import bisect_right
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -28,6 +29,7 @@ _log = logging.getLogger(__name__)
 
 _FLOAT: Final = 4  # bytes
 _MIB: Final = 1 << 20
+_MOST: Final = 1 << 40  # Gaussians
 # Floats per Gaussian, beside the parameters: what one iteration holds at once.
 # Activation: scales twice, their squares, sigmoid, coefficient, factor, opacities.
 _ACTIVATION: Final = 3 + 3 + 3 + 3 + 1 + 1 + 1 + 2
@@ -48,7 +50,7 @@ class Needs:
 
     Args:
         now: of the process, or of the device, before the first iteration. reached: the most so far.
-        gaussians: how many there are at the start.
+        gaussians: their number at the start.
         held: per Gaussian, for the whole run: parameters, moments, statistics, and what strategies keep.
         worked: per Gaussian, while an iteration runs.
         lists: per Gaussian, of the rasterizer; at most `most_lists` in all.
@@ -76,11 +78,7 @@ class Needs:
         """The most Gaussians whose peak is within the budget, 0 where not even the first are."""
         if self.peak(self.gaussians) > budget:
             return 0
-        low, high = self.gaussians, 1 << 40
-        while low < high:
-            middle = (low + high + 1) // 2
-            low, high = (middle, high) if self.peak(middle) <= budget else (low, middle - 1)
-        return low
+        return bisect_right(range(_MOST), budget, lo=self.gaussians, key=self.peak) - 1
 
 
 def needs(state: TrainState, rasterizer: Rasterizer) -> Needs:
@@ -113,7 +111,7 @@ def needs(state: TrainState, rasterizer: Rasterizer) -> Needs:
     )
 
 
-def require(found: Needs, budget: int | None, most: int | None) -> None:
+def require(needed: Needs, budget: int | None, most: int | None) -> None:
     """Refuse a run whose start does not fit; warn where it cannot grow as far as it may.
 
     Args:
@@ -122,30 +120,35 @@ def require(found: Needs, budget: int | None, most: int | None) -> None:
     Raises:
         SettingError: the first Gaussians need more than the budget.
     """
-    allowed = budget if budget is not None else available(found)
+    allowed = budget if budget is not None else available(needed)
     if allowed is None:
         return
-    start, whose = found.peak(found.gaussians), "fit.memory allows" if budget is not None else "is free on this machine"
+    start, source = (
+        needed.peak(needed.gaussians),
+        "fit.memory allows" if budget is not None else "is free on this machine",
+    )
     if start > allowed:
         raise SettingError(
-            f"fit.memory: {found.gaussians:,} Gaussians need {mebibytes(start)} MiB, and {mebibytes(allowed)} MiB {whose}. "
+            f"fit.memory: {needed.gaussians:,} Gaussians need {mebibytes(start)} MiB, and {mebibytes(allowed)} MiB {source}. "
             "Raise data.views.shrink, lower fit.max_degree or data.cloud.max_points, or raise fit.memory."
         )
-    fits = found.fits(allowed)
+    fits = needed.fits(allowed)
     if most is not None and fits < most:
         _log.warning(
             "%d Gaussians, the most that there may be, need %d MiB, and %d MiB %s: %d fit.",
-            most, mebibytes(found.peak(most)), mebibytes(allowed), whose, fits,
+            most, mebibytes(needed.peak(most)), mebibytes(allowed), source, fits,
         )  # fmt: skip
 
 
-def says(found: Needs, most: int | None) -> str:
-    more = (found.peak(10 * found.gaussians + 10**6) - found.peak(9 * found.gaussians + 10**6)) / found.gaussians
-    line = f"{mebibytes(found.peak(found.gaussians))} MiB at the start ({mebibytes(found.reached)} MiB were taken until now)"
+def summary(needed: Needs, most: int | None) -> str:
+    """A line of the run's printed plan."""
+    n = needed.gaussians
+    more = (needed.peak(10 * n + 10**6) - needed.peak(9 * n + 10**6)) / n
+    line = f"{mebibytes(needed.peak(n))} MiB at the start ({mebibytes(needed.reached)} MiB were taken until now)"
     line += f", {more / 1024:.1f} KiB for each further Gaussian"
-    return (
-        line if most is None else f"{line}, {mebibytes(found.peak(most))} MiB with {most:,}, the most that there may be"
-    )
+    if most is None:
+        return line
+    return f"{line}, {mebibytes(needed.peak(most))} MiB with {most:,}, the most that there may be"
 
 
 def release() -> None:
@@ -161,25 +164,25 @@ def mebibytes(size: int) -> int:
 
 
 def resident() -> int:
-    """Bytes that the process holds now; 0 where the system does not say."""
-    return _told_by("/proc/self/status", "VmRSS") or 0
+    """Bytes that the process holds now; 0 without /proc."""
+    return system_bytes("/proc/self/status", "VmRSS") or 0
 
 
 def peak() -> int:
-    """The most bytes that the process has held; 0 where the system does not say."""
-    return _told_by("/proc/self/status", "VmHWM") or 0
+    """The most bytes that the process has held; 0 without /proc."""
+    return system_bytes("/proc/self/status", "VmHWM") or 0
 
 
-def available(found: Needs) -> int | None:
-    """Bytes that training may take on this machine, with what it holds already; None where the system does not say."""
-    if found.cuda:
-        return int(torch.cuda.mem_get_info()[0]) + found.now
-    free = _told_by("/proc/meminfo", "MemAvailable")
-    return None if free is None else free + found.now
+def available(needed: Needs) -> int | None:
+    """Bytes that training may take on this machine, those that it holds already included; None without /proc."""
+    if needed.cuda:
+        return int(torch.cuda.mem_get_info()[0]) + needed.now
+    free = system_bytes("/proc/meminfo", "MemAvailable")
+    return None if free is None else free + needed.now
 
 
-def _told_by(file: str, name: str) -> int | None:
-    """Bytes; None where the system does not say."""
+def system_bytes(file: str, name: str) -> int | None:
+    """An entry of a file of /proc; None where there is none."""
     try:
         lines = dict(line.split(":", 1) for line in Path(file).read_text().splitlines())
         return int(lines[name].split()[0]) * 1024

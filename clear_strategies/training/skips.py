@@ -1,4 +1,4 @@
-"""Work that a scene does not need, decided from the scene itself while it trains.
+"""Work that a run leaves out where the scene does not need it.
 
 Exact skips (rows that do not move, HR while λ_HR = 0) are always on, because they change nothing. The
 skips here change the result a little. Each is a setting whose default was chosen by measurement
@@ -22,7 +22,7 @@ from clear_strategies.schedules import milestone
 _log = logging.getLogger(__name__)
 
 PLATEAU_LOSS: Final = "loss_views"
-"""The column of the history that tells a plateau: the mean loss of training views, every Gaussian drawn."""
+"""The column of the history by which a plateau is found: the mean loss of training views, every Gaussian drawn."""
 
 _REDUCED: Final = 2  # the coarse SR image has half the size of the fine one
 
@@ -59,8 +59,8 @@ class SkipPolicy:
         self.skips = skips if skips is not None else Skips()
         self._coarse: dict[str, View] = {}
 
-    def says(self, views: Sequence[View]) -> list[str]:
-        """A phrase for each skip that is on, for the plan; a warning for one that cannot act."""
+    def descriptions(self, views: Sequence[View]) -> list[str]:
+        """A phrase for each skip that is on, for the plan; a warning for one that has no effect."""
         s, phrases = self.skips, []
         if s.coarse_until > 0 and not any(map(_halves, views)):
             _log.warning("skips.coarse_until has no effect: SR images are halved where data.views.sr_scale is even.")
@@ -84,8 +84,7 @@ class SkipPolicy:
         if not _halves(view):
             return view
         if view.name not in self._coarse:
-            hr = view.hr.reduced(_REDUCED)
-            self._coarse[view.name] = replace(view, hr=hr, truth=None)
+            self._coarse[view.name] = replace(view, hr=view.hr.reduced(_REDUCED), truth=None)
         return self._coarse[view.name]
 
     def coarse_bytes(self, views: Sequence[View], t: int) -> int:
@@ -104,12 +103,9 @@ class SkipPolicy:
     def measured(self, t: int) -> bool:
         """Whether the training views are drawn whole after iteration t, to find a plateau."""
         s = self.skips
-        return (
-            s.plateau_gain > 0
-            and s.plateau_window > 0
-            and t % s.plateau_window == 0
-            and s.plateau_from <= t < s.plateau_to
-        )
+        if s.plateau_gain == 0 or s.plateau_window == 0:
+            return False
+        return t % s.plateau_window == 0 and s.plateau_from <= t < s.plateau_to
 
     def settled(self, history: Sequence[dict[str, Number]], t: int) -> bool:
         """Whether the training views have stopped improving by iteration t; `plateau_to` then follows. Unknown, and so False,
@@ -120,14 +116,15 @@ class SkipPolicy:
             return False
         rows = deferred.resolve(history)
         before, now = rows[t - window - 1], rows[t - 1]
-        if PLATEAU_LOSS not in before.keys() & now.keys() or self._compares(before) != self._compares(now):
+        if PLATEAU_LOSS not in before.keys() & now.keys() or self._measured_loss(before) != self._measured_loss(now):
             return False
         return now[PLATEAU_LOSS] > (1 - self.skips.plateau_gain) * before[PLATEAU_LOSS]
 
-    def _compares(self, row: Mapping[str, float]) -> tuple[bool, bool]:
-        """What the measured loss of a row compares: whether HR, and whether HR at half its size."""
-        hr = row["lambda_hr"] > 0
-        return hr, hr and row["t"] <= self.skips.coarse_until
+    def _measured_loss(self, row: Mapping[str, float]) -> str:
+        """Which loss `PLATEAU_LOSS` of a row is."""
+        if row["lambda_hr"] == 0:
+            return "LR"
+        return "HR at half its size" if row["t"] <= self.skips.coarse_until else "HR"
 
 
 def _halves(view: View) -> bool:

@@ -14,18 +14,13 @@ from clear_strategies.errors import SettingError
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_it_names_versions_memory_and_backends(capsys):
+def test_it_names_versions_memory_backends_and_missing_extras_with_what_they_add(capsys, monkeypatch):
+    monkeypatch.setattr(doctor, "find_spec", lambda name: None if name == "pycolmap" else object())
     doctor.main([])
     said = capsys.readouterr().out
     for word in ("python", "torch", "processor", "memory", "rasterizers", "SR images"):
         assert word in said
     assert "torch                   works: differs from the reference by 0.0e+00" in said
-
-
-def test_missing_extras_are_named_with_what_they_add(capsys, monkeypatch):
-    monkeypatch.setattr(doctor, "find_spec", lambda name: None if name == "pycolmap" else object())
-    doctor.main([])
-    said = capsys.readouterr().out
     assert "poses for photos without any (data=photos): pip install 'clear-strategies[colmap]' (lacks pycolmap)" in said
 
 

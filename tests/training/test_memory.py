@@ -68,12 +68,12 @@ def test_cpp_counts_the_pairs_of_its_lists():
     assert 40 <= size // (16 + 2 * 64) <= 40 * bins
 
 
-def test_the_plan_says_what_the_start_and_the_cap_need():
-    line = memory.says(NEEDS, 100_000)
+def test_the_plan_has_what_the_start_and_the_cap_need():
+    line = memory.summary(NEEDS, 100_000)
     assert line.startswith("150 MiB at the start (150 MiB were taken until now), ")
     assert line.endswith(f"{memory.mebibytes(NEEDS.peak(100_000))} MiB with 100,000, the most that there may be")
 
 
-def test_the_process_knows_what_it_holds():
+def test_the_system_tells_what_the_process_holds():
     assert 0 < memory.resident() <= memory.peak()
     assert memory.available(NEEDS) > NEEDS.now

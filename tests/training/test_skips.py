@@ -58,13 +58,13 @@ def test_photos_that_sr_does_not_enlarge_keep_their_reference_and_are_rendered_a
 
 def test_a_skip_that_cannot_act_is_a_warning_and_not_in_the_plan(caplog):
     view, skips = toy.scene().train[0], Skips(coarse_until=10, plateau_gain=0.01)
-    half, window = SkipPolicy(skips).says([view])
+    half, window = SkipPolicy(skips).descriptions([view])
     assert half == "HR at half its size until iteration 10"
     assert "500 iterations gain less than 1.0%" in window
     assert not caplog.records
     odd = replace(view, hr=view.hr.reduced(4))  # by a factor of 1
-    assert SkipPolicy(replace(skips, plateau_window=0)).says([odd]) == []
-    assert SkipPolicy(skips).says([odd]) == [window]
+    assert SkipPolicy(replace(skips, plateau_window=0)).descriptions([odd]) == []
+    assert SkipPolicy(skips).descriptions([odd]) == [window]
     assert "skips.coarse_until has no effect" in caplog.text
     assert "skips.plateau_gain has no effect" in caplog.text
 
@@ -132,14 +132,6 @@ def test_a_plateau_is_left_out_and_the_run_has_its_end(caplog):
     assert state.optimizer.steps == ITERATIONS  # so the learning rates are those of the end
     assert "training goes on at t=18" in caplog.text
     assert sum(state.conductor.work_log.entries["iterations"].skipped.values()) == 9
-
-
-def test_a_coarse_start_trains():
-    state = start(("gco", "p2g", "svs"))
-    state.skip_policy = SkipPolicy(Skips(coarse_until=12))
-    for _ in range(ITERATIONS):
-        iterate(state, toy.RASTERIZER)
-    assert all(bool(p.isfinite().all()) for p in state.field.raw().values())
 
 
 def test_one_render_serves_both_scales_while_they_have_one_size():
