@@ -1,4 +1,4 @@
-"""Where a job computes: the rasterizer, the device that the field lies on, and the threads."""
+"""Where a job computes: the rasterizer, the device of the field, and the threads."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class RasterizerSettings:
     """A rasterizer of this repository by name, and its settings; None leaves a setting to the backend.
 
     Args:
-        name: auto, or a name that `rasterizers.load` knows.
+        name: auto, or a name of `rasterizers.names`.
         preset: cut-offs by name, see `rasterizers.PRESETS`; alpha_min and transmittance_min win over it.
         kernel, near, alpha_min, alpha_max, transmittance_min, antialiased: see `RasterSettings`.
-        background: RGB in [0, 1]; None: the data set's own.
+        background: RGB in [0, 1]; None: that of the data set.
         memory: MiB that the lists of one image may take (cpp, warp).
         threads: of the kernels (cpp); None: as many as torch has.
         isa: instruction set of the kernels (cpp): avx512, avx2 or baseline; None: the fastest of this processor.
@@ -62,16 +62,15 @@ class RasterizerSettings:
         return name, functools.partial(rasterizers.load, name, **{**of_device, **settings})
 
 
-_OWN: Final = f"{RasterizerSettings.__module__}.{RasterizerSettings.__qualname__}"
+BY_NAME: Final = f"{RasterizerSettings.__module__}.{RasterizerSettings.__qualname__}"
+"""The `_target_` of a rasterizer of this repository."""
 
 
 def rasterizer_node(node: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration's `rasterizer`; for another class than ours only what every rasterizer has, and its own settings.
-
-    `rasterizer._target_=pkg.Mine` keeps the fields of `RasterSettings`, so that they mean the same for each rasterizer;
-    None leaves one to the class.
+    """The configuration's `rasterizer`. For a class of another package, `rasterizer._target_=pkg.Mine`, it keeps the fields of
+    `RasterSettings`, so that they mean the same for each rasterizer, and leaves out `name` and every None.
     """
-    if node.get(TARGET) in (None, _OWN):
+    if node.get(TARGET) in (None, BY_NAME):
         return dict(node)
     return {key: value for key, value in node.items() if key != "name" and value is not None} | {"_partial_": True}
 
@@ -168,8 +167,8 @@ def threads(asked: int | None) -> tuple[int, str]:
     """How many threads a job has, and why."""
     if asked is not None:
         return asked, "fit.threads"
-    jobs, here = jobs_at_once(), f"of {sweep.cores()} here"
-    return sweep.threads(jobs), here if jobs == 1 else f"{here}, hydra.launcher.n_jobs={jobs}"
+    jobs, reason = jobs_at_once(), f"of {sweep.cores()} here"
+    return sweep.threads(jobs), reason if jobs == 1 else f"{reason}, hydra.launcher.n_jobs={jobs}"
 
 
 def jobs_at_once() -> int:

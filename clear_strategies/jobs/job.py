@@ -20,7 +20,8 @@ from clear_strategies import files
 from clear_strategies.compose import tree
 from clear_strategies.data.prepare import save_lr
 from clear_strategies.data.scene import Scene
-from clear_strategies.jobs import device, resume, scene
+from clear_strategies.jobs import device, resume
+from clear_strategies.jobs import scene as scenes
 from clear_strategies.jobs.budget import Budget
 from clear_strategies.jobs.budget import Plan as TimePlan
 from clear_strategies.jobs.lock import hold
@@ -33,6 +34,7 @@ from clear_strategies.outputs.metrics import Evaluation
 from clear_strategies.outputs.progress import progress_bar
 from clear_strategies.schedules import scaled
 from clear_strategies.training import memory, signals
+from clear_strategies.training.checkpoint import CHECKPOINTS
 from clear_strategies.training.loop import fit
 from clear_strategies.training.state import TrainState
 from clear_strategies.viewing import live
@@ -44,14 +46,29 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
+class _Place:
+    """What the trainings of a job share.
+
+    Args:
+        scene: on the CPU. device_scene: the same scene on the device of `drawing`.
+        watch: called after each iteration.
+    """
+
+    scene: Scene
+    device_scene: Scene
+    drawing: device.Drawing
+    watch: Callable[[], None] | None
+
+
+@dataclass(frozen=True, slots=True)
 class _Training:
     """One training of a job: the run itself, or its baseline.
 
     Args:
         compared: the configuration from `resume.comparable`, which a resumed run must have in common.
-        folder: where its files go.
-        pictures: what shows it there; None for a baseline, which the run's own pictures show.
+        folder: for its files.
         overrides: of the command line, for the report; None: unknown.
+        pictures: that it writes; None for a baseline, since the run's own pictures show it.
         timed: how it keeps to its minutes; None: it has no limit.
     """
 
@@ -59,23 +76,17 @@ class _Training:
     conductor: Conductor
     compared: Mapping[str, Any]
     folder: Path
-    pictures: results.Pictures | None
-    overrides: Sequence[str] | None = None
+    overrides: Sequence[str] | None
+    pictures: results.Pictures | None = None
     timed: TimePlan | None = None
 
     @classmethod
-    def of(cls, settings: JobSettings, values: Mapping[str, Any], folder: Path) -> _Training:
-        """The run itself, with these settings. `values` is the configuration that they were built from."""
-        fit, conductor = settings.fit, settings.conductor(settings.fit.stretch)
-        pictures = results.Pictures(fit.map_views, fit.video, fit.page)
-        return cls(settings, conductor, resume.comparable(values), folder, pictures)
-
-    def baseline(self, values: Mapping[str, Any]) -> _Training:
-        """The training beside this one, without any strategy, in a folder within its folder."""
-        without = replace(self.settings, strategies={})
-        alone = _Training.of(without, {**values, "strategies": {}}, self.folder / BASELINE)
-        overrides = None if self.overrides is None else overrides_of(self.overrides)
-        return replace(alone, pictures=None, overrides=overrides)
+    def of(
+        cls, settings: JobSettings, values: Mapping[str, Any], folder: Path, overrides: Sequence[str] | None
+    ) -> _Training:
+        """The training with these settings, built from the configuration `values`."""
+        conductor = settings.conductor(settings.fit.stretch)
+        return cls(settings, conductor, resume.comparable(values), folder, overrides)
 
     def lasting(self, iterations: int) -> _Training:
         """The same training with this number of iterations, whatever time it takes."""
@@ -83,7 +94,7 @@ class _Training:
         compared = {**self.compared, "fit.iterations": iterations, "fit.minutes": None}
         return replace(self, settings=settings, conductor=settings.conductor(settings.fit.stretch), compared=compared)
 
-    def with_data(self, data: scene.DataSettings) -> _Training:
+    def with_data(self, data: scenes.DataSettings) -> _Training:
         """The same training with this limit of its HR images."""
         if data is self.settings.data:
             return self
@@ -91,25 +102,25 @@ class _Training:
         return replace(self, settings=replace(self.settings, data=data), compared=compared)
 
     def timed_by(self, budget: Budget, place: _Place, trainings: int) -> _Training:
-        """The same training with as many iterations as fit into the time that is left for it and the others."""
+        """The same training with as many iterations as fit into the time that is left for this number of trainings."""
         fit = self.settings.fit
         pilot, rasterizer = self.lasting(fit.iterations).start(place, None), place.drawing.rasterizer
-        plan = budget.iterations(pilot, rasterizer, trainings=trainings, maps=fit.map_views, frames=fit.video)
-        return replace(self.lasting(plan.iterations), timed=plan)
+        time_plan = budget.iterations(pilot, rasterizer, trainings=trainings, maps=fit.map_views, frames=fit.video)
+        return replace(self.lasting(time_plan.iterations), timed=time_plan)
 
     @property
     def chosen(self) -> plan.Chosen:
         return plan.Chosen(self.settings.method, list(self.settings.strategies), self.overrides)
 
     def start(self, place: _Place, source: str | None) -> TrainState:
-        """The state that training starts from: the initial one, or the checkpoint that `source` asks for.
+        """The state that training starts from: the initial one, or the checkpoint that `source` names.
 
         Args:
             source: a value of `fit.resume`.
         """
         settings, stretch = self.settings, self.settings.fit.stretch
         state = TrainState.start(
-            place.there,
+            place.device_scene,
             self.conductor,
             settings=scaled(settings.fit, stretch),
             density=scaled(settings.density, stretch),
@@ -120,23 +131,6 @@ class _Training:
         )
         resume.resume(state, source, self.folder, self.compared)
         return state
-
-
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """What the trainings of a job share: the scene, the rasterizer and the device.
-
-    Args:
-        scene: on the CPU.
-        there: the same scene on the device of `drawing`.
-        drawing: the rasterizer and its device.
-        watch: called after each iteration.
-    """
-
-    scene: Scene
-    there: Scene
-    drawing: device.Drawing
-    watch: Callable[[], None] | None
 
 
 def run(
@@ -164,18 +158,21 @@ def run(
     """
     values = tree(config)
     settings = settings_of(values)
-    budget = None if settings.fit.minutes is None else Budget.of(settings.fit.minutes)
-    if settings.fit.viewer:
+    fit = settings.fit
+    budget = None if fit.minutes is None else Budget.of(fit.minutes)
+    if fit.viewer:
         live.require_viewer()
-    if settings.fit.log == "tensorboard":
+    if fit.log == "tensorboard":
         tensorboard.require_tensorboard()
-    ours, baseline = replace(_Training.of(settings, values, folder), overrides=overrides), None
-    if settings.fit.baseline and _why_without_baseline(settings) is None:
-        baseline = ours.baseline(values)
-    drawing = device.drawing(settings.rasterizer, settings.fit.device)
+    training, baseline = _Training.of(settings, values, folder, overrides), None
+    training = replace(training, pictures=results.Pictures(fit.map_views, fit.video, fit.page))
+    if fit.baseline and _why_without_baseline(settings) is None:
+        alone, others = replace(settings, strategies={}), None if overrides is None else overrides_of(overrides)
+        baseline = _Training.of(alone, {**values, "strategies": {}}, folder / BASELINE, others)
+    drawing = device.drawing(settings.rasterizer, fit.device)
     with hold(folder), signals.interrupted("before training began"):
         files.sweep(folder)
-        return _run(ours, baseline, drawing, watch, budget)
+        return _run(training, baseline, drawing, watch, budget)
 
 
 def _why_without_baseline(settings: JobSettings) -> str | None:
@@ -193,79 +190,91 @@ def _in_sweep() -> bool:
 
 
 def _run(
-    ours: _Training,
+    training: _Training,
     baseline: _Training | None,
     drawing: device.Drawing,
     watch: Callable[[], None] | None,
     budget: Budget | None,
 ) -> float | None:
-    settings = ours.settings
-    if settings.fit.resume == resume.AUTO and (finished := resume.finished(ours.folder, ours.compared)) is not None:
-        return finished[0]
-    threads, why = device.threads(settings.fit.threads)
+    settings = training.settings
+    if settings.fit.resume == resume.AUTO:
+        finished = resume.finished(training.folder, training.compared)
+        if finished is not None:
+            score = finished.shown.mean.get("ours")
+            return None if score is None else score.psnr
+    threads, reason = device.threads(settings.fit.threads)
     torch.set_num_threads(threads)
-    loaded, data = _loaded(ours, budget)
-    ours, baseline = ours.with_data(data), None if baseline is None else baseline.with_data(data)
+    scene, data = _loaded(training, budget)
     if settings.data.save_lr is not None:
-        save_lr(loaded, Path(settings.data.save_lr))
+        save_lr(scene, Path(settings.data.save_lr))
         return None
     device.log_choice(settings.rasterizer, drawing)
-    drawing = drawing.over(loaded.background)
-    place = _Place(loaded, loaded.to(drawing.device), drawing, watch)
+    drawing = drawing.over(scene.background)
+    place = _Place(scene, scene.to(drawing.device), drawing, watch)
+    training, baseline = training.with_data(data), None if baseline is None else baseline.with_data(data)
     if budget is not None:
-        ours = ours.timed_by(budget, place, 1 if baseline is None else 2)
-        baseline = None if baseline is None else baseline.lasting(ours.settings.fit.iterations)
-    # Run and baseline are set up before either trains, so that an error does not come after the first has trained.
-    source, first = settings.fit.resume, None
-    if baseline is not None:
-        source, of_baseline = resume.of_both(source, ours.compared, baseline.compared)
-        if of_baseline != resume.AUTO or resume.finished(baseline.folder, baseline.compared) is None:
-            first = baseline.start(place, of_baseline)
-    state = ours.start(place, source)
-    idle = [override for override in ours.overrides or () if override.lstrip("+").startswith("density.")]
-    if idle and not isinstance(state.density.settings, type(settings.density)):
-        _log.warning("%s has no effect: %s densifies in place of it.", ", ".join(idle), state.density.name)
-    memory.release()
+        training = training.timed_by(budget, place, 1 if baseline is None else 2)
+        baseline = None if baseline is None else baseline.lasting(training.settings.fit.iterations)
+    state, baseline_state = _started(training, baseline, place)
+    _announce(training, state, place, f"{threads} ({reason})")
     # In a sweep the console shows one line per job; the rest is in run.log.
     level = logging.DEBUG if _in_sweep() else logging.INFO
-    found, most = memory.needs(state, drawing.rasterizer), state.density.cap
-    machine = {
-        "rasterizer": f"{drawing.name}, kernel {drawing.kernel} px²",
-        "threads": f"{threads} ({why})",
-        "memory": memory.says(found, most),
-        **({} if ours.timed is None else {"time": ours.timed.says()}),
-    }
-    said = plan.describe(loaded, state, ours.chosen, machine)
-    _log.log(level, "%s", said.short)
-    _log.debug("%s", said.details)
-    memory.require(found, None if settings.fit.memory is None else settings.fit.memory << 20, most)
     if settings.fit.baseline and baseline is None:
         _log.log(level, "fit.baseline: no baseline trains beside this run, %s.", _why_without_baseline(settings))
-    results.remove_earlier(ours.folder, all_files=state.t == 1)
+    results.remove_earlier(training.folder, all_files=state.t == 1)
     if baseline is None and state.t == 1:
-        results.remove_earlier(ours.folder / BASELINE, all_files=True)
-    beside = None if baseline is None else _trained_first(baseline, first, place)
-    first = None  # its memory is for what trains now
-    evaluation, seconds = _train(ours, state, place, beside)
+        results.remove_earlier(training.folder / BASELINE, all_files=True)
+    trained = None if baseline is None else _train_baseline(baseline, baseline_state, place)
+    baseline_state = None  # its memory is for what trains now
+    evaluation, seconds = _train(training, state, place, trained)
     for remark in plan.remarks(state):
         _log.log(level, "%s", remark)
-    _log.log(level, "%s", score_table.describe(ours.folder, evaluation, seconds, beside))
+    _log.log(level, "%s", score_table.describe(training.folder, evaluation, seconds, trained))
     if _in_sweep():
-        _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, ours.folder, evaluation, seconds))
+        _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, training.folder, evaluation, seconds))
     mean = evaluation.mean("test") or evaluation.mean("train")
     return None if mean is None else mean.psnr
 
 
-def _loaded(training: _Training, budget: Budget | None) -> tuple[Scene, scene.DataSettings]:
+def _loaded(training: _Training, budget: Budget | None) -> tuple[Scene, scenes.DataSettings]:
     """The scene, and the data set's settings with the size of HR that the time allows."""
     settings, capture, data = training.settings, None, training.settings.data
     if budget is not None:
         capture = data.reader()
-        data = scene.timed(capture, data, settings.prior, budget)
-    return scene.load(data, settings.prior, settings.fit.seed, training.conductor.prior, capture), data
+        data = scenes.timed(capture, data, settings.prior, budget)
+    return scenes.load(data, settings.prior, settings.fit.seed, training.conductor.prior, capture), data
 
 
-def _trained_first(training: _Training, state: TrainState | None, place: _Place) -> Baseline:
+def _started(training: _Training, baseline: _Training | None, place: _Place) -> tuple[TrainState, TrainState | None]:
+    """The states of the run and of its baseline, made before either trains, so that an error does not come after the first has
+    trained. The baseline's is None where there is none, or where it is finished.
+    """
+    source, state = training.settings.fit.resume, None
+    if baseline is not None:
+        source, baseline_source = resume.sources(source, training.compared, baseline.compared)
+        if baseline_source != resume.AUTO or resume.finished(baseline.folder, baseline.compared) is None:
+            state = baseline.start(place, baseline_source)
+    return training.start(place, source), state
+
+
+def _announce(training: _Training, state: TrainState, place: _Place, threads: str) -> None:
+    """Log the plan. A SettingError if the run does not fit into memory."""
+    memory.release()
+    drawing, limit = place.drawing, training.settings.fit.memory
+    needed, most = memory.needs(state, drawing.rasterizer), state.density.cap
+    machine = {
+        "rasterizer": f"{drawing.name}, kernel {drawing.kernel} px²",
+        "threads": threads,
+        "memory": memory.summary(needed, most),
+        **({} if training.timed is None else {"time": training.timed.description()}),
+    }
+    described = plan.describe(place.scene, state, training.chosen, machine)
+    _log.log(logging.DEBUG if _in_sweep() else logging.INFO, "%s", described.short)
+    _log.debug("%s", described.details)
+    memory.require(needed, None if limit is None else limit << 20, most)
+
+
+def _train_baseline(training: _Training, state: TrainState | None, place: _Place) -> Baseline:
     """Train the baseline and read its results.
 
     Args:
@@ -292,14 +301,14 @@ def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[
     calls = [] if place.watch is None else [place.watch]
     if training.timed is not None:
         calls.append(training.timed.hurry(state))
-    with ExitStack() as open_:
+    with ExitStack() as stack:
         if fit_settings.viewer:
-            saved, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"
+            cameras, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"
             tell = functools.partial(_log.info, "look while it trains: %s")
-            turn = open_.enter_context(live.watched(painter, saved, title, tell))
+            turn = stack.enter_context(live.watched(painter, cameras, title, tell))
             calls.append(lambda: turn(state.t - 1))
         if fit_settings.log == "tensorboard":
-            calls.append(open_.enter_context(tensorboard.logged(training.folder, state, place.scene, painter)))
+            calls.append(stack.enter_context(tensorboard.logged(training.folder, state, place.scene, painter)))
 
         def after_step() -> None:
             for call in calls:
@@ -309,12 +318,12 @@ def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[
 
 
 def _train(
-    training: _Training, state: TrainState, place: _Place, beside: Baseline | None = None
+    training: _Training, state: TrainState, place: _Place, baseline: Baseline | None = None
 ) -> tuple[Evaluation, float]:
     """Train to the end and write the files; return the scores and the seconds of training.
 
     Args:
-        beside: the finished baseline, to show next to the run's results.
+        baseline: the finished baseline, to show next to the run's results.
     """
     settings, rasterizer, alone = training.settings, place.drawing.rasterizer, device.jobs_at_once() == 1
     began = time.perf_counter() - state.seconds  # with what a resumed run took before
@@ -322,8 +331,15 @@ def _train(
         write_cameras(training.folder, place.scene)
         watched = _watched(training, state, place)
         with watched as after_step, progress_bar(state, after_step, training.chosen.title, shown=alone) as progress:
-            checkpoints = training.folder / resume.CHECKPOINTS
-            fit(state, place.there, rasterizer, checkpoints=checkpoints, config=training.compared, progress=progress)
+            checkpoints = training.folder / CHECKPOINTS
+            fit(
+                state,
+                place.device_scene,
+                rasterizer,
+                checkpoints=checkpoints,
+                config=training.compared,
+                progress=progress,
+            )
         seconds = time.perf_counter() - began
         training.conductor.on_fit_end()  # its memory is for the results
         memory.release()
@@ -331,6 +347,6 @@ def _train(
             training.folder, place.scene, state, rasterizer, training.chosen,
             backend=place.drawing.name, down=settings.data.views.downsample,
             painter=Painter(state.field, place.drawing.make), pictures=training.pictures, seconds=seconds,
-            config=training.compared, antialiased=place.drawing.antialiased, baseline=beside,
+            config=training.compared, antialiased=place.drawing.antialiased, baseline=baseline,
         )  # fmt: skip
     return evaluation, seconds

@@ -12,17 +12,16 @@ from clear_strategies.compose import flat
 from clear_strategies.errors import DataError
 from clear_strategies.outputs import metrics
 from clear_strategies.outputs.baseline import FOLDER as BASELINE
+from clear_strategies.outputs.metrics import Metrics
 from clear_strategies.settings import CHANGES_NO_RESULT
 from clear_strategies.training import checkpoint
-from clear_strategies.training.checkpoint import Checkpoint
+from clear_strategies.training.checkpoint import CHECKPOINTS, Checkpoint
 from clear_strategies.training.state import TrainState
 
 _log = logging.getLogger(__name__)
 
 _TRAIN_AGAIN: Final = "remove the file: the run is then trained again"
 AUTO: Final = "auto"  # the value of fit.resume that is not a path
-
-CHECKPOINTS: Final = "checkpoints"
 
 # What may differ between a run and the one that it resumes. Another device changes bits, which is logged.
 _NOT_COMPARED: Final = CHANGES_NO_RESULT | {"fit.device"}
@@ -34,8 +33,8 @@ def comparable(values: Mapping[str, Any]) -> dict[str, Any]:
     return dict(json.loads(json.dumps(compared)))  # as it comes back from a file
 
 
-def finished(folder: Path, config: Mapping[str, Any]) -> tuple[float | None] | None:
-    """What the finished run in this folder returned; None where there is none.
+def finished(folder: Path, config: Mapping[str, Any]) -> Metrics | None:
+    """The results of the finished run in this folder; None where there is none.
 
     Raises:
         DataError: it was another configuration's, or its metrics.json is damaged.
@@ -45,30 +44,41 @@ def finished(folder: Path, config: Mapping[str, Any]) -> tuple[float | None] | N
         return None
     content = metrics.read(path, _TRAIN_AGAIN)
     _require_same(path, content.config, config)
-    ours = content.shown.mean.get("ours")
-    psnr = None if ours is None else ours.psnr
-    score = "no PSNR" if psnr is None else f"PSNR {psnr:.2f} dB"
+    mean = content.shown.mean.get("ours")
+    score = "no PSNR" if mean is None or mean.psnr is None else f"PSNR {mean.psnr:.2f} dB"
     _log.info("%s: this run finished on %s (%s); nothing is trained.", folder, content.provenance.date, score)
-    return (psnr,)
+    return content
 
 
-def resume(state: TrainState, asked: str | None, folder: Path, config: Mapping[str, Any]) -> None:
-    """Restore what `fit.resume` asks for.
+def resume(state: TrainState, source: str | None, folder: Path, config: Mapping[str, Any]) -> None:
+    """Restore what `fit.resume` names.
 
     Args:
-        asked: a run's folder or one of its checkpoints; "auto": the newest checkpoint in `folder` that is whole, or none.
+        source: a run's folder or one of its checkpoints; "auto": the newest checkpoint in `folder` that is whole, or none.
 
     Raises:
         DataError: the checkpoint is damaged, or another configuration's.
     """
-    if asked == AUTO:
-        _resume_newest(state, folder / CHECKPOINTS, config)
-    elif asked is not None:
-        restore(state, checkpoint.load(Path(asked)), Path(asked), config)
+    if source is None:
+        return
+    if source != AUTO:
+        restore(state, checkpoint.load(Path(source)), Path(source), config)
+        return
+    checkpoints = checkpoint.saved(folder / CHECKPOINTS)
+    for path in reversed(checkpoints):
+        try:
+            saved = checkpoint.load(path)
+        except DataError as error:
+            _log.warning("%s; trying an earlier one.", error)
+            continue
+        restore(state, saved, path, config)
+        return
+    if checkpoints:
+        _log.warning("%s: no checkpoint is whole; the run starts from the beginning.", folder / CHECKPOINTS)
 
 
-def of_both(asked: str | None, run: Mapping[str, Any], baseline: Mapping[str, Any]) -> tuple[str | None, str | None]:
-    """What `fit.resume` means for a run and for the baseline beside it, which trains first.
+def sources(source: str | None, run: Mapping[str, Any], baseline: Mapping[str, Any]) -> tuple[str | None, str | None]:
+    """`fit.resume` of a run, and of the baseline beside it, which trains first.
 
     A path leads to the run, or, of a run that was stopped while its baseline trained, to that baseline; the run itself
     then starts from the beginning.
@@ -79,19 +89,19 @@ def of_both(asked: str | None, run: Mapping[str, Any], baseline: Mapping[str, An
     Raises:
         DataError: no checkpoint is there, it is damaged, or it is another configuration's.
     """
-    if asked is None or asked == AUTO:
-        return asked, asked
-    source = Path(asked)
-    folder = folder_of(source)
-    beside = folder / BASELINE
-    begun = bool(checkpoint.saved(beside / CHECKPOINTS))
+    if source is None or source == AUTO:
+        return source, source
+    path = Path(source)
+    folder = folder_of(path)
+    baseline_folder = folder / BASELINE
+    begun = bool(checkpoint.saved(baseline_folder / CHECKPOINTS))
     if begun and not checkpoint.saved(folder / CHECKPOINTS):
-        return None, str(beside)
-    saved = checkpoint.load(source)
+        return None, str(baseline_folder)
+    saved = checkpoint.load(path)
     if saved.config == baseline:
-        return None, asked
-    _require_same(source, saved.config, run)  # now, not after the baseline has trained
-    return asked, str(beside) if begun else None
+        return None, source
+    _require_same(path, saved.config, run)  # now, not after the baseline has trained
+    return source, str(baseline_folder) if begun else None
 
 
 def folder_of(source: Path) -> Path:
@@ -102,20 +112,6 @@ def folder_of(source: Path) -> Path:
 def newest(folder: Path) -> Path | None:
     """The newest checkpoint of the run in this folder."""
     return next(reversed(checkpoint.saved(folder / CHECKPOINTS)), None)
-
-
-def _resume_newest(state: TrainState, folder: Path, config: Mapping[str, Any]) -> None:
-    found = checkpoint.saved(folder)
-    for source in reversed(found):
-        try:
-            saved = checkpoint.load(source)
-        except DataError as error:
-            _log.warning("%s; trying an earlier one.", error)
-            continue
-        restore(state, saved, source, config)
-        return
-    if found:
-        _log.warning("%s: no checkpoint is whole; the run starts from the beginning.", folder)
 
 
 def restore(state: TrainState, saved: Checkpoint, source: Path, config: Mapping[str, Any]) -> None:

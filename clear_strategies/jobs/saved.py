@@ -11,23 +11,25 @@ from typing import Any, Final
 import numpy as np
 import torch
 
+from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.data.ply import read_gaussians
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.jobs import device
-from clear_strategies.jobs.device import Drawing, RasterizerSettings
-from clear_strategies.jobs.resume import CHECKPOINTS, folder_of
-from clear_strategies.settings import build, with_defaults
+from clear_strategies.jobs.device import Drawing
+from clear_strategies.jobs.resume import folder_of
+from clear_strategies.settings import TARGET, build, with_defaults
 from clear_strategies.training import checkpoint
+from clear_strategies.training.checkpoint import CHECKPOINTS
 from clear_strategies.training.field import GaussianField
-from clear_strategies.viewing import cameras
-from clear_strategies.viewing.cameras import SavedCamera
+from clear_strategies.viewing.cameras import FILE as CAMERAS
+from clear_strategies.viewing.cameras import SavedCamera, read_cameras
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
 
 PLY: Final = "point_cloud.ply"
-_FAR: Final = 2.5  # distance of the camera that is made up for a lone PLY file, in radii of the scene
+_FAR: Final = 2.5  # radii of the scene, distance of the camera for a PLY file without cameras
 _SIZE: Final = (1280, 720)  # px, of that camera
 _DEPTH: Final = 3  # cameras.json lies at most so many folders above a PLY file
 
@@ -42,7 +44,7 @@ class SavedSplat:
         source: what was opened, for messages.
         cameras: of the run; empty where none are known.
         antialiased: it was trained with opacity compensation.
-        baked: it comes from a PLY file, where f_det and the 3D filter can no longer be told apart from the rest.
+        baked: it comes from a PLY file, whose colours and scales include f_det and the 3D filter.
     """
 
     folder: Path
@@ -74,8 +76,8 @@ def open_splat(path: Path, rasterizer: str | None = None) -> SavedSplat:
     folder = folder_of(path)
     if checkpoint.saved(folder / CHECKPOINTS):
         return _of_checkpoint(path, folder, rasterizer)
-    found = [folder / PLY, *sorted(folder.glob(f"point_cloud/iteration_*/{PLY}"), key=lambda p: len(p.parent.name))]
-    if (ply := next((p for p in reversed(found) if p.is_file()), None)) is not None:
+    files = [folder / PLY, *sorted(folder.glob(f"point_cloud/iteration_*/{PLY}"), key=lambda p: len(p.parent.name))]
+    if (ply := next((p for p in reversed(files) if p.is_file()), None)) is not None:
         return _of_ply(ply, rasterizer)
     raise DataError(path, "run", "has neither a checkpoint nor a point_cloud.ply", "give a run's folder or a PLY file")
 
@@ -104,51 +106,51 @@ def _of_checkpoint(path: Path, folder: Path, rasterizer: str | None) -> SavedSpl
         field.filter_3d = parameters["filter_3d"].clone()
     except (KeyError, ValueError, TypeError) as error:
         raise DataError(path, "tensors", f"hold no field ({error})", "give a run of this program") from error
-    known = _cameras_near(folder, 0)
-    # None is the default, also of a field that only an earlier version had.
-    chosen = {key: value for key, value in saved.config.items() if value is not None}
-    own = {key.removeprefix("rasterizer."): v for key, v in chosen.items() if key.startswith("rasterizer.")}
+    cameras = _cameras_near(folder, 0)
+    settings = {
+        key.removeprefix("rasterizer."): value
+        for key, value in saved.config.items()
+        if key.startswith("rasterizer.") and value is not None  # the default, also of a field of an earlier version
+    }
     source = f"{folder}, {saved.t - 1} iterations, {len(field):,} Gaussians"
-    painter, antialiased = _painter(field, _drawing(own, rasterizer), known), bool(own.get("antialiased", True))
-    return SavedSplat(folder, _name(folder), source, painter, known, antialiased, baked=False)
+    painter, antialiased = (
+        _painter(field, _drawing(settings, rasterizer), cameras),
+        bool(settings.get("antialiased", True)),
+    )
+    return SavedSplat(folder, _name(folder), source, painter, cameras, antialiased, baked=False)
 
 
 def _of_ply(path: Path, rasterizer: str | None) -> SavedSplat:
     g = read_gaussians(path)
     if not len(g):
         raise DataError(path, "element vertex", "has no Gaussians", "export it again")
-    field = GaussianField(
-        {
-            "means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities, "sh0": g.sh0, "shN": g.shN,
-            "detail": torch.zeros_like(g.means),
-        }
-    )  # fmt: skip
+    field = GaussianField({name: getattr(g, name) for name in PARAMETERS} | {"detail": torch.zeros_like(g.means)})
     field.degree = field.max_degree
-    known = _cameras_near(path.parent, _DEPTH)
+    cameras = _cameras_near(path.parent, _DEPTH)
     drawing = _drawing({} if g.antialiased else {"kernel": 0.3, "antialiased": False}, rasterizer)
     source = f"{path}, {len(field):,} Gaussians"
     name = _name(path.parent) if path.name == PLY else path.stem
-    return SavedSplat(path.parent, name, source, _painter(field, drawing, known), known, g.antialiased, baked=True)
+    return SavedSplat(path.parent, name, source, _painter(field, drawing, cameras), cameras, g.antialiased, baked=True)
 
 
 def _name(folder: Path) -> str:
     return folder.name or "splat"
 
 
-def _painter(field: GaussianField, drawing: Drawing, known: Sequence[SavedCamera]) -> Painter:
-    """Draws the field over the background of the known cameras; black where there are none."""
-    drawing = drawing.over(known[0].background if known else (0.0, 0.0, 0.0))
+def _painter(field: GaussianField, drawing: Drawing, cameras: Sequence[SavedCamera]) -> Painter:
+    """Draws the field over the background of the cameras; black where there are none."""
+    drawing = drawing.over(cameras[0].background if cameras else (0.0, 0.0, 0.0))
     return Painter(field.to(drawing.device), drawing.make)
 
 
-def _drawing(node: Mapping[str, Any], name: str | None) -> Drawing:
+def _drawing(settings: Mapping[str, Any], name: str | None) -> Drawing:
     """The rasterizer with the settings of a run, or of the name that was asked for."""
-    defaults = with_defaults({"_target_": f"{RasterizerSettings.__module__}.{RasterizerSettings.__qualname__}"})
+    defaults = with_defaults({TARGET: device.BY_NAME})
     if name is not None:
-        shared = {key: node[key] for key in ("kernel", "antialiased", "background") if key in node}
+        shared = {key: settings[key] for key in ("kernel", "antialiased", "background") if key in settings}
         return device.drawing(build({**defaults, **shared, "name": name}, "rasterizer"), None)
     try:
-        return device.drawing(build(device.rasterizer_node({**defaults, **node}), "rasterizer"), None)
+        return device.drawing(build(device.rasterizer_node({**defaults, **settings}), "rasterizer"), None)
     except SettingError as error:
         _log.warning("%s The fastest rasterizer of this machine draws instead.", error)
         return device.drawing(build(defaults, "rasterizer"), None)
@@ -157,6 +159,6 @@ def _drawing(node: Mapping[str, Any], name: str | None) -> Drawing:
 def _cameras_near(folder: Path, above: int) -> list[SavedCamera]:
     """The cameras.json of a folder, or of one of the folders above it."""
     for candidate in (folder, *list(folder.resolve().parents)[:above]):
-        if (candidate / cameras.FILE).is_file():
-            return cameras.read_cameras(candidate / cameras.FILE)
+        if (candidate / CAMERAS).is_file():
+            return read_cameras(candidate / CAMERAS)
     return []
