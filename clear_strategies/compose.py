@@ -5,8 +5,8 @@ conductor("clear", "strategies.gco.tolerance=0.1", iterations=30_000)
 
 from __future__ import annotations
 
-import difflib
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
@@ -101,12 +101,12 @@ def conductor(
     return settings.conductor(iterations / REFERENCE_ITERATIONS, _detail(config).of_run(iterations))
 
 
-# Options for both doors, readings=literal above all, set these as well; a host has its own. Of `optim` it has no f_det.
+# Options for runs and hosts, such as readings=literal, set these as well; a host has its own, but for the rates of f_det.
 _TRAINERS: Final = ("optim", "skips", "data")
 
 
 def _detail(config: DictConfig) -> DetailRates:
-    """The rates of f_det where an option for both doors sets them, else the defaults."""
+    """The rates of f_det that an option has set, else the defaults."""
     optim = OmegaConf.to_container(config.get("optim", OmegaConf.create()))
     keys = {"detail": "rate", "detail_steps": "steps", "detail_decay": "decay"}
     return DetailRates(**{keys[key]: value for key, value in optim.items() if key in keys})  # type: ignore[union-attr]
@@ -142,13 +142,6 @@ def flat(node: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return leaves
 
 
-def nearest_setting(key: str, arguments: Iterable[str]) -> str | None:
-    """The setting of a run that an unknown key of its command line most resembles; None where there is none like it."""
-    overrides = [a for a in arguments if not a.startswith(("-", "hydra.")) and a.partition("=")[0].lstrip("+") != key]
-    known: Any = OmegaConf.to_container(composed(overrides, "config"))
-    return next(iter(difflib.get_close_matches(key, flat(known), 1, 0.8)), None)
-
-
 def composed(overrides: list[str], config: str = "conductor") -> DictConfig:
     """conf/ with these overrides, from its file `config`: "config" for a run, "conductor" for a host.
 
@@ -157,47 +150,47 @@ def composed(overrides: list[str], config: str = "conductor") -> DictConfig:
     """
     # The caller may be a Hydra application, whose state is restored afterwards.
     shared = GlobalHydra.instance()
-    theirs, shared.hydra = shared.hydra, None
+    before, shared.hydra = shared.hydra, None
     try:
         require_each_once(overrides)
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             return hydra.compose(config, overrides)
     except (HydraException, OmegaConfBaseException) as error:
-        told = of_hydra(error).rstrip(".")
-        raise SettingError(f"{' '.join(overrides)}: {told}. See conf/ for what there is.") from error
+        problem = of_hydra(error).rstrip(".")
+        raise SettingError(f"{' '.join(overrides)}: {problem}. See conf/ for what there is.") from error
     finally:
-        GlobalHydra.instance().hydra = theirs
+        GlobalHydra.instance().hydra = before
 
 
 def require_each_once(overrides: Iterable[str]) -> None:
     """Raise a SettingError for a strategy that is named twice, since Hydra merges the two into one silently, and for one before
     a method that brings more than strategies, which a method does not set aside.
     """
-    further: str | None = None
+    also_brought: str | None = None
     for override in OverridesParser.create().parse_overrides(list(overrides)):
-        if override.key_or_group == "method" and further is not None:
-            raise SettingError(f"+method={override.value()}: sets strategies aside, and {further}. Leave it out.")
+        if override.key_or_group == "method" and also_brought is not None:
+            raise SettingError(f"+method={override.value()}: sets strategies aside, and {also_brought}. Leave it out.")
         if override.key_or_group != "strategy" or override.is_sweep_override():
             continue
         value = override.value()
-        chosen = [str(entry) for entry in (value if isinstance(value, list) else [value])]
-        for entry in chosen:
-            if more := [part for part in _parts(entry) if part.startswith("/")]:
-                further = f"+strategy={entry} before it brings {', '.join(more)} as well"
-        names = [name for entry in chosen for name in _members(entry)]
-        if twice := next((name for name in names if names.count(name) > 1), None):
+        options = [str(option) for option in (value if isinstance(value, list) else [value])]
+        for option in options:
+            if other_groups := [part for part in _parts(option) if part.startswith("/")]:
+                also_brought = f"+strategy={option} before it brings {', '.join(other_groups)} as well"
+        strategies = Counter(strategy for option in options for strategy in _strategies_of(option))
+        if twice := next((strategy for strategy, count in strategies.items() if count > 1), None):
             raise SettingError(f"+strategy: must name each strategy once, got {twice} twice in {override.input_line}.")
 
 
-def _members(name: str) -> list[str]:
+def _strategies_of(option: str) -> list[str]:
     """The strategies that an option of conf/strategy consists of, those of the options that it names included."""
-    named = [part for part in _parts(name) if not part.startswith(("/", "_"))]
-    return [member for part in named for member in _members(part)] or [name]
+    parts = [part for part in _parts(option) if not part.startswith(("/", "_"))]
+    return [strategy for part in parts for strategy in _strategies_of(part)] or [option]
 
 
-def _parts(name: str) -> list[str]:
+def _parts(option: str) -> list[str]:
     """The options that an option of conf/strategy names, those of other groups with a `/` in front."""
-    file = CONF / "strategy" / f"{name}.yaml"
+    file = CONF / "strategy" / f"{option}.yaml"
     content: Any = OmegaConf.to_container(OmegaConf.load(file)) if file.is_file() else {}
     return [part for part in content.get("defaults", []) if isinstance(part, str)]
 
@@ -216,13 +209,13 @@ class _ConfSource(FileConfigSource):
 
 
 class _ReadConf(SearchPathPlugin):
-    """Makes Hydra read conf/ by `_ConfSource`, and after it the folders that other packages bring; others are read as usual."""
+    """Makes Hydra read conf/, and after it the folders that other packages bring, by `_ConfSource`."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        ours = [e for e in search_path.get_path() if e.path is not None and e.path.removeprefix("file://") == str(CONF)]
-        for element in ours:
+        conf = [e for e in search_path.get_path() if e.path is not None and e.path.removeprefix("file://") == str(CONF)]
+        for element in conf:
             element.path = f"{_ConfSource.scheme()}://{CONF}"
-        for point in entry_points(group=OPTIONS) if ours else ():
+        for point in entry_points(group=OPTIONS) if conf else ():
             search_path.append(point.name, f"{_ConfSource.scheme()}://{_folder_of(point)}")
 
 
@@ -249,11 +242,11 @@ def _one_folder(name: str) -> str:
     """`${one_folder:name}` in conf/: the name of a job's folder, one word that every file system takes. A path among the
     overrides would otherwise lead elsewhere: behind `../..` all jobs share a folder.
     """
-    flat_name = name.replace("/", "_")
-    if len(flat_name.encode()) <= _LONGEST_NAME:
-        return flat_name
-    told = hashlib.sha256(name.encode()).hexdigest()[:8]
-    return f"{flat_name.encode()[: _LONGEST_NAME - len(told) - 1].decode(errors='ignore')}_{told}"
+    word = name.replace("/", "_")
+    if len(word.encode()) <= _LONGEST_NAME:
+        return word
+    digest = hashlib.sha256(name.encode()).hexdigest()[:8]
+    return f"{word.encode()[: _LONGEST_NAME - len(digest) - 1].decode(errors='ignore')}_{digest}"
 
 
 OmegaConf.register_new_resolver("settings_without_result", _unnamed, replace=True)

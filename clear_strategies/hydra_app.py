@@ -7,6 +7,7 @@ docs/reference/files.md lists them. metrics.json is written last, so a folder th
 
 from __future__ import annotations
 
+import difflib
 import logging
 import os
 import re
@@ -21,12 +22,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from clear_strategies.compose import CONF, nearest_setting, require_each_once
+from clear_strategies.compose import CONF, composed, flat, require_each_once
 from clear_strategies.errors import ClearError, SettingError
-from clear_strategies.jobs import exit_codes, sweep
-from clear_strategies.jobs.sweep import Sweep
+from clear_strategies.jobs import exit_codes
+from clear_strategies.jobs.sweep import FAILED, LEFT, Sweep, Watch, stop_on_signals
 
 _log = logging.getLogger(__name__)
 
@@ -46,7 +47,7 @@ def main(overrides: Sequence[str] | None = None) -> None:
     Raises:
         SettingError: an override names no setting, a flag is unknown, or a library of the trainer is not installed.
     """
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra passes errors on instead of printing them its own way
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     arguments = sys.argv[1:] if overrides is None else overrides
     _require_known_flags(arguments)
     sys.argv[1:] = [_VERBOSE if a in ("-v", "--verbose") else a for a in arguments]  # Hydra reads them there
@@ -60,7 +61,7 @@ def main(overrides: Sequence[str] | None = None) -> None:
 
 
 def _require_known_flags(arguments: Sequence[str]) -> None:
-    """Hydra would answer an unknown flag with its own usage, which names none of our commands."""
+    """Raise a SettingError for an unknown flag; Hydra's own message names none of our commands."""
     for word in arguments:
         flag = word.partition("=")[0]
         if flag.startswith("--") and flag != "--verbose" and not any(known.startswith(flag) for known in _FLAGS):
@@ -69,64 +70,67 @@ def _require_known_flags(arguments: Sequence[str]) -> None:
 
 
 def _no_such_setting(key: str) -> str:
-    """The message for an override that names no setting, with the name that was probably meant."""
+    """The message for an override that names no setting, with the most similar one."""
     if (CONF / key).is_dir():
         return f"{key}: no choice of this group is there to be replaced, so it is added: +{key}=…."
+    words = [word for word in sys.argv[1:] if not word.startswith(("-", "hydra."))]
+    overrides = [word for word in words if word.partition("=")[0].lstrip("+") != key]
     try:
-        near = nearest_setting(key, sys.argv[1:])
+        settings: Any = OmegaConf.to_container(composed(overrides, "config"))
+        near = difflib.get_close_matches(key, flat(settings), 1, 0.8)
     except SettingError:  # another override is wrong as well
-        near = None
-    remedy = f"Did you mean {near}?" if near else "clear-strategies settings lists all."
+        near = []
+    remedy = f"Did you mean {near[0]}?" if near else "clear-strategies settings lists all."
     return f"{key}: there is no such setting. {remedy}"
 
 
 def job(config: DictConfig) -> float | None:
     """One job of Hydra's. Returns what `jobs.job.run` does; in a sweep also None for a job that failed or did not start."""
-    hydra_config, ours = HydraConfig.get(), _sweep()
-    if ours is not None and _launcher(hydra_config) == "joblib" and not ours.begun_here:
+    hydra_config, sweep = HydraConfig.get(), _sweep()
+    if sweep is not None and _launcher(hydra_config) == "joblib" and not sweep.begun_here:
         # A terminal sends Ctrl-C to joblib's workers too; one stop is enough, and it comes from the sweep.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if ours is not None and ours.stopped_by is not None:
+    if sweep is not None and sweep.stopped_by is not None:
         _log.warning("job %s is not started: the sweep was stopped.", hydra_config.job.num)
         return None
     try:
-        from clear_strategies.jobs import job as one
+        from clear_strategies.jobs import job
 
-        require_each_once(hydra_config.overrides.task)
-        folder, overrides = Path(hydra_config.runtime.output_dir), list(hydra_config.overrides.task)
-        return one.run(config, folder, _watch(), overrides)
+        overrides = list(hydra_config.overrides.task)
+        require_each_once(overrides)
+        return job.run(config, Path(hydra_config.runtime.output_dir), _watch(), overrides)
     except (Exception, KeyboardInterrupt) as error:
         if (ending := exit_codes.describe(error)) is None:
             raise
-        _end(error, ending, config, hydra_config, ours)
+        _end(error, ending, config, hydra_config, sweep)
         return None
 
 
 def _end(
-    error: BaseException, ending: exit_codes.Ending, config: DictConfig, hydra_config: Any, ours: Sweep | None
+    error: BaseException, ending: exit_codes.Ending, config: DictConfig, hydra_config: Any, sweep: Sweep | None
 ) -> None:
     """Log why a job ended, and exit; in a sweep only where the other jobs cannot continue."""
     from clear_strategies.jobs.lock import HeldError
 
-    code, message = ending.code, ending.message
+    code, message = ending
     number, launcher = hydra_config.job.get("num"), _launcher(hydra_config)
-    if ours is not None and isinstance(error, HeldError) and config.fit.get("resume") == "auto":
+    if sweep is not None and isinstance(error, HeldError) and config.fit.get("resume") == "auto":
         _log.warning("left to the other process: %s", message)
-        ours.note(sweep.LEFT, number, message)
+        sweep.note(LEFT, number, message)
         return
     _log.log(logging.INFO if code > exit_codes.SIGNALS else logging.ERROR, "%s", message)  # a stop is no error
     if code > exit_codes.SIGNALS:
         signum = code - exit_codes.SIGNALS
-        if ours is not None and launcher == "joblib":
-            ours.stop(signum)  # ending a worker would have joblib kill the others before they have saved
+        if sweep is not None and launcher == "joblib":
+            sweep.stop(signum)  # ending a worker would have joblib kill the others before they have saved
             return
         if signum not in (signal.SIGINT, signal.SIGTERM):
             signal.raise_signal(signum)  # all is saved: now the launcher's handler may resubmit the job
         sys.exit(code)
-    if ours is None or (code == exit_codes.NO_DISK and launcher == "basic"):
+    if sweep is None or (code == exit_codes.NO_DISK and launcher == "basic"):
         sys.exit(code)
     # The other jobs continue, and jobs on other machines may have another disk.
-    ours.note(sweep.FAILED, number, message)
+    sweep.note(FAILED, number, message)
 
 
 class SweepCallback(Callback):
@@ -136,16 +140,16 @@ class SweepCallback(Callback):
     """
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        ours = Sweep.begin(Path(config.hydra.sweep.dir))
+        sweep = Sweep.begin(Path(config.hydra.sweep.dir))
         if _launcher(config.hydra) == "joblib":
-            sweep.stop_on_signals(ours)
+            stop_on_signals(sweep)
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        ours = Sweep.current()
-        if ours is None:
+        sweep = Sweep.current()
+        if sweep is None:
             return
         _report(Path(config.hydra.sweep.dir))
-        stopped, failed, left = ours.stopped_by, ours.notes(sweep.FAILED), ours.notes(sweep.LEFT)
+        stopped, failed, left = sweep.stopped_by, sweep.notes(FAILED), sweep.notes(LEFT)
         if left:
             _log.warning("%d job(s) were left to other processes: %s", len(left), " | ".join(left))
         if failed:
@@ -180,5 +184,5 @@ def _launcher(hydra_config: Any) -> str:
 
 def _watch() -> Callable[[], None] | None:
     """For joblib's jobs: checks after each iteration whether the sweep was stopped, by any process."""
-    ours = _sweep()
-    return sweep.Watch(ours) if ours is not None and _launcher(HydraConfig.get()) == "joblib" else None
+    sweep = _sweep()
+    return Watch(sweep) if sweep is not None and _launcher(HydraConfig.get()) == "joblib" else None

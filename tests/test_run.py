@@ -195,21 +195,6 @@ def test_ctrl_c_while_data_is_prepared_is_one_line(tmp_path):
     assert said.read_text() == "reading\nstopped by SIGINT before training began. Nothing was saved.\n"
 
 
-def test_without_the_trainers_libraries_the_command_names_the_extra(tmp_path):
-    code = (
-        "import sys, importlib.util as u\n"
-        "whole = u.find_spec\n"
-        "import clear_strategies.jobs.exit_codes as e\n"
-        "e.find_spec = lambda name: None if name in ('cv2', 'scipy') else whole(name)\n"
-        "from clear_strategies.run import main\n"
-        "main()\n"
-    )
-    said = tmp_path / "said"
-    assert started("-c", code, "+strategy=clear", cwd=tmp_path, said=said).wait() == 2
-    assert "training needs cv2, scipy" in said.read_text()
-    assert "pip install 'clear-strategies[train]'" in said.read_text()
-
-
 def test_the_package_itself_lists_its_doors(tmp_path):
     result = run(cwd=tmp_path, module="clear_strategies")
     assert result.returncode == 0, result.stderr

@@ -13,6 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 from clear_strategies import commands, hydra_app
 from clear_strategies.commands import settings
 from clear_strategies.errors import SettingError
+from clear_strategies.jobs import exit_codes
 from tests.helpers.command_line import ROOT
 
 SLOW = ("hydra", "numpy", "omegaconf", "torch")
@@ -101,13 +102,22 @@ def test_settings_lists_groups_choices_and_values(capsys):
 
 
 @pytest.mark.usefixtures("hydra_undone")
-@pytest.mark.parametrize("key", ["strategy", "method", "readings"])
-def test_a_group_that_is_to_be_added_is_told_so(key):
-    with pytest.raises(SettingError, match=rf"^{key}: .* it is added: \+{key}="):
-        hydra_app.main([f"{key}=clear"])
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        *((f"{group}=clear", rf"^{group}: .* it is added: \+{group}=") for group in ("strategy", "method", "readings")),
+        ("fit.nothing_like_it=1", r"fit\.nothing_like_it: there is no such setting\. clear-strategies se"),
+        ("fit.iteration=1", r"fit\.iteration: there is no such setting\. Did you mean fit\.iterations\?"),
+        ("--multrun", r"--multrun: there is no such flag\. A setting is written name=value"),
+    ],
+)
+def test_a_wrong_override_is_refused_with_what_was_meant(word, message):
+    with pytest.raises(SettingError, match=message):
+        hydra_app.main([word])
 
 
 @pytest.mark.usefixtures("hydra_undone")
-def test_a_setting_that_is_not_there_is_told_with_where_all_are():
-    with pytest.raises(SettingError, match=r"fit\.nothing_like_it: there is no such setting\. clear-strategies se"):
-        hydra_app.main(["fit.nothing_like_it=1"])
+def test_without_the_trainers_libraries_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr(exit_codes, "find_spec", lambda name: None if name in ("cv2", "scipy") else name)
+    with pytest.raises(SettingError, match=r"training needs cv2, scipy.* pip install 'clear-strategies\[train\]'"):
+        hydra_app.main(["+strategy=clear"])
