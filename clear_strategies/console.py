@@ -1,4 +1,4 @@
-"""What the programs say on the terminal, and how much of it. conf/config.yaml sets a run's logging up with this.
+"""Messages on the terminal. conf/config.yaml sets a run's logging up with this.
 
 INFO is for everybody: the plan, what takes long, the result and where to look next. DEBUG is for those who ask (`-v`): every
 round of the densifier, timings, which kernels were chosen. Warnings are always shown. A run's run.log has all three.
@@ -16,7 +16,7 @@ from typing import Any, Final, TextIO
 
 _OURS: Final = ("clear_strategies", "rasterizers", "integration")
 
-_CHATTY: Final = ("websockets", "PIL", "matplotlib", "asyncio")  # libraries that tell every event at INFO
+_CHATTY: Final = ("websockets", "PIL", "matplotlib", "asyncio")  # libraries that log every event at INFO
 _PREFIXES: Final = {logging.WARNING: "warning: ", logging.ERROR: "error: ", logging.CRITICAL: "error: "}
 
 
@@ -25,7 +25,7 @@ class Console(logging.StreamHandler[Any]):
 
     Args:
         stream: None: stdout.
-        verbose: also what run.log alone has otherwise.
+        verbose: also details, which otherwise only run.log has.
     """
 
     def __init__(self, stream: TextIO | io.TextIOBase | None = None, *, verbose: bool = False) -> None:
@@ -37,7 +37,7 @@ class Console(logging.StreamHandler[Any]):
         return _PREFIXES.get(record.levelno, "") + super().format(record)
 
     def emit(self, record: logging.LogRecord) -> None:
-        bars = sys.modules.get("tqdm")  # where nobody has imported it, there is no bar
+        bars = sys.modules.get("tqdm")  # not imported: there is no bar
         with contextlib.nullcontext() if bars is None else bars.tqdm.external_write_mode(file=self.stream):
             super().emit(record)
 

@@ -21,7 +21,7 @@ from clear_strategies.errors import DataError
 _log = logging.getLogger(__name__)
 
 _PARTIAL: Final = ".partial"
-_TOLD: Final = 40  # characters of a file's name in that of its part, which may then be as long as names can be
+_KEPT: Final = 40  # characters of a file's name in that of its part, so that a name may be as long as the disk allows
 _LARGEST: Final = 64 << 30
 
 
@@ -37,7 +37,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """The path that a library writes to in place of `path`, with the same suffix; renamed to it afterwards, or removed."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem[:_TOLD]}.{_unique()}{_PARTIAL}{path.suffix}")
+    partial = path.with_name(f".{path.stem[:_KEPT]}.{_unique()}{_PARTIAL}{path.suffix}")
     try:
         yield partial
         partial.replace(path)
@@ -45,16 +45,16 @@ def replacing(path: Path) -> Iterator[Path]:
         partial.unlink(missing_ok=True)  # exists only after an exception or Ctrl-C
 
 
-def install(made: Path, folder: Path, last: str) -> None:
-    """Rename a folder that is complete to `folder`, or leave it where another process has made the same meanwhile.
+def install(complete: Path, folder: Path, last: str) -> None:
+    """Rename a folder that is complete to `folder`, or leave it where another process has written the same meanwhile.
 
     Args:
-        last: the file whose presence says that `folder` is complete.
+        last: the file that only a complete `folder` has.
     """
     if not (folder / last).is_file():
         shutil.rmtree(folder, ignore_errors=True)
     try:
-        made.rename(folder)
+        complete.rename(folder)
     except OSError:
         if not (folder / last).is_file():
             raise
@@ -62,7 +62,7 @@ def install(made: Path, folder: Path, last: str) -> None:
 
 def partial_of(path: Path) -> Path:
     """Where one call writes what will be renamed to `path`; each time another."""
-    return path.with_name(f".{path.name[:_TOLD]}.{_unique()}{_PARTIAL}")
+    return path.with_name(f".{path.name[:_KEPT]}.{_unique()}{_PARTIAL}")
 
 
 def _unique() -> str:
@@ -73,18 +73,18 @@ def _unique() -> str:
 def require_regular(path: Path, *, most: int = _LARGEST) -> None:
     """Refuse what is no regular file: a pipe blocks for ever, and a device such as /dev/zero has no end.
 
-    What is not there, or cannot be looked at, is left to whoever opens it.
+    A path that does not exist or cannot be examined is left to the caller's own open.
 
     Raises:
         DataError: it is a pipe, a device or a socket, or has more than `most` bytes.
     """
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return
-    if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+    if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
         raise DataError(path, "file", "is a pipe, a device or a socket", "give a regular file")
-    if found.st_size > most:
+    if status.st_size > most:
         raise DataError(path, "size", f"is more than {most >> 20} MiB", "check the path")
 
 
@@ -98,7 +98,7 @@ def read_bytes(path: Path, *, most: int = _LARGEST, remedy: str = "check the pat
 
 
 def sweep(folder: Path) -> None:
-    """Remove what processes that died left of their writes in a run's folder. Call it while no other process writes there."""
+    """Remove partial files of processes that died from a run's folder. Call it while no other process writes there."""
     for depth in ("", "*/", "*/*/"):
         for left in folder.glob(f"{depth}.*{_PARTIAL}*"):
             if left.is_dir() and not left.is_symlink():

@@ -65,8 +65,8 @@ class Run:
         """The Gaussians by gsplat's names, on the CPU: means [N, 3], quats [N, 4] (w, x, y, z), log scales [N, 3], logit
         opacities [N], sh0 [N, 1, 3] and shN [N, K, 3]. f_det and the 3D filter are part of them, as in point_cloud.ply.
         """
-        found = read_gaussians(self.folder / "point_cloud.ply")
-        return {name: getattr(found, name) for name in PARAMETERS}
+        gaussians = read_gaussians(self.folder / "point_cloud.ply")
+        return {name: getattr(gaussians, name) for name in PARAMETERS}
 
     @property
     def cameras(self) -> Sequence[Camera]:
@@ -92,11 +92,11 @@ class Run:
             for part in ("test", "train")
             if (mean := facts[part]["mean"].get("ours")) is not None
         )
-        said = f"{facts['scene']}: {facts['gaussians']:,} Gaussians, {facts['iterations']} iterations, {facts['seconds']:.0f} s"
+        line = f"{facts['scene']}: {facts['gaussians']:,} Gaussians, {facts['iterations']} iterations, {facts['seconds']:.0f} s"
         page = self.folder / "splat.html"
         link = f' · <a href="{html.escape(str(page))}">turn it in the browser</a>' if page.is_file() else ""
         return (
-            f"<p><b>{html.escape(said)}</b>{link}</p>"
+            f"<p><b>{html.escape(line)}</b>{link}</p>"
             f"<table><tr><th>views</th><th>PSNR</th><th>SSIM</th></tr>{scores}</table>"
             f"{_picture(self.folder / 'contact_sheet.png')}{_film(self.folder / 'path.mp4')}"
         )

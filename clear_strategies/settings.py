@@ -42,18 +42,19 @@ CHANGES_NO_RESULT: Final = frozenset(
         "threads", "verbose", "video", "viewer",
     )
 ) | {"rasterizer.memory"}  # fmt: skip
-"""Settings with which the same field is trained, bit for bit: what is kept, shown and written beside it, and how fast. Resuming
-does not compare them, a sweep's folders are not named by them, and a report does not tell runs apart by them.
+"""Settings that do not change a bit of the trained field: what is kept, shown and written beside it, and how fast. Resuming
+does not compare them, a sweep's folders are not named by them, and a report does not distinguish runs by them.
 """
 _NUMBERS: Final = BeartypeConf(is_pep484_tower=True)  # an int is accepted where a float is asked for
 _EMPTY: Final = inspect.Parameter.empty
+_VARIADIC: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 _ABSENT: Final = object()
 
 
 def with_defaults(node: Any) -> Any:
-    """The node with the defaults of every `_target_` in it, nested dataclasses included; what the node says wins.
+    """The node with the defaults of every `_target_` in it, nested dataclasses included; values of the node win.
 
-    A target that cannot be imported is left as it is: `build` says why, if the node is used at all.
+    A target that cannot be imported is left as it is; `build` refuses it, if the node is used at all.
     """
     if isinstance(node, list):
         return [with_defaults(value) for value in node]
@@ -131,9 +132,6 @@ def _with_key(message: str, key: str, parameters: Mapping[str, Any]) -> str:
     return f"{key}.{message}" if message.partition(" ")[0].rstrip(":") in parameters else f"{key}: {message}"
 
 
-_VARIADIC: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
-
-
 # Libraries that the package itself uses. They hold nothing that a setting could stand for, and much that writes files or
 # runs programs.
 _LIBRARIES: Final = {
@@ -181,10 +179,10 @@ def _located(target: Any) -> Callable[..., Any]:
     module, _, name = target.rpartition(".")
     if not module:
         raise ImportError("it names no module")
-    found = getattr(importlib.import_module(module), name)
-    if not callable(found):
+    function = getattr(importlib.import_module(module), name)
+    if not callable(function):
         raise ImportError("it is neither a class nor a function")
-    return typing.cast("Callable[..., Any]", found)
+    return typing.cast("Callable[..., Any]", function)
 
 
 def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
@@ -234,7 +232,7 @@ def _plain(value: Any) -> Any:
 
 
 def _merged(defaults: Mapping[str, Any], node: Mapping[str, Any]) -> dict[str, Any]:
-    """The defaults, replaced by what the node says; a nested node of another `_target_` takes the place of the default."""
+    """The defaults, replaced by the values of the node; a nested node of another `_target_` replaces the default as a whole."""
     merged = {**defaults}
     for key, value in node.items():
         default = merged.get(key)
@@ -272,7 +270,7 @@ def _of_type(value: Any, hint: Any, key: str) -> Any:
                 warnings.simplefilter("ignore", BeartypeDecorHintPep585DeprecationWarning)
                 if is_bearable(candidate, hint, conf=_NUMBERS):
                     return candidate
-        except BeartypeException:  # a hint that beartype does not know
+        except BeartypeException:  # a hint that beartype does not support
             return value
     shown = repr(value) if isinstance(value, str | int | float | list | Mapping | None) else f"a {type(value).__name__}"
     raise SettingError(f"{key}: must be {_in_words(hint)}, got {shown}.")
@@ -284,7 +282,7 @@ def _takes_bool(hint: Any) -> bool:
         return any(_takes_bool(part) for part in get_args(hint))
     if get_origin(hint) is Literal:
         return any(isinstance(value, bool) for value in get_args(hint))
-    return hint in (bool, Any, object) or hint not in (int, float, str, None, types.NoneType)
+    return hint not in (int, float, str, None, types.NoneType)
 
 
 _WORDS: Final[Mapping[Any, str]] = {

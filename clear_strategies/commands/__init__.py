@@ -3,8 +3,8 @@
 A command is a module of this folder with `main(arguments)`, imported only when it is called. It returns when it is done and
 raises a `ClearError` for what the user can solve: a run or an argument that cannot be used, a library that is not installed.
 `clear_strategies.run` calls it, and turns errors into exit codes.
-A command imports torch, Hydra and what needs them in the functions that use them, so that its `--help`, and what it says to
-a wrong argument, are there at once.
+A command imports torch, Hydra and what needs them in the functions that use them, so that its `--help`, and the message for a
+wrong argument, come at once.
 
 What begins with an override or a flag is Hydra's: `+strategy=clear`, `fit.iterations=300`, `-m`, `--cfg job`.
 """

@@ -15,7 +15,7 @@ LONGEST: Final = 1280  # px, of a video where render --width asks for nothing
 
 
 class _Parser(argparse.ArgumentParser):
-    """Errors are ours: one line, and the exit code of a setting that cannot be used."""
+    """Raises a SettingError for wrong arguments, in place of argparse's usage and exit."""
 
     def error(self, message: str) -> NoReturn:
         raise SettingError(f"{message}. {self.prog} --help lists the arguments.")

@@ -29,18 +29,18 @@ def cameras_of(splat: SavedSplat, options: argparse.Namespace) -> tuple[list[str
         if not chosen:
             raise SettingError(f"--path {path}: {splat.folder} has no {path} cameras. Try --path cameras.")
         names = [file_stem(saved.name) for saved in chosen]
-        found = [saved.camera for saved in chosen]
+        views = [saved.camera for saved in chosen]
     else:
-        found, fps = _of_path(splat, path, options.frames)
-        names = [f"{i:04d}" for i in range(len(found))]
+        views, fps = _of_path(splat, path, options.frames)
+        names = [f"{i:04d}" for i in range(len(views))]
     if options.width is not None:
-        found = [resized(c, options.width, max(1, round(c.height * options.width / c.width))) for c in found]
+        views = [resized(c, options.width, max(1, round(c.height * options.width / c.width))) for c in views]
     if path not in STILLS:
-        found = [cameras.at_most(c, None if options.width is not None else LONGEST) for c in found]
-        if len({(c.width, c.height) for c in found}) > 1:
-            found = [cameras.framed(c, found[0].width, found[0].height) for c in found]
+        views = [cameras.at_most(c, None if options.width is not None else LONGEST) for c in views]
+        if len({(c.width, c.height) for c in views}) > 1:
+            views = [cameras.framed(c, views[0].width, views[0].height) for c in views]
             _log.warning("the cameras have different sizes; all frames have the first one's.")
-    return names, found, float(options.fps or fps or FPS)
+    return names, views, float(options.fps or fps or FPS)
 
 
 def _of_path(splat: SavedSplat, path: str, frames: int) -> tuple[list[Camera], float | None]:

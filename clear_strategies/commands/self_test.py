@@ -43,29 +43,28 @@ def backends(broken: list[str], *, slow: bool) -> Iterator[tuple[str, str]]:
                 yield name, f"not here: {reason}"
                 continue
             try:
-                told, fine = _compared(name, splats, camera, exact)
+                text, works = _compared(name, splats, camera, exact)
             except (BackendUnavailable, RuntimeError, ValueError) as error:
-                told, fine = f"FAILS: {one_line(error)[:200]}", False
-            if not fine:
+                text, works = f"FAILS: {one_line(error)[:200]}", False
+            if not works:
                 broken.append(name)
-            yield name, told
+            yield name, text
 
 
 def _compared(name: str, splats: Splats, camera: Camera, exact: Tensor) -> tuple[str, bool]:
-    """What to say of the backend's picture, and whether it is the reference's."""
+    """How the backend's picture differs from the reference's and how long it took, and whether they are the same."""
     rasterizer = rasterizers.load(name, preset="accurate")
     device = "cuda" if "cuda" in rasterizer.traits.devices and torch.cuda.is_available() else "cpu"
-    there = Splats(**{tensor: getattr(splats, tensor).to(device) for tensor in PARAMETERS})
-    rasterizer(there, camera)
+    splats = Splats(**{tensor: getattr(splats, tensor).to(device) for tensor in PARAMETERS})
+    rasterizer(splats, camera)
     began = time.perf_counter()
-    image = rasterizer(there, camera).image.cpu()
+    image = rasterizer(splats, camera).image.cpu()
     milliseconds = 1e3 * (time.perf_counter() - began)
-    off = float((image - exact).abs().max())
-    fine = off <= _TOLERANCE
+    error = float((image - exact).abs().max())
+    works = error <= _TOLERANCE
     module = getattr(rasterizer, "module", None)
-    which = f" ({module})" if isinstance(module, str) else ""
-    verdict = f"{'works' if fine else 'WRONG'}{which}"
-    return f"{verdict}: differs from the reference by {off:.1e}, {milliseconds:.1f} ms", fine
+    verdict = ("works" if works else "WRONG") + (f" ({module})" if isinstance(module, str) else "")
+    return f"{verdict}: differs from the reference by {error:.1e}, {milliseconds:.1f} ms", works
 
 
 def _scene() -> tuple[Splats, Camera]:

@@ -67,27 +67,25 @@ def overrides(arguments: Sequence[str]) -> list[str]:
         path = path.parent
     if not path.is_dir() and not path.is_file():
         raise SettingError(f"train: {path} is not there. Name the folder of the photos or of the capture, or a video.")
-    chosen = [] if any(override.startswith(CHOOSE_STRATEGIES) for override in rest) else ["+strategy=best"]
-    chosen += (
-        [] if any(override.startswith(_CHOOSE_ITERATIONS) for override in rest) else [f"fit.iterations={_ITERATIONS}"]
-    )
+    defaults = {"+strategy=best": CHOOSE_STRATEGIES, f"fit.iterations={_ITERATIONS}": _CHOOSE_ITERATIONS}
+    used = [default for default, chosen in defaults.items() if not any(word.startswith(chosen) for word in rest)]
     reader, root = detect(path) if path.is_dir() else ("photos", path)
-    return [*chosen, f"data={reader}", f"data.path={quoted(str(root))}", *rest]
+    return [*used, f"data={reader}", f"data.path={quoted(str(root))}", *rest]
 
 
 def _settings(arguments: Sequence[str]) -> list[str]:
     """Hydra's overrides: `--minutes M` and `--minutes=M` are one of them."""
-    found, rest = list[str](), iter(arguments)
+    settings, rest = list[str](), iter(arguments)
     for word in rest:
         name, equals, value = word.partition("=")
         if name not in _FLAGS:
-            found.append(word)
+            settings.append(word)
             continue
         value = value if equals else next(rest, "")
         if not value or value.startswith("-"):
             raise SettingError(f"{name} needs a number: {name} 4.")
-        found.append(f"{_FLAGS[name]}={value}")
-    return found
+        settings.append(f"{_FLAGS[name]}={value}")
+    return settings
 
 
 def detect(folder: Path) -> tuple[str, Path]:

@@ -57,8 +57,8 @@ def _require_own(host: str) -> None:
     """Raise a SettingError for an address of another machine, for which the viewer's server would wait for ever."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
-        with socket.socket(family, kind) as found:
-            found.bind(address)
+        with socket.socket(family, kind) as bound:
+            bound.bind(address)
     except OSError as error:
         remedy = "Take 127.0.0.1, for this machine alone, or 0.0.0.0, for all that reach it."
         raise SettingError(

@@ -41,7 +41,7 @@ def describe(error: BaseException) -> Ending | None:
         return Ending(error.exit_code, one_line(error))
     if isinstance(error, KeyboardInterrupt):
         return Ending(SIGNALS + signal.SIGINT, "stopped by SIGINT.")  # a job says what it has saved
-    if isinstance(error, _told_by_libraries()):
+    if isinstance(error, _library_errors()):
         return Ending(UNUSABLE, of_hydra(error))  # before OSError: Hydra's error for an option that is not there is one
     if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and _NO_MEMORY in str(error)):
         return Ending(UNUSABLE, f"out of memory: {one_line(error) or 'Python had none left'} {_LESS_MEMORY}")
@@ -54,7 +54,7 @@ def describe(error: BaseException) -> Ending | None:
     return None
 
 
-def _told_by_libraries() -> tuple[type[Exception], ...]:
+def _library_errors() -> tuple[type[Exception], ...]:
     """Errors whose messages are for the user; imported here, so that a wrong word waits for none of these libraries."""
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException

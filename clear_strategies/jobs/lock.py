@@ -1,9 +1,9 @@
 """One writer per folder: a job holds `run.lock` while it writes, and takes over the lock of a job that has died.
 
-The lock says who holds it, so that messages can, and it outlives a file system without `flock`. A process on this host is
-known to be dead; so is an earlier try of the same Slurm job, because Slurm starts a job again only after it has ended. The
-lock of another host is respected, because nothing is known of its processes. (The `filelock` package has no holder's name,
-and decides by `flock` alone, which network file systems of clusters often lack.)
+The lock names its holder, for messages, and works on a file system without `flock`. Whether a process of this host has died
+can be checked; an earlier try of the same Slurm job has, because Slurm starts a job again only after it has ended. The lock
+of another host is respected, because its processes cannot be checked. (The `filelock` package has no holder's name, and
+decides by `flock` alone, which network file systems of clusters often lack.)
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ def hold(folder: Path) -> Iterator[None]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / NAME
-    mine = json.dumps(_me())
-    with _alone_with(path) as file:
-        left = file.read()
-        if left:  # empty: this call has created it
-            _require_stale(path, left)
+    holder = json.dumps(_this_process())
+    with _exclusive(path) as file:
+        earlier = file.read()
+        if earlier:  # empty: this call has created it
+            _require_stale(path, earlier)
         try:
             file.truncate(0)
-            file.write(mine)
+            file.write(holder)
             file.flush()
         except OSError:  # a full disk: a partial lock names no owner
             path.unlink(missing_ok=True)
@@ -54,13 +54,13 @@ def hold(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        with suppress(FileNotFoundError), _alone_with(path) as file:  # the whole folder may be gone
-            if file.read() in (mine, ""):  # empty: it had been removed, and this call created it again
+        with suppress(FileNotFoundError), _exclusive(path) as file:  # the whole folder may be gone
+            if file.read() in (holder, ""):  # empty: it had been removed, and this call created it again
                 path.unlink(missing_ok=True)
 
 
 @contextmanager
-def _alone_with(path: Path) -> Iterator[TextIO]:
+def _exclusive(path: Path) -> Iterator[TextIO]:
     """Open the lock file, created if it does not exist, while no other process reads or writes it."""
     while True:
         with _opened(path) as file:
@@ -103,7 +103,7 @@ def _require_stale(path: Path, text: str) -> None:
     _log.warning("%s: %s ended without releasing it; taken over.", path, name)
 
 
-def _me() -> dict[str, Any]:
+def _this_process() -> dict[str, Any]:
     return {
         "host": socket.gethostname(),
         "pid": os.getpid(),
@@ -120,9 +120,9 @@ def _slurm() -> dict[str, Any]:
 
 
 def _alive(holder: dict[str, Any]) -> bool | None:
-    """Whether the process that wrote the lock still runs; None: this host cannot tell."""
-    mine = _slurm()
-    if mine and holder.get("slurm_job") == mine["slurm_job"] and holder["slurm_restarts"] < mine["slurm_restarts"]:
+    """Whether the process that wrote the lock still runs; None: this host cannot check it."""
+    job = _slurm()
+    if job and holder.get("slurm_job") == job["slurm_job"] and holder["slurm_restarts"] < job["slurm_restarts"]:
         return False
     if holder.get("host") != socket.gethostname() or not isinstance(holder.get("pid"), int):
         return None
@@ -130,7 +130,7 @@ def _alive(holder: dict[str, Any]) -> bool | None:
 
 
 def _started(pid: int) -> str | None:
-    """When the process started, in ticks since boot, which tells a reused process number; None: it has ended."""
+    """When the process started, in ticks since boot, since process numbers are reused; None: it has ended."""
     try:
         # The command, in parentheses, may hold anything; after it come the state (field 3) and the rest.
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

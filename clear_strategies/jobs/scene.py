@@ -27,7 +27,7 @@ _NETWORK: Final = "waifu2x"  # of `auto`: close to the truth and fast
 
 
 def _variable() -> Any:
-    """A key that only some data sets have; conf/ puts it there, the defaults do not."""
+    """A key that only some data sets have: conf/ has it, the defaults have not."""
     return field(default=None, metadata={LISTED: False})
 
 
@@ -62,8 +62,8 @@ class DataSettings:
 
 @dataclass(frozen=True, slots=True)
 class AutoPrior:
-    """The capture's own prior where its reader gives it one, as the demo's does; for all other captures waifu2x, where it is
-    installed and reaches the factor, else bicubic.
+    """The prior that the reader gives the capture, as the demo's does; else waifu2x, where it is installed and reaches the
+    factor, or bicubic.
     """
 
     def of(self, capture: Capture, factor: int) -> Prior:
@@ -92,21 +92,21 @@ def load(
     data: DataSettings,
     prior: PriorSettings,
     seed: int,
-    decorated: Callable[[Prior], Prior] = lambda prior: prior,
-    known: Capture | None = None,
+    decorate: Callable[[Prior], Prior] = lambda prior: prior,
+    capture: Capture | None = None,
 ) -> Scene:
     """Read the data set and prepare its views and its initial points.
 
     Args:
-        decorated: what becomes of the chosen prior, see `Conductor.prior`.
-        known: the capture, where it has been read already.
+        decorate: applied to the chosen prior, see `Conductor.prior`.
+        capture: where it has been read already.
     """
-    capture, views = read(data, prior, known)
+    capture, views = read(data, prior, capture)
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
     else:
         chosen = _chosen(prior, at_hr(capture, views), views.sr_scale)
-    scene = prepare(capture, views, decorated(cached(chosen)), data.cloud, seed=seed)
+    scene = prepare(capture, views, decorate(cached(chosen)), data.cloud, seed=seed)
     # Logged once the photos are known to be usable.
     if isinstance(prior, AutoPrior) and data.save_lr is None and views.photos_are != "both":
         if isinstance(chosen, Bicubic):
@@ -116,23 +116,30 @@ def load(
     return scene
 
 
-def read(data: DataSettings, prior: PriorSettings, known: Capture | None = None) -> tuple[Capture, ViewSettings]:
-    """The capture as the data set has it, and the settings of its views, both within the limit of the HR images."""
-    capture = data.reader() if known is None else known
+def read(data: DataSettings, prior: PriorSettings, capture: Capture | None = None) -> tuple[Capture, ViewSettings]:
+    """The capture as the data set has it, and the settings of its views, both within the limit of the HR images.
+
+    Args:
+        capture: where it has been read already.
+    """
+    if capture is None:
+        capture = data.reader()
     require_text((capture.name, *(frame.name for frame in capture.frames), *capture.unplaced))
     auto = isinstance(prior, AutoPrior) and data.save_lr is None
     return within_limit(capture, data.views, reaches=_reach(prior, auto), super_resolve=not auto)
 
 
 def timed(capture: Capture, data: DataSettings, prior: PriorSettings, budget: Budget) -> DataSettings:
-    """The data set with HR images no larger than the time allows that SR images take; the limit is one that can be typed."""
+    """The data set with HR images no larger than the time for SR images allows; the limit has three digits, so that a resumed
+    run can be given it.
+    """
     views = data.views
     if views.photos_are != "lr" or isinstance(prior, functools.partial):
         return data
-    found = budget.megapixels(split(capture, views)[0], _chosen(prior, capture, views.sr_scale), views.sr_scale)
-    if found is None or (views.max_hr_megapixels is not None and views.max_hr_megapixels <= found):
+    limit = budget.megapixels(split(capture, views)[0], _chosen(prior, capture, views.sr_scale), views.sr_scale)
+    if limit is None or (views.max_hr_megapixels is not None and views.max_hr_megapixels <= limit):
         return data
-    return replace(data, views=replace(views, max_hr_megapixels=float(f"{found:.3g}")))
+    return replace(data, views=replace(views, max_hr_megapixels=float(f"{limit:.3g}")))
 
 
 def _chosen(prior: PriorSettings, capture: Capture, factor: int) -> Prior:

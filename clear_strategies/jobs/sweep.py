@@ -27,7 +27,7 @@ _ENVIRONMENT: Final = "CLEAR_SWEEP"
 _STOP: Final = "stop"
 FAILED, LEFT = "failed_", "left_"
 """Of a job: it failed; it was left to another process, which holds its folder."""
-_SECONDS_BETWEEN_LOOKS: Final = 0.5  # for the stop; a look is one question to the file system
+_POLL_SECONDS: Final = 0.5  # between two checks whether the sweep was stopped
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,12 +100,12 @@ class Watch:
     """Turns the sweep's stop into the signal that training saves at. Called after each iteration."""
 
     def __init__(self, sweep: Sweep) -> None:
-        self.sweep, self.next_look = sweep, 0.0
+        self.sweep, self.next_poll = sweep, 0.0
 
     def __call__(self) -> None:
-        if time.monotonic() < self.next_look:
+        if time.monotonic() < self.next_poll:
             return
-        self.next_look = time.monotonic() + _SECONDS_BETWEEN_LOOKS
+        self.next_poll = time.monotonic() + _POLL_SECONDS
         # After a first signal, e.g. a Ctrl-C that reached this worker as well, training has restored the default handler:
         # it is about to save already, and a second signal would kill it.
         if self.sweep.stopped_by is not None and callable(signal.getsignal(signal.SIGTERM)):

@@ -9,7 +9,7 @@ from typing import Final
 
 WALL: Final = "seconds"
 PROCESSOR: Final = "processor_seconds"
-"""Columns of the history. On a busy machine the processors' seconds say more than the wall's."""
+"""Columns of the history. On a busy machine processor seconds are the better measure."""
 PROBE: Final = "probe_"
 """Before a column's name: the seconds of a row's evaluation of test views, which are not in that column."""
 

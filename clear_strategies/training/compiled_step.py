@@ -174,27 +174,14 @@ class CompiledStep:
         Args:
             merged: receives the dense gradient; nothing is left out. anchor: in place of the strategies' own.
         """
-        o, a = self.conductor.objective, g_lr.activation
-        m, e = (1.0, None) if hr is None else (hr.m, hr.step.evidence)
-        activation = {
-            "scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid,
-            "factor": a.factor.contiguous(), "route": m.float().contiguous() if isinstance(m, Tensor) else None,
-        }  # fmt: skip
-        gaussians = self._passes(
-            activation,
-            g_lr.table(),
-            None if hr is None else hr.base.table(),
-            None if hr is None or hr.hf is None else hr.hf.table(),
-            o.lambda_hf,
-        )
-        λ = o.lambda_hr(t)
+        gaussians, λ = self._gaussians(g_lr, hr), self.conductor.objective.lambda_hr(t)
         conflict: dict[str, Number] = {}
         rule, compared = None, None
         if hr is not None and λ > 0:
             rule, compared = self._rule, gaussians.compare()  # before correction
             shares = zip((*CONFLICT_GROUPS, "gaussian"), compared.opposed, compared.comparable, strict=True)
             conflict = {group: deferred.defer(deferred.ratio, opposed, n) for group, opposed, n in shares}
-        anchor = self._anchor(len(a.sigmoid)) if anchor is None else anchor
+        anchor = self._anchor(len(params["means"])) if anchor is None else anchor
         decays = (hr is not None and hr.hf is not None) or "detail" in anchor.targets
         keep = 1 - self.optimizer.rates.detail_decay if decays else 1.0
         attributes = {
@@ -208,14 +195,25 @@ class CompiledStep:
         skips = self.skips and merged is None
         shN, active = params["shN"], g_lr.gradients.basis.shape[1] - 1
         bands = active if skips and self._above_is_quiet(shN, active, anchor.targets.get("shN")) else shN.shape[1]
-        q = None if e is None else e.reliability.float().contiguous()
+        evidence = None if hr is None else hr.step.evidence
+        q = None if evidence is None else evidence.reliability.float().contiguous()
         settings = kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, skips, 3 * bands)
         stepped = gaussians.step(attributes, rule, q, settings)
         if rule is not None and compared is not None:
-            rule.report(_reports(rule, compared, stepped), e)
+            rule.report(_reports(rule, compared, stepped), evidence)
         if merged is None:
             self._note_skips(stepped, bands, shN.shape[1])
         return conflict
+
+    def _gaussians(self, g_lr: Factors, hr: HrGradients[Factors] | None) -> kernel.GaussianStep:
+        """The two passes over the gradients of one view."""
+        a, m = g_lr.activation, None if hr is None else hr.m
+        activation = {
+            "scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid,
+            "factor": a.factor.contiguous(), "route": m.float().contiguous() if isinstance(m, Tensor) else None,
+        }  # fmt: skip
+        base, hf = (None, None) if hr is None else (hr.base.table(), None if hr.hf is None else hr.hf.table())
+        return self._passes(activation, g_lr.table(), base, hf, self.conductor.objective.lambda_hf)
 
     def _anchor(self, n: int) -> Anchor:
         if self._regularizer is None:
@@ -229,8 +227,8 @@ class CompiledStep:
     def _above_is_quiet(self, shN: Tensor, active: int, anchor: Tensor | None) -> bool:
         """Whether bands above the active degree have no momentum and no pull.
 
-        The answer is computed anew when a tensor has been replaced (densification, resuming, the anchor). While the
-        tensors are the same it holds: a pass that skips the bands leaves them quiet, and momentum does not vanish.
+        Recomputed when a tensor has been replaced (densification, resuming, the anchor). While the tensors are the same the
+        result holds: a pass that skips the bands leaves them quiet, and momentum does not vanish.
         """
         tensors = (self.optimizer.first["shN"], self.optimizer.second["shN"], anchor)
         if self._examined is not None:

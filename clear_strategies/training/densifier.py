@@ -44,7 +44,7 @@ class Gaussians(Protocol):
 
 @runtime_checkable
 class Moments(Protocol):
-    """What an optimizer remembers per Gaussian."""
+    """What an optimizer keeps per Gaussian."""
 
     def take(self, parents: Int[Tensor, " M"], fresh: Bool[Tensor, " M"]) -> None:
         """Gather it, after the Gaussians; fresh rows start without momentum."""
@@ -89,7 +89,7 @@ class Densifier(Protocol):
         ...
 
     def reset_due(self, t: int) -> bool:
-        """Whether opacities are lowered at t; renders right after that say nothing about the field."""
+        """Whether opacities are lowered at t; renders right after that do not show how good the field is."""
         ...
 
     def state_dict(self) -> dict[str, Tensor]: ...

@@ -18,9 +18,10 @@ from rasterizers.interface import Camera, RasterSettings
 
 _log = logging.getLogger(__name__)
 
-# A camera samples what it draws, whatever the capture's unit (Mip-Splatting: what is farther than 0.2) …
 NEAR: Final = RasterSettings().near
-"""… and draws what is farther than this, unless its rasterizer has another near plane."""
+"""The near plane where the rasterizer has no other. A camera samples what it draws, whatever the capture's unit; Mip-Splatting
+counts what is farther than 0.2.
+"""
 
 _MARGIN: Final = 0.15  # of the image: a centre counts up to this share outside of each side (Mip-Splatting)
 

@@ -71,12 +71,12 @@ class LearningRates:
         return DetailRates(self.detail, self.detail_steps, self.detail_decay)
 
     def of_run(self, iterations: int) -> LearningRates:
-        """The rates of a run of this length, which `geometry_steps` and `detail_steps` tell.
+        """The rates of a run of this length, by `geometry_steps` and `detail_steps`.
 
-        A Gaussian begins round, as large as the distance to its neighbours, and has to become the disc that the photos ask for.
-        Adam moves a parameter by at most its rate in a step, so a run of a twentieth of the iterations ends on the way. The
-        factor that is best grows more slowly than T shrinks, because the noise at the end grows with the rate. Colours need
-        none: they begin as the photos show them, and higher rates of theirs only fit the training views more closely.
+        A Gaussian begins round, as large as the distance to its neighbours, and has to become a disc. Adam moves a parameter by
+        at most its rate in a step, so a run of a twentieth of the iterations ends on the way. The best factor grows more slowly
+        than T shrinks, because the noise at the end grows with the rate. Colours need no factor: they begin as the photos show
+        them, and higher rates only fit the training views more closely.
         """
         rates = replace(self, detail=self.of_detail.of_run(iterations).rate)
         if iterations >= self.geometry_steps:
@@ -90,7 +90,7 @@ class LearningRates:
         return replace(rates, means=means, scales=factor * self.scales, quats=factor * self.quats)
 
     def at(self, t: int, extent: float) -> dict[str, float]:
-        """Every attribute's rate at iteration t, in its own unit."""
+        """Every attribute's rate at iteration t, in the attribute's unit."""
         cools = self.cool_from < self.end
         warmth = min(1.0, max(0, self.end + 1 - t) / (self.end + 1 - self.cool_from)) if cools else 1.0
         rates = {name: warmth * getattr(self, name) for name in ATTRIBUTES if name != "means"}
