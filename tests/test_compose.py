@@ -44,16 +44,15 @@ def test_what_is_skipped_reaches_the_reader(reader):
     assert {key: data.reader.keywords[key] for key in ("missing", "broken")} == {"missing": "skip", "broken": "skip"}
 
 
-def test_overrides_reach_strategies_and_objective():
+def test_overrides_reach_strategies_and_objective_and_milestones_stretch_to_the_hosts_length():
     c = conductor("gco", "strategies.gco.tolerance=0.2", "objective=lr_only")
     assert c.strategies[0].tolerance == 0.2
     assert c.objective.lambda_hr(5_000) == 0
-
-
-def test_milestones_stretch_to_the_hosts_length():
     c = conductor("clear", iterations=30_000)
     assert c.strategies[2].anchor_start == 15_000
     assert (c.objective.lambda_hr.start, c.objective.lambda_hr.full) == (1_500, 9_000)
+    with pytest.raises(ValueError, match="at least 1"):
+        conductor("gco", iterations=0)
 
 
 @pytest.mark.parametrize(
@@ -104,11 +103,6 @@ def test_a_hydra_application_keeps_its_own_state():
     assert not GlobalHydra.instance().is_initialized()
 
 
-def test_a_host_of_no_iterations_is_refused():
-    with pytest.raises(ValueError, match="at least 1"):
-        conductor("gco", iterations=0)
-
-
 def test_clear_on_the_command_line_is_clear_in_python():
     """The defaults have one owner, the class: strategies, objective and all numbers are the same, field by field."""
     ours = Conductor(GCO(), P2G(), SVS())
@@ -149,10 +143,6 @@ def test_what_was_published_keeps_its_rates(chosen, steps):
     assert composed(*chosen).optim.geometry_steps == steps
 
 
-def test_p2g_takes_the_operator_that_makes_the_lr_images():
-    assert settings_of(tree(composed("+strategy=p2g", "data.views.downsample=area"))).strategies["p2g"].down == "area"
-
-
 GROUPS = ("strategy", "rasterizer", "data", "prior", "objective", "density", "optim", "skips", "method")
 NEEDED = {
     **{f"data={name}": "data.path=here" for name in ("blender", "colmap", "llff", "nerfstudio", "photos")},
@@ -164,7 +154,7 @@ NEEDED = {
 @pytest.mark.parametrize("group", GROUPS)
 def test_every_option_composes_into_settings(group):
     for name in options(group):
-        chosen = f"{'+' if group in ('strategy', 'method') else ''}{group}={name}"
+        chosen = f"{'+' * (group in ('strategy', 'method'))}{group}={name}"
         config = composed(chosen, *([NEEDED[chosen]] if chosen in NEEDED else []))
         assert isinstance(settings_of(tree(config)).conductor(1.0), Conductor), name
 
@@ -198,10 +188,9 @@ def default_at(path: tuple[str, ...], whole: Any) -> Any:
 @pytest.mark.slow
 def test_no_default_stands_in_a_class_and_in_conf():
     """A file may give a class's default only where it takes back what another file says."""
-    whole = [OmegaConf.to_container(composed(*o)) for group in GROUPS for name in options(group)
-             for o in [[f"{'+' if group in ('strategy', 'method') else ''}{group}={name}"]]]  # fmt: skip
-    everything = list(written())
-    repeated = []
+    chosen = [f"{'+' * (group in ('strategy', 'method'))}{group}={name}" for group in GROUPS for name in options(group)]
+    whole = [OmegaConf.to_container(composed(option)) for option in chosen]
+    everything, repeated = list(written()), []
     for file, path, value in everything:
         if path[-1].startswith("_") or value in ("???",):
             continue
@@ -225,12 +214,9 @@ REFUSED = {
 
 @pytest.mark.parametrize(("overrides", "message"), REFUSED.items(), ids=list(REFUSED))
 def test_a_setting_that_cannot_be_used_is_named_by_its_key(overrides, message):
-    def settle() -> None:
+    with pytest.raises(SettingError) as refused:  # noqa: PT012
         settings = settings_of(tree(composed(*overrides.split())))
         device.drawing(settings.rasterizer, settings.fit.device)
-
-    with pytest.raises(SettingError) as refused:
-        settle()
     assert message in str(refused.value)
 
 
@@ -244,8 +230,9 @@ def test_a_host_gets_the_strategies_and_the_decorators_of_best():
     assert best.prior(Bicubic()) == run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic())
 
 
-def test_back_projection_reduces_by_the_operator_that_made_the_photos():
-    run = settings_of(tree(composed("+strategy=[gco,back_projected]", "data.views.downsample=area")))
+def test_p2g_and_back_projection_reduce_by_the_operator_that_makes_the_lr_images():
+    run = settings_of(tree(composed("+strategy=[p2g,back_projected]", "data.views.downsample=area")))
+    assert run.strategies["p2g"].down == "area"
     assert run.conductor(1.0).prior(Bicubic()) == BackProjected(Bicubic(), down="area")
 
 

@@ -39,11 +39,8 @@ def test_details_are_for_those_who_ask_and_warnings_have_a_prefix(logger, verbos
 
 
 def test_what_chatty_libraries_do_is_not_shown_and_their_warnings_are():
-    stream, server = (
-        io.StringIO(),
-        logging.LogRecord("websockets.server", logging.INFO, "", 0, "server listening", None, None),
-    )
-    console = Console(stream)
+    server = logging.LogRecord("websockets.server", logging.INFO, "", 0, "server listening", None, None)
+    console = Console(stream := io.StringIO())
     console.handle(server)
     server.levelno = logging.WARNING
     console.handle(server)
@@ -63,19 +60,10 @@ def test_a_message_stands_on_a_line_of_its_own_above_the_bar(logger, monkeypatch
     assert "3/10" in screen.getvalue().partition("said")[2]  # the bar is drawn again below
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("console")
-    return folder, {
-        name: run("+strategy=clear", *TINY, f"hydra.run.dir={name}", *more, cwd=folder)
-        for name, more in {"quiet": [], "loud": ["-v"]}.items()
-    }
-
-
-def test_by_default_the_console_has_the_plan_the_bar_the_result_and_where_to_look(demo):
-    folder, runs = demo
-    quiet = runs["quiet"]
-    assert quiet.returncode == 0, quiet.stderr
+def test_by_default_the_console_has_the_plan_the_bar_the_result_and_where_to_look_and_with_v_all_details(tmp_path):
+    folder, tiny = tmp_path, ["+strategy=clear", *TINY]
+    quiet, loud = (run(*tiny, f"hydra.run.dir={name}", *v, cwd=folder) for name, *v in (["quiet"], ["loud", "-v"]))
+    assert quiet.returncode == loud.returncode == 0, quiet.stderr + loud.stderr
     lines = [line for line in quiet.stdout.splitlines() if not re.search(r": \d+ of \d+ ", line)]  # on a slow machine
     assert lines[0].split()[0] == "scene"
     done = next(i for i, line in enumerate(lines) if line.startswith("done in"))
@@ -91,16 +79,9 @@ def test_by_default_the_console_has_the_plan_the_bar_the_result_and_where_to_loo
     assert "it/s" in quiet.stderr
     log = (folder / "quiet" / "run.log").read_text()
     assert all(detail in log for detail in [*DETAILS, "done in", "scene"])
-
-
-def test_v_shows_what_run_log_has(demo):
-    folder, runs = demo
-    loud = runs["loud"]
-    assert loud.returncode == 0, loud.stderr
     assert all(detail in loud.stdout for detail in DETAILS)
     assert "verbose: true" in (folder / "loud" / ".hydra" / "config.yaml").read_text()
-    fields = [(folder / name / "point_cloud.ply").read_bytes() for name in runs]
-    assert fields[0] == fields[1]
+    assert len({(folder / name / "point_cloud.ply").read_bytes() for name in ("quiet", "loud")}) == 1
 
 
 @pytest.mark.slow

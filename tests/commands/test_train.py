@@ -29,12 +29,9 @@ def test_minutes_are_a_setting_and_leave_the_number_of_iterations_open(tmp_path,
     assert "fit.iterations=1000" in train.overrides([str(tmp_path)])
 
 
-def test_frames_are_a_setting_of_the_reader(tmp_path):
+def test_frames_are_a_setting_of_the_reader_and_photos_in_a_folder_called_images_are_found(tmp_path):
     (tmp_path / "clip.mp4").touch()
     assert "data.reader.frames=24" in train.overrides([str(tmp_path / "clip.mp4"), "--frames", "24"])
-
-
-def test_photos_in_a_folder_called_images_are_found(tmp_path):
     (tmp_path / "images").mkdir()
     assert train.detect(tmp_path) == ("photos", tmp_path / "images")
 

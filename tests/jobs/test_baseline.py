@@ -125,15 +125,12 @@ def test_the_baseline_is_the_run_without_strategies_on_the_same_scene(whole, tmp
     assert plan < first < done
 
 
-def test_the_baseline_keeps_the_overrides_of_the_run_but_those_of_its_strategies(whole):
-    ours, beside = (json.loads((whole / f / "metrics.json").read_text())["overrides"] for f in (".", "baseline"))
-    assert (ours[0], ours[1:]) == ("+strategy=gco", beside)
-
-
-def test_a_run_is_the_same_with_and_without_its_baseline(whole, tmp_path):
+def test_a_run_is_the_same_with_and_without_its_baseline_which_has_its_other_overrides(whole, tmp_path):
     train(tmp_path, "fit.baseline=false")
     assert field(tmp_path) == field(whole)
     assert not (tmp_path / "baseline").exists()
+    ours, beside = (json.loads((whole / f / "metrics.json").read_text())["overrides"] for f in (".", "baseline"))
+    assert (ours[0], ours[1:]) == ("+strategy=gco", beside)
 
 
 def test_a_finished_run_is_not_trained_again_with_auto(whole, caplog):
@@ -206,9 +203,8 @@ def test_what_is_a_baseline_itself_trains_none(tmp_path, overrides, why, caplog)
 
 
 def test_the_jobs_of_a_sweep_train_none(tmp_path, monkeypatch, caplog):
-    config = composed("hydra.mode=MULTIRUN", "hydra.job.num=0", hydra=True)
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
-    HydraConfig.instance().set_config(config)
+    HydraConfig.instance().set_config(composed("hydra.mode=MULTIRUN", "hydra.job.num=0", hydra=True))
     with caplog.at_level("DEBUG"):
         train(tmp_path)
     assert "since it is a job of a sweep" in caplog.text

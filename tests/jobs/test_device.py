@@ -39,10 +39,12 @@ def settings(*overrides: str) -> JobSettings:
     return settings_of(tree(composed(*overrides)))
 
 
-def test_a_device_that_is_not_there_is_refused_in_one_sentence(monkeypatch):
+def test_a_device_that_is_not_there_or_that_the_rasterizer_does_not_draw_on_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(SettingError, match=r"fit\.device: is cuda, and torch finds no CUDA device"):
         device.drawing(RasterizerSettings(), "cuda")
+    with pytest.raises(SettingError, match="is cuda, and the rasterizer cpp draws on cpu alone"):
+        drawn_on(frozenset({"cpu"}), "cpp", "cuda")
 
 
 @pytest.mark.parametrize(
@@ -53,11 +55,6 @@ def test_a_device_that_is_not_there_is_refused_in_one_sentence(monkeypatch):
 def test_null_is_cuda_where_torch_finds_it_and_the_rasterizer_draws_there(devices, asked, there, expected, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: there)
     assert drawn_on(frozenset(devices), "this", asked) == expected
-
-
-def test_a_rasterizer_of_the_other_device_is_refused_in_one_sentence():
-    with pytest.raises(SettingError, match="is cuda, and the rasterizer cpp draws on cpu alone"):
-        drawn_on(frozenset({"cpu"}), "cpp", "cuda")
 
 
 def test_warp_gets_the_device_of_the_job(monkeypatch):

@@ -14,25 +14,32 @@ from clear_strategies.jobs import exit_codes
 from tests.helpers.command_line import environment
 
 
-def test_ctrl_c_outside_of_a_job_says_nothing_of_what_was_saved() -> None:
-    assert exit_codes.describe(KeyboardInterrupt()) == (130, "stopped by SIGINT.")
-
-
 @pytest.mark.parametrize(
-    ("number", "remedy"), [(errno.ENOSPC, "Free space, or write elsewhere"), (errno.EROFS, "Write")]
+    ("error", "code", "message"),
+    [
+        (KeyboardInterrupt(), 130, "stopped by SIGINT."),  # a job says what it has saved
+        (
+            OSError(errno.ENOSPC, "No space", "x.ply"),
+            3,
+            "x.ply: No space. Free space, or write elsewhere (hydra.run.dir=",
+        ),
+        (
+            OSError(errno.EROFS, "Read-only", "x.ply"),
+            3,
+            "x.ply: Read-only. Write elsewhere (hydra.run.dir=FOLDER of a run, --out",
+        ),
+        (
+            OSError("Broken pipe\n\nFFMPEG COMMAND:\nffmpeg"),
+            3,
+            "output: Broken pipe FFMPEG COMMAND: ffmpeg. Write elsewhere",
+        ),
+    ],
 )
-def test_space_is_a_remedy_of_a_full_disk_alone(number: int, remedy: str) -> None:
-    ending = exit_codes.describe(OSError(number, os.strerror(number), "x.ply"))
-    code, message = ending
-    assert code == exit_codes.NO_DISK
-    assert message.startswith(f"x.ply: {os.strerror(number)}. {remedy}")
-    assert "--out of a command" in message
-
-
-def test_the_message_of_a_library_that_cannot_write_is_one_line() -> None:
-    ending = exit_codes.describe(OSError("Broken pipe\n\nFFMPEG COMMAND:\nffmpeg -y"))
+def test_an_error_that_the_user_can_solve_is_one_line_and_an_exit_code(error, code, message) -> None:
+    ending = exit_codes.describe(error)
     assert ending is not None
-    assert ending.message.startswith("output: Broken pipe FFMPEG COMMAND: ffmpeg -y. Write elsewhere")
+    assert ending.code == code
+    assert ending.message.startswith(message)
 
 
 def test_a_reader_that_leaves_is_no_error(tmp_path: Path) -> None:

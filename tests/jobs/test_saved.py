@@ -12,7 +12,7 @@ import torch
 import rasterizers
 from clear_strategies.commands import export
 from clear_strategies.errors import SettingError
-from clear_strategies.jobs.saved import open_splat, overview
+from clear_strategies.jobs.saved import open_splat
 from clear_strategies.outputs.formats import export_ply
 from clear_strategies.training import checkpoint
 from tests.helpers import saved_run, toy
@@ -90,12 +90,13 @@ def test_ply_files_in_one_folder_are_exported_under_their_own_names_and_never_ov
     assert {model.read_bytes() for model in models} == {(folder / "point_cloud.ply").read_bytes()}
 
 
-def test_a_lone_ply_file_has_a_camera_that_sees_it(run, tmp_path):
+def test_a_lone_ply_file_has_an_upright_camera_that_sees_it(run, tmp_path):
     folder, field = run
     shutil.copy(folder / "point_cloud.ply", tmp_path)
     splat = open_splat(tmp_path)
     assert not splat.cameras
     (camera,) = splat.poses()
+    assert torch.equal(camera.world_to_camera[:3, :3], torch.eye(3, dtype=camera.world_to_camera.dtype))
     assert float(splat.painter.numbers(camera, torch.ones(len(field))).max()) > 0.2
     points = field.means.data.double() @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     u = points[:, 0] / points[:, 2] * camera.fx + camera.cx
@@ -124,8 +125,3 @@ def test_a_rasterizer_that_is_not_here_gives_way(run, tmp_path, caplog):
     assert "draws instead" in caplog.text
     with pytest.raises(SettingError, match="nothing"):
         open_splat(folder, "nothing")
-
-
-def test_the_overview_is_upright(run):
-    pose = overview(run[1]).world_to_camera[:3, :3]
-    assert torch.equal(pose, torch.eye(3, dtype=pose.dtype))

@@ -31,6 +31,7 @@ def test_a_photo_that_no_view_uses_may_be_too_small(caplog):
         scene = load(DataSettings(reader=lambda: replace(capture, frames=frames), views=views), AutoPrior(), 0)
     assert tiny.name not in {view.name for view in (*scene.train, *scene.test)}
     assert "prior: auto chose demo" in caplog.text
+    assert AutoPrior().of(replace(capture, name="mine"), 4).label.startswith("demo (synthetic")
 
 
 @pytest.mark.parametrize("whose", ["capture", "frame", "unplaced"])
@@ -99,12 +100,7 @@ def test_no_photos_of_a_folder_called_demo_are_taken_for_their_own_sr_images(wri
     assert not scene.synthetic_prior
 
 
-def test_the_demo_brings_its_own_prior_whatever_it_is_called():
-    called = replace(demo.read(width=64, height=48, views=4, train=2), name="mine")
-    assert AutoPrior().of(called, 4).label.startswith("demo (synthetic")
-
-
-def test_auto_without_the_extra_says_in_one_line_what_to_install(monkeypatch, caplog):
+def test_auto_without_the_extra_names_it_in_one_line(monkeypatch, caplog):
     monkeypatch.setattr(ncnn, "find_spec", lambda name: None)
     with caplog.at_level("DEBUG"):
         scene = of_photos()
@@ -122,16 +118,12 @@ def test_auto_says_why_a_factor_is_left_to_bicubic(tmp_path, monkeypatch, caplog
     assert "auto chose bicubic (no detail beyond LR). waifu2x enlarges by 2 or 4, not by 3; for SR" in caplog.text
 
 
-@pytest.mark.parametrize("prior", ["realesrgan", "waifu2x"])
-def test_a_factor_that_the_network_has_not_is_refused_before_data_is_read(prior: str, tmp_path: Path, monkeypatch):
+def test_a_factor_that_the_network_has_not_is_refused_before_data_is_read(tmp_path: Path, monkeypatch):
     fake_ncnn.install(tmp_path, monkeypatch)
-    values = tree(composed(f"prior={prior}", "data.views.sr_scale=3"))
-    with pytest.raises(SettingError, match=rf"^data\.views\.sr_scale: must be (2 or )?4 with {prior}, got 3: "):
-        settings_of(values)
-
-
-def test_a_network_with_errors_added_is_asked_for_its_factors_too(tmp_path: Path, monkeypatch):
-    fake_ncnn.install(tmp_path, monkeypatch)
+    for prior in ("realesrgan", "waifu2x"):
+        values = tree(composed(f"prior={prior}", "data.views.sr_scale=3"))
+        with pytest.raises(SettingError, match=rf"^data\.views\.sr_scale: must be (2 or )?4 with {prior}, got 3: "):
+            settings_of(values)
     require_factor(Corrupted(Ncnn()), 2)
     with pytest.raises(SettingError, match="must be 4 with realesrgan, got 2"):
         require_factor(Corrupted(Ncnn("realesrgan")), 2)

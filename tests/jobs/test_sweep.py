@@ -35,7 +35,7 @@ def whole(tmp_path_factory) -> Path:
     return folder / "here"
 
 
-def test_a_finished_run_is_not_trained_again(whole):
+def test_a_finished_run_is_not_trained_again_and_one_of_another_configuration_is_refused(whole):
     def state() -> dict[Path, int]:
         return {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.is_file() and ".hydra" not in p.parts}
 
@@ -45,9 +45,6 @@ def test_a_finished_run_is_not_trained_again(whole):
     assert "this run finished on" in again.stdout + again.stderr
     assert "nothing is trained" in again.stdout + again.stderr
     assert {p: t for p, t in state().items() if p.name != "run.log"} == before
-
-
-def test_a_folder_of_another_configuration_is_refused(whole):
     other = run("+strategy=gco", "hydra.run.dir=here", *AUTO, "fit.iterations=40", cwd=whole.parent)
     assert other.returncode == 2
     assert "this is not the configuration that wrote it" in other.stdout + other.stderr
