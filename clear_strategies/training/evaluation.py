@@ -13,9 +13,7 @@ from clear_strategies.data.scene import Scene
 from clear_strategies.training.state import TrainState
 from rasterizers.interface import Rasterizer
 
-PROBING: Final = "probe test views"
-"""The stage of the work log in which test views are evaluated."""
-
+_STAGE: Final = "probe test views"
 _VIEWS_OF_LOSS: Final = 4
 
 
@@ -23,9 +21,9 @@ def evaluate(state: TrainState, scene: Scene, rasterizer: Rasterizer, done: int)
     """Add the mean PSNR of the first few test views, as far as their HR photos are known, to the last row of the history."""
     work_log = state.conductor.work_log
     if state.reset_due(done) and not state.ended:
-        work_log.skip(PROBING, "opacities were reset in this iteration")
+        work_log.skip(_STAGE, "opacities were reset in this iteration")
         return
-    with work_log.stage(PROBING):
+    with work_log.stage(_STAGE):
         values = [
             psnr_of(state.field.render(rasterizer, view.hr.camera), view.truth)
             for view in scene.test[: state.settings.probe_views]

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -90,6 +90,7 @@ class StepCounts:
     still: int | Int[Tensor, ""]
 
 
+@runtime_checkable
 class GaussianStep(Protocol):
     """The two passes over one view's gradients. Implementations take them as `cpp.CppGaussianStep` does."""
 
