@@ -99,8 +99,8 @@ def _called(node: Mapping[str, Any], key: str) -> Any:
     try:
         function = _located(target)
     except (ImportError, AttributeError) as error:
-        own = str(target).startswith(("clear_strategies.", "rasterizers."))
-        remedy = "pip install 'clear-strategies[train]'" if own else "Correct its dotted name"
+        of_this_package = str(target).startswith(("clear_strategies.", "rasterizers."))
+        remedy = "pip install 'clear-strategies[train]'" if of_this_package else "Correct its dotted name"
         raise SettingError(f"{key}: {target} cannot be imported ({one_line(error)}). {remedy}.") from error
     _require_buildable(function, target, key)
     parameters, hints = _parameters(function), _hints(function)
@@ -204,10 +204,10 @@ def _defaults(function: Callable[..., Any]) -> dict[str, Any]:
     node: dict[str, Any] = {TARGET: None}
     for name, parameter in _parameters(function).items():
         default = parameter.default
-        if (own := declared.get(name)) is not None:
-            if not own.metadata.get(LISTED, True):
+        if (declaration := declared.get(name)) is not None:
+            if not declaration.metadata.get(LISTED, True):
                 continue
-            default = own.default if own.default_factory is MISSING else own.default_factory()
+            default = declaration.default if declaration.default_factory is MISSING else declaration.default_factory()
         if (value := _plain(default)) is not _ABSENT:
             node[name] = value
     return node

@@ -56,7 +56,7 @@ def test_numbers_and_pictures_are_logged_and_the_run_has_the_bits_of_one_without
     log = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0, "images": 0}).Reload()
     tags = log.Tags()
     expected = {"loss/lr", "loss/base", "psnr/train_lr", "psnr/test", "field/n_gaussians", "conflict/conflict",
-                "conflict/means", "learning rate/means", "schedule/lambda_hr"}  # fmt: skip
+                "conflict/means", "corrected/corrected", "learning rate/means", "schedule/lambda_hr"}  # fmt: skip
     assert expected <= set(tags["scalars"]), tags["scalars"]
     assert [event.step for event in log.Scalars("loss/lr")] == list(range(1, 13))
     history = (folder / "history.csv").read_text().splitlines()
@@ -76,12 +76,3 @@ def test_without_the_package_the_extra_is_named_before_anything_is_read(monkeypa
     monkeypatch.setattr(tensorboard, "find_spec", lambda _: None)
     with pytest.raises(SettingError, match=r"pip install 'clear-strategies\[log\]'"):
         tensorboard.require_tensorboard()
-
-
-@pytest.mark.parametrize(
-    ("column", "tag"),
-    [("loss_lr", "loss/lr"), ("conflict", "conflict/conflict"), ("conflict_means", "conflict/means"),
-     ("corrected", "corrected/corrected"), ("n_gaussians", "field/n_gaussians"), ("dropout", "strategies/dropout")],
-)  # fmt: skip
-def test_charts_are_grouped(column, tag):
-    assert tensorboard._tag(column) == tag
