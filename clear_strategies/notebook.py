@@ -123,7 +123,7 @@ def train(
     overrides = list(settings) if photos is None else train_command.overrides([str(photos), *settings])
     if photos is None and not any(word.startswith(train_command.CHOOSE_STRATEGIES) for word in settings):
         overrides.append("+strategy=best")
-    if word := next((word for word in overrides if word.lstrip("+~").startswith("hydra.")), None):
+    if word := next((word for word in overrides if word.lstrip("+~").startswith(("hydra.", "hydra/"))), None):
         key, _, value = word.partition("=")
         refuse(
             key, "must be left out, since Hydra takes no part in a run from Python", value, "folder=… is for its files"

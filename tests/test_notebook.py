@@ -61,8 +61,9 @@ def test_a_folder_without_a_finished_run_and_a_wrong_setting_are_told(tmp_path: 
         cs.train(None, "fit.iteration=3", folder=tmp_path / "run")
     with pytest.raises(SettingError, match=r"data\.save_lr: must be null, since .* on the command line"):
         cs.train(None, f"data.save_lr={tmp_path / 'lr'}", folder=tmp_path / "run")
-    with pytest.raises(SettingError, match=r"hydra\.run\.dir: must be left out, .*folder=… is for its files"):
-        cs.train(None, "fit.iterations=1", f"hydra.run.dir={tmp_path / 'elsewhere'}", folder=tmp_path / "run")
+    for key, value in (("hydra.run.dir", tmp_path / "elsewhere"), ("hydra/launcher", "basic")):
+        with pytest.raises(SettingError, match=rf"{key}: must be left out, .*folder=… is for its files"):
+            cs.train(None, "fit.iterations=1", f"{key}={value}", folder=tmp_path / "run")
     assert not (tmp_path / "lr").exists()
     assert not (tmp_path / "run").exists()
     with pytest.raises(SettingError, match="is not there"):
