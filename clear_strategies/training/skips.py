@@ -108,15 +108,18 @@ class SkipPolicy:
         return t % s.plateau_window == 0 and s.plateau_from <= t < s.plateau_to
 
     def settled(self, history: Sequence[dict[str, Number]], t: int) -> bool:
-        """Whether the training views have stopped improving by iteration t; `plateau_to` then follows. Unknown, and so False,
-        where the structure has changed at one end of the window, or where another loss was measured there.
+        """Whether the training views have stopped improving by iteration t, the last of the history; `plateau_to` then follows.
+        Unknown, and so False, where iterations were left out within the window, where the structure has changed at one end of
+        it, or where another loss was measured there.
         """
         window = self.skips.plateau_window
-        if not (self.measured(t) and self.measured(t - window)):
+        if not (self.measured(t) and self.measured(t - window) and len(history) > window):
             return False
         rows = deferred.resolve(history)
-        before, now = rows[t - window - 1], rows[t - 1]
-        if PLATEAU_LOSS not in before.keys() & now.keys() or self._measured_loss(before) != self._measured_loss(now):
+        before, now = rows[-1 - window], rows[-1]
+        if before["t"] != t - window or PLATEAU_LOSS not in before.keys() & now.keys():
+            return False
+        if self._measured_loss(before) != self._measured_loss(now):
             return False
         return now[PLATEAU_LOSS] > (1 - self.skips.plateau_gain) * before[PLATEAU_LOSS]
 

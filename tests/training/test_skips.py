@@ -78,7 +78,8 @@ def test_a_plateau_is_a_window_that_gains_less_than_asked(now, ends):
 def test_a_plateau_begins_neither_early_nor_between_windows_nor_late():
     skips = Skips(plateau_gain=0.5, plateau_window=4, plateau_from=7, plateau_to=20)
     rows = loss_rows(*[1.0] * 24)
-    assert [t for t in range(1, 25) if SkipPolicy(skips).settled(rows, t)] == [12, 16]
+    assert [t for t in range(1, 25) if SkipPolicy(skips).settled(rows[:t], t)] == [12, 16]
+    assert not SkipPolicy(skips).settled([*rows[:6], rows[15]], 16)  # those between were left out
 
 
 @pytest.mark.parametrize("peak", [0.0, 1.0])
