@@ -169,7 +169,9 @@ def _require_buildable(function: Callable[..., Any], target: Any, key: str) -> N
     method = "." in getattr(function, "__qualname__", "").rpartition("<locals>.")[2]
     plain = inspect.isfunction(function) and not method and (not own or home.startswith(_READERS))
     if not (inspect.isclass(function) or plain):
-        raise SettingError(f"{key}: {str(target)[:80]} is no class, and no function that reads data. Name one of these.")
+        raise SettingError(
+            f"{key}: {str(target)[:80]} is no class, and no function that reads data. Name one of these."
+        )
 
 
 def _located(target: Any) -> Callable[..., Any]:

@@ -34,17 +34,12 @@ def test_processes_of_one_number_in_two_containers_do_not_write_into_one_file(tm
     assert list(tmp_path.iterdir()) == [tmp_path / "sr.png"]
 
 
-def test_a_file_may_have_the_longest_name_that_a_disk_takes(tmp_path: Path) -> None:
-    target = tmp_path / f"{'ω' * 125}.png"
-    files.write_text(target, "1")
-    assert list(tmp_path.iterdir()) == [target]
-
-
-def test_missing_folders_are_made_and_an_old_file_is_replaced(tmp_path: Path) -> None:
-    target = tmp_path / "a" / "b" / "ω.txt"
+def test_missing_folders_are_made_and_an_old_file_is_replaced_whatever_the_length_of_its_name(tmp_path: Path) -> None:
+    target = tmp_path / "a" / "b" / f"{'ω' * 125}.txt"  # the longest that a disk takes
     files.write_text(target, "1")
     files.write_text(target, "ω̃ = 2")
     assert target.read_text(encoding="utf-8") == "ω̃ = 2"
+    assert list(target.parent.iterdir()) == [target]
 
 
 def test_json_has_null_where_a_number_is_not_finite(tmp_path: Path) -> None:

@@ -113,10 +113,8 @@ def _of_checkpoint(path: Path, folder: Path, rasterizer: str | None) -> SavedSpl
         if key.startswith("rasterizer.") and value is not None  # the default, also of a field of an earlier version
     }
     source = f"{folder}, {saved.t - 1} iterations, {len(field):,} Gaussians"
-    painter, antialiased = (
-        _painter(field, _drawing(settings, rasterizer), cameras),
-        bool(settings.get("antialiased", True)),
-    )
+    painter = _painter(field, _drawing(settings, rasterizer), cameras)
+    antialiased = bool(settings.get("antialiased", True))
     return SavedSplat(folder, _name(folder), source, painter, cameras, antialiased, baked=False)
 
 

@@ -123,10 +123,8 @@ def require(needed: Needs, budget: int | None, most: int | None) -> None:
     allowed = budget if budget is not None else available(needed)
     if allowed is None:
         return
-    start, source = (
-        needed.peak(needed.gaussians),
-        "fit.memory allows" if budget is not None else "is free on this machine",
-    )
+    start = needed.peak(needed.gaussians)
+    source = "fit.memory allows" if budget is not None else "is free on this machine"
     if start > allowed:
         raise SettingError(
             f"fit.memory: {needed.gaussians:,} Gaussians need {mebibytes(start)} MiB, and {mebibytes(allowed)} MiB {source}. "

@@ -146,13 +146,12 @@ def test_opacity_reset_acts_on_what_is_drawn():
     assert not optimizer.first["opacities"].any()
 
 
-def test_white_backgrounds_get_an_early_reset():
-    white = Density(DensitySettings(), 1, extent=1.0, seed=0, white_background=True)
-    black = Density(DensitySettings(), 1, extent=1.0, seed=0)
-    assert [t for t in range(1, 10_001) if white.reset_due(t)] == [500, 3000]
-    assert [t for t in range(1, 10_001) if black.reset_due(t)] == [3000]
-    off = Density(DensitySettings(stop=0), 1, extent=1.0, seed=0, white_background=True)
-    assert not any(map(off.reset_due, range(1, 10_001)))
+@pytest.mark.parametrize(
+    ("white", "stop", "resets"), [(True, 5_000, [500, 3000]), (False, 5_000, [3000]), (True, 0, [])]
+)
+def test_white_backgrounds_get_an_early_reset(white, stop, resets):
+    density = Density(DensitySettings(stop=stop), 1, extent=1.0, seed=0, white_background=white)
+    assert [t for t in range(1, 10_001) if density.reset_due(t)] == resets
 
 
 @pytest.mark.parametrize(("anchor_start", "probed"), [(6, True), (7, False)])
@@ -247,6 +246,11 @@ def test_the_3d_filter_by_hand_and_unseen_gaussians_take_the_largest():
     assert f.tolist() == pytest.approx([4 / camera.fx * 0.2**0.5, 8 / camera.fx * 0.2**0.5, 8 / camera.fx * 0.2**0.5])
     assert not filter_std(means[2:], [camera], 0.2).any()
     assert not filter_std(means, [camera], 0.0).any()
+    pose = camera.world_to_camera.clone()
+    pose[:3, 3] *= 0.1  # another unit of the world
+    means[2, 2] = -3.8  # depth 0.2
+    smaller = replace(camera, world_to_camera=pose)
+    assert torch.allclose(filter_std(0.1 * means, [smaller], 0.2), 0.1 * filter_std(means, [camera], 0.2))
 
 
 def test_filtered_opacity_sends_its_gradient_into_the_scales():
@@ -287,15 +291,6 @@ def test_extent_of_cameras():
     centers = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 0, 0]])
     assert cameras_extent(centers) == pytest.approx(1.1)
     assert cameras_extent(centers[:1]) > 0
-
-
-def test_the_3d_filter_does_not_depend_on_the_unit_of_the_world():
-    camera = toy.camera(0.0)
-    means = torch.tensor([[0.0, 0, -3.8], [0, 0, 0], [0, 0, 4]])  # depths 0.2, 4, 8
-    pose = camera.world_to_camera.clone()
-    pose[:3, 3] *= 0.1
-    smaller = replace(camera, world_to_camera=pose)
-    assert torch.allclose(filter_std(0.1 * means, [smaller], 0.2), 0.1 * filter_std(means, [camera], 0.2))
 
 
 def test_the_3d_filter_counts_what_the_rasterizer_of_the_run_draws():
