@@ -1,8 +1,11 @@
-"""A splat in the formats of viewers."""
+"""A splat in the formats of viewers; gaussforge writes .spz (Niantic's version 4) and .sog (PlayCanvas's version 2)."""
 
 from __future__ import annotations
 
+import tempfile
+from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -10,21 +13,20 @@ import torch
 from clear_strategies import files
 from clear_strategies.data.ply import GaussianPly, write_gaussians
 from clear_strategies.errors import SettingError
-from clear_strategies.outputs.format_names import FORMATS
 from clear_strategies.outputs.gltf import glb_bytes
-from clear_strategies.outputs.packed import packed_bytes
 from clear_strategies.training.field import GaussianField
-from rasterizers.geometry import SH_C0
+from rasterizers.geometry import SH_C0, spherical_harmonics
+
+_SPZ_VERSION: Final = 4
+_DIRECTION: Final = (1.0, 2.0, 4.0)  # in which no spherical harmonic is 0
 
 
 def write_format(path: Path, g: GaussianPly, form: str) -> None:
-    """Write the Gaussians as one of `FORMATS`, atomically.
+    """Write the Gaussians as one of `format_names.FORMATS`, atomically.
 
     Raises:
-        SettingError: there is no such format, or what it needs is not installed.
+        SettingError: gaussforge is not installed, or refuses the splat.
     """
-    if form not in FORMATS:
-        raise SettingError(f"--to must be one of {', '.join(FORMATS)}, got {form}.")
     if form == "ply":
         write_gaussians(path, g)
     elif form == "splat":
@@ -32,7 +34,7 @@ def write_format(path: Path, g: GaussianPly, form: str) -> None:
     elif form == "glb":
         files.write_bytes(path, glb_bytes(g))
     else:
-        files.write_bytes(path, packed_bytes(g, form))
+        files.write_bytes(path, _packed_bytes(g, form))
 
 
 def export_ply(path: Path, field: GaussianField, *, antialiased: bool = True) -> None:
@@ -78,3 +80,30 @@ def splat_bytes(g: GaussianPly) -> bytes:
     ):
         table[name] = values[order].cpu().numpy()
     return table.tobytes()
+
+
+def _packed_bytes(g: GaussianPly, form: str) -> bytes:
+    """The .spz or .sog file, by gaussforge."""
+    try:
+        import gaussforge
+    except ImportError as error:
+        remedy = "pip install 'clear-strategies[export]', or choose --to ply, --to glb or --to splat"
+        raise SettingError(f"--to {form} needs gaussforge, which is not installed: {remedy}.") from error
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "splat.ply"
+        write_gaussians(source, turned(g) if form == "spz" else g)
+        converted = gaussforge.GaussForge().convert(source.read_bytes(), "ply", form, spz_version=_SPZ_VERSION)
+    if "error" in converted:
+        raise SettingError(f"--to {form}: gaussforge refuses the splat ({converted['error']}). Choose another format.")
+    return bytes(converted["data"])
+
+
+def turned(g: GaussianPly) -> GaussianPly:
+    """Half a turn around x: y points down in 3DGS files and up in SPZ, and gaussforge leaves the axes as they are."""
+    turn = g.means.new_tensor([1.0, -1.0, -1.0])
+    direction = torch.nn.functional.normalize(g.means.new_tensor([_DIRECTION]), dim=1)
+    bands = g.shN.shape[1]
+    signs = (spherical_harmonics(direction * turn, bands) / spherical_harmonics(direction, bands))[0, 1:].round()
+    return replace(
+        g, means=g.means * turn, quats=g.quats * g.quats.new_tensor([1.0, 1.0, -1.0, -1.0]), shN=g.shN * signs[:, None]
+    )
