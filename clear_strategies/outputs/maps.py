@@ -7,8 +7,8 @@ Five maps per view, in [0, 1] at each HR pixel:
   together.  Eq. 7, 11
 - `conflict`: 1 where g_LR and g_HR of a Gaussian point apart, else 0.  Eq. 6
 
-The last two render the Gaussians over black with that number as their grey. The maps come from copies of the run's strategies;
-the run does not change. `maps_picture` draws them side by side, and the depth where it came from dense stereo.
+The last two render the Gaussians over black with that number as their grey. The strategies are copied, so that the run does not
+change. `maps_picture` draws the maps side by side, and the depth where it comes from dense stereo.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from clear_strategies.outputs.maps_picture import write_depth, write_maps_pictur
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.field import FieldShot, GaussianField
-from rasterizers.geometry import SH_C0
-from rasterizers.interface import Camera, Rasterizer
+from clear_strategies.viewing.look import Painter
+from rasterizers.interface import Rasterizer
 
 _log = logging.getLogger(__name__)
 
@@ -63,22 +63,22 @@ class ViewMaps:
 
 
 def write_maps(
-    folder: Path, views: Sequence[View], field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, t: int
+    folder: Path, views: Sequence[View], painter: Painter, conductor: Conductor, rasterizer: Rasterizer, t: int
 ) -> None:
-    """Write maps.json and, for each of the views, a folder of 8-bit grey PNGs (value = 255 × number).
+    """Write maps.json and, for each view, a folder of 8-bit grey PNGs (value = 255 × number), its LR photo and its prior.
 
-    The LR photo and the prior lie beside them. The other arguments are those of `view_maps`.
+    Args:
+        views: at least one. The other arguments are those of `view_maps`.
     """
     means: dict[str, Mapping[str, float]] = {}
     for view in views:
-        found = view_maps(field, conductor, rasterizer, view, t)
-        means[view.name] = found.means
-        own = folder / file_stem(view.name)
-        for name, values in {**found.maps, "lr": view.lr.image, "prior": view.hr.image}.items():
-            write_png(own / f"{name}.png", values)
-        write_maps_picture(own / "maps.png", view, found.maps, found.means)
+        view_folder, of_view = folder / file_stem(view.name), view_maps(painter, conductor, rasterizer, view, t)
+        means[view.name] = of_view.means
+        for name, values in {**of_view.maps, "lr": view.lr.image, "prior": view.hr.image}.items():
+            write_png(view_folder / f"{name}.png", values)
+        write_maps_picture(view_folder / "maps.png", view, of_view.maps, of_view.means)
         if view.depth is not None:
-            write_depth(own / "depth.png", view.depth_photo, view.depth, f"{view.name}: depth by stereo")
+            write_depth(view_folder / "depth.png", view.depth_photo, view.depth, f"{view.name}: depth by stereo")
     corrector = conductor.owner("correct")
     if corrector is None:
         _log.debug("maps: no strategy of this run corrects, so there is no corrected.png.")
@@ -92,13 +92,19 @@ def write_maps(
     files.write_json(folder / "maps.json", content)
 
 
-def view_maps(field: GaussianField, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int) -> ViewMaps:
-    """The maps of one view by the strategies of the run as they are at iteration t, without dropout."""
+def view_maps(painter: Painter, conductor: Conductor, rasterizer: Rasterizer, view: View, t: int) -> ViewMaps:
+    """The maps of one view by the strategies of the run as they are at iteration t, without dropout.
+
+    Args:
+        painter: of the run's field. rasterizer: of the run.
+    """
     evidence = _evidence(conductor, view)
     patches = {} if evidence is None else _enlarged(evidence[1], view)
-    numbers, compared = _compare(*_gradients(field, conductor, rasterizer, view, t))
-    drawn = _draw(field, rasterizer, view.hr.camera, torch.stack(list(numbers.values()), dim=1))
-    maps = {**patches, **{name: drawn[..., k].clamp(0, 1) for k, name in enumerate(numbers)}}
+    numbers, compared = _compare(*_gradients(painter.field, conductor, rasterizer, view, t))
+    maps = {
+        **patches,
+        **{name: painter.numbers(view.hr.camera, values).clamp(0, 1) for name, values in numbers.items()},
+    }
     means = {name: float(patch.mean()) for name, patch in patches.items()}
     means |= {name: float(values[compared].mean()) for name, values in numbers.items()}
     return ViewMaps(maps, means)
@@ -151,18 +157,3 @@ def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, T
 def _inner(a: Grads, b: Grads) -> Float[Tensor, " N"]:
     """⟨a_i, b_i⟩ over the concatenated groups."""
     return torch.stack([row_dot(a[name], b[name]) for name in CONFLICT_GROUPS if name in a]).sum(0)
-
-
-def _draw(
-    field: GaussianField, rasterizer: Rasterizer, camera: Camera, numbers: Float[Tensor, "N K"]
-) -> Float[Tensor, "H W 3"]:
-    """Render the Gaussians with K <= 3 numbers as their colour; black elsewhere, whatever the rasterizer's background."""
-    splats = field.baked()
-
-    def drawn(rgb: Tensor) -> Tensor:
-        sh0 = ((rgb - 0.5) / SH_C0)[:, None]
-        return rasterizer(replace(splats, sh0=sh0, shN=splats.shN[:, :0], rgb_offset=None), camera).image
-
-    rgb = splats.means.new_zeros(len(splats), 3)
-    rgb[:, : numbers.shape[1]] = numbers.to(rgb)
-    return drawn(rgb) - drawn(torch.zeros_like(rgb))

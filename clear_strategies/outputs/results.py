@@ -105,7 +105,7 @@ def write_results(
     if pictures is not None:
         with work_log.stage("maps"):
             if mapped := spaced(state.views, pictures.map_views):
-                write_maps(folder / "maps", mapped, field, state.conductor, rasterizer, state.t - 1)
+                write_maps(folder / "maps", mapped, painter, state.conductor, rasterizer, state.t - 1)
         memory.release()  # the gradients that the maps are made of: several times the field
         with work_log.stage("contact sheet and curves"):
             _write_sheet(folder, scene, evaluation, title, baseline)

@@ -3,41 +3,60 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
+import rasterizers
 from clear_strategies import GCO, P2G, SVS, Conductor, RandomBackground
 from clear_strategies.core.evidence import PatchMaps
 from clear_strategies.core.gradients import Grads, conflict_ratio
 from clear_strategies.core.view import DepthMap, View
 from clear_strategies.data.photo_files import read_image
 from clear_strategies.merging.objective import Objective
-from clear_strategies.outputs.maps import view_maps, write_maps
+from clear_strategies.outputs.maps import ViewMaps, view_maps, write_maps
 from clear_strategies.schedules import WarmupDecay
 from clear_strategies.strategies.base import Strategy
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.state import TrainState
+from clear_strategies.viewing.look import Painter
 from clear_strategies.viewing.points import MAPS
 from tests.helpers import toy
 
 OBJECTIVE = Objective(lambda_hr=WarmupDecay(start=0, full=1), kernels="torch")
+SCENE = toy.scene()
+LEFT = (torch.arange(96) < 48)[:, None]
+# The left half of the prior is a negative, so that there is something to find.
+NEGATIVE = tuple(replace(v, hr=replace(v.hr, image=torch.where(LEFT, 1 - v.hr.image, v.hr.image))) for v in SCENE.train)
 
 
-def trained(*strategies: Strategy, iterations: int = 3) -> TrainState:
-    """A few iterations with a prior whose left half is a negative, so that there is something to find."""
-    scene = toy.scene()
-    left = (torch.arange(96) < 48)[:, None]
-    train = tuple(
-        replace(v, hr=replace(v.hr, image=torch.where(left, 1 - v.hr.image, v.hr.image))) for v in scene.train
-    )
-    state = toy.started(*strategies, objective=OBJECTIVE, of=replace(scene, train=train), iterations=iterations)
-    for _ in range(iterations):
+def trained(*strategies: Strategy) -> TrainState:
+    state = toy.started(*strategies, objective=OBJECTIVE, of=replace(SCENE, train=NEGATIVE), iterations=3)
+    for _ in range(3):
         iterate(state, toy.RASTERIZER)
     return state
+
+
+def drawn_by(state: TrainState, **settings: Any) -> tuple[Painter, Conductor, rasterizers.Rasterizer]:
+    make = partial(rasterizers.load, "torch", **settings)
+    return Painter(state.field, make), state.conductor, make()
+
+
+def maps_of(state: TrainState, view: View | None = None, t: int = 1, **settings: Any) -> ViewMaps:
+    return view_maps(*drawn_by(state, **settings), view or state.views[0], t)
+
+
+def written(folder: Path, state: TrainState, views: Sequence[View]) -> dict[str, Any]:
+    """The content of maps.json."""
+    write_maps(folder, views, *drawn_by(state), 1)
+    content: dict[str, Any] = json.loads((folder / "maps.json").read_text())
+    return content
 
 
 def everything(state: TrainState) -> dict[str, Tensor]:
@@ -50,7 +69,7 @@ def test_making_maps_does_not_change_the_run() -> None:
     before, logs = everything(state), [dict(s.logs) for s in strategies]
     caches, entries = [set(s.cache) for s in strategies], dict(state.conductor.work_log.entries)
     for view in state.views:
-        view_maps(state.field, state.conductor, toy.RASTERIZER, view, 1)
+        maps_of(state, view)
     after = everything(state)
     assert before.keys() == after.keys()
     assert all(torch.equal(before[name], after[name]) for name in before)
@@ -62,9 +81,8 @@ def test_making_maps_does_not_change_the_run() -> None:
 def test_patch_maps_are_p2gs_evidence_enlarged_to_hr() -> None:
     p2g = P2G(patch=8, reliability_scale=0.02)
     state = trained(p2g)
-    view = state.views[0]
-    maps = view_maps(state.field, state.conductor, toy.RASTERIZER, view, 1).maps
-    R, A = p2g.patch_evidence(view.lr.image, view.hr.image, 4)
+    maps = maps_of(state).maps
+    R, A = p2g.patch_evidence(state.views[0].lr.image, state.views[0].hr.image, 4)
     assert maps["reliability"].shape == (64, 96)
     assert maps["reliability"][31, 32] == R[0, 1]  # patches of 32 HR pixels
     assert maps["demand"][32, 95] == A[1, 2]
@@ -73,14 +91,12 @@ def test_patch_maps_are_p2gs_evidence_enlarged_to_hr() -> None:
 
 def test_conflict_is_the_ratio_that_training_logs() -> None:
     state = trained()
-    view = state.views[0]
-    found = view_maps(state.field, state.conductor, toy.RASTERIZER, view, 1)
+    view, found = state.views[0], maps_of(state)
     lr, hr = state.field.render_scales(toy.RASTERIZER, view)
     (g_lr,) = lr.vjp(OBJECTIVE.lr(lr.image, view.lr.image).cotangents)
     g_base, g_hf = hr.vjp(OBJECTIVE.hr(hr.image, view.hr.image).cotangents)
     assert found.means["conflict"] == pytest.approx(conflict_ratio(g_lr, g_base + g_hf * 0.2)["gaussian"])
     assert 0 < found.means["conflict"] < 1
-    assert "corrected" not in found.maps
 
 
 class OwnPatches(Strategy):
@@ -95,10 +111,9 @@ class OwnPatches(Strategy):
 
 def test_any_strategy_can_have_patch_maps(tmp_path: Path) -> None:
     state = trained(OwnPatches())
-    write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER, 1)
-    content = json.loads((tmp_path / "maps.json").read_text())
-    assert content["evidence"] == "OwnPatches"
+    content = written(tmp_path, state, state.views[:1])
     means = content["views"][state.views[0].name]
+    assert content["evidence"] == "OwnPatches"
     assert (means["reliability"], means["demand"], means["weight"]) == (0.5, 0.25, 0.125)
 
 
@@ -109,23 +124,16 @@ class Halve(Strategy):
         return hr * 0.5
 
 
-def test_corrected_is_the_share_of_the_hr_gradient_that_was_taken_away() -> None:
+def test_corrected_is_the_share_of_the_hr_gradient_that_was_taken_away_over_black_whatever_the_background() -> None:
     state = trained(Halve())
     state.conductor.objective = replace(OBJECTIVE, lambda_hr=WarmupDecay(peak=0, final=0))  # as it may be at the end
-    found = view_maps(state.field, state.conductor, toy.RASTERIZER, state.views[0], 1)
+    found = maps_of(state)
     assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
-    # Drawn over black: nowhere more than the number itself, and nearly that where Gaussians cover the pixel.
+    # Nowhere more than the number itself, and nearly that where Gaussians cover the pixel.
     assert float(found.maps["corrected"].max()) == pytest.approx(0.5, abs=0.1)
     assert float(found.maps["corrected"].max()) <= 0.5 + 1e-5
-
-
-def test_maps_are_drawn_over_black_whatever_the_background() -> None:
-    import rasterizers
-
-    state = trained(Halve())
-    white = rasterizers.load("torch", background=(1.0, 1.0, 1.0))
     state.field.opacities.data[:] = -4.0  # little is drawn
-    found = view_maps(state.field, state.conductor, white, state.views[0], 1)
+    found = maps_of(state, background=(1.0, 1.0, 1.0))
     assert found.means["corrected"] == pytest.approx(0.5, rel=1e-6)
     assert 0 < float(found.maps["corrected"].max()) < 0.4
 
@@ -136,8 +144,7 @@ def test_maps_show_what_a_strategy_corrects_at_the_end_of_the_run() -> None:
             return Grads(hr) if step.t < 2 else Grads(hr) * 0.0
 
     state = trained(Late())
-    shown = [view_maps(state.field, state.conductor, toy.RASTERIZER, state.views[0], t).means for t in (1, 2)]
-    assert [means["corrected"] for means in shown] == pytest.approx([0, 1])
+    assert [maps_of(state, t=t).means["corrected"] for t in (1, 2)] == pytest.approx([0, 1])
 
 
 def test_maps_of_transparent_photos_compare_them_before_the_background_that_is_drawn() -> None:
@@ -145,47 +152,39 @@ def test_maps_of_transparent_photos_compare_them_before_the_background_that_is_d
     view = state.views[0]
     view = replace(view, hr=replace(view.hr, transparency=torch.ones_like(view.hr.image[..., 0])))
     assert state.conductor.background(1) is not None
-    found = view_maps(state.field, state.conductor, toy.RASTERIZER, view, 1)
-    expected = view_maps(state.field, Conductor(GCO(), objective=OBJECTIVE), toy.RASTERIZER, view, 1)
-    assert found.means == expected.means
+    found = maps_of(state, view)
+    state.conductor = Conductor(GCO(), objective=OBJECTIVE)
+    assert found.means == maps_of(state, view).means
 
 
 def test_a_folder_of_maps_is_complete(tmp_path: Path) -> None:
     state = trained(GCO(), P2G())
-    write_maps(tmp_path, state.views[:2], state.field, state.conductor, toy.RASTERIZER, 1)
-    content = json.loads((tmp_path / "maps.json").read_text())
-    assert (content["corrector"], content["evidence"]) == ("GCO", "P2G")
-    assert set(content["views"]) == {view.name for view in state.views[:2]}
-    for view in state.views[:2]:
-        own = tmp_path / view.name
-        assert {path.name for path in own.iterdir()} == {f"{name}.png" for name in (*MAPS, "lr", "prior", "maps")}
-        assert set(content["views"][view.name]) == set(MAPS)
-        found = view_maps(state.field, state.conductor, toy.RASTERIZER, view, 1).maps
-        for name in MAPS:
-            assert float((read_image(own / f"{name}.png")[..., 0] - found[name]).abs().max()) <= 0.5 / 255 + 1e-6
-
-
-def test_views_with_stereo_show_their_depth(tmp_path: Path) -> None:
-    state = trained()
     view = state.views[0]
-    shape = view.lr.image.shape[:2]
-    depth = torch.rand(shape) + 1
-    depth[0] = torch.nan
-    found = DepthMap(depth, depth.isfinite().float() * 0.5)
-    nothing = DepthMap(torch.full(shape, torch.nan), torch.zeros(shape))
-    for depth_map in (found, nothing):
-        views = [replace(view, depth=depth_map), state.views[1]]
-        write_maps(tmp_path, views, state.field, state.conductor, toy.RASTERIZER, 1)
-        assert read_image(tmp_path / view.name / "depth.png").shape[1] > 500
-        assert not (tmp_path / state.views[1].name / "depth.png").exists()
+    content = written(tmp_path, state, state.views[:1])
+    assert (content["corrector"], content["evidence"]) == ("GCO", "P2G")
+    assert set(content["views"]) == {view.name}
+    assert set(content["views"][view.name]) == set(MAPS)
+    files = {path.stem: path for path in (tmp_path / view.name).iterdir()}
+    assert set(files) == {*MAPS, "lr", "prior", "maps"}
+    for name, values in maps_of(state).maps.items():
+        assert float((read_image(files[name])[..., 0] - values).abs().max()) <= 0.5 / 255 + 1e-6
 
 
-def test_without_a_strategy_that_corrects_or_has_evidence_its_maps_are_missing(tmp_path, caplog):
+def test_views_with_stereo_show_their_depth_and_maps_that_no_strategy_makes_are_missing(tmp_path: Path, caplog) -> None:
     caplog.set_level("DEBUG")
     state = trained()
-    write_maps(tmp_path, state.views[:1], state.field, state.conductor, toy.RASTERIZER, 1)
-    content = json.loads((tmp_path / "maps.json").read_text())
+    shape = state.views[0].lr.image.shape[:2]
+    depth = torch.rand(shape) + 1
+    depth[0] = torch.nan
+    some = DepthMap(depth, depth.isfinite().float() * 0.5)
+    nothing = DepthMap(torch.full(shape, torch.nan), torch.zeros(shape))
+    maps = (some, nothing, None)
+    views = [replace(state.views[0], name=str(i), depth=found) for i, found in enumerate(maps)]
+    content = written(tmp_path, state, views)
     assert (content["corrector"], content["evidence"]) == (None, None)
-    assert set(content["views"][state.views[0].name]) == {"conflict"}
-    assert not (tmp_path / state.views[0].name / "reliability.png").exists()
     assert "no strategy of this run corrects" in caplog.text
+    for view in views:
+        assert set(content["views"][view.name]) == {"conflict"}
+        kinds = {"conflict", "lr", "prior", "maps"} | ({"depth"} if view.depth is not None else set())
+        assert {path.stem for path in (tmp_path / view.name).iterdir()} == kinds
+    assert read_image(tmp_path / "0" / "depth.png").shape[1] > 500
