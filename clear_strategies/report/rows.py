@@ -6,6 +6,7 @@ error.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import statistics
@@ -17,6 +18,7 @@ from clear_strategies.report.runs import BASELINES, FACTS, SCORES, Run
 
 _log = logging.getLogger(__name__)
 
+Item = TypeVar("Item")
 Key = TypeVar("Key", bound=Hashable)
 
 # Overrides that choose what the baselines see.
@@ -39,10 +41,10 @@ class Difference:
     pairs: int = 0
 
     @classmethod
-    def paired(cls, own: Sequence[float], first: Sequence[float], differences: Sequence[float]) -> Difference:
-        """From the values of two methods, and their differences where they share a seed."""
+    def paired(cls, values: Sequence[float], first: Sequence[float], differences: Sequence[float]) -> Difference:
+        """From the values of a method and of the first, and their differences where they share a seed."""
         if len(differences) < 2:
-            return cls(mean(own) - mean(first), pairs=len(differences))
+            return cls(mean(values) - mean(first), pairs=len(differences))
         error = statistics.stdev(differences) / math.sqrt(len(differences))
         return cls(mean(differences), error, len(differences))
 
@@ -87,11 +89,14 @@ class Row:
 def compare(runs: Sequence[Run]) -> list[Row]:
     """For each scene, in the order of the runs, its baselines and one row per method; then the averages over scenes."""
     scenes = _grouped(runs, lambda run: run.scene)
-    rows = {scene: [*_baseline_rows(of_scene), *_method_rows(of_scene)] for scene, of_scene in scenes.items()}
+    rows: dict[str, list[Row]] = {}
+    for scene, of_scene in scenes.items():
+        baselines = [_baseline_rows(of_scene, baseline) for baseline in BASELINES]
+        rows[scene] = [*itertools.chain(*baselines), *_method_rows(of_scene)]
     averages = []
     # Scores against LR photos, or of training views, are not averaged with others.
-    for marks, same in _grouped([of_scene[0] for of_scene in scenes.values()], lambda run: run.marks).items():
-        averages += _averages([rows[run.scene] for run in same], marks)
+    for marks, alike in _grouped(scenes, lambda scene: scenes[scene][0].marks).items():
+        averages += _averages([rows[scene] for scene in alike], marks)
     return [row for of_scene in rows.values() for row in of_scene] + averages
 
 
@@ -107,23 +112,18 @@ def shared_settings(runs: Sequence[Run]) -> list[str]:
 
 def _in_all(lists: Sequence[Sequence[str]]) -> list[str]:
     """What every list holds, in the order of the first."""
-    return [setting for setting in lists[0] if all(setting in of for of in lists)] if lists else []
+    return [setting for setting in lists[0] if all(setting in other for other in lists)] if lists else []
 
 
-def _baseline_rows(runs: Sequence[Run]) -> list[Row]:
-    """Of one scene: one row per baseline, or one per input (data, prior) where the runs differ in it."""
-    rows = []
-    for baseline in BASELINES:
-        inputs = {run: _inputs(run, baseline) for run in runs if baseline in run.scores}
-        shared = _in_all([*inputs.values()])
-        by_input: dict[frozenset[str], list[Run]] = {}
-        for run, of in inputs.items():
-            by_input.setdefault(frozenset(of), []).append(run)
-        for same in by_input.values():
-            label = _label(baseline, inputs[same[0]], shared)
-            # Runs with the same input have the same baseline, unless the prior depends on the seed.
-            values = {m: sorted(set(_known(run.scores[baseline][m] for run in same))) for m in SCORES}
-            rows.append(Row(same[0].scene, label, baseline, tuple(same), values))
+def _baseline_rows(runs: Sequence[Run], baseline: str) -> list[Row]:
+    """Of one scene: the row of a baseline, or one per input (data, prior) where the runs differ in it."""
+    inputs = {run: _inputs(run, baseline) for run in runs if baseline in run.scores}
+    shared, rows = _in_all([*inputs.values()]), []
+    for same in _grouped(inputs, lambda run: frozenset(inputs[run])).values():
+        label = _label(baseline, inputs[same[0]], shared)
+        # Runs with the same input have the same baseline, unless the prior depends on the seed.
+        values = {m: sorted(set(_known(run.scores[baseline][m] for run in same))) for m in SCORES}
+        rows.append(Row(same[0].scene, label, baseline, tuple(same), values))
     return rows
 
 
@@ -168,7 +168,7 @@ def _averages(scenes: Sequence[Sequence[Row]], marks: str) -> list[Row]:
         delta = None
         if not rows[0].is_baseline:
             first = first or rows
-            pairs = [d for row, start in zip(rows, first, strict=True) for d in _seed_differences(row.runs, start.runs)]
+            pairs = [d for row, base in zip(rows, first, strict=True) for d in _seed_differences(row.runs, base.runs)]
             psnr = [mean(row.values["psnr"]) for row in first]
             delta = Difference(0.0) if rows is first else Difference.paired(values.get("psnr", ()), psnr, pairs)
         averages.append(Row(title, _label(*identity, shared), rows[0].name, (), values, delta))
@@ -179,13 +179,12 @@ def _by_identity(rows: Sequence[Row]) -> dict[tuple[str, tuple[str, ...]], Row]:
     """The rows of one scene by name and settings, without the `data` settings that all of its runs share: those describe
     the scene.
     """
-    shared = shared_settings([run for row in rows for run in row.runs])
-    found = {}
+    shared = [s for s in shared_settings([run for row in rows for run in row.runs]) if _is_input(s, ("data",))]
+    by_identity = {}
     for row in rows:
-        own = _inputs(row.runs[0], row.name) if row.is_baseline else row.runs[0].settings
-        settings = [s for s in own if not (s in shared and _is_input(s, ("data",)))]
-        found[row.name, tuple(sorted(settings))] = row
-    return found
+        settings = _inputs(row.runs[0], row.name) if row.is_baseline else row.runs[0].settings
+        by_identity[row.name, tuple(sorted(s for s in settings if s not in shared))] = row
+    return by_identity
 
 
 def _inputs(run: Run, baseline: str) -> list[str]:
@@ -205,8 +204,8 @@ def _is_input(setting: str, groups: tuple[str, ...] = _INPUT) -> bool:
 
 def _seed_differences(runs: Sequence[Run], first: Sequence[Run]) -> list[float]:
     """PSNR minus that of the first method, for each seed that both have."""
-    own, start = _psnr_by_seed(runs), _psnr_by_seed(first)
-    return [own[seed] - start[seed] for seed in own if seed in start]
+    psnr, base = _psnr_by_seed(runs), _psnr_by_seed(first)
+    return [psnr[seed] - base[seed] for seed in psnr if seed in base]
 
 
 def _psnr_by_seed(runs: Sequence[Run]) -> dict[int, float]:
@@ -219,10 +218,10 @@ def _label(name: str, settings: Sequence[str], shared: Sequence[str]) -> str:
     return ", ".join((name, *(s for s in settings if s not in shared)))
 
 
-def _grouped(runs: Iterable[Run], key: Callable[[Run], Key]) -> dict[Key, list[Run]]:
-    groups: dict[Key, list[Run]] = {}
-    for run in runs:
-        groups.setdefault(key(run), []).append(run)
+def _grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    groups: dict[Key, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
     return groups
 
 

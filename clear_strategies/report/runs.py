@@ -73,18 +73,18 @@ class Run:
         marks = ["synthetic prior"] * content.synthetic_prior
         marks += [] if part is content.test else ["training views"]
         marks += [f"against {part.against}"] if "LR" in part.against else []
-        methods = ("ours", *(image for image in BASELINES if image in part.mean))
+        images = ("ours", *(image for image in BASELINES if image in part.mean))
         try:
             return cls(
                 folder=folder,
                 scene=content.scene + (f" ({', '.join(marks)})" if marks else ""),
                 marks=", ".join(marks),
                 name=_name(overrides, content.strategies),
-                settings=tuple(o for o in overrides if _is_setting(o)),
+                settings=tuple(filter(_is_setting, overrides)),
                 seed=content.seed,
                 iterations=content.iterations,
-                scores={m: asdict(part.mean[m].numbers) for m in methods},
-                views={file_stem(view): metrics.as_float(of["ours"].psnr) for view, of in part.views.items()},
+                scores={image: asdict(part.mean[image].numbers) for image in images},
+                views={file_stem(view): metrics.as_float(scores["ours"].psnr) for view, scores in part.views.items()},
                 facts={
                     "conflict": metrics.as_float(content.conflict.get("gaussian")),
                     "gaussians": content.gaussians,
@@ -107,19 +107,21 @@ def collect(folders: Iterable[Path]) -> list[Run]:
     """
     folders = list(folders)
     folders += [link for folder in folders for link in _sorted(folder.glob("*")) if link.is_symlink() and link.is_dir()]
-    found: dict[Path, None] = {}
+    finished: dict[Path, None] = {}
     for folder in folders:
-        runs_here = _sorted(path.parent for path in folder.rglob("metrics.json"))
-        owners = list(dict.fromkeys(map(_owner, runs_here)))
-        sweeps = list(dict.fromkeys(owner.parent for owner in owners))
-        order = {owner: (sweeps.index(owner.parent), _job(owner), i) for i, owner in enumerate(owners)}
-        for run in sorted(runs_here, key=lambda run: (*order[_owner(run)], run == _owner(run))):
-            found[run.resolve()] = None
+        in_folder = _sorted(path.parent for path in folder.rglob("metrics.json"))
+        owners = [_owner(run) for run in in_folder]
+        sweeps = [owner.parent for owner in owners]
+        order = [
+            (sweeps.index(owner.parent), _job(owner), owners.index(owner), run == owner)
+            for run, owner in zip(in_folder, owners, strict=True)
+        ]
+        finished |= dict.fromkeys(run.resolve() for _, run in sorted(zip(order, in_folder, strict=True)))
     for unfinished in _sorted(path.parent for folder in folders for path in folder.rglob(_HYDRA)):
-        if unfinished.resolve() not in found:
+        if unfinished.resolve() not in finished:
             _log.warning("%s: left out, it has no metrics.json: the run did not finish.", unfinished)
     runs = []
-    for folder in found:
+    for folder in finished:
         try:
             runs.append(Run.read(folder))
         except DataError as error:
@@ -132,22 +134,24 @@ def collect(folders: Iterable[Path]) -> list[Run]:
 
 
 def _each_baseline_once(runs: Sequence[Run]) -> list[Run]:
-    """Without the baselines beside runs that another run repeats: one on its own, else the first of these."""
+    """Leave out a baseline beside a run where another run has its configuration: one on its own, else an earlier baseline."""
     alone = [run for run in runs if _owner(run.folder) == run.folder]
     kept: list[Run] = []
     for run in runs:
-        others = [other for other in (*alone, *kept) if other.config and other.config == run.config]
-        if others and run not in alone:
-            _log.info("%s: left out, it is the same training as %s.", run.folder, others[0].folder)
+        same = [other for other in (*alone, *kept) if other.config and other.config == run.config]
+        if same and run not in alone:
+            _log.info("%s: left out, it is the same training as %s.", run.folder, same[0].folder)
         else:
             kept.append(run)
     return kept
 
 
 def _owner(folder: Path) -> Path:
-    """The run that a baseline trained beside, else the folder itself. Hydra's files are the run's; one from Python has none."""
-    of_run = any((folder.parent / name).exists() for name in (_HYDRA, "metrics.json"))
-    beside = folder.name == baseline.FOLDER and not (folder / _HYDRA).is_dir() and of_run
+    """The folder of the run that a baseline trained beside; of any other run, its own. A baseline beside a run has no files of
+    Hydra's, and a run from Python has none either.
+    """
+    in_run = any((folder.parent / name).exists() for name in (_HYDRA, "metrics.json"))
+    beside = folder.name == baseline.FOLDER and not (folder / _HYDRA).is_dir() and in_run
     return folder.parent if beside else folder
 
 
