@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
+import collections
 import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-import torch
-
 from clear_strategies.core.view import View
-from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.view_names import file_stem
 from clear_strategies.viewing import FPS, cameras, film, page, paths, video
-from clear_strategies.viewing.film import DepthScale
 from clear_strategies.viewing.look import Painter
 from rasterizers.interface import Camera, Color
 
@@ -24,36 +21,32 @@ _LONGEST: Final = 960  # px: a frame takes a fraction of a second, and the file 
 
 
 def write_loop(folder: Path, train: Sequence[Camera], painter: Painter, frames: int) -> None:
-    """Write the video of a loop through the training cameras; without imageio-ffmpeg none, with a message."""
+    """Write the video of a loop through the training cameras. Without imageio-ffmpeg, log a message instead."""
     if not frames:
         return
-    if (lack := video.missing()) is not None:
-        _log.info("no video of the camera path is written: %s.", lack)
+    if (missing := video.missing()) is not None:
+        _log.info("no video of the camera path is written: %s.", missing)
         return
     began = time.perf_counter()
-    where = [cameras.at_most(camera, _LONGEST) for camera in paths.through(train, frames)]
-    video.write_videos([folder / "path.mp4", folder / "path.gif"], film.color_frames(painter, where), fps=FPS)
+    path = [cameras.at_most(camera, _LONGEST) for camera in paths.through(train, frames)]
+    video.write_videos([folder / "path.mp4", folder / "path.gif"], film.color_frames(painter, path), fps=FPS)
     _log.debug(
         "path.mp4, path.gif: %d frames of %dx%d in %.1f s (fit.video=0 writes none).",
-        frames, where[0].width, where[0].height, time.perf_counter() - began,
+        frames, path[0].width, path[0].height, time.perf_counter() - began,
     )  # fmt: skip
 
 
 def write_depths(folder: Path, views: Sequence[View], painter: Painter) -> None:
-    """Write the depth of views as rendered, all in the same colours, each with the legend."""
-    where = [cameras.at_most(view.hr.camera, _LONGEST) for view in views]
-    if not where:
-        return
-    scale = DepthScale.of(painter, where)
-    for view, camera in zip(views, where, strict=True):
-        picture = scale.picture(painter.depth(camera))
-        write_png(folder / f"{file_stem(view.name)}.png", torch.from_numpy(picture) / 255)
+    """Write the depth of at least one view as rendered, all in the same colours, each with a legend."""
+    shown = [cameras.at_most(view.hr.camera, _LONGEST) for view in views]
+    files = [folder / f"{file_stem(view.name)}.png" for view in views]
+    collections.deque(film.saving(film.depth_frames(painter, shown), files), maxlen=0)
 
 
 def write_splat_page(
     folder: Path, train: Sequence[Camera], painter: Painter, most: int, title: str, background: Color
 ) -> None:
-    """Write splat.html, unless the field has more Gaussians than `most`, or the page cannot be made: a message then says why.
+    """Write splat.html. Where the field has more Gaussians than `most`, or the page cannot be made, log why instead.
 
     Args:
         most: 0: write no page, without a message.
@@ -61,8 +54,8 @@ def write_splat_page(
     count = len(painter.field)
     if most == 0:
         return
-    if (lack := page.missing()) is not None:
-        _log.info("no %s is written: %s.", page.FILE, lack)
+    if (missing := page.missing()) is not None:
+        _log.info("no %s is written: %s.", page.FILE, missing)
         return
     if count > most:
         _log.info("no %s is written: there are %s Gaussians, fit.page is %s.", page.FILE, f"{count:,}", f"{most:,}")

@@ -21,7 +21,6 @@ from torch import Tensor
 
 from clear_strategies import files
 from clear_strategies.core import images
-from clear_strategies.core.view import View
 from clear_strategies.data import strict_json
 from clear_strategies.data.cameras import pose_from_opengl, rigid_inverse
 from clear_strategies.data.photo_files import jpeg
@@ -62,15 +61,20 @@ class SavedCamera:
 def write_cameras(folder: Path, scene: Scene) -> None:
     """Write `cameras.json`, and the small pictures of the training views."""
     entries: list[dict[str, Any]] = []
-    for split, views in (("train", scene.train), ("test", scene.test)):
-        for view in views:
-            entry = {**_entry(len(entries), view), "split": split, "background": list(scene.background)}
-            if split == "train":
-                entry["photo"] = f"{PHOTOS}/{file_stem(view.name)}.jpg"
-                photo = view.lr.image.cpu()
-                small = images.area_mean(photo, math.ceil(photo.shape[1] / _PHOTO_WIDTH))
-                files.write_bytes(folder / entry["photo"], jpeg(small, quality=80))
-            entries.append(entry)
+    for number, view in enumerate((*scene.train, *scene.test)):
+        camera = view.hr.camera
+        entry: dict[str, Any] = {
+            "id": number, "img_name": view.name, "width": camera.width, "height": camera.height,
+            "position": camera.center.tolist(), "rotation": camera.world_to_camera.double()[:3, :3].T.tolist(),
+            "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "scale": view.factor,
+            "split": "train" if number < len(scene.train) else "test", "background": list(scene.background),
+        }  # fmt: skip
+        if entry["split"] == "train":
+            entry["photo"] = f"{PHOTOS}/{file_stem(view.name)}.jpg"
+            photo = view.lr.image.cpu()
+            small = images.area_mean(photo, math.ceil(photo.shape[1] / _PHOTO_WIDTH))
+            files.write_bytes(folder / entry["photo"], jpeg(small, quality=80))
+        entries.append(entry)
     files.write_json(folder / FILE, entries)
 
 
@@ -87,10 +91,10 @@ def read_path(path: Path, size: tuple[int, int]) -> tuple[list[Camera], float | 
     """A camera path: cameras.json, a transforms.json, or the camera_path.json that the viewers of nerfstudio and nerfview save.
 
     Args:
-        size: (width, height) of cameras that name none.
+        size: (width, height) of cameras that have none in the file.
 
     Returns:
-        The cameras, and frames per second where the file names them.
+        The cameras, and the file's frames per second if it has them.
 
     Raises:
         DataError: it is no such file.
@@ -106,10 +110,8 @@ def read_path(path: Path, size: tuple[int, int]) -> tuple[list[Camera], float | 
     if "frames" in content:
         return [_of_transforms(path, i, frame, size) for i, frame in enumerate(transforms_of(path, content))], None
     saved = typed(path, content, _ViewerPath, remedy="save the path again")
-    width, height = (
-        round(own or given) for own, given in zip((saved.render_width, saved.render_height), size, strict=True)
-    )
-    return [_of_viewer(path, i, key, (width, height)) for i, key in enumerate(saved.camera_path)], saved.fps
+    size = round(saved.render_width or size[0]), round(saved.render_height or size[1])
+    return [_of_viewer(path, i, key, size) for i, key in enumerate(saved.camera_path)], saved.fps
 
 
 def at_most(camera: Camera, longest: int | None) -> Camera:
@@ -127,24 +129,6 @@ def framed(camera: Camera, width: int, height: int) -> Camera:
         for frame, principal, size in ((width, camera.cx, camera.width), (height, camera.cy, camera.height))
     )
     return replace(camera, fx=times * camera.fx, fy=times * camera.fy, cx=cx, cy=cy, width=width, height=height)
-
-
-def _entry(number: int, view: View) -> dict[str, Any]:
-    camera = view.hr.camera
-    pose = camera.world_to_camera.double()
-    return {
-        "id": number,
-        "img_name": view.name,
-        "width": camera.width,
-        "height": camera.height,
-        "position": camera.center.tolist(),
-        "rotation": pose[:3, :3].T.tolist(),
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "scale": view.factor,
-    }
 
 
 class _Entry(msgspec.Struct):
@@ -181,7 +165,7 @@ def _saved_camera(path: Path, i: int, entry: _Entry) -> SavedCamera:
     try:
         rotation = np.array(entry.rotation, float).reshape(3, 3)
     except (TypeError, ValueError) as error:
-        raise DataError(path, f"[{i}].rotation", f"is none ({error})", "write the file again") from error
+        raise DataError(path, f"[{i}].rotation", f"must be a 3x3 matrix ({error})", "write the file again") from error
     width, height = round(entry.width), round(entry.height)
     pose = rigid_inverse(path, f"[{i}].rotation", rotation, np.array(entry.position))
     cx = width / 2 if entry.cx is None else entry.cx

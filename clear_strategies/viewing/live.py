@@ -1,4 +1,4 @@
-"""The viewer of a run that trains: pictures are drawn by the training thread, between two iterations."""
+"""The viewer of a run that trains: the training thread draws its pictures, between two iterations."""
 
 from __future__ import annotations
 
@@ -19,58 +19,58 @@ _PATIENCE: Final = 0.02  # seconds between looks at the queue while the run is p
 
 
 class Turns:
-    """Runs what other threads ask for at the moments that the training thread chooses; after `close`, at once.
+    """Runs functions of other threads in the training thread, when that calls `serve`; after `close`, in their own.
 
-    The field is then never drawn while an iteration changes it, and the run's bits are those of a run without a viewer.
+    The field is thus never drawn while an iteration changes it, and the run's bits are those of a run without a viewer.
     """
 
     def __init__(self) -> None:
-        self._asked: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
+        self._calls: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
         self._closed = threading.Event()
 
     def ask(self, function: Callable[[], Any]) -> Any:
-        """Called by another thread: its result, once the training thread has called it."""
+        """Called by another thread: wait until the training thread has called the function, and return its result."""
         if self._closed.is_set():
             return function()
-        answer: Future[Any] = Future()
-        self._asked.put((function, answer))
-        while not answer.done():
+        result: Future[Any] = Future()
+        self._calls.put((function, result))
+        while not result.done():
             if self._closed.is_set():
                 self.serve()
             time.sleep(0.002)
-        return answer.result()
+        return result.result()
 
     def serve(self) -> None:
-        """Called by the training thread: do all that was asked for."""
+        """Called by the training thread: call the functions that wait."""
         while True:
             try:
-                function, answer = self._asked.get_nowait()
+                function, result = self._calls.get_nowait()
             except queue.Empty:
                 return
             try:
-                answer.set_result(function())
-            except Exception as error:  # it belongs to the thread that asked
-                answer.set_exception(error)
+                result.set_result(function())
+            except Exception as error:  # raised in the thread that waits
+                result.set_exception(error)
 
     def close(self) -> None:
-        """Training has ended: the field changes no more."""
+        """Called when training has ended and the field no longer changes."""
         self._closed.set()
 
 
 def require_viewer() -> None:
     """Raise a SettingError where one of the viewer's libraries is not installed."""
-    if lacks := [name for name in ("viser", "nerfview", "splines") if find_spec(name) is None]:
-        raise SettingError(f"the viewer needs {' and '.join(lacks)}: pip install 'clear-strategies[view]'.")
+    if missing := [name for name in ("viser", "nerfview", "splines") if find_spec(name) is None]:
+        raise SettingError(f"the viewer needs {' and '.join(missing)}: pip install 'clear-strategies[view]'.")
 
 
 @contextmanager
 def watched(
     painter: Painter, cameras: Sequence[SavedCamera], title: str, report: Callable[[str], None]
 ) -> Iterator[Callable[[int], None]]:
-    """A viewer while a run trains. Yields what to call after each iteration, with its number.
+    """A viewer while a run trains. Yields a function to call after each iteration, with its number.
 
     Args:
-        report: told the address.
+        report: called with the viewer's address.
     """
     from clear_strategies.viewing import points
     from clear_strategies.viewing.server import Screen, SplatViewer
@@ -85,7 +85,7 @@ def watched(
         while viewer.paused:
             turns.serve()
             time.sleep(_PATIENCE)
-        viewer.tell(iteration)
+        viewer.show_progress(iteration)
 
     try:
         yield after_step

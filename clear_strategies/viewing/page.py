@@ -52,7 +52,7 @@ class ShownCamera:
 
 
 def missing() -> str | None:
-    """What is not installed that a page needs, with the remedy; None where nothing is."""
+    """Why no page can be written, with the remedy; None where viser is installed."""
     return None if find_spec("viser") is not None else "viser is not installed: pip install 'clear-strategies[view]'"
 
 

@@ -1,8 +1,8 @@
-"""What the Gaussians can be coloured by: f_det, opacity, and the evidence maps of training views carried over to them."""
+"""Colours of the Gaussians in the viewer: by f_det, by opacity, and by the maps of training views carried over to them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -26,13 +26,15 @@ _TOP: Final = 0.98  # quantile of |f_det| at the end of its colours
 
 
 def names(folder: Path | None) -> list[str]:
-    """What there is to choose from, of a run in this folder."""
+    """The names of `colors`: opacity, f_det, and the maps in a run's folder."""
     maps = [name for name in MAPS if folder is not None and any(folder.glob(f"maps/*/{name}.png"))]
     return ["opacity", "f_det", *maps]
 
 
 def colors(painter: Painter, folder: Path | None, cameras: Sequence[SavedCamera]) -> dict[str, Float[Tensor, "N 3"]]:
-    """RGB of each Gaussian by these names; viridis from 0 to 1, f_det up to its 98 % quantile, grey where a map says nothing."""
+    """RGB of each Gaussian, by the names of `names`: viridis from 0 to 1, f_det up to its 98 % quantile, grey where no map shows
+    the Gaussian.
+    """
     field = painter.field
     detail = field.detail.data.norm(dim=1).cpu()
     top = float(np.quantile(detail.numpy(), _TOP)) if len(detail) else 0.0
@@ -57,15 +59,14 @@ def on_gaussians(painter: Painter, maps: Sequence[tuple[Camera, Float[Tensor, "H
 
 
 def _maps(folder: Path, name: str, cameras: Sequence[SavedCamera]) -> list[tuple[Camera, Float[Tensor, "H W"]]]:
-    by_name: Mapping[str, Camera] = {saved.name: saved.camera for saved in cameras}
-    views = strict_json.read_object(folder / "maps" / "maps.json").get("views", {})
-    found = []
-    for view in views:
+    by_name = {saved.name: saved.camera for saved in cameras}
+    maps = []
+    for view in strict_json.read_object(folder / "maps" / "maps.json").get("views", {}):
         path = folder / "maps" / file_stem(view) / f"{name}.png"
         if view in by_name and path.is_file():
             camera = by_name[view]
-            found.append((camera, read_image(path, expect=(camera.width, camera.height))[..., 0]))
-    return found
+            maps.append((camera, read_image(path, expect=(camera.width, camera.height))[..., 0]))
+    return maps
 
 
 def _viridis(values: Float[Tensor, " N"]) -> Float[Tensor, "N 3"]:

@@ -52,11 +52,11 @@ Points = Mapping[str, Float[Tensor, "N 3"]]
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What the panel asks for.
+    """The choices of the panel.
 
     Args:
         show: color, depth, coverage, or a name in `Points`.
-        grid: draw the pixels of the window, or those that an LR or HR camera has, enlarged.
+        grid: draw the pixels of the window, or those of an LR or HR camera, enlarged.
     """
 
     show: str = _COLOR
@@ -70,7 +70,7 @@ class Screen:
 
     Args:
         cameras: of the run; the first one's pixels are those of the grids.
-        points: makes `Points`, which is asked for when the panel first needs it.
+        points: returns `Points`; called when the panel shows one of them.
     """
 
     painter: Painter
@@ -112,9 +112,9 @@ class Screen:
 
     @functools.cached_property
     def depth_scale(self) -> DepthScale:
-        """Chosen once, from the cameras of the run."""
-        where = [at_most(saved.camera, _SMALL) for saved in self.cameras]
-        return DepthScale.of(self.painter, where) if where else DepthScale(0.0, 10.0)
+        """From the cameras of the run; 0 to 10 where none is known."""
+        cameras = [at_most(saved.camera, _SMALL) for saved in self.cameras]
+        return DepthScale.of(self.painter, cameras) if cameras else DepthScale(0.0, 10.0)
 
 
 class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no types
@@ -144,7 +144,7 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
             with server.gui.add_folder("Training", order=-1):
                 iteration = server.gui.add_number("Iteration", 0, disabled=True)
                 self._training = {"iteration": iteration, "pause": server.gui.add_checkbox("Pause", False)}
-        self._told = 0.0
+        self._shown_at = 0.0
         self._add_cameras()
 
     @property
@@ -153,21 +153,21 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def view(self) -> View:
-        """What the panel asks for now."""
+        """The choices of the panel now."""
         h = self._switches
         look = Look(sh=h["sh"].value, detail=h["detail"].value, filter_3d=h["filter_3d"].value, mip=h["mip"].value)
         return View(h["show"].value, look, h["grid"].value)
 
     @property
     def paused(self) -> bool:
-        """Whether the run that trains is to wait."""
+        """Whether the button pauses the run that trains."""
         return self._training is not None and bool(self._training["pause"].value)
 
-    def tell(self, iteration: int) -> None:
+    def show_progress(self, iteration: int) -> None:
         """Show the iteration, and draw the field as it is now; at most once in `_EVERY` seconds."""
-        if self._training is None or time.monotonic() - self._told < _EVERY:
+        if self._training is None or time.monotonic() - self._shown_at < _EVERY:
             return
-        self._told = time.monotonic()
+        self._shown_at = time.monotonic()
         self._training["iteration"].value = iteration
         for number, client in self.server.get_clients().items():
             if (renderer := self._renderers.get(number)) is not None:

@@ -26,7 +26,7 @@ Frame = UInt8[np.ndarray, "_ _ 3"]
 
 
 def missing() -> str | None:
-    """What is not installed that videos need, with the remedy; None where nothing is."""
+    """Why no video can be written, with the remedy; None where imageio-ffmpeg is installed."""
     return None if find_spec("imageio_ffmpeg") is not None else "videos need imageio-ffmpeg: pip install imageio-ffmpeg"
 
 
@@ -39,8 +39,8 @@ def write_videos(paths: Iterable[Path], frames: Iterable[Frame], *, fps: float) 
     Raises:
         SettingError: imageio-ffmpeg is not installed, a suffix is another one, or there is no frame.
     """
-    if (lack := missing()) is not None:
-        raise SettingError(f"{lack}.")
+    if (problem := missing()) is not None:
+        raise SettingError(f"{problem}.")
     with ExitStack() as stack:
         sends: list[Callable[[Any], Any]] = []
         for frame in frames:
