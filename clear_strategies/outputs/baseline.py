@@ -1,4 +1,4 @@
-"""The baseline that trained beside a run (`fit.baseline`), as its folder shows it."""
+"""The baseline that trained beside a run (`fit.baseline`), read from its folder."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from clear_strategies.outputs import metrics
 from clear_strategies.outputs.image_scores import ImageScores
 
 FOLDER: Final = "baseline"
-"""Its name, in the folder of the run that it trained beside."""
-_STRATEGIES: Final = ("strategy=", "strategies.")  # how the overrides begin that a baseline does not have
+"""Its name in the folder of the run."""
 _TRAIN_AGAIN: Final = "remove this baseline's metrics.json: it is then trained again"
 
 
 def overrides_of(run: Iterable[str]) -> list[str]:
-    """The overrides of the baseline beside a run with these: all but those of its strategies."""
-    return [override for override in run if not override.lstrip("+~").startswith(_STRATEGIES)]
+    """The overrides of the baseline beside a run with these overrides: all but those of its strategies."""
+    return [override for override in run if not override.lstrip("+~").startswith(("strategy=", "strategies."))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +27,7 @@ class Baseline:
     """A finished baseline.
 
     Args:
-        means: part ("test", "train") -> mean scores of its renders; a part without views is not there.
+        means: part ("test", "train") -> mean scores of its renders; a part without views is missing.
         views: test view -> scores of its render.
         seconds: of training.
     """
@@ -43,13 +42,13 @@ class Baseline:
         """Read a run's folder.
 
         Raises:
-            DataError: metrics.json is not there or damaged, or a render of a test view is not there.
+            DataError: metrics.json is missing or damaged, or the render of a test view is missing.
         """
         path = folder / "metrics.json"
         content = metrics.read(path, _TRAIN_AGAIN)
         parts = {"test": content.test, "train": content.train}
         try:
-            found = cls(
+            baseline = cls(
                 folder=folder,
                 means={name: part.mean["ours"].numbers for name, part in parts.items() if part.mean},
                 views={view: row["ours"].numbers for view, row in content.test.views.items()},
@@ -57,16 +56,16 @@ class Baseline:
             )
         except KeyError as error:
             raise DataError(path, str(error), "is missing", _TRAIN_AGAIN) from error
-        for view in found.views:
-            if not found.render_of(view).is_file():
-                raise DataError(found.render_of(view), "file", "is not there", _TRAIN_AGAIN)
-        return found
+        for render in map(baseline.render_of, baseline.views):
+            if not render.is_file():
+                raise DataError(render, "file", "is not there", _TRAIN_AGAIN)
+        return baseline
 
     def render_of(self, view: str) -> Path:
         """The file of its render of a test view."""
         return self.folder / "renders" / f"{file_stem(view)}.png"
 
     def to_json(self) -> dict[str, Any]:
-        """What metrics.json of the run holds of it."""
+        """Its entry in metrics.json of the run."""
         means = {part: asdict(mean) for part, mean in self.means.items()}
         return {"folder": self.folder.name, "seconds": self.seconds, **means}

@@ -61,15 +61,15 @@ def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: 
     for j, row in enumerate(rows):
         y = top + j * (cell_h + 2 * LINE + GAP)
         page.text(LINE, y + cell_h / 2, row.name, rotation=90, ha="center", va="center", color=FAINT)
-        shown = {name: _pixels(image) for name, image in row.images.items()}
+        pixels = {name: _pixels(image) for name, image in row.images.items()}
         if row.truth is not None:
-            shown["ground truth"] = _pixels(row.truth)
-            shown["error of ours"] = error_map(shown["ours"], shown["ground truth"])
+            pixels["ground truth"] = _pixels(row.truth)
+            pixels["error of ours"] = error_map(pixels["ours"], pixels["ground truth"])
         for i, column in enumerate(columns):
             x = left + i * (cell_w + GAP)
-            if column in shown:
-                drawn = page.image(x, y, shown[column], times)
-                error = drawn if column == "error of ours" else error
+            if column in pixels:
+                image = page.image(x, y, pixels[column], times)
+                error = image if column == "error of ours" else error
             if column in row.captions:
                 page.text(x + cell_w / 2, y + cell_h + LINE, row.captions[column], ha="center")
     page.text(left, page.height - LINE, note, color=FAINT)

@@ -29,7 +29,7 @@ _TITLE, _BAR = 3 * LINE, 5 * LINE  # px: the height above an image, the width be
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Panel:
-    """An image under its title; numbers have a colour bar from `span[0]` to `span[1]`."""
+    """An image below its title; an image of numbers has a colour bar from `span[0]` to `span[1]`."""
 
     title: str
     image: Float[Tensor, "H W"] | Float[Tensor, "H W 3"]
@@ -56,18 +56,18 @@ def write_maps_picture(
     _write(path, title, panels, view.hr.camera.width, last_bar="0: none or never, 1: all or always")
 
 
-def write_depth(path: Path, photo: Photo, found: DepthMap, title: str) -> None:
+def write_depth(path: Path, photo: Photo, stereo: DepthMap, title: str) -> None:
     """Draw photo, depth and confidence side by side, each with its legend; grey is unknown.
 
     Args:
-        photo: the view at LR. found: on its pixel grid.
+        photo: the view at LR. stereo: on its pixel grid.
     """
-    depth, confidence = (x.where(found.known, torch.nan) for x in (found.depth, found.confidence))
+    depth, confidence = (x.where(stereo.known, torch.nan) for x in (stereo.depth, stereo.confidence))
     scale = DepthScale.spanning(depth)
     panels = [
         _Panel("LR photo", photo.image),
         _Panel(
-            f"depth, world units; known at {found.coverage:.0%}, grey elsewhere",
+            f"depth, world units; known at {stereo.coverage:.0%}, grey elsewhere",
             depth,
             "viridis_r",
             (scale.near, scale.far),

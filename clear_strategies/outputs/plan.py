@@ -1,4 +1,4 @@
-"""The plan: what a run prints before it trains, and what it remarks on its strategies at the end."""
+"""The plan that a run prints before it trains, and its remarks on the strategies at the end."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clear_strategies.training.state import TrainState
 
 _log = logging.getLogger(__name__)
 
-# What a user decides on, or wants to know before waiting for the result. The rest is for `-v` and run.log.
+# The facts on the console; the others are for `-v` and run.log.
 _SHORT: Final[Sequence[str]] = (
     "scene", "poses", "HR side", "train views", "test views", "not used", "LR", "HR", "the SR images add", "initial points",
     "method", "strategies", "rasterizer", "memory", "time", "iterations", "skipped",
@@ -27,11 +27,12 @@ _SHORT: Final[Sequence[str]] = (
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """What the command line chose, by name.
+    """The choices of the command line.
 
     Args:
         method: a published baseline (`+method=`).
-        overrides: all that was chosen, as it was written; None: unknown.
+        strategies: their names.
+        overrides: all of them, as written; None: unknown.
     """
 
     method: str | None
@@ -45,7 +46,7 @@ class Chosen:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A line for each fact; `short` has those that a user decides on, or wants to know before the result is there."""
+    """A line for each fact: `short` for the console, `details` for `-v` and run.log."""
 
     short: str
     details: str
@@ -55,30 +56,28 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[s
     """The plan: the data, the strategies, the milestones and what is skipped. Strategies without effect give a warning.
 
     Args:
-        machine: what computes, label -> fact: the rasterizer, the threads, the memory.
+        machine: label -> fact: the rasterizer, the threads, the memory.
     """
     settings, conductor = state.settings, state.conductor
-    strategies = ", ".join(
-        f"{name} ({type(s).__name__})" for name, s in zip(chosen.strategies, conductor.strategies, strict=True)
-    )
+    named = list(zip(chosen.strategies, conductor.strategies, strict=True))
+    strategies = ", ".join(f"{name} ({type(s).__name__})" for name, s in named)
     lines = {
         **scene.notes,
         **({} if chosen.method is None else {"method": f"{chosen.method}; strategies named before it take no part"}),
         "strategies": strategies or ("none (the paper's baseline)" if chosen.method is None else "none"),
-        "device": _named(state.device),
+        "device": _device_name(state.device),
         **machine,
         "per-Gaussian pass": "readable" if state.compiled_step is None else "compiled",
         "iterations": f"{settings.iterations}, seed {settings.seed}",
         "milestones": ", ".join(f"{name} {t}" for name, t in marks(state).items()),
     }
-    for s in conductor.strategies:
-        if found := milestones(s):
-            lines[f"milestones of {type(s).__name__}"] = ", ".join(f"{name} {t}" for name, t in found.items())
-    if found := milestones(state.density.settings):
-        lines[f"milestones of {state.density.name}"] = ", ".join(f"{name} {t}" for name, t in found.items())
-    for name, s in zip(chosen.strategies, conductor.strategies, strict=True):
-        if (prepared := s.summary()) is not None:
-            lines[name.replace("_", " ")] = prepared
+    owners = [(type(s).__name__, milestones(s)) for s in conductor.strategies]
+    for owner, its in (*owners, (state.density.name, milestones(state.density.settings))):
+        if its:
+            lines[f"milestones of {owner}"] = ", ".join(f"{name} {t}" for name, t in its.items())
+    for name, s in named:
+        if (summary := s.summary()) is not None:
+            lines[name.replace("_", " ")] = summary
     lines["skipped"] = "; ".join(_skipped(state)) or "nothing"
     _warn_of_idle_strategies(conductor, settings.iterations)
     short = {label: lines[label] for label in _SHORT if label in lines}
@@ -121,11 +120,12 @@ def _warn_of_idle_strategies(conductor: Conductor, iterations: int) -> None:
             _log.warning("%s has no effect: %s.", type(s).__name__, why)
 
 
-def _named(device: torch.device) -> str:
+def _device_name(device: torch.device) -> str:
     return f"{device.type}, {torch.cuda.get_device_name(device)}" if device.type == "cuda" else device.type
 
 
 def marks(state: TrainState) -> dict[str, int]:
+    """The iterations that curves.png marks, by name."""
     hr = state.conductor.objective.lambda_hr
     at = {"HR from": hr.start, "HR full": hr.full, **state.density.marks}
     if hr.final != hr.peak:
@@ -136,12 +136,11 @@ def marks(state: TrainState) -> dict[str, int]:
 
 
 def remarks(state: TrainState) -> list[str]:
-    """What each strategy says of the means of the run's history; see `Strategy.in_hindsight`."""
+    """`Strategy.in_hindsight` of each strategy, given the means of the run's history."""
     columns: defaultdict[str, list[float]] = defaultdict(list)
     for row in state.history_as_floats():
         for name, value in row.items():
             if not math.isnan(value):
                 columns[name].append(value)
     means = {name: sum(values) / len(values) for name, values in columns.items()}
-    said = (strategy.in_hindsight(means) for strategy in state.conductor.strategies)
-    return [remark for remark in said if remark is not None]
+    return [remark for s in state.conductor.strategies if (remark := s.in_hindsight(means)) is not None]

@@ -19,16 +19,16 @@ _READ_EVERY: Final = 0.25  # seconds; reading the history's numbers waits for th
 def progress_bar(
     state: TrainState, after_step: Callable[[], None] | None = None, name: str | None = None, *, shown: bool = True
 ) -> Iterator[Progress]:
-    """A bar with loss, PSNR, number of Gaussians, conflict ratio and remaining time.
+    """A bar with loss, PSNR, number of Gaussians, conflict ratio and remaining time. Yields the function that advances it.
 
     Args:
         after_step: called after each iteration.
-        name: of what trains, before the bar.
+        name: of the training, in front of the bar.
         shown: False where several jobs share the terminal.
     """
     from tqdm import tqdm
 
-    beside: dict[str, str] = {}
+    numbers: dict[str, str] = {}
     redraw_every = 0.5 if sys.stderr.isatty() else 15  # seconds; a log file needs no animation
     total, done = state.settings.iterations, state.t - 1
     with tqdm(
@@ -38,13 +38,13 @@ def progress_bar(
 
         def show(row: Mapping[str, float]) -> None:
             λ_lr, λ_hr = state.conductor.objective.lambda_lr, row["lambda_hr"]
-            beside["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
-            beside["N"] = f"{int(row['n_gaussians']):,}"
+            numbers["loss"] = f"{λ_lr * row['loss_lr'] + λ_hr * row.get('loss_base', 0.0):.4f}"
+            numbers["N"] = f"{int(row['n_gaussians']):,}"
             if not math.isnan(row.get("conflict", math.nan)):
-                beside["conflict"] = f"{row['conflict']:.2f}"
+                numbers["conflict"] = f"{row['conflict']:.2f}"
             if "psnr_test" in row:
-                beside["psnr"] = f"{row['psnr_test']:.2f} dB"
-            bar.set_postfix(beside, refresh=False)
+                numbers["psnr"] = f"{row['psnr_test']:.2f} dB"
+            bar.set_postfix(numbers, refresh=False)
 
         def update(state: TrainState) -> None:
             nonlocal last_read

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import operator
 import shlex
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from dataclasses import astuple
 from pathlib import Path
 from typing import Final
 
@@ -21,27 +22,31 @@ _LEGEND: Final = (
 
 def describe(folder: Path, evaluation: Evaluation, seconds: float, baseline: Baseline | None = None) -> str:
     """The mean scores of the test and training views: of the run, of what it is compared with, and the difference."""
-    beside = "" if baseline is None else f" (the baseline in {baseline.seconds:.0f} s)"
+    folder, of_baseline = _relative(folder), "" if baseline is None else f" (the baseline in {baseline.seconds:.0f} s)"
     rows = [(part, *row) for part in ("test", "train") for row in _rows(part, evaluation, baseline)]
     width = max((len(image) for _, image, _ in rows), default=0)
-    lines = [f"  {part:<5}  {image:<{width}}  {numbers}" for part, image, numbers in rows]
-    note = f"  {NOTE}." if any(image in ("bicubic", "prior") for _, image, _ in rows) else ""
-    unknown = [part for part in ("test", "train") if evaluation.against_lr(part)]
-    reduced = (
-        f"  {' and '.join(unknown)}: nobody knows the HR photos, so reduced images are compared with the LR photos."
-    )
-    notes = filter(None, [_LEGEND if lines else "", note, reduced if unknown else ""])
-    return "\n".join([f"done in {seconds:.0f} s{beside}: {_near(folder)}", *lines, *notes, _look_next(_near(folder))])
+    lines = [f"done in {seconds:.0f} s{of_baseline}: {folder}"]
+    lines += [f"  {part:<5}  {image:<{width}}  {numbers}" for part, image, numbers in rows]
+    if rows:
+        lines.append(_LEGEND)
+    if any(image in ("bicubic", "prior") for _, image, _ in rows):
+        lines.append(f"  {NOTE}.")
+    if unknown := " and ".join(part for part in ("test", "train") if evaluation.against_lr(part)):
+        lines.append(f"  {unknown}: the HR photos are unknown, so reduced images are compared with the LR photos.")
+    page = f"{folder / 'splat.html'} in a browser, " if (folder / "splat.html").exists() else ""
+    look = f"{page}{folder / 'contact_sheet.png'}, or clear-strategies view {shlex.quote(str(folder))}"
+    return "\n".join([*lines, f"  look next: {look}"])
 
 
 def describe_baseline(baseline: Baseline) -> str:
-    return f"the baseline: {_in_short(baseline.seconds, baseline.means)}: {_near(baseline.folder)}"
+    """One line."""
+    return f"the baseline: {_in_short(baseline.seconds, baseline.means)}: {_relative(baseline.folder)}"
 
 
 def describe_job(number: int, folder: Path, evaluation: Evaluation, seconds: float) -> str:
     """One line, of a job among many."""
     means = {part: mean for part in ("test", "train") if (mean := evaluation.mean(part)) is not None}
-    return f"job {number}: {_in_short(seconds, means)}: {_near(folder)}"
+    return f"job {number}: {_in_short(seconds, means)}: {_relative(folder)}"
 
 
 def _in_short(seconds: float, means: Mapping[str, ImageScores]) -> str:
@@ -49,29 +54,22 @@ def _in_short(seconds: float, means: Mapping[str, ImageScores]) -> str:
     return f"done in {seconds:.0f} s" + ("" if part is None else f", {part} views {means[part].psnr:.2f} dB")
 
 
-def _near(folder: Path) -> Path:
-    """The folder as it is called from here."""
-    here = Path.cwd()
-    return folder.relative_to(here) if here in folder.parents else folder
-
-
-def _look_next(folder: Path) -> str:
-    pages = [f"{page} in a browser" for page in (folder / "splat.html",) if page.exists()]
-    shown = ", ".join([*pages, str(folder / "contact_sheet.png")])
-    return f"  look next: {shown}, or clear-strategies view {shlex.quote(str(folder))}"
+def _relative(folder: Path) -> Path:
+    """Relative to the working directory, where the folder lies in it."""
+    return folder.relative_to(Path.cwd()) if Path.cwd() in folder.parents else folder
 
 
 def _rows(part: str, evaluation: Evaluation, baseline: Baseline | None) -> Iterator[tuple[str, str]]:
-    ours, theirs = evaluation.mean(part), None if baseline is None else baseline.means.get(part)
-    if theirs is not None:
-        yield "baseline", _numbers(theirs)
+    ours, base = evaluation.mean(part), None if baseline is None else baseline.means.get(part)
+    if base is not None:
+        yield "baseline", _numbers(base)
     if ours is not None:
         yield "ours", _numbers(ours)
-    if ours is not None and theirs is not None:
-        difference = (getattr(ours, f.name) - getattr(theirs, f.name) for f in fields(ImageScores))
+    if ours is not None and base is not None:
+        difference = map(operator.sub, astuple(ours), astuple(base))
         yield OURS_MINUS_BASELINE, _numbers(ImageScores(*difference), "+")
     if evaluation.against_lr(part):
-        return  # they are made from the very photos that they would be compared with
+        return  # bicubic and prior are made from the photos that they would be compared with
     for image in ("bicubic", "prior"):
         if (mean := evaluation.mean(part, image)) is not None:
             yield image, _numbers(mean)

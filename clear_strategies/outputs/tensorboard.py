@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
 FOLDER: Final = "tensorboard"
-_EVERY: Final = 50  # iterations between two looks at the history: reading its numbers waits for the device
+_EVERY: Final = 50  # iterations between two reads of the history, which wait for the device
 _LONGEST: Final = 960  # px, of a picture
 
-# Columns of the history by the beginning of their names; what begins with none of these is a number of a strategy.
+# Prefix of a column of the history -> group of charts. Other columns are numbers of a strategy.
 _GROUPS: Final = {
     "loss_": "loss/", "psnr_": "psnr/", "conflict": "conflict/", "corrected": "corrected/", "n_gaussians": "field/",
     "detail_abs": "field/", "lambda_hr": "schedule/", "seconds": "schedule/", "processor_seconds": "schedule/",
@@ -38,9 +38,9 @@ def require_tensorboard() -> None:
 
 @contextmanager
 def logged(folder: Path, state: TrainState, scene: Scene, painter: Painter) -> Iterator[Callable[[], None]]:
-    """A log in a run's folder. Yields what to call after each iteration; the last numbers are written at the end.
+    """A log in a run's folder. Yields a function to call after each iteration; the last numbers are written at the end.
 
-    A run that is resumed goes on in the same log: what its predecessor wrote beyond the checkpoint is hidden.
+    A resumed run continues the log; entries beyond its checkpoint are hidden.
     """
     from torch.utils.tensorboard import SummaryWriter
 
@@ -53,7 +53,7 @@ def logged(folder: Path, state: TrainState, scene: Scene, painter: Painter) -> I
 
 
 class _Log:
-    """Writes the rows of the history that it has not written."""
+    """Writes the rows of the history as they come, and a picture now and then."""
 
     def __init__(self, writer: SummaryWriter, state: TrainState, scene: Scene, painter: Painter) -> None:
         self._writer, self._state, self._painter = writer, state, painter
@@ -95,8 +95,8 @@ class _Log:
 
 
 def _tag(column: str) -> str:
-    """The name of a column in TensorBoard, whose charts are grouped by what precedes the slash."""
-    for beginning, group in _GROUPS.items():
-        if column.startswith(beginning):
-            return group + (column.removeprefix(beginning).strip("_") or beginning)
+    """The name of a column in TensorBoard, which groups charts by the part before the slash."""
+    for prefix, group in _GROUPS.items():
+        if column.startswith(prefix):
+            return group + (column.removeprefix(prefix).strip("_") or prefix)
     return f"strategies/{column}"

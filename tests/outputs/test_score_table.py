@@ -57,7 +57,7 @@ def test_an_sr_image_is_not_compared_with_the_photo_that_it_is_made_of() -> None
     words = [line.split() for line in text.splitlines()]
     assert [image for part, image, *_ in words if part == "train"] == ["ours"]
     assert NOTE not in text
-    assert "nobody knows the HR photos" in text
+    assert "the HR photos are unknown" in text
 
 
 @pytest.mark.parametrize(("means", "said"), [({"test": THEIRS}, ", test views 23.09 dB"), ({}, "")])
