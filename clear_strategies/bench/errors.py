@@ -36,7 +36,7 @@ from clear_strategies.outputs import metrics
 from clear_strategies.outputs.figures import ERROR_MAX, error_map, spaced
 
 _SOLID: Final = 0.9  # alpha below it counts as a hole
-_OUTSIDE: Final = 0.25  # a camera is outside of others that are further away than this, see `distance_from_hull`
+_OUTSIDE: Final = 0.25  # a camera farther than this from the training cameras is outside, see `distance_from_hull`
 _SEEN_BY: Final = ("no training view", "one", "several")
 _STEEPEST: Final = 0.2  # the share of a photo's pixels that are its edges
 _PICTURED: Final = 3  # test views, from the worst to the best
@@ -50,7 +50,7 @@ class HeldOut:
 
     Args:
         images: renders in [0, 1] by the name of their run.
-        seen: how many training views see what the pixel shows.
+        seen: the number of training views that see the surface at each pixel.
         distance: from the hull of the training cameras.
         factor: pixels per LR pixel.
     """
@@ -67,7 +67,8 @@ class HeldOut:
 def measure(results: Results, *, run: Path, reference: Path | None = None) -> None:
     """Fill `results` with the parts of the error, the views, and a picture of some of them.
 
-    `reference` is another run of the same test views; what is seen by how many views is that of `run`.
+    Args:
+        reference: another run of the same test views. How many views see a surface is measured in `run` alone.
 
     Raises:
         DataError: a folder holds no finished run, it has no test views, or its data are not there.
@@ -104,7 +105,7 @@ def measure(results: Results, *, run: Path, reference: Path | None = None) -> No
 
 
 def _settings(run: Path) -> JobSettings:
-    """The settings that a run was made with, of its metrics.json."""
+    """The settings of a run, from its metrics.json."""
     nested: dict[str, Any] = {}
     for key, value in metrics.read(run / "metrics.json", "give the folder of a finished run").config.items():
         *above, name = key.split(".")
@@ -145,7 +146,7 @@ def waves(error: Float[Tensor, "H W 3"], factor: int) -> dict[str, float]:
 
 
 def parts(view: HeldOut) -> Iterator[dict[str, object]]:
-    """Of one view and each of its runs, the pixels and the squared error of every part of every group."""
+    """The pixels and the squared error of every part of every group, for each run of a view."""
     down, right = torch.gradient(view.truth.mean(dim=2))
     steepness = torch.hypot(down, right).double()
     edge = steepness > torch.quantile(steepness.flatten()[:: max(1, steepness.numel() >> 20)], 1 - _STEEPEST)
@@ -169,7 +170,7 @@ def parts(view: HeldOut) -> Iterator[dict[str, object]]:
 
 
 def budget(views: Sequence[HeldOut]) -> pd.DataFrame:
-    """Of all views together, a row for each part of each group.
+    """A row for each part of each group, over all views.
 
     Returns:
         group, part; pixels: their share; of each run: its share of the squared error, its PSNR there, and what the PSNR of all
@@ -181,13 +182,13 @@ def budget(views: Sequence[HeldOut]) -> pd.DataFrame:
     for run, of_run in rows.groupby("run", sort=False):
         table = of_run.groupby(["group", "part"], sort=False)[["pixels", "error"]].sum()
         total = table.loc[("all", "all pixels"), "error"]
-        found = {
+        measures = {
             "share": table["error"] / total,
             "psnr": _psnr(table["error"], table["pixels"]),
             "if perfect": _psnr(total - table["error"], everything),
         }
         columns = columns or [table["pixels"] / everything]
-        columns.append(pd.DataFrame(found).add_prefix(f"{run}: "))
+        columns.append(pd.DataFrame(measures).add_prefix(f"{run}: "))
     return pd.concat(columns, axis=1).reset_index()
 
 

@@ -1,8 +1,8 @@
 """Time and error of one training iteration of CLEAR, stage by stage, and the time without L_HF and without HR.
 
-The truth is the same iteration in float64 by the readable path, at the same cut-offs, whose stages get what the measured ones
-were given. Compared is what a stage hands on: images, their cotangents, the gradients of the Gaussians, and the merged gradient,
-as Adam's first moment holds it after a step.
+The truth is the same iteration in float64 by the readable path, at the same cut-offs; each of its stages gets the inputs of the
+measured stage. The outputs of the stages are compared: images, their cotangents, the gradients of the Gaussians, and the merged
+gradient, as Adam's first moment holds it after a step.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ _PRESET: Final = "fast"
 _NOISE: Final = 0.02  # standard deviation in the photos
 
 
-Stages = dict[str, dict[str, Tensor]]
-"""What the stages of an iteration hand on, by the stage and by name."""
+Outputs = dict[str, dict[str, Tensor]]
+"""Stage of an iteration -> name -> tensor."""
 
 
 class Training:
@@ -134,33 +134,33 @@ def errors(workload: Workload, view: View, rasterizer: Rasterizer) -> dict[str, 
     """The largest relative L2 error of a stage's images, or of the attributes of its gradients."""
     truth, wide = in_float64(truth_backend(), workload, PRESETS[_PRESET])
     lr, hr = (replace(photo, image=photo.image.to(wide.splats.means)) for photo in (view.lr, view.hr))
-    found = _handed_on(workload, view, rasterizer, "auto")
-    expected = _handed_on(wide, replace(view, lr=lr, hr=hr), truth, "off", given=found)
+    measured = _outputs(workload, view, rasterizer, "auto")
+    expected = _outputs(wide, replace(view, lr=lr, hr=hr), truth, "off", given=measured)
     return {
         # The basis is no gradient, and has any value where a Gaussian is not seen.
         stage: max(relative(x, expected[stage][name]) for name, x in tensors.items() if name != "basis")
-        for stage, tensors in found.items()
+        for stage, tensors in measured.items()
     }
 
 
-def _handed_on(
-    workload: Workload, view: View, rasterizer: Rasterizer, fused: FusedMode, given: Stages | None = None
-) -> Stages:
-    """What the stages of an iteration hand on. Nothing is dropped: a device draws masks of its own.
+def _outputs(
+    workload: Workload, view: View, rasterizer: Rasterizer, fused: FusedMode, given: Outputs | None = None
+) -> Outputs:
+    """The outputs of the stages of an iteration without dropout, whose masks differ between devices.
 
     Args:
-        given: what those of another iteration handed on; each stage gets it in place of what this one makes.
+        given: the outputs of another iteration; each stage gets them as inputs in place of this iteration's own.
     """
-    seen: Stages = {"render": {}}
+    outputs: Outputs = {"render": {}}
 
     def watched(r: Rendering, scale: str) -> Any:
-        seen["render"][scale] = r.image
+        outputs["render"][scale] = r.image
         image = r.image if given is None else given["render"][scale].to(r.image)
 
         def vjp(cotangents: Tensor) -> SplatGradients:
-            seen[f"losses {scale}"] = {"cotangents": cotangents.clone()}
+            outputs[f"losses {scale}"] = {"cotangents": cotangents.clone()}
             g = r.vjp(cotangents if given is None else given[f"losses {scale}"]["cotangents"].to(image))
-            seen[f"backward {scale}"] = {f.name: getattr(g, f.name).clone() for f in fields(g)}
+            outputs[f"backward {scale}"] = {f.name: getattr(g, f.name).clone() for f in fields(g)}
             if given is None:
                 return g
             return SplatGradients(**{name: x.to(image) for name, x in given[f"backward {scale}"].items()})
@@ -174,7 +174,7 @@ def _handed_on(
     watching = _Rasterizer(traits=rasterizer.traits, render_scales=render_scales)
     state = Training(workload, view, watching, Objective(), dropout=False, fused=fused).state
     iterate(state, watching)
-    return seen | dict.fromkeys(("per-Gaussian pass", "optimizer"), state.optimizer.first)
+    return outputs | dict.fromkeys(("per-Gaussian pass", "optimizer"), state.optimizer.first)
 
 
 class _Rasterizer(SimpleNamespace):

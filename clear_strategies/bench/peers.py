@@ -30,7 +30,7 @@ class Peer:
     """A rasterizer of another project.
 
     Args:
-        differences: what it computes and ours does not, and the other way round.
+        differences: between what it computes and what our rasterizers compute.
         rules: its settings where they differ from `scenes.SETTINGS`.
     """
 
@@ -40,8 +40,8 @@ class Peer:
     rules: Mapping[str, Any] = field(default_factory=dict)
 
 
-def found(note: Callable[[str], None]) -> list[Peer]:
-    """The peers that draw on this GPU, each tried on a tiny scene; the others are noted."""
+def available(note: Callable[[str], None]) -> list[Peer]:
+    """The peers that draw a tiny scene on this GPU; `note` gets why the others do not."""
     peers: list[Peer] = []
     for name in ("gsplat", "gswarp"):
         try:

@@ -69,7 +69,7 @@ def measure(
     require_device(device)
     backends, truth = usable(backend, device, results.note), accuracy.truth_backend()
     workloads = [scenes.load(name).to(device) for name in scene]
-    others = peers.found(results.note) if device == "cuda" and peers.PRESET in preset else []
+    others = peers.available(results.note) if device == "cuda" and peers.PRESET in preset else []
     times, errors, turns = list[dict[str, Any]](), list[dict[str, Any]](), list[pd.DataFrame]()
     for workload in workloads:
         results.log(f"{workload.name}: {len(workload.splats):,} Gaussians")
@@ -110,7 +110,7 @@ def require_device(device: str) -> None:
 
 
 def usable(asked: Sequence[str], device: str, note: Callable[[str], None]) -> list[str]:
-    """The backends that run here, of those asked for; a DataError where a name is unknown, or none runs."""
+    """The backends that run on the device, of those in `asked`, or of all. A DataError where a name is unknown, or none runs."""
     reasons = rasterizers.available()
     for name in asked:
         if name not in reasons:
@@ -124,10 +124,10 @@ def usable(asked: Sequence[str], device: str, note: Callable[[str], None]) -> li
             reasons[name] = f"it does not run on {device}"
         if reasons[name] is not None:
             note(f"{name}: {reasons[name]}")
-    found = [name for name in dict.fromkeys(asked or reasons) if reasons[name] is None]
-    if not found:
+    names = [name for name in dict.fromkeys(asked or reasons) if reasons[name] is None]
+    if not names:
         raise DataError("--backend", ", ".join(asked), "cannot run here", "see the lines above")
-    return found
+    return names
 
 
 def turn(contestant: Contestant, cotangents: Float[Tensor, "K H W 3"]) -> dict[str, float]:

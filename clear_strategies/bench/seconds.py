@@ -1,8 +1,8 @@
-"""Seconds until the picture is as good: when each variant first reaches the PSNR that the reference ends with.
+"""Seconds until a variant first reaches the PSNR that the reference ends with.
 
 A variant is a list of overrides, and the first is the reference. Each training is one process; the variants of a scene and a
 seed follow each other before the next seed, so that other work on the machine slows all of them alike. A finished training
-is kept. The test views are evaluated all along a run, all of them, and the training's clock stands still meanwhile.
+is kept. All test views are evaluated repeatedly during a training, whose clock stops meanwhile.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Row = dict[str, Any]
 
 
 def train(folder: Path, overrides: Sequence[str]) -> str | None:
-    """Train in a process of its own; returns the line that says why it failed, or None."""
+    """Train in a process of its own; returns the line of its output that explains a failure, else None."""
     program = [sys.executable, "-m", "clear_strategies.run", "fit.baseline=false"]
     child = subprocess.run(  # noqa: S603 - this interpreter
         [*program, *overrides, f"hydra.run.dir={quoted(str(folder.resolve()))}"],
@@ -57,7 +57,7 @@ def train(folder: Path, overrides: Sequence[str]) -> str | None:
     if child.returncode == 0:
         return None
     lines = [line for line in (child.stdout + child.stderr).splitlines() if line.strip()]
-    # Hydra's own errors name the problem first; the run and Python name it last.
+    # Hydra's errors name the problem in the first line; those of a run and of Python in the last.
     of_hydra = [line for line in lines if line.startswith(("In '", "Could not", "Error"))]
     return (of_hydra or lines[-1:] or [f"its process ended with code {child.returncode}"])[0].strip()
 
@@ -71,7 +71,7 @@ def measure(
     seeds: Sequence[int],
     probes: int,
 ) -> None:
-    """Train what is not finished yet, and say when each variant reached the reference.
+    """Train what is not finished yet, and compare when each variant reached the reference.
 
     Args:
         overrides: of all trainings; those of a variant win over them.
@@ -85,17 +85,19 @@ def measure(
     shared = [*overrides, *_COMMON, f"fit.probe_every={REFERENCE_ITERATIONS // probes}"]
     rows, curves = list[Row](), list[Row]()
     for seed, name in itertools.product(seeds, scene or [""]):
-        own = [f"fit.seed={seed}", f"fit.threads={torch.get_num_threads()}"]
+        common = [*([f"+scene={name}"] if name else []), *shared, f"fit.seed={seed}"]
+        common.append(f"fit.threads={torch.get_num_threads()}")
         target: float | None = None
         for variant in variants:
-            chosen = [*([f"+scene={name}"] if name else []), *shared, *own, *variant]
-            says = f"{name or 'run'}, {name_of(variant)}, seed {seed}"
-            folder = (results.out or Path()) / _name(says, chosen)
+            chosen, label = [*common, *variant], f"{name or 'run'}, {name_of(variant)}, seed {seed}"
+            # The folder's name ends in a hash of the overrides.
+            digest = hashlib.sha256("\n".join(chosen).encode()).hexdigest()[:10]
+            folder = (results.out or Path()) / (re.sub(r"\W+", "_", label)[:60] + f"_{digest}")
             try:
                 kept = _trained(folder, chosen)
                 row, curve = read(folder, target, variant=name_of(variant), seed=seed)
             except DataError as error:
-                results.note(f"{says}: {error}".replace(str(folder.resolve()), folder.name))
+                results.note(f"{label}: {error}".replace(str(folder.resolve()), folder.name))
                 if target is None:
                     break  # there is nothing to compare with
                 continue
@@ -103,7 +105,7 @@ def measure(
             rows.append(row)
             curves += curve
             took = f"{row['training_s']:.1f} s, of processors {row['training_processor_s']:.1f}{', kept' * kept}"
-            results.log(f"{says}: {row['psnr']:.2f} dB, {took}")
+            results.log(f"{label}: {row['psnr']:.2f} dB, {took}")
     if not rows:
         raise DataError("seconds", "trainings", "no reference finished", "see the lines above")
     table, probed = pd.DataFrame(rows), pd.DataFrame(curves)
@@ -155,14 +157,8 @@ def summary(trainings: pd.DataFrame) -> pd.DataFrame:
     return table.reset_index()
 
 
-def _name(says: str, overrides: Sequence[str]) -> str:
-    """The name of a training's folder ends in a hash of its overrides."""
-    digest = hashlib.sha256("\n".join(overrides).encode()).hexdigest()[:10]
-    return re.sub(r"\W+", "_", says)[:60] + f"_{digest}"
-
-
 def _trained(folder: Path, overrides: Sequence[str]) -> bool:
-    """Train into the folder, unless that is done; returns whether it was. A DataError says why it failed."""
+    """Train into the folder, unless that is done; returns whether it was. Raises a DataError where training fails."""
     if (folder / _COMMAND).is_file():  # written last
         return True
     before = _clocks()
@@ -173,16 +169,19 @@ def _trained(folder: Path, overrides: Sequence[str]) -> bool:
 
 
 def _clocks() -> dict[str, float]:
-    """The time now, and that of the processors in all processes that this one started and that ended."""
+    """Wall-clock time, and the processor time of all child processes that have ended, s."""
     times = os.times()
     return {WALL: time.perf_counter(), PROCESSOR: times.children_user + times.children_system}
 
 
 def read(folder: Path, target: float | None, **facts: Any) -> tuple[Row, list[Row]]:
-    """A finished training: its row in the table, and the PSNR of the test views all along.
+    """The row of a finished training in the table, and the PSNR of its test views at each evaluation.
 
-    `reached` is the iteration that first has the target, and its seconds; NaN: none has. The target is by default its own end.
-    The command's seconds are those without the evaluations on the way.
+    `reached` is the first iteration with at least the target PSNR, NaN where none has it; `reached_…` are the seconds until
+    then. The command's seconds leave out the evaluations.
+
+    Args:
+        target: dB; None: the training's own last PSNR.
     """
     metrics, command, rows = read_object(folder / "metrics.json"), read_object(folder / _COMMAND), history(folder)
     probes = [row for row in rows if "psnr_test" in row]

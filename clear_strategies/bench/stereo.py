@@ -1,7 +1,7 @@
-"""How right the depth of the training photos is, how much of them it covers, and how long it takes.
+"""Error, coverage and run time of the depth of the training photos.
 
-The reference is the capture's exact depth where it is known (the demo), or else the SfM points that a photo observes.
-These come from all photos, test views too; stereo does not see them.
+The reference is the capture's exact depth where it is known (the demo), else the SfM points that a photo observes. These come
+from all photos, test views too; stereo does not use them.
 """
 
 from __future__ import annotations
@@ -46,37 +46,39 @@ def measure(results: Results, *, overrides: Sequence[str]) -> None:
     triangulated = time.perf_counter()
     maps = depth_maps(photos, features.means, data.cloud.stereo, capture.background)
     end = time.perf_counter()
-    errors = [_errors(capture, *of_view) for of_view in zip(frames, photos, maps, strict=True)]
-    asked = sum(total for _, total in errors)
-    names, coverage = [Path(frame.name).stem for frame in frames], [m.coverage for m in maps]
-    found = [*errors, (torch.cat([error for error, _ in errors]), asked)]
-    of_views = zip([*names, "all"], [*coverage, sum(coverage) / len(maps)], found, strict=True)
-    results.tables["stereo"] = pd.DataFrame({"view": view, "coverage": c, **_shares(*e)} for view, c, e in of_views)
+    errors, rows, points = list[Tensor](), list[dict[str, str | float]](), 0
+    for frame, photo, depth in zip(frames, photos, maps, strict=True):
+        error, of_view = _errors(capture, frame, photo, depth)
+        rows.append({"view": Path(frame.name).stem, "coverage": depth.coverage, **_shares(error, of_view)})
+        errors.append(error)
+        points += of_view
+    mean_coverage = sum(depth.coverage for depth in maps) / len(maps)
+    rows.append({"view": "all", "coverage": mean_coverage, **_shares(torch.cat(errors), points)})
+    results.tables["stereo"] = pd.DataFrame(rows)
     size = f"{photos[0].camera.width}x{photos[0].camera.height}"
     results.note(
         f"{capture.name}, {len(photos)} photos, the first of {size}: depth in {end - triangulated:.1f} s after "
         f"{triangulated - start:.1f} s for {len(features)} triangulated points, {torch.get_num_threads()} threads."
     )
-    if asked == 0:
+    if points == 0:
         results.note("there is nothing to compare with: the scene has neither SfM points nor known depth.")
 
 
-def _shares(known: Float[Tensor, " K"], asked: int) -> dict[str, float]:
+def _shares(errors: Float[Tensor, " K"], points: int) -> dict[str, float]:
     """Reference points, the share of them where depth is known, and the shares of these within each relative error."""
-    within = {f"within {limit:.0%}": float((known <= limit).double().mean()) for limit in _CLOSE}
-    return {"points": float(asked), "known": len(known) / asked if asked else float("nan"), **within}
+    within = {f"within {limit:.0%}": float((errors <= limit).double().mean()) for limit in _CLOSE}
+    return {"points": float(points), "known": len(errors) / points if points else float("nan"), **within}
 
 
-def _errors(capture: Capture, frame: Frame, photo: Photo, found: DepthMap) -> tuple[Float[Tensor, " K"], int]:
+def _errors(capture: Capture, frame: Frame, photo: Photo, estimate: DepthMap) -> tuple[Float[Tensor, " K"], int]:
     """(|z / z_reference - 1| where the depth is known, the number of reference points)."""
     pixels, depth = _reference(capture, frame, photo)
-    estimated = found.depth.cpu().double()[pixels[:, 1], pixels[:, 0]]
-    error = (estimated / depth - 1).abs()
+    error = (estimate.depth.cpu().double()[pixels[:, 1], pixels[:, 0]] / depth - 1).abs()
     return error[error.isfinite()], len(depth)
 
 
 def _reference(capture: Capture, frame: Frame, photo: Photo) -> tuple[Int[Tensor, "N 2"], Float[Tensor, " N"]]:
-    """(columns and rows, depth) of what is known of this photo."""
+    """(columns and rows, depth) of the reference points of a photo."""
     if capture.depth is not None:
         exact = capture.depth(photo.camera).double()
         row, column = torch.nonzero(exact.isfinite(), as_tuple=True)

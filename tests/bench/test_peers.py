@@ -91,5 +91,5 @@ def test_missing_and_broken_peers_are_noted_in_a_line_each(monkeypatch):
 
     monkeypatch.setattr(metadata, "version", version)
     notes = []
-    assert peers.found(notes.append) == []
+    assert peers.available(notes.append) == []
     assert notes == ["gsplat: not installed (pip install gsplat).", "gswarp: cannot be used (no compiler)."]
