@@ -82,7 +82,8 @@ def write_coverage(folder: Path, scene: Scene, painter: Painter, title: str) -> 
         legend = {f"seen by {name}": _rgb(color) for name, color in zip(_SEEN, _COLORS, strict=True)}
         legend["the photos"] = _rgb(_CAMERA)
         colors = torch.from_numpy(_colored(coverage.times))
-        page.write_points_page(folder / PAGE, coverage.points, colors, cameras, title, legend)
+        with page.optional(PAGE):
+            page.write_points_page(folder / PAGE, coverage.points, colors, cameras, title, legend)
 
 
 def _rgb(color: str) -> page.RGB:

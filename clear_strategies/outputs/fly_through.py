@@ -61,10 +61,7 @@ def write_splat_page(
         _log.info("no %s is written: there are %s Gaussians, fit.page is %s.", page.FILE, f"{count:,}", f"{most:,}")
         return
     began, path = time.perf_counter(), folder / page.FILE
-    try:
+    with page.optional(page.FILE):
         page.write_page(path, painter.field.baked(), train, title, background)
-    except OSError as error:  # the rest of the run is worth more than its page
-        _log.warning("%s could not be written: %s.", page.FILE, error)
-        return
-    size, seconds = path.stat().st_size / 1e6, time.perf_counter() - began
-    _log.debug("%s: %.1f MB in %.1f s (fit.page=0 writes none).", page.FILE, size, seconds)
+        size, seconds = path.stat().st_size / 1e6, time.perf_counter() - began
+        _log.debug("%s: %.1f MB in %.1f s (fit.page=0 writes none).", page.FILE, size, seconds)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import html
 import io
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -26,6 +27,8 @@ from rasterizers.interface import Camera, Color, Splats
 
 if TYPE_CHECKING:
     import viser
+
+_log = logging.getLogger(__name__)
 
 FILE: Final = "splat.html"
 _DISTANCE: Final = 20.0  # of the first camera from the scene in the page: covariances are float16 there
@@ -54,6 +57,15 @@ class ShownCamera:
 def missing() -> str | None:
     """Why no page can be written, with the remedy; None where viser is installed."""
     return None if find_spec("viser") is not None else "viser is not installed: pip install 'clear-strategies[view]'"
+
+
+@contextlib.contextmanager
+def optional(name: str) -> Iterator[None]:
+    """Log a warning in place of an OSError: the other files of a run are worth more than its page of this name."""
+    try:
+        yield
+    except OSError as error:
+        _log.warning("%s could not be written: %s.", name, error)
 
 
 def write_page(path: Path, splats: Splats, cameras: Sequence[Camera], title: str, background: Color) -> None:

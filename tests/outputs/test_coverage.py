@@ -49,6 +49,17 @@ def test_dollars_in_names_are_no_mathematics(tmp_path: Path) -> None:
     assert (tmp_path / coverage.PICTURE).is_file()
 
 
+def test_a_page_that_cannot_be_written_does_not_stop_the_run(tmp_path, monkeypatch, caplog) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError("no loopback address")
+
+    monkeypatch.setattr(coverage.page, "missing", lambda: None)
+    monkeypatch.setattr(coverage.page, "write_points_page", refuse)
+    coverage.write_coverage(tmp_path, SCENE, wall.painter(), "toy")
+    assert "coverage.html could not be written: no loopback address." in caplog.text
+    assert (tmp_path / coverage.PICTURE).is_file()
+
+
 def test_points_have_the_colour_of_their_number_of_photos() -> None:
     colors = coverage._colored(torch.tensor([0, 1, 2, 3, 9]))
     assert (colors[3] == colors[4]).all()
