@@ -52,7 +52,7 @@ TRAIN_RENDERS: Final = 4  # training views whose renders are kept where there ar
 
 
 class Scores(msgspec.Struct):
-    """`ImageScores` as the file has them, where null stands for a number that was not finite."""
+    """`ImageScores` in the file; null stands for a number that was not finite."""
 
     psnr: float | None
     ssim: float | None
@@ -73,14 +73,14 @@ class Part(msgspec.Struct):
 
 
 class Provenance(msgspec.Struct):
-    """Of the facts about where the run was made, those that are read again."""
+    """The facts of `provenance` that are read again."""
 
     date: str = "an unknown date"
     plan: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 class Metrics(msgspec.Struct):
-    """What metrics.json of a finished run holds, for everybody who reads one."""
+    """The fields of metrics.json that are read again."""
 
     scene: str
     strategies: list[str]
@@ -94,7 +94,6 @@ class Metrics(msgspec.Struct):
     train: Part
     provenance: Provenance
     config: dict[str, Any] = msgspec.field(default_factory=dict)
-    method: str | None = None
     overrides: list[str] | None = None
 
     @property

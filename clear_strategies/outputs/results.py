@@ -55,7 +55,7 @@ _SHEET_VIEWS: Final = 4  # test views on the contact sheet, in views/ and in dep
 
 @dataclass(frozen=True, slots=True)
 class Pictures:
-    """What shows a run, besides its scores and the renders of its test views.
+    """The pictures of a run, besides the renders of its test views.
 
     Args:
         map_views: how many training views get maps, at most.
@@ -90,7 +90,7 @@ def write_results(
         scene: on the CPU, wherever the field is.
         down: D, by which the LR images were made.
         painter: of the state's field, for depth and video.
-        pictures: None writes none but the renders, which is all that another run's contact sheet needs.
+        pictures: None: none but the renders, which another run's contact sheet needs.
         antialiased: the rasterizer compensates opacities, see `RasterSettings`.
         baseline: the one that trained beside it.
     """
@@ -128,15 +128,15 @@ def remove_earlier(folder: Path, *, all_files: bool) -> None:
     """Remove metrics.json of an earlier run, because its presence says that a run is finished.
 
     Args:
-        all_files: also the other files of that run, which would pass as those of a run that starts anew. They are known by the
-            views of its metrics.json; files of others stay.
+        all_files: also the other files of that run, which would be taken for those of the new run. The views in its
+            metrics.json name them; all other files stay.
     """
     path = folder / _METRICS
     if not path.exists():
         return
     _log.warning("%s: of an earlier run; removed%s.", path, ", and the pictures and tables of that run" * all_files)
     stems: set[str] = set()
-    with suppress(DataError):
+    with suppress(DataError):  # damaged, or of another program
         content = metrics.read(path, "")
         stems = {file_stem(name) for part in (content.test, content.train) for name in part.views}
     path.unlink()

@@ -69,17 +69,16 @@ def write(runs: Sequence[Run], out: Path, *, paper: str | None = None, page_mb: 
     """Write the files of a report into `out`; returns the text of report.md.
 
     Args:
-        paper: the key in `PAPER` of the table to show beside ours.
+        paper: a key of `PAPER`, whose table stands beside ours.
         page_mb: size limit of report.html, 10⁶ bytes; the page shows fewer views where not all fit.
     """
     published = None if paper is None else PAPER[paper]
-
     rows = compare(runs)
 
-    def table(some: Sequence[Row], of: Sequence[Row] = rows) -> Table:
+    def table(shown: Sequence[Row], noted: Sequence[Row] = rows) -> Table:
         if published is None:
-            return layout(some)
-        return layout(some, beside=published.columns(some), notes=published.notes(of))
+            return layout(shown)
+        return layout(shown, beside=published.columns(shown), notes=published.notes(noted))
 
     text = table(rows).markdown
     files.write_text(out / "report.md", text)

@@ -220,8 +220,7 @@ function viewer(holder, number) {
     const caption = (layer) => [element("b", {}, layer.label), layer.note ? ` ${layer.note}` : ""];
     const both = [element("span", {}, ...caption(left)), element("span", {}, ...caption(right))];
     captions.replaceChildren(both[state.mode === 1 ? state.flipped : 0], scale.node, state.mode === 1 ? "" : both[1]);
-    const view = scene.views[state.view];
-    stage.show(view, state.mode === 2 ? 2 : 1);
+    stage.show(scene.views[state.view], state.mode === 2 ? 2 : 1);
   }
 
   function layerImage(i) {

@@ -77,7 +77,7 @@ class Images:
 
 
 def skipped_work(runs: Mapping[str, Run]) -> Columns:
-    """What each method skipped, why, and what that saved; empty where nothing was skipped."""
+    """The skipped work of each method, the reason, and the seconds saved; empty where nothing was skipped."""
     lines = [(method, line) for method, run in runs.items() for line in skips(run.folder)]
     columns: Columns = {
         "method": [method for method, _ in lines],
@@ -112,7 +112,7 @@ def write_page(path: Path, sections: Sequence[Section], *, budget_mb: float = BU
 
 
 def _limits(scenes: Sequence[Mapping[str, Any]], *, lossy: bool, views: int) -> str:
-    """What the budget cost."""
+    """What the page leaves out to keep to its size limit."""
     limits = ["Photos are JPEGs, so error maps are exact to about 0.01 only."] if lossy else []
     if views < _VIEWS and any(scene["offered"] > views for scene in scenes):
         limits.append(f"Only {views} of the test views fit into --page-mb.")
@@ -120,7 +120,7 @@ def _limits(scenes: Sequence[Mapping[str, Any]], *, lossy: bool, views: int) -> 
 
 
 def _scene(section: Section, images: Images, views: int) -> dict[str, Any]:
-    """What page.js needs to know about a scene."""
+    """The data of a scene for page.js."""
     offered = _test_views(section)
     shown = [view for name in spaced(offered, views) if (view := _view(section, name, images)) is not None]
     return {"name": section.title, "offered": len(offered), "views": shown, "maps": _maps(section, images, views)}
@@ -163,23 +163,22 @@ def _view(section: Section, name: str, images: Images) -> dict[str, Any] | None:
 
 def _maps(section: Section, images: Images, views: int) -> list[dict[str, Any]]:
     """Training views with the maps of every method."""
-    found: dict[str, dict[str, Any]] = {}
+    mapped: dict[str, dict[str, Any]] = {}
     for method, run in section.runs.items():
         folder = run.folder / "maps"
         try:
             means = read_object(folder / "maps.json")["views"] if folder.is_dir() else {}
             for name in spaced(list(means), views):
-                own = folder / (stem := file_stem(name))
-                if name not in found:
-                    width, height = image_size(own / "prior.png")
+                of_view = folder / (stem := file_stem(name))
+                if name not in mapped:
+                    width, height = image_size(of_view / "prior.png")
                     under = [
-                        {"label": label, "image": images.add(own / f"{kind}.png")}
+                        {"label": label, "image": images.add(of_view / f"{kind}.png")}
                         for kind, label in (("prior", "SR prior"), ("lr", "LR, enlarged"))
                     ]
-                    size = {"width": width, "height": height}
-                    found[name] = {"name": stem, **size, "under": under, "methods": []}
-                maps = {kind: own / f"{kind}.png" for kind in MAPS if (own / f"{kind}.png").is_file()}
-                found[name]["methods"].append({
+                    mapped[name] = {"name": stem, "width": width, "height": height, "under": under, "methods": []}
+                maps = {kind: path for kind in MAPS if (path := of_view / f"{kind}.png").is_file()}
+                mapped[name]["methods"].append({
                     "label": method,
                     "maps": {kind: images.add(path, exact=True) for kind, path in maps.items()},
                     "means": means[name],
@@ -187,19 +186,18 @@ def _maps(section: Section, images: Images, views: int) -> list[dict[str, Any]]:
                 })  # fmt: skip
         except (DataError, KeyError, TypeError) as error:
             _log.warning("%s: its maps cannot be shown (%s).", run.folder, error)
-    for view in found.values():  # one scale for all methods, so that they can be compared
+    for view in mapped.values():  # one scale for all methods, so that they can be compared
         peaks = {kind: max((m["peaks"].get(kind, 0.0) for m in view["methods"]), default=0.0) for kind in MAPS}
         view["tops"] = {kind: next((top for top in _TOPS if peak <= top), 1.0) for kind, peak in peaks.items()}
-    return list(found.values())
+    return list(mapped.values())
 
 
 def _splats(section: Section, folder: Path) -> dict[str, str]:
     """The splat.html of each run that has one, as an address from the report's folder."""
-    found = {method: run.folder / splat_page.FILE for method, run in section.runs.items()}
     return {
-        method: quote(Path(os.path.relpath(file, folder)).as_posix())
-        for method, file in found.items()
-        if file.is_file()
+        method: quote(Path(os.path.relpath(page, folder)).as_posix())
+        for method, run in section.runs.items()
+        if (page := run.folder / splat_page.FILE).is_file()
     }
 
 

@@ -52,9 +52,9 @@ class PaperTable:
 
     def columns(self, rows: Sequence[Row]) -> dict[str, Columns]:
         """The paper's numbers, each right of ours; LPIPS, which we do not measure, right of SSIM."""
-        found = [self._numbers(row) for row in rows]
+        numbers = [self._numbers(row) for row in rows]
         cells = {
-            measure: {f"{name}, paper": [format(of[measure], form) if measure in of else "" for of in found]}
+            measure: {f"{name}, paper": [format(n[measure], form) if measure in n else "" for n in numbers]}
             for measure, (name, form) in _MEASURES.items()
         }
         cells["ssim"] |= {"LPIPS": ["–" for _ in rows], **cells.pop("lpips")}
@@ -100,19 +100,19 @@ class PaperTable:
         def planned(label: str) -> list[str]:
             return list(dict.fromkeys(run.plan[label] for run in runs if label in run.plan))
 
-        found = []
+        differences = []
         if iterations := sorted({run.iterations for run in runs} - {self.iterations}):
-            found.append(f"{', '.join(f'{n:,}' for n in iterations)} iterations")
+            differences.append(f"{', '.join(f'{n:,}' for n in iterations)} iterations")
         if counts := sorted({text.split(":")[0] for text in planned("train views")} - {str(self.views)}):
-            found.append(f"{', '.join(counts)} training views")
+            differences.append(f"{', '.join(counts)} training views")
         inputs = [re.split(", (?:SR images|reference): ", text, maxsplit=1) for text in planned("HR")]
         if sizes := dict.fromkeys(size for size, *_ in inputs if size.partition(" ")[0] not in self.pixels):
-            found.append(f"HR {', '.join(sizes)} (protocol: {' or '.join(self.pixels)})")
+            differences.append(f"HR {', '.join(sizes)} (protocol: {' or '.join(self.pixels)})")
         if priors := dict.fromkeys(prior for _, *rest in inputs for prior in rest if "resshift" not in prior.lower()):
-            found.append(f"prior {', '.join(priors)} (paper: ResShift)")
+            differences.append(f"prior {', '.join(priors)} (paper: ResShift)")
         if clouds := planned("initial points"):
-            found.append(f"initial points {' | '.join(clouds)} (the paper does not say where its own come from)")
-        return found
+            differences.append(f"initial points {' | '.join(clouds)} (the paper does not say where its own come from)")
+        return differences
 
 
 @cache
