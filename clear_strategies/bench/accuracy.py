@@ -29,30 +29,30 @@ def draw(render: Callable[[], Any], cotangent: Float[Tensor, "H W 3"]) -> Drawn:
     return {"image": rendering.image.detach().cpu(), **{name: getattr(g, name)[0].cpu() for name in ATTRIBUTES}}
 
 
-def relative(found: Tensor, truth: Tensor) -> float:
+def relative(measured: Tensor, truth: Tensor) -> float:
     """The relative L2 error; the absolute one where the truth is 0."""
     truth = truth.double()
-    size, error = float(truth.norm()), float((found.to(truth) - truth).norm())
+    size, error = float(truth.norm()), float((measured.to(truth) - truth).norm())
     return error / size if size > 0 else error
 
 
-def errors(found: Drawn, truth: Drawn) -> dict[str, float]:
+def errors(measured: Drawn, truth: Drawn) -> dict[str, float]:
     """Table columns: absolute errors of the image, and relative L2 errors of each attribute's gradient.
 
-    `<attribute>_relative` is over all Gaussians, `<attribute>_median` the median of their own.
+    `<attribute>_relative` is over all Gaussians, `<attribute>_median` the median of the Gaussians' relative errors.
     """
-    difference = (found["image"].double() - truth["image"].double()).abs().numpy()
+    difference = (measured["image"].double() - truth["image"].double()).abs().numpy()
     columns = {
         "image_max": float(difference.max()),
         "image_p99.99": float(np.quantile(difference, 0.9999)),
         "image_mean": float(difference.mean()),
     }
     for name in ATTRIBUTES:
-        x, expected = (drawn[name].double().reshape(len(truth[name]), -1) for drawn in (found, truth))
+        x, expected = (drawn[name].double().reshape(len(truth[name]), -1) for drawn in (measured, truth))
         size = expected.norm(dim=1)
-        own = ((x - expected).norm(dim=1) / size)[size > 0]
+        of_each = ((x - expected).norm(dim=1) / size)[size > 0]
         columns[f"{name}_relative"] = relative(x, expected)
-        columns[f"{name}_median"] = float(own.median()) if len(own) else 0.0
+        columns[f"{name}_median"] = float(of_each.median()) if len(of_each) else 0.0
     return columns
 
 

@@ -32,6 +32,6 @@ def lines(rows: pd.DataFrame, *, log: bool = False) -> Figure:
     panels[0].set_ylabel(y)
     for i, name in enumerate(names):
         panels[0].plot([], [], "o-", markersize=3, color=f"C{i}", label=textwrap.fill(name, 48 * len(scenes)))
-    beside = max(1, 40 * len(scenes) // max(map(len, names)))  # columns that the width holds
-    figure.legend(loc="outside lower left", fontsize=8, ncols=min(beside, len(names)))
+    columns = max(1, 40 * len(scenes) // max(map(len, names)))  # that the width holds
+    figure.legend(loc="outside lower left", fontsize=8, ncols=min(columns, len(names)))
     return figure

@@ -1,4 +1,4 @@
-"""What a question found: tables as CSV, figures as PNG, and the machine they belong to as JSON."""
+"""The results of a question: tables as CSV, figures as PNG, and the machine that they were measured on as JSON."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from clear_strategies.outputs.provenance import provenance
 
 @dataclass(slots=True, eq=False)
 class Results:
-    """Everything one question found.
+    """The results of one question.
 
     Args:
         log: prints a line while measuring.

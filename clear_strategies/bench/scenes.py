@@ -86,8 +86,8 @@ def _surface(
         return random.uniform(-0.1, 1.1, (2, n)) * [[width], [height]]
 
     def directions(n: int) -> Array:
-        found = random.normal(size=(n, 3))
-        return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+        vectors = random.normal(size=(n, 3))
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
     u, v = pixels(counts[0])
     depth = 8 + 0.6 * np.sin(u / (90 * unit)) * np.cos(v / (70 * unit)) + random.normal(0, 0.02, len(u))

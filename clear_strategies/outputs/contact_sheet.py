@@ -37,12 +37,7 @@ class SheetRow:
 
 
 def write_contact_sheet(path: Path, rows: Sequence[SheetRow], title: str, note: str = OWN_PHOTO) -> None:
-    """Draw one row per view: its images and, where the truth is known, the truth and the error of ours. `note` stands below.
-
-    Without rows no file is written.
-    """
-    if not rows:
-        return
+    """Draw one row per view: its images and, where the truth is known, the truth and the error of ours. `note` stands below."""
     columns = list(rows[0].images)
     if any(row.truth is not None for row in rows):
         columns += ["ground truth", "error of ours"]

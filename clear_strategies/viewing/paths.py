@@ -15,7 +15,7 @@ from rasterizers.interface import Camera
 
 _MOST_KEYS: Final = 24  # a path through more cameras passes these, as far apart as possible
 _WRAP: Final = 3  # keys repeated at both ends, so that the rotation's spline has no seam
-_SURROUNDED: Final = 0.5  # mean direction from the scene to the cameras: shorter than this, they stand around it
+_SURROUNDED: Final = 0.5  # cameras surround the scene where the mean of the unit vectors to them is shorter than this
 _BEHIND, _ABOVE = 2.0, 1.1  # of the distance of the farthest camera from the scene: where an overview stands
 _SWAY: Final = 0.1  # of the distance to the scene: the radii of the ellipse for a single camera
 
@@ -168,10 +168,7 @@ def _round_trip(centers: Float[np.ndarray, "C 3"], chosen: Sequence[int]) -> lis
 
 def _plane(normal: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "2 3"]:
     """Two unit vectors across the normal."""
-    side = np.cross(up, normal)
-    if np.linalg.norm(side) < 1e-6:
-        side = np.cross(np.eye(3)[int(np.abs(normal).argmin())], normal)
-    side = _unit(side)
+    side = -_across(normal, up)
     return np.stack([side, np.cross(normal, side)])
 
 
@@ -180,11 +177,16 @@ def _looking(
 ) -> Float[np.ndarray, "3 3"]:
     """The axes of a camera that looks at the focus, upright."""
     forward = _unit(focus - center)
-    right = np.cross(forward, up)
-    if np.linalg.norm(right) < 1e-6:
-        right = np.cross(forward, np.eye(3)[int(np.abs(forward).argmin())])
-    right = _unit(right)
+    right = _across(forward, up)
     return np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def _across(direction: Float[np.ndarray, " 3"], up: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    """The unit vector direction x up; where they are parallel, another one across the direction."""
+    side = np.cross(direction, up)
+    if np.linalg.norm(side) < 1e-6:
+        side = np.cross(direction, np.eye(3)[int(np.abs(direction).argmin())])
+    return _unit(side)
 
 
 def _placed(like: Camera, center: Float[np.ndarray, " 3"], axes: Float[np.ndarray, "3 3"]) -> Camera:

@@ -64,7 +64,7 @@ def _opened(stack: ExitStack, path: Path, width: int, height: int, fps: float) -
         smaller = _SMALLER.format(fps=min(fps, _GIF_FPS), width=GIF_WIDTH)
         extra = ["-filter_complex", f"{smaller};{_ONE_PALETTE}", "-loop", "0"]
     else:
-        raise SettingError(f"{path}: videos are .mp4 or .gif.")
+        raise SettingError(f"{path}: a video must be .mp4 or .gif. Choose another suffix.")
     partial = stack.enter_context(files.replacing(path.absolute()))  # ffmpeg takes "a:" at the beginning for a protocol
     writer: Any = imageio_ffmpeg.write_frames(
         str(partial), (width, height), fps=fps, codec=codec, pix_fmt_out=pixels, quality=None, output_params=extra,

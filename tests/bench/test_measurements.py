@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -39,14 +40,11 @@ def measured(question, **options) -> Results:
 def test_contenders_take_turns_and_warm_ups_do_not_count(device, warm_ups):
     order = []
 
-    def contender(name: str):
-        def turn():
-            order.append(name)
-            return {"stage": float(len(order))}
+    def turn(name: str) -> dict[str, float]:
+        order.append(name)
+        return {"stage": float(len(order))}
 
-        return turn
-
-    turns = timing.interleaved({"a": contender("a"), "b": contender("b")}, 3, device=device, label="")
+    turns = timing.interleaved({name: partial(turn, name) for name in "ab"}, 3, device=device, label="")
     assert order == ["a", "b"] * (3 + warm_ups)
     first = 2 * warm_ups + 1
     assert list(turns.query("contender == 'a'")["ms"]) == [first, first + 2, first + 4]
@@ -79,9 +77,7 @@ def test_unavailable_backends_are_noted(monkeypatch):
 
 def test_errors_are_those_of_their_definitions():
     def drawn(image: list[float], gradient: list[list[float]]) -> accuracy.Drawn:
-        g = torch.tensor(gradient)
-        gradients = {name: g[:, 0] if name == "opacities" else g for name in accuracy.ATTRIBUTES}
-        return {"image": torch.tensor(image).view(1, -1, 3), **gradients}
+        return {"image": torch.tensor(image), **dict.fromkeys(accuracy.ATTRIBUTES, torch.tensor(gradient))}
 
     truth = drawn([0.0, 0, 0], [[3.0, 4], [0, 0], [1, 0]])
     found = drawn([0.3, 0, 0], [[3.0, 4], [0, 1], [2, 0]])
@@ -95,10 +91,8 @@ def test_errors_are_those_of_their_definitions():
 def test_finer_cut_offs_have_smaller_errors(tiny):
     v = drawing.random_cotangents(tiny)[0]
     truth = accuracy.truth("torch", tiny, v, accuracy.NO_CUT_OFFS)
-    found = []
-    for preset in rasterizers.PRESETS:
-        contestant = drawing.backend_on(tiny, "torch", preset)
-        found.append(accuracy.errors(accuracy.draw(contestant.render, v), truth))
+    renders = [drawing.backend_on(tiny, "torch", preset).render for preset in rasterizers.PRESETS]
+    found = [accuracy.errors(accuracy.draw(render, v), truth) for render in renders]
     for name in accuracy.ATTRIBUTES:
         fast, accurate, exact = (errors[f"{name}_relative"] for errors in found)
         assert fast > 3 * accurate > 9 * exact, name
@@ -118,11 +112,8 @@ def test_an_iteration_trains_clear_and_moves_nothing(tiny, reference):
 
 
 def test_an_iteration_is_measured_with_and_without_hr():
-    table = (
-        measured(iteration, scene="tiny", backend="torch", repeats=1, device="cpu")
-        .tables["iteration"]
-        .set_index("stage")
-    )
+    tables = measured(iteration, scene="tiny", backend="torch", repeats=1, device="cpu").tables
+    table = tables["iteration"].set_index("stage")
     assert list(table.columns) == ["lr_and_hr_ms", "without_l_hf_ms", "lr_only_ms", "error"]
     stages = ["render", "losses LR", "backward LR", "losses HR", "backward HR", "per-Gaussian pass"]
     assert 0 < table.loc[stages, "error"].max() < 1e-4

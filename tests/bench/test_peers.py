@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import namedtuple
+from functools import partial
 from importlib import metadata
 
 import pytest
@@ -26,10 +27,7 @@ def errors(peer: peers.Peer, workload: scenes.Workload, **rules: object) -> dict
 
 
 def test_gsplat_is_called_with_its_conventions(tiny):
-    def rasterization(*tensors, **settings):
-        return autograd.rasterization(*tensors, **settings, backend="torch")
-
-    peer = peers.gsplat(rasterization, "stand-in")
+    peer = peers.gsplat(partial(autograd.rasterization, backend="torch"), "stand-in")
     assert not peer.rules
     found = errors(peer, tiny, alpha_max=0.99)  # the stand-in's cap
     assert found["image_p99.99"] < 1e-5

@@ -9,18 +9,15 @@ import torch
 
 import rasterizers
 from clear_strategies.bench import iteration, scenes
+from clear_strategies.bench.accuracy import ATTRIBUTES
 from clear_strategies.outputs.formats import export_ply
 from tests.helpers import toy
 
 
-def test_a_generated_scene_is_the_same_every_time():
-    one, other = scenes.load("tiny"), scenes.load("tiny")
-    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-        assert torch.equal(getattr(one.splats, name), getattr(other.splats, name)), name
-
-
-def test_a_generated_scene_has_its_stated_statistics():
-    scene = scenes.surfaces("s", 20_000, 1008, 756, radius=5.5)
+def test_a_generated_scene_is_the_same_every_time_and_has_its_stated_statistics():
+    scene, again = (scenes.surfaces("s", 20_000, 1008, 756, radius=5.5) for _ in range(2))
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(scene.splats, name), getattr(again.splats, name)), name
     splats, camera = scene.splats, scene.camera
     pose = camera.world_to_camera
     x, y, z = (splats.means @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)

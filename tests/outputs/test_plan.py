@@ -65,8 +65,12 @@ def test_any_strategy_states_what_it_skips_marks_and_warns_of(caplog: pytest.Log
     caplog.clear()
     lines(started(Quiet(), lambda_hr=WarmupDecay(peak=2, final=0, start=0, full=1)), "quiet")
     assert "no effect" not in caplog.text
-    lines(started(GCO(), lambda_hr=WarmupDecay(start=state.settings.iterations)), "gco")
-    assert "GCO has no effect: lambda_HR is 0 throughout." in caplog.text
+    for idle in (WarmupDecay(start=state.settings.iterations), WarmupDecay(peak=0, final=0)):
+        caplog.clear()
+        found = lines(started(GCO(), P2G(), lambda_hr=idle), "gco", "p2g")
+        for name in ("GCO", "P2G"):
+            assert f"{name} has no effect: lambda_HR is 0 throughout." in caplog.text
+    assert "HR scale throughout (lambda_HR = 0)" in found["skipped"]
 
 
 def test_a_run_ends_with_what_its_history_shows_of_a_strategy() -> None:
@@ -82,13 +86,6 @@ def test_the_console_gets_what_a_user_decides_on_and_run_log_the_rest() -> None:
     assert not set(short) & set(details)
     assert any("milestones" in line for line in details)
     assert short[-1].split(maxsplit=1) == ["more", f"{len(details)} lines in run.log, or here with -v"]
-
-
-def test_strategies_without_hr_are_idle(caplog: pytest.LogCaptureFixture) -> None:
-    found = lines(started(GCO(), P2G(), lambda_hr=WarmupDecay(peak=0, final=0)), "gco", "p2g")
-    assert "HR scale throughout (lambda_HR = 0)" in found["skipped"]
-    for name in ("GCO", "P2G"):
-        assert f"{name} has no effect: lambda_HR is 0 throughout." in caplog.text
 
 
 def test_the_progress_bar_counts_iterations(capsys: pytest.CaptureFixture[str]) -> None:

@@ -103,7 +103,7 @@ def test_the_baseline_beside_a_run_is_shown_and_its_means_are_kept(tmp_path: Pat
     assert not holds(read(tmp_path / "alone" / "contact_sheet.png"), marked.numpy(), times=times)
 
 
-def test_conflict_csv_holds_columns_of_history_csv(tmp_path: Path, state: TrainState) -> None:
+def test_conflict_csv_holds_columns_of_history_csv_and_the_ply_says_how_it_was_drawn(tmp_path, state) -> None:
     write(tmp_path, state, pictures=None)
     history, conflict = (
         list(csv.DictReader((tmp_path / f"{name}.csv").open(newline=""))) for name in ("history", "conflict")
@@ -112,27 +112,22 @@ def test_conflict_csv_holds_columns_of_history_csv(tmp_path: Path, state: TrainS
     assert {"t", "conflict", "conflict_means", "corrected", "mean_q", "mean_w"} <= set(conflict[0])
     mean = sum(float(row["conflict"]) for row in conflict) / len(conflict)
     assert json.loads((tmp_path / "metrics.json").read_text())["conflict"]["gaussian"] == pytest.approx(mean)
-
-
-def test_the_ply_file_says_how_the_run_was_drawn(tmp_path: Path, state: TrainState) -> None:
-    write(tmp_path, state, pictures=None)
     assert not read_gaussians(tmp_path / "point_cloud.ply").antialiased
 
 
-def test_no_map_views_means_no_maps(tmp_path: Path, state: TrainState) -> None:
-    write(tmp_path, state, pictures=replace(PICTURES, map_views=0))
-    assert not (tmp_path / "maps").exists()
-
-
-def test_a_run_without_test_views_shows_training_views(tmp_path: Path, state: TrainState) -> None:
+def test_a_run_without_test_views_shows_training_views_and_what_is_not_wanted_or_cannot_be_written_is_missing(
+    tmp_path, state, monkeypatch, caplog
+):
+    monkeypatch.setattr("clear_strategies.viewing.video.find_spec", lambda _: None)
     scene = replace(SCENE, test=(), train=SCENE.train * 2)
-    write(tmp_path, state, scene=scene, pictures=replace(PICTURES, map_views=0, video_frames=0))
+    with caplog.at_level("DEBUG"):
+        write(tmp_path, state, scene=scene, pictures=Pictures(map_views=0, video_frames=2, page_gaussians=0))
     assert names(tmp_path / "renders") == {f"{view.name}.png" for view in SCENE.train}
     assert names(tmp_path / "depth") == names(tmp_path / "renders")
-    shown = read(tmp_path / "contact_sheet.png")
     times = round(magnification(SCENE.train[0].hr.image.shape[1]))
-    assert holds(shown, SCENE.train[0].hr.image.numpy(), times=times)
-    assert not (tmp_path / "path.mp4").exists()
+    assert holds(read(tmp_path / "contact_sheet.png"), SCENE.train[0].hr.image.numpy(), times=times)
+    assert "pip install imageio-ffmpeg" in caplog.text
+    assert not names(tmp_path) & {"maps/", "path.mp4", "splat.html", "coverage.html", "coverage.png"}
 
 
 def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(tmp_path, state, monkeypatch):
@@ -157,7 +152,7 @@ def test_photos_of_two_cameras_with_one_file_name_have_files_of_their_own(tmp_pa
 
 
 def test_an_earlier_run_goes_with_all_of_its_files_and_no_other(tmp_path: Path, state: TrainState) -> None:
-    write(tmp_path, state, pictures=replace(PICTURES, page_gaussians=0))
+    write(tmp_path, state, pictures=replace(PICTURES, video_frames=0, page_gaussians=0))
     write_cameras(tmp_path, SCENE)
     kept = {tmp_path / "notes.txt", tmp_path / "depth" / "measured.png", tmp_path / "checkpoints" / "step_0000004"}
     for path in kept:
@@ -179,20 +174,13 @@ def test_the_sheet_of_photos_at_hr_shows_no_sr(tmp_path, state, monkeypatch):
         return replace(view, hr=replace(view.hr, image=view.truth))
 
     sheets: list[Any] = []
+    monkeypatch.setattr(results, "write_curves", lambda *_: None)
     monkeypatch.setattr(results, "write_contact_sheet", lambda path, rows, title, note: sheets.append((rows, note)))
     scene = replace(SCENE, train=tuple(map(photos, SCENE.train)), test=tuple(map(photos, SCENE.test)))
-    write(tmp_path, state, scene=scene, pictures=replace(PICTURES, map_views=0, video_frames=0))
+    write(tmp_path, state, scene=scene, pictures=Pictures(map_views=0, video_frames=0, page_gaussians=0))
     (((row,), note),) = sheets
     assert list(row.images) == ["ours"]
     assert note == ""
-
-
-def test_a_video_that_cannot_be_written_is_named(tmp_path, state, monkeypatch, caplog):
-    monkeypatch.setattr("clear_strategies.viewing.video.find_spec", lambda _: None)
-    with caplog.at_level("DEBUG"):
-        write(tmp_path, state, pictures=replace(PICTURES, map_views=0))
-    assert "pip install imageio-ffmpeg" in caplog.text
-    assert not (tmp_path / "path.mp4").exists()
 
 
 def test_metrics_json_is_missing_where_another_file_could_not_be_written(tmp_path, state, monkeypatch):

@@ -13,6 +13,8 @@ import torch
 
 from clear_strategies import report
 from clear_strategies.data.photo_files import write_png
+from clear_strategies.report.page import Section, write_page
+from clear_strategies.report.table import Table
 from tests.helpers.finished_run import make_run
 
 
@@ -97,10 +99,9 @@ def test_a_page_over_its_budget_shows_fewer_views_and_says_so(tmp_path: Path, ca
             *(run / "views" / f"v{i}_{k}.png" for k in ("lr", "prior", "truth")),
         ):
             write_png(path, torch.rand(96, 128, 3, generator=g))
-    sizes = []
+    sizes, section = [], Section("demo", Table({}), {"gco": report.Run.read(run)})
     for budget in (20.0, 0.4, 0.25, 0.01):
-        report.write(report.collect([tmp_path]), tmp_path, page_mb=budget)
-        sizes.append((tmp_path / "report.html").stat().st_size / 1e6)
+        sizes.append(write_page(tmp_path / "report.html", [section], budget_mb=budget) / 1e6)
         page = Page(tmp_path / "report.html")
         assert page.data["scenes"][0]["views"], budget
     assert sizes[0] > sizes[1] > sizes[2] >= sizes[3]
@@ -109,21 +110,15 @@ def test_a_page_over_its_budget_shows_fewer_views_and_says_so(tmp_path: Path, ca
     assert "report.html is larger than 0.01 MB" in caplog.text
 
 
-def test_runs_without_views_and_maps_still_make_a_page(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    run = make_run(tmp_path / "0", "+strategy=gco")
+def test_runs_without_views_and_maps_still_make_a_page_and_splats_are_linked(tmp_path, caplog) -> None:
+    run = make_run(tmp_path / "runs" / "a b#", "+strategy=gco")
     for folder in ("views", "maps"):
         shutil.rmtree(run / folder)
-    report.write(report.collect([tmp_path]), tmp_path)
-    (scene,) = Page(tmp_path / "report.html").data["scenes"]
+    (run / "splat.html").write_text("<html></html>")
+    report.write(report.collect([tmp_path / "runs"]), tmp_path / "report")
+    page = Page(tmp_path / "report" / "report.html")
+    (scene,) = page.data["scenes"]
     assert [layer["label"] for layer in scene["views"][0]["layers"]] == ["gco"]
     assert scene["maps"] == []
     assert "no run has views/" in caplog.text
-
-
-def test_the_splats_of_runs_that_have_a_page_are_linked(tmp_path: Path) -> None:
-    make_run(tmp_path / "runs" / "a b#", "+strategy=gco")
-    make_run(tmp_path / "runs" / "1", "+strategy=baseline")
-    (tmp_path / "runs" / "a b#" / "splat.html").write_text("<html></html>")
-    report.write(report.collect([tmp_path / "runs"]), tmp_path / "report")
-    links = [to for to in Page(tmp_path / "report" / "report.html").references if to.endswith("splat.html")]
-    assert links == ["../runs/a%20b%23/splat.html"]
+    assert [to for to in page.references if to.endswith("splat.html")] == ["../runs/a%20b%23/splat.html"]

@@ -13,19 +13,24 @@ from clear_strategies.errors import DataError
 from tests.helpers.finished_run import make_run, rows_of, scores
 
 
-def test_a_run_is_named_by_its_strategies_as_given_on_the_command_line(tmp_path: Path) -> None:
-    make_run(tmp_path / "0", "+strategy=baseline", strategies=[])
-    make_run(tmp_path / "1", "+strategy=[gco,p2g]", strategies=["gco", "p2g"])
-    make_run(tmp_path / "2", "+strategy=clear_paper", strategies=["gco", "p2g", "svs"])
-    bare = make_run(tmp_path / "3", strategies=["mine", "svs"])
-    (bare / ".hydra" / "overrides.yaml").unlink()
-    assert {"baseline", "gco + p2g", "clear_paper", "mine + svs"} <= set(rows_of(tmp_path))
-
-
-def test_a_later_command_in_its_folder_does_not_rename_a_run(tmp_path: Path) -> None:
-    folder = make_run(tmp_path, "+strategy=clear", "fit.iterations=20", overrides=["+strategy=gco", "fit.seed=3"])
+@pytest.mark.parametrize(
+    ("overrides", "facts", "name"),
+    [
+        (["+strategy=baseline"], {}, "baseline"),
+        (["+strategy=[gco,p2g]"], {}, "gco + p2g"),
+        (["+strategy=clear_paper"], {"strategies": ["gco", "p2g", "svs"]}, "clear_paper"),
+        ([], {"strategies": ["mine", "svs"]}, "mine + svs"),
+        (["+strategy=clear", "+method=srgs"], {}, "srgs"),
+        (["+strategy=clear"], {"overrides": ["+strategy=gco"]}, "gco"),
+    ],
+    ids=["none", "list", "preset", "without overrides", "a method replaces", "a later command rewrote Hydra's file"],
+)
+def test_a_run_is_named_by_its_strategies_as_given_on_the_command_line(tmp_path, overrides, facts, name):
+    folder = make_run(tmp_path, *overrides, **facts)
+    if not overrides:
+        (folder / ".hydra" / "overrides.yaml").unlink()
     run = report.Run.read(folder)
-    assert (run.name, run.settings) == ("gco", ())
+    assert (run.name, run.settings) == (name, ())
 
 
 def test_runs_from_python_are_told_apart_as_those_of_the_command_line(tmp_path: Path) -> None:
@@ -41,11 +46,6 @@ def test_runs_from_python_are_told_apart_as_those_of_the_command_line(tmp_path: 
     ]  # fmt: skip
 
 
-def test_a_method_replaces_the_strategies_before_it(tmp_path: Path) -> None:
-    run = report.Run.read(make_run(tmp_path / "run", "+strategy=clear", "+method=srgs"))
-    assert run.name == "srgs"
-
-
 def test_runs_of_a_sweep_are_in_the_order_of_their_jobs(tmp_path: Path) -> None:
     for number, name in ((2, "a_clear"), (10, "b_more"), (0, "z_baseline")):
         folder = make_run(tmp_path / name, f"+strategy={name[2:]}")
@@ -54,10 +54,11 @@ def test_runs_of_a_sweep_are_in_the_order_of_their_jobs(tmp_path: Path) -> None:
 
 
 def test_runs_that_are_linked_into_a_folder_belong_to_it_and_count_once(tmp_path: Path) -> None:
-    ours = make_run(tmp_path / "runs" / "ours", "+strategy=gco")
-    (tmp_path / "runs" / "latest").symlink_to(ours)
-    (tmp_path / "runs" / "sweep").symlink_to(make_run(tmp_path / "disk" / "sweep" / "0", "+strategy=clear").parent)
-    assert [run.name for run in report.collect([tmp_path / "runs"])] == ["gco", "clear"]
+    runs = tmp_path / "runs"
+    ours = make_run(runs / "ours", "+strategy=gco")
+    (runs / "latest").symlink_to(ours)
+    (runs / "sweep").symlink_to(make_run(tmp_path / "disk" / "sweep" / "0", "+strategy=clear").parent)
+    assert [run.name for run in report.collect([runs, ours, runs / ".." / "runs" / "ours"])] == ["gco", "clear"]
 
 
 def test_damaged_and_unfinished_runs_are_left_out_with_a_warning(
@@ -75,11 +76,6 @@ def test_damaged_and_unfinished_runs_are_left_out_with_a_warning(
         (message,) = (r.getMessage() for r in caplog.records if str(tmp_path / name) in r.getMessage())
         assert "left out" in message
         assert "\n" not in message
-
-
-def test_a_run_given_twice_counts_once(tmp_path: Path) -> None:
-    make_run(tmp_path / "0", "+strategy=gco")
-    assert len(report.collect([tmp_path, tmp_path / "0", tmp_path / "0" / ".." / "0"])) == 1
 
 
 def make_pair(folder: Path, *overrides: str, baseline: float = 20.0, seed: int = 0, **facts: Any) -> Path:
@@ -125,12 +121,10 @@ def test_a_baseline_run_on_its_own_counts_instead_of_one_beside_a_run(tmp_path: 
     assert len(report.collect([tmp_path / "baseline", tmp_path / "clear"])) == 3
 
 
-def test_a_finished_baseline_beside_an_unfinished_run_counts(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_finished_baseline_beside_an_unfinished_run_counts_and_without_any_the_folder_is_refused(tmp_path, caplog):
     (make_pair(tmp_path / "run") / "metrics.json").unlink()
     assert [run.name for run in report.collect([tmp_path])] == ["baseline"]
     assert f"{tmp_path / 'run'}: left out, it has no metrics.json" in caplog.text
-
-
-def test_a_folder_without_runs_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "run" / "baseline" / "metrics.json").unlink()
     with pytest.raises(DataError, match="there is no finished run here: give the folder of a run or of a sweep"):
         report.collect([tmp_path, tmp_path / "absent"])

@@ -68,22 +68,23 @@ def test_a_transforms_file_is_a_path(tmp_path):
     assert (found.fx, found.width, found.height) == (pytest.approx(50), 100, 50)
 
 
+TURNED = [{"width": 4, "height": 4, "fx": 4, "fy": 4, "rotation": [[1, 0], [0, 1]], "position": [0, 0, 0]}]
+
+
 @pytest.mark.parametrize(
-    "content",
+    ("content", "message"),
     [
-        "", "[]", "[1]", "{}", '{"frames": []}', '{"camera_path": []}', '{"camera_path": [{"fov": 50}]}', "[{}]",
-        "[{", "nonsense",
+        (None, "cannot be read"), ("", "is not valid"), ("[{", "is not valid"), ("[]", "is an empty list"),
+        ("[1]", "must be"), ("[{}]", "is missing"), ("{}", "is no camera path"), ('{"frames": []}', "frames"),
+        ('{"camera_path": []}', "camera_path"), ('{"camera_path": [{"fov": 50}]}', "is missing"),
+        (json.dumps(TURNED), r"\[0\].rotation: must be a 3x3 matrix"),
     ],
 )  # fmt: skip
-def test_what_is_no_path_is_refused_in_one_line(tmp_path, content):
-    (tmp_path / "path.json").write_text(content)
-    with pytest.raises(DataError, match=r"path\.json"):
+def test_what_is_no_path_is_refused_in_one_line(tmp_path, content, message):
+    if content is not None:
+        (tmp_path / "path.json").write_text(content)
+    with pytest.raises(DataError, match=rf"path\.json: .*{message}"):
         cameras.read_path(tmp_path / "path.json", (100, 50))
-
-
-def test_a_path_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(DataError, match="cannot be read"):
-        cameras.read_path(tmp_path / "no.json", (100, 50))
 
 
 @pytest.mark.parametrize(("longest", "size"), [(None, (96, 64)), (48, (48, 32)), (31, (32, 20)), (1000, (96, 64))])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
-from http.client import HTTPConnection
+import time
+from concurrent.futures import ThreadPoolExecutor
+from urllib.request import urlopen
 
 import pytest
 
@@ -14,51 +16,30 @@ from clear_strategies.viewing.live import Turns
 from tests.helpers import saved_run
 
 
-def asked(turns: Turns, function) -> tuple[threading.Thread, list]:
-    answers: list = []
-
-    def ask() -> None:
-        try:
-            answers.append(turns.ask(function))
-        except ValueError as error:
-            answers.append(error)
-
-    thread = threading.Thread(target=ask, daemon=True)
-    thread.start()
-    return thread, answers
+@pytest.fixture
+def other():
+    with ThreadPoolExecutor(1) as thread:
+        yield thread
 
 
-def test_what_another_thread_asks_for_is_done_by_the_training_thread():
+def test_what_another_thread_asks_for_is_done_by_the_training_thread_and_errors_are_raised_where_it_asked(other):
     turns = Turns()
-    thread, answers = asked(turns, threading.get_ident)
-    thread.join(0.05)
-    assert answers == []
-    while thread.is_alive():
+    ident, error = (other.submit(turns.ask, function) for function in (threading.get_ident, lambda: 1 / 0))
+    time.sleep(0.05)
+    assert not ident.done()
+    while not error.done():
         turns.serve()
-    assert answers == [threading.get_ident()]
+    assert ident.result() == threading.get_ident()
+    with pytest.raises(ZeroDivisionError):
+        error.result()
 
 
-def test_after_training_it_is_done_at_once():
+def test_after_training_it_is_done_at_once(other):
     turns = Turns()
-    waiting, early = asked(turns, lambda: "asked while training")
+    early = other.submit(turns.ask, lambda: "asked while training")
     turns.close()
-    waiting.join(5)
-    late, answers = asked(turns, threading.get_ident)
-    late.join(5)
-    assert early == ["asked while training"]
-    assert answers == [late.ident]
-
-
-def test_an_error_belongs_to_the_thread_that_asked():
-    turns = Turns()
-
-    def fails():
-        raise ValueError("no picture")
-
-    thread, answers = asked(turns, fails)
-    while thread.is_alive():
-        turns.serve()
-    assert str(answers[0]) == "no picture"
+    assert early.result(5) == "asked while training"
+    assert other.submit(turns.ask, threading.get_ident).result(5) == other.submit(threading.get_ident).result()
 
 
 def test_missing_libraries_are_named(monkeypatch):
@@ -67,19 +48,13 @@ def test_missing_libraries_are_named(monkeypatch):
         live.require_viewer()
 
 
-def answer(address: str) -> bytes:
-    connection = HTTPConnection(address.removeprefix("http://"), timeout=20)
-    connection.request("GET", "/")
-    return connection.getresponse().read()
-
-
 def test_a_viewer_is_there_while_a_run_trains(tmp_path):
     pytest.importorskip("clear_strategies.viewing.server", exc_type=ImportError)
     saved_run.write(tmp_path)
     splat, addresses = open_splat(tmp_path), []
     with live.watched(splat.painter, splat.cameras, "toy", addresses.append) as after_step:
         after_step(1)
-        assert b"<html" in answer(addresses[0])
+        assert b"<html" in urlopen(addresses[0], timeout=20).read()  # noqa: S310 - our own address
         after_step(2)
     with pytest.raises(OSError, match="refused"):
-        answer(addresses[0])
+        urlopen(addresses[0], timeout=20)  # noqa: S310

@@ -44,16 +44,14 @@ def test_an_overview_stands_above_the_cameras_and_farther_away_and_looks_at_the_
     assert forward @ (focus - place) / np.linalg.norm(focus - place) == pytest.approx(1, abs=1e-6)
 
 
-def test_a_path_passes_its_cameras_and_is_even_and_closed():
-    path = centers(paths.through(SHUFFLED, 120))
+def test_a_path_passes_its_cameras_and_is_even_and_closed_and_looks_where_they_look():
+    frames = paths.through(SHUFFLED, 120)
+    path = centers(frames)
     for camera in RING:
         assert np.linalg.norm(path - camera.center.numpy(), axis=1).min() < 0.1
     steps = np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1)
     assert steps.max() < 1.3 * steps.min()  # the last step leads to the first frame
-
-
-def test_frames_on_a_ring_look_inwards_between_the_cameras():
-    for camera in paths.through(SHUFFLED, 50):
+    for camera in frames:
         forward, inwards = camera.world_to_camera[2, :3], -camera.center / camera.center.norm()
         assert float(forward @ inwards) > 0.99
         R = camera.world_to_camera[:3, :3]
@@ -61,22 +59,19 @@ def test_frames_on_a_ring_look_inwards_between_the_cameras():
 
 
 def test_many_cameras_are_thinned():
-    dense = [at((3 * math.cos(a), 0.0, 3 * math.sin(a))) for a in np.arange(300) * math.tau / 300]
+    dense = [at((3 * math.cos(a), 0.0, 3 * math.sin(a))) for a in np.arange(100) * math.tau / 100]
     steps = np.linalg.norm(np.diff(centers(paths.through(dense, 60)), axis=0), axis=1)
     assert steps.max() < 1.5 * steps.min()
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_few_cameras_give_a_path_too(count):
+def test_few_cameras_and_cameras_at_one_place_give_a_path_too(count):
     path = paths.through(RING[:count], 10)
     assert len(path) == 10
     assert len({tuple(center.round(6)) for center in centers(path)}) > 3
-    assert all(math.isfinite(x) for x in centers(path).flatten())
-
-
-def test_cameras_at_one_place_give_a_path():
-    path = paths.through([RING[0]] * 3, 5)
-    np.testing.assert_allclose(centers(path), np.tile(RING[0].center.numpy(), (5, 1)), atol=1e-6)
+    assert np.isfinite(centers(path)).all()
+    still = paths.through([RING[0]] * (count + 1), 5)  # several cameras at one place
+    np.testing.assert_allclose(centers(still), np.tile(RING[0].center.numpy(), (5, 1)), atol=1e-6)
 
 
 def test_an_ellipse_goes_around_a_scene_that_is_surrounded():

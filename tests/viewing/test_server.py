@@ -42,12 +42,8 @@ def close(found, exact):
     assert np.abs(found.astype(int) - exact).max() <= 1
 
 
-def test_the_window_shows_what_is_measured(screen, splat):
-    close(screen.draw(server.View(), POSE, FOV, (96, 64)), to_bytes(splat.painter.color(CAMERA)))
-
-
-def test_switches_reach_the_picture(screen, splat):
-    look = Look(detail=False, sh=False)
+@pytest.mark.parametrize("look", [Look(), Look(detail=False, sh=False)])
+def test_the_window_shows_what_is_measured_and_switches_reach_the_picture(screen, splat, look):
     found = screen.draw(server.View(look=look), POSE, FOV, (96, 64))
     close(found, to_bytes(splat.painter.color(CAMERA, look)))
 
@@ -60,12 +56,9 @@ def test_the_grid_of_lr_has_the_pixels_of_an_lr_camera_each_a_square(screen, spl
     assert (found[:times, :times] == found[0, 0]).all()
 
 
-def test_depth_and_coverage_are_pictures(screen):
+def test_depth_and_coverage_are_pictures_and_points_are_coloured_by_what_is_known_of_them(screen, splat):
     for show in ("depth", "coverage"):
         assert screen.draw(server.View(show=show), POSE, FOV, (96, 64)).shape == (64, 96, 3)
-
-
-def test_points_are_coloured_by_what_is_known_of_them(screen, splat):
     found = screen.draw(server.View(show="opacity"), POSE, FOV, (96, 64))
     colors = points.colors(splat.painter, None, ())["opacity"]
     close(found, to_bytes(splat.painter.points(CAMERA, colors)))
@@ -97,12 +90,13 @@ def test_the_viewer_opens_and_closes(splat, screen):
         viewer.close()
 
 
-@pytest.mark.parametrize("port", ["-1", "65536"])
-def test_a_port_that_no_machine_has_is_refused(port):
-    with pytest.raises(SettingError, match=f"^--port: must be 0 to 65535, got {port}"):
-        view.main(["nowhere", "--port", port])
-
-
-def test_an_address_of_another_machine_is_refused():
-    with pytest.raises(SettingError, match=r"^--host: must be an address of this machine, got 192\.0\.2\.1 \("):
-        view.main(["nowhere", "--host", "192.0.2.1"])
+@pytest.mark.parametrize(
+    ("option", "value", "rule"),
+    [
+        ("--port", "-1", "0 to 65535"), ("--port", "65536", "0 to 65535"),
+        ("--host", "192.0.2.1", "an address of this machine"),
+    ],
+)  # fmt: skip
+def test_a_port_that_no_machine_has_and_an_address_of_another_machine_are_refused(option, value, rule):
+    with pytest.raises(SettingError, match=f"^{option}: must be {rule}, got {value}"):
+        view.main(["nowhere", option, value])

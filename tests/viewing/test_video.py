@@ -22,11 +22,16 @@ def read(path):
     return np.stack([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader])
 
 
-def test_an_mp4_holds_the_frames(tmp_path):
-    video.write_videos([tmp_path / "a.mp4"], FRAMES, fps=10)
-    found = read(tmp_path / "a.mp4")
+def test_an_mp4_holds_the_frames_and_a_gif_is_written_beside_it_in_a_folder_that_looks_like_a_protocol(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    video.write_videos([Path("10:30/a.mp4"), Path("10:30/a.gif")], iter(FRAMES), fps=10)
+    found = read(tmp_path / "10:30" / "a.mp4")
     assert found.shape == (10, 32, 48, 3)
     assert np.abs(found.mean((1, 2, 3)) - np.arange(10) * 20).max() < 4
+    assert Path("10:30/a.gif").read_bytes()[:6] == b"GIF89a"
+    assert {path.name for path in Path("10:30").iterdir()} == {"a.mp4", "a.gif"}
 
 
 def test_an_mp4_says_by_which_matrix_its_colours_are_made(tmp_path):
@@ -34,18 +39,6 @@ def test_an_mp4_says_by_which_matrix_its_colours_are_made(tmp_path):
     command = [ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "a.mp4"]
     assert "bt709" in subprocess.run(command, check=False, capture_output=True, text=True).stderr
     assert read(tmp_path / "a.mp4")[0].mean((0, 1)) == pytest.approx((30, 180, 30), abs=4)
-
-
-def test_a_folder_named_by_the_time_of_day_is_no_protocol(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    video.write_videos([Path("10:30/a.mp4"), Path("10:30/a.gif")], FRAMES, fps=10)
-    assert len(read(tmp_path / "10:30" / "a.mp4")) == len(FRAMES)
-
-
-def test_a_gif_is_written_beside_it(tmp_path):
-    video.write_videos([tmp_path / "a.mp4", tmp_path / "a.gif"], iter(FRAMES), fps=10)
-    assert (tmp_path / "a.gif").read_bytes()[:6] == b"GIF89a"
-    assert {path.name for path in tmp_path.iterdir()} == {"a.mp4", "a.gif"}
 
 
 def test_a_video_that_breaks_leaves_nothing(tmp_path):
@@ -58,9 +51,12 @@ def test_a_video_that_breaks_leaves_nothing(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("name", "frames"), [("a.avi", FRAMES), ("a.mp4", [])])
-def test_what_gives_no_video_is_refused(tmp_path, name, frames):
-    with pytest.raises(SettingError):
+@pytest.mark.parametrize(
+    ("name", "frames", "message"),
+    [("a.avi", FRAMES, "a video must be .mp4 or .gif"), ("a.mp4", [], "needs at least 1 frame")],
+)
+def test_what_gives_no_video_is_refused(tmp_path, name, frames, message):
+    with pytest.raises(SettingError, match=message):
         video.write_videos([tmp_path / name], frames, fps=10)
 
 
