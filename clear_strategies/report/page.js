@@ -323,7 +323,7 @@ function maps(holder, number) {
     scale.show(true, String(view.tops[kind]));
     const known = method && kind in method.maps;
     caption.replaceChildren(element("span", {}, element("b", {}, MAPS[kind])), scale.node,
-      element("span", {}, known ? (mean == null ? "" : `mean ${mean.toFixed(3)}`) : "this method corrects nothing"));
+      element("span", {}, known ? (mean == null ? "" : `mean ${mean.toFixed(3)}`) : "this method has no such map of this view"));
     stage.show(view, 1);
   }
 

@@ -33,6 +33,7 @@ _log = logging.getLogger(__name__)
 
 BUDGET_MB: Final = 20.0
 _VIEWS: Final = 4  # test views of a scene, at most
+_PHOTOS: Final = {"lr": "LR, enlarged", "prior": "SR prior", "truth": "truth"}
 _TOPS: Final = (0.05, 0.1, 0.25, 0.5, 1.0)  # values at which the colours of a map may end
 _FOLDER: Final = Path(__file__).resolve().parent
 
@@ -69,7 +70,7 @@ class Images:
     def add(self, path: Path, *, exact: bool = False) -> str:
         """Embed an image file; returns its key."""
         as_jpeg = self.lossy and not exact
-        content = jpeg(read_image(path)) if as_jpeg else path.read_bytes()
+        content = jpeg(read_image(path)) if as_jpeg else files.read_bytes(path)
         key = hashlib.sha256(content).hexdigest()[:12]
         kind = "jpeg" if as_jpeg else "png"
         self.uris.setdefault(key, f"data:image/{kind};base64,{base64.b64encode(content).decode()}")
@@ -122,7 +123,10 @@ def _limits(scenes: Sequence[Mapping[str, Any]], *, lossy: bool, views: int) -> 
 def _scene(section: Section, images: Images, views: int) -> dict[str, Any]:
     """The data of a scene for page.js."""
     offered = _test_views(section)
-    shown = [view for name in spaced(offered, views) if (view := _view(section, name, images)) is not None]
+    names = spaced(offered, views)
+    # page.js finds a layer by its number, so that all views have the same layers.
+    kinds = [kind for kind in _PHOTOS if all(_photo(section, name, kind) is not None for name in names)]
+    shown = [view for name in names if (view := _view(section, name, kinds, images)) is not None]
     return {"name": section.title, "offered": len(offered), "views": shown, "maps": _maps(section, images, views)}
 
 
@@ -144,12 +148,12 @@ def _photo(section: Section, view: str, kind: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _view(section: Section, name: str, images: Images) -> dict[str, Any] | None:
+def _view(section: Section, name: str, kinds: Sequence[str], images: Images) -> dict[str, Any] | None:
     layers = []
     try:
-        for kind, label in (("lr", "LR, enlarged"), ("prior", "SR prior"), ("truth", "truth")):
+        for kind in kinds:
             if (path := _photo(section, name, kind)) is not None:
-                layers.append({"label": label, "kind": kind, "note": "", "image": images.add(path)})
+                layers.append({"label": _PHOTOS[kind], "kind": kind, "note": "", "image": images.add(path)})
         for method, run in section.runs.items():
             path = run.folder / "renders" / f"{name}.png"
             width, height = image_size(path)
@@ -173,19 +177,26 @@ def _maps(section: Section, images: Images, views: int) -> list[dict[str, Any]]:
                 if name not in mapped:
                     width, height = image_size(of_view / "prior.png")
                     under = [
-                        {"label": label, "image": images.add(of_view / f"{kind}.png")}
-                        for kind, label in (("prior", "SR prior"), ("lr", "LR, enlarged"))
+                        {"label": _PHOTOS[kind], "image": images.add(of_view / f"{kind}.png")}
+                        for kind in ("prior", "lr")
                     ]
-                    mapped[name] = {"name": stem, "width": width, "height": height, "under": under, "methods": []}
+                    mapped[name] = {"name": stem, "width": width, "height": height, "under": under, "methods": {}}
                 maps = {kind: path for kind in MAPS if (path := of_view / f"{kind}.png").is_file()}
-                mapped[name]["methods"].append({
+                mapped[name]["methods"][method] = {
                     "label": method,
                     "maps": {kind: images.add(path, exact=True) for kind, path in maps.items()},
                     "means": means[name],
-                    "peaks": {kind: float(read_image(path)[..., 0].flatten().quantile(0.995)) for kind, path in maps.items()},
-                })  # fmt: skip
+                    "peaks": {
+                        kind: float(read_image(path)[..., 0].flatten().quantile(0.995)) for kind, path in maps.items()
+                    },
+                }
         except (DataError, KeyError, TypeError) as error:
             _log.warning("%s: its maps cannot be shown (%s).", run.folder, error)
+    # page.js finds a method by its number, so that all views have the same methods.
+    methods = [method for method in section.runs if any(method in view["methods"] for view in mapped.values())]
+    for view in mapped.values():
+        nothing = {method: {"label": method, "maps": {}, "means": {}, "peaks": {}} for method in methods}
+        view["methods"] = list((nothing | view["methods"]).values())
     for view in mapped.values():  # one scale for all methods, so that they can be compared
         peaks = {kind: max((m["peaks"].get(kind, 0.0) for m in view["methods"]), default=0.0) for kind in MAPS}
         view["tops"] = {kind: next((top for top in _TOPS if peak <= top), 1.0) for kind, peak in peaks.items()}

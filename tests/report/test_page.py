@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from clear_strategies import report
+from clear_strategies import files, report
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.report.page import Section, write_page
 from clear_strategies.report.table import Table
@@ -108,6 +108,29 @@ def test_a_page_over_its_budget_shows_fewer_views_and_says_so(tmp_path: Path, ca
     assert (sizes[1] <= 0.4, sizes[2] <= 0.25) == (True, True)
     assert "test views fit into --page-mb" in page.text
     assert "report.html is larger than 0.01 MB" in caplog.text
+
+
+def test_layers_and_methods_have_the_same_numbers_in_all_views(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """page.js finds them by number: those of another view would stand under the wrong name."""
+    runs = {name: report.Run.read(make_run(tmp_path / name, "+strategy=gco", seed=i)) for i, name in enumerate("abc")}
+    (tmp_path / "b" / "maps" / "train").rename(tmp_path / "b" / "maps" / "other")
+    files.write_json(tmp_path / "b" / "maps" / "maps.json", {"views": {"other.png": {}}})
+    (tmp_path / "c" / "maps" / "train" / "lr.png").unlink()  # damaged, and read first by a page of its own
+    for run in runs.values():
+        shutil.copy(run.folder / "renders" / "view.png", run.folder / "renders" / "wide.png")
+        for kind in ("lr", "prior"):  # the truth of this view is unknown
+            shutil.copy(run.folder / "views" / f"view_{kind}.png", run.folder / "views" / f"wide_{kind}.png")
+    write_page(tmp_path / "report.html", [Section("demo", Table({}), runs), Section("c", Table({}), {"c": runs["c"]})])
+    both, damaged = Page(tmp_path / "report.html").data["scenes"]
+    for view in both["views"]:
+        assert [layer["label"] for layer in view["layers"]] == ["LR, enlarged", "SR prior", "a", "b", "c"]
+    assert [view["name"] for view in both["maps"]] == ["train", "other"]
+    assert [[m["label"] for m in view["methods"]] for view in both["maps"]] == [["a", "b", "c"]] * 2
+    assert [bool(m["maps"]) for m in both["maps"][1]["methods"]] == [False, True, False]
+    assert damaged["maps"] == []
+    assert "its maps cannot be shown" in caplog.text
 
 
 def test_runs_without_views_and_maps_still_make_a_page_and_splats_are_linked(tmp_path, caplog) -> None:
