@@ -33,14 +33,14 @@ from clear_strategies.jobs.saved import open_splat
 from clear_strategies.jobs.scene import read
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.outputs import metrics
-from clear_strategies.outputs.figures import ERROR_MAX, error_map, spaced
+from clear_strategies.outputs.figures import BLUE, ERROR_MAX, RED, YELLOW, error_map, spaced
 
 _SOLID: Final = 0.9  # alpha below it counts as a hole
 _OUTSIDE: Final = 0.25  # a camera farther than this from the training cameras is outside, see `distance_from_hull`
 _SEEN_BY: Final = ("no training view", "one", "several")
 _STEEPEST: Final = 0.2  # the share of a photo's pixels that are its edges
 _PICTURED: Final = 3  # test views, from the worst to the best
-_COLORS: Final = ("#ee6677", "#ccbb44", "#4477aa")  # of _SEEN_BY
+_COLORS: Final = (RED, YELLOW, BLUE)  # of _SEEN_BY
 _WAVES: Final = (1, 4, 16)  # the longest wave of each band, in the shortest waves that the LR photos hold
 
 
@@ -80,18 +80,18 @@ def measure(results: Results, *, run: Path, reference: Path | None = None) -> No
     if not frames:
         remedy = "train with test views: data.views.test_every=8"
         raise DataError(run, "test views", "there are none, and training photos say nothing of the error", remedy)
-    field, train = splats["run"].painter, splats["run"].poses()
-    depths = [(camera, field.depth(camera)) for camera in train]
+    painter, train = splats["run"].painter, splats["run"].poses()
+    depths = [(camera, painter.depth(camera)) for camera in train]
     centers = torch.stack([camera.center for camera in train])
     views = [
         HeldOut(
-            Path(frame.name).stem,
-            photo.image,
-            {name: splat.painter.color(photo.camera) for name, splat in splats.items()},
-            field.numbers(photo.camera, torch.ones(len(field.field))),
-            seen_by(photo.camera, field.depth(photo.camera), depths),
-            distance_from_hull(photo.camera.center, centers),
-            1 if view_settings.photos_are == "lr" else view_settings.sr_scale,
+            name=Path(frame.name).stem,
+            truth=photo.image,
+            images={name: splat.painter.color(photo.camera) for name, splat in splats.items()},
+            alpha=painter.numbers(photo.camera, torch.ones(len(painter.field))),
+            seen=seen_by(photo.camera, painter.depth(photo.camera), depths),
+            distance=distance_from_hull(photo.camera.center, centers),
+            factor=1 if view_settings.photos_are == "lr" else view_settings.sr_scale,
         )
         for frame, photo in zip(frames, photos_of(frames, view_settings), strict=True)
     ]

@@ -72,9 +72,9 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[s
         "milestones": ", ".join(f"{name} {t}" for name, t in marks(state).items()),
     }
     owners = [(type(s).__name__, milestones(s)) for s in conductor.strategies]
-    for owner, its in (*owners, (state.density.name, milestones(state.density.settings))):
-        if its:
-            lines[f"milestones of {owner}"] = ", ".join(f"{name} {t}" for name, t in its.items())
+    for owner, iterations in (*owners, (state.density.name, milestones(state.density.settings))):
+        if iterations:
+            lines[f"milestones of {owner}"] = ", ".join(f"{name} {t}" for name, t in iterations.items())
     for name, s in named:
         if (summary := s.summary()) is not None:
             lines[name.replace("_", " ")] = summary

@@ -60,15 +60,14 @@ def test_what_is_gained_where_all_error_lies_is_everything_and_elsewhere_nothing
 
 
 @pytest.mark.parametrize(
-    ("center", "distance"),
-    [([0.5, 0.5, 0], 0), ([2, 2, 0], 0.5), ([0.5, 0.5, 1], 1 / 8**0.5), ([-1, 0, 0], 1 / 8**0.5)],
-)
-def test_distance_from_the_hull_is_that_of_its_nearest_point(center, distance):
-    assert distance_from_hull(torch.tensor(center, dtype=torch.float32), TRIANGLE) == pytest.approx(distance, abs=2e-3)
-
-
-def test_of_a_single_camera_everything_else_is_outside():
-    assert distance_from_hull(TRIANGLE[1], TRIANGLE[:1]) == math.inf
+    ("center", "hull", "distance"),
+    [
+        ([0.5, 0.5, 0], TRIANGLE, 0), ([2, 2, 0], TRIANGLE, 0.5), ([0.5, 0.5, 1], TRIANGLE, 1 / 8**0.5),
+        ([-1, 0, 0], TRIANGLE, 1 / 8**0.5), ([2, 0, 0], TRIANGLE[:1], math.inf),
+    ],
+)  # fmt: skip
+def test_distance_from_the_hull_is_that_of_its_nearest_point(center, hull, distance):
+    assert distance_from_hull(torch.tensor(center, dtype=torch.float32), hull) == pytest.approx(distance, abs=2e-3)
 
 
 @pytest.mark.slow

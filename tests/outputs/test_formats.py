@@ -21,9 +21,6 @@ from rasterizers.geometry import SH_C0, rotation_matrix, spherical_harmonics
 from tests.helpers import saved_run
 
 LAYOUT = [("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)]
-by_another_program = pytest.mark.skipif(
-    shutil.which("splat-transform") is None, reason="npm install -g @playcanvas/splat-transform"
-)
 
 
 @pytest.fixture(scope="module")
@@ -32,15 +29,24 @@ def run(tmp_path_factory):
     return folder, saved_run.write(folder)
 
 
+@pytest.fixture
+def exported(run, tmp_path):
+    def export_as(form):
+        export.main([str(run[0]), "--to", form, "--out", str(tmp_path / f"a.{form}")])
+        return tmp_path / f"a.{form}"
+
+    return export_as
+
+
 def sorted_by_x(values, x):
     return values[np.argsort(x, kind="stable")]
 
 
-def test_a_splat_file_holds_position_scale_colour_and_rotation(run, tmp_path):
-    folder, field = run
-    export.main([str(folder), "--to", "splat", "--out", str(tmp_path / "a.splat")])
-    table = np.frombuffer((tmp_path / "a.splat").read_bytes(), LAYOUT)
-    exact = field.baked()
+def test_a_splat_file_holds_position_scale_colour_and_rotation_and_the_most_visible_come_first(run, exported):
+    table = np.frombuffer(exported("splat").read_bytes(), LAYOUT)
+    weight = table["scales"].prod(1) * table["rgba"][:, 3]
+    assert weight[:10].min() > weight[-10:].max()
+    exact = run[1].baked()
     order = np.argsort(exact.means[:, 0].numpy(), kind="stable")
     found = sorted_by_x(table, table["means"][:, 0])
     np.testing.assert_array_equal(found["means"], exact.means.numpy()[order])
@@ -52,17 +58,9 @@ def test_a_splat_file_holds_position_scale_colour_and_rotation(run, tmp_path):
     np.testing.assert_allclose((found["quats"].astype(float) - 128) / 128, quats, atol=1.01 / 128)
 
 
-def test_the_largest_and_most_opaque_come_first(run):
-    g = read_gaussians(run[0] / "point_cloud.ply")
-    table = np.frombuffer(formats.splat_bytes(g), LAYOUT)
-    weight = table["scales"].prod(1) * table["rgba"][:, 3]
-    assert weight[:10].min() > weight[-10:].max()
-
-
-def test_a_ply_is_the_one_of_the_run(run, tmp_path):
+def test_a_ply_is_the_one_of_the_run(run, exported):
     folder, _ = run
-    export.main([str(folder), "--to", "ply", "--out", str(tmp_path / "a.ply")])
-    assert (tmp_path / "a.ply").read_bytes() == (folder / "point_cloud.ply").read_bytes()
+    assert exported("ply").read_bytes() == (folder / "point_cloud.ply").read_bytes()
     export.main([str(folder), "--to", "ply", "--sh", "1"])
     assert read_gaussians(folder / f"{folder.name}.ply").shN.shape[1] == 3
 
@@ -91,11 +89,9 @@ def read_glb(path):
     return content, found
 
 
-def test_a_glb_holds_the_splats_of_the_ply(run, tmp_path):
-    folder, _ = run
-    export.main([str(folder), "--to", "glb", "--out", str(tmp_path / "a.glb")])
-    content, found = read_glb(tmp_path / "a.glb")
-    g, prefix = read_gaussians(folder / "point_cloud.ply"), "KHR_gaussian_splatting:"
+def test_a_glb_holds_the_splats_of_the_ply(run, exported):
+    content, found = read_glb(exported("glb"))
+    g, prefix = read_gaussians(run[0] / "point_cloud.ply"), "KHR_gaussian_splatting:"
     exact = {
         "POSITION": g.means, f"{prefix}SCALE": g.scales.exp(), f"{prefix}OPACITY": g.opacities.sigmoid()[:, None],
         f"{prefix}ROTATION": torch.nn.functional.normalize(g.quats, dim=1)[:, [1, 2, 3, 0]],
@@ -132,29 +128,24 @@ def errors_of_glb(path) -> list[str]:
     return [f"{m['code']} {m['pointer']}" for m in json.loads(ended.stdout) if m["severity"] <= 1]
 
 
-def test_khronos_validator_finds_nothing_but_the_names_that_it_does_not_know_yet(run, tmp_path):
+def test_khronos_validator_finds_nothing_but_the_names_that_it_does_not_know_yet(exported):
     """glTF-Validator issue 252: it refuses attributes named by an extension. With names that glTF keeps for applications,
     of the same length, the same file is without errors and warnings.
     """
-    path = tmp_path / "a.glb"
-    export.main([str(run[0]), "--to", "glb", "--out", str(path)])
+    path = exported("glb")
     named = "MESH_PRIMITIVE_INVALID_ATTRIBUTE /meshes/0/primitives/0/attributes/KHR_gaussian_splatting:"
     assert [error for error in errors_of_glb(path) if not error.startswith(named)] == []
     path.write_bytes(path.read_bytes().replace(b"KHR_gaussian_splatting:", b"_HR_gaussian_splatting:"))
     assert errors_of_glb(path) == []
 
 
-@by_another_program
+@pytest.mark.skipif(shutil.which("splat-transform") is None, reason="npm install -g @playcanvas/splat-transform")
 @pytest.mark.parametrize("form", ["ply", "splat", "spz", "sog"])
-def test_another_program_reads_what_is_written(run, tmp_path, form):
-    folder, field = run
-    export.main([str(folder), "--to", form, "--out", str(tmp_path / f"a.{form}")])
-    subprocess.run(
-        ["splat-transform", "-q", "-w", str(tmp_path / f"a.{form}"), str(tmp_path / "back.ply")],
-        check=True, capture_output=True, timeout=120,
-    )  # fmt: skip
-    back, exact = read_gaussians(tmp_path / "back.ply"), field.baked()
-    assert len(back) == len(field)
+def test_another_program_reads_what_is_written(run, exported, tmp_path, form):
+    command = ["splat-transform", "-q", "-w", exported(form), tmp_path / "back.ply"]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    back, exact = read_gaussians(tmp_path / "back.ply"), run[1].baked()
+    assert len(back) == len(run[1])
     x, order = np.sort(back.means[:, 0].numpy()), np.argsort(exact.means[:, 0].numpy())
     np.testing.assert_allclose(x, exact.means[:, 0].numpy()[order], atol=2e-3)
     opacity = sorted_by_x(back.opacities.sigmoid().numpy(), back.means[:, 0].numpy())
@@ -162,11 +153,10 @@ def test_another_program_reads_what_is_written(run, tmp_path, form):
 
 
 @pytest.mark.parametrize(("form", "back"), [("spz", formats.turned), ("sog", lambda g: g)])
-def test_a_packed_file_holds_the_splats_of_the_ply(run, tmp_path, form, back):
+def test_a_packed_file_holds_the_splats_of_the_ply(run, exported, tmp_path, form, back):
     """Read by the library that wrote it; SPZ's y points up."""
     gaussforge = pytest.importorskip("gaussforge", reason="pip install gaussforge")
-    export.main([str(run[0]), "--to", form, "--out", str(tmp_path / f"a.{form}")])
-    data = (tmp_path / f"a.{form}").read_bytes()
+    data = exported(form).read_bytes()
     assert form != "spz" or struct.unpack_from("<4sI", data) == (b"NGSP", 4)
     (tmp_path / "back.ply").write_bytes(gaussforge.GaussForge().convert(data, form, "ply")["data"])
     g, found = read_gaussians(run[0] / "point_cloud.ply"), back(read_gaussians(tmp_path / "back.ply"))

@@ -32,7 +32,7 @@ def scene(train: tuple[View, ...], test: tuple[View, ...]) -> Scene:
     return Scene("made up", train, test, PointCloud(torch.zeros(1, 3), torch.zeros(1, 3), "one point"))
 
 
-def test_each_view_is_scored_by_method_and_the_mean_is_over_views() -> None:
+def test_each_view_is_scored_by_method_and_the_mean_is_over_views_if_there_are_any() -> None:
     a, b = view("a", noise(0, 48, 64)), view("b", noise(1, 48, 64))
     evaluation = metrics.evaluate(scene((a,), (a, b)), lambda camera: a.truth)  # type: ignore[arg-type,return-value]
     assert set(evaluation.renders) == {"a", "b"}
@@ -42,6 +42,9 @@ def test_each_view_is_scored_by_method_and_the_mean_is_over_views() -> None:
     mean = evaluation.mean("test")
     assert mean.psnr == pytest.approx((PSNR_CAP + evaluation.test["b"]["ours"].psnr) / 2)
     assert evaluation.against == {"test": "HR photos", "train": "HR photos"}
+    without = metrics.evaluate(scene((a,), ()), lambda camera: a.truth)  # type: ignore[arg-type,return-value]
+    assert without.mean("test") is None
+    assert metrics.to_json(without)["test"] == {"against": "nothing", "views": {}, "mean": {}}
 
 
 def test_where_hr_is_unknown_the_reduced_render_is_compared_with_lr() -> None:
@@ -61,14 +64,6 @@ def test_where_the_hr_side_is_photos_nothing_is_scored_but_the_render() -> None:
     assert not made.hr_is_photo
     evaluation = metrics.evaluate(scene((photos,), (photos,)), lambda camera: photos.hr.image)
     assert set(evaluation.test["a"]) == {"ours"}
-
-
-def test_a_scene_without_test_views_has_no_mean() -> None:
-    a = view("a", noise(0, 48, 64))
-    evaluation = metrics.evaluate(scene((a,), ()), lambda camera: a.hr.image)
-    assert evaluation.mean("test") is None
-    content = metrics.to_json(evaluation)
-    assert content["test"] == {"against": "nothing", "views": {}, "mean": {}}
 
 
 def test_a_render_that_is_not_finite_has_a_warning_and_null_in_the_file(tmp_path, caplog):

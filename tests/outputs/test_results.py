@@ -121,12 +121,13 @@ def test_a_run_without_test_views_shows_training_views_and_what_is_not_wanted_or
     monkeypatch.setattr("clear_strategies.viewing.video.find_spec", lambda _: None)
     scene = replace(SCENE, test=(), train=SCENE.train * 2)
     with caplog.at_level("DEBUG"):
-        write(tmp_path, state, scene=scene, pictures=Pictures(map_views=0, video_frames=2, page_gaussians=0))
+        write(tmp_path, state, scene=scene, pictures=Pictures(map_views=0, video_frames=2, page_gaussians=1))
     assert names(tmp_path / "renders") == {f"{view.name}.png" for view in SCENE.train}
     assert names(tmp_path / "depth") == names(tmp_path / "renders")
     times = round(magnification(SCENE.train[0].hr.image.shape[1]))
     assert holds(read(tmp_path / "contact_sheet.png"), SCENE.train[0].hr.image.numpy(), times=times)
     assert "pip install imageio-ffmpeg" in caplog.text
+    assert "no splat.html is written" in caplog.text
     assert not names(tmp_path) & {"maps/", "path.mp4", "splat.html", "coverage.html", "coverage.png"}
 
 
@@ -160,13 +161,10 @@ def test_an_earlier_run_goes_with_all_of_its_files_and_no_other(tmp_path: Path, 
     results.remove_earlier(tmp_path, all_files=True)
     assert {path for path in tmp_path.rglob("*") if path.is_file()} == kept
     assert names(tmp_path) == {"notes.txt", "depth/", "checkpoints/"}
-
-
-def test_of_a_file_that_is_no_runs_nothing_else_is_removed(tmp_path: Path) -> None:
-    for name in ("metrics.json", "curves.png"):
-        files.write_text(tmp_path / name, "{}")
-    results.remove_earlier(tmp_path, all_files=True)
-    assert names(tmp_path) == {"curves.png"}
+    for name in ("metrics.json", "curves.png"):  # of another program
+        files.write_text(tmp_path / "other" / name, "{}")
+    results.remove_earlier(tmp_path / "other", all_files=True)
+    assert names(tmp_path / "other") == {"curves.png"}
 
 
 def test_the_sheet_of_photos_at_hr_shows_no_sr(tmp_path, state, monkeypatch):

@@ -11,7 +11,7 @@ import rasterizers
 from clear_strategies.training.field import GaussianField
 from clear_strategies.viewing.film import DepthScale
 from clear_strategies.viewing.look import Look, Painter
-from tests.helpers import saved_run, toy
+from tests.helpers import saved_run, toy, wall
 
 CAMERA = toy.camera(0.2)
 
@@ -43,19 +43,9 @@ def test_each_part_can_be_left_out(field, part):
 
 
 def test_depth_is_the_distance_of_what_is_seen():
-    """A wall of opaque Gaussians at z = 5, over a background that must not count."""
-    x, y = torch.meshgrid(torch.linspace(-2, 2, 24), torch.linspace(-2, 2, 24), indexing="ij")
-    n = x.numel()
-    wall = GaussianField(
-        {
-            "means": torch.stack([x.flatten(), y.flatten(), torch.full((n,), 1.0)], 1),
-            "quats": torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4), "scales": torch.full((n, 3), -2.0),
-            "opacities": torch.full((n,), 6.0), "sh0": torch.ones(n, 1, 3), "shN": torch.zeros(n, 0, 3),
-            "detail": torch.zeros(n, 3),
-        }
-    )  # fmt: skip
-    depth = Painter(wall, make).depth(toy.camera(0.0))
-    torch.testing.assert_close(depth[20:40, 30:60], torch.full((20, 30), 5.0), atol=0.02, rtol=0)
+    """A wall at z = 4, over a background that must not count."""
+    depth = Painter(wall.painter().field, make).depth(wall.at(0.0))
+    torch.testing.assert_close(depth, torch.full((40, 60), 4.0), atol=0.02, rtol=0)
 
 
 def test_depth_is_unknown_where_nothing_is(field):

@@ -74,13 +74,10 @@ def test_few_cameras_and_cameras_at_one_place_give_a_path_too(count):
     np.testing.assert_allclose(centers(still), np.tile(RING[0].center.numpy(), (5, 1)), atol=1e-6)
 
 
-def test_an_ellipse_goes_around_a_scene_that_is_surrounded():
+def test_an_ellipse_goes_around_a_scene_that_is_surrounded_and_stays_in_front_of_another():
     ellipse = paths.ellipse(RING, 16)
     np.testing.assert_allclose(np.linalg.norm(centers(ellipse)[:, [0, 2]], axis=1), 3, rtol=0.05)
     assert all(float(c.world_to_camera[2, :3] @ c.center) < -2.5 for c in ellipse)  # looks at the origin
-
-
-def test_an_ellipse_stays_in_front_of_a_scene_that_is_not():
     forward = [at((x, y, 0), (0, 0, 4)) for x in (-1.0, 0.0, 1.0) for y in (-0.5, 0.5)]
     found = centers(paths.ellipse(forward, 12))
     assert np.abs(found[:, 2]).max() < 0.2
