@@ -18,10 +18,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 import rasterizers
-from clear_strategies.bench import accuracy, peers, plots, scenes
+from clear_strategies.bench import accuracy, peers, scenes
 from clear_strategies.bench.accuracy import NO_CUT_OFFS, Drawn, affordable
 from clear_strategies.bench.peers import Peer
-from clear_strategies.bench.results import Results
+from clear_strategies.bench.results import Results, line_chart
 from clear_strategies.bench.scenes import SETTINGS, Workload
 from clear_strategies.bench.timing import interleaved, medians, milliseconds
 from clear_strategies.core.work_log import WorkLog
@@ -100,7 +100,7 @@ def figure(time: pd.DataFrame, error: pd.DataFrame) -> Figure:
     rows["forward + backward, ms"] = rows["forward_ms"] + rows["backward_k1_ms"]
     error_of = "error of the gradient of the means,\nrelative L2, against float64"
     rows = rows.assign(line="").rename(columns={"preset": "mark", "means_relative": error_of})
-    return plots.lines(rows[[*plots.WHO, "forward + backward, ms", error_of]], log=True)
+    return line_chart(rows, "forward + backward, ms", error_of, log=True)
 
 
 def require_device(device: str) -> None:
@@ -204,10 +204,10 @@ def _error_rows(workload: Workload, contestants: Sequence[Contestant], backend: 
     cotangent = random_cotangents(workload)[0]
     truths: dict[tuple[Any, ...], Drawn] = {}
     for c in contestants:
-        found = accuracy.draw(c.render, cotangent)
+        drawn = accuracy.draw(c.render, cotangent)
         for against, cut_offs in ((SAME, PRESETS[c.names["preset"]]), (NONE, NO_CUT_OFFS)):
             rules = {**c.rules, **cut_offs}
             key = tuple(sorted(rules.items()))
             if key not in truths:
                 truths[key] = accuracy.truth(backend, workload, cotangent, rules)
-            yield {**c.names, "truth": against, **accuracy.errors(found, truths[key])}
+            yield {**c.names, "truth": against, **accuracy.errors(drawn, truths[key])}

@@ -23,8 +23,7 @@ import torch
 from matplotlib.figure import Figure
 
 from clear_strategies import files
-from clear_strategies.bench import plots
-from clear_strategies.bench.results import Results
+from clear_strategies.bench.results import Results, line_chart
 from clear_strategies.commands.train import quoted
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.errors import DataError
@@ -119,7 +118,7 @@ def figure(curves: pd.DataFrame) -> Figure:
     names = {"training_s": "seconds of training", "psnr": "PSNR of the test views, dB", "variant": "name"}
     ends = ~curves.duplicated(["scene", "variant", "seed"], keep="last")
     rows = curves.assign(line=curves["seed"], mark=curves["seed"].astype(str).where(ends, "")).rename(columns=names)
-    return plots.lines(rows[[*plots.WHO, names["training_s"], names["psnr"]]])
+    return line_chart(rows, names["training_s"], names["psnr"])
 
 
 def name_of(variant: Sequence[str]) -> str:

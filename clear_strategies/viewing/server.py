@@ -154,9 +154,9 @@ class SplatViewer(nerfview.Viewer):  # type: ignore[misc]  # nerfview has no typ
 
     def view(self) -> View:
         """The choices of the panel now."""
-        h = self._switches
-        look = Look(sh=h["sh"].value, detail=h["detail"].value, filter_3d=h["filter_3d"].value, mip=h["mip"].value)
-        return View(h["show"].value, look, h["grid"].value)
+        values = {name: switch.value for name, switch in self._switches.items()}
+        show, grid = values.pop("show"), values.pop("grid")
+        return View(show, Look(**values), grid)
 
     @property
     def paused(self) -> bool:
