@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
@@ -66,6 +67,15 @@ def curve(
         window = max(1, len(y) // 50)
         x, y = x[window - 1 :], np.convolve(y, np.ones(window) / window, mode="valid")
     return x, y
+
+
+def column_means(history: History) -> dict[str, float]:
+    """The mean of each column over the rows where it is not NaN; a column without such a row is left out."""
+    columns: defaultdict[str, list[float]] = defaultdict(list)
+    for row in history:
+        for name, value in row.items():
+            columns[name] += [] if math.isnan(value) else [value]
+    return {name: sum(values) / len(values) for name, values in columns.items() if values}
 
 
 def finish(axis: Axes, *, legend: Literal["best", "upper right"] | None = "best") -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -13,6 +11,7 @@ import torch
 
 from clear_strategies.data.scene import Scene
 from clear_strategies.merging.conductor import Conductor
+from clear_strategies.outputs.figures import column_means
 from clear_strategies.schedules import milestones
 from clear_strategies.training.state import TrainState
 
@@ -137,10 +136,5 @@ def marks(state: TrainState) -> dict[str, int]:
 
 def remarks(state: TrainState) -> list[str]:
     """`Strategy.in_hindsight` of each strategy, given the means of the run's history."""
-    columns: defaultdict[str, list[float]] = defaultdict(list)
-    for row in state.history_as_floats():
-        for name, value in row.items():
-            if not math.isnan(value):
-                columns[name].append(value)
-    means = {name: sum(values) / len(values) for name, values in columns.items()}
+    means = column_means(state.history_as_floats())
     return [remark for s in state.conductor.strategies if (remark := s.in_hindsight(means)) is not None]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -25,7 +24,7 @@ from clear_strategies.outputs import coverage, metrics
 from clear_strategies.outputs.baseline import Baseline
 from clear_strategies.outputs.contact_sheet import OWN_PHOTO, TRAINED_ON, SheetRow, write_contact_sheet
 from clear_strategies.outputs.curves import write_curves
-from clear_strategies.outputs.figures import spaced
+from clear_strategies.outputs.figures import column_means, spaced
 from clear_strategies.outputs.fly_through import write_depths, write_loop, write_splat_page
 from clear_strategies.outputs.formats import export_ply
 from clear_strategies.outputs.maps import write_maps
@@ -207,10 +206,6 @@ def _write_tables(
 
 def _mean_conflict(history: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Mean over the iterations that compared gradients, by group and, as "gaussian", for the Gaussian as a whole."""
-    rows = [row for row in history if "conflict" in row]
-    means = {}
-    for key in dict.fromkeys(k for row in rows for k in row if k == "conflict" or k.startswith("conflict_")):
-        values = [row[key] for row in rows if key in row and not math.isnan(row[key])]
-        if values:
-            means["gaussian" if key == "conflict" else key.removeprefix("conflict_")] = sum(values) / len(values)
-    return means
+    means = {"conflict_gaussian" if name == "conflict" else name: mean for name, mean in column_means(history).items()}
+    prefix = "conflict_"
+    return {name.removeprefix(prefix): mean for name, mean in means.items() if name.startswith(prefix)}

@@ -1,4 +1,4 @@
-"""Looking at a field: how it is drawn, from where, and what it is drawn into: pictures, videos, a page, a viewer."""
+"""Showing a field: its rendering, cameras and paths, and pictures, videos, pages and a viewer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a field is drawn to be looked at: by the run's own rasterizer, with parts of the model switched off on request."""
+"""Rendering of a field for display, by the run's rasterizer, with parts of the model switched off on request."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Painter:
     """Draws a field.
 
     Args:
-        make: makes the rasterizer of the run; takes fields of `RasterSettings`, which win over the run's.
+        make: returns the rasterizer of the run; takes fields of `RasterSettings`, which override the run's.
     """
 
     field: GaussianField
