@@ -26,8 +26,16 @@ Frame = UInt8[np.ndarray, "_ _ 3"]
 
 
 def missing() -> str | None:
-    """Why no video can be written, with the remedy; None where imageio-ffmpeg is installed."""
-    return None if find_spec("imageio_ffmpeg") is not None else "videos need imageio-ffmpeg: pip install imageio-ffmpeg"
+    """Why no video can be written, with the remedy; None where imageio-ffmpeg and a program of ffmpeg are installed."""
+    if find_spec("imageio_ffmpeg") is None:
+        return "videos need imageio-ffmpeg: pip install imageio-ffmpeg"
+    import imageio_ffmpeg
+
+    try:
+        imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError:
+        return "videos need ffmpeg, and that of imageio-ffmpeg does not run here: install ffmpeg"
+    return None
 
 
 def write_videos(paths: Iterable[Path], frames: Iterable[Frame], *, fps: float) -> None:
@@ -37,7 +45,7 @@ def write_videos(paths: Iterable[Path], frames: Iterable[Frame], *, fps: float) 
         frames: all of one size, with an even height and width.
 
     Raises:
-        SettingError: imageio-ffmpeg is not installed, a suffix is another one, or there is no frame.
+        SettingError: ffmpeg is missing, a suffix is another one, or there is no frame.
     """
     if (problem := missing()) is not None:
         raise SettingError(f"{problem}.")

@@ -60,7 +60,13 @@ def test_what_gives_no_video_is_refused(tmp_path, name, frames, message):
         video.write_videos([tmp_path / name], frames, fps=10)
 
 
-def test_a_missing_library_is_named(monkeypatch, tmp_path):
+def test_a_missing_program_and_a_missing_library_are_named(monkeypatch, tmp_path):
+    def nowhere() -> str:
+        raise RuntimeError("No ffmpeg exe could be found.")
+
+    monkeypatch.setattr(ffmpeg, "get_ffmpeg_exe", nowhere)
+    with pytest.raises(SettingError, match="does not run here: install ffmpeg"):
+        video.write_videos([tmp_path / "a.mp4"], FRAMES, fps=10)
     monkeypatch.setattr(video, "find_spec", lambda _: None)
     with pytest.raises(SettingError, match="pip install imageio-ffmpeg"):
         video.write_videos([tmp_path / "a.mp4"], FRAMES, fps=10)
