@@ -34,7 +34,7 @@ from integration.log import show_log
 from integration.model_proxy import AttachedModel, Role
 from integration.replacing import ReplacedMethods
 from integration.rows import ROWS, RowNumbers
-from integration.views import sr_images, sr_source, view
+from integration.views import sr_source, view
 
 _log = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ class Attached:
             )
         self._settings, self._density, self._module = settings, density, module
         self._conductor: Conductor = conductor(settings.strategies, *settings.overrides, iterations=trainer.max_steps)
-        self._sr, self._factor = sr_source(sr_images(settings.sr, settings.suffix), self._conductor, settings.factor)
+        self._sr, self._factor = sr_source(settings.sr, self._conductor, settings.factor, settings.suffix)
         end_with_strategies(self._conductor, density, "densify_until_iter")
         self._views: dict[str, View] = {}
         self._masks: dict[str, Tensor] = {}

@@ -160,28 +160,24 @@ def enlarged_mask(mask: Float[Tensor, "h w"], factor: int) -> Float[Tensor, "H W
     return mask.repeat_interleave(factor, 0).repeat_interleave(factor, 1)
 
 
-def sr_images(sr: SuperResolve | str | Path | None, suffix: str = "") -> SuperResolve | None:
-    """The function that gives SR images: those of a folder where `sr` names one, else `sr` itself.
-
-    Args:
-        suffix: what the SR tool appended to the names in the folder.
-    """
-    if sr is None or not isinstance(sr, str | Path):
-        return sr
-    from clear_strategies.data.priors import Images
-
-    return Images(str(sr), suffix)
-
-
-def sr_source(sr: SuperResolve | str | Path | None, conductor: Conductor, factor: int) -> tuple[SuperResolve, int]:
+def sr_source(
+    sr: SuperResolve | str | Path | None, conductor: Conductor, factor: int, suffix: str = ""
+) -> tuple[SuperResolve, int]:
     """What makes the SR images, with the conductor's decorators around it, and their factor. Without SR images the "HR" view
     is the LR view.
+
+    Args:
+        sr: the folder of the SR images, or a function that makes them. suffix: what the SR tool appended to the names there.
 
     Raises:
         SettingError: there are no SR images, but the objective or a strategy needs them.
     """
-    if (images := sr_images(sr)) is not None:
-        return conductor.prior(images), factor
+    if isinstance(sr, str | Path):
+        from clear_strategies.data.priors import Images
+
+        sr = Images(str(sr), suffix)
+    if sr is not None:
+        return conductor.prior(sr), factor
     λ = conductor.objective.lambda_hr
     if λ.peak > 0 or λ.final > 0 or conductor.owner("observe") is not None:
         raise SettingError(

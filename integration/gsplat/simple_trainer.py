@@ -22,7 +22,7 @@ from integration.gsplat.points import start_from_stereo
 from integration.log import show_log
 from integration.points import Points, wants_stereo
 from integration.replacing import Replaced
-from integration.views import SuperResolve, sr_images, sr_source
+from integration.views import SuperResolve, sr_source
 
 _log = logging.getLogger(__name__)
 
@@ -79,7 +79,6 @@ def install(
     show_log()
     if wants_stereo(points):
         start_from_stereo(runner_class)
-    images = sr_images(sr, suffix)
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
     in_use: list[_Installed] = []  # of the last Runner: its evaluation may come after its training
 
@@ -88,7 +87,7 @@ def install(
         require_supported(runner.cfg, runner.world_size)
         chosen = conductor(strategies, *overrides, iterations=runner.cfg.max_steps)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
-        source, scale = sr_source(images, chosen, factor)
+        source, scale = sr_source(sr, chosen, factor, suffix)
         photos = photos_of(runner.trainset, runner.device)
         masks = {photo.name: photo.mask for photo in photos if photo.mask is not None}
         if in_use:

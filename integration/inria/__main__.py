@@ -11,14 +11,13 @@ import logging
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from integration import launcher
 from integration.errors import HostError
-from integration.inria import Attached
 from integration.inria.cameras import photo_of
 from integration.inria.from_options import install
-from integration.launcher import Launch, run_script
 from integration.views import save_photos
 
 _log = logging.getLogger("integration.inria")  # __name__ is "__main__" here
@@ -28,72 +27,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a train.py with CLEAR; returns the exit status."""
     why = "it called no GaussianModel.training_setup, or made no step"
     return launcher.main(
-        "integration.inria", "the train.py of a 3DGS-style trainer", arguments, lambda launch: _Run(launch).train(), why
+        "integration.inria", "the train.py of a 3DGS-style trainer", arguments, _installed_by_training_setup, why
     )
 
 
-class _Run:
-    """One run of a train.py.
+@contextmanager
+def _installed_by_training_setup(save_lr: Path | None, settings: dict[str, Any]) -> Iterator[list[Any]]:
+    """CLEAR is installed after the script's first call of `training_setup`, for the cameras of the last `Scene`."""
+    importlib.import_module("gaussian_renderer")  # whose `render` install replaces
+    scene: Any = importlib.import_module("scene")
+    setup, init = scene.GaussianModel.training_setup, scene.Scene.__init__
+    scenes, attached = list[Any](), list[Any]()
 
-    Attributes:
-        attached: None before the script's `training_setup`.
-    """
+    @functools.wraps(init)
+    def init_and_remember(loaded: Any, *args: Any, **kwargs: Any) -> None:
+        init(loaded, *args, **kwargs)
+        scenes.append(loaded)
 
-    def __init__(self, launch: Launch) -> None:
-        self._launch = launch
-        self._scene: Any = None
-        self.attached: Attached | None = None
-
-    def train(self) -> bool:
-        """Whether a step of CLEAR was made."""
-        folder = str(self._launch.script.parent.resolve())
-        sys.path.insert(0, folder)  # for the host's modules
-        try:
-            with self._hooked_host():
-                run_script(self._launch)
-        finally:
-            sys.path.remove(folder)
-        if self.attached is None or not self.attached.attachment.counts["merges"]:
-            return False
-        _log.info("%s.", self.attached.attachment.summary())
-        return True
-
-    @contextmanager
-    def _hooked_host(self) -> Iterator[None]:
-        importlib.import_module("gaussian_renderer")
-        scene: Any = importlib.import_module("scene")
-        setup, init = scene.GaussianModel.training_setup, scene.Scene.__init__
-
-        @functools.wraps(init)
-        def init_and_remember(loaded: Any, *args: Any, **kwargs: Any) -> None:
-            init(loaded, *args, **kwargs)
-            self._scene = loaded
-
-        @functools.wraps(setup)
-        def setup_and_install(gaussians: Any, opt: Any, *args: Any, **kwargs: Any) -> Any:
-            result = setup(gaussians, opt, *args, **kwargs)
-            scene.GaussianModel.training_setup = setup  # points=stereo, and a restored checkpoint, call it again
-            self._install(gaussians, opt)
-            return result
-
-        scene.GaussianModel.training_setup, scene.Scene.__init__ = setup_and_install, init_and_remember
-        try:
-            yield
-        finally:
-            scene.GaussianModel.training_setup, scene.Scene.__init__ = setup, init
-            if self.attached is not None:
-                self.attached.remove()
-
-    def _install(self, gaussians: Any, opt: Any) -> None:
-        if self._scene is None:
+    @functools.wraps(setup)
+    def setup_and_install(gaussians: Any, opt: Any, *args: Any, **kwargs: Any) -> Any:
+        result = setup(gaussians, opt, *args, **kwargs)
+        scene.GaussianModel.training_setup = setup  # points=stereo, and a restored checkpoint, call it again
+        if not scenes:
             raise HostError(
                 "training_setup was called before a Scene was made, so the training cameras are unknown. Put the line "
                 "install(gaussians, scene, opt, …) into the script instead."
             )
-        if self._launch.save_lr is not None:
-            save_photos(map(photo_of, self._scene.getTrainCameras()), self._launch.save_lr)
+        if save_lr is not None:
+            save_photos(map(photo_of, scenes[-1].getTrainCameras()), save_lr)
             raise SystemExit(0)
-        self.attached = install(gaussians, self._scene, opt, **self._launch.settings)
+        attached.append(install(gaussians, scenes[-1], opt, **settings))
+        return result
+
+    scene.GaussianModel.training_setup, scene.Scene.__init__ = setup_and_install, init_and_remember
+    try:
+        yield attached
+        for each in attached:
+            _log.info("%s.", each.attachment.summary())
+    finally:
+        scene.GaussianModel.training_setup, scene.Scene.__init__ = setup, init
+        for each in attached:
+            each.remove()
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ class Attached:
         gaussians: the host's GaussianModel, after `training_setup`.
         cameras: all training cameras (`scene.getTrainCameras()`), each with its photo.
         sr: the folder of the SR images, or a function that makes them (`clear_strategies.data.priors` has some). None:
-            there are none, for strategies and objectives that do not use HR.
+            there are none, for strategies and objectives that do not use HR. suffix: what the SR tool appended to the names.
         factor: HR pixels per LR pixel.
         threshold: opt.densify_grad_threshold, which scales P2G's score; None: a loop without densification.
         densify_until: opt.densify_until_iter; refused where an anchor would be taken before. 0: a strategy of the conductor may
@@ -79,6 +79,7 @@ class Attached:
         conductor: Conductor,
         *,
         sr: SuperResolve | str | Path | None = None,
+        suffix: str = "",
         factor: int = 4,
         threshold: float | None = THRESHOLD,
         densify_until: int | None = None,
@@ -96,7 +97,7 @@ class Attached:
             raise HostError("these gaussians are attached already; remove() the attachment that did it first.")
         require_end(conductor, densify_until, "densify_until_iter")
         self._model = gaussians
-        self.views = HostViews(cameras, *sr_source(sr, conductor, factor), gaussians._xyz.device)
+        self.views = HostViews(cameras, *sr_source(sr, conductor, factor, suffix), gaussians._xyz.device)
         self._rows = CarriedRows(gaussians, self._host_params)
         self._attached = AttachedModel(
             gaussians, _ROLES, self._host_params, self._rows, conductor, self.views.all, detail=detail, densifier=gaussians,

@@ -13,7 +13,7 @@ from integration.inria.attached import Attached
 from integration.inria.points import start_from_stereo
 from integration.log import show_log
 from integration.points import Points, wants_stereo
-from integration.views import SuperResolve, sr_images
+from integration.views import SuperResolve
 
 
 def install(
@@ -61,7 +61,7 @@ def install(
         start_from_stereo(gaussians, scene, opt)
     end_with_strategies(chosen, opt, "densify_until_iter")
     attached = Attached(
-        gaussians, scene.getTrainCameras(), chosen, sr=sr_images(sr, suffix), factor=factor, seed=seed,
+        gaussians, scene.getTrainCameras(), chosen, sr=sr, suffix=suffix, factor=factor, seed=seed,
         threshold=getattr(opt, "densify_grad_threshold", None), densify_until=getattr(opt, "densify_until_iter", None),
         own_background=bool(getattr(opt, "random_background", False)),
     )  # fmt: skip
