@@ -30,10 +30,10 @@ from integration.detail import sh0_offset
 from integration.errors import HostError
 from integration.host_cameras import enlarged_camera
 from integration.host_rendering import Target
+from integration.lineage import ROWS, RowNumbers
 from integration.log import show_log
 from integration.model_proxy import AttachedModel, Role
 from integration.replacing import ReplacedMethods
-from integration.rows import ROWS, RowNumbers
 from integration.views import sr_source, view
 
 _log = logging.getLogger(__name__)

@@ -1,25 +1,23 @@
 """Which Gaussian came from which.
 
-Hosts that gather every entry of their parameters carry row numbers, see rows.py; 3DGS's GaussianModel names the rows that it
-keeps, see inria/rows.py. Others do not say. Such a host replaces its parameters when it clones, splits or prunes. The replaced
-parameters hold the values of the last step, and every new row is a copy of an old row except for position, scale and opacity.
-A comparison of both sets therefore finds the change, whatever functions of the host made it.
+Hosts that gather every entry of their parameters carry row numbers among them, see `RowNumbers`. 3DGS's GaussianModel names the
+rows that it keeps, see inria/rows.py.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
-_COPIED: Final = ("quats", "sh0")  # rows that split children keep; some hosts change the opacity of clones
-COMPARED: Final = ("means", *_COPIED)
-"""The parameters that `find_change` reads."""
-_HASH_FACTOR: Final = 0x2545F4914F6CDD1D
+from integration.errors import HostError
+
+ROWS: Final = "clear_rows"
+"""Key of the row numbers."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,32 +45,6 @@ class Lineage(Protocol):
         ...
 
 
-class MatchedRows:
-    """The lineage of a host that does not say, by its parameters' values.
-
-    Args:
-        params: returns the host's current leaves, by gsplat's names.
-    """
-
-    def __init__(self, params: Callable[[], Mapping[str, Tensor]]) -> None:
-        self._params = params
-        self.restart()
-
-    def restart(self) -> None:
-        self._known = self._compared()
-
-    def poll(self) -> Change | None:
-        now = self._compared()
-        if now["means"] is self._known["means"]:
-            return None
-        before, self._known = self._known, now
-        return find_change(before, now)
-
-    def _compared(self) -> dict[str, Tensor]:
-        params = self._params()
-        return {name: params[name] for name in COMPARED}
-
-
 def is_same(parents: Int[Tensor, " M"], n: int) -> bool:
     """Whether the M rows are the N rows that they come from, in the same order."""
     return len(parents) == n and bool((parents == torch.arange(n, device=parents.device)).all())
@@ -91,71 +63,81 @@ def change_of(parents: Int[Tensor, " M"], n: int) -> Change | None:
     return Change(parents, first[parents] != place)
 
 
-def find_change(before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> Change | None:
-    """Compare the parameters `COMPARED` of N Gaussians with those of M Gaussians; None: the rows are the same.
+class RowNumbers:
+    """Row numbers that clone, split, prune, relocation and MCMC's sampling gather, since they gather every entry.
 
-    Equal rows are the same Gaussian. The parent of any other row is the Gaussian with the same rotation and colour, or
-    the nearest of several.
+    Args:
+        entries: the host's parameters, which may hold one that is not trained; or the `state` of gsplat 1.4's strategies, whose
+            parameters may not.
+        means: returns the current positions.
+        as_parameter: whether the numbers must be a parameter.
     """
-    old, new = (torch.cat([_bits(rows[name]) for name in COMPARED], 1) for rows in (before, after))
-    parents, _ = _first_equal(old, new)
-    moved = (parents < 0).nonzero()[:, 0]
-    if len(moved):
-        parents[moved] = nearest_copied(before, {name: after[name][moved] for name in COMPARED})
-    if is_same(parents, len(old)):
-        return None
-    rows = torch.arange(len(new), device=parents.device)
-    # Hosts append a clone behind its parent, so the first of equal rows is the old Gaussian.
-    first = torch.full((len(old) + 1,), len(new), device=parents.device).scatter_reduce(0, parents + 1, rows, "amin")
-    fresh = first[parents + 1] != rows
-    fresh[moved] = True
-    return Change(parents, fresh)
+
+    def __init__(
+        self, entries: MutableMapping[str, Any] | torch.nn.ParameterDict, means: Callable[[], Tensor], *,
+        as_parameter: bool = True,
+    ) -> None:  # fmt: skip
+        self._entries: Any = entries
+        self._means, self._as_parameter = means, as_parameter
+        self._hooks = (
+            [
+                entries.register_state_dict_post_hook(_leave_out),  # type: ignore[no-untyped-call]
+                entries.register_load_state_dict_pre_hook(_put_in),  # type: ignore[no-untyped-call]
+            ]
+            if isinstance(entries, torch.nn.ParameterDict)
+            else []
+        )
+        self.restart()
+
+    def restart(self) -> None:
+        """Number the rows from 1: operations of gsplat 1.4 write 0 where the origin is unknown."""
+        means = self._means()
+        rows = torch.arange(1, len(means) + 1, device=means.device)
+        self._numbered = len(means)
+        self._put(rows)
+        self._unchanged = self._entries[ROWS]
+
+    def poll(self) -> Change | None:
+        """The change since the last call; None: there was none.
+
+        Raises:
+            HostError: a densifier changed the parameters but not this one, or the origin of a row is unknown.
+        """
+        rows: Tensor = self._entries[ROWS]
+        n = len(self._means())
+        if len(rows) != n and self._as_parameter:
+            raise HostError(
+                f"the densifier changed the number of Gaussians from {len(rows):,} to {n:,} without the parameter {ROWS}. It "
+                "must treat every entry of the parameters alike."
+            )
+        if rows is self._unchanged or len(rows) != n:
+            return None
+        if bool((rows == 0).any()):
+            raise HostError("gsplat 1.4 does not say where relocated Gaussians come from. Update it to 1.5 or later.")
+        change = change_of(rows.detach() - 1, self._numbered)
+        self.restart()
+        return change
+
+    def take(self, parents: Int[Tensor, " M"]) -> None:
+        """Row i of the parameters now comes from row parents[i]; the numbers follow."""
+        self._put(self._entries[ROWS].detach()[parents])
+
+    def remove(self) -> None:
+        """Take the row numbers out of the host."""
+        if ROWS in self._entries:
+            del self._entries[ROWS]
+        for hook in self._hooks:
+            hook.remove()
+
+    def _put(self, rows: Int[Tensor, " N"]) -> None:
+        self._entries[ROWS] = torch.nn.Parameter(rows, requires_grad=False) if self._as_parameter else rows
 
 
-def are_copies(rows: Mapping[str, Tensor], of: Mapping[str, Tensor], parents: Int[Tensor, " M"]) -> bool:
-    """Whether each of M rows has the rotation and colour of its parent; a row without a parent (-1) may have any."""
-    known = (parents >= 0).nonzero()[:, 0]
-    return all(bool((_bits(rows[name][known]) == _bits(of[name][parents[known]])).all()) for name in _COPIED)
+def _leave_out(_: Any, stored: dict[str, Any], prefix: str, *__: Any) -> None:
+    """A host's checkpoints hold what it trains."""
+    stored.pop(f"{prefix}{ROWS}", None)
 
 
-def nearest_copied(before: Mapping[str, Tensor], rows: Mapping[str, Tensor]) -> Int[Tensor, " M"]:
-    """The Gaussian of the same rotation and colour as each of M rows, the nearest of several; -1: there is none."""
-    old, new = (torch.cat([_bits(given[name]) for name in _COPIED], 1) for given in (before, rows))
-    parents, (order, begin, end) = _first_equal(old, new)
-    ambiguous = (parents >= 0) & (end - begin > 1)
-    for first in sorted(set(begin[ambiguous].tolist())):
-        children = (ambiguous & (begin == first)).nonzero()[:, 0]
-        candidates = order[first : int(end[children[0]])]
-        distances = torch.cdist(rows["means"][children], before["means"][candidates])
-        parents[children] = candidates[distances.argmin(1)]
-    return parents
-
-
-def _bits(rows: Float[Tensor, "N ..."]) -> Int[Tensor, "N K"]:
-    """Integers that are equal where the rows are equal bit by bit."""
-    flat = rows.detach().flatten(1).contiguous()
-    return flat.view(torch.int64 if flat.dtype == torch.float64 else torch.int32).long()
-
-
-def _hash(bits: Int[Tensor, "N K"]) -> Int[Tensor, " N"]:
-    h = torch.zeros_like(bits[:, 0])
-    for column in bits.unbind(1):
-        h = (h ^ column) * _HASH_FACTOR
-        h = h ^ (h >> 29)
-    return h
-
-
-def _first_equal(
-    old: Int[Tensor, "N K"], new: Int[Tensor, "M K"]
-) -> tuple[Int[Tensor, " M"], tuple[Tensor, Tensor, Tensor]]:
-    """The first old row equal to each new row, or -1.
-
-    Also returns an order of the old rows that groups equal rows, and the begin and end of each new row's group in it.
-    """
-    wanted, (keys, order) = _hash(new), _hash(old).sort(stable=True)
-    begin, end = torch.searchsorted(keys, wanted), torch.searchsorted(keys, wanted, right=True)
-    if not len(old):
-        return torch.full_like(begin, -1), (order, begin, end)
-    parents = order[begin.clamp_max(len(old) - 1)]
-    parents[(old[parents] != new).any(1)] = -1
-    return parents, (order, begin, end)
+def _put_in(module: Any, stored: dict[str, Any], prefix: str, *_: Any) -> None:
+    """Loading such a checkpoint keeps the numbers."""
+    stored.setdefault(f"{prefix}{ROWS}", module[ROWS])

@@ -24,8 +24,8 @@ from integration.errors import HostError
 from integration.host_field import HostField
 from integration.host_rendering import HostRendering, Target
 from integration.host_score import warn_if_score_is_unused
+from integration.lineage import ROWS, RowNumbers
 from integration.replacing import Replaced
-from integration.rows import ROWS, RowNumbers
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 

@@ -1,4 +1,9 @@
-"""Which Gaussian came from which in a GaussianModel: row indices follow the two functions that change its structure."""
+"""Which Gaussian came from which in a GaussianModel: row indices follow the two functions that change its structure.
+
+Where the indices are lost, values tell. A model replaces its parameters when it clones, splits or prunes. The replaced parameters
+hold the values of the last step, and every new row is a copy of an old row except for position, scale and opacity. A comparison
+of both sets therefore finds the change, whatever functions of the host made it.
+"""
 
 from __future__ import annotations
 
@@ -8,25 +13,28 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from integration.lineage import COMPARED, Change, MatchedRows, are_copies, change_of, is_same, nearest_copied
+from integration.lineage import Change, change_of, is_same
 from integration.replacing import ReplacedMethods
 
 _log = logging.getLogger(__name__)
 
-_NAMES: Final = {"means": "xyz", "quats": "rotation", "sh0": "f_dc"}
-"""The parameter groups of 3DGS that hold the parameters `COMPARED`."""
+_COPIED: Final = ("quats", "sh0")  # rows that split children keep; some hosts change the opacity of clones
+_COMPARED: Final = ("means", *_COPIED)
+_GROUPS: Final = {"means": "xyz", "quats": "rotation", "sh0": "f_dc"}
+"""The parameter groups of 3DGS that hold the parameters `_COMPARED`."""
+_HASH_FACTOR: Final = 0x2545F4914F6CDD1D
 
 
-class CarriedRows(MatchedRows):
+class CarriedRows:
     """Row indices that follow a GaussianModel's `_prune_optimizer` and `cat_tensors_to_optimizer`.
 
     The densifiers of 3DGS and its forks end in these two functions. The first keeps rows, and says which. The second appends
     rows, which are copies of rows that exist at that moment except for position, scale and opacity, so that their parents are
     found by value among them. If other functions have changed the structure, or a row is no copy of the parent that was
-    carried, the parents of all rows are found by value (`MatchedRows`).
+    carried, the parents of all rows are found by value.
 
     Args:
         model: the GaussianModel; both methods are replaced in this object.
@@ -34,45 +42,52 @@ class CarriedRows(MatchedRows):
     """
 
     def __init__(self, model: Any, params: Callable[[], Mapping[str, Tensor]]) -> None:
-        super().__init__(params)
-        self._model, self._warned = model, False
+        self._model, self._params, self._warned = model, params, False
         self._methods = ReplacedMethods(model, {
-            "_prune_optimizer": functools.partial(_after, self._keep),
-            "cat_tensors_to_optimizer": functools.partial(_after, self._append),
+            "_prune_optimizer": functools.partial(_hooked, self._keep),
+            "cat_tensors_to_optimizer": functools.partial(_hooked, self._append),
         })  # fmt: skip
+        self.restart()
 
     def restart(self) -> None:
-        super().restart()
-        self._number()
+        """Every row comes from itself."""
+        self._before = self._compared()
+        means = self._before["means"]
+        self._parents = torch.arange(len(means), device=means.device)
+        self._fresh = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        self._carried = False
 
     def poll(self) -> Change | None:
-        now = self._compared()
-        if now["means"] is self._known["means"]:
+        """The change since the last call; None: there was none."""
+        before, parents, fresh, carried = self._before, self._parents, self._fresh, self._carried
+        if self._compared()["means"] is before["means"]:
             return None
-        parents, fresh, carried = self._parents, self._fresh, self._carried
-        self._number()
-        if carried and len(parents) == len(now["means"]) and are_copies(now, self._known, parents):
-            n = len(self._known["means"])
-            self._known = now
-            return None if is_same(parents, n) else Change(parents, fresh)
+        self.restart()
+        now = self._before
+        if carried and len(parents) == len(now["means"]) and _are_copies(now, before, parents):
+            return None if is_same(parents, len(before["means"])) else Change(parents, fresh)
         if carried and not self._warned:
             self._warned = True
             _log.warning(
                 "%s changes its rows elsewhere than in _prune_optimizer and cat_tensors_to_optimizer. Their parents are found by "
                 "the values of colours and rotations instead.", type(self._model).__name__,
             )  # fmt: skip
-        return super().poll()
+        return find_change(before, now)
+
+    def take(self, parents: Int[Tensor, " M"]) -> None:
+        """Row i of the model has been replaced by row parents[i]."""
+        self._carried = True
+        change = change_of(parents, len(self._parents))
+        if change is not None:
+            self._parents, self._fresh = self._parents[parents], self._fresh[parents] | change.fresh
 
     def remove(self) -> None:
         """Give the model its own methods back."""
         self._methods.undo()
 
-    def _number(self) -> None:
-        """Every row comes from itself."""
-        means = self._compared()["means"]
-        self._parents = torch.arange(len(means), device=means.device)
-        self._fresh = torch.zeros(len(means), dtype=torch.bool, device=means.device)
-        self._carried = False
+    def _compared(self) -> dict[str, Tensor]:
+        params = self._params()
+        return {name: params[name] for name in _COMPARED}
 
     def _keep(self, rows: Tensor) -> None:
         """Before `_prune_optimizer(rows)`: it keeps these rows."""
@@ -84,23 +99,86 @@ class CarriedRows(MatchedRows):
         """Before `cat_tensors_to_optimizer(tensors)`: it appends these rows, by the names of the parameter groups."""
         self._carried = True
         now = self._compared()
-        if len(self._parents) != len(now["means"]) or any(name not in tensors for name in _NAMES.values()):
+        if len(self._parents) != len(now["means"]) or any(name not in tensors for name in _GROUPS.values()):
             return
-        found = nearest_copied(now, {name: tensors[_NAMES[name]] for name in COMPARED})
+        found = _nearest_copied(now, {name: tensors[_GROUPS[name]] for name in _COMPARED})
         parents = self._parents[found.clamp_min(0)] if len(now["means"]) else found
         self._parents = torch.cat((self._parents, torch.where(found < 0, -1, parents)))
         self._fresh = torch.cat((self._fresh, torch.ones_like(found, dtype=torch.bool)))
 
-    def take(self, parents: Int[Tensor, " M"]) -> None:
-        """Row i of the model has been replaced by row parents[i]."""
-        self._carried = True
-        change = change_of(parents, len(self._parents))
-        if change is not None:
-            self._parents, self._fresh = self._parents[parents], self._fresh[parents] | change.fresh
 
-
-def _after(hook: Callable[[Any], None], method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+def _hooked(hook: Callable[[Any], None], method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     """Call the method after the hook; both get the same first argument."""
     with torch.no_grad():
         hook((*args, *kwargs.values())[0])
     return method(*args, **kwargs)
+
+
+def find_change(before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> Change | None:
+    """Compare the parameters `_COMPARED` of N Gaussians with those of M Gaussians; None: the rows are the same.
+
+    Equal rows are the same Gaussian. The parent of any other row is the Gaussian with the same rotation and colour, or
+    the nearest of several.
+    """
+    old, new = (torch.cat([_bits(rows[name]) for name in _COMPARED], 1) for rows in (before, after))
+    parents, _ = _first_equal(old, new)
+    moved = (parents < 0).nonzero()[:, 0]
+    if len(moved):
+        parents[moved] = _nearest_copied(before, {name: after[name][moved] for name in _COMPARED})
+    if is_same(parents, len(old)):
+        return None
+    rows = torch.arange(len(new), device=parents.device)
+    # Hosts append a clone behind its parent, so the first of equal rows is the old Gaussian.
+    first = torch.full((len(old) + 1,), len(new), device=parents.device).scatter_reduce(0, parents + 1, rows, "amin")
+    fresh = first[parents + 1] != rows
+    fresh[moved] = True
+    return Change(parents, fresh)
+
+
+def _are_copies(rows: Mapping[str, Tensor], of: Mapping[str, Tensor], parents: Int[Tensor, " M"]) -> bool:
+    """Whether each of M rows has the rotation and colour of its parent; a row without a parent (-1) may have any."""
+    known = (parents >= 0).nonzero()[:, 0]
+    return all(bool((_bits(rows[name][known]) == _bits(of[name][parents[known]])).all()) for name in _COPIED)
+
+
+def _nearest_copied(before: Mapping[str, Tensor], rows: Mapping[str, Tensor]) -> Int[Tensor, " M"]:
+    """The Gaussian of the same rotation and colour as each of M rows, the nearest of several; -1: there is none."""
+    old, new = (torch.cat([_bits(given[name]) for name in _COPIED], 1) for given in (before, rows))
+    parents, (order, begin, end) = _first_equal(old, new)
+    ambiguous = (parents >= 0) & (end - begin > 1)
+    for first in sorted(set(begin[ambiguous].tolist())):
+        children = (ambiguous & (begin == first)).nonzero()[:, 0]
+        candidates = order[first : int(end[children[0]])]
+        distances = torch.cdist(rows["means"][children], before["means"][candidates])
+        parents[children] = candidates[distances.argmin(1)]
+    return parents
+
+
+def _bits(rows: Float[Tensor, "N ..."]) -> Int[Tensor, "N K"]:
+    """Integers that are equal where the rows are equal bit by bit."""
+    flat = rows.detach().flatten(1).contiguous()
+    return flat.view(torch.int64 if flat.dtype == torch.float64 else torch.int32).long()
+
+
+def _hash(bits: Int[Tensor, "N K"]) -> Int[Tensor, " N"]:
+    h = torch.zeros_like(bits[:, 0])
+    for column in bits.unbind(1):
+        h = (h ^ column) * _HASH_FACTOR
+        h = h ^ (h >> 29)
+    return h
+
+
+def _first_equal(
+    old: Int[Tensor, "N K"], new: Int[Tensor, "M K"]
+) -> tuple[Int[Tensor, " M"], tuple[Tensor, Tensor, Tensor]]:
+    """The first old row equal to each new row, or -1.
+
+    Also returns an order of the old rows that groups equal rows, and the begin and end of each new row's group in it.
+    """
+    wanted, (keys, order) = _hash(new), _hash(old).sort(stable=True)
+    begin, end = torch.searchsorted(keys, wanted), torch.searchsorted(keys, wanted, right=True)
+    if not len(old):
+        return torch.full_like(begin, -1), (order, begin, end)
+    parents = order[begin.clamp_max(len(old) - 1)]
+    parents[(old[parents] != new).any(1)] = -1
+    return parents, (order, begin, end)

@@ -12,7 +12,7 @@ from clear_strategies.errors import SettingError
 from clear_strategies.schedules import Ramp
 from integration import HostError
 from integration.gsplat import attach
-from integration.rows import ROWS
+from integration.lineage import ROWS
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
 from tests.helpers.inria import HR_FROM_START

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from integration.inria.rows import CarriedRows
-from integration.lineage import MatchedRows
+from integration.inria.rows import CarriedRows, find_change
 from tests.helpers import toy
 from tests.helpers.inria import N, loop, options
 
@@ -39,22 +38,22 @@ def pruned(*rows):
 def test_of_two_equal_gaussians_the_one_that_the_host_keeps_is_the_parent(model):
     for p in host_params(model).values():
         p[7] = p[3]
-    carried, matched = rows_of(model), MatchedRows(lambda: host_params(model))
+    carried, before = rows_of(model), host_params(model)
     model.prune_points(pruned(3))
     assert carried.poll().parents[6] == 7
-    assert matched.poll().parents[6] == 3  # what values alone tell
+    assert find_change(before, host_params(model)).parents[6] == 3  # by values alone
 
 
 @torch.no_grad()
 def test_rows_that_moved_after_the_change_are_still_the_old_gaussians(model):
     """As with MCMC's noise: by value every row would be new, and f_det would lose its moments."""
-    carried, matched = rows_of(model), MatchedRows(lambda: host_params(model))
+    carried, before = rows_of(model), host_params(model)
     append(model, [5])
     model._xyz += 0.01
     change = carried.poll()
     assert change.parents.tolist() == [*range(N), 5]
     assert change.fresh.nonzero()[:, 0].tolist() == [N]
-    assert int(matched.poll().fresh.sum()) == N + 1
+    assert int(find_change(before, host_params(model)).fresh.sum()) == N + 1
 
 
 @torch.no_grad()

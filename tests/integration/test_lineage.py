@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from integration.lineage import change_of, find_change
+from integration.inria.rows import find_change
+from integration.lineage import change_of
 
 
 def gaussians(*x, colours=None, rotation=0.0):
