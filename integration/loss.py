@@ -6,7 +6,7 @@ that must stay as it is, see attachment.py.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -53,14 +53,12 @@ def joint_loss(
     trained = {name: p for name, p in params.items() if name in merged}
     gradients = [merged[name].to(p) for name, p in trained.items()]
 
-    slot = lr.gradient_slot if scaler is not None and isinstance(lr, AutogradShot) else None
-    score = None if slot is None else score_for_host(slot, update.score, update.ordinary, lr.visible, scaler)
-
-    def write_score(loss_scale: Float[Tensor, ""]) -> None:
-        if slot is not None and score is not None:
-            slot.write(loss_scale * score)
-
-    loss: Tensor = _GivenGradients.apply(value, gradients, write_score, *trained.values())  # type: ignore[no-untyped-call]
+    loss: Tensor = _GivenGradients.apply(value, gradients, *trained.values())  # type: ignore[no-untyped-call]
+    if scaler is not None and isinstance(lr, AutogradShot):
+        slot = lr.gradient_slot
+        score = score_for_host(slot, update.score, update.ordinary, lr.visible, scaler)
+        if score is not None:
+            loss.register_hook(lambda loss_scale: slot.write(loss_scale * score))  # type: ignore[no-untyped-call]
     return loss, update
 
 
@@ -77,7 +75,7 @@ def extra_loss(conductor: Conductor, image: Float[Tensor, "h w 3"], extra: Extra
     """
     losses = conductor.extra_loss(image, extra, t)
     value = conductor.objective.lambda_lr * losses.values["lr"]
-    loss: Tensor = _GivenGradients.apply(value, [losses.cotangents[0]], lambda scale: None, image)  # type: ignore[no-untyped-call]
+    loss: Tensor = _GivenGradients.apply(value, [losses.cotangents[0]], image)  # type: ignore[no-untyped-call]
     return loss
 
 
@@ -85,13 +83,10 @@ class _GivenGradients(torch.autograd.Function):
     """A scalar whose gradients are given; scaling the loss scales them."""
 
     @staticmethod
-    def forward(
-        ctx: Any, value: Scalar, gradients: list[Tensor], write_score: Callable[[Tensor], None], *params: Tensor
-    ) -> Tensor:
-        ctx.gradients, ctx.write_score = gradients, write_score
+    def forward(ctx: Any, value: Scalar, gradients: list[Tensor], *params: Tensor) -> Tensor:
+        ctx.gradients = gradients
         return torch.as_tensor(value, dtype=params[0].dtype, device=params[0].device)
 
     @staticmethod
     def backward(ctx: Any, *loss_scale: Tensor) -> Any:
-        ctx.write_score(loss_scale[0])
-        return None, None, None, *(g * loss_scale[0] for g in ctx.gradients)
+        return None, None, *(g * loss_scale[0] for g in ctx.gradients)

@@ -7,7 +7,7 @@ import torch
 
 from clear_strategies import GCO, P2G, SVS, Conductor
 from clear_strategies.training.field import GaussianField
-from integration import AutogradShot, extra_loss, joint_loss
+from integration import AutogradShot, ScoreScaler, extra_loss, joint_loss
 from rasterizers import Splats, autograd
 from tests.helpers import toy
 from tests.helpers.inria import HR_FROM_START
@@ -50,15 +50,17 @@ def test_backward_gives_the_conductors_gradient(strategies):
         assert torch.allclose(p.grad, 2 * expected[name], atol=1e-4 * scale, rtol=1e-3), name
 
 
-def test_its_value_is_the_sum_of_the_losses():
+def test_its_value_is_the_sum_of_the_losses_and_backward_writes_the_score_for_a_densifier():
     scene = toy.scene(20)
     host, view = Host(scene), scene.train[0]
     conductor = Conductor(GCO(), objective=HR_FROM_START)
     lr, hr = host.render(view.lr.camera, detail=False), host.render(view.hr.camera)
-    loss, update = joint_loss(conductor, host.params, lr, hr, view, 50)
+    loss, update = joint_loss(conductor, host.params, lr, hr, view, 50, ScoreScaler(1e-4))
     l = update.losses
-    assert float(loss) == pytest.approx(l["lr"] + l["base"] + 0.2 * l["hf"], rel=1e-6)
-    assert update.score.shape == (20,)
+    assert loss.item() == pytest.approx(l["lr"] + l["base"] + 0.2 * l["hf"], rel=1e-6)
+    (2 * loss).backward()
+    written = lr.means2d.grad * torch.tensor([view.lr.camera.width / 2, view.lr.camera.height / 2])
+    assert torch.allclose(written.norm(dim=1), 2 * update.score)
 
 
 def test_an_extra_view_is_learned_from_in_a_step_of_its_own():
