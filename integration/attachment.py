@@ -36,7 +36,6 @@ from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients, only
-from integration.detail import PATIENCE, warn_if_untrained
 from integration.errors import HostError
 from integration.extra_steps import ExtraSteps
 from integration.host_field import HostDensity, HostField
@@ -48,6 +47,7 @@ from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 _LOGGED_EVERY: Final = 500  # merges between two lines of the log
+_PATIENCE: Final = 10  # steps with a gradient of f_det, before a warning that none was made on it
 
 
 class Attachment:
@@ -289,23 +289,17 @@ class Attachment:
         grad_scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
         trained = {name: p for name, p in self.params().items() if p.grad is not None or name == "detail"}
         g_lr = Grads({
-            name: self._grad_of_this_pass(name, p) * (1 / grad_scale) for name, p in trained.items() if p.grad is not None
+            name: self._grad_of_this_pass(name, p.grad) * (1 / grad_scale) for name, p in trained.items() if p.grad is not None
         })  # fmt: skip
         values = {name: p.detach() for name, p in trained.items()}
         hr_trained = None if hr_grads is None else only(hr_grads, trained)
         merged = self.conductor.merge(values, g_lr, hr_trained, self.t)
         if "detail" in merged.grads:
-            # L_HF does not change with a constant added to the colours, so that nothing else would hold the mean of f_det.
-            trained["detail"].mul_(1 - self.conductor.detail.decay / self.accumulation)
+            self._decay_detail(trained["detail"])
         for name, p in trained.items():
             # Without HR the gradient of f_det is 0 and not None, so that its Adam counts every step.
             g = merged.grads[name] * grad_scale if name in merged.grads else torch.zeros_like(p)
             p.grad = (g + self._grads_before[name] if name in self._grads_before else g).to(p)
-        λ = self.conductor.objective.lambda_hr(self.t)
-        if λ > 0 and "detail" in merged.grads:
-            self._detail_gradients += 1
-            if self._detail_gradients == PATIENCE * self.accumulation and self.conductor.detail.rate > 0:
-                warn_if_untrained(trained["detail"])
         if screen_gradient is not None and hr_grads is not None:
             scores = partial(self.conductor.scores, hr=hr_grads, t=self.t)
             if write_score(rendering.shot, screen_gradient / grad_scale, scores, self._scaler, grad_scale):
@@ -313,6 +307,7 @@ class Attachment:
         self._grads_before = {}
         self._passes += 1
         self.counts["merges"] += 1
+        λ = self.conductor.objective.lambda_hr(self.t)
         losses = {} if hr_grads is None else hr_grads.losses
         self._logged = {"t": float(self.t), "lambda_hr": λ, **losses, **self.conductor.logs()}
         self._logged |= conflict_columns(merged.conflict)
@@ -321,15 +316,28 @@ class Attachment:
             losses_now = ", ".join(f"L_{name} {now[name]:.4f}" for name in losses) or "no HR"
             _log.info("t=%d: %s, lambda_HR %.3f, %s Gaussians.", self.t, losses_now, λ, f"{self._n:,}")
 
+    def _decay_detail(self, detail: Tensor) -> None:
+        """L_HF does not change with a constant added to the colours, so that nothing else would hold the mean of f_det."""
+        rates = self.conductor.detail
+        detail.mul_(1 - rates.decay / self.accumulation)
+        if self.conductor.objective.lambda_hr(self.t) == 0:
+            return
+        self._detail_gradients += 1
+        if self._detail_gradients == _PATIENCE * self.accumulation and rates.rate > 0 and not bool(detail.any()):
+            _log.warning(
+                "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail; "
+                "attach adds it to the dictionary of optimizers.", _PATIENCE,
+            )  # fmt: skip
+
     def _grad_versions(self) -> list[tuple[int, int]]:
         """What changes with every gradient of the Gaussians; empty where all of them are frozen."""
         trained = [p.grad for name, p in self.params().items() if p.requires_grad and name != "detail"]
         return [(0, 0) if g is None else (id(g), g._version) for g in trained]
 
-    def _grad_of_this_pass(self, name: str, p: Tensor) -> Tensor:
-        if p.grad is None or p.grad.is_sparse:
+    def _grad_of_this_pass(self, name: str, grad: Tensor) -> Tensor:
+        if grad.is_sparse:
             raise HostError(
                 f"{name}.grad is sparse, but the gradients of all Gaussians are merged. In gsplat: "
                 "rasterization(sparse_grad=False)."
             )
-        return p.grad - self._grads_before[name] if name in self._grads_before else p.grad
+        return grad - self._grads_before[name] if name in self._grads_before else grad

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
@@ -15,10 +14,6 @@ from integration.errors import HostError
 from integration.lineage import Change, Lineage
 from rasterizers.geometry import SH_C0
 
-_log = logging.getLogger(__name__)
-
-PATIENCE: Final = 10
-"""Steps with a gradient of f_det, before `warn_if_untrained` is called."""
 _EPS: Final = 1e-15  # Adam's, as in 3DGS: gradients of mean losses are near 1e-6
 
 
@@ -32,15 +27,6 @@ def detail_adam(detail: torch.nn.Parameter, rates: DetailRates) -> torch.optim.A
         {name: value for name, value in kwargs.items() if name != "visibility"},
     ))  # fmt: skip
     return adam
-
-
-def warn_if_untrained(detail: Tensor) -> None:
-    """Warn if f_det is still 0."""
-    if not bool(detail.any()):
-        _log.warning(
-            "f_det has no effect: none of its first %d gradients was stepped on. Step the optimizer of the parameter detail; "
-            "attach adds it to the dictionary of optimizers.", PATIENCE,
-        )  # fmt: skip
 
 
 def sh0_offset(detail: Float[Tensor, "N 3"], sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
