@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Final, Literal
+from typing import Literal
 
 import torch
 
@@ -12,6 +12,7 @@ from clear_strategies.core.points import MAX_POINTS, PointCloud
 from clear_strategies.errors import SettingError
 from clear_strategies.geometry import stereo
 from clear_strategies.geometry.projection import intrinsics
+from integration.errors import HostError
 from integration.views import HostPhoto
 
 _log = logging.getLogger(__name__)
@@ -19,8 +20,11 @@ _log = logging.getLogger(__name__)
 Points = Literal["own", "stereo"]
 """Whose points the Gaussians start from."""
 
-ELSEWHERE: Final = "Leave points at own, and write points3D.ply for the host to read: docs/how-to/stereo.md shows how."
-"""What to do in a host whose points cannot be replaced."""
+
+def no_stereo(problem: str) -> HostError:
+    """The error of a host whose points cannot be replaced, with the remedy."""
+    remedy = "Leave points at own, and write points3D.ply for the host to read: docs/how-to/stereo.md shows how."
+    return HostError(f"points=stereo: {problem}. {remedy}")
 
 
 def wants_stereo(points: str) -> bool:

@@ -9,9 +9,8 @@ import logging
 from typing import Any, Final
 
 from clear_strategies.core.points import PointCloud
-from integration.errors import HostError
 from integration.gsplat.data import photos_of
-from integration.points import ELSEWHERE, stereo_points
+from integration.points import no_stereo, stereo_points
 
 _log = logging.getLogger(__name__)
 
@@ -32,9 +31,8 @@ def start_from_stereo(runner_class: Any) -> None:
     """
     module = getattr(inspect.unwrap(runner_class.__init__), "__globals__", {})
     if missing := [name for name in (_CREATE, "Dataset") if name not in module]:
-        raise HostError(
-            f"points=stereo: the module of {runner_class.__name__} has no {missing[0]}, which gsplat's simple_trainer.py has. "
-            f"{ELSEWHERE}"
+        raise no_stereo(
+            f"the module of {runner_class.__name__} has no {missing[0]}, which gsplat's simple_trainer.py has"
         )
     create, dataset = module[_CREATE], module["Dataset"]
 

@@ -7,9 +7,8 @@ from typing import Any, Final
 
 import torch
 
-from integration.errors import HostError
 from integration.inria.cameras import photo_of
-from integration.points import ELSEWHERE, stereo_points
+from integration.points import no_stereo, stereo_points
 
 _OPEN: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
@@ -26,51 +25,28 @@ def start_from_stereo(gaussians: Any, scene: Any, opt: Any) -> None:
         HostError: the host has no create_from_pcd with the arguments that 3DGS and its forks have.
         DataError: there are fewer than two photos, or stereo confirms no depth.
     """
-    cameras = scene.getTrainCameras()
-    create, cloud_type = _host_functions(gaussians)
-    given = {"pcd": None, "cam_infos": cameras, "spatial_lr_scale": _extent(gaussians, scene)}
-    arguments = _arguments(gaussians, create, given)
-    cloud = stereo_points([photo_of(camera, gaussians._xyz.device) for camera in cameras])
-    means, colors = cloud.means.numpy(), cloud.colors.numpy()
-    pcd = cloud_type(points=means, colors=colors, normals=torch.zeros_like(cloud.means).numpy())
-    create(**arguments | {"pcd": pcd})
-    gaussians.training_setup(opt)
-
-
-def _host_functions(gaussians: Any) -> tuple[Any, Any]:
-    """(the model's create_from_pcd, the host's type of point clouds), which its module imports."""
-    create = getattr(gaussians, "create_from_pcd", None)
+    model, create = type(gaussians).__name__, getattr(gaussians, "create_from_pcd", None)
     if create is None:
-        raise HostError(
-            f"points=stereo: {type(gaussians).__name__} has no create_from_pcd, which a GaussianModel has in 3DGS. {ELSEWHERE}"
-        )
-    names = getattr(inspect.unwrap(create), "__globals__", {})
-    if "BasicPointCloud" not in names:
-        raise HostError(
-            f"points=stereo: the module of {type(gaussians).__name__} has no BasicPointCloud, which it has in 3DGS. {ELSEWHERE}"
-        )
-    return create, names["BasicPointCloud"]
-
-
-def _arguments(gaussians: Any, create: Any, given: dict[str, Any]) -> dict[str, Any]:
-    """What the host's create_from_pcd takes of `given`: forks have two or three of these arguments."""
+        raise no_stereo(f"{model} has no create_from_pcd, which a GaussianModel has in 3DGS")
+    point_cloud = getattr(inspect.unwrap(create), "__globals__", {}).get("BasicPointCloud")
+    if point_cloud is None:
+        raise no_stereo(f"the module of {model} has no BasicPointCloud, which it has in 3DGS")
+    cameras = scene.getTrainCameras()
+    extent = getattr(scene, "cameras_extent", getattr(gaussians, "spatial_lr_scale", None))
+    if extent is None:
+        raise no_stereo(f"{type(scene).__name__} has no cameras_extent, which a Scene has in 3DGS")
+    known = {"pcd": None, "cam_infos": cameras, "spatial_lr_scale": float(extent)}  # forks take two or three of them
     parameters = inspect.signature(create).parameters
     unknown = [
-        name for name, p in parameters.items() if name not in given and p.default is p.empty and p.kind not in _OPEN
+        name for name, p in parameters.items() if name not in known and p.default is p.empty and p.kind not in _OPEN
     ]
     if unknown or "pcd" not in parameters:
-        raise HostError(
-            f"points=stereo: {type(gaussians).__name__}.create_from_pcd must take pcd, and of others spatial_lr_scale and "
-            f"cam_infos at most, as in 3DGS, got ({', '.join(parameters)}). {ELSEWHERE}"
+        raise no_stereo(
+            f"{model}.create_from_pcd must take pcd, and of others spatial_lr_scale and cam_infos at most, as in 3DGS, got "
+            f"({', '.join(parameters)})"
         )
-    return {name: value for name, value in given.items() if name in parameters}
-
-
-def _extent(gaussians: Any, scene: Any) -> float:
-    """The size of the scene, which 3DGS's Scene passes to create_from_pcd, and which that keeps."""
-    for owner, name in ((scene, "cameras_extent"), (gaussians, "spatial_lr_scale")):
-        if (found := getattr(owner, name, None)) is not None:
-            return float(found)
-    raise HostError(
-        f"points=stereo: {type(scene).__name__} has no cameras_extent, which a Scene has in 3DGS. {ELSEWHERE}"
-    )
+    cloud = stereo_points([photo_of(camera, gaussians._xyz.device) for camera in cameras])
+    means, normals = cloud.means.numpy(), torch.zeros_like(cloud.means).numpy()
+    pcd = point_cloud(points=means, colors=cloud.colors.numpy(), normals=normals)
+    create(**{name: value for name, value in known.items() if name in parameters} | {"pcd": pcd})
+    gaussians.training_setup(opt)
