@@ -7,7 +7,7 @@ from __future__ import annotations
 import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal
 
@@ -194,12 +194,10 @@ class AttachedModel:
         if overrides.detail is not None and "detail" not in overrides.used:
             self._warn_once("render does not read the model's constant colours: the detail feature has no effect.")
         trained = {name: p for name, p in params.items() if p.requires_grad}
-        rendering = host_rendering(result, camera, trained, gate, self._to_pixels)
-        slot = rendering.shot.gradient_slot
-        if slot.tensor.shape[-1] == 3 and hasattr(self._model, "xyz_gradient_accum_abs"):
-            # Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts.
-            return replace(rendering, shot=replace(rendering.shot, slot=replace(slot, ranked=2)))
-        if slot.tensor.shape[-1] == 4 and self._scoring is not None:
+        # Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts.
+        ranks = hasattr(self._model, "xyz_gradient_accum_abs")
+        rendering = host_rendering(result, camera, trained, gate, self._to_pixels, ranks_by_third_column=ranks)
+        if rendering.shot.gradient_slot.tensor.shape[-1] == 4 and self._scoring is not None:
             self._warn_once(
                 "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
                 "score of %s goes to the first two columns only.", type(self._scoring).__name__,
@@ -227,6 +225,8 @@ def host_rendering(
     params: Mapping[str, Tensor],
     gate: Float[Tensor, " N"] | None,
     to_pixels: ToPixels,
+    *,
+    ranks_by_third_column: bool,
 ) -> HostRendering:
     """The result of a host's `render`: a dict with "render" [3, H, W], "viewspace_points" [N, 2 or more], "radii" and
     "visibility_filter" [N]. Gaussians that the gate drops are marked as not visible in it.
@@ -235,6 +235,7 @@ def host_rendering(
         camera: the camera of the photo at this resolution.
         to_pixels: returns, for a result, the factors from gradients of its "viewspace_points" to 1/pixel; None: the
             points are in NDC.
+        ranks_by_third_column: a third column of "viewspace_points" holds what the host ranks Gaussians by.
 
     Raises:
         HostError: the result has another type, or the image another size.
@@ -263,7 +264,9 @@ def host_rendering(
             "visibility_filter": passed & kept if passed.dtype == torch.bool else passed[kept[passed.reshape(-1)]],
         }
     width, height = camera.width, camera.height
-    slot = ScreenGradientSlot(centres, (width, height), to_pixels(result) or (2 / width, 2 / height))
+    scale = to_pixels(result) or (2 / width, 2 / height)
+    ranked = 2 if ranks_by_third_column and centres.shape[-1] == 3 else None
+    slot = ScreenGradientSlot(centres, (width, height), scale, ranked=ranked)
     means2d = project(params["means"].detach(), camera)
     return HostRendering(AutogradShot(image.permute(1, 2, 0), means2d, visible, params, slot), image, result)
 

@@ -16,7 +16,8 @@ class Replaced:
     """
 
     def __init__(self, original: Callable[..., Any], replacement: Callable[..., Any]) -> None:
-        self._original, self._places = original, []  # type: tuple[Any, list[tuple[Any, str]]]
+        self._original = original
+        self._places: list[tuple[Any, str]] = []
         for module in list(sys.modules.values()):
             for name, value in list(vars(module).items()) if hasattr(module, "__dict__") else ():
                 if value is original:
