@@ -34,7 +34,7 @@ from integration.lineage import ROWS, RowNumbers
 from integration.log import show_log
 from integration.model_proxy import AttachedModel, Role
 from integration.replacing import ReplacedMethods
-from integration.views import sr_source, view
+from integration.views import by_name, sr_source, view
 
 _log = logging.getLogger(__name__)
 
@@ -184,18 +184,17 @@ class Attached:
 
     def _views_from_dataset(self, dataset: Any) -> None:
         """Every training photo as its dataset loads it: undistorted, over the background, with its mask."""
-        device = self._host_params()["means"].device
+        device, views = self._host_params()["means"].device, []
         for i in range(len(dataset)):
             camera, (name, image, mask), _ = dataset[i]
-            if name in self._views:
-                raise HostError(f"two training photos are called {name!r}. Give each its own name.")
             fx, fy, cx, cy = (float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy"))
             K = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
             pixels = image.permute(1, 2, 0).to(device)
             if mask is not None:
                 self._masks[name] = mask[0].to(device).float()
             pose = camera.world_to_camera.T
-            self._views[name] = view(name, pixels, pose, K, self._sr, self._factor, self._masks.get(name))
+            views.append(view(name, pixels, pose, K, self._sr, self._factor, self._masks.get(name)))
+        self._views = by_name(views)
 
     def _training_step(self, original: Callable[..., Any], batch: Any, *args: Any, **kwargs: Any) -> Any:
         if self.attachment is None:

@@ -9,7 +9,7 @@ or none:
 Only names that all these repositories share are used, and only their own train.py imports them.
 """
 
-from integration.inria.attached import THRESHOLD, Attached, Render, attach
+from integration.inria.attached import Attached, attach
 from integration.inria.from_options import install
 
-__all__ = ["THRESHOLD", "Attached", "Render", "attach", "install"]
+__all__ = ["Attached", "attach", "install"]

@@ -27,8 +27,6 @@ from integration.views import SuperResolve, sr_source
 
 _log = logging.getLogger(__name__)
 
-Render = Callable[..., Any]
-
 _ATTRIBUTES: Final = {
     "means": "_xyz", "quats": "_rotation", "scales": "_scaling", "opacities": "_opacity", "sh0": "_features_dc",
     "shN": "_features_rest",
@@ -43,9 +41,6 @@ _SAVERS: Final = ("save_ply", "save_fused_ply")
 _STATE: Final = "clear"
 """Key of our state in the optimizer's state, which the host's checkpoints hold."""
 
-THRESHOLD: Final = 2e-4
-"""3DGS's default of densify_grad_threshold."""
-
 
 class Attached:
     """The strategies of a conductor in a 3DGS-style loop; `install` makes one from the host's own options.
@@ -56,7 +51,7 @@ class Attached:
         sr: the folder of the SR images, or a function that makes them (`clear_strategies.data.priors` has some). None:
             there are none, for strategies and objectives that do not use HR. suffix: what the SR tool appended to the names.
         factor: HR pixels per LR pixel.
-        threshold: opt.densify_grad_threshold, which scales P2G's score; None: a loop without densification.
+        threshold: opt.densify_grad_threshold (by default 3DGS's own), which scales P2G's score; None: the loop does not densify.
         densify_until: opt.densify_until_iter; refused where an anchor would be taken before. 0: a strategy of the conductor may
             densify in place of the host.
         detail: train the detail feature f_det beside the host's parameters.
@@ -81,7 +76,7 @@ class Attached:
         sr: SuperResolve | str | Path | None = None,
         suffix: str = "",
         factor: int = 4,
-        threshold: float | None = THRESHOLD,
+        threshold: float | None = 2e-4,
         densify_until: int | None = None,
         detail: bool = True,
         own_background: bool = False,
@@ -118,7 +113,7 @@ class Attached:
         """The current leaves, by gsplat's names."""
         return self._attached.params()
 
-    def wrap(self, render: Render) -> Render:
+    def wrap(self, render: Callable[..., Any]) -> Callable[..., Any]:
         """`render` that renders training cameras at both scales, and shows f_base + f_det anywhere else."""
         signature = inspect.signature(render)
 
@@ -146,7 +141,7 @@ class Attached:
 
         return wrapped
 
-    def replace_everywhere(self, render: Render) -> Render:
+    def replace_everywhere(self, render: Callable[..., Any]) -> Callable[..., Any]:
         """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
         wrapped = self.wrap(render)
         self._replaced = Replaced(render, wrapped)

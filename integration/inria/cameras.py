@@ -54,10 +54,6 @@ class HostViews:
         self.masks = {photo.name: photo.mask for photo in photos if photo.mask is not None}
         self._by_name: dict[str, tuple[Any, View]] = dict(zip(names, zip(cameras, self.all, strict=True), strict=True))
 
-    def __getitem__(self, name: str) -> View:
-        """The view of the photo of that name."""
-        return self._by_name[name][1]
-
     def find(self, camera: Any) -> View | None:
         """The view of a training camera, or of a copy: a camera of the same name and pose. None: it is another camera."""
         if (name := getattr(camera, "image_name", None)) not in self._by_name:

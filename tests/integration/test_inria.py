@@ -65,9 +65,6 @@ def double(view, camera):
 class InDouble(HostViews):
     """The views in double precision."""
 
-    def __getitem__(self, name):
-        return self.find(self._by_name[name][0])
-
     def find(self, camera):
         return double(super().find(camera), camera)
 
@@ -87,7 +84,7 @@ def test_its_steps_equal_those_of_our_own_trainer(sampling, inria_host, inria_ca
     gaussians, scene = inria_host.setup(opt)
     clear = attach(gaussians, scene.getTrainCameras(), conductors[0], sr=inria_capture / "sr", densify_until=0)
     clear.views = InDouble(scene.cameras, Images(str(inria_capture / "sr")), 4)
-    views = tuple(clear.views[view.name] for view in toy_scene.train)
+    views = tuple(map(clear.views.find, scene.cameras))
 
     own = in_double(replace(toy_scene, train=views), conductors[1], STEPS)
     own.field.scales += 0.3 * torch.randn(N, 3, generator=torch.Generator().manual_seed(1))

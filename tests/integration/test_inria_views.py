@@ -55,7 +55,7 @@ def test_a_pixel_that_the_hosts_mask_hides_is_hidden_at_both_scales(inria_host, 
         camera.alpha_mask[..., 12:] = 0
     clear = attach(gaussians, scene.cameras, Conductor(GCO(), objective=HR_FROM_START), sr=inria_capture / "sr")
     camera, gradients = scene.cameras[1], []
-    assert bool((clear.views[camera.image_name].hr.image[:, 48:] == 0).all())
+    assert bool((clear.views.find(camera).hr.image[:, 48:] == 0).all())
 
     def render(viewpoint_camera, *args):
         package = inria_host.render(viewpoint_camera, *args)

@@ -186,7 +186,7 @@ def test_densification_ends_when_a_strategy_ends_it(host, sr):
 
 def test_two_photos_of_one_name_are_refused(host, sr):
     host.photos.append(host.photos[0])
-    with pytest.raises(HostError, match="two training photos are called"):
+    with pytest.raises(SettingError, match="is the name of several"):
         fitted(host, host.controller(**sr), 1)
 
 
