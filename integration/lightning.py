@@ -33,7 +33,7 @@ from integration.host_rendering import Target
 from integration.lineage import ROWS, RowNumbers
 from integration.log import show_log
 from integration.model_proxy import AttachedModel, Role
-from integration.replacing import ReplacedMethods
+from integration.replacing import replace_methods
 from integration.views import by_name, sr_source, view
 
 _log = logging.getLogger(__name__)
@@ -130,7 +130,7 @@ class Attached:
         self._resumed: Mapping[str, Any] = {}
         self._sh0_holds_detail = False  # while the host writes its files
         self.attachment: Attachment | None = None
-        ReplacedMethods(module, {
+        replace_methods(module, {
             "forward": self._forward, "training_step": self._training_step, "save_gaussians": self._save_with_detail,
             "on_save_checkpoint": self._save_state, "on_load_checkpoint": self._load_state,
         })  # fmt: skip
@@ -226,16 +226,16 @@ class Attached:
     @contextmanager
     def _using(self, model: Any) -> Iterator[None]:
         """The module renders another model."""
-        own, self._module.gaussian_model = self._module.gaussian_model, model
+        trained, self._module.gaussian_model = self._module.gaussian_model, model
         try:
             yield
         finally:
-            self._module.gaussian_model = own
+            self._module.gaussian_model = trained
 
     def _show_detail_in_viewer(self) -> None:
         """The host's viewer calls the renderer itself."""
         if (viewer := getattr(self._module, "web_viewer", None)) is not None:
-            ReplacedMethods(viewer, {"process_all_render_requests": self._show})
+            replace_methods(viewer, {"process_all_render_requests": self._show})
 
     def _show(self, original: Callable[..., Any], model: Any, *args: Any) -> Any:
         return original(model if self.attachment is None else self._attached.with_detail(), *args)

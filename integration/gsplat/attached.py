@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
 import torch
@@ -25,7 +25,7 @@ from integration.host_field import HostField
 from integration.host_rendering import HostRendering, Target
 from integration.host_score import warn_if_score_is_unused
 from integration.lineage import ROWS, RowNumbers
-from integration.replacing import Replaced
+from integration.replacing import replace_everywhere
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
 
@@ -95,7 +95,7 @@ class Attached:
         self._named: View | None = None  # by `rendering`, if it was called
         self._found_by_pose = True
         self._colors_are_bands = False  # whether the loop has drawn spherical harmonics; RGB then is something else
-        self._replaced: list[Replaced] = []
+        self._undo = ExitStack()
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
         warn_if_score_is_unused(conductor, strategy, threshold)
@@ -160,7 +160,7 @@ class Attached:
     def replace_everywhere(self, rasterization: Rasterization) -> Rasterization:
         """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
         wrapped = self.wrap(rasterization)
-        self._replaced.append(Replaced(rasterization, wrapped))
+        self._undo.callback(replace_everywhere(rasterization, wrapped))
         return wrapped
 
     @torch.no_grad()
@@ -174,9 +174,7 @@ class Attached:
     def remove(self) -> None:
         """Restore the loop; f_det stays a parameter, see `fold_detail`."""
         self.attachment.remove()
-        for replaced in self._replaced:
-            replaced.undo()
-        self._replaced.clear()
+        self._undo.close()
         self._rows.remove()
 
     def _of_gaussians(self) -> list[torch.optim.Optimizer]:

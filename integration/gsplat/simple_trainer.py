@@ -21,7 +21,7 @@ from integration.gsplat.data import photos_of
 from integration.gsplat.points import start_from_stereo
 from integration.log import show_log
 from integration.points import Points, wants_stereo
-from integration.replacing import Replaced
+from integration.replacing import replace_everywhere
 from integration.views import SuperResolve, sr_source
 
 _log = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ def install(
 
 
 def require_supported(config: Any, processes: int = 1) -> None:
-    """Raise a SettingError, which says why, for an option of simple_trainer that does not work with two scales."""
+    """Raise a SettingError for an option of simple_trainer that does not work with two scales."""
     for name, (needed, why) in _NEEDED.items():
         found = getattr(config, name, needed)
         if found != needed:
@@ -134,7 +134,7 @@ class _Installed:
         self.attached.replace_everywhere(rendering.rasterization)
         export = getattr(sys.modules["gsplat"], "export_splats", None)
         if export is not None:
-            Replaced(export, functools.wraps(export)(functools.partial(self._export, export)))
+            replace_everywhere(export, functools.wraps(export)(functools.partial(self._export, export)))
         runner.splats.register_state_dict_post_hook(functools.partial(self._fold))  # torch marks it by an attribute
 
     def finish(self) -> None:

@@ -6,6 +6,7 @@ import functools
 import inspect
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,7 +23,7 @@ from integration.host_rendering import Target
 from integration.inria.cameras import HostViews
 from integration.inria.rows import CarriedRows
 from integration.model_proxy import AttachedModel, Role
-from integration.replacing import Replaced, ReplacedMethods
+from integration.replacing import replace_everywhere, replace_methods
 from integration.views import SuperResolve, sr_source
 
 _log = logging.getLogger(__name__)
@@ -100,12 +101,12 @@ class Attached:
             own_background=own_background,
         )  # fmt: skip
         self.attachment = self._attached.attachment
-        self._methods = ReplacedMethods(gaussians, {
+        self._undo = ExitStack()
+        self._undo.callback(replace_methods(gaussians, {
             **dict.fromkeys(_SAVERS, self._save_with_detail), "compute_3D_filter": self._compute_filter_at_hr,
             "training_setup": self._training_setup,
-        })  # fmt: skip
+        }))  # fmt: skip
         self._black: bool | None = None  # the host's background, once it is known
-        self._replaced: Replaced | None = None
         self._hooks: list[Any] = []
         self._hook_optimizer()
 
@@ -144,7 +145,7 @@ class Attached:
     def replace_everywhere(self, render: Callable[..., Any]) -> Callable[..., Any]:
         """Replace the function by its wrapped version in every loaded module, under any name; `remove` undoes it."""
         wrapped = self.wrap(render)
-        self._replaced = Replaced(render, wrapped)
+        self._undo.callback(replace_everywhere(render, wrapped))
         return wrapped
 
     @torch.no_grad()
@@ -159,9 +160,7 @@ class Attached:
         self._rows.remove()
         for hook in self._hooks:
             hook.remove()
-        self._methods.undo()
-        if self._replaced is not None:
-            self._replaced.undo()
+        self._undo.close()
 
     def _host_params(self) -> dict[str, Tensor]:
         return {name: getattr(self._model, attribute) for name, attribute in _ATTRIBUTES.items()}

@@ -1,8 +1,8 @@
 """Which Gaussian came from which in a GaussianModel: row indices follow the two functions that change its structure.
 
-Where the indices are lost, values tell. A model replaces its parameters when it clones, splits or prunes. The replaced parameters
-hold the values of the last step, and every new row is a copy of an old row except for position, scale and opacity. A comparison
-of both sets therefore finds the change, whatever functions of the host made it.
+Where the indices are lost, values identify the rows. A model replaces its parameters when it clones, splits or prunes. The
+replaced parameters hold the values of the last step, and every new row is a copy of an old row except for position, scale and
+opacity. A comparison of both sets therefore finds the change, whatever functions of the host made it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from integration.lineage import Change, change_of, is_same
-from integration.replacing import ReplacedMethods
+from integration.replacing import replace_methods
 
 _log = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ class CarriedRows:
 
     def __init__(self, model: Any, params: Callable[[], Mapping[str, Tensor]]) -> None:
         self._model, self._params, self._warned = model, params, False
-        self._methods = ReplacedMethods(model, {
+        self._undo = replace_methods(model, {
             "_prune_optimizer": functools.partial(_hooked, self._keep),
             "cat_tensors_to_optimizer": functools.partial(_hooked, self._append),
         })  # fmt: skip
@@ -83,7 +83,7 @@ class CarriedRows:
 
     def remove(self) -> None:
         """Give the model its own methods back."""
-        self._methods.undo()
+        self._undo()
 
     def _compared(self) -> dict[str, Tensor]:
         params = self._params()
@@ -101,10 +101,10 @@ class CarriedRows:
         now = self._compared()
         if len(self._parents) != len(now["means"]) or any(name not in tensors for name in _GROUPS.values()):
             return
-        found = _nearest_copied(now, {name: tensors[_GROUPS[name]] for name in _COMPARED})
-        parents = self._parents[found.clamp_min(0)] if len(now["means"]) else found
-        self._parents = torch.cat((self._parents, torch.where(found < 0, -1, parents)))
-        self._fresh = torch.cat((self._fresh, torch.ones_like(found, dtype=torch.bool)))
+        nearest = _nearest_copied(now, {name: tensors[_GROUPS[name]] for name in _COMPARED})
+        parents = self._parents[nearest.clamp_min(0)] if len(now["means"]) else nearest
+        self._parents = torch.cat((self._parents, torch.where(nearest < 0, -1, parents)))
+        self._fresh = torch.cat((self._fresh, torch.ones_like(nearest, dtype=torch.bool)))
 
 
 def _hooked(hook: Callable[[Any], None], method: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
@@ -143,7 +143,7 @@ def _are_copies(rows: Mapping[str, Tensor], of: Mapping[str, Tensor], parents: I
 
 def _nearest_copied(before: Mapping[str, Tensor], rows: Mapping[str, Tensor]) -> Int[Tensor, " M"]:
     """The Gaussian of the same rotation and colour as each of M rows, the nearest of several; -1: there is none."""
-    old, new = (torch.cat([_bits(given[name]) for name in _COPIED], 1) for given in (before, rows))
+    old, new = (torch.cat([_bits(params[name]) for name in _COPIED], 1) for params in (before, rows))
     parents, (order, begin, end) = _first_equal(old, new)
     ambiguous = (parents >= 0) & (end - begin > 1)
     for first in sorted(set(begin[ambiguous].tolist())):
