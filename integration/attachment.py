@@ -152,10 +152,10 @@ class Attachment:
         """Hook the steps of the host's optimizers, and no longer those of earlier ones. The first steps once an iteration."""
         for hook in self._hooks:
             hook.remove()
-        each = list(dict.fromkeys(optimizers))  # one optimizer may have several parameters
+        distinct = list(dict.fromkeys(optimizers))  # one optimizer may have several parameters
         self._hooks = [
-            *(o.register_step_pre_hook(lambda *_: self._before_step()) for o in each[:1]),
-            *(o.register_step_post_hook(lambda o, *_: self._after_step(o)) for o in each),
+            *(o.register_step_pre_hook(lambda *_: self._before_step()) for o in distinct[:1]),
+            *(o.register_step_post_hook(lambda o, *_: self._after_step(o)) for o in distinct),
         ]
 
     def state_dict(self) -> dict[str, Any]:
@@ -219,8 +219,8 @@ class Attachment:
         """The steps on extra views, and what densifies in place of the host."""
         if self._extra.stepping:
             return
-        if made := self._extra.step(optimizer):
-            self.counts["extra views"] += made
+        if steps := self._extra.step(optimizer):
+            self.counts["extra views"] += steps
         self._density.after_step(optimizer, self.t)
 
     def _finish_previous_step(self) -> None:
@@ -239,7 +239,7 @@ class Attachment:
         if parents is None and n == self._n:
             return
         state = ", ".join(self.conductor.state_dict())
-        if self._step is not None:  # without parents nobody may remember Gaussians, so nobody needs to know them
+        if self._step is not None:  # without parents, what it holds per Gaussian cannot be gathered
             self._step = Step(self._step.t, self._step.view) if parents is None else self._step.resized(parents)
         if parents is not None:
             self.conductor.on_resize(parents)

@@ -19,11 +19,10 @@ def end_with_strategies(conductor: Conductor, settings: Any, name: str, first: i
         first: the host's number of its first iteration, 0 or 1.
     """
     until = getattr(settings, name, None)
-    if until is None:
-        return
-    end = _end_of_densification(conductor, int(until), first)
-    if end < until:
-        _log.info("densification ends at %s=%d instead of %d (%s).", name, end, until, _who(conductor, end + 1 - first))
+    if until is not None and (end := _end_of_densification(conductor, int(until), first)) < until:
+        _log.info(
+            "densification ends at %s=%d instead of %d (%s).", name, end, until, _forbidding(conductor, end + 1 - first)
+        )
         setattr(settings, name, end)
 
 
@@ -45,11 +44,11 @@ def require_end(conductor: Conductor, until: int | None, name: str, first: int =
         )
     _log.warning(
         "the host densifies until %s=%d, but %s ends densification at %d. Lower %s to that iteration.",
-        name, until, _who(conductor, end + 1 - first), end, name,
+        name, until, _forbidding(conductor, end + 1 - first), end, name,
     )  # fmt: skip
 
 
-def _end_of_densification(conductor: Conductor, until: int, first: int = 1) -> int:
+def _end_of_densification(conductor: Conductor, until: int, first: int) -> int:
     """The first iteration, in the host's count, from which on the strategies no longer allow densification; at most `until`.
 
     A host has an end, but cannot be asked at each iteration: it densifies where a strategy forbids it earlier, with a warning.
@@ -59,11 +58,11 @@ def _end_of_densification(conductor: Conductor, until: int, first: int = 1) -> i
     if gaps := sorted({*range(first, end)} - {*allowed}):
         _log.warning(
             "%s forbids densification at %d of the iterations before %d, the first is %d, but the host densifies there: "
-            "only the end can be set from here.", _who(conductor, gaps[0] + 1 - first), len(gaps), end, gaps[0],
+            "only the end can be set from here.", _forbidding(conductor, gaps[0] + 1 - first), len(gaps), end, gaps[0],
         )  # fmt: skip
     return end
 
 
-def _who(conductor: Conductor, t: int) -> str:
+def _forbidding(conductor: Conductor, t: int) -> str:
     """The strategies that forbid densification at iteration t."""
     return ", ".join(type(s).__name__ for s in conductor.strategies if not s.may_densify(t))

@@ -18,8 +18,8 @@ _EPS: Final = 1e-15  # Adam's, as in 3DGS: gradients of mean losses are near 1e-
 
 
 def detail_adam(detail: torch.nn.Parameter, rates: DetailRates) -> torch.optim.Adam:
-    """An Adam for f_det. A loop that tells its optimizers which Gaussians the photo shows (gsplat's SelectiveAdam) may tell this
-    one, too: it steps all of them, since others are visible at HR.
+    """An Adam for f_det that steps all Gaussians. A loop may pass it the visible ones, as gsplat's SelectiveAdam takes them: the
+    argument is dropped, since others are visible at HR.
     """
     adam = torch.optim.Adam([detail], lr=rates.rate, eps=_EPS)
     adam.register_step_pre_hook(lambda _, args, kwargs: (

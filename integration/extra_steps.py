@@ -39,7 +39,7 @@ class ExtraSteps:
         self._gradients: list[Grads] = []
         self._rendered: Mapping[str, Tensor] = {}  # what they are gradients of
         self.stepping = False
-        self._made, self._unused = False, 0  # whether any step was ever made; iterations without one until then
+        self._ever_stepped, self._unused = False, 0  # iterations with extra views until the first step on one
 
     def render(self, extra_views: Sequence[ExtraView], t: int, render: Callable[[Camera], AutogradShot]) -> None:
         """Render the extra views of iteration t, without a gate and without f_det, and take their gradients."""
@@ -50,40 +50,40 @@ class ExtraSteps:
 
     @torch.no_grad()
     def step(self, optimizer: torch.optim.Optimizer) -> int:
-        """One step of this optimizer for each extra view; returns how many positions have made.
+        """One step of this optimizer for each extra view; returns how many steps the positions made.
 
         An optimizer whose parameters were replaced after the views were rendered makes none (3DGS densifies before it steps).
         """
         if self.stepping or not self._gradients:
             return 0
-        present = [p for group in optimizer.param_groups for p in group["params"]]
-        known = {id(p) for p in present}
-        mine = {name: p for name, p in self._rendered.items() if id(p) in known and p.requires_grad}
-        if not mine:
+        stepped = [p for group in optimizer.param_groups for p in group["params"]]
+        ids = {id(p) for p in stepped}
+        params = {name: p for name, p in self._rendered.items() if id(p) in ids and p.requires_grad}
+        if not params:
             return 0
-        before, self.stepping = [p.grad for p in present], True
+        before, self.stepping = [p.grad for p in stepped], True
         scale = getattr(optimizer, "grad_scale", None)  # an AMP gradient scaler's, which a fused optimizer divides by
         if scale is not None:  # gradients of extra views are not scaled
             optimizer.grad_scale = None  # type: ignore[attr-defined]
         try:
             for grads in self._gradients:
-                for p in present:
+                for p in stepped:
                     p.grad = None
-                for name, p in mine.items():
+                for name, p in params.items():
                     p.grad = grads[name].to(p)
-                _step(optimizer, mine)
+                _step(optimizer, next(iter(params.values())))
         finally:
             self.stepping = False
             if scale is not None:
                 optimizer.grad_scale = scale  # type: ignore[attr-defined]
-            for p, grad in zip(present, before, strict=True):
+            for p, grad in zip(stepped, before, strict=True):
                 p.grad = grad
-        self._made = True
-        return len(self._gradients) if "means" in mine else 0
+        self._ever_stepped = True
+        return len(self._gradients) if "means" in params else 0
 
     def forget(self) -> None:
         """Before an iteration: drop the gradients of the one before, stepped on or not. Warn where none ever is."""
-        if self._gradients and not self._made:
+        if self._gradients and not self._ever_stepped:
             self._unused += 1
             if self._unused == _PATIENCE:
                 _log.warning(
@@ -93,8 +93,8 @@ class ExtraSteps:
         self._gradients, self._rendered = [], {}
 
 
-def _step(optimizer: torch.optim.Optimizer, mine: Mapping[str, Tensor]) -> None:
-    """One step. An Adam of visible Gaussians is told which move, 3DGS's SparseGaussianAdam also how many there are."""
-    takes, rows = inspect.signature(type(optimizer).step).parameters, next(iter(mine.values()))
-    told: dict[str, Any] = {"visibility": torch.ones(len(rows), dtype=torch.bool, device=rows.device), "N": len(rows)}
-    optimizer.step(**{name: value for name, value in told.items() if name in takes})
+def _step(optimizer: torch.optim.Optimizer, rows: Tensor) -> None:
+    """One step of all rows. An Adam of visible Gaussians takes which move, 3DGS's SparseGaussianAdam also how many there are."""
+    parameters = inspect.signature(type(optimizer).step).parameters
+    known: dict[str, Any] = {"visibility": torch.ones(len(rows), dtype=torch.bool, device=rows.device), "N": len(rows)}
+    optimizer.step(**{name: value for name, value in known.items() if name in parameters})

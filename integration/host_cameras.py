@@ -58,7 +58,7 @@ def replaced_camera(camera: Any, by: Camera) -> Any:
 
 
 def _first(camera: Any, names: tuple[str, ...]) -> Any:
-    return next((found for name in names if (found := getattr(camera, name, None)) is not None), None)
+    return next((value for name in names if (value := getattr(camera, name, None)) is not None), None)
 
 
 def _like(value: Any, present: Any) -> Any:

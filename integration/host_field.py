@@ -23,10 +23,10 @@ class HostField:
         rows: returns every tensor of the host with a row per Gaussian, by the host's names.
         names: gsplat's parameter name -> the host's.
         optimizers: returns those of the parameters.
-        put: gives the host its new tensors, and tells it that row i of each is row parents[i] of the old one.
+        put: replaces the host's tensors; row i of each new one is row parents[i] of the old one.
 
     Attributes:
-        moments: what its optimizers remember per Gaussian.
+        moments: the per-Gaussian state of its optimizers.
     """
 
     def __init__(
@@ -73,11 +73,7 @@ class HostField:
 
 
 class HostMoments:
-    """What a host's optimizers remember per Gaussian, e.g. Adam's moments.
-
-    Args:
-        optimizers: returns them.
-    """
+    """The per-Gaussian state of a host's optimizers, e.g. Adam's moments."""
 
     def __init__(self, optimizers: Callable[[], Sequence[torch.optim.Optimizer]]) -> None:
         self.optimizers = optimizers

@@ -42,7 +42,7 @@ class RenderAt(Protocol):
 
 
 def called_at(on_backward: WeakMethod[Callable[[int], None]], nth: int) -> Callable[[Tensor], None]:
-    """A hook of the nth rendering. It holds neither the rendering nor what does: a hook that did would never be freed."""
+    """A tensor hook that calls `on_backward(nth)`. Its reference is weak: with a strong one, its tensor would never be freed."""
     return lambda _: None if (alive := on_backward()) is None else alive(nth)
 
 

@@ -118,8 +118,8 @@ def write_score(
     score, ordinary = scores(screen_lr)
     if score is ordinary:  # without a strategy's score, the statistic that the host's threshold is meant for stays
         return False
-    own = torch.linalg.vector_norm(screen_lr, dim=-1)
-    written = score_for_host(slot, score, own, shot.visible, scaler, loss_scale)
+    statistic = torch.linalg.vector_norm(screen_lr, dim=-1)  # the host's own
+    written = score_for_host(slot, score, statistic, shot.visible, scaler, loss_scale)
     if written is not None:
         slot.write(loss_scale * written)
     return written is not None

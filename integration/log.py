@@ -1,11 +1,11 @@
-"""What the adapters say, for hosts that have not configured Python's logging."""
+"""The log of the adapters in hosts that have not configured Python's logging."""
 
 from __future__ import annotations
 
 import logging
 from typing import Final
 
-_OURS: Final = ("integration", "clear_strategies", "rasterizers")
+_PACKAGES: Final = ("integration", "clear_strategies", "rasterizers")
 
 
 def show_log() -> None:
@@ -14,7 +14,7 @@ def show_log() -> None:
         return
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("[clear] %(message)s"))
-    for name in _OURS:
+    for name in _PACKAGES:
         logger = logging.getLogger(name)
         if not logger.handlers:
             logger.addHandler(handler)

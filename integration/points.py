@@ -44,7 +44,7 @@ def wants_stereo(points: str) -> bool:
 
 
 def stereo_points(photos: Sequence[HostPhoto]) -> PointCloud:
-    """Dense stereo between a host's training photos; one line of the log says what was found.
+    """Dense stereo between a host's training photos; one line of the log sums them up.
 
     Args:
         photos: in the host's world. Where the mask is below 0.5 the host hides the pixel, which gets no points. Stereo runs on
@@ -57,14 +57,14 @@ def stereo_points(photos: Sequence[HostPhoto]) -> PointCloud:
         DataError: there are fewer than two photos, or stereo confirms no depth.
     """
     posed = [photo.posed for photo in photos]
-    found = stereo(
+    dense = stereo(
         [photo.image for photo in posed],
         torch.stack([photo.camera.world_to_camera for photo in posed]) if posed else torch.zeros(0, 4, 4),
         torch.stack([intrinsics(photo.camera) for photo in posed]) if posed else torch.zeros(0, 3, 3),
         masks=[None if photo.mask is None else photo.mask >= 0.5 for photo in photos],
     )
-    cloud = PointCloud(found.means.cpu(), found.colors.cpu(), found.summary)
+    cloud = PointCloud(dense.means.cpu(), dense.colors.cpu(), dense.summary)
     kept = cloud.at_most(MAX_POINTS)
     chosen = "" if len(kept) == len(cloud) else f"; {len(kept):,} of them, chosen at random, are used"
-    _log.info("points=stereo: %s%s.", found.summary, chosen)
+    _log.info("points=stereo: %s%s.", dense.summary, chosen)
     return kept

@@ -1,4 +1,4 @@
-"""What is checked, and said, when strategies are attached to a host."""
+"""Checks and log messages when strategies are attached to a host."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ def announce(conductor: Conductor, views: Sequence[View], *, own_background: boo
             "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
             ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
         )
-    for own, hook, does in (
+    for by_host, hook, reason in (
         (own_density, "densifier", "densifies by itself; where it is told not to, this strategy does"),
         (own_background, "background", "chooses its background itself"),
     ):
-        if own and (owner := conductor.owner(hook)) is not None:
-            _log.info("%s has no effect here: the host %s.", type(owner).__name__, does)
+        if by_host and (owner := conductor.owner(hook)) is not None:
+            _log.info("%s has no effect here: the host %s.", type(owner).__name__, reason)
     if not conductor.strategies:
         _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")

@@ -77,8 +77,8 @@ class HostPhoto:
         """See `view`."""
         lr = self.posed
         image, camera = lr.image, lr.camera
-        made = super_resolved(sr, self.name, image.cpu(), factor)
-        sr_image = made.image.to(image)
+        result = super_resolved(sr, self.name, image.cpu(), factor)
+        sr_image = result.image.to(image)
         _require_range(self.name, "SR image", sr_image)
         sr_image = sr_image.clamp(0, 1)
         mask = None if self.mask is None else self.mask.to(image)
@@ -88,7 +88,7 @@ class HostPhoto:
         view = View(
             self.name, Photo(camera, image), Photo(camera.scaled(factor), sr_image),
             sr_source=getattr(sr, "label", "unknown"),
-            disagreement=None if made.disagreement is None else made.disagreement.to(image),
+            disagreement=None if result.disagreement is None else result.disagreement.to(image),
         )  # fmt: skip
         return view if mask is None else view.hiding(mask > _SHOWN)
 
@@ -132,9 +132,9 @@ def by_name(views: Sequence[View]) -> dict[str, View]:
     """
     named = {view.name: view for view in views}
     if len(named) < len(views):
-        twice = next(view.name for view in views if named[view.name] is not view)
+        duplicate = next(view.name for view in views if named[view.name] is not view)
         raise SettingError(
-            f"views: strategies know each by its name, but {twice!r} is the name of several. Where folders have equal file "
+            f"views: strategies know each by its name, but {duplicate!r} is the name of several. Where folders have equal file "
             "names, name the views with their folders."
         )
     return named

@@ -179,11 +179,11 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
 @contextmanager
 def _rendering_with(rasterization: Any) -> Iterator[None]:
     """Replace gsplat's function in splatfacto's module."""
-    own, splatfacto.rasterization = splatfacto.rasterization, rasterization
+    original, splatfacto.rasterization = splatfacto.rasterization, rasterization
     try:
         yield
     finally:
-        splatfacto.rasterization = own
+        splatfacto.rasterization = original
 
 
 def _adam(lr: float, lr_final: float | None = None) -> dict[str, Any]:
