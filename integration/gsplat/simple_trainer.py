@@ -6,6 +6,7 @@ import functools
 import logging
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
@@ -132,15 +133,18 @@ class _Installed:
             runner.splats, runner.optimizers, views, chosen, strategy=runner.cfg.strategy, seed=seed, masks=masks
         )
         self.attached.replace_everywhere(rendering.rasterization)
+        self._undo = ExitStack()
         export = getattr(sys.modules["gsplat"], "export_splats", None)
         if export is not None:
-            replace_everywhere(export, functools.wraps(export)(functools.partial(self._export, export)))
+            with_detail = functools.wraps(export)(functools.partial(self._export, export))
+            self._undo.callback(replace_everywhere(export, with_detail))
         runner.splats.register_state_dict_post_hook(functools.partial(self._fold))  # torch marks it by an attribute
 
     def finish(self) -> None:
-        """Leave its splats as they are drawn, and the rasterization to the next Runner."""
+        """Leave its splats as they are drawn, and gsplat's functions to the next Runner."""
         self.attached.fold_detail()
         self.attached.remove()
+        self._undo.close()
 
     def _export(self, export: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """`export_splats` of the trained splats, with f_det in their constant band."""

@@ -142,3 +142,4 @@ def test_a_second_runner_in_one_process_trains_too(trainer, monkeypatch):
         assert runner.clear.attached.attachment.counts["merges"] == 8
     assert torch.equal(*drawn)
     runner.clear.finish()
+    assert not hasattr(gsplat.export_splats, "__wrapped__")  # else the splats of every Runner stay in memory
