@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 from weakref import WeakMethod
 
 import torch
@@ -33,12 +33,8 @@ class HostRendering:
     returned: Any
 
 
-class RenderAt(Protocol):
-    """Renders by the host's own renderer: with f_det at HR, without it at LR and by another camera."""
-
-    def __call__(self, target: Target, gate: Float[Tensor, " N"] | None) -> HostRendering:
-        """The rendering, whose opacities are multiplied by `gate`."""
-        ...
+RenderAt = Callable[[Target, Float[Tensor, " N"] | None], HostRendering]
+"""Renders by the host's own renderer, opacities multiplied by the gate: with f_det at HR, without it for any other target."""
 
 
 def called_at(on_backward: WeakMethod[Callable[[int], None]], nth: int) -> Callable[[Tensor], None]:

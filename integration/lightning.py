@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -33,7 +32,7 @@ from integration.host_rendering import Target
 from integration.lineage import ROWS, RowNumbers
 from integration.log import show_log
 from integration.model_proxy import AttachedModel, Role
-from integration.replacing import replace_methods
+from integration.replacing import replace_methods, replaced_attribute
 from integration.views import by_name, sr_source, view
 
 _log = logging.getLogger(__name__)
@@ -210,27 +209,18 @@ class Attached:
         if self.attachment is None:
             return original(camera, *args, **kwargs)
         if self._batch is None or not self._module.training:
-            with self._using(self._attached.with_detail()):
+            with replaced_attribute(self._module, "gaussian_model", self._attached.with_detail()):
                 return original(camera, *args, **kwargs)
         _, photo, extra = self._batch
 
         def render(model: Any, sized: Any, target: Target) -> Any:
-            with self._using(model):
+            with replaced_attribute(self._module, "gaussian_model", model):
                 result = original(sized, *args, **kwargs)
             if target == "hr":  # at LR the host itself applies its exposure, bilateral grid …
                 self._module.output_processor.training_forward((sized, photo, extra), result)
             return result
 
         return self._attached.render_view(self._views[photo[0]], camera, render)
-
-    @contextmanager
-    def _using(self, model: Any) -> Iterator[None]:
-        """The module renders another model."""
-        trained, self._module.gaussian_model = self._module.gaussian_model, model
-        try:
-            yield
-        finally:
-            self._module.gaussian_model = trained
 
     def _show_detail_in_viewer(self) -> None:
         """The host's viewer calls the renderer itself."""

@@ -1,15 +1,16 @@
-"""Functions in place of a host's own: in every module that holds one, or in one object. Each returns what undoes it."""
+"""Functions and attributes in place of a host's own."""
 
 from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 
 def replace_everywhere(original: Callable[..., Any], replacement: Callable[..., Any]) -> Callable[[], None]:
-    """Replace a function in all loaded modules, under any name.
+    """Replace a function in all loaded modules, under any name; returns what undoes it.
 
     Functions that a module binds later, or holds in another object, are not found; an `Attachment` raises an error if
     its host then renders with the original.
@@ -30,7 +31,7 @@ def replace_everywhere(original: Callable[..., Any], replacement: Callable[..., 
 
 
 def replace_methods(owner: Any, replacements: Mapping[str, Callable[..., Any]]) -> Callable[[], None]:
-    """Replace methods of one object; each replacement gets the original as its first argument.
+    """Replace methods of one object; returns what undoes it. Each replacement gets the original as its first argument.
 
     Args:
         replacements: by the name of the method. Those that the object does not have are left out.
@@ -45,3 +46,14 @@ def replace_methods(owner: Any, replacements: Mapping[str, Callable[..., Any]]) 
             vars(owner).pop(name, None)
 
     return undo
+
+
+@contextmanager
+def replaced_attribute(owner: Any, name: str, value: Any) -> Iterator[None]:
+    """The attribute has another value inside the context."""
+    original = getattr(owner, name)
+    setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        setattr(owner, name, original)

@@ -31,7 +31,7 @@ from rasterizers.interface import Camera
 
 _ATTACHED: Final = "clear_attached"  # attribute of a wrapped function: its Attached
 _SAME_POSE: Final = 1e-3  # largest difference between the entries of two poses of one camera
-_CLEARLY: Final = 10  # times as far as the nearest pose must the next be: frames of a video may lie closer than that
+_POSE_RATIO: Final = 10  # how many times as far the second nearest pose must be, since frames of a video lie close
 
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
@@ -92,9 +92,9 @@ class Attached:
             params if state is None else state, lambda: params[self._names["means"]], as_parameter=state is None
         )
         self._poses = torch.stack([view.lr.camera.world_to_camera for view in self._views]).to(means)
-        self._named: View | None = None  # by `rendering`, if it was called
-        self._found_by_pose = True
-        self._colors_are_bands = False  # whether the loop has drawn spherical harmonics; RGB then is something else
+        self._found_by_pose = True  # else renderings are those of `_named`, see `rendering`
+        self._named: View | None = None
+        self._has_drawn_bands = False  # after a call with spherical harmonics, one without them draws no colours
         self._undo = ExitStack()
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
@@ -105,7 +105,7 @@ class Attached:
             poll_parents=self._poll_parents, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
             own_background=own_background, field=self._field() if may_densify else None,
         )  # fmt: skip
-        self.attachment.hook(self._of_gaussians())
+        self.attachment.hook(self._optimizers_of_gaussians())
 
     def params(self) -> dict[str, Tensor]:
         """The current leaves, by gsplat's names."""
@@ -114,7 +114,7 @@ class Attached:
 
     def wrap(self, rasterization: Rasterization) -> Rasterization:
         """`rasterization` that renders training views at both scales, and shows f_det in renderings without gradients."""
-        if (by := getattr(rasterization, _ATTACHED, None)) is not None and not by.attachment.removed:
+        if (attached := getattr(rasterization, _ATTACHED, None)) is not None and not attached.attachment.removed:
             raise HostError("this rasterization is wrapped already; remove() the attachment that wrapped it first.")
         signature = inspect.signature(rasterization)
         var_keyword = [name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD]
@@ -177,7 +177,7 @@ class Attached:
         self._undo.close()
         self._rows.remove()
 
-    def _of_gaussians(self) -> list[torch.optim.Optimizer]:
+    def _optimizers_of_gaussians(self) -> list[torch.optim.Optimizer]:
         """The optimizers of the Gaussians; others, e.g. of poses, do not count."""
         return [self._optimizers[name] for name in (*self._names.values(), "detail") if name in self._optimizers]
 
@@ -191,7 +191,7 @@ class Attached:
         def rows() -> dict[str, Tensor]:
             return {name: p for name, p in self._params.items() if name != ROWS}
 
-        return HostField(rows, self._names, self._of_gaussians, put)
+        return HostField(rows, self._names, self._optimizers_of_gaussians, put)
 
     def _poll_parents(self) -> Int[Tensor, " M"] | None:
         change = self._rows.poll()
@@ -200,11 +200,11 @@ class Attached:
     def _draws_colors(self, call: Mapping[str, Any]) -> bool:
         """Whether a call draws the colours of the scene, and not its depth alone, its normals or other features."""
         as_bands = call.get("sh_degree") is not None
-        self._colors_are_bands |= as_bands
+        self._has_drawn_bands |= as_bands
         if "RGB" not in call.get("render_mode", "RGB") or call["colors"].shape[-1] != 3:
             return False
         of_no_photo = self._named is None and not self._found_by_pose
-        return as_bands or not (self._colors_are_bands or of_no_photo)
+        return as_bands or not (self._has_drawn_bands or of_no_photo)
 
     def _find_view(self, viewmats: Float[Tensor, "*C 4 4"]) -> View | None:
         poses = viewmats.detach().reshape(-1, 4, 4)
@@ -216,7 +216,7 @@ class Attached:
         distances = (self._poses - poses).abs().amax((1, 2)).tolist()
         tolerance = _SAME_POSE * max(1.0, float(poses.abs().max()))
         near = sorted((distance, i) for i, distance in enumerate(distances) if distance <= tolerance)
-        if len(near) > 1 and near[1][0] <= _CLEARLY * near[0][0]:
+        if len(near) > 1 and near[1][0] <= _POSE_RATIO * near[0][0]:
             names = " and ".join(self._views[i].name for _, i in near[:2])
             raise HostError(f"{names} have the same pose. Say which is rendered: with clear.rendering(view): …")
         return self._views[near[0][1]] if near else None

@@ -8,7 +8,6 @@ import inspect
 import logging
 from typing import Any, Final
 
-from clear_strategies.core.points import PointCloud
 from integration.gsplat.data import photos_of
 from integration.points import no_stereo, stereo_points
 
@@ -38,20 +37,15 @@ def start_from_stereo(runner_class: Any) -> None:
 
     @functools.wraps(create)
     def create_from_stereo(parser: Any, *args: Any, **kwargs: Any) -> Any:
-        given = inspect.signature(create).bind(parser, *args, **kwargs)
-        given.apply_defaults()
-        init_type = given.arguments.get("init_type", "sfm")
+        call = inspect.signature(create).bind(parser, *args, **kwargs)
+        call.apply_defaults()
+        init_type = call.arguments.get("init_type", "sfm")
         if init_type == "sfm":
-            parser = _with_points(parser, stereo_points(photos_of(dataset(parser, split="train"))))
+            cloud = stereo_points(photos_of(dataset(parser, split="train")))
+            parser = copy.copy(parser)  # what else its points are used for (depths) needs its own
+            parser.points, parser.points_rgb = cloud.means.numpy(), (cloud.colors * 255).numpy()
         else:
             _log.warning("points=stereo has no effect with init_type=%s. Set init_type=sfm.", init_type)
         return create(parser, *args, **kwargs)
 
     module[_CREATE] = create_from_stereo
-
-
-def _with_points(parser: Any, cloud: PointCloud) -> Any:
-    """A copy of the parser with other points; what else its points are used for (depths) needs its own."""
-    changed = copy.copy(parser)
-    changed.points, changed.points_rgb = cloud.means.numpy(), (cloud.colors * 255).numpy()
-    return changed

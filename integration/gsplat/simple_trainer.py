@@ -81,23 +81,23 @@ def install(
     if wants_stereo(points):
         start_from_stereo(runner_class)
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats
-    in_use: list[_Installed] = []  # of the last Runner: its evaluation may come after its training
+    last: _Installed | None = None  # of the last Runner, whose evaluation may come after its training
 
     @functools.wraps(train)
     def train_with_clear(runner: Any) -> Any:
+        nonlocal last
         require_supported(runner.cfg, runner.world_size)
         chosen = conductor(strategies, *overrides, iterations=runner.cfg.max_steps)
         end_with_strategies(chosen, runner.cfg.strategy, "refine_stop_iter", first=0)
         source, scale = sr_source(sr, chosen, factor, suffix)
         photos = photos_of(runner.trainset, runner.device)
         masks = {photo.name: photo.mask for photo in photos if photo.mask is not None}
-        if in_use:
-            in_use.pop().finish()
-        runner.clear = _Installed(runner, [photo.view(source, scale) for photo in photos], masks, chosen, seed)
-        in_use.append(runner.clear)
-        installed(runner.clear.attached)
+        if last is not None:
+            last.finish()
+        runner.clear = last = _Installed(runner, [photo.view(source, scale) for photo in photos], masks, chosen, seed)
+        installed(last.attached)
         result = train(runner)
-        _log.info("%s.", runner.clear.attached.attachment.summary())
+        _log.info("%s.", last.attached.attachment.summary())
         return result
 
     @functools.wraps(rasterize_splats)

@@ -23,7 +23,7 @@ from integration.host_rendering import Target
 from integration.inria.cameras import HostViews
 from integration.inria.rows import CarriedRows
 from integration.model_proxy import AttachedModel, Role
-from integration.replacing import replace_everywhere, replace_methods
+from integration.replacing import replace_everywhere, replace_methods, replaced_attribute
 from integration.views import SuperResolve, sr_source
 
 _log = logging.getLogger(__name__)
@@ -225,11 +225,9 @@ class Attached:
     def _save_with_detail(self, save: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """`save_ply` with f_det in the colours of the file."""
         trained = self._model._features_dc
-        self._model._features_dc = torch.nn.Parameter(trained.detach() + self._attached.detail.offset(trained))
-        try:
+        shown = torch.nn.Parameter(trained.detach() + self._attached.detail.offset(trained))
+        with replaced_attribute(self._model, "_features_dc", shown):
             return save(*args, **kwargs)
-        finally:
-            self._model._features_dc = trained
 
 
 attach = Attached

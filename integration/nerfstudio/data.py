@@ -43,12 +43,11 @@ def views_from_datamanager(
     """
     files = datamanager.train_dataset.image_filenames
     _require_unique_stems(files)
-    for file, item in zip(files, _cached(datamanager), strict=True):
-        if "mask" in item:
-            raise DataError(
-                Path(file).name, "mask", "hides pixels from splatfacto's loss but not from the losses of the SR image",
-                "train without masks",
-            )  # fmt: skip
+    if masked := [Path(file).name for file, item in zip(files, _cached(datamanager), strict=True) if "mask" in item]:
+        raise DataError(
+            masked[0], "mask", "hides pixels from splatfacto's loss but not from the losses of the SR image",
+            "train without masks",
+        )  # fmt: skip
     return tuple(photo.view(sr, factor) for photo in photos_of(datamanager, device))
 
 
@@ -113,13 +112,12 @@ def over_black(image: Tensor) -> Float[Tensor, "H W 3"]:
 def _mask(item: Any) -> Float[Tensor, "H W"] | None:
     """1 where a photo shows the scene: what its mask shows, and not less than half transparent. None: everywhere."""
     image, mask = item["image"], item.get("mask")
-    alpha = None
+    shown = []
     if image.shape[-1] == 4:
-        alpha = image[..., 3].float() / (255 if image.dtype == torch.uint8 else 1)
-    shown = None if mask is None else mask.reshape(image.shape[:2]).to(image.device).float()
-    if alpha is None or shown is None:
-        return alpha if shown is None else shown
-    return torch.minimum(alpha, shown)
+        shown.append(image[..., 3].float() / (255 if image.dtype == torch.uint8 else 1))
+    if mask is not None:
+        shown.append(mask.reshape(image.shape[:2]).to(image.device).float())
+    return torch.stack(shown).amin(0) if shown else None
 
 
 def _cached(datamanager: Any) -> Any:

@@ -7,8 +7,6 @@ The `TrainerConfig` is written out, because splatfacto's cannot be imported whil
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -35,6 +33,7 @@ from integration.gsplat import Attached, attach
 from integration.log import show_log
 from integration.nerfstudio.data import photos_of, prior, views_from_datamanager
 from integration.nerfstudio.datamanager import ClearDatamanagerConfig
+from integration.replacing import replaced_attribute
 from integration.views import save_photos
 
 NAMES: Final = {"sh0": "features_dc", "shN": "features_rest"}
@@ -116,7 +115,7 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
     def get_outputs(self, camera: Any) -> dict[str, Any]:
         if not self.training or self.attached is None:
             return super().get_outputs(camera)  # type: ignore[no-any-return]
-        with _rendering_with(self.attached.wrap(splatfacto.rasterization)):
+        with replaced_attribute(splatfacto, "rasterization", self.attached.wrap(splatfacto.rasterization)):
             return super().get_outputs(camera)  # type: ignore[no-any-return]
 
     def get_metrics_dict(self, outputs: Any, batch: Any) -> dict[str, Any]:
@@ -174,16 +173,6 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
             CONSOLE.log(f"CLEAR: detached after step {step}: {self.attached.attachment.summary()}.")
             self.attached.remove()
             self.attached = None
-
-
-@contextmanager
-def _rendering_with(rasterization: Any) -> Iterator[None]:
-    """Replace gsplat's function in splatfacto's module."""
-    original, splatfacto.rasterization = splatfacto.rasterization, rasterization
-    try:
-        yield
-    finally:
-        splatfacto.rasterization = original
 
 
 def _adam(lr: float, lr_final: float | None = None) -> dict[str, Any]:
