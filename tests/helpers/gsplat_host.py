@@ -3,38 +3,37 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 
 from clear_strategies import Conductor
+from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 from clear_strategies.training.optim import LearningRates
 from integration.gsplat import Attached, attach
 from rasterizers import autograd
 from tests.helpers import toy
 from tests.helpers.host_parts import photometric
+from tests.helpers.inria import HR_FROM_START
 
 rasterization = functools.partial(autograd.rasterization, backend="torch")
-
-
-def intrinsics(camera):
-    return torch.tensor([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], dtype=torch.float64)
 
 
 def drawn(function, splats, camera, **settings):
     """Six tensors of gsplat's names, drawn by a function like gsplat's `rasterization`."""
     p = splats
     activated = p["scales"].exp(), p["opacities"].sigmoid(), torch.cat([p["sh0"], p["shN"]], 1)
-    view = camera.world_to_camera[None], intrinsics(camera), camera.width, camera.height
+    view = camera.world_to_camera[None], intrinsics(camera)[None], camera.width, camera.height
     return function(p["means"], p["quats"], *activated, *view, **{"sh_degree": 3, **settings})
 
 
 class Host:
     """Parameters, optimizers and LR photos (name -> camera and image) of a gsplat-style trainer."""
 
-    def __init__(self, scene, extent=1.0, strategy=None, scaler=None, accumulation=1, eps=1e-15):
+    def __init__(
+        self, scene, extent=1.0, strategy=None, scaler=None, accumulation=1, eps=1e-15, rasterization=rasterization
+    ):
+        self.rasterization = rasterization
         self.photos = {v.name: v.lr for v in scene.train}
         raw = GaussianField.from_cloud(scene.cloud).raw()
         self.splats = {k: torch.nn.Parameter(p.clone()) for k, p in raw.items() if k != "detail"}
@@ -48,8 +47,8 @@ class Host:
         self.grads = {}
         self.degree = lambda step: min(3, step)
 
-    def render(self, camera, step):
-        return drawn(rasterization, self.splats, camera, sh_degree=self.degree(step), packed=False)
+    def render(self, camera, step=0):
+        return drawn(self.rasterization, self.splats, camera, sh_degree=self.degree(step), packed=False)
 
     def train(self, names, between=lambda: None):
         """The order of gsplat's simple_trainer: backward, step, densify."""
@@ -72,22 +71,31 @@ class Host:
             between()
 
 
-@contextmanager
-def attached(host: Host, scene, conductor: Conductor, function=None, **settings) -> Iterator[Attached]:
-    """The host with CLEAR in its loop."""
+def attached(host: Host, scene, conductor: Conductor, **settings) -> Attached:
+    """CLEAR in the host's loop."""
     clear = attach(host.splats, host.optimizers, scene.train, conductor, **settings)
-    clear.replace_everywhere(function or rasterization)
-    try:
-        yield clear
-    finally:
-        clear.remove()
-
-
-def trained(host: Host, scene, conductor: Conductor, names, **settings) -> Attached:
-    """Train on the views of these names with CLEAR."""
-    with attached(host, scene, conductor, **settings) as clear:
-        host.train(names)
+    host.rasterization = clear.wrap(host.rasterization)
     return clear
+
+
+def trained(host: Host, scene, conductor: Conductor, names, /, **settings) -> Attached:
+    """Train on the views of these names with CLEAR."""
+    clear = attached(host, scene, conductor, **settings)
+    host.train(names)
+    clear.remove()
+    return clear
+
+
+def started(*strategies, host=None, scene=None, **settings):
+    """A host on the toy scene, CLEAR in its loop, and a function that renders its photo i."""
+    scene = scene or toy.scene(20)
+    host = host or Host(scene)
+    clear = attached(host, scene, Conductor(*strategies, objective=HR_FROM_START), **settings)
+
+    def render(i=0, **call):
+        return drawn(host.rasterization, host.splats, scene.train[i].lr.camera, **call)[0]
+
+    return host, clear, render
 
 
 def densified(

@@ -15,9 +15,9 @@ from gsplat.rendering import rasterization
 from gsplat.strategy import DefaultStrategy
 
 from clear_strategies.core.points import PointCloud
+from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.training.field import GaussianField
 from tests.helpers import toy
-from tests.helpers.gsplat_host import intrinsics
 from tests.helpers.host_parts import photometric
 
 
@@ -53,7 +53,7 @@ class Dataset:
     def __getitem__(self, item):
         photo = self.parser.scene.train[item].lr
         return {
-            "K": intrinsics(photo.camera)[0].float(), "camtoworld": torch.linalg.inv(photo.camera.world_to_camera),
+            "K": intrinsics(photo.camera).float(), "camtoworld": torch.linalg.inv(photo.camera.world_to_camera),
             "image": photo.image * 255, "image_id": item,
         }  # fmt: skip
 

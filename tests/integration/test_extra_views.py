@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 
 import pytest
 import torch
@@ -17,7 +18,7 @@ from integration.gsplat import attach
 from integration.inria.attached import _ATTRIBUTES
 from rasterizers import Splats
 from tests.helpers import gsplat_host, inria, toy
-from tests.helpers.gsplat_host import Host
+from tests.helpers.gsplat_host import Host, started
 from tests.helpers.host_parts import FROM_START
 from tests.integration.test_inria import trained as trained_inria
 from tests.integration.test_lightning import attachment_of, fitted, host  # noqa: F401 - a fixture
@@ -98,13 +99,11 @@ def test_accumulated_passes_are_one_step_with_one_extra_step(drawn):
 
 def stepped(make, scaler=None):
     """The parameters after a step by the optimizers that `make` gives for them, and how many extra steps were counted."""
-    scene = toy.scene(20)
-    trainer = Host(scene)
+    trainer = Host(toy.scene(20))
     trainer.optimizers = make(trainer.splats)
     loss_scale = None if scaler is None else scaler.get_scale
-    clear = attach(trainer.splats, trainer.optimizers, scene.train, dark(), detail=False, loss_scale=loss_scale)
-    loss = gsplat_host.drawn(clear.wrap(gsplat_host.rasterization), trainer.splats, scene.train[0].lr.camera)[0].mean()
-    (loss if scaler is None else scaler.scale(loss)).backward()
+    _, clear, render = started(toy.ShowsDark(), host=trainer, detail=False, loss_scale=loss_scale)
+    (render().mean() if scaler is None else scaler.scale(render().mean())).backward()
     for optimizer in dict.fromkeys(trainer.optimizers.values()):
         optimizer.step() if scaler is None else scaler.step(optimizer)
     return trainer.splats, clear.attachment.counts["extra views"]
@@ -118,14 +117,12 @@ def test_an_adam_of_all_parameters_makes_one_extra_step():
 
 
 def test_extra_views_that_no_optimizer_steps_on_give_a_warning(caplog):
-    scene = toy.scene(20)
-    trainer = Host(scene)
-    known, trainer.optimizers = trainer.optimizers, {"all": torch.optim.Adam(list(trainer.splats.values()))}
-    clear = attach(trainer.splats, known, scene.train, dark(), detail=False)
-    rasterization = clear.wrap(gsplat_host.rasterization)
+    trainer = Host(toy.scene(20))
+    unknown = torch.optim.Adam(list(trainer.splats.values()))
+    _, clear, render = started(toy.ShowsDark(), host=trainer, detail=False)
     for _ in range(11):
-        gsplat_host.drawn(rasterization, trainer.splats, scene.train[0].lr.camera)[0].mean().backward()
-        trainer.optimizers["all"].step()
+        render().mean().backward()
+        unknown.step()
     assert caplog.text.count("extra views have no effect") == 1
     assert clear.attachment.counts["extra views"] == 0
 
@@ -208,28 +205,21 @@ def test_views_that_were_made_without_a_decorator_are_warned_of(caplog):
         assert ("BackProjected has no effect: the views were made without it" in caplog.text) != prior_asked
 
 
-@pytest.mark.parametrize("names", [("visibility",), ("visibility", "N")], ids=["gsplat", "3dgs"])
-def test_an_adam_of_visible_gaussians_is_told_what_it_asks_for(names):
-    told = []
+@pytest.mark.parametrize(
+    "step", [lambda self, visibility: None, lambda self, visibility, N: None], ids=["gsplat", "3dgs"]
+)
+def test_an_adam_of_visible_gaussians_steps_all_of_them_on_an_extra_view(step):
+    calls = []
 
-    class Selective(torch.optim.Adam):
-        if len(names) == 1:
+    @functools.wraps(step)
+    def recorded(self, *args, **kwargs):
+        calls.append((*args, *kwargs.values()))
 
-            def step(self, visibility):
-                told.append((visibility,))
-
-        else:
-
-            def step(self, visibility, N):
-                told.append((visibility, N))
-
-    scene = toy.scene(20)
-    trainer = Host(scene)
-    trainer.optimizers = {name: Selective([p]) for name, p in trainer.splats.items()}
-    clear = attach(trainer.splats, trainer.optimizers, scene.train, dark())
-    rasterization = clear.wrap(gsplat_host.rasterization)
-    gsplat_host.drawn(rasterization, trainer.splats, scene.train[0].lr.camera)[0].mean().backward()
-    everyone = torch.ones(20, dtype=torch.bool)
-    trainer.optimizers["means"].step(*(everyone, 20)[: len(names)])
-    assert [torch.equal(step[0], everyone) for step in told] == [True, True]
-    assert {step[1:] for step in told} == {(20,)[: len(names) - 1]}
+    selective, trainer = type("Selective", (torch.optim.Adam,), {"step": recorded}), Host(toy.scene(20))
+    trainer.optimizers = {name: selective([p]) for name, p in trainer.splats.items()}
+    started(toy.ShowsDark(), host=trainer)[2]().mean().backward()
+    everyone = torch.ones(20, dtype=torch.bool), 20
+    trainer.optimizers["means"].step(*everyone[: step.__code__.co_argcount - 1])
+    by_host, on_extra_view = calls
+    assert torch.equal(by_host[0], on_extra_view[0])
+    assert by_host[1:] == on_extra_view[1:]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import gc
-from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
@@ -21,8 +20,8 @@ from integration import HostError
 from integration.gsplat import attach
 from integration.host_rendering import HostRendering
 from rasterizers import autograd
-from tests.helpers import gsplat_host, toy
-from tests.helpers.gsplat_host import Host
+from tests.helpers import toy
+from tests.helpers.gsplat_host import Host, attached, rasterization, started, trained
 from tests.helpers.inria import HR_FROM_START
 from tests.helpers.own_trainer import RASTERIZER, in_double
 
@@ -51,28 +50,9 @@ def double(view):
     return View(view.name, photo(view.lr), photo(view.hr))
 
 
-@pytest.fixture
-def attached():
-    """Attach to a host; the module is restored after the test."""
-    with ExitStack() as stack:
-        yield lambda *args, **settings: stack.enter_context(gsplat_host.attached(*args, **settings))
-
-
-@pytest.fixture
-def begun(attached):
-    """`made(conductor)`: a host with CLEAR in its loop, CLEAR, and their scene."""
-
-    def made(conductor=None, **settings):
-        scene = toy.scene(20)
-        host = Host(scene)
-        return host, attached(host, scene, conductor or Conductor(), **settings), scene
-
-    return made
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SUBSETS)
-def test_fifty_steps_equal_those_of_our_own_trainer(name, attached, mcmc_acts):
+def test_fifty_steps_equal_those_of_our_own_trainer(name, mcmc_acts):
     """With a larger ε than that of training, also because of rounding errors."""
     scene = toy.scene(40)
     scene = replace(scene, train=tuple(map(double, scene.train)))
@@ -97,10 +77,9 @@ def test_fifty_steps_equal_those_of_our_own_trainer(name, attached, mcmc_acts):
     assert clear.attachment.counts["HR renders"] == STEPS - 2  # lambda_HR is 0 until t = 2
 
 
-def first_gradient(scene, strategies, **settings):
-    host = Host(scene)
-    conductor = Conductor(*strategies, objective=HR_FROM_START)
-    clear = gsplat_host.trained(host, scene, conductor, [scene.train[0].name], **settings)
+def first_gradient(scene, strategies, rasterization=rasterization):
+    host = Host(scene, rasterization=rasterization)
+    clear = trained(host, scene, Conductor(*strategies, objective=HR_FROM_START), [scene.train[0].name])
     return host.grads, clear
 
 
@@ -128,7 +107,7 @@ def test_each_strategy_changes_what_it_should_and_nothing_else():
 
 
 @pytest.mark.parametrize("accumulation", [1, 2])
-def test_gradient_scaling_and_accumulation_do_not_change_the_merge(accumulation, attached):
+def test_gradient_scaling_and_accumulation_do_not_change_the_merge(accumulation):
     scene = toy.scene(30)
     plain, _ = first_gradient(scene, subset("gco"))
 
@@ -159,39 +138,47 @@ def test_gradient_scaling_and_accumulation_do_not_change_the_merge(accumulation,
         assert torch.allclose(host.grads[name] / 1024, g, rtol=1e-4, atol=1e-6 * float(g.abs().max())), name
 
 
-def test_renderings_without_gradients_show_the_detail_feature_and_train_nothing(begun):
-    host, clear, scene = begun()
+def test_renderings_of_no_photo_show_the_detail_feature_and_train_nothing():
+    host, clear, _ = started()
+    elsewhere = toy.camera(1.2).scaled(0.25)
     with torch.no_grad():
-        before, _, _ = host.render(scene.train[0].hr.camera, 3)
+        before = host.render(elsewhere)[0]
         host.splats["detail"] += 0.2
-        shown, _, _ = host.render(scene.train[0].hr.camera, 3)
-        clear.fold_detail()
-        folded, _, _ = host.render(scene.train[0].hr.camera, 3)
+        shown = host.render(elsewhere)[0]
+    with_gradients = host.render(elsewhere)[0]
+    assert torch.equal(with_gradients, shown)
     assert float((shown - before).max()) > 0.05
-    assert torch.allclose(shown, folded, atol=1e-6)
+    with_gradients.sum().backward()
+    assert host.splats["detail"].grad is None
+    clear.fold_detail()
+    assert torch.allclose(host.render(elsewhere)[0], shown, atol=1e-6)
     assert float(host.splats["detail"].abs().max()) == 0
     assert clear.attachment.counts["LR renders"] == 0
 
 
 @pytest.mark.parametrize(("iterations", "share"), [(300, 0.2), (30_000, 1)])
-def test_f_det_learns_at_a_lower_rate_in_a_short_run(iterations, share, begun):
-    host, _, _ = begun(composed_conductor("baseline", iterations=iterations))
+def test_f_det_learns_at_a_lower_rate_in_a_short_run(iterations, share):
+    scene = toy.scene(20)
+    host = Host(scene)
+    attached(host, scene, composed_conductor("baseline", iterations=iterations))
     assert host.optimizers["detail"].param_groups[0]["lr"] == pytest.approx(LearningRates().detail * share)
 
 
-def test_f_det_fades_as_the_readings_of_the_conductor_say(begun):
-    for decay in (0.0, 0.5):
-        host, clear, scene = begun(Conductor(objective=HR_FROM_START, detail=DetailRates(decay=decay)))
-        host.splats["detail"].data += 1.0
-        host.optimizers["detail"].param_groups[0]["lr"] = 0.0
-        host.train([scene.train[0].name])
-        assert float(host.splats["detail"].mean()) == pytest.approx(1 - decay)
-        clear.remove()
+@pytest.mark.parametrize("decay", [0.0, 0.5])
+def test_f_det_fades_at_the_decay_of_the_conductor(decay):
+    scene = toy.scene(20)
+    host = Host(scene)
+    attached(host, scene, Conductor(objective=HR_FROM_START, detail=DetailRates(decay=decay)))
+    host.splats["detail"].data += 1.0
+    host.optimizers["detail"].param_groups[0]["lr"] = 0.0
+    host.train([scene.train[0].name])
+    assert float(host.splats["detail"].mean()) == pytest.approx(1 - decay)
 
 
-def test_remove_restores_the_loop(begun):
-    host, clear, scene = begun(Conductor(GCO()), detail=False)
+def test_remove_restores_the_loop():
+    host, clear, _ = started(GCO(), detail=False)
     clear.remove()
+    scene = toy.scene(20)
     alone = Host(scene)
     for each in (alone, host):
         each.train([v.name for v in scene.train])
@@ -199,96 +186,67 @@ def test_remove_restores_the_loop(begun):
         assert torch.equal(p, host.splats[name])
 
 
-def test_other_cameras_show_the_detail_feature_and_wrong_sizes_are_refused(begun):
-    host, clear, scene = begun()
-    host.splats["detail"].data += 0.2
-    elsewhere = toy.camera(1.2).scaled(0.25)
-    with torch.no_grad():
-        evaluated = host.render(elsewhere, 0)[0]
-    shown = host.render(elsewhere, 0)[0]
-    assert torch.equal(shown, evaluated)
-    shown.sum().backward()
-    assert host.splats["detail"].grad is None
-    assert clear.attachment.counts["LR renders"] == 0
-    with pytest.raises(HostError, match=r"rendered at 96x64, but its photo has 24x16"):
-        host.render(scene.train[0].hr.camera, 0)
-
-
-def test_a_pose_that_two_views_share_is_refused_unless_the_view_is_named(attached):
+def test_a_pose_that_two_views_share_is_refused_unless_the_view_is_named():
     scene = toy.scene(20)
     first, second = scene.train[:2]
-    twins = replace(scene, train=(first, replace(second, lr=first.lr, hr=first.hr)))
-    host = Host(scene)
-    clear = attached(host, twins, Conductor(objective=HR_FROM_START))
+    scene = replace(scene, train=(first, replace(second, lr=first.lr, hr=first.hr)))
+    _, clear, render = started(scene=scene)
     with pytest.raises(HostError, match=f"{first.name} and {second.name} have the same pose"):
-        host.render(first.lr.camera, 0)
-    with clear.rendering(twins.train[1]):
-        host.render(first.lr.camera, 0)
+        render()
+    with clear.rendering(scene.train[1]):
+        render()
     assert clear.attachment.counts["HR renders"] == 1
 
 
-def test_a_renderer_without_projected_centres_trains_without_a_score(monkeypatch):
-    """The renderer of gsplat's 3DGUT (with_ut, with_eval3d) has no gradient of the projected centres."""
+def with_info(change):
+    """`rasterization` with other entries in its `info`."""
 
     @functools.wraps(autograd.rasterization)
-    def unprojected(*args, **kwargs):
-        renders, alphas, info = autograd.rasterization(*args, backend="torch", **kwargs)
-        return renders, alphas, {**info, "means2d": info["means2d"].detach()}
+    def changed(*args, **kwargs):
+        renders, alphas, info = rasterization(*args, **kwargs)
+        return renders, alphas, info | change(info)
 
-    monkeypatch.setattr(gsplat_host, "rasterization", unprojected)
+    return changed
+
+
+def test_a_renderer_without_projected_centres_trains_without_a_score():
+    """The renderer of gsplat's 3DGUT (with_ut, with_eval3d) has no gradient of the projected centres."""
     scene = toy.scene(20)
-    host = Host(scene)
-    names = [v.name for v in scene.train]
-    clear = gsplat_host.trained(
-        host, scene, Conductor(*subset("clear"), objective=HR_FROM_START), names, function=unprojected
-    )
+    host = Host(scene, rasterization=with_info(lambda info: {"means2d": info["means2d"].detach()}))
+    conductor = Conductor(*subset("clear"), objective=HR_FROM_START)
+    clear = trained(host, scene, conductor, [v.name for v in scene.train])
     assert clear.attachment.counts["merges"] == 3
     assert float(host.splats["detail"].abs().max()) > 0
 
 
-def test_a_wrapped_function_cannot_be_wrapped_again(begun):
-    begun()
-    with pytest.raises(HostError, match="wrapped already"):
-        begun()
+def test_radii_of_gsplat_1_4_are_supported():
+    scene = toy.scene(30)
+    new, _ = first_gradient(scene, subset("clear"))
+    old, _ = first_gradient(scene, subset("clear"), with_info(lambda info: {"radii": info["radii"][..., 0]}))
+    for name, g in new.items():
+        assert torch.equal(old[name], g), name
 
 
-def test_missing_parameters_and_views_are_refused():
+def test_what_cannot_be_attached_or_drawn_is_refused():
+    host, clear, render = started()
     scene = toy.scene(20)
-    host = Host(scene)
+    with pytest.raises(HostError, match=r"rendered at 96x64, but its photo has 24x16"):
+        host.render(scene.train[0].hr.camera)
+    with pytest.raises(HostError, match="two renderings of training views"):
+        (render(0).mean() + render(1).mean()).backward()
+    with pytest.raises(HostError, match="wrapped already"):
+        clear.wrap(host.rasterization)
+    with pytest.raises(HostError, match="has no parameter Ks"):
+        clear.wrap(lambda means, opacities, colors, viewmats, width, height: None)
+    host.rasterization = functools.wraps(rasterization)(lambda *args, **call: (*rasterization(*args, **call), None))
+    host.rasterization = clear.wrap(host.rasterization)
+    with pytest.raises(HostError, match="returns 4 values, gsplat's rasterization returns 3"):
+        render()
     with pytest.raises(ValueError, match="at least one view"):
         attach(host.splats, host.optimizers, (), Conductor())
     del host.splats["sh0"]
     with pytest.raises(ValueError, match="sh0 is missing"):
         attach(host.splats, host.optimizers, scene.train, Conductor())
-
-
-def test_radii_of_gsplat_1_4_are_supported(monkeypatch):
-    @functools.wraps(autograd.rasterization)
-    def older(*args, **kwargs):
-        renders, alphas, info = autograd.rasterization(*args, backend="torch", **kwargs)
-        return renders, alphas, {**info, "radii": info["radii"][..., 0]}
-
-    scene = toy.scene(30)
-    new, _ = first_gradient(scene, subset("clear"))
-    monkeypatch.setattr(gsplat_host, "rasterization", older)
-    old, _ = first_gradient(scene, subset("clear"), function=older)
-    for name, g in new.items():
-        assert torch.equal(old[name], g), name
-
-
-def started(strategies=()):
-    """A host on the toy scene, CLEAR, and a function that renders the host's photos with it."""
-    scene = toy.scene(20)
-    host = Host(scene)
-    clear = attach(host.splats, host.optimizers, scene.train, Conductor(*strategies, objective=HR_FROM_START))
-    rasterization = clear.wrap(gsplat_host.rasterization)
-    return host, clear, lambda i: gsplat_host.drawn(rasterization, host.splats, scene.train[i].lr.camera)[0]
-
-
-def test_two_views_in_one_backward_pass_are_refused():
-    _, _, render = started()
-    with pytest.raises(HostError, match="two renderings of training views"):
-        (render(0).mean() + render(1).mean()).backward()
 
 
 def test_a_second_pass_over_the_view_can_stand_beside_it():
@@ -319,7 +277,7 @@ def test_renderings_are_freed_after_their_step_and_with_the_loop(last_one_has_ba
 
 
 def test_a_frozen_parameter_stays():
-    host, _, render = started((GCO(), toy.ShowsDark()))
+    host, _, render = started(GCO(), toy.ShowsDark())
     host.splats["means"].requires_grad_(False)
     before = host.splats["means"].clone()
     for i in (0, 1):
@@ -334,17 +292,5 @@ def test_the_detail_feature_of_a_checkpoint_is_trained():
     scene = toy.scene(20)
     host = Host(scene)
     host.splats["detail"] = torch.nn.Parameter(torch.zeros(20, 3))  # as a checkpoint of the host holds it
-    gsplat_host.trained(host, scene, Conductor(P2G(), objective=HR_FROM_START), [v.name for v in scene.train])
+    trained(host, scene, Conductor(P2G(), objective=HR_FROM_START), [v.name for v in scene.train])
     assert float(host.splats["detail"].abs().max()) > 0
-
-
-def test_a_function_with_other_parameters_or_results_is_refused():
-    @functools.wraps(autograd.rasterization)
-    def rasterization_2dgs(*args, **kwargs):
-        return (*autograd.rasterization(*args, backend="torch", **kwargs), None)
-
-    host, clear, _ = started()
-    with pytest.raises(HostError, match="has no parameter Ks"):
-        clear.wrap(lambda means, opacities, colors, viewmats, width, height: None)
-    with pytest.raises(HostError, match="returns 4 values, gsplat's rasterization returns 3"):
-        gsplat_host.drawn(clear.wrap(rasterization_2dgs), host.splats, toy.scene(20).train[0].lr.camera)

@@ -9,82 +9,75 @@ from dataclasses import replace
 import pytest
 import torch
 
-from clear_strategies import P2G, Conductor
+from clear_strategies import P2G, Conductor, RandomBackground
 from clear_strategies.core.view import View
 from clear_strategies.errors import SettingError
+from clear_strategies.geometry.projection import intrinsics
 from integration import HostError
 from integration.gsplat import attach
 from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
-from tests.helpers.gsplat_host import Host
-from tests.helpers.inria import HR_FROM_START
-from tests.integration.test_gsplat import started
+from tests.helpers.gsplat_host import Host, started
 
 
 def test_a_function_is_wrapped_again_once_the_attachment_that_wrapped_it_is_removed():
     host, first, _ = started()
-    wrapped = first.wrap(gsplat_host.rasterization)
     first.remove()
-    scene = toy.scene(20)
-    second = attach(host.splats, host.optimizers, scene.train, Conductor(objective=HR_FROM_START))
-    gsplat_host.drawn(second.wrap(wrapped), host.splats, scene.train[0].lr.camera)[0].mean().backward()
+    _, second, render = started(host=host)
+    render().mean().backward()
     assert (first.attachment.counts["merges"], second.attachment.counts["merges"]) == (0, 1)
 
 
 def with_detail():
-    """A wrapped function of a host whose f_det is 0.2, its Gaussians, CLEAR, and the camera of a photo."""
-    host, clear, _ = started((P2G(patch=4),))
-    host.splats["detail"].data += 0.2
+    """A host whose function draws depths, too, and whose f_det is 0.2; that function, CLEAR, and what renders a photo."""
 
     @functools.wraps(autograd.rasterization)
     def function(*args, render_mode="RGB", **kwargs):
         image, alpha, info = gsplat_host.rasterization(*args, **kwargs)
         return (image if "RGB" in render_mode else alpha), alpha, info
 
-    return function, host.splats, clear, toy.scene(20).train[0].lr.camera
+    host, clear, render = started(P2G(patch=4), host=Host(toy.scene(20), rasterization=function))
+    host.splats["detail"].data += 0.2
+    return host, function, clear, render
 
 
-def features(function, splats, camera, colors):
-    p = splats
-    view = camera.world_to_camera[None], gsplat_host.intrinsics(camera), camera.width, camera.height
+def features(function, host, colors):
+    p, camera = host.splats, host.photos["view0"].camera
+    view = camera.world_to_camera[None], intrinsics(camera)[None], camera.width, camera.height
     return function(p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), colors, *view)[0]
 
 
 @pytest.mark.parametrize("named", [True, False])
 @pytest.mark.parametrize("grad", [True, False])
 def test_normals_beside_the_photo_have_no_detail_feature(named, grad):
-    function, splats, clear, camera = with_detail()
-    rasterization = clear.wrap(function)
-    gsplat_host.drawn(rasterization, splats, camera)[0].mean().backward()
-    normals = torch.nn.functional.normalize(splats["means"].detach())
+    host, function, clear, render = with_detail()
+    render().mean().backward()
+    normals = torch.nn.functional.normalize(host.splats["means"].detach())
     with clear.rendering(None) if named else nullcontext(), torch.set_grad_enabled(grad):
-        image = features(rasterization, splats, camera, normals)
-    assert torch.equal(image, features(function, splats, camera, normals))
+        image = features(host.rasterization, host, normals)
+    assert torch.equal(image, features(function, host, normals))
     assert clear.attachment.counts["LR renders"] == 1
 
 
 def test_a_depth_pass_of_a_photo_is_part_of_its_step():
-    function, splats, clear, camera = with_detail()
-    rasterization = clear.wrap(function)
-    image = gsplat_host.drawn(rasterization, splats, camera)[0]
-    depth = gsplat_host.drawn(rasterization, splats, camera, render_mode="ED")[0]
-    (image.mean() + depth.mean()).backward()
+    _, _, clear, render = with_detail()
+    (render().mean() + render(render_mode="ED").mean()).backward()
     assert clear.attachment.counts["LR renders"] == clear.attachment.counts["merges"] == 1
 
 
 def test_colours_of_a_loop_without_spherical_harmonics_have_the_detail_feature():
-    function, splats, clear, camera = with_detail()
-    rasterization, colors = clear.wrap(function), torch.rand(20, 3)
+    host, function, _, _ = with_detail()
+    colors = torch.rand(20, 3)
     with torch.no_grad():
-        image = features(rasterization, splats, camera, colors)
-    assert torch.equal(image, features(function, splats, camera, colors + splats["detail"]).detach())
+        image = features(host.rasterization, host, colors)
+        assert torch.equal(image, features(function, host, colors + host.splats["detail"]))
 
 
 def test_a_photo_rendered_with_a_part_of_the_gaussians_is_refused():
-    function, splats, clear, camera = with_detail()
-    part = {name: p[:7] for name, p in splats.items()}
+    host, _, _ = started()
+    part = {name: p[:7] for name, p in host.splats.items()}
     with pytest.raises(HostError, match="view0 is rendered with 7 of 20 Gaussians"):
-        gsplat_host.drawn(clear.wrap(function), part, camera)
+        gsplat_host.drawn(host.rasterization, part, host.photos["view0"].camera)
 
 
 @pytest.mark.parametrize("origin", [0.0, 3e5], ids=["near the origin", "in coordinates of a map"])
@@ -136,13 +129,12 @@ def test_a_loop_without_backward_is_refused():
 
 
 def test_a_second_pass_by_the_function_that_was_wrapped_stands_beside_the_photo():
-    host, clear, _ = started()
-    rasterization, camera = clear.wrap(gsplat_host.rasterization), toy.scene(20).train[0].lr.camera
-    first = gsplat_host.drawn(rasterization, host.splats, camera)[0]
+    host, clear, render = started()
     with pytest.raises(HostError, match="its __wrapped__"):
-        (first.mean() + gsplat_host.drawn(rasterization, host.splats, camera)[0].mean()).backward()
-    first = gsplat_host.drawn(rasterization, host.splats, camera)[0]
-    (first.mean() + gsplat_host.drawn(rasterization.__wrapped__, host.splats, camera)[0].mean()).backward()
+        (render().mean() + render().mean()).backward()
+    first = render()
+    host.rasterization = host.rasterization.__wrapped__
+    (first.mean() + render().mean()).backward()
     assert clear.attachment.counts["merges"] == 1
 
 
@@ -161,3 +153,23 @@ def test_several_processes_are_refused_since_each_would_merge_on_its_own(monkeyp
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
     with pytest.raises(SettingError, match="in one process, got 2"):
         started()
+
+
+@pytest.mark.parametrize("own_background", [False, True])
+def test_both_scales_and_extra_views_are_over_the_background_of_a_strategy_unless_the_loop_has_its_own(
+    own_background, caplog
+):
+    caplog.set_level("INFO")
+    backgrounds, chosen = [], RandomBackground()
+
+    @functools.wraps(autograd.rasterization)
+    def recorded(**call):
+        backgrounds.append(call.get("backgrounds"))
+        return gsplat_host.rasterization(**call)
+
+    host = Host(toy.scene(20), rasterization=recorded)
+    _, _, render = started(chosen, toy.ShowsDark(), host=host, own_background=own_background)
+    render().mean().backward()
+    assert ("RandomBackground has no effect here" in caplog.text) == own_background
+    color = None if own_background else torch.tensor(chosen.background(1)).tolist()
+    assert [b if b is None else b[0].tolist() for b in backgrounds] == [color] * 3

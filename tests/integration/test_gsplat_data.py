@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from clear_strategies import Conductor, DataError
+from clear_strategies import DataError
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.priors import Images
-from integration.gsplat import attach
+from clear_strategies.geometry.projection import intrinsics
 from integration.gsplat.data import photos_of, views_from_dataset
 from integration.views import save_photos
 from tests.helpers import gsplat_host, toy
-from tests.helpers.inria import HR_FROM_START
 
 NAMES = ("cam1/0001.png", "cam2/0001.png", "cam2/0002.png")
 HIDDEN = slice(12, None)  # columns of 24
@@ -34,7 +34,7 @@ class Dataset:
     def __getitem__(self, item):
         photo = self.train[item].lr
         found = {
-            "K": gsplat_host.intrinsics(photo.camera)[0].float(), "image": photo.image * 255, "image_id": item,
+            "K": intrinsics(photo.camera).float(), "image": photo.image * 255, "image_id": item,
             "camtoworld": torch.linalg.inv(photo.camera.world_to_camera),
         }  # fmt: skip
         if item == 0:
@@ -74,14 +74,13 @@ def test_a_masked_pixel_is_hidden_at_both_scales(dataset, tmp_path):
     masks = {photo.name: photo.mask for photo in photos_of(dataset)}
     assert [mask is None for mask in masks.values()] == [False, True, True]
     assert float(views[0].hr.image[:, 4 * 12 :].abs().max()) == 0
-    assert hr_gradient(views, dataset.train[0].lr.camera, masks[NAMES[0]]) > 0
-    assert hr_gradient(views, dataset.train[0].lr.camera, torch.zeros(16, 24)) == 0
+    assert hr_gradient(views, masks[NAMES[0]]) > 0
+    assert hr_gradient(views, torch.zeros(16, 24)) == 0
 
 
-def hr_gradient(views, camera, mask):
+def hr_gradient(views, mask):
     """Σ |∂(L_base + L_HF) / ∂ means| of the first view."""
-    host = gsplat_host.Host(toy.scene(24))
-    clear = attach(host.splats, host.optimizers, views, Conductor(objective=HR_FROM_START), masks={NAMES[0]: mask})
-    renders, _, _ = gsplat_host.drawn(clear.wrap(gsplat_host.rasterization), host.splats, camera)
-    (renders * 0).sum().backward()  # nothing of the photo
+    scene = replace(toy.scene(24), train=views)
+    host, _, render = gsplat_host.started(host=gsplat_host.Host(scene), scene=scene, masks={NAMES[0]: mask})
+    (render() * 0).sum().backward()  # nothing of the photo
     return float(host.splats["means"].grad.abs().sum())

@@ -88,30 +88,25 @@ def test_an_anchor_is_taken_once_mcmc_has_ended(gsplat_strategies):
 
 
 def test_a_densifier_that_forgets_a_parameter_is_an_error():
-    scene = toy.scene(20)
-    host = Host(scene)
-    clear = attach(host.splats, host.optimizers, scene.train, Conductor())
-    rasterization = clear.wrap(gsplat_host.rasterization)
+    host, _, render = gsplat_host.started()
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "detail"):
         host.splats[name] = torch.nn.Parameter(host.splats[name].detach()[1:])
     with pytest.raises(HostError, match=rf"from 20 to 19 without the parameter {ROWS}"):
-        gsplat_host.drawn(rasterization, host.splats, scene.train[0].lr.camera)
+        render()
 
 
 def test_the_state_of_gsplat_1_4_carries_the_rows_and_must_know_their_origin():
-    scene, state, recorder = toy.scene(20), {}, toy.Recorder()
-    host = Host(scene)
-    clear = attach(host.splats, host.optimizers, scene.train, Conductor(recorder), state=state)
-    rasterization, camera = clear.wrap(gsplat_host.rasterization), scene.train[0].lr.camera
+    state, recorder = {}, toy.Recorder()
+    host, _, render = gsplat_host.started(recorder, state=state)
     assert ROWS not in host.splats
     for name, p in host.splats.items():
         host.splats[name] = torch.nn.Parameter(p.detach()[1:])
     state[ROWS] = state[ROWS][1:]
-    gsplat_host.drawn(rasterization, host.splats, camera)
+    render()
     assert torch.equal(recorder.changes[0], torch.arange(1, 20))
     state[ROWS] = torch.zeros_like(state[ROWS])
     with pytest.raises(HostError, match="does not say where relocated Gaussians come from"):
-        gsplat_host.drawn(rasterization, host.splats, camera)
+        render()
 
 
 def test_checkpoints_and_later_loops_know_nothing_of_the_rows():
@@ -136,11 +131,9 @@ def test_a_resumed_loop_takes_the_anchor_as_if_it_had_not_stopped(stopped_at):
         host = Host(scene)
         for name, p in (splats or {}).items():
             host.splats.setdefault(name, torch.nn.Parameter(p)).data = p
-        conductor = Conductor(SVS(anchor_start=2, anchor_strength=0.01), objective=HR_FROM_START)
-        clear = attach(host.splats, host.optimizers, scene.train, conductor)
+        _, clear, _ = gsplat_host.started(SVS(anchor_start=2, anchor_strength=0.01), host=host, scene=scene)
         if state is not None:
             clear.attachment.load_state_dict(state)
-        clear.replace_everywhere(gsplat_host.rasterization)
         host.train([scene.train[t % 3].name for t in steps])
         clear.remove()
         return host.splats, clear.attachment
@@ -154,23 +147,17 @@ def test_a_resumed_loop_takes_the_anchor_as_if_it_had_not_stopped(stopped_at):
 
 
 def test_a_loop_goes_back_to_a_checkpoint_with_another_number_of_gaussians():
-    scene = toy.scene(20)
-    host, recorder = Host(scene), toy.Recorder()
-    clear = attach(host.splats, host.optimizers, scene.train, Conductor(recorder, SplatSuRe(), objective=HR_FROM_START))
-    rasterization = clear.wrap(gsplat_host.rasterization)
-
-    def step(view):
-        gsplat_host.drawn(rasterization, host.splats, view.lr.camera)[0].mean().backward()
-
-    for view in scene.train:
-        step(view)
+    recorder = toy.Recorder()
+    host, clear, render = gsplat_host.started(recorder, SplatSuRe())
+    for i in range(3):
+        render(i).mean().backward()
     state = copy.deepcopy(clear.attachment.state_dict())
     stored = {name: p.detach().clone() for name, p in host.splats.items() if name != ROWS}
     for name, p in host.splats.items():
         host.splats[name] = torch.nn.Parameter(p.detach()[5:], requires_grad=p.requires_grad)
-    step(scene.train[0])
+    render(0).mean().backward()
     host.splats.update({name: torch.nn.Parameter(p) for name, p in stored.items()})
     clear.attachment.load_state_dict(state)
-    step(scene.train[1])
+    render(1).mean().backward()
     assert len(recorder.changes) == 1
     assert {rows.shape for rows in clear.attachment.conductor.state_dict().values()} == {(20,)}

@@ -19,6 +19,7 @@ from clear_strategies.data.photo_files import read_image, write_png
 from clear_strategies.data.priors import Bicubic, Cached, Images
 from clear_strategies.errors import DataError, SettingError
 from clear_strategies.geometry import stereo
+from clear_strategies.geometry.projection import intrinsics
 from integration.nerfstudio.data import (
     over_black,
     photos_of,
@@ -29,6 +30,7 @@ from integration.nerfstudio.data import (
     world_to_camera,
 )
 from integration.views import save_photos
+from rasterizers import autograd
 from tests.helpers import gsplat_host, toy
 from tests.helpers.gsplat_host import Host
 from tests.helpers.inria import HR_FROM_START
@@ -43,7 +45,7 @@ class DataManager:
     ):  # fmt: skip
         photos = [view.lr for view in toy.scene(24).train]
         flip = torch.tensor([1.0, -1, -1, 1])
-        Ks = torch.cat([gsplat_host.intrinsics(photo.camera) for photo in photos])
+        Ks = torch.stack([intrinsics(photo.camera) for photo in photos])
         self.lens = Ks / 2
         cameras = SimpleNamespace(
             camera_to_worlds=torch.stack([p.camera.world_to_camera.inverse() * flip for p in photos])[:, :3],
@@ -122,7 +124,7 @@ def test_seed_points_are_the_stereo_cloud_of_the_undistorted_photos():
     assert set(metadata) == {"scale", "points3D_xyz", "points3D_rgb"}
     expected = stereo(
         [item["image"] for item in manager.photos], torch.stack([camera.world_to_camera for camera in cameras]),
-        torch.cat([gsplat_host.intrinsics(camera) for camera in cameras]),
+        torch.stack([intrinsics(camera) for camera in cameras]),
     )  # fmt: skip
     assert metadata["points3D_xyz"].shape == metadata["points3D_rgb"].shape == expected.means.shape
     near = (metadata["points3D_xyz"] - expected.means).norm(dim=1) < 0.01
@@ -157,6 +159,13 @@ def test_alpha_is_composited_over_black():
     assert over_black(torch.ones(1, 1, 3)).flatten().tolist() == [1, 1, 1]
 
 
+@functools.wraps(autograd.rasterization)
+def with_absgrad(**call):
+    renders, alphas, info = gsplat_host.rasterization(**call)
+    info["means2d"].register_hook(lambda g: setattr(info["means2d"], "absgrad", 3 * g.abs()))
+    return renders, alphas, info
+
+
 class Splatfacto(Host):
     """A host with splatfacto's shapes, names and keyword call. Its densifier reads Σ|∂L/∂u|, which only CUDA computes; three
     times the absolute value of the sum takes its place.
@@ -165,7 +174,7 @@ class Splatfacto(Host):
     names = {"sh0": "features_dc", "shN": "features_rest"}  # noqa: RUF012
 
     def __init__(self, scene):
-        super().__init__(scene)
+        super().__init__(scene, rasterization=with_absgrad)
         p = self.splats
         p["features_dc"], p["features_rest"] = torch.nn.Parameter(p.pop("sh0")[:, 0].detach()), p.pop("shN")
         p["opacities"] = torch.nn.Parameter(p["opacities"].detach()[:, None])
@@ -174,61 +183,45 @@ class Splatfacto(Host):
 
     def render(self, camera, step):
         p = self.splats
-        renders, alphas, self.info = gsplat_host.rasterization(
+        renders, alphas, self.info = self.rasterization(
             means=p["means"], quats=p["quats"], scales=p["scales"].exp(), opacities=p["opacities"].sigmoid().squeeze(-1),
             colors=torch.cat((p["features_dc"][:, None], p["features_rest"]), 1), viewmats=camera.world_to_camera[None],
-            Ks=gsplat_host.intrinsics(camera), width=camera.width, height=camera.height, sh_degree=min(3, step), packed=False,
+            Ks=intrinsics(camera)[None], width=camera.width, height=camera.height, sh_degree=min(3, step), packed=False,
         )  # fmt: skip
         self.info["means2d"].retain_grad()
         return renders, alphas, self.info
 
 
-def with_absgrad(rasterization):
-    @functools.wraps(rasterization)
-    def wrapped(*args, **kwargs):
-        renders, alphas, info = rasterization(*args, **kwargs)
-        info["means2d"].register_hook(lambda g: setattr(info["means2d"], "absgrad", 3 * g.abs()))
-        return renders, alphas, info
-
-    return wrapped
+def trained(host, scene, *strategies, threshold=None):
+    settings = {"names": getattr(host, "names", None), "strategy": threshold and SimpleNamespace(grow_grad2d=threshold)}
+    conductor = Conductor(*strategies, objective=HR_FROM_START)
+    return gsplat_host.trained(host, scene, conductor, [scene.train[0].name], **settings).attachment
 
 
-def trained(host, scene, *strategies, threshold=None, monkeypatch=None):
-    function = with_absgrad(gsplat_host.rasterization) if isinstance(host, Splatfacto) else gsplat_host.rasterization
-    with monkeypatch.context() as patch:
-        patch.setattr(gsplat_host, "rasterization", function)
-        with gsplat_host.attached(
-            host, scene, Conductor(*strategies, objective=HR_FROM_START), function, names=getattr(host, "names", None),
-            strategy=threshold and SimpleNamespace(grow_grad2d=threshold),
-        ) as clear:  # fmt: skip
-            host.train([scene.train[0].name])
-    return clear
-
-
-def test_splatfactos_shapes_give_the_same_gradients_as_gsplats(monkeypatch):
+def test_splatfactos_shapes_give_the_same_gradients_as_gsplats():
     scene = toy.scene(30)
     scene = replace(scene, train=tuple(replace(v, hr=replace(v.hr, image=v.hr.image.flip(1))) for v in scene.train))
     splatfacto, plain = Splatfacto(scene), Host(scene)
     strategies = GCO(), P2G(patch=4)
-    corrected = trained(splatfacto, scene, *strategies, monkeypatch=monkeypatch).attachment.log["corrected"]
-    trained(plain, scene, *strategies, monkeypatch=monkeypatch)
+    corrected = trained(splatfacto, scene, *strategies).log["corrected"]
+    trained(plain, scene, *strategies)
     assert corrected > 0
     for name, expected in plain.grads.items():
         g = splatfacto.grads[Splatfacto.names.get(name, name)]
         assert torch.allclose(g.reshape(expected.shape), expected, atol=1e-5 * float(expected.abs().max())), name
 
 
-def test_as_many_pass_by_the_score_as_by_the_absolute_gradient_which_is_unchanged_without_one(monkeypatch):
+def test_as_many_pass_by_the_score_as_by_the_absolute_gradient_which_is_unchanged_without_one():
     scene = toy.scene(30)
     plain = Splatfacto(scene)
-    clear = trained(plain, scene, GCO(), threshold=1.0, monkeypatch=monkeypatch)
-    assert clear.attachment.counts["scores written"] == 0
+    attachment = trained(plain, scene, GCO(), threshold=1.0)
+    assert attachment.counts["scores written"] == 0
     assert torch.equal(plain.info["means2d"].absgrad, 3 * plain.info["means2d"].grad.abs())
     ndc = torch.tensor([24 / 2, 16 / 2])
     own = (plain.info["means2d"].absgrad[0] * ndc).norm(dim=-1)
     threshold = float(own.sort().values[-8] * (1 - 1e-3))  # eight pass
     host = Splatfacto(scene)
-    clear = trained(host, scene, P2G(patch=4), threshold=threshold, monkeypatch=monkeypatch)
+    attachment = trained(host, scene, P2G(patch=4), threshold=threshold)
     written = (host.info["means2d"].absgrad[0] * ndc).norm(dim=-1)
-    assert clear.attachment.counts["scores written"] == 1
+    assert attachment.counts["scores written"] == 1
     assert int((written >= threshold).sum()) == 8

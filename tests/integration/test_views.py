@@ -7,6 +7,7 @@ import torch
 
 from clear_strategies import P2G
 from clear_strategies.errors import DataError, SettingError
+from clear_strategies.geometry.projection import intrinsics
 from integration.views import by_name, view
 from tests.helpers import toy
 
@@ -16,11 +17,8 @@ PHOTO = toy.scene(20).train[0].lr
 def of_host(
     name="photo", sr=lambda name, image, factor: image.repeat_interleave(4, 0).repeat_interleave(4, 1), **settings
 ):
-    c = PHOTO.camera
-    K = torch.tensor([[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]])
-    return view(
-        **{"name": name, "image": PHOTO.image, "world_to_camera": c.world_to_camera, "K": K, "sr": sr} | settings
-    )
+    photo = {"image": PHOTO.image, "world_to_camera": PHOTO.camera.world_to_camera, "K": intrinsics(PHOTO.camera)}
+    return view(**{"name": name, "sr": sr} | photo | settings)
 
 
 def test_what_a_mask_hides_is_hidden_at_both_scales():
