@@ -45,11 +45,8 @@ def inria_attached(inria_host, inria_capture):
 
     def made(*strategies, objective=inria.HR_FROM_START, sr=inria_capture / "sr", **settings):
         gaussians, scene = inria_host.setup(inria.options(inria_host, inria_capture))
-        return (
-            attach(gaussians, scene.cameras, Conductor(*strategies, objective=objective), sr=sr, **settings),
-            gaussians,
-            scene,
-        )
+        conductor = Conductor(*strategies, objective=objective)
+        return attach(gaussians, scene.cameras, conductor, sr=sr, **settings), gaussians, scene
 
     return made
 

@@ -100,25 +100,18 @@ def test_its_steps_equal_those_of_our_own_trainer(sampling, inria_host, inria_ca
     gaussians.active_sh_degree = -1
     gaussians.filter_3D = torch.zeros(N, 1)  # as Mip-Splatting has
     for camera in scene.cameras:
-        camera.original_image, camera.world_view_transform = (
-            camera.original_image.double(),
-            camera.world_view_transform.double(),
-        )
+        camera.original_image = camera.original_image.double()
+        camera.world_view_transform = camera.world_view_transform.double()
     loop(inria_host, clear, opt, gaussians, scene, names=names)
 
-    found = clear.params()
+    params = clear.params()
     assert sampling == (len(own.field) > N)
     assert len(gaussians.filter_3D) == len(own.field)
     for name, p in own.field.raw().items():
-        difference = float((p.flatten() - found[name].detach().flatten()).norm() / p.norm().clamp_min(1e-12))
+        difference = float((p.flatten() - params[name].detach().flatten()).norm() / p.norm().clamp_min(1e-12))
         assert difference < 1e-9, name
     assert clear.attachment.counts["merges"] == STEPS
     assert clear.attachment.counts["HR renders"] == STEPS - 1  # lambda_HR is 0 until t = 1
-
-
-def run_once(host, folder, *strategies, **settings):
-    _, clear, grads = trained(host, folder, strategies, iterations=1, **settings)
-    return grads, clear
 
 
 def test_other_colours_in_place_of_the_models_are_no_rendering_of_a_photo(inria_attached):
@@ -212,48 +205,43 @@ def test_without_hr_no_sr_images_are_needed(inria_host, inria_capture):
         attach(gaussians, scene.getTrainCameras(), Conductor(GCO()))
 
 
-def test_evaluation_and_saved_files_use_the_detail_feature_and_training_does_not(inria_host, inria_capture):
+def test_evaluation_viewers_and_saved_files_show_the_detail_feature(inria_host, inria_capture):
     gaussians, clear, _ = trained(inria_host, inria_capture, (), iterations=4, densify_until_iter=0)
-    render, camera = clear.wrap(inria_host.render), clear_camera(inria_capture)
-    dc = gaussians._features_dc
+    render, dc, file = clear.wrap(inria_host.render), gaussians._features_dc, inria_capture / "shown.ply"
+    camera = importlib.import_module("scene").Scene(inria_capture, type(gaussians)()).cameras[0]
     with torch.no_grad():
         plain = inria_host.render(camera, gaussians, None, None)["render"]
         shown = render(camera, gaussians, None, None)["render"]
-        gaussians.save_ply(inria_capture / "shown.ply")
+        assert float((shown - plain).abs().max()) > 1e-4
+        gaussians.save_ply(file)
         assert gaussians._features_dc is dc
-        saved = load_file(inria_capture / "shown.ply")["f_dc"]
         assert torch.equal(inria_host.render(camera, gaussians, None, None)["render"], plain)
-        clear.fold_detail()
-        assert torch.equal(saved, gaussians._features_dc)
-        assert torch.allclose(inria_host.render(camera, gaussians, None, None)["render"], shown, atol=1e-6)
-    assert float((shown - plain).abs().max()) > 1e-4
+    camera.image_name = None  # a MiniCam: 3DGS's viewer renders inside the training loop, with gradients on
+    viewed = render(camera, gaussians, None, None)["render"]
+    assert torch.equal(viewed, shown)
+    viewed.sum().backward()
+    assert clear.params()["detail"].grad is None
+    assert clear.attachment.counts["merges"] == 4
+    clear.fold_detail()
+    assert torch.equal(load_file(file)["f_dc"], gaussians._features_dc)
     clear.remove()
-    gaussians.save_ply(inria_capture / "shown.ply")
     assert type(gaussians).save_ply is gaussians.save_ply.__func__
-
-
-def clear_camera(folder):
-    scene = importlib.import_module("scene")
-    return scene.Scene(folder, scene.GaussianModel()).cameras[0]
 
 
 def test_remove_restores_the_loop(inria_host, inria_capture):
     opt = options(inria_host, inria_capture, iterations=3)
-    results = []
-    for attached in (False, True):
-        gaussians, scene = inria_host.setup(opt)
-        if attached:
-            clear = attach(gaussians, scene.cameras, Conductor(GCO()), sr=inria_capture / "sr", detail=False)
-            clear.replace_everywhere(inria_host.render)
-            clear.remove()
-        inria_host.loop(opt, gaussians, scene)
-        results.append(gaussians)
-    assert torch.equal(results[0]._xyz, results[1]._xyz)
-    assert torch.equal(results[0]._opacity, results[1]._opacity)
+    alone, attached = (inria_host.setup(opt) for _ in range(2))
+    clear = attach(attached[0], attached[1].cameras, Conductor(GCO()), sr=inria_capture / "sr", detail=False)
+    clear.replace_everywhere(inria_host.render)
+    clear.remove()
+    for each in (alone, attached):
+        inria_host.loop(opt, *each)
+    assert torch.equal(alone[0]._xyz, attached[0]._xyz)
+    assert torch.equal(alone[0]._opacity, attached[0]._opacity)
 
 
 def test_without_the_detail_feature_the_other_gradients_are_the_same(inria_host, inria_capture, inria_attached):
-    with_detail, _ = run_once(inria_host, inria_capture, GCO())
+    _, _, with_detail = trained(inria_host, inria_capture, [GCO()], iterations=1)
     clear, gaussians, scene = inria_attached(GCO(), detail=False)
     package = clear.wrap(inria_host.render)(scene.cameras[1], gaussians, None, None)
     inria_host.photometric(package["render"], scene.cameras[1].original_image).backward()
@@ -268,18 +256,3 @@ def test_a_renderer_that_does_not_read_the_getters_is_warned_of(inria_host, capl
     render(scene.cameras[0], gaussians, None, None)
     assert "dropout has no effect" in caplog.text
     assert "detail feature has no effect" in caplog.text
-
-
-def test_other_cameras_show_the_detail_feature_also_with_gradients(inria_host, inria_capture):
-    """3DGS's viewer renders inside the training loop, with gradients on."""
-    gaussians, clear, _ = trained(inria_host, inria_capture, (), iterations=4, densify_until_iter=0)
-    render, camera = clear.wrap(inria_host.render), clear_camera(inria_capture)
-    with torch.no_grad():
-        evaluated = render(camera, gaussians, None, None)["render"]
-    camera.image_name = None  # a MiniCam
-    merges = clear.attachment.counts["merges"]
-    shown = render(camera, gaussians, None, None)["render"]
-    assert torch.equal(shown, evaluated)
-    shown.sum().backward()
-    assert clear.params()["detail"].grad is None
-    assert clear.attachment.counts["merges"] == merges

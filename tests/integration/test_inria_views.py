@@ -9,6 +9,7 @@ import torch
 
 from clear_strategies import GCO, Conductor, DataError
 from clear_strategies.errors import SettingError
+from clear_strategies.geometry import projection
 from integration import HostError
 from integration.inria import attach
 from integration.inria.cameras import intrinsics
@@ -109,7 +110,5 @@ def test_views_need_unique_names_and_sr_images_of_the_right_size(inria_host, inr
 
 def test_intrinsics_are_read_from_the_projection(inria_host, inria_capture):
     _, scene = inria_host.setup(options(inria_host, inria_capture))
-    camera = toy.scene(N).train[0].lr.camera
-    K = intrinsics(scene.cameras[0])
-    expected = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]).double()
-    assert torch.allclose(K, expected, atol=1e-4)
+    expected = projection.intrinsics(toy.scene(N).train[0].lr.camera)
+    assert torch.allclose(intrinsics(scene.cameras[0]), expected, atol=1e-4)
