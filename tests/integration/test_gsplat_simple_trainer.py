@@ -54,8 +54,8 @@ def rendered(splats):
 
 def test_its_checkpoint_and_its_ply_are_the_model_that_was_evaluated(trainer, caplog):
     with caplog.at_level(logging.INFO):
-        assert trainer.run([*trainer.sr, *OVERRIDES]) == 0
-    assert "8 merges" in caplog.text
+        assert trainer.run([*trainer.sr, *OVERRIDES], "--pose_noise", "0.01") == 0
+    assert "8 merges" in caplog.text  # views are recognised by their index
     assert "refine_stop_iter=3 instead of 7" in caplog.text  # SVS ends densification at half of the steps
     evaluated = torch.load(trainer.folder / "image.pt")
     splats = torch.load(trainer.folder / "ckpt.pt")["splats"]
@@ -77,12 +77,6 @@ def test_mcmc_densifies_in_place_of_its_default_strategy(trainer, caplog, mcmc_a
     assert "MCMC has no effect here: the host densifies by itself" in caplog.text
     assert "refine_stop_iter=3 instead of 7" in caplog.text
     assert len(torch.load(trainer.folder / "ckpt.pt")["splats"]["means"]) != 27
-
-
-def test_views_are_recognised_by_their_index_when_poses_are_noisy(trainer, caplog):
-    with caplog.at_level(logging.INFO):
-        assert trainer.run([*trainer.sr, *OVERRIDES], "--pose_noise", "0.01") == 0
-    assert "8 merges" in caplog.text
 
 
 def test_options_that_do_not_work_with_two_scales_are_refused_before_the_first_step(trainer, caplog):

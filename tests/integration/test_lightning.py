@@ -20,6 +20,7 @@ from tests.helpers import toy
 from tests.helpers.host_parts import FROM_START
 
 N = 24
+WITHOUT_HR = ["objective.lambda_hr.peak=0", "objective.lambda_hr.final=0"]
 
 
 @pytest.fixture
@@ -35,10 +36,8 @@ def host(monkeypatch):
         numbers = (torch.tensor(x) for x in (c.fx, c.fy, c.cx, c.cy, c.width, c.height))
         camera = splatting.Camera(*numbers, c.world_to_camera.T)
         photos.append((f"images/{view.name}.png", camera, view.lr.image.permute(2, 0, 1)))
-    vanilla = importlib.import_module(
-        "internal.density_controllers.vanilla_density_controller"
-    ).VanillaDensityController
-    yield SimpleNamespace(splatting=splatting, controller=controller, vanilla=vanilla, scene=scene, photos=photos)
+    densities = importlib.import_module("internal.density_controllers.vanilla_density_controller")
+    yield SimpleNamespace(splatting=splatting, controller=controller, densities=densities, scene=scene, photos=photos)
     for name in [m for m in sys.modules if m.split(".")[0] == "internal" or m == "integration.lightning"]:
         del sys.modules[name]
 
@@ -54,9 +53,8 @@ def sr(host, tmp_path):
 def fitted(host, density, steps, pixels=True, start=0, mask=None, checkpoint=None):
     torch.manual_seed(0)
     module = host.splatting.GaussianSplatting(host.scene.cloud, density, host.splatting.Renderer(pixels))
-    module.gaussian_model.gaussians["scales"].data += torch.tensor(
-        [0.0, 0.3, 0.6]
-    )  # the rotation of round ones is rounding
+    # the gradient of the rotation of round ones is rounding
+    module.gaussian_model.gaussians["scales"].data += torch.tensor([0.0, 0.3, 0.6])
     host.splatting.fit(module, host.photos, steps, start, mask, checkpoint)
     return module
 
@@ -107,9 +105,9 @@ def test_centres_in_pixels_and_in_ndc_give_the_same_densification(host, sr):
 
 def test_dropped_gaussians_have_no_gradient(host):
     half = ["strategies.svs.dropout.shape=constant", "strategies.svs.dropout.maximum=0.5", "strategies.svs.looks=0"]
-    off = ["objective.lambda_hr.peak=0", "objective.lambda_hr.final=0"]
     plain, dropped = (
-        fitted(host, host.controller(strategies=name, overrides=[*off, *more]), 1).grads["means"].abs().sum(1) > 0
+        fitted(host, host.controller(strategies=name, overrides=[*WITHOUT_HR, *more]), 1).grads["means"].abs().sum(1)
+        > 0
         for name, more in (("baseline", ()), ("svs", half))
     )
     assert 5 <= int((plain & ~dropped).sum()) <= N - 5
@@ -121,31 +119,22 @@ def test_the_hosts_exposure_is_applied_at_both_scales(host, sr):
 
 
 def test_without_hr_no_sr_images_are_needed(host):
-    off = ["objective.lambda_hr.peak=0", "objective.lambda_hr.final=0"]
-    module = fitted(host, host.controller(strategies="svs", overrides=off), 3)
+    module = fitted(host, host.controller(strategies="svs", overrides=WITHOUT_HR), 3)
     assert attachment_of(module).counts == {"LR renders": 3, "merges": 3}
     with pytest.raises(SettingError, match="sr: must be the folder of the SR images"):
         fitted(host, host.controller(strategies="svs"), 3)
 
 
 def test_a_score_without_a_threshold_is_warned_of(host, sr, caplog):
-    base = importlib.import_module("internal.density_controllers.density_controller").DensityController()
+    base = host.densities.DensityController()
     fitted(host, host.controller(base=base, strategies="p2g", **sr, overrides=["strategies.p2g.patch=4"]), 1)
-    assert (
-        "DensityController does not read the screen gradient: the densification score of P2G has no effect"
-        in caplog.text
-    )
-
-
-def test_max_steps_must_be_set(host, sr):
-    with pytest.raises(HostError, match="max_steps=-1"):
-        fitted(host, host.controller(**sr), -1)
+    assert "DensityController does not read the screen gradient: the densification score of P2G" in caplog.text
 
 
 def test_a_run_saves_its_checkpoint_and_continues_from_it_as_if_it_had_not_stopped(host, sr):
     """The host pickles its live renderer with every checkpoint, so nothing may hang on it."""
     settings = {**sr, "overrides": FROM_START}
-    quiet = host.vanilla(densify_until_iter=0)
+    quiet = host.densities.VanillaDensityController(densify_until_iter=0)
     whole = fitted(host, host.controller(base=quiet, **settings), 8)
     module = fitted(host, host.controller(base=quiet, **settings), 5)
     stored = torch.load(io.BytesIO(module.checkpoint), weights_only=False)
@@ -193,14 +182,15 @@ def test_two_photos_of_one_name_are_refused(host, sr):
 @pytest.mark.parametrize(
     ("trainer", "message"),
     [
-        ({"world_size": 2}, r"one process trains, got 2. Set trainer.devices=1"),
-        ({"precision": "16-mixed"}, r"got precision=16-mixed. Set trainer.precision=32"),
+        ({"max_steps": -1}, "got max_steps=-1. Set trainer.max_steps"),
+        ({"world_size": 2}, "one process trains, got 2. Set trainer.devices=1"),
+        ({"precision": "16-mixed"}, "got precision=16-mixed. Set trainer.precision=32"),
     ],
-    ids=["processes", "precision"],
+    ids=lambda value: value if isinstance(value, str) else next(iter(value)),
 )
-def test_several_processes_and_half_precision_are_refused_before_the_first_step(trainer, message, host, sr):
+def test_a_trainer_without_steps_with_several_processes_or_in_half_precision_is_refused(trainer, message, host, sr):
     module = unfitted(host, sr)
-    module.trainer = SimpleNamespace(global_step=0, max_steps=5, **trainer)
+    module.trainer = SimpleNamespace(**{"global_step": 0, "max_steps": 5} | trainer)
     with pytest.raises(HostError, match=message):
         module.density_controller.setup("fit", module)
 

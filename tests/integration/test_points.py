@@ -189,14 +189,6 @@ def test_gaussians_are_made_again_at_the_stereo_cloud(newer, inria_host, inria_c
     clear.remove()
 
 
-def test_gaussians_stay_the_hosts_own_by_default(inria_host, inria_capture):
-    gaussians, scene, opt = own_gaussians(inria_host, inria_capture)
-    optimizer, xyz = gaussians.optimizer, gaussians._xyz
-    install_in_inria(gaussians, scene, opt, sr=inria_capture / "sr", overrides=FROM_START).remove()
-    assert gaussians.optimizer is optimizer
-    assert gaussians._xyz is xyz
-
-
 def test_pixels_under_an_alpha_mask_give_no_points(inria_host, inria_capture):
     _, scene, _ = own_gaussians(inria_host, inria_capture)
     whole = stereo_points([photo_of(camera) for camera in scene.cameras])
@@ -232,12 +224,6 @@ def test_a_fork_of_another_shape_is_refused_with_the_file_as_remedy(
     with pytest.raises(HostError, match=message) as refused:
         install_stereo(gaussians, scene, opt, inria_capture)
     assert "docs/how-to/stereo.md" in str(refused.value)
-
-
-def test_the_launcher_trains_from_stereo(inria_launched):
-    means = inria_launched("whole", "--iterations", "6", points="stereo")["xyz"]
-    assert means.shape == expected().means.shape
-    assert float((means - expected().means).norm(dim=1).median()) < 0.02
 
 
 def test_the_launchers_name_the_flag_and_refuse_other_words_before_the_host_starts(capsys, caplog):
