@@ -1,10 +1,9 @@
 """The pictures of the documentation.
 
-`python docs/figures.py` draws those of docs/explanation/evidence-sparse.md from its CSV files. `python docs/figures.py demo`
-trains the demo, as the README's first command does, and draws the README's picture of it, docs/images/demo.png; further
-words are overrides of the run. `python docs/figures.py notebook` runs docs/tutorial/notebook.ipynb and keeps what its
-cells show. `python docs/figures.py pages RUN` opens a run's splat.html and the viewer in Chromium, and takes a
-picture of each.
+python docs/figures.py                     those of docs/explanation/evidence-sparse.md, from its CSV files
+python docs/figures.py demo [OVERRIDE …]   the README's, docs/images/demo.png: trains the demo as its first command does
+python docs/figures.py notebook            runs docs/tutorial/notebook.ipynb and keeps the outputs of its cells
+python docs/figures.py pages RUN           a run's splat.html and the viewer, in Chromium
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ def numbers(cell: str) -> list[float]:
 
 
 def error(cell: str) -> float:
-    """What stands behind ±, else 0."""
+    """The number after ±; 0 without one."""
     return float(cell.split("±")[1]) if "±" in cell else 0.0
 
 
@@ -68,12 +67,12 @@ def ablation(folder: Path) -> None:
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
     figure, axes = plt.subplots(figsize=(7, 3))
     for k, scene in enumerate(scenes):
-        own = {row["method"]: row["Δ"] for row in rows if row["scene"] == scene}
+        gains = {row["method"]: row["Δ"] for row in rows if row["scene"] == scene}
         average = scene.startswith("average")
         axes.errorbar(
             [i + 0.11 * (k - (len(scenes) - 1) / 2) for i in range(len(methods))],
-            [numbers(own[m])[0] for m in methods],
-            [error(own[m]) for m in methods],
+            [numbers(gains[m])[0] for m in methods],
+            [error(gains[m]) for m in methods],
             fmt="D" if average else "o",
             color="black" if average else None,
             markersize=6 if average else 4,
@@ -219,11 +218,14 @@ def settled(page: Any) -> bytes:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["demo"]:
-        demo(DOCS / "images", *sys.argv[2:])
-    elif sys.argv[1:2] == ["notebook"]:
-        notebook(DOCS / "tutorial" / "notebook.ipynb")
-    elif sys.argv[1:2] == ["pages"]:
-        pages(DOCS / "images", Path(sys.argv[2]))
-    else:
-        main(DOCS / "images")
+    match sys.argv[1:]:
+        case []:
+            main(DOCS / "images")
+        case ["demo", *overrides]:
+            demo(DOCS / "images", *overrides)
+        case ["notebook"]:
+            notebook(DOCS / "tutorial" / "notebook.ipynb")
+        case ["pages", run]:
+            pages(DOCS / "images", Path(run))
+        case _:
+            sys.exit(__doc__)

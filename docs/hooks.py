@@ -11,7 +11,8 @@ import importlib
 import inspect
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -46,10 +47,6 @@ class Section:
     summary: str
     settings: tuple[Setting, ...]
 
-    @property
-    def undescribed(self) -> list[str]:
-        return [f"{self.key}.{s.name}" for s in self.settings if not s.description]
-
 
 @dataclass(frozen=True)
 class Group:
@@ -61,7 +58,7 @@ class Group:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """MkDocs calls this with the files of the site."""
+    """MkDocs calls this with the files of the site, to which the configuration reference is added."""
     from mkdocs.structure.files import File
 
     files.append(File.generated(config, PAGE, content=page(groups())))
@@ -83,46 +80,48 @@ def groups() -> list[Group]:
     """Everything in conf/, the base configuration first. Each field is listed once, each class once per node."""
     if str(ROOT) not in sys.path:
         sys.path.insert(0, str(ROOT))
-    folders = sorted({path.parent for path in CONF.rglob("*.yaml")}, key=lambda p: (p != CONF, str(p)))
-    return [_group(folder) for folder in folders]
+    folders = sorted({path.parent for path in CONF.rglob("*.yaml") if path.parent != CONF}, key=str)
+    # conf/conductor.yaml is left out: the fields of a conductor are among those of a run.
+    return [_group(CONF, [CONF / "config.yaml"]), *(_group(folder, folder.glob("*.yaml")) for folder in folders)]
 
 
-def _group(folder: Path) -> Group:
-    paths = sorted(folder.glob("*.yaml"), key=lambda p: (not p.stem.startswith("_"), p.stem != "auto", p.stem))
+def _group(folder: Path, files: Iterable[Path]) -> Group:
+    paths = sorted(files, key=lambda p: (not p.stem.startswith("_"), p.stem != "auto", p.stem))
     texts = {path: path.read_text(encoding="utf-8") for path in paths}
     sections = [section for path in paths for section in _sections(path, texts[path])]
-    built = {(s.key, s.target): s for s in reversed(sections) if s.target}
-    known = {f"{s.key}.{field.name}" for s in built.values() for field in s.settings}
-    shown: list[Section] = []
-    sets: dict[str, list[str]] = {}
+    known = {f"{s.key}.{setting.name}" for s in sections if s.target for setting in s.settings}
+    listed: list[Section] = []
+    classes: set[tuple[str, str]] = set()
+    sets: defaultdict[str, list[str]] = defaultdict(list)  # the fields that a choice sets and that are listed elsewhere
     for section in sections:
         if section.target:
-            if built.pop((section.key, section.target), None) is not None:
-                shown.append(section)
+            if (section.key, section.target) not in classes:
+                classes.add((section.key, section.target))
+                listed.append(section)
             continue
-        fresh = tuple(s for s in section.settings if f"{section.key}.{s.name}" not in known)
-        again = [s for s in section.settings if s not in fresh]
-        sets.setdefault(section.choice, []).extend(f"`{section.key}.{s.name}={s.default}`" for s in again)
-        known |= {f"{section.key}.{s.name}" for s in fresh}
-        if fresh:
-            shown.append(dataclasses.replace(section, settings=fresh))
+        own = tuple(s for s in section.settings if f"{section.key}.{s.name}" not in known)
+        sets[section.choice] += [f"`{section.key}.{s.name}={s.default}`" for s in section.settings if s not in own]
+        known |= {f"{section.key}.{s.name}" for s in own}
+        if own:
+            listed.append(dataclasses.replace(section, settings=own))
     options = {}
     for path in paths:
         if path.stem.startswith("_"):
             continue
         summaries = [s.summary for s in sections if s.choice == path.stem and s.summary]
         options[path.stem] = _heading(texts[path]) or next(iter(summaries), "")
-        if set_here := sets.get(path.stem):
-            options[path.stem] += f" Sets {', '.join(set_here)}."
-    return Group(folder.relative_to(CONF).as_posix(), options, tuple(shown))
+        if sets[path.stem]:
+            options[path.stem] += f" Sets {', '.join(sets[path.stem])}."
+    return Group(folder.relative_to(CONF).as_posix(), options, tuple(listed))
 
 
-def undescribed(found: list[Group]) -> list[str]:
+def undescribed(listed: list[Group]) -> list[str]:
     """The fields that neither a docstring nor a comment describes."""
-    return sorted({name for group in found for section in group.sections for name in section.undescribed})
+    sections = [section for group in listed for section in group.sections]
+    return sorted({f"{s.key}.{setting.name}" for s in sections for setting in s.settings if not setting.description})
 
 
-def page(found: list[Group]) -> str:
+def page(listed: list[Group]) -> str:
     """The Markdown of the reference."""
     lines = [
         "# Configuration",
@@ -134,7 +133,7 @@ def page(found: list[Group]) -> str:
         "`fit.iterations`.",
         "",
     ]
-    for group in found:
+    for group in listed:
         lines += [f"## {'The base configuration' if group.name == '.' else f'`{group.name}=`'}", ""]
         if group.name != ".":
             lines += ["| choice | what it is |", "|---|---|"]
@@ -275,7 +274,7 @@ def _values(instance: Any) -> dict[str, str]:
 
 def _comments(text: str) -> dict[str, str]:
     """The comment behind each key of a YAML text, by the key's dotted path."""
-    found: dict[str, str] = {}
+    comments: dict[str, str] = {}
     stack: list[tuple[int, str]] = []
     current: str | None = None
     column = 0
@@ -287,9 +286,9 @@ def _comments(text: str) -> dict[str, str]:
             stack.append((len(key[1]), key[2]))
             current = ".".join(name for _, name in stack)
             if note:
-                found[current], column = note[1].strip(), note.start()
+                comments[current], column = note[1].strip(), note.start()
             else:
                 column = -1
-        elif note and current in found and column > 0 and abs(note.start() - column) <= 1:
-            found[current] += " " + note[1].strip()
-    return found
+        elif note and current in comments and column > 0 and abs(note.start() - column) <= 1:
+            comments[current] += " " + note[1].strip()
+    return comments

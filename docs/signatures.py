@@ -1,4 +1,4 @@
-"""What a class or function says of its arguments: their types and defaults, and the descriptions in its docstring."""
+"""The arguments of a class or function: types and defaults from its signature, descriptions from its docstring."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def parameters(built: Any) -> Iterator[inspect.Parameter]:
     for parameter in inspect.signature(built).parameters.values():
         if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             continue
-        made = factories.get(parameter.name)
-        yield parameter.replace(default=made()) if made is not None else parameter
+        factory = factories.get(parameter.name)
+        yield parameter.replace(default=factory()) if factory is not None else parameter
 
 
 def hints(built: Any) -> dict[str, str]:
@@ -70,7 +70,7 @@ def docstring(built: Any) -> tuple[str, dict[str, str]]:
 
 
 def _arguments(text: str) -> dict[str, str]:
-    """What the `Args:` of a docstring say, by argument."""
+    """The descriptions in the `Args:` of a docstring, by argument."""
     block = re.search(r"^Args:\n((?:[ \t]+.*\n?|\n)+)", text, re.MULTILINE)
     described: dict[str, str] = {}
     if block:
@@ -94,7 +94,7 @@ def _arguments(text: str) -> dict[str, str]:
 
 
 def described(value: str, text: str) -> str:
-    """The description, which says where the value must or does come from."""
+    """The description; of a value that is required, or that follows another field, it says so."""
     if value == "???":
         text = f"Required. {_sentence(text)}".strip()
     elif not text and value.startswith("${"):
@@ -104,4 +104,4 @@ def described(value: str, text: str) -> str:
 
 def _sentence(text: str) -> str:
     text = " ".join(text.replace("(10k)", "").split())  # the type says that it is a milestone
-    return text[:1].upper() + text[1:] if re.match(r"[a-z]+ [a-z(]", text) else text
+    return text[:1].upper() + text[1:] if re.match(r"[a-z]+ [a-z(`]", text) else text
