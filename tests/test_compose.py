@@ -32,7 +32,12 @@ def names(c):
 
 def test_names_are_those_of_the_command_line():
     assert names(conductor("clear")) == ["GCO", "P2G", "SVS"]
-    assert names(conductor("gco, svs")) == names(conductor("[gco,svs]")) == names(conductor(["gco", "svs"])) == ["GCO", "SVS"]
+    assert (
+        names(conductor("gco, svs"))
+        == names(conductor("[gco,svs]"))
+        == names(conductor(["gco", "svs"]))
+        == ["GCO", "SVS"]
+    )
     assert names(conductor("baseline")) == []
     assert names(conductor("clear", "~strategies.p2g")) == ["GCO", "SVS"]
 
