@@ -193,10 +193,9 @@ class AttachedModel:
             self._warn_once("render reads none of the model's opacity getters: dropout has no effect.")
         if overrides.detail is not None and "detail" not in overrides.used:
             self._warn_once("render does not read the model's constant colours: the detail feature has no effect.")
-        trained = {name: p for name, p in params.items() if p.requires_grad}
         # Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts.
         ranks = hasattr(self._model, "xyz_gradient_accum_abs")
-        rendering = host_rendering(result, camera, trained, gate, self._to_pixels, ranks_by_third_column=ranks)
+        rendering = host_rendering(result, camera, params, gate, self._to_pixels, ranks_by_third_column=ranks)
         if rendering.shot.gradient_slot.tensor.shape[-1] == 4 and self._scoring is not None:
             self._warn_once(
                 "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "

@@ -171,11 +171,12 @@ def test_a_host_that_densifies_after_the_anchor_nevertheless_is_stopped(inria_ho
         loop(inria_host, clear, options(inria_host, inria_capture), gaussians, scene)
 
 
-def test_a_parameter_that_the_host_does_not_train_gets_no_gradient(inria_host, inria_attached):
+@pytest.mark.parametrize("name", ["_features_rest", "_xyz"])
+def test_a_parameter_that_the_host_does_not_train_gets_no_gradient(name, inria_host, inria_attached):
     clear, gaussians, scene = inria_attached(GCO())
-    gaussians._features_rest.requires_grad_(False)
+    frozen = getattr(gaussians, name).requires_grad_(False)
     clear.wrap(inria_host.render)(scene.cameras[1], gaussians, None, None)["render"].sum().backward()
-    assert gaussians._features_rest.grad is None
+    assert frozen.grad is None
     assert clear.attachment.counts["merges"] == 1
 
 
