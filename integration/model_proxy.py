@@ -169,7 +169,7 @@ class AttachedModel:
 
         Args:
             camera: the host's.
-            render: the host's function of a model and a camera; it also gets what is drawn.
+            render: the host's function of a model and a camera; the third argument is what is drawn.
         """
 
         def render_at(target: Target, gate: Tensor | None) -> HostRendering:
@@ -179,23 +179,23 @@ class AttachedModel:
                 sized, pinhole = enlarged_camera(camera, view.factor), view.hr.camera
             else:
                 sized, pinhole = replaced_camera(camera, target), target
-            return self._render(lambda model: render(model, sized, target), pinhole, gate, with_detail=target == "hr")
+            params = self.params() if target == "hr" else self._host_params()
+            overrides = Overrides(gate, params.get("detail"))
+            result = render(proxy(self._model, overrides, self._roles), sized, target)
+            return self._rendering(result, overrides, pinhole, params)
 
         return self.attachment.render_view(view, render_at)
 
-    def _render(
-        self, render: Callable[[Any], Any], camera: Camera, gate: Float[Tensor, " N"] | None, *, with_detail: bool
+    def _rendering(
+        self, result: Any, overrides: Overrides, camera: Camera, params: Mapping[str, Tensor]
     ) -> HostRendering:
-        params = self.params() if with_detail else self._host_params()
-        overrides = Overrides(gate, params.get("detail"))
-        result = render(proxy(self._model, overrides, self._roles))
-        if gate is not None and "gate" not in overrides.used:
+        if overrides.gate is not None and "gate" not in overrides.used:
             self._warn_once("render reads none of the model's opacity getters: dropout has no effect.")
         if overrides.detail is not None and "detail" not in overrides.used:
             self._warn_once("render does not read the model's constant colours: the detail feature has no effect.")
         # Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts.
         ranks = hasattr(self._model, "xyz_gradient_accum_abs")
-        rendering = host_rendering(result, camera, params, gate, self._to_pixels, ranks_by_third_column=ranks)
+        rendering = host_rendering(result, camera, params, overrides.gate, self._to_pixels, ranks_by_third_column=ranks)
         if rendering.shot.gradient_slot.tensor.shape[-1] == 4 and self._scoring is not None:
             self._warn_once(
                 "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
