@@ -73,7 +73,7 @@ class Transform(msgspec.Struct):
         Args:
             path, where: of this frame, for the message.
         """
-        # Of a turned photo only given sizes tell whether they are those of the stored pixels.
+        # If the photo is turned, only given sizes show whether the lens is that of the stored pixels.
         real = (0, 0) if self.w is not None and self.h is not None else image_size(image)
         width, height = (
             float(size) if given is None else given for given, size in zip((self.w, self.h), real, strict=True)
@@ -95,7 +95,7 @@ class Transform(msgspec.Struct):
 
 
 def transforms_of(path: Path, content: Mapping[str, Any]) -> list[Transform]:
-    """The frames of a file's content; what a frame has itself wins."""
+    """The frames of a file's content; a frame's own values replace those shared by all."""
     frames = typed(
         path, content.get("frames") or None, list[dict[str, Any]], where="frames", remedy="give a transforms file"
     )

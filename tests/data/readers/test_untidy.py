@@ -20,7 +20,7 @@ from tests.helpers.captures import GOOD, HEIGHT, NAMES, WIDTH
 from tests.stress.bad_inputs.scenes import READERS
 
 PHOTOS = {"colmap": "images", "nerfstudio": "images", "blender": "train", "llff": "images_4"}
-# What happens to photos, what the refusal says, the setting that goes on without them, and the photos that are then used.
+# What is done to the photos, parts of the message, the setting that goes on without them, and the photos that are then used.
 DEFECTS: dict[str, tuple[Callable[[Path], object], tuple[str, ...], dict[str, object], str]] = {
     "missing": (lambda f: (f / "b.png").unlink(), ("1 of ", "b.png", "data.missing=skip"), {"missing": "skip"}, "ac"),
     "truncated": (lambda f: os.truncate(f / "b.png", 200), ("b.png", "data.broken=skip"), {"broken": "skip"}, "ac"),
@@ -40,13 +40,13 @@ def built(tmp_path: Path, reader: str) -> tuple[Path, Path, Callable[..., Captur
 @pytest.mark.parametrize(("defect", "reader"), CASES)
 def test_a_defect_is_refused_in_one_line_with_the_setting_that_goes_on(tmp_path, defect, reader, caplog):
     root, folder, read = built(tmp_path, reader)
-    spoil, says, cure, used = DEFECTS[defect]
+    spoil, message, setting, used = DEFECTS[defect]
     spoil(folder)
     with pytest.raises(DataError) as refusal:
         [frame.load() for frame in read(root).frames]
     assert "\n" not in str(refusal.value)
-    assert all(part in str(refusal.value) for part in says), str(refusal.value)
-    capture = read(root, **cure)
+    assert all(part in str(refusal.value) for part in message), str(refusal.value)
+    capture = read(root, **setting)
     assert [Path(frame.name).stem for frame in capture.frames] == list(used)
     assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
     assert ("b.png" in caplog.text) == (used == "ac")

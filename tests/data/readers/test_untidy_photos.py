@@ -1,4 +1,4 @@
-"""Folders of photos as phones and people leave them: each ends well, or with one line that names the file and the cure.
+"""Folders of photos as phones and people leave them: each ends well, or with one line that names the file and the remedy.
 
 Structure from motion is replaced by a model that is there already, of three photos a, b and c.
 """
@@ -103,11 +103,11 @@ def test_untidy_photos_that_can_be_read_are_read(of_photos, name, caplog):
 
 
 class Refusal(NamedTuple):
-    """What the folder holds, what the refusal says, and the setting that goes on without it, if there is one."""
+    """What is done to the folder, parts of the message, and the setting that goes on without the photo, if there is one."""
 
-    make: Callable[[Path], object]
-    says: tuple[str, ...]
-    cure: dict[str, object] | None = None
+    spoil: Callable[[Path], object]
+    message: tuple[str, ...]
+    setting: dict[str, object] | None = None
 
 
 SKIP, BROKEN = {"broken": "skip"}, "data.broken=skip"
@@ -129,16 +129,16 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_the_others_are_refused_in_one_line_with_the_file_and_the_cure(of_photos, name):
+def test_the_others_are_refused_in_one_line_with_the_file_and_the_remedy(of_photos, name):
     folder, read = of_photos
     case = REFUSED[name]
-    case.make(folder)
+    case.spoil(folder)
     with pytest.raises(DataError) as refusal:
         [frame.load() for frame in read().frames]
     assert "\n" not in str(refusal.value)
-    assert all(part in str(refusal.value) for part in case.says), str(refusal.value)
-    if case.cure is not None:
-        capture = read(**case.cure)
+    assert all(part in str(refusal.value) for part in case.message), str(refusal.value)
+    if case.setting is not None:
+        capture = read(**case.setting)
         assert len(capture.frames) == 3
         assert all(bool(frame.load().isfinite().all()) for frame in capture.frames)
 
