@@ -154,11 +154,13 @@ def test_the_readmes_loop_prints_the_number_of_its_table(run_block, capsys):
     assert printed == pytest.approx(float(shown), abs=0.15)
 
 
-def test_the_readmes_blocks_are_as_short_as_promised():
+def test_the_readme_and_its_blocks_are_as_short_as_promised():
     loop, gco = ([line for line in b.splitlines() if line.strip()] for b in blocks(ROOT / "README.md", "python"))
     assert len(loop) <= 25
     assert len(gco) <= 10
     assert all(len(line) <= 120 for line in loop + gco)
+    assert len(blocks(ROOT / "README.md", "bash")) == 2  # the commands of the gate
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 160
 
 
 # Commands of the README and the guides that no test runs, and why; `test_commands_are_understood` reads all of them.
@@ -177,20 +179,12 @@ NOT_RUN = {
 }
 
 
-def followed(page: Path) -> list[list[str]]:
-    """The commands of a guide that can be run here, each by the first guide that has it."""
-    lines = {" ".join(words): words for block in blocks(page, "sh") for words in commands(block)}
-    known = {line for earlier in FOLLOWED.values() for line in map(" ".join, earlier)}
-    return [
-        words
-        for line, words in lines.items()
-        if line not in known and not any(re.search(why, line) for why in NOT_RUN.values())
-    ]
-
-
-FOLLOWED: dict[Path, list[list[str]]] = {}
+# The commands of the guides that a test runs, each by the first guide that has it.
+FOLLOWED: dict[str, tuple[Path, list[str]]] = {}
 for guide in [ROOT / "README.md", *sorted((DOCS / "how-to").glob("*.md"))]:
-    FOLLOWED[guide] = followed(guide)
+    for words in (words for block in blocks(guide, "sh") for words in commands(block)):
+        if not any(re.search(why, " ".join(words)) for why in NOT_RUN.values()):
+            FOLLOWED.setdefault(" ".join(words), (guide, words))
 
 
 def follow(lines: list[list[str]], folder: Path) -> None:
@@ -200,23 +194,18 @@ def follow(lines: list[list[str]], folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", [page for page, lines in FOLLOWED.items() if lines], ids=name)
+@pytest.mark.parametrize("page", dict.fromkeys(guide for guide, _ in FOLLOWED.values()), ids=name)
 def test_commands_of_the_guides_run(page, tmp_path):
     (tmp_path / f"{documented.PACKAGE}.py").write_text("".join(blocks(page, "python")[:1]))
-    follow(FOLLOWED[page], tmp_path)
-
-
-def test_the_readme_has_the_two_commands_of_the_gate():
-    assert len(blocks(ROOT / "README.md", "bash")) == 2
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 160
+    follow([words for guide, words in FOLLOWED.values() if guide == page], tmp_path)
 
 
 @pytest.mark.slow
 def test_the_first_tutorial_works(tmp_path):
     page = blocks(DOCS / "tutorial" / "first-scene.md", "sh")
-    followed = [words for block in page for words in commands(block) if words[:2] == ["python", "-m"]]
-    assert len(followed) > 5
-    follow(followed, tmp_path)
+    lines = [words for block in page for words in commands(block) if words[:2] == ["python", "-m"]]
+    assert len(lines) > 5
+    follow(lines, tmp_path)
     assert (tmp_path / "outputs" / "compared" / "report.html").is_file()
 
 
