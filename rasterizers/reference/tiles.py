@@ -7,12 +7,15 @@ indices (stable sorts).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rasterizers.reference.projection import Projection
+
+_SLAB: Final = 64  # pairs of a tile that are blended at a time; opaque tiles stop between slabs
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +80,6 @@ class TileLists:
         inside = position < self.lengths[tiles, None]
         pairs = torch.where(inside, self.starts[tiles, None] + position, 0)
         return torch.where(inside, self.gaussians[pairs], len(self.visible))
-
-
-_SLAB = 64  # pairs of a tile that are blended at a time; opaque tiles stop between slabs
 
 
 @torch.no_grad()
