@@ -67,13 +67,13 @@ class Synchronisations(TorchDispatchMode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.found: list[str] = []
+        self.operations: list[str] = []
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         name = func._schema.name
         masked = name == "aten::index" and any(i is not None and i.dtype == torch.bool for i in args[1])
         if name in self.WAITING or masked:
-            self.found.append(name)
+            self.operations.append(name)
         return func(*args, **(kwargs or {}))
 
 
@@ -83,7 +83,7 @@ def test_the_host_does_not_wait_for_the_device(warp_step):
     step.step(c.fields[1].raw(), *factors, T)  # reads what changes only with the number of Gaussians
     with Synchronisations() as recorded:
         conflict = step.step(c.fields[1].raw(), *factors, T + 1)
-    assert recorded.found == []
+    assert recorded.operations == []
     assert all(0 <= share <= 1 for share in as_floats(conflict).values())
 
 
@@ -109,8 +109,8 @@ def test_cuda_fields_without_warp_use_the_readable_path_and_log_why(adam_on_cuda
     monkeypatch.setattr("clear_strategies.training.compiled_step.require_warp", missing)
     with caplog.at_level("DEBUG"):
         assert compiled_step_for(Conductor(), adam_on_cuda) is None
-    (said,) = caplog.messages
-    assert said.endswith("takes the readable path: the compiled pass needs NVIDIA Warp, which is not installed.")
+    (message,) = caplog.messages
+    assert message.endswith("takes the readable path: the compiled pass needs NVIDIA Warp, which is not installed.")
 
 
 @pytest.mark.slow

@@ -1,8 +1,8 @@
 """`python -m tests.stress`: every stress measurement whole, and docs/stability.md with what it found.
 
 `--only NAME …` measures some of them and keeps the other rows of docs/stability.csv. Options make the longest smaller; the
-page says how many cases ran, and with how many a release is measured. Each row is written when it is there, so that what is
-interrupted keeps what it has measured.
+page says how many cases ran, and with how many a release is measured. Each row is written as soon as it is measured, so that
+an interrupted command keeps its rows.
 """
 
 from __future__ import annotations
@@ -103,35 +103,31 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     if options.list:
-        given = [*bad_inputs.inputs(), *attacks.attacks()]
-        sys.stdout.write("".join(f"{one.id}\n" for one in given))
+        sys.stdout.write("".join(f"{given.id}\n" for given in (*bad_inputs.inputs(), *attacks.attacks())))
         return 0
-    found = list[Row]()
+    measured = list[Row]()
     with tempfile.TemporaryDirectory() as folder:
         for name in (name for name in MEASUREMENTS if name in options.only):
             _log.info("%s …", name)
-            there = Path(folder) / name
-            there.mkdir()
-            for row in MEASUREMENTS[name](options, there):
+            part_folder = Path(folder) / name
+            part_folder.mkdir()
+            for row in MEASUREMENTS[name](options, part_folder):
                 day = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d}"
-                found.append(replace(row, part=name, measured=day))
-                _write(options.out, found)
+                measured.append(replace(row, part=name, measured=day))
+                _write(options.out, measured)
             if name != "fuzz" or options.formats is None:
-                _write(options.out, found, whole={name})
+                _write(options.out, measured, whole={name})
     _log.info("%s", options.out)
-    return int(not all(row.met for row in found))
+    return int(not all(row.met for row in measured))
 
 
-def _write(out: Path, found: list[Row], whole: Container[str] = ()) -> None:
+def _write(out: Path, measured: list[Row], whole: Container[str] = ()) -> None:
+    """Write the CSV file, and docs/stability.md with its rows as the table; the page's words stay."""
     csv = out.with_suffix(".csv")
-    rows.write(csv, rows.merged(rows.read(csv), found, list(MEASUREMENTS), whole))
-    files.write_text(out, page(rows.read(csv)))
-
-
-def page(found: list[Row]) -> str:
-    """docs/stability.md, whose words stay, with the table of these rows."""
+    rows.write(csv, rows.merged(rows.read(csv), measured, list(MEASUREMENTS), whole))
     words = re.sub(r"Measured on \w+\.", f"Measured on {platform.machine()}.", PAGE.read_text(encoding="utf-8"))
-    return re.sub(r"(^\|.*\n)+", lambda _: rows.table(found), words, count=1, flags=re.MULTILINE)
+    table = rows.table(rows.read(csv))
+    files.write_text(out, re.sub(r"(^\|.*\n)+", lambda _: table, words, count=1, flags=re.MULTILINE))
 
 
 if __name__ == "__main__":

@@ -232,12 +232,12 @@ def _outcomes(folder: Path, most: int | None) -> Iterator[tuple[str, str, bool]]
     points = list(_points(folder))
     step = 1 if most is None else max(1, len(points) // most)
     for scenario, kind, at, states in points[::step]:
-        here = folder / "run"
-        scenario.prepare(here)
+        run_folder = folder / "run"
+        scenario.prepare(run_folder)
         with fault(at, FAULTS[kind]) as seen, suppress(OSError, Killed):
-            scenario.act(here)
-        yield scenario.name, f"{kind} at {seen[-1]} {at}", _whole(here, states)
-        shutil.rmtree(here)
+            scenario.act(run_folder)
+        yield scenario.name, f"{kind} at {seen[-1]} {at}", _whole(run_folder, states)
+        shutil.rmtree(run_folder)
 
 
 States = dict[str, set[bytes]]
@@ -246,14 +246,14 @@ States = dict[str, set[bytes]]
 def _points(folder: Path) -> Iterator[tuple[Scenario, str, int, States]]:
     """Every fault point, and what each file that is no checkpoint may hold afterwards."""
     for scenario in SCENARIOS:
-        here = folder / "whole"
-        scenario.prepare(here)
+        run_folder = folder / "whole"
+        scenario.prepare(run_folder)
         states: States = {}
-        _add_contents(here, states)
+        _add_contents(run_folder, states)
         with fault(0, Killed) as seen:
-            scenario.act(here)
-        _add_contents(here, states)
-        shutil.rmtree(here)
+            scenario.act(run_folder)
+        _add_contents(run_folder, states)
+        shutil.rmtree(run_folder)
         for kind in FAULTS:
             for at, name in enumerate(seen, 1):
                 if kind != "short write" or name == "write":

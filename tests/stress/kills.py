@@ -42,26 +42,24 @@ def measure(folder: Path, kills: int) -> Row:
     began = time.monotonic()
     _require_done(_started(config, folder / "whole"))
     seconds = time.monotonic() - began
-    expected, rng, bad, run = _results(folder / "whole"), random.Random(0), Worst(), 0  # noqa: S311 - no secret
-    while bad.cases < kills:
-        here, newest, run = folder / f"run{run}", 0, run + 1
-        for _ in range(min(rng.randint(1, _MOST_KILLS), kills - bad.cases)):
+    expected, rng, failures, run = _results(folder / "whole"), random.Random(0), Worst(), 0  # noqa: S311 - no secret
+    while failures.cases < kills:
+        run_folder, newest, run = folder / f"run{run}", 0, run + 1
+        for _ in range(min(rng.randint(1, _MOST_KILLS), kills - failures.cases)):
             delay = rng.uniform(0, seconds)
-            pid = _started(config, here)
+            pid = _started(config, run_folder)
             time.sleep(delay)
             os.kill(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
-            found = _newest(here)
-            bad.add(
-                float(found is None or found < newest), f"run {run}, killed after {delay:.2f} s: a checkpoint is lost"
-            )
-            newest = found or newest
-        _require_done(_started(config, here))
-        same, rests = _results(here) == expected, _rests(here)
-        bad.add_to_last(
+            t = _newest(run_folder)
+            failures.add(float(t is None or t < newest), f"run {run}, killed after {delay:.2f} s: a checkpoint is lost")
+            newest = t or newest
+        _require_done(_started(config, run_folder))
+        same, rests = _results(run_folder) == expected, _rests(run_folder)
+        failures.add_to_last(
             float(not same or bool(rests)), f"run {run}: {'another result' if not same else f'left {rests}'}"
         )
-    return bad.row(
+    return failures.row(
         "SIGKILLs of a run: a checkpoint lost, a rest after the next start, or another result", "cpu", 0, 200
     )
 

@@ -203,13 +203,13 @@ class Lifecycle(RuleBasedStateMachine):
 @contextmanager
 def _refused(kind: type[Exception], match: str) -> Iterator[None]:
     """As pytest.raises, whose failure is no Exception."""
-    said = None
+    message = None
     try:
         yield
     except kind as error:
-        said = str(error)
-    assert said is not None, f"{kind.__name__} was not raised: {match}"
-    assert re.search(match, said), f"{said} does not say {match}"
+        message = str(error)
+    assert message is not None, f"{kind.__name__} was not raised: {match}"
+    assert re.search(match, message), f"{message} does not match {match}"
 
 
 def _require_same(before: dict[str, torch.Tensor], now: dict[str, torch.Tensor]) -> None:

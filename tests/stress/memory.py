@@ -52,25 +52,26 @@ def run(overrides: Sequence[str]) -> tuple[float, float, float, int]:
     gc.collect()
     ctypes.CDLL("libc.so.6").malloc_trim(0)
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
-    base, found, most, reached = memory.resident(), list[memory.Needs](), [0], [0]
-    count, fit = memory.needs, job.fit
+    base, gaussians, peak, plans = memory.resident(), 0, 0, list[memory.Needs]()
+    needs, fit = memory.needs, job.fit
 
     def noted(state: TrainState, rasterizer) -> memory.Needs:
-        found.append(count(state, rasterizer))
-        return found[-1]
+        plans.append(needs(state, rasterizer))
+        return plans[-1]
 
-    def watched(state: TrainState, *arguments, **options) -> TrainState:
-        inner = options.pop("progress")
+    def watched(state: TrainState, *arguments, progress, **options) -> TrainState:
+        nonlocal peak
 
-        def progress(state: TrainState) -> None:
-            most[0] = max(most[0], len(state.field))
-            inner(state)
+        def counted(state: TrainState) -> None:
+            nonlocal gaussians
+            gaussians = max(gaussians, len(state.field))
+            progress(state)
 
-        ended = fit(state, *arguments, progress=progress, **options)
-        reached[0] = memory.peak()
+        ended = fit(state, *arguments, progress=counted, **options)
+        peak = memory.peak()
         return ended
 
     with mock.patch.object(memory, "needs", noted), mock.patch.object(job, "fit", watched):
         job.run(composed(*overrides), folder / "run")
-    one = found[0]
-    return (one.peak(most[0]) - base) / 2**20, (reached[0] - base) / 2**20, (one.reached - base) / 2**20, most[0]
+    plan = plans[0]
+    return *((size - base) / 2**20 for size in (plan.peak(gaussians), peak, plan.reached)), gaussians

@@ -50,25 +50,25 @@ def measure(backends: Mapping[str, Rasterizer], *, every: int = 1) -> Iterator[R
     v = torch.randn(1, 9, 9, 3, generator=torch.Generator().manual_seed(0))
     images, gradients = ({name: Worst() for name in backends} for _ in range(2))
     for where, splats in cases(every):
-        right = exact(to(splats, torch.float64), _CAMERA)
-        theirs = right.vjp(v.double()) if bool(right.visible.any()) else None
+        reference = exact(to(splats, torch.float64), _CAMERA)
+        expected = reference.vjp(v.double()) if bool(reference.visible.any()) else None
         for name, draw in backends.items():
-            found = draw(splats, _CAMERA)
-            images[name].add(float((found.image.double() - right.image).abs().max()), where)
-            if theirs is not None:
-                gradients[name].add(_gradient_error(found.vjp(v), theirs, splats), where)
+            rendering = draw(splats, _CAMERA)
+            images[name].add(float((rendering.image.double() - reference.image).abs().max()), where)
+            if expected is not None:
+                gradients[name].add(_gradient_error(rendering.vjp(v), expected, splats), where)
     for name in backends:
         yield images[name].row("single Gaussians: image", name, _IMAGE, 13_923)
         yield gradients[name].row("single Gaussians: gradient", name, _GRADIENT, gradients[name].cases * every)
 
 
-def _gradient_error(ours, theirs, splats: Splats) -> float:
+def _gradient_error(gradients, expected, splats: Splats) -> float:
     """The largest relative error over the attributes, each in units that its own scale removes: g · parameter."""
     units = {"means": splats.means, "quats": splats.quats, "scales": splats.scales, "opacities": splats.opacities}
     errors, sizes = [], []
     for name in NAMES:
         unit = units.get(name, torch.ones(1)).double().abs().amax()
-        a, b = gradient_of(ours, name).double() * unit, gradient_of(theirs, name) * unit
+        a, b = gradient_of(gradients, name).double() * unit, gradient_of(expected, name) * unit
         errors.append(float(torch.linalg.vector_norm(a - b)))
         sizes.append(float(torch.linalg.vector_norm(b)))
     scale = max(sizes)

@@ -1,4 +1,4 @@
-"""What a stress measurement found, and the table of all of them."""
+"""The result of a stress measurement, and the table of all of them."""
 
 from __future__ import annotations
 
@@ -74,18 +74,20 @@ def write(path: Path, rows: Iterable[Row]) -> None:
     files.write_csv(path, ({name: getattr(row, name) for name in names} for row in rows), names)
 
 
-def merged(earlier: Sequence[Row], found: Sequence[Row], order: Sequence[str], whole: Container[str] = ()) -> list[Row]:
-    """The rows that were measured now in place of their earlier ones, by part.
+def merged(
+    earlier: Sequence[Row], measured: Sequence[Row], order: Sequence[str], whole: Container[str] = ()
+) -> list[Row]:
+    """The earlier rows with the measured ones in their places, by part.
 
     Args:
         whole: the parts that were measured to the end: an earlier row of theirs that was not measured again goes.
     """
-    now = {(row.part, row.what, row.backend) for row in found}
+    now = {(row.part, row.what, row.backend) for row in measured}
     kept = [
         row for row in earlier
         if row.part in order and row.part not in whole and (row.part, row.what, row.backend) not in now
     ]  # fmt: skip
-    return sorted([*kept, *found], key=lambda row: order.index(row.part))
+    return sorted([*kept, *measured], key=lambda row: order.index(row.part))
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ import torch
 from clear_strategies import GCO, P2G, SVS, Conductor, Objective
 from clear_strategies.density.adaptive import DensitySettings
 from clear_strategies.schedules import scaled
-from clear_strategies.training import checkpoint
+from clear_strategies.training import checkpoint, memory
 from clear_strategies.training.evaluation import evaluate
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.mip import MipFilter
@@ -52,7 +52,7 @@ def run(iterations: int) -> list[Row]:
         density=scaled(DensitySettings(max_gaussians=400, threshold=1e-4), stretch),
         rates=scaled(LearningRates(), stretch), mip=scaled(MipFilter(), stretch),
     )  # fmt: skip
-    memory, files, bad = [], [], 0
+    resident, files, bad = [], [], 0
     with tempfile.TemporaryDirectory() as folder:
         for t in range(1, iterations + 1):
             iterate(state, rasterizer)
@@ -61,22 +61,15 @@ def run(iterations: int) -> list[Row]:
                 evaluate(state, scene, rasterizer, t)
                 checkpoint.save(Path(folder), state.checkpoint({}))
                 gc.collect()
-                memory.append(_resident())
+                resident.append(memory.resident())
                 files.append(len(os.listdir("/proc/self/fd")))  # noqa: PTH208
-    settled = len(memory) // 5
-    growth = max(memory[settled:]) / memory[settled - 1] - 1
-    where = (
-        f"{memory[settled - 1] >> 20} MiB after {iterations // 5:,}, {max(memory[settled:]) >> 20} MiB at most since"
-    )
+    settled = len(resident) // 5
+    before, after = resident[settled - 1], max(resident[settled:])
+    where = f"{before >> 20} MiB after {iterations // 5:,}, {after >> 20} MiB at most since"
     more = float(max(files[settled:]) - files[settled - 1])
-    found = {
-        "growth of the memory after a fifth of the run": (growth, _GROWTH, where),
+    measured = {
+        "growth of the memory after a fifth of the run": (after / before - 1, _GROWTH, where),
         "open files more than after a fifth of the run": (more, 0, f"{files[-1]} open"),
         "iterations with a loss that is not finite": (float(bad), 0, "none"),
     }
-    return [Row(f"soak: {what}", backend, iterations, *said, _GOAL) for what, said in found.items()]
-
-
-def _resident() -> int:
-    """Bytes."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return [Row(f"soak: {what}", backend, iterations, *numbers, _GOAL) for what, numbers in measured.items()]
