@@ -126,12 +126,10 @@ def check_is_reproducible(make: Make) -> None:
 
 def check_state_is_all_there_is(make: Make) -> None:
     """A strategy given its state back goes on as if it had never stopped, from any iteration."""
+    trace = [*_trace(_conductor(make), 1, _STEPS)]
     for cut in range(1, _STEPS):
-        whole = _conductor(make)
-        trace = [*_trace(whole, 1, _STEPS)]
-        first = _conductor(make)
+        first, second = _conductor(make), _conductor(make)
         beginning = [*_trace(first, 1, cut)]
-        second = _conductor(make)
         second.load_state_dict(first.state_dict())
         rest = [*_trace(second, cut, _STEPS)]
         for a, b in zip(trace, [*beginning, *rest], strict=True):
