@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -46,13 +46,8 @@ class Image(NamedTuple):
     name: str
 
 
-class Point(NamedTuple):
-    """A point with its 8-bit colour and the ids of the images that observe it."""
-
-    id: int
-    position: tuple[float, ...]
-    color: tuple[int, ...]
-    track: np.ndarray
+Point = tuple[int, Sequence[float], Sequence[int], np.ndarray]
+"""Id, position, 8-bit colour, and the ids of the images that observe it; a plain tuple, because there may be millions."""
 
 
 def damaged(path: Path, where: str, problem: str) -> DataError:
@@ -144,11 +139,11 @@ def _binary_images(path: Path) -> Iterator[Image]:
 def _binary_points(path: Path) -> Iterator[Point]:
     file = _Bytes(path)
     for i in range(file.count("number of points", 8 + 24 + 3 + 8 + 8)):
-        number, x, y, z, r, g, b, _ = file.take("<Q3d3Bd", f"point {i}")
+        record = file.take("<Q3d3Bd", f"point {i}")  # id, position, colour, error
         length = file.count(f"track of point {i}", 8)
         track = np.frombuffer(file.data, "<i4", 2 * length, file.at)[::2]
         file.at += 8 * length
-        yield Point(number, (x, y, z), (r, g, b), track)
+        yield record[0], record[1:4], record[4:7], track
     file.finish()
 
 
@@ -187,12 +182,12 @@ def _text_points(path: Path) -> Iterator[Point]:
     for line, cells in _rows(path):
         if len(cells) < 8 or len(cells) % 2:
             raise damaged(path, f"line {line}", f"has {len(cells)} columns where 8 and pairs belong")
-        position = tuple(_number(path, line, cell) for cell in cells[1:4])
-        color = tuple(_integer(path, line, cell) for cell in cells[4:7])
+        position = [_number(path, line, cell) for cell in cells[1:4]]
+        color = [_integer(path, line, cell) for cell in cells[4:7]]
         if not all(0 <= c <= 255 for c in color):
-            raise DataError(path, f"line {line}", f"has the colour {list(color)}", "colours lie in 0..255")
+            raise DataError(path, f"line {line}", f"has the colour {color}", "colours lie in 0..255")
         track = np.array([_integer(path, line, cell) for cell in cells[8::2]], np.int64)
-        yield Point(_integer(path, line, cells[0]), position, color, track)
+        yield _integer(path, line, cells[0]), position, color, track
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
