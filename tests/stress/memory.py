@@ -39,7 +39,9 @@ def measure() -> Iterator[Row]:
             continue
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
             predicted, reached, loading, gaussians = pool.submit(run, overrides).result()
-        where = f"predicted {predicted:.0f} MiB for {gaussians:,} Gaussians, taken {reached:.0f}, {loading:.0f} before it"
+        where = (
+            f"predicted {predicted:.0f} MiB for {gaussians:,} Gaussians, taken {reached:.0f}, {loading:.0f} before it"
+        )
         yield Row("predicted peak of memory: relative error", name, 1, abs(predicted / reached - 1), _BOUND, where)
 
 
