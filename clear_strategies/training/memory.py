@@ -30,6 +30,7 @@ _log = logging.getLogger(__name__)
 _FLOAT: Final = 4  # bytes
 _MIB: Final = 1 << 20
 _MOST: Final = 1 << 40  # Gaussians
+_KEPT: Final = 20 * _MIB  # what training frees and the C library keeps: 18 to 29 MiB on three scenes, with one arena 7
 # Floats per Gaussian, beside the parameters: what one iteration holds at once.
 # Activation: scales twice, their squares, sigmoid, coefficient, factor, opacities.
 _ACTIVATION: Final = 3 + 3 + 3 + 3 + 1 + 1 + 1 + 2
@@ -55,6 +56,7 @@ class Needs:
         worked: per Gaussian, while an iteration runs.
         lists: per Gaussian, of the rasterizer; at most `most_lists` in all.
         pixels: of the images of one iteration, and of the coarse SR images of all views.
+        kept: by the C library, of what training frees.
         cuda: this is the device's memory, not the process's.
     """
 
@@ -66,13 +68,14 @@ class Needs:
     lists: int
     most_lists: int
     pixels: int
+    kept: int = 0
     cuda: bool = False
 
     def peak(self, gaussians: int) -> int:
         """With this many Gaussians, from the start or by growing to them. Checkpoints are written without copies."""
         grown = max(0, gaussians - self.gaussians) * self.held
         drawn = min(gaussians * self.lists, self.most_lists)
-        return max(self.reached, self.now + grown + gaussians * self.worked + drawn + self.pixels)
+        return max(self.reached, self.now + grown + gaussians * self.worked + drawn + self.pixels + self.kept)
 
     def fits(self, budget: int) -> int:
         """The most Gaussians whose peak is within the budget, 0 where not even the first are."""
@@ -107,6 +110,7 @@ def needs(state: TrainState, rasterizer: Rasterizer) -> Needs:
         most_lists=most,
         pixels=_FLOAT * _PER_PIXEL * (view.hr.image.shape[0] * view.hr.image.shape[1])
         + state.skip_policy.coarse_bytes(state.views, state.t),
+        kept=0 if cuda else _KEPT,
         cuda=cuda,
     )
 

@@ -27,6 +27,7 @@ def test_the_peak_is_that_of_loading_or_what_training_adds():
     assert NEEDS.peak(1000) == 150 * MIB
     assert NEEDS.peak(100_000) == 100 * MIB + 99_000 * 800 + 100_000 * 700 + 40 * MIB + MIB
     assert replace(NEEDS, most_lists=400 * MIB).peak(100_000) - NEEDS.peak(100_000) == 100_000 * 500 - 40 * MIB
+    assert replace(NEEDS, kept=MIB).peak(100_000) - NEEDS.peak(100_000) == MIB
 
 
 @pytest.mark.parametrize("budget", [151, 300, 4000])
