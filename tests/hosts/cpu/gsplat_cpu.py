@@ -18,6 +18,7 @@ theirs = inspect.signature(gsplat.rendering.rasterization)
 @functools.wraps(gsplat.rendering.rasterization)
 def rasterization(*args, **kwargs):
     call = theirs.bind(*args, **kwargs).arguments
+    call["viewmats"] = call["viewmats"].detach()  # poses have no gradient in this package
     renders, alphas, info = autograd.rasterization(**{k: v for k, v in call.items() if k in KNOWN}, backend="torch")
     if call.get("with_ut"):  # the unscented transform has no gradient of the projected centres
         info["means2d"] = info["means2d"].detach()
