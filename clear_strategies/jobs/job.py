@@ -134,10 +134,7 @@ class _Training:
 
 
 def run(
-    config: DictConfig,
-    folder: Path,
-    watch: Callable[[], None] | None = None,
-    overrides: Sequence[str] | None = None,
+    config: DictConfig, folder: Path, watch: Callable[[], None] | None = None, overrides: Sequence[str] | None = None
 ) -> float | None:
     """Run one job and write its files into `folder`.
 
@@ -334,15 +331,8 @@ def _train(
         write_cameras(training.folder, place.scene)
         watched = _watched(training, state, place)
         with watched as after_step, progress_bar(state, after_step, training.chosen.title, shown=alone) as progress:
-            checkpoints = training.folder / CHECKPOINTS
-            fit(
-                state,
-                place.device_scene,
-                rasterizer,
-                checkpoints=checkpoints,
-                config=training.compared,
-                progress=progress,
-            )
+            folder = training.folder / CHECKPOINTS
+            fit(state, place.device_scene, rasterizer, checkpoints=folder, config=training.compared, progress=progress)
         seconds = time.perf_counter() - began
         training.conductor.on_fit_end()  # its memory is for the results
         memory.release()

@@ -304,11 +304,7 @@ class Conductor:
             s.logs.clear()
 
     def _backward_hr(
-        self,
-        hr: Shot,
-        step: Step,
-        vjp: Callable[..., Sequence[Any]],
-        lr_cotangents: Tensor | None = None,
+        self, hr: Shot, step: Step, vjp: Callable[..., Sequence[Any]], lr_cotangents: Tensor | None = None
     ) -> tuple[Any | None, HrGradients[Any]]:
         """∇(λ_LR L_LR) where its cotangents [1, H, W, 3] are given, and the gradients of the HR losses."""
         stage = self.work_log.stage
