@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 from torch import Tensor
@@ -90,14 +90,14 @@ def _back_projection(views: Sequence[View], down: DownKernel) -> dict[str, str]:
     before = [view.disagreement for view in views if view.disagreement is not None]
     if not before:
         return {}
-    after = [(images.downsample(view.hr.image, view.factor, down) - view.lr.image).abs() for view in views]
+    after = ((images.downsample(view.hr.image, view.factor, down) - view.lr.image).abs() for view in views)
     text = f"SR images differed from the LR photos by {_grey_levels(before):.2f} grey levels, now by {_grey_levels(after):.2f}"
     return {"back-projection": text}
 
 
 def _added_detail(views: Sequence[View]) -> float:
     """Mean |I_HR - U(I_LR)| in grey levels of 255. Logs a warning if there is no detail."""
-    added = _grey_levels([(v.hr.image - images.upsample(v.lr.image, v.factor)).abs() for v in views])
+    added = _grey_levels((v.hr.image - images.upsample(v.lr.image, v.factor)).abs() for v in views)
     if added < _ROUNDING:
         _log.warning(
             "the SR images add %.2f grey levels to bicubic: HR still constrains the field between LR pixels, but there "
@@ -106,6 +106,7 @@ def _added_detail(views: Sequence[View]) -> float:
     return added
 
 
-def _grey_levels(differences: Sequence[Tensor]) -> float:
-    """The mean over images of their mean difference, in grey levels of 255."""
-    return 255 * sum(float(difference.mean()) for difference in differences) / len(differences)
+def _grey_levels(differences: Iterable[Tensor]) -> float:
+    """The mean over images of their mean difference, in grey levels of 255. Of many photos one difference at a time is held."""
+    means = [float(difference.mean()) for difference in differences]
+    return 255 * sum(means) / len(means)
