@@ -58,9 +58,8 @@ def ray_angles(a: Camera, b: Camera, points: Float[Tensor, "N 3"]) -> Float[Tens
     """Angles at these points (float64) between the rays from two cameras, degrees."""
     x, y = points - a.center.double(), points - b.center.double()
     sine = torch.linalg.vector_norm(torch.linalg.cross(x, y), dim=-1)
-    return torch.rad2deg(
-        torch.atan2(sine, (x * y).sum(-1))
-    )  # not from the cosine alone: that of a small angle rounds to 1
+    # Not from the cosine alone: that of a small angle rounds to 1.
+    return torch.rad2deg(torch.atan2(sine, (x * y).sum(-1)))
 
 
 def sample_colors(image: Float[Tensor, "H W 3"], pixels: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
