@@ -102,15 +102,12 @@ class Run:
         )
 
 
-def train(
-    photos: str | Path | None = None, *settings: str, minutes: float | None = None, folder: str | Path | None = None
-) -> Run:
+def train(photos: str | Path | None = None, *settings: str, folder: str | Path | None = None) -> Run:
     """Train on photos, a video or a capture, as `clear-strategies train` does, and return the finished run.
 
     Args:
         photos: a folder of photos or of a capture, or a video; None: the demo scene.
         settings: as on the command line: "fit.iterations=3000", "+strategy=clear".
-        minutes: that the whole run should take; None: no limit. See `fit.minutes`.
         folder: for the run's files; None: outputs/<name>/<time>.
 
     Raises:
@@ -119,7 +116,6 @@ def train(
     """
     exit_codes.require_train()
     console.show()
-    settings = settings if minutes is None else (*settings, f"fit.minutes={minutes}")
     overrides = list(settings) if photos is None else train_command.overrides([str(photos), *settings])
     if photos is None and not any(word.startswith(train_command.CHOOSE_STRATEGIES) for word in settings):
         overrides.append("+strategy=best")

@@ -23,7 +23,6 @@ or a Blender scene in the folder.
 The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}. Settings change that:
 
   clear-strategies train photos/ fit.iterations=3000
-  clear-strategies train photos/ --minutes 4                      done in about four minutes
   clear-strategies train photos/ data.views.test_every=8          every 8th photo is kept for testing
   clear-strategies train photos/ data.views.max_hr_megapixels=8   sharper, slower, more memory
   clear-strategies train clip.mp4 --frames 24                     24 of its sharpest frames
@@ -36,8 +35,8 @@ The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}
 CHOOSE_STRATEGIES: Final = ("+strategy=", "+method=", "experiment=", "+experiment=")
 _PLAIN: Final = re.compile(r"(/|\./|(\.\./)+)?[A-Za-z_][\w./-]*", re.ASCII)  # needs no quotes, for Hydra or a shell
 _NO_TEXT: Final = ("null", "true", "false", "nan", "inf")
-_FLAGS: Final = {"--minutes": "fit.minutes", "--frames": "data.reader.frames"}
-_CHOOSE_ITERATIONS: Final = ("fit.iterations=", "fit.minutes=", "experiment=", "+experiment=", "+protocol=", "+scene=")
+_FLAGS: Final = {"--frames": "data.reader.frames"}
+_CHOOSE_ITERATIONS: Final = ("fit.iterations=", "experiment=", "+experiment=", "+protocol=", "+scene=")
 
 
 def main(arguments: list[str]) -> None:
@@ -74,7 +73,7 @@ def overrides(arguments: Sequence[str]) -> list[str]:
 
 
 def _settings(arguments: Sequence[str]) -> list[str]:
-    """Hydra's overrides: `--minutes M` and `--minutes=M` are one of them."""
+    """Hydra's overrides: `--frames N` and `--frames=N` are one of them."""
     settings, rest = list[str](), iter(arguments)
     for word in rest:
         name, equals, value = word.partition("=")
@@ -83,7 +82,7 @@ def _settings(arguments: Sequence[str]) -> list[str]:
             continue
         value = value if equals else next(rest, "")
         if not value or value.startswith("-"):
-            raise SettingError(f"{name} needs a number: {name} 4.")
+            raise SettingError(f"{name} needs a number: {name} 24.")
         settings.append(f"{_FLAGS[name]}={value}")
     return settings
 

@@ -22,8 +22,6 @@ from clear_strategies.data.prepare import save_lr
 from clear_strategies.data.scene import Scene
 from clear_strategies.jobs import device, resume
 from clear_strategies.jobs import scene as scenes
-from clear_strategies.jobs.budget import Budget
-from clear_strategies.jobs.budget import Plan as TimePlan
 from clear_strategies.jobs.lock import hold
 from clear_strategies.jobs.settings import JobSettings, settings_of
 from clear_strategies.merging.conductor import Conductor
@@ -69,7 +67,6 @@ class _Training:
         folder: for its files.
         overrides: of the command line, for the report; None: unknown.
         pictures: that it writes; None for a baseline, since the run's own pictures show it.
-        timed: how it keeps to its minutes; None: it has no limit.
     """
 
     settings: JobSettings
@@ -78,7 +75,6 @@ class _Training:
     folder: Path
     overrides: Sequence[str] | None
     pictures: results.Pictures | None = None
-    timed: TimePlan | None = None
 
     @classmethod
     def of(
@@ -87,26 +83,6 @@ class _Training:
         """The training with these settings, built from the configuration `values`."""
         conductor = settings.conductor(settings.fit.stretch)
         return cls(settings, conductor, resume.comparable(values), folder, overrides)
-
-    def lasting(self, iterations: int) -> _Training:
-        """The same training with this number of iterations, whatever time it takes."""
-        settings = replace(self.settings, fit=replace(self.settings.fit, iterations=iterations, minutes=None))
-        compared = {**self.compared, "fit.iterations": iterations, "fit.minutes": None}
-        return replace(self, settings=settings, conductor=settings.conductor(settings.fit.stretch), compared=compared)
-
-    def with_data(self, data: scenes.DataSettings) -> _Training:
-        """The same training with this limit of its HR images."""
-        if data is self.settings.data:
-            return self
-        compared = {**self.compared, "data.views.max_hr_megapixels": data.views.max_hr_megapixels}
-        return replace(self, settings=replace(self.settings, data=data), compared=compared)
-
-    def timed_by(self, budget: Budget, place: _Place, trainings: int) -> _Training:
-        """The same training with as many iterations as fit into the time that is left for this number of trainings."""
-        fit = self.settings.fit
-        pilot, rasterizer = self.lasting(fit.iterations).start(place, None), place.drawing.rasterizer
-        time_plan = budget.iterations(pilot, rasterizer, trainings=trainings, maps=fit.map_views, frames=fit.video)
-        return replace(self.lasting(time_plan.iterations), timed=time_plan)
 
     @property
     def chosen(self) -> plan.Chosen:
@@ -156,7 +132,6 @@ def run(
     values = tree(config)
     settings = settings_of(values)
     fit = settings.fit
-    budget = None if fit.minutes is None else Budget.of(fit.minutes)
     if fit.viewer:
         live.require_viewer()
     if fit.log == "tensorboard":
@@ -169,7 +144,7 @@ def run(
     drawing = device.drawing(settings.rasterizer, fit.device)
     with hold(folder), signals.interrupted("before training began"):
         files.sweep(folder)
-        return _run(training, baseline, drawing, watch, budget)
+        return _run(training, baseline, drawing, watch)
 
 
 def _why_without_baseline(settings: JobSettings) -> str | None:
@@ -191,7 +166,6 @@ def _run(
     baseline: _Training | None,
     drawing: device.Drawing,
     watch: Callable[[], None] | None,
-    budget: Budget | None,
 ) -> float | None:
     settings = training.settings
     if settings.fit.resume == resume.AUTO:
@@ -201,17 +175,13 @@ def _run(
             return None if score is None else score.psnr
     threads, reason = device.threads(settings.fit.threads)
     torch.set_num_threads(threads)
-    scene, data = _loaded(training, budget)
+    scene = scenes.load(settings.data, settings.prior, settings.fit.seed, training.conductor.prior)
     if settings.data.save_lr is not None:
         save_lr(scene, Path(settings.data.save_lr))
         return None
     device.log_choice(settings.rasterizer, drawing)
     drawing = drawing.over(scene.background)
     place = _Place(scene, scene.to(drawing.device), drawing, watch)
-    training, baseline = training.with_data(data), None if baseline is None else baseline.with_data(data)
-    if budget is not None:
-        training = training.timed_by(budget, place, 1 if baseline is None else 2)
-        baseline = None if baseline is None else baseline.lasting(training.settings.fit.iterations)
     state, baseline_state = _started(training, baseline, place)
     _announce(training, state, place, f"{threads} ({reason})")
     # In a sweep the console shows one line per job; the rest is in run.log.
@@ -231,15 +201,6 @@ def _run(
         _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, training.folder, evaluation, seconds))
     mean = evaluation.mean("test") or evaluation.mean("train")
     return None if mean is None else mean.psnr
-
-
-def _loaded(training: _Training, budget: Budget | None) -> tuple[Scene, scenes.DataSettings]:
-    """The scene, and the data set's settings with the size of HR that the time allows."""
-    settings, capture, data = training.settings, None, training.settings.data
-    if budget is not None:
-        capture = data.reader()
-        data = scenes.timed(capture, data, settings.prior, budget)
-    return scenes.load(data, settings.prior, settings.fit.seed, training.conductor.prior, capture), data
 
 
 def _started(training: _Training, baseline: _Training | None, place: _Place) -> tuple[TrainState, TrainState | None]:
@@ -263,7 +224,6 @@ def _announce(training: _Training, state: TrainState, place: _Place, threads: st
         "rasterizer": f"{drawing.name}, kernel {drawing.kernel} px²",
         "threads": threads,
         "memory": memory.summary(needed, most),
-        **({} if training.timed is None else {"time": training.timed.description()}),
     }
     described = plan.describe(place.scene, state, training.chosen, machine)
     _log.log(logging.DEBUG if _in_sweep() else logging.INFO, "%s", described.short)
@@ -299,8 +259,6 @@ def _watched(training: _Training, state: TrainState, place: _Place) -> Iterator[
     """
     fit_settings, painter = training.settings.fit, Painter(state.field, place.drawing.make)
     calls = [] if place.watch is None else [place.watch]
-    if training.timed is not None:
-        calls.append(training.timed.hurry(state))
     with ExitStack() as stack:
         if fit_settings.viewer:
             cameras, title = read_cameras(training.folder / CAMERAS), f"{place.scene.name} · {training.chosen.title}"

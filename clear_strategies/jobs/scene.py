@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final, cast
 
 from clear_strategies.data.capture import Capture
@@ -16,9 +16,8 @@ from clear_strategies.data.prepare import at_hr, prepare
 from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
 from clear_strategies.data.priors.ncnn import factors, missing_packages
 from clear_strategies.data.scene import Scene
-from clear_strategies.data.view_settings import ViewSettings, split
+from clear_strategies.data.view_settings import ViewSettings
 from clear_strategies.errors import SettingError
-from clear_strategies.jobs.budget import Budget
 from clear_strategies.settings import LISTED
 
 _log = logging.getLogger(__name__)
@@ -93,15 +92,13 @@ def load(
     prior: PriorSettings,
     seed: int,
     decorate: Callable[[Prior], Prior] = lambda prior: prior,
-    capture: Capture | None = None,
 ) -> Scene:
     """Read the data set and prepare its views and its initial points.
 
     Args:
         decorate: applied to the chosen prior, see `Conductor.prior`.
-        capture: where it has been read already.
     """
-    capture, views = read(data, prior, capture)
+    capture, views = read(data, prior)
     if data.save_lr is not None:
         chosen: Prior = Bicubic()  # the images that the prior itself reads may not exist yet
     else:
@@ -116,30 +113,12 @@ def load(
     return scene
 
 
-def read(data: DataSettings, prior: PriorSettings, capture: Capture | None = None) -> tuple[Capture, ViewSettings]:
-    """The capture as the data set has it, and the settings of its views, both within the limit of the HR images.
-
-    Args:
-        capture: where it has been read already.
-    """
-    if capture is None:
-        capture = data.reader()
+def read(data: DataSettings, prior: PriorSettings) -> tuple[Capture, ViewSettings]:
+    """The capture as the data set has it, and the settings of its views, both within the limit of the HR images."""
+    capture = data.reader()
     require_text((capture.name, *(frame.name for frame in capture.frames), *capture.unplaced))
     auto = isinstance(prior, AutoPrior) and data.save_lr is None
     return within_limit(capture, data.views, reaches=_reach(prior, auto), super_resolve=not auto)
-
-
-def timed(capture: Capture, data: DataSettings, prior: PriorSettings, budget: Budget) -> DataSettings:
-    """The data set with HR images no larger than the time for SR images allows; the limit has three digits, so that a resumed
-    run can be given it.
-    """
-    views = data.views
-    if views.photos_are != "lr" or isinstance(prior, functools.partial):
-        return data
-    limit = budget.megapixels(split(capture, views)[0], _chosen(prior, capture, views.sr_scale), views.sr_scale)
-    if limit is None or (views.max_hr_megapixels is not None and views.max_hr_megapixels <= limit):
-        return data
-    return replace(data, views=replace(views, max_hr_megapixels=float(f"{limit:.3g}")))
 
 
 def _chosen(prior: PriorSettings, capture: Capture, factor: int) -> Prior:

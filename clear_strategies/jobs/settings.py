@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from clear_strategies.compose import ConductorSettings
-from clear_strategies.core.checks import require_number, require_whole
+from clear_strategies.core.checks import require_whole
 from clear_strategies.data.priors import Bicubic, Prior
 from clear_strategies.errors import SettingError
 from clear_strategies.jobs import device, scene
@@ -39,8 +39,6 @@ class RunSettings(FitSettings):
         resume: a run's folder or one of its checkpoints: continue from there, bit for bit. auto: look into the run's own
             folder. If the run is finished, train nothing; if it has checkpoints, continue from the newest one; else start
             from the beginning. Both apply to the baseline, too.
-        minutes: of wall time that the whole run should take: the size of HR is reduced and the number of iterations is chosen for
-            it, `iterations` at most, by a measurement of some seconds. None: it takes as long as it takes.
         device: cpu or cuda: where field, views and optimizer are. None: cuda if torch finds it and the rasterizer draws
             there, else cpu. A run may be resumed on another device; its bits then differ.
         threads: number of threads of torch and the kernels. None: all cores, divided by the jobs that run at once (joblib,
@@ -55,7 +53,6 @@ class RunSettings(FitSettings):
     viewer: bool = False
     baseline: bool = False
     resume: str | None = None
-    minutes: float | None = None
     device: Device | None = None
     threads: int | None = None
 
@@ -63,14 +60,6 @@ class RunSettings(FitSettings):
         FitSettings.__post_init__(self)
         for name in ("map_views", "video", "page"):
             require_whole(name, getattr(self, name), least=0)
-        if self.minutes is not None:
-            require_number("minutes", self.minutes, above=0)
-        if self.minutes is not None and self.resume is not None:
-            raise SettingError(
-                "minutes and resume exclude each other: a resumed run has the iterations and the size of HR that it began "
-                "with. Leave minutes out, and give fit.iterations and data.views.max_hr_megapixels the values that the run "
-                "chose; where one differs, resuming refuses and names it."
-            )
         if self.threads is not None:
             require_whole("threads", self.threads, least=1)
 

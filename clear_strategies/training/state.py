@@ -117,12 +117,8 @@ class TrainState:
             return
         s = self.skip_policy.skips
         reason = f"the training views' loss fell by less than {s.plateau_gain:.1%} in {s.plateau_window} iterations"
-        self.skip_until(min(s.plateau_to, self.settings.iterations), reason)
-
-    def skip_until(self, last: int, reason: str) -> None:
-        """Leave out the iterations from the next one to `last`."""
-        done, left_out = self.t - 1, last + 1 - self.t
-        self.t = last + 1
+        self.t = min(s.plateau_to, self.settings.iterations) + 1
+        left_out = self.t - done - 1
         self.optimizer.steps += left_out  # the learning rates follow the iteration
         self.conductor.work_log.skip("iterations", reason, left_out)
         _log.info("t=%d: %s; training goes on at t=%d.", done, reason, self.t)

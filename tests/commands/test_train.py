@@ -22,16 +22,12 @@ def test_the_reader_is_the_one_of_what_lies_in_the_folder(tmp_path, file, kind):
     assert train.detect(tmp_path) == (kind, tmp_path)
 
 
-@pytest.mark.parametrize("said", [["--minutes", "2.5"], ["--minutes=2.5"], ["fit.minutes=2.5"]], ids=" ".join)
-def test_minutes_are_a_setting_and_leave_the_number_of_iterations_open(tmp_path, said):
-    fit = tree(composed(train.overrides([str(tmp_path), "fit.seed=3", *said, "fit.video=0"]), "config"))["fit"]
-    assert (fit["minutes"], fit["seed"], fit["video"], fit["iterations"]) == (2.5, 3, 0, 10_000)
-    assert "fit.iterations=1000" in train.overrides([str(tmp_path)])
-
-
 def test_frames_are_a_setting_of_the_reader_and_photos_in_a_folder_called_images_are_found(tmp_path):
     (tmp_path / "clip.mp4").touch()
-    assert "data.reader.frames=24" in train.overrides([str(tmp_path / "clip.mp4"), "--frames", "24"])
+    for said in (["--frames", "24"], ["--frames=24"]):
+        overrides = train.overrides([str(tmp_path / "clip.mp4"), *said, "fit.seed=3"])
+        assert overrides[-2:] == ["data.reader.frames=24", "fit.seed=3"]
+        assert "fit.iterations=1000" in overrides
     (tmp_path / "images").mkdir()
     assert train.detect(tmp_path) == ("photos", tmp_path / "images")
 

@@ -10,11 +10,9 @@ import pytest
 from clear_strategies.compose import tree
 from clear_strategies.errors import DataError
 from clear_strategies.jobs import job, resume
-from clear_strategies.jobs.budget import Budget
-from clear_strategies.outputs import metrics
 from clear_strategies.training.loop import iterate
 from clear_strategies.training.signals import Interrupted
-from tests.helpers import pictures, toy
+from tests.helpers import toy
 from tests.helpers.command_line import TINY
 from tests.helpers.configs import composed
 from tests.helpers.short_run import start
@@ -40,19 +38,6 @@ def test_device_threads_and_memory_may_differ_and_defaults_are_compared_too():
     saved = replace(start(()).checkpoint({}), config=compared("density.every=50"))
     with pytest.raises(DataError, match=r"density\.every: 50 then, 100 now"):
         resume.restore(start(()), saved, Path("there"), compared())
-
-
-def test_a_run_is_not_resumed_with_another_size_of_hr_than_its_time_allowed(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(Budget, "megapixels", lambda *_: 0.0300049)
-    chosen = [*TINY, "+strategy=gco", "prior=bicubic", "fit.threads=1", "data.views.photos_are=lr"]
-    again = [*chosen, f"fit.resume={tmp_path / 'timed'}"]
-    with pictures.not_drawn():
-        job.run(composed(*chosen, "fit.minutes=0.001"), tmp_path / "timed")
-        config = metrics.read(tmp_path / "timed" / "metrics.json", "").config
-        assert config["data.views.max_hr_megapixels"] == 0.03
-        with pytest.raises(DataError, match=r"data\.views\.max_hr_megapixels: 0\.03 then, 2\.1 now"):
-            job.run(composed(*again), tmp_path / "again")
-        job.run(composed(*again, "data.views.max_hr_megapixels=0.03"), tmp_path / "again")
 
 
 def test_ctrl_c_after_training_names_the_checkpoint_that_was_saved(tmp_path: Path, monkeypatch):

@@ -12,7 +12,6 @@ from clear_strategies.data.priors.interface import (
     SuperResolved,
     fingerprint,
     network_of,
-    passes_of,
     super_resolved,
 )
 from clear_strategies.data.priors.ncnn import Ncnn
@@ -21,6 +20,5 @@ from clear_strategies.data.priors.self_ensembled import SelfEnsembled
 
 __all__ = [
     "BackProjected", "Bicubic", "Cached", "Corrupted", "DemoPrior", "DnnSuperres", "Images", "Ncnn", "Network", "Onnx",
-    "Prior", "SelfEnsembled", "SuperResolved", "cache_folder", "cached", "fingerprint", "network_of", "passes_of",
-    "super_resolved",
+    "Prior", "SelfEnsembled", "SuperResolved", "cache_folder", "cached", "fingerprint", "network_of", "super_resolved",
 ]  # fmt: skip

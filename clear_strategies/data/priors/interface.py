@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 import os
 import time
 from collections.abc import Iterator
@@ -88,11 +87,6 @@ def layers(prior: object) -> Iterator[object]:
     while prior is not None:
         yield prior
         prior = getattr(prior, "prior", None)
-
-
-def passes_of(prior: object) -> int:
-    """How many times a prior runs its network for one photo."""
-    return math.prod(getattr(inner, "passes", 1) for inner in layers(prior))
 
 
 def fingerprint(network: Network) -> str:

@@ -33,7 +33,6 @@ _REFUSED: dict[str, str] = {
     "fit.map_views=-1": "at least 0",
     "fit.video=-1": "at least 0",
     "fit.page=-1": "at least 0, got -1",
-    "fit.minutes=0": "> 0, got 0",
     "fit.threads=0": "at least 1",
     "fit.device=tpu": "cpu",
     "fit.seed=x": "whole number",
