@@ -8,8 +8,7 @@ One training iteration:
    parameter becomes the merged gradient. If a strategy has a densification score, the tensor that the densifier reads
    holds it; otherwise the densifier's statistic stays the host's own.
 3. Gradient clipping, unscaling, the optimizer step and densification are the host's, in any order.
-4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view. Then a strategy may densify
-   in place of the host.
+4. After the host's optimizer has stepped, it steps once more on the gradient of each extra view.
 
 The merge runs at the end of `backward()`, not in an optimizer hook. Gradient clipping therefore sees the merged gradient,
 optimizers other than `torch.optim.Optimizer` work, and so do hosts that densify before the step (3DGS) as well as hosts
@@ -38,7 +37,6 @@ from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients, only
 from integration.errors import HostError
 from integration.extra_steps import ExtraSteps
-from integration.host_field import HostDensity, HostField
 from integration.host_rendering import HostRendering, RenderAt, called_at, random_state_kept
 from integration.host_score import ScoreScaler, write_score
 from integration.start import announce, require_supported
@@ -65,7 +63,6 @@ class Attachment:
         accumulation: backward passes per optimizer step, each of 1/accumulation of the loss.
         masks: [h, w] by the name of a view, what the host multiplies its LR image by; the HR image is multiplied here.
         own_background: the host chooses the colour behind its renderings; `background` then counts for nothing.
-        field: its Gaussians, for a strategy that densifies in place of the host; None: the host densifies by itself.
 
     Attributes:
         t: the current iteration, from 1.
@@ -87,7 +84,6 @@ class Attachment:
         accumulation: int = 1,
         masks: Mapping[str, Tensor] | None = None,
         own_background: bool = True,
-        field: HostField | None = None,
     ) -> None:
         require_supported(conductor, accumulation)
         self._views = by_name(views)
@@ -110,8 +106,7 @@ class Attachment:
         self._logged: dict[str, deferred.Number] = {}
         self._hooks: list[Any] = []
         conductor.on_fit_start(len(views), seed, params()["means"].device, views)
-        announce(conductor, views, own_background=own_background, own_density=field is None)
-        self._density = HostDensity(conductor, field, views, seed)
+        announce(conductor, views, own_background=own_background)
 
     def render_view(self, view: View, render_at: RenderAt) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR."""
@@ -131,7 +126,6 @@ class Attachment:
             hr_grads = conductor.hr_gradients(shot, view, t)
         self._step = Step(t, view) if hr_grads is None else hr_grads.step
         if self._passes == 0:  # one step of the host, however many passes it accumulates
-            self._density.before_rendering()
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
                 with random_state_kept(means.device):
@@ -155,7 +149,7 @@ class Attachment:
         distinct = list(dict.fromkeys(optimizers))  # one optimizer may have several parameters
         self._hooks = [
             *(o.register_step_pre_hook(lambda *_: self._before_step()) for o in distinct[:1]),
-            *(o.register_step_post_hook(lambda o, *_: self._after_step(o)) for o in distinct),
+            *(o.register_step_post_hook(lambda o, *_: self._step_on_extra_views(o)) for o in distinct),
         ]
 
     def state_dict(self) -> dict[str, Any]:
@@ -166,7 +160,6 @@ class Attachment:
             "t": self.t, "passes": self._passes, "strategies": self.conductor.state_dict(),
             "view": None if self._step is None else self._step.view.name,
             "score": None if self._scaler is None else self._scaler.state_dict(),
-            "density": self._density.state_dict(),
         }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -179,7 +172,6 @@ class Attachment:
             self._step = Step(self.t, view)
         if self._scaler is not None and state.get("score") is not None:
             self._scaler.load_state_dict(state["score"])
-        self._density.load_state_dict(state.get("density", {}))
 
     def summary(self) -> str:
         """What was done how often, e.g. for the end of a log."""
@@ -215,13 +207,9 @@ class Attachment:
             self.counts["steps of the host alone"] += 1
         self._merges_before_step = merges
 
-    def _after_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """The steps on extra views, and what densifies in place of the host."""
-        if self._extra.stepping:
-            return
-        if steps := self._extra.step(optimizer):
+    def _step_on_extra_views(self, optimizer: torch.optim.Optimizer) -> None:
+        if not self._extra.stepping and (steps := self._extra.step(optimizer)):
             self.counts["extra views"] += steps
-        self._density.after_step(optimizer, self.t)
 
     def _finish_previous_step(self) -> None:
         """Call `on_resize` and `after_step`, now that the host has stepped and perhaps densified."""

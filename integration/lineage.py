@@ -118,10 +118,6 @@ class RowNumbers:
         self.restart()
         return change
 
-    def take(self, parents: Int[Tensor, " M"]) -> None:
-        """Row i of the parameters now comes from row parents[i]; the numbers follow."""
-        self._put(self._entries[ROWS].detach()[parents])
-
     def remove(self) -> None:
         """Take the row numbers out of the host."""
         if ROWS in self._entries:

@@ -22,7 +22,6 @@ from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 from integration.detail import DetailFeature, sh0_offset
 from integration.errors import HostError
 from integration.host_cameras import enlarged_camera, replaced_camera
-from integration.host_field import HostField
 from integration.host_rendering import HostRendering, Target
 from integration.host_score import warn_if_score_is_unused
 from integration.lineage import Lineage
@@ -121,7 +120,7 @@ class AttachedModel:
         detail: train f_det.
         densifier, threshold: what densifies in the host, and its threshold on the screen gradient.
         to_pixels: see `host_rendering`.
-        views, masks, seed, field, own_background: see `Attachment`.
+        views, masks, seed, own_background: see `Attachment`.
 
     Attributes:
         detail: f_det, which follows the host's structure even if it is not trained.
@@ -142,7 +141,6 @@ class AttachedModel:
         masks: Mapping[str, Tensor],
         seed: int,
         to_pixels: ToPixels = lambda result: None,
-        field: HostField | None = None,
         own_background: bool = True,
     ) -> None:
         warn_if_score_is_unused(conductor, densifier, threshold)
@@ -152,7 +150,7 @@ class AttachedModel:
         self._warned: set[str] = set()
         self.attachment = Attachment(
             conductor, self.params, views=views, seed=seed, threshold=threshold, masks=masks,
-            poll_parents=lambda: self.detail.poll_parents(conductor.state_dict), field=field, own_background=own_background,
+            poll_parents=lambda: self.detail.poll_parents(conductor.state_dict), own_background=own_background,
         )  # fmt: skip
 
     def params(self) -> dict[str, Tensor]:

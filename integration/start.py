@@ -28,11 +28,11 @@ def require_supported(conductor: Conductor, accumulation: int) -> None:
         raise SettingError(f"CLEAR trains in one process, got {n}. Start the training without torchrun, on one device.")
 
 
-def announce(conductor: Conductor, views: Sequence[View], *, own_background: bool, own_density: bool) -> None:
+def announce(conductor: Conductor, views: Sequence[View], *, own_background: bool) -> None:
     """Log what each strategy will do, and which have no effect. After `on_fit_start`.
 
     Args:
-        own_background, own_density: the host chooses its background, and densifies, by itself.
+        own_background: the host chooses its background by itself.
     """
     for s in conductor.strategies:
         if (prepared := s.summary()) is not None:
@@ -42,11 +42,11 @@ def announce(conductor: Conductor, views: Sequence[View], *, own_background: boo
             "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
             ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
         )
-    for by_host, hook, reason in (
-        (own_density, "densifier", "densifies by itself; where it is told not to, this strategy does"),
-        (own_background, "background", "chooses its background itself"),
-    ):
-        if by_host and (owner := conductor.owner(hook)) is not None:
+    for hook, reason in {
+        "densifier": "keeps its own density control",
+        **({"background": "chooses its background itself"} if own_background else {}),
+    }.items():
+        if (owner := conductor.owner(hook)) is not None:
             _log.info("%s has no effect here: the host %s.", type(owner).__name__, reason)
     if not conductor.strategies:
         _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")

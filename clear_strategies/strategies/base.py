@@ -78,8 +78,8 @@ class Strategy:
         control, a `clear_strategies.training.densifier.Densifier`; None: the trainer does.
 
         Args:
-            field: the initial Gaussians, a `clear_strategies.training.densifier.Gaussians`; in this package's trainer a
-                `clear_strategies.training.field.GaussianField`. Other trainers call `step` alone.
+            field: the initial Gaussians, a `clear_strategies.training.field.GaussianField`. Other trainers never call this hook,
+                since they keep their own density control.
             views: all training views.
         """
         return None

@@ -21,10 +21,9 @@ from integration.autograd_shot import AutogradShot, ScreenGradientSlot
 from integration.densification import require_end
 from integration.detail import detail_adam, sh0_offset
 from integration.errors import HostError
-from integration.host_field import HostField
 from integration.host_rendering import HostRendering, Target
 from integration.host_score import warn_if_score_is_unused
-from integration.lineage import ROWS, RowNumbers
+from integration.lineage import RowNumbers
 from integration.replacing import replace_everywhere
 from rasterizers.geometry import SH_C0
 from rasterizers.interface import Camera
@@ -42,8 +41,7 @@ class Attached:
     Args:
         params: gsplat's dict of leaves. optimizers: one for each of them.
         views: all training views. A rendering is that of the view named by `rendering`, else of the one with its pose.
-        strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one. Where there is
-            none, or a `DefaultStrategy` with refine_stop_iter=0, a strategy of the conductor may densify.
+        strategy: gsplat's densification strategy, whose threshold scales P2G's score; None: a loop without one.
         state: of gsplat 1.4's strategy, in which every change of structure is recorded; later versions record it in `params`.
         detail: add the detail feature f_det as `params["detail"]`, with an Adam of its own. gsplat's strategies clone,
             split and prune it like any other parameter.
@@ -99,11 +97,10 @@ class Attached:
         stop, threshold = (getattr(strategy, name, None) for name in ("refine_stop_iter", "grow_grad2d"))
         require_end(conductor, stop, "refine_stop_iter", first=0)
         warn_if_score_is_unused(conductor, strategy, threshold)
-        may_densify = strategy is None or (threshold is not None and stop == 0)
         self.attachment = Attachment(
             conductor, self.params, views=self._views, seed=seed, loss_scale=loss_scale, accumulation=accumulation,
             poll_parents=self._poll_parents, restart_parents=self._rows.restart, threshold=threshold, masks=masks,
-            own_background=own_background, field=self._field() if may_densify else None,
+            own_background=own_background,
         )  # fmt: skip
         self.attachment.hook(self._optimizers_of_gaussians())
 
@@ -180,18 +177,6 @@ class Attached:
     def _optimizers_of_gaussians(self) -> list[torch.optim.Optimizer]:
         """The optimizers of the Gaussians; others, e.g. of poses, do not count."""
         return [self._optimizers[name] for name in (*self._names.values(), "detail") if name in self._optimizers]
-
-    def _field(self) -> HostField:
-        """All entries of the parameters, as gsplat's strategies gather them."""
-
-        def put(new: Mapping[str, Tensor], parents: Int[Tensor, " M"]) -> None:
-            self._params.update(new)
-            self._rows.take(parents)
-
-        def rows() -> dict[str, Tensor]:
-            return {name: p for name, p in self._params.items() if name != ROWS}
-
-        return HostField(rows, self._names, self._optimizers_of_gaussians, put)
 
     def _poll_parents(self) -> Int[Tensor, " M"] | None:
         change = self._rows.poll()

@@ -5,20 +5,18 @@ from __future__ import annotations
 import functools
 import inspect
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
 import torch
-from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.merging.conductor import Conductor
 from integration.densification import require_end
 from integration.errors import HostError
 from integration.host_cameras import enlarged_camera
-from integration.host_field import HostField
 from integration.host_rendering import Target
 from integration.inria.cameras import HostViews
 from integration.inria.rows import CarriedRows
@@ -53,8 +51,7 @@ class Attached:
             there are none, for strategies and objectives that do not use HR. suffix: what the SR tool appended to the names.
         factor: HR pixels per LR pixel.
         threshold: opt.densify_grad_threshold (by default 3DGS's own), which scales P2G's score; None: the loop does not densify.
-        densify_until: opt.densify_until_iter; refused where an anchor would be taken before. 0: a strategy of the conductor may
-            densify in place of the host.
+        densify_until: opt.densify_until_iter; refused where an anchor would be taken before.
         detail: train the detail feature f_det beside the host's parameters.
         own_background: the host chooses the colour behind its renderings (`--random_background`); else the strategies may choose
             another for `bg_color` where that is black.
@@ -97,8 +94,7 @@ class Attached:
         self._rows = CarriedRows(gaussians, self._host_params)
         self._attached = AttachedModel(
             gaussians, _ROLES, self._host_params, self._rows, conductor, self.views.all, detail=detail, densifier=gaussians,
-            threshold=threshold, masks=self.views.masks, seed=seed, field=self._field() if densify_until == 0 else None,
-            own_background=own_background,
+            threshold=threshold, masks=self.views.masks, seed=seed, own_background=own_background,
         )  # fmt: skip
         self.attachment = self._attached.attachment
         self._undo = ExitStack()
@@ -175,20 +171,6 @@ class Attached:
             if not self._black:
                 _log.warning("the background stays as it is: strategies choose another only in place of a black one.")
         return {"bg_color": own.new_tensor(color)} if self._black else {}
-
-    def _field(self) -> HostField:
-        """Every tensor of the model with a row per Gaussian: forks have more than 3DGS, e.g. filter_3D."""
-        model = self._model
-
-        def rows() -> dict[str, Tensor]:
-            n = len(model._xyz)
-            return {name: v for name, v in vars(model).items() if isinstance(v, Tensor) and v.dim() and len(v) == n}
-
-        def put(new: Mapping[str, Tensor], parents: Int[Tensor, " M"]) -> None:
-            vars(model).update(new)
-            self._rows.take(parents)
-
-        return HostField(rows, _ATTRIBUTES, lambda: [model.optimizer], put)
 
     def _training_setup(self, original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         """The host starts again with a new optimizer, as `restore` does with the parameters of a checkpoint."""

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from integration.lineage import Change, change_of, is_same
+from integration.lineage import Change, is_same
 from integration.replacing import replace_methods
 
 _log = logging.getLogger(__name__)
@@ -73,13 +73,6 @@ class CarriedRows:
                 "the values of colours and rotations instead.", type(self._model).__name__,
             )  # fmt: skip
         return find_change(before, now)
-
-    def take(self, parents: Int[Tensor, " M"]) -> None:
-        """Row i of the model has been replaced by row parents[i]."""
-        self._carried = True
-        change = change_of(parents, len(self._parents))
-        if change is not None:
-            self._parents, self._fresh = self._parents[parents], self._fresh[parents] | change.fresh
 
     def remove(self) -> None:
         """Give the model its own methods back."""

@@ -1,4 +1,4 @@
-"""The 3DGS-style host of tests/helpers/inria_host, and MCMC on toy scenes."""
+"""The 3DGS-style host of tests/helpers/inria_host."""
 
 from __future__ import annotations
 
@@ -9,18 +9,10 @@ import pytest
 from safetensors.torch import load_file
 
 from clear_strategies import Conductor
-from clear_strategies.density import mcmc
 from integration.inria import attach
 from integration.inria.__main__ import main
 from tests.helpers import inria, toy
 from tests.helpers.host_parts import FROM_START
-
-
-@pytest.fixture
-def mcmc_acts(monkeypatch):
-    """MCMC densifies, however short the run and sparse the points."""
-    monkeypatch.setattr(mcmc, "_SHORT_RUN", 0)
-    monkeypatch.setattr(mcmc, "_DENSE", float("inf"))
 
 
 @pytest.fixture

@@ -54,16 +54,6 @@ def test_schedules_are_those_of_the_hosts_own_options(inria_host, inria_capture)
         install(gaussians, scene, object(), sr=inria_capture / "sr")
 
 
-def test_mcmc_densifies_where_the_host_is_told_not_to(inria_host, inria_capture, mcmc_acts):
-    opt = options(inria_host, inria_capture, densify_until_iter=0)
-    gaussians, scene = inria_host.setup(opt)
-    clear = install(gaussians, scene, opt, strategies="clear,mcmc", overrides=FROM_START[2:], sr=inria_capture / "sr")
-    state = clear.attachment.state_dict()
-    assert int(state["density"]["cap"]) == 5 * N
-    clear.attachment.load_state_dict(state | {"density": {"cap": torch.tensor(7)}})
-    assert int(clear.attachment.state_dict()["density"]["cap"]) == 7
-
-
 @pytest.mark.parametrize("points", ["own", "stereo"])
 def test_a_run_continues_from_the_hosts_checkpoint_as_if_it_had_not_stopped(
     points, inria_capture, inria_launched, caplog
