@@ -258,20 +258,6 @@ class Rasterizer(Protocol):
         ...
 
 
-@runtime_checkable
-class CountsLists(Protocol):
-    """A rasterizer that predicts the memory of its lists, for the prediction of a run's peak."""
-
-    @property
-    def memory(self) -> int:
-        """MiB that the lists may take; beyond it an image is drawn in parts."""
-        ...
-
-    def list_bytes(self, splats: Splats, camera: Camera) -> int:
-        """Bytes of the lists of an image, with those of its gradients for two cotangents, if it were drawn in one part."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class RasterSettings:
     """The settings of every backend.

@@ -218,12 +218,10 @@ def _started(training: _Training, baseline: _Training | None, place: _Place) -> 
 def _announce(training: _Training, state: TrainState, place: _Place, threads: str) -> None:
     """Log the plan, and what was set in vain. A SettingError if the run does not fit into memory."""
     memory.release()
-    drawing, limit = place.drawing, training.settings.fit.memory
-    needed, most = memory.needs(state, drawing.rasterizer), state.density.cap
     machine = {
-        "rasterizer": f"{drawing.name}, kernel {drawing.kernel} px²",
+        "rasterizer": f"{place.drawing.name}, kernel {place.drawing.kernel} px²",
         "threads": threads,
-        "memory": memory.summary(needed, most),
+        "memory": memory.require(state, training.settings.fit.memory),
     }
     described = plan.describe(place.scene, state, training.chosen, machine)
     _log.log(logging.DEBUG if _in_sweep() else logging.INFO, "%s", described.short)
@@ -231,7 +229,6 @@ def _announce(training: _Training, state: TrainState, place: _Place, threads: st
     idle = [override for override in training.overrides or () if override.lstrip("+").startswith("density.")]
     if idle and not isinstance(state.density.settings, type(training.settings.density)):
         _log.warning("%s has no effect: %s densifies in place of it.", ", ".join(idle), state.density.name)
-    memory.require(needed, None if limit is None else limit << 20, most)
 
 
 def _train_baseline(training: _Training, state: TrainState | None, place: _Place) -> Baseline:

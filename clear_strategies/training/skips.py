@@ -87,12 +87,6 @@ class SkipPolicy:
             self._coarse[view.name] = replace(view, hr=view.hr.reduced(_REDUCED), truth=None)
         return self._coarse[view.name]
 
-    def coarse_bytes(self, views: Sequence[View], t: int) -> int:
-        """Of the coarse SR images that are kept from iteration t on."""
-        if t > self.skips.coarse_until:
-            return 0
-        return sum(view.hr.image.nbytes // _REDUCED**2 for view in filter(_halves, views))
-
     def lr_due(self, view: View, hr_due: bool, work_log: WorkLog) -> bool:
         """Whether LR is rendered: not where HR at half its size is as large as the photo, for one render then serves both."""
         if view.factor > 1 or not hr_due or view is not self._coarse.get(view.name):

@@ -25,8 +25,6 @@ _TRAITS: Final = Traits(
     devices=frozenset({"cpu"}), dtypes=frozenset({torch.float32, torch.float64}), native_threads=True, depth=True
 )
 _LONGEST_SIDE: Final = 32 << 15  # px: bins of 32 px are numbered in 16 bits
-_PAIR_BYTES: Final = 16  # its Gaussian, its place, and the blocks of its bin that the ellipse reaches
-_SUMS_BYTES: Final = 128  # a pair's sums for two or three cotangents
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +62,6 @@ class CppRasterizer(Backend):
     @property
     def traits(self) -> Traits:
         return _TRAITS
-
-    def list_bytes(self, splats: Splats, camera: Camera) -> int:
-        """See `interface.CountsLists`; projects the Gaussians and draws nothing."""
-        pairs: int = _Frame(self, [(splats, camera)]).native.pairs(0)
-        return pairs * (_PAIR_BYTES + _SUMS_BYTES)
 
     def draw(self, jobs: Sequence[tuple[Splats, Camera]], depth: Sequence[bool]) -> list[Rendering]:
         """Jobs of one pose share projection, colour and depth order."""

@@ -29,7 +29,6 @@ from tests.stress import (
     gco,
     kills,
     lifecycle,
-    memory,
     projection,
     rows,
     sanitizers,
@@ -76,7 +75,6 @@ MEASUREMENTS: dict[str, Callable[[argparse.Namespace, Path], Iterable[Row]]] = {
     "inputs": lambda options, folder: bad_inputs.measure(folder),
     "attacks": lambda options, folder: [attacks.measure(folder)],
     "fuzz": _fuzz,
-    "memory": lambda options, folder: memory.measure(),
     "soak": lambda options, folder: soak.measure(options.iterations),
     "sanitizers": _sanitizers,
 }
