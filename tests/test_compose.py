@@ -151,7 +151,7 @@ def test_what_was_published_keeps_its_rates(chosen, steps):
 GROUPS = ("strategy", "rasterizer", "data", "prior", "objective", "density", "optim", "skips", "method")
 NEEDED = {
     **{f"data={name}": "data.path=here" for name in ("blender", "colmap", "llff", "nerfstudio", "photos")},
-    **{f"prior={name}": "prior.path=here" for name in ("dnn_superres", "images", "onnx")},
+    **{f"prior={name}": "prior.path=here" for name in ("images", "onnx")},
     "prior=corrupted": "prior.prior.path=here",
 }
 

@@ -4,7 +4,6 @@ from clear_strategies.data.priors.back_projected import BackProjected
 from clear_strategies.data.priors.bicubic import Bicubic
 from clear_strategies.data.priors.cache import Cached, cache_folder, cached
 from clear_strategies.data.priors.corrupted import Corrupted, DemoPrior
-from clear_strategies.data.priors.dnn_superres import DnnSuperres
 from clear_strategies.data.priors.images import Images
 from clear_strategies.data.priors.interface import (
     Network,
@@ -16,9 +15,8 @@ from clear_strategies.data.priors.interface import (
 )
 from clear_strategies.data.priors.ncnn import Ncnn
 from clear_strategies.data.priors.onnx import Onnx
-from clear_strategies.data.priors.self_ensembled import SelfEnsembled
 
 __all__ = [
-    "BackProjected", "Bicubic", "Cached", "Corrupted", "DemoPrior", "DnnSuperres", "Images", "Ncnn", "Network", "Onnx",
-    "Prior", "SelfEnsembled", "SuperResolved", "cache_folder", "cached", "fingerprint", "network_of", "super_resolved",
+    "BackProjected", "Bicubic", "Cached", "Corrupted", "DemoPrior", "Images", "Ncnn", "Network", "Onnx",
+    "Prior", "SuperResolved", "cache_folder", "cached", "fingerprint", "network_of", "super_resolved",
 ]  # fmt: skip

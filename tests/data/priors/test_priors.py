@@ -11,52 +11,37 @@ import torch
 
 from clear_strategies.core import images
 from clear_strategies.data.photo_files import read_image
-from clear_strategies.data.priors import Bicubic, DnnSuperres, Images, Onnx
+from clear_strategies.data.priors import Bicubic, Images, Onnx
 from clear_strategies.data.priors.interface import super_resolved
 from clear_strategies.errors import DataError, SettingError
 from tests.helpers.networks import photo, psnr
 
 
-@pytest.mark.parametrize("prior", [Images, Onnx, DnnSuperres])
-def test_a_prior_without_its_path_is_refused_at_construction(prior: type[Images | Onnx | DnnSuperres]) -> None:
+@pytest.mark.parametrize("prior", [Images, Onnx])
+def test_a_prior_without_its_path_is_refused_at_construction(prior: type[Images | Onnx]) -> None:
     with pytest.raises(SettingError, match=r"prior\.path: must be .*, got ''"):
         prior()
 
 
-@pytest.mark.parametrize("prior", [Onnx, DnnSuperres])
-def test_a_model_that_is_not_there_is_refused(prior: type[Onnx | DnnSuperres], tmp_path: Path) -> None:
+def test_a_model_that_is_not_there_is_refused(tmp_path: Path) -> None:
     for path in (tmp_path / "absent", tmp_path):
         with pytest.raises(DataError, match=r"file: is not there: set prior\.path"):
-            prior(str(path))("view", photo(8, 12), 4)
-
-
-def test_dnn_superres_refuses_what_is_not_its_kind_of_network(tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match=r"prior\.model: must be one of edsr, espcn, fsrcnn, lapsrn, got 'srgan'"):
-        DnnSuperres("x.pb", model="srgan")
-    path = tmp_path / "garbage.pb"
-    path.write_bytes(b"not a graph")
-    with pytest.raises(DataError, match=r"garbage\.pb: network: cannot be run as espcn x4") as error:
-        DnnSuperres(str(path))("view", photo(8, 12), 4)
-    assert "\n" not in str(error.value)
+            Onnx(str(path))("view", photo(8, 12), 4)
 
 
 def test_real_networks_do_on_fern_what_is_known_of_them(shared_data: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """504x376 from 126x94, a training view. ONNX comes after dnn_superres: in one process they must not disturb each other."""
+    """504x376 from 126x94, a training view."""
     weights, photos = shared_data / "sr_weights", sorted((shared_data / "fern" / "images_4").iterdir())
     hr = images.downsample(images.crop_to_multiple(read_image(photos[10]), 8), 2)[:376, :504]
     lr = images.downsample(hr, 4)
     expected = {
         Bicubic(): 23.51,
-        DnnSuperres(str(weights / "ESPCN_x4.pb"), "espcn"): 23.42,
-        DnnSuperres(str(weights / "FSRCNN_x4.pb"), "fsrcnn"): 23.44,
         Onnx(str(weights / "span_x4.onnx")): 25.24,
         Onnx(str(weights / "imdn_x4.onnx")): 25.38,
     }
     found = {prior: psnr(prior("fern", lr, 4), hr) for prior in expected}
     assert found == pytest.approx(expected, abs=0.03)
     assert not [record for record in caplog.records if record.levelno > logging.INFO]
-    with pytest.raises(DataError, match=r"ESPCN_x4\.pb: network: "):  # another scale
-        DnnSuperres(str(weights / "ESPCN_x4.pb"))("view", photo(8, 12), 3)
 
 
 @pytest.mark.parametrize(
