@@ -194,8 +194,6 @@ def _run(
     trained = None if baseline is None else _train_baseline(baseline, baseline_state, place)
     baseline_state = None  # its memory is for what trains now
     evaluation, seconds = _train(training, state, place, trained)
-    for remark in plan.remarks(state):
-        _log.log(level, "%s", remark)
     _log.log(level, "%s", score_table.describe(training.folder, evaluation, seconds, trained))
     if _in_sweep():
         _log.info("%s", score_table.describe_job(HydraConfig.get().job.num, training.folder, evaluation, seconds))

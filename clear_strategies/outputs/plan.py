@@ -1,4 +1,4 @@
-"""The plan that a run prints before it trains, and its remarks on the strategies at the end."""
+"""The plan that a run prints before it trains."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import torch
 
 from clear_strategies.data.scene import Scene
 from clear_strategies.merging.conductor import Conductor
-from clear_strategies.outputs.figures import column_means
 from clear_strategies.schedules import milestones
 from clear_strategies.training.state import TrainState
 
@@ -68,12 +67,10 @@ def describe(scene: Scene, state: TrainState, chosen: Chosen, machine: Mapping[s
         **machine,
         "per-Gaussian pass": "readable" if state.compiled_step is None else "compiled",
         "iterations": f"{settings.iterations}, seed {settings.seed}",
-        "milestones": ", ".join(f"{name} {t}" for name, t in marks(state).items()),
+        "milestones": _listed(marks(state)),
     }
-    owners = [(type(s).__name__, milestones(s)) for s in conductor.strategies]
-    for owner, iterations in (*owners, (state.density.name, milestones(state.density.settings))):
-        if iterations:
-            lines[f"milestones of {owner}"] = ", ".join(f"{name} {t}" for name, t in iterations.items())
+    if iterations := milestones(state.density.settings):
+        lines[f"milestones of {state.density.name}"] = _listed(iterations)
     for name, s in named:
         if (summary := s.summary()) is not None:
             lines[name.replace("_", " ")] = summary
@@ -106,7 +103,6 @@ def _skipped(state: TrainState) -> list[str]:
         skipped.append(f"HR scale until iteration {hr.start} (lambda_HR = 0)")
     if state.mip.variance == 0:
         skipped.append("3D filter (variance 0)")
-    skipped += [phrase for s in conductor.strategies for phrase in s.skipped()]
     return skipped + state.skip_policy.descriptions(state.views)
 
 
@@ -124,17 +120,15 @@ def _device_name(device: torch.device) -> str:
 
 
 def marks(state: TrainState) -> dict[str, int]:
-    """The iterations that curves.png marks, by name."""
+    """The iterations that curves.png marks, by name: of λ_HR, of densification and of the strategies."""
     hr = state.conductor.objective.lambda_hr
     at = {"HR from": hr.start, "HR full": hr.full, **state.density.marks}
     if hr.final != hr.peak:
         at["HR decays"] = hr.decay_from
     for s in state.conductor.strategies:
-        at |= s.marks()
+        at |= {f"{type(s).__name__} {name}": t for name, t in milestones(s).items()}
     return at
 
 
-def remarks(state: TrainState) -> list[str]:
-    """`Strategy.in_hindsight` of each strategy, given the means of the run's history."""
-    means = column_means(state.history_as_floats())
-    return [remark for s in state.conductor.strategies if (remark := s.in_hindsight(means)) is not None]
+def _listed(iterations: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {t}" for name, t in iterations.items())
