@@ -25,7 +25,18 @@ NO_DISK: Final = 3
 SIGNALS: Final = 128
 
 # What the extra [train] brings beside the core, by the names that are imported.
-TRAIN: Final = ("cv2", "jinja2", "kornia", "matplotlib", "msgspec", "safetensors", "scipy", "skimage", "tqdm")
+TRAIN: Final = (
+    "cv2",
+    "filelock",
+    "jinja2",
+    "kornia",
+    "matplotlib",
+    "msgspec",
+    "safetensors",
+    "scipy",
+    "skimage",
+    "tqdm",
+)
 
 
 class Ending(NamedTuple):

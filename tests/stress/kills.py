@@ -101,4 +101,4 @@ def _results(folder: Path) -> tuple[bytes, dict[str, bytes]]:
 
 
 def _rests(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.rglob("*") if ".partial" in path.name or path.name == "run.lock")
+    return sorted(path.name for path in folder.rglob("*") if ".partial" in path.name)

@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
 from collections.abc import Callable
 from pathlib import Path
 
 from clear_strategies.data.photo_folders import PhotoRules, image_folder, list_images
 from clear_strategies.data.readers import colmap
 from clear_strategies.jobs import resume
-from clear_strategies.jobs.lock import NAME, hold
+from clear_strategies.jobs.lock import hold
 from clear_strategies.jobs.saved import open_splat
 from tests.helpers.captures import GOOD
 from tests.stress.bad_inputs import BadInput, at
 from tests.stress.bad_inputs.scenes import READERS
-
-
-def _held(lock: bytes | Callable[[Path], object]) -> Callable[[Path], object]:
-    """Of a folder whose lock is there already."""
-
-    def take(path: Path) -> None:
-        with hold(path.parent):
-            pass
-
-    return at(NAME, take, lock)
 
 
 def _held_twice(folder: Path) -> None:
@@ -58,7 +46,6 @@ def _hidden_photos_only(folder: Path) -> None:
     (folder / "notes.txt").write_text("")
 
 
-_ELSEWHERE = {"host": socket.gethostname() + "-another", "pid": 1, "started": "1", "since": "2026-01-01"}
 _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     **{f"{kind} at a path that is absent": (at("none", read), "none") for kind, read in READERS.items()},
     **{f"{kind} at a path that is a file": (at("file", read, b"no folder"), "file") for kind, read in READERS.items()},
@@ -74,16 +61,6 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "name of a photo with 300 letters": (_named("x" * 300), "is no file name"),
     "name of a photo with 200 accents": (_named("é" * 200), "is no file name"),
     "lock held by this process": (_held_twice, "is at work in this folder"),
-    "lock held on another host": (_held(json.dumps(_ELSEWHERE).encode()), "cannot be known from"),
-    "lock that is no JSON": (_held(b"{"), "cannot be known from"),
-    "lock that is a list": (_held(b"[]"), "cannot be known from"),
-    "lock that names no process": (_held(b'{"host": 3}'), "remove this file"),
-    "lock that is a folder": (_held(Path.mkdir), "lock: is a link or no regular file"),
-    "lock that is a pipe": (_held(os.mkfifo), "lock: is a link or no regular file"),
-    "lock that is a link": (
-        _held(lambda path: path.symlink_to(path.with_name("canary"))),
-        "lock: is a link or no regular file",
-    ),
     "run that is absent": (at("none", open_splat), "none"),
     "run that is an empty folder": (open_splat, ": "),
     "run that is a text": (at("file", open_splat, b"no folder"), "file"),
