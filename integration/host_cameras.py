@@ -1,6 +1,6 @@
-"""Cameras of hosts whose `render` takes a camera object: 3DGS and its forks, gaussian-splatting-lightning.
+"""Cameras of hosts whose `render` takes a camera object: 3DGS and its forks.
 
-Both keep their matrices for row vectors, and a projection to NDC. Their names differ, and each host has some of these.
+They keep their matrices for row vectors, and a projection to NDC; each fork has some of these attributes.
 """
 
 from __future__ import annotations
@@ -15,12 +15,7 @@ from torch import Tensor
 
 from rasterizers.interface import Camera
 
-_IN_PIXELS: Final = (
-    "image_width", "image_height", "width", "height", "focal_x", "focal_y", "fx", "fy", "cx", "cy",
-)  # fmt: skip
-_VIEW: Final = ("world_view_transform", "world_to_camera")
-_PROJECTION: Final = ("projection_matrix", "projection")
-_FULL: Final = ("full_proj_transform", "full_projection")
+_IN_PIXELS: Final = ("image_width", "image_height", "focal_x", "focal_y", "fx", "fy", "cx", "cy")
 
 
 def enlarged_camera(camera: Any, factor: int) -> Any:
@@ -35,30 +30,25 @@ def enlarged_camera(camera: Any, factor: int) -> Any:
 def replaced_camera(camera: Any, by: Camera) -> Any:
     """A copy of a host's camera with the pose, the intrinsics and the size of `by`; depth planes and names stay."""
     pose = by.world_to_camera.double().cpu()
-    view, full = pose.T, _first(camera, _FULL)
+    view, full = pose.T, getattr(camera, "full_proj_transform", None)
     projection = None
     if full is not None:
-        projection = torch.linalg.solve(_first(camera, _VIEW).double().cpu(), full.double().cpu())
+        projection = torch.linalg.solve(camera.world_view_transform.double().cpu(), full.double().cpu())
         projection[0, 0], projection[1, 1] = 2 * by.fx / by.width, 2 * by.fy / by.height
         projection[2, 0], projection[2, 1] = 2 * by.cx / by.width - 1, 2 * by.cy / by.height - 1
-    rotation = pose[:3, :3] if isinstance(getattr(camera, "R", None), Tensor) else pose[:3, :3].T  # 3DGS: transposed
-    fov_x, fov_y = 2 * math.atan(by.width / (2 * by.fx)), 2 * math.atan(by.height / (2 * by.fy))
     values: dict[str, Any] = {
-        "image_width": by.width, "image_height": by.height, "width": by.width, "height": by.height,
+        "image_width": by.width, "image_height": by.height,
         "focal_x": by.fx, "focal_y": by.fy, "fx": by.fx, "fy": by.fy, "cx": by.cx, "cy": by.cy,
-        "FoVx": fov_x, "FoVy": fov_y, "fov_x": fov_x, "fov_y": fov_y, "R": rotation, "T": pose[:3, 3],
-        "camera_center": by.center.double().cpu(), **dict.fromkeys(_VIEW, view), **dict.fromkeys(_PROJECTION, projection),
-        **dict.fromkeys(_FULL, None if projection is None else view @ projection),
+        "FoVx": 2 * math.atan(by.width / (2 * by.fx)), "FoVy": 2 * math.atan(by.height / (2 * by.fy)),
+        "R": pose[:3, :3].T, "T": pose[:3, 3], "camera_center": by.center.double().cpu(),
+        "world_view_transform": view, "projection_matrix": projection,
+        "full_proj_transform": None if projection is None else view @ projection,
     }  # fmt: skip
     moved = copy.copy(camera)
     for name, value in values.items():
         if getattr(camera, name, None) is not None and value is not None:
             setattr(moved, name, _like(value, getattr(camera, name)))
     return moved
-
-
-def _first(camera: Any, names: tuple[str, ...]) -> Any:
-    return next((value for name in names if (value := getattr(camera, name, None)) is not None), None)
 
 
 def _like(value: Any, present: Any) -> Any:

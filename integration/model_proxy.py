@@ -31,7 +31,6 @@ _log = logging.getLogger(__name__)
 
 Role = Literal["gate", "detail"]
 """What an override changes: opacities are multiplied by the gate, colours are offset by f_det."""
-ToPixels = Callable[[Mapping[str, Any]], tuple[float, float] | None]
 
 
 @dataclass(slots=True, eq=False)
@@ -119,7 +118,6 @@ class AttachedModel:
         lineage: finds the host's changes of structure.
         detail: train f_det.
         densifier, threshold: what densifies in the host, and its threshold on the screen gradient.
-        to_pixels: see `host_rendering`.
         views, masks, seed, own_background: see `Attachment`.
 
     Attributes:
@@ -140,11 +138,10 @@ class AttachedModel:
         threshold: float | None,
         masks: Mapping[str, Tensor],
         seed: int,
-        to_pixels: ToPixels = lambda result: None,
         own_background: bool = True,
     ) -> None:
         warn_if_score_is_unused(conductor, densifier, threshold)
-        self._model, self._roles, self._host_params, self._to_pixels = model, roles, params, to_pixels
+        self._model, self._roles, self._host_params = model, roles, params
         self.detail, self._has_detail = DetailFeature(lambda: params()["means"], lineage, conductor.detail), detail
         self._scoring = conductor.owner("score")
         self._warned: set[str] = set()
@@ -193,7 +190,7 @@ class AttachedModel:
             self._warn_once("render does not read the model's constant colours: the detail feature has no effect.")
         # Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts.
         ranks = hasattr(self._model, "xyz_gradient_accum_abs")
-        rendering = host_rendering(result, camera, params, overrides.gate, self._to_pixels, ranks_by_third_column=ranks)
+        rendering = host_rendering(result, camera, params, overrides.gate, ranks_by_third_column=ranks)
         if rendering.shot.gradient_slot.tensor.shape[-1] == 4 and self._scoring is not None:
             self._warn_once(
                 "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
@@ -221,17 +218,14 @@ def host_rendering(
     camera: Camera,
     params: Mapping[str, Tensor],
     gate: Float[Tensor, " N"] | None,
-    to_pixels: ToPixels,
     *,
     ranks_by_third_column: bool,
 ) -> HostRendering:
-    """The result of a host's `render`: a dict with "render" [3, H, W], "viewspace_points" [N, 2 or more], "radii" and
+    """The result of a host's `render`: a dict with "render" [3, H, W], "viewspace_points" [N, 2 or more] in NDC, "radii" and
     "visibility_filter" [N]. Gaussians that the gate drops are marked as not visible in it.
 
     Args:
         camera: the camera of the photo at this resolution.
-        to_pixels: returns, for a result, the factors from gradients of its "viewspace_points" to 1/pixel; None: the
-            points are in NDC.
         ranks_by_third_column: a third column of "viewspace_points" holds what the host ranks Gaussians by.
 
     Raises:
@@ -261,9 +255,8 @@ def host_rendering(
             "visibility_filter": passed & kept if passed.dtype == torch.bool else passed[kept[passed.reshape(-1)]],
         }
     width, height = camera.width, camera.height
-    scale = to_pixels(result) or (2 / width, 2 / height)
     ranked = 2 if ranks_by_third_column and centres.shape[-1] == 3 else None
-    slot = ScreenGradientSlot(centres, (width, height), scale, ranked=ranked)
+    slot = ScreenGradientSlot(centres, (width, height), (2 / width, 2 / height), ranked=ranked)
     means2d = project(params["means"].detach(), camera)
     return HostRendering(AutogradShot(image.permute(1, 2, 0), means2d, visible, params, slot), image, result)
 

@@ -11,17 +11,13 @@ import torch
 import rasterizers
 from clear_strategies import Conductor, FadingOpacity, SplatSuRe
 from clear_strategies.compose import conductor as composed_conductor
-from clear_strategies.core import images
-from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.priors import Bicubic
 from integration.gsplat import attach
 from integration.inria.attached import _ATTRIBUTES
 from rasterizers import Splats
 from tests.helpers import gsplat_host, inria, toy
 from tests.helpers.gsplat_host import Host, started
-from tests.helpers.host_parts import FROM_START
 from tests.integration.test_inria import trained as trained_inria
-from tests.integration.test_lightning import attachment_of, fitted, host  # noqa: F401 - a fixture
 
 
 @pytest.fixture
@@ -163,15 +159,6 @@ def test_an_inria_style_host_draws_any_camera(inria_host, inria_capture, drawn):
     before = copy.copy(clear.params())
     before |= {name: getattr(start, attribute) for name, attribute in _ATTRIBUTES.items()}
     assert torch.allclose(image.double(), reference(before, camera, 0), atol=1e-4)
-
-
-def test_a_lightning_host_draws_it_and_steps_on_it(host, tmp_path, drawn):  # noqa: F811 - the fixture
-    for view in host.scene.train:
-        write_png(tmp_path / f"{view.name}_x4.png", images.quantize(view.hr.image))
-    shown = [*FROM_START[:2], "+strategies.dark._target_=tests.helpers.toy.ShowsDark"]
-    module = fitted(host, host.controller(strategies="baseline", sr=str(tmp_path), suffix="_x4", overrides=shown), 4)
-    assert len(drawn) == 4
-    assert attachment_of(module).counts["extra views"] == 4
 
 
 def test_opacities_fade_in_a_gsplat_host():

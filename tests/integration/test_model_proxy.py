@@ -19,7 +19,7 @@ ROLES = (
 
 
 class Model:
-    """Getters as in Mip-Splatting, where one calls another, and a method as in gaussian-splatting-lightning."""
+    """Getters as in Mip-Splatting, where one calls another, and a method."""
 
     def __init__(self):
         g = torch.Generator().manual_seed(0)

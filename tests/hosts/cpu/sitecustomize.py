@@ -64,13 +64,6 @@ class Midas(torch.nn.Module):
         return x.mean(1)
 
 
-class LambdaLR(torch.optim.lr_scheduler.LambdaLR):
-    """With an argument that torch no longer has."""
-
-    def __init__(self, *args, verbose=False, **kwargs):
-        super().__init__(*args, **kwargs)
-
-
 class Transforms:
     def dpt_transform(self, x):
         return torch.as_tensor(x).permute(2, 0, 1)[None].float() / 255
@@ -79,10 +72,7 @@ class Transforms:
 torch.hub.load = lambda repository, name, *_, **__: Transforms() if name == "transforms" else Midas()
 
 
-if os.environ["HOST"].startswith(("gsplat", "lightning")):
-    import gsplat_relocation  # noqa: F401
-    import no_lpips  # noqa: F401
-
-    torch.optim.lr_scheduler.LambdaLR = LambdaLR
 if os.environ["HOST"].startswith("gsplat"):
     import gsplat_cpu  # noqa: F401
+    import gsplat_relocation  # noqa: F401
+    import no_lpips  # noqa: F401

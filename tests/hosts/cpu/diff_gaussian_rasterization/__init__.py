@@ -40,7 +40,7 @@ class GaussianRasterizer(torch.nn.Module):
 
         drawn = draw(shs[:, :1], shs[:, 1:bands], background, InNdc.apply(means2D, w, h, HOST == "mip-splatting"))
         image, radii = drawn.image.permute(2, 0, 1).contiguous(), 3 * drawn.visible.int()
-        if HOST in ("mip-splatting", "dropgaussian", "lightning"):
+        if HOST in ("mip-splatting", "dropgaussian"):
             return image, radii
         z = (means3D @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3])[:, 2:].clamp_min(0.2)
         value = (1 / z if HOST == "3dgs" else z).expand(-1, 3)
