@@ -54,9 +54,10 @@ def back_project(camera: Camera, pixels: Float[Tensor, "G 2"], depth: Float[Tens
     return ((torch.stack((x, y, depth), dim=1) - pose[:3, 3]) @ pose[:3, :3]).float()
 
 
-def ray_angles(a: Camera, b: Camera, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-    """Angles at these points (float64) between the rays from two cameras, degrees."""
-    x, y = points - a.center.double(), points - b.center.double()
+def ray_angles(a: Float[Tensor, " 3"], b: Float[Tensor, "*K 3"], points: Float[Tensor, "N 3"]) -> Float[Tensor, "*K N"]:
+    """Angles at these points between the rays from camera centres a and b, degrees; all in float64."""
+    y = points - b[..., None, :]
+    x = (points - a).expand_as(y)
     sine = torch.linalg.vector_norm(torch.linalg.cross(x, y), dim=-1)
     # Not from the cosine alone: that of a small angle rounds to 1.
     return torch.rad2deg(torch.atan2(sine, (x * y).sum(-1)))

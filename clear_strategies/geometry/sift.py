@@ -171,7 +171,7 @@ def triangulate_pair(
 
     (u, depth_a), (v, depth_b) = project(a, points), project(b, points)
     error = torch.maximum(torch.linalg.vector_norm(u - x, dim=-1), torch.linalg.vector_norm(v - y, dim=-1))
-    angle = ray_angles(a, b, points)
+    angle = ray_angles(a.center.double(), b.center.double(), points)
     good = points.isfinite().all(-1) & (depth_a > 0) & (depth_b > 0)
     good &= (squares / 2).sqrt() <= settings.epipolar
     good &= (error <= settings.reprojection) & (angle >= settings.angle)

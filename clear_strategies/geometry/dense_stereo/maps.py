@@ -54,7 +54,7 @@ def depth_maps(
     if points is None:
         points = features_of(photos).means
     points = points.cpu()
-    compared = comparisons(photos, points)
+    compared = comparisons(photos, points, max(_ASKED, settings.sources))
     estimates = _estimates(photos, compared, settings)
     needed = settings.agreeing or (2 if len(photos) >= _MANY_PHOTOS else 1)
     maps = []

@@ -8,17 +8,19 @@ from dataclasses import dataclass
 from typing import Final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core.view import Photo
 from clear_strategies.geometry.cameras import common_box
 from clear_strategies.geometry.dense_stereo.settings import StereoSettings
-from clear_strategies.geometry.projection import back_project, inside_of, project, ray_angles, seen_pixels
+from clear_strategies.geometry.projection import back_project, project, projection_matrix, ray_angles, seen_pixels
 from rasterizers.interface import Camera
 
 _FEW: Final = 20  # points in a photo, below which a grid at guessed depths replaces them
 _SAMPLED: Final = 1000  # points in a photo, at most, by which the others are scored
+_CANDIDATES: Final = 4  # photos that all of these points score, for each that is asked for
+_GLANCED: Final = 40  # the fewer points, about, by which these are chosen
 _ANGLES: Final = (1.0, 5.0, 20.0, 45.0)  # degrees between rays: useless, best from, best to, too different to compare
 _LEAST_SCORE: Final = 0.05
 _QUANTILES: Final = (0.02, 0.98)
@@ -40,17 +42,20 @@ class Comparison:
     near: float
 
 
-def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"]) -> list[Comparison]:
-    """For each photo, the others that see the same surfaces at a useful angle, and the range of depth.
+def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"], most: int) -> list[Comparison]:
+    """For each photo, the `most` others that see the same surfaces at the best angles, and the range of depth.
+
+    Of more photos than `_CANDIDATES` for each that is asked for, a few points choose those that all points score.
 
     Args:
         points: of the surfaces, world units; where a photo sees few, depths are guessed from the cameras.
     """
-    cameras = [photo.camera for photo in photos]
     low, high = common_box(photos)
     middle = (low + high)[None] / 2
+    cameras = _Cameras([photo.camera for photo in photos])
     compared = []
-    for i, camera in enumerate(cameras):
+    for i, photo in enumerate(photos):
+        camera = photo.camera
         inside, _, _, depth = seen_pixels(camera, points)
         if len(depth) >= _FEW:
             seen = points[inside].double()[:: math.ceil(len(depth) / _SAMPLED)]
@@ -60,9 +65,13 @@ def comparisons(photos: Sequence[Photo], points: Float[Tensor, "N 3"]) -> list[C
             distance = float(project(camera, middle)[1][0])
             distance = distance if distance > 0 else float(torch.linalg.vector_norm(middle - camera.center))
             seen, far, near = _grid(camera, distance), _GUESS_FAR / distance, _GUESS_NEAR / distance
-        scores = {j: _score(camera, other, seen) for j, other in enumerate(cameras) if j != i}
-        others = sorted((j for j in scores if scores[j] >= _LEAST_SCORE), key=lambda j: (-scores[j], j))
-        compared.append(Comparison(tuple(others), far, near))
+        others = torch.tensor([j for j in range(len(photos)) if j != i], dtype=torch.long)
+        if len(others) > _CANDIDATES * most:
+            glance = cameras.scores(i, others, seen[:: math.ceil(len(seen) / _GLANCED)])
+            others = others[glance.topk(_CANDIDATES * most).indices.sort().values]
+        scores = cameras.scores(i, others, seen)
+        best = scores.argsort(descending=True, stable=True)[:most]
+        compared.append(Comparison(tuple(others[best[scores[best] >= _LEAST_SCORE]].tolist()), far, near))
     return compared
 
 
@@ -84,13 +93,29 @@ def _grid(camera: Camera, distance: float) -> Float[Tensor, "36 3"]:
     return back_project(camera, torch.cartesian_prod(x, y), torch.full((36,), distance, dtype=torch.float64)).double()
 
 
-def _score(camera: Camera, other: Camera, points: Float[Tensor, "M 3"]) -> float:
-    """The share of the points that both see, each weighted by how well its angle and its scales suit a comparison."""
-    pixels, depth = project(other, points)
-    inside = inside_of(other, pixels, depth)
-    angle = ray_angles(camera, other, points)
-    none, best, until, different = _ANGLES
-    suits = torch.minimum((angle - none) / (best - none), (different - angle) / (different - until)).clamp(0, 1)
-    scale = (project(camera, points)[1] / camera.fx) / (depth / other.fx)  # of the same surface in the two photos
-    suits = suits * torch.minimum(scale, 1 / scale).clamp(0, 1)
-    return float(torch.where(inside, suits, 0.0).mean())
+class _Cameras:
+    """Cameras as tensors in float64, so that a photo is scored against many others at once."""
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        self.matrix = torch.stack([projection_matrix(c) for c in cameras])
+        self.center = torch.stack([c.center.double().cpu() for c in cameras])
+        self.size = torch.tensor([(c.width, c.height) for c in cameras], dtype=torch.float64)
+        self.fx = torch.tensor([c.fx for c in cameras], dtype=torch.float64)
+
+    def scores(self, one: int, others: Int[Tensor, " K"], points: Float[Tensor, "M 3"]) -> Float[Tensor, " K"]:
+        """The share of the points that `one` and each other see, weighted by how well their angles and scales suit."""
+        x, y, depth = self._projected(others, points).unbind(-1)
+        width, height = self.size[others, :, None].unbind(1)
+        x, y = x / depth, y / depth
+        inside = (depth > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        angle = ray_angles(self.center[one], self.center[others], points)
+        none, best, until, different = _ANGLES
+        suits = torch.minimum((angle - none) / (best - none), (different - angle) / (different - until)).clamp(0, 1)
+        # Of the same surface in the two photos.
+        scale = (self._projected(one, points)[:, 2] / self.fx[one]) / (depth / self.fx[others, None])
+        suits = suits * torch.minimum(scale, 1 / scale).clamp(0, 1)
+        return torch.where(inside, suits, 0.0).mean(-1)
+
+    def _projected(self, which: int | Int[Tensor, " K"], points: Float[Tensor, "M 3"]) -> Float[Tensor, "*K M 3"]:
+        matrix = self.matrix[which]
+        return points @ matrix[..., :3].mT + matrix[..., None, :, 3]

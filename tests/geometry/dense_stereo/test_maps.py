@@ -35,13 +35,13 @@ def test_depth_of_a_known_surface_is_found_from_the_cameras_alone(surface: Surfa
         assert (error < 0.03).float().mean() > 0.97
 
 
-def test_photos_are_scored_by_some_of_many_points(monkeypatch) -> None:
-    asked = []
-    monkeypatch.setattr(sources, "_score", lambda _, __, points: asked.append(len(points)) or 0.0)
-    points = torch.rand(50_000, 3) * 0.1 + torch.tensor((0.0, 0.0, 4.0))
-    sources.comparisons(photos_of(slanted), points)
-    assert len(asked) == 6
-    assert 500 <= max(asked) <= 1000
+def test_a_few_points_choose_the_photos_that_all_points_would_choose(monkeypatch: pytest.MonkeyPatch) -> None:
+    ring = [Photo(camera(0.05 * i, 0.7 * i), torch.zeros(48, 64, 3)) for i in range(-30, 30)]
+    points = torch.rand(50_000, 3) * torch.tensor((4.0, 2.0, 1.0)) + torch.tensor((-2.0, -1.0, 4.0))
+    chosen = sources.comparisons(ring, points, 8)
+    monkeypatch.setattr(sources, "_CANDIDATES", len(ring))
+    assert chosen == sources.comparisons(ring, points, 8)
+    assert all(len(comparison.others) == 8 for comparison in chosen)
 
 
 @pytest.mark.slow
