@@ -26,7 +26,7 @@ from clear_strategies.training.checkpoint import Checkpoint
 from clear_strategies.training.field import GaussianField
 from clear_strategies.viewing.cameras import write_cameras
 from tests.helpers import toy
-from tests.stress.rows import Row, Worst
+from tests.stress.rows import Row, failures
 
 
 class Killed(BaseException):
@@ -215,20 +215,20 @@ def measure(folder: Path, *, most: int | None = None) -> Row:
     Args:
         most: of the fault points, evenly chosen; None: all.
     """
-    flush, lost = os.fsync, Worst()
+    flush = os.fsync
     os.fsync = lambda descriptor: None  # a disk's own cache is not part of this, and waiting for it is most of the time
     try:
-        for what, failed, whole in _outcomes(folder, most):
-            lost.add(float(not whole), f"{what}: {failed}")
+        return failures(
+            _outcomes(folder, most),
+            "fault points of save, export, resume: a checkpoint lost, a torn file, a rest",
+            "all",
+        )
     finally:
         os.fsync = flush
-    return lost.row(
-        "fault points of save, export and resume: a checkpoint lost, a torn file or a rest", "all", 0, 1_500
-    )
 
 
-def _outcomes(folder: Path, most: int | None) -> Iterator[tuple[str, str, bool]]:
-    """The scenario, the operation that failed and how, and whether all was whole afterwards."""
+def _outcomes(folder: Path, most: int | None) -> Iterator[tuple[str, str | None]]:
+    """The scenario and the operation that failed, and what was not whole afterwards."""
     points = list(_points(folder))
     step = 1 if most is None else max(1, len(points) // most)
     for scenario, kind, at, states in points[::step]:
@@ -236,7 +236,8 @@ def _outcomes(folder: Path, most: int | None) -> Iterator[tuple[str, str, bool]]
         scenario.prepare(run_folder)
         with fault(at, FAULTS[kind]) as seen, suppress(OSError, Killed):
             scenario.act(run_folder)
-        yield scenario.name, f"{kind} at {seen[-1]} {at}", _whole(run_folder, states)
+        where = f"{scenario.name}: {kind} at {seen[-1]} {at}"
+        yield where, None if _whole(run_folder, states) else "not whole"
         shutil.rmtree(run_folder)
 
 

@@ -42,8 +42,6 @@ _BLOCK = 10_000  # mutants
 _EXTREMES = (b"\0", b"\x7f", b"\x80", b"\xff")
 _LONGEST = 8  # bytes of one edit
 
-_log = logging.getLogger("tests.stress")
-
 Target = tuple[Sequence[Path], Callable[[], None]]
 """The files of which one is damaged, and what reads them and checks what comes back."""
 Targets = Callable[[Path], dict[str, Target]]
@@ -175,31 +173,26 @@ def _require_capture(capture: Capture) -> None:
         _require(set(capture.points.track_image.tolist()) <= {frame.sfm_id for frame in capture.frames})
 
 
-def names(targets: Targets) -> list[str]:
-    """The formats."""
-    return list(_written(targets)[1])
-
-
-def measure(
-    targets: Targets, count: int, *, only: Sequence[str] | None = None, goal: int = 0, processes: int = 0
-) -> Iterator[Row]:
-    """How many of the first `count` mutants of each format gave an unsound result, another error, or took too much.
+def measure(targets: Targets, count: int, *, only: Sequence[str] | None = None, processes: int = 0) -> Row:
+    """How many of the first `count` mutants of each file gave an unsound result, another error, or took too much.
 
     Args:
-        only: some of the formats; None: all. processes: that share the mutants; 0: this one reads them.
+        only: some of the files; None: all. processes: that share the mutants; 0: this one reads them.
     """
+    names = list(_written(targets)[1]) if only is None else only
+    failed, first = 0, "none"
     with ExitStack() as stack:
         spread: Callable[..., Iterable[tuple[int, str]]] = map
         if processes:
             spawn = multiprocessing.get_context("spawn")
             spread = stack.enter_context(ProcessPoolExecutor(processes, mp_context=spawn)).map
-        for name in names(targets) if only is None else only:
-            began, starts = time.monotonic(), range(0, count, _BLOCK)
+        for name in names:
+            starts = range(0, count, _BLOCK)
             counts = [min(_BLOCK, count - start) for start in starts]
-            found = list(spread(_block, repeat(targets), repeat(name), range(len(starts)), counts))
-            _log.info("%s: %.0f us each", name, (time.monotonic() - began) / count * 1e6)
-            failed, where = sum(n for n, _ in found), next((where for n, where in found if n), "none")
-            yield Row(f"damaged {name}: unsound, untyped or slow", "all", count, float(failed), 0, where, goal)
+            for n, where in spread(_block, repeat(targets), repeat(name), range(len(starts)), counts):
+                failed, first = failed + n, f"{name}: {where}" if n and not failed else first
+    what = f"damaged files, {targets.__name__}: unsound, untyped or slow"
+    return Row(what, "all", count * len(names), float(failed), 0, first)
 
 
 def _block(targets: Targets, name: str, block: int, count: int) -> tuple[int, str]:
