@@ -42,13 +42,6 @@ def test_names_are_those_of_the_command_line():
     assert names(conductor("clear", "~strategies.p2g")) == ["GCO", "SVS"]
 
 
-@pytest.mark.parametrize("reader", ["photos", "colmap", "llff", "blender", "nerfstudio"])
-def test_what_is_skipped_reaches_the_reader(reader):
-    words = [f"data={reader}", "data.path=photos", "data.missing=skip", "data.broken=skip"]
-    data = settings_of(tree(compose_module.composed(words, "config"))).data
-    assert {key: data.reader.keywords[key] for key in ("missing", "broken")} == {"missing": "skip", "broken": "skip"}
-
-
 def test_overrides_reach_strategies_and_objective_and_milestones_stretch_to_the_hosts_length():
     c = conductor("gco", "strategies.gco.tolerance=0.2", "objective=lr_only")
     assert c.strategies[0].tolerance == 0.2

@@ -26,7 +26,7 @@ The command trains +strategy=best on all photos for fit.iterations={_ITERATIONS}
   clear-strategies train photos/ data.views.test_every=8          every 8th photo is kept for testing
   clear-strategies train photos/ data.views.max_hr_megapixels=8   sharper, slower, more memory
   clear-strategies train clip.mp4 --frames 24                     24 of its sharpest frames
-  clear-strategies train photos/ data.missing=skip data.broken=skip
+  clear-strategies train photos/ data.reader.skip_faulty=true         go on without photos that cannot be read
   clear-strategies train photos/ fit.log=tensorboard -v           curves while it trains; every detail on the console
 
 `clear-strategies settings data=photos` lists all settings.

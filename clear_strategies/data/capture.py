@@ -9,7 +9,8 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import Final
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -19,6 +20,8 @@ from clear_strategies.data.photo_files import has_alpha, image_size, read_image
 from clear_strategies.data.priors.interface import Prior
 from clear_strategies.errors import DataError
 from rasterizers.interface import Camera, Color
+
+BLACK: Final = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +117,7 @@ class Capture:
     name: str
     frames: tuple[Frame, ...]
     points: SfmPoints | None = None
-    background: Color = (0.0, 0.0, 0.0)
+    background: Color = BLACK
     notes: dict[str, str] = field(default_factory=dict)
     own_prior: Callable[[Mapping[str, Callable[[], Float[Tensor, "H W 3"]]]], Prior] | None = None
     depth: Callable[[Camera], Float[Tensor, "H W"]] | None = None
@@ -128,12 +131,19 @@ def sorted_by_name(frames: Sequence[Frame], file: Path) -> tuple[Frame, ...]:
 
 
 def require_names(frames: Sequence[Frame], file: Path) -> None:
-    """Raise a DataError where two frames have the same name, or there is no frame."""
+    """Raise a DataError where two frames have the same name, a name leads out of a folder, or there is no frame.
+
+    Images are written by these names, e.g. by `data.save_lr`.
+    """
     if not frames:
         raise DataError(file, "frames", "there is none", "give a capture with at least one posed photo")
     for name, following in itertools.pairwise(sorted(frame.name for frame in frames)):
         if name == following:
             raise DataError(file, "file name", f"{name!r} belongs to two frames", "give each photo one pose")
+    for path in (PurePosixPath(frame.name) for frame in frames):
+        if path.is_absolute() or ".." in path.parts:
+            problem = f"'{path}' leads out of the folder of the photos"
+            raise DataError(file, "file name", problem, "put the photos, or links to them, below one folder")
 
 
 def lens_notes(frames: Sequence[Frame]) -> dict[str, str]:

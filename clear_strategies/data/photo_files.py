@@ -90,7 +90,7 @@ def read_image(
         try:
             image.load()
         except Exception as error:  # PIL's decoders raise many types of error on damaged bytes
-            remedy = "replace the damaged file, or go on without it: data.broken=skip"
+            remedy = "replace the damaged file, or go on without it: data.reader.skip_faulty=true"
             raise DataError(path, "pixels", f"cannot be decoded ({error})", remedy) from error
         if turn is None:
             _refuse_turned(path, image)
@@ -186,7 +186,7 @@ def _opened(path: Path, turn: bool | None) -> Iterator[Image.Image]:
     except FileNotFoundError as error:
         raise DataError(path, "file", "is not there", "check the path") from error
     except Exception as error:  # PIL raises many types of error on damaged headers
-        remedy = f"use one of {', '.join(_FORMATS)}, or go on without the file: data.broken=skip"
+        remedy = f"use one of {', '.join(_FORMATS)}, or go on without the file: data.reader.skip_faulty=true"
         raise DataError(path, "file", f"is no readable image ({type(error).__name__})", remedy) from error
     with image:
         if image.width * image.height > _MAX_PIXELS:

@@ -1,28 +1,20 @@
-"""The photos of a folder or a capture: where they are, which can be used, and names that may not lead elsewhere."""
+"""The photos of a folder or a capture: where they are, and which can be used."""
 
 from __future__ import annotations
 
 import logging
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal, TypeVar, get_args
+from typing import Final, TypeVar
 
-from clear_strategies.core.checks import as_color, require_choice
 from clear_strategies.data.photo_files import SUFFIXES, read_image
 from clear_strategies.errors import DataError
-from rasterizers.interface import Color
 
 _log = logging.getLogger(__name__)
 
 _FOLDERS: Final = ("images", "images_2", "images_4", "images_8")
-_LONGEST_NAME: Final = 1024
-_LONGEST_PART: Final = 255  # bytes
 _LISTED: Final = 5  # names in a message, at most
-
-Fault = Literal["refuse", "skip"]
-"""A capture with faulty photos is refused, or read without them."""
 
 _Entry = TypeVar("_Entry")
 
@@ -86,88 +78,40 @@ def by_stem(paths: Iterable[Path]) -> dict[str, list[Path]]:
     return stems
 
 
-def require_faults(missing: Fault, broken: Fault) -> None:
-    """Raise a SettingError unless both are "refuse" or "skip"."""
-    require_choice("data.missing", missing, get_args(Fault))
-    require_choice("data.broken", broken, get_args(Fault))
+def is_file(path: Path) -> bool:
+    """Whether the path leads to a file; not for a name that no file can have, such as one of 5,000 letters."""
+    return os.path.isfile(path)  # noqa: PTH113 - Path.is_file raises for a name that is too long
 
 
-@dataclass(frozen=True, slots=True)
-class PhotoRules:
-    """The arguments that readers share.
+def usable(
+    listing: Path, entries: Sequence[_Entry], path_of: Callable[[_Entry], Path], *, skip_faulty: bool
+) -> list[_Entry]:
+    """The entries whose photos can be used, in their order.
 
     Args:
-        background: RGB in [0, 1] behind transparent pixels; None: black.
-        allow_outside: follow file names and links that lead out of the folder.
-        missing: photos that do not exist: "refuse" or "skip".
-        broken: photos that cannot be decoded. "skip" decodes every photo and leaves these out; "refuse" decodes none, so that
-            they fail when they are loaded.
+        listing: the file or folder that lists the photos, for messages.
+        skip_faulty: decode every photo, and leave out those that are missing or cannot be decoded, with a warning for each.
+            Else no photo is decoded: a damaged one fails when it is loaded.
 
     Raises:
-        SettingError: a value is none of these.
+        DataError: a photo is missing and none may be left out, or none is left.
     """
-
-    background: Color | None = None
-    allow_outside: bool = False
-    missing: Fault = "refuse"
-    broken: Fault = "refuse"
-
-    def __post_init__(self) -> None:
-        require_faults(self.missing, self.broken)
-        if self.background is not None:
-            object.__setattr__(self, "background", as_color("data.reader.background", self.background))
-
-    def inside(self, root: Path, name: str, *, file: Path) -> Path:
-        """`root / name`, which must be inside `root` once symbolic links are resolved, unless `allow_outside`.
-
-        Args:
-            file: the file that has the name, for messages.
-
-        Raises:
-            DataError: the name is absolute or leads out of `root`, or is no file name.
-        """
-        longest = max(len(part.encode(errors="replace")) for part in name.replace("\\", "/").split("/"))
-        if not 0 < len(name) <= _LONGEST_NAME or "\0" in name or longest > _LONGEST_PART:
-            problem = f"{name[:80]!r} is no file name"
-            raise DataError(file, "file name", problem, "name an image inside the data set's folder")
-        if self.allow_outside:
-            return root / name
-        try:
-            within = not os.path.isabs(name) and (root / name).resolve().is_relative_to(root.resolve())  # noqa: PTH117
-        except (OSError, RuntimeError, ValueError) as error:  # circular links, names that no system allows
-            problem = f"{name[:80]!r} cannot be resolved ({type(error).__name__})"
-            raise DataError(file, "file name", problem, "rename the file") from error
-        if not within:
-            remedy = "keep the images inside the data set's folder, or follow it: data.reader.allow_outside=true"
-            raise DataError(file, "file name", f"{name!r} leads out of {root}", remedy)
-        return root / name
-
-    def usable(self, file: Path, entries: Sequence[_Entry], path_of: Callable[[_Entry], Path]) -> list[_Entry]:
-        """The entries whose photos can be used, in their order.
-
-        Args:
-            file: the file or folder that lists the photos, for messages.
-
-        Raises:
-            DataError: a photo is missing and refused, or none is left.
-        """
-        absent = [path_of(entry).name for entry in entries if not path_of(entry).is_file()]
-        if absent:
-            problem = f"{len(absent)} of {len(entries)} are not there: {some(absent)}"
-            if self.missing == "refuse":
-                raise DataError(file, "photos", problem, "put them back, or train without them: data.missing=skip")
-            _log.warning("%s: %s. They are skipped.", file, problem)
-        kept = [entry for entry in entries if path_of(entry).is_file()]
-        if self.broken == "skip":
-            kept = [entry for entry in kept if _decodes(path_of(entry))]
-        if entries and not kept:
-            raise DataError(file, "photos", f"none of {len(entries)} can be used", "check the path")
-        return kept
+    absent = [path_of(entry).name for entry in entries if not is_file(path_of(entry))]
+    if absent and not skip_faulty:
+        problem = f"{len(absent)} of {len(entries)} are not there: {some(absent)}"
+        raise DataError(
+            listing, "photos", problem, "put them back, or train without them: data.reader.skip_faulty=true"
+        )
+    kept = [entry for entry in entries if _decodes(path_of(entry))] if skip_faulty else list(entries)
+    if entries and not kept:
+        raise DataError(listing, "photos", f"none of {len(entries)} can be used", "check the path")
+    return kept
 
 
 def some(names: Sequence[str]) -> str:
-    """The first few names."""
-    return ", ".join(names[:_LISTED]) + (", …" if len(names) > _LISTED else "")
+    """The first few names, each at most 80 characters of it."""
+    shown = [name[:80].encode(errors="backslashreplace").decode() for name in names[:_LISTED]]
+    return ", ".join(shown) + (", …" if len(names) > _LISTED else "")
 
 
 def _decodes(path: Path) -> bool:

@@ -12,9 +12,10 @@ import msgspec
 from clear_strategies.data.cameras import Lens, pose_from_opengl
 from clear_strategies.data.capture import Frame
 from clear_strategies.data.photo_files import image_size
-from clear_strategies.data.photo_folders import PhotoRules
+from clear_strategies.data.photo_folders import usable
 from clear_strategies.data.strict_json import Number, typed
 from clear_strategies.errors import DataError
+from rasterizers.interface import Color
 
 # Distortion keys of each model, in OpenCV's order. nerfstudio's OPENCV has a k4 that OpenCV's polynomial lacks.
 _MODELS: Final = {
@@ -116,8 +117,10 @@ def frames_of(
     file: Path,
     transforms: Sequence[Transform],
     photos: Sequence[tuple[str, Path, str | None]],
-    rules: PhotoRules,
     folder: Path | None = None,
+    *,
+    background: Color | None,
+    skip_faulty: bool,
 ) -> list[Frame]:
     """The frames of a file whose photos can be used.
 
@@ -126,13 +129,13 @@ def frames_of(
         folder: the folder that all photos are in or below; None: the photo's own. Masks lie beside it.
     """
     frames = []
-    for i in rules.usable(file, range(len(photos)), lambda i: photos[i][1]):
+    for i in usable(file, range(len(photos)), lambda i: photos[i][1], skip_faulty=skip_faulty):
         where, transform, (name, path, split) = f"frames[{i}]", transforms[i], photos[i]
         pose = pose_from_opengl(file, f"{where}.transform_matrix", transform.transform_matrix)
         lens = transform.lens(file, where, path)
-        mask = rules.inside(file.parent, transform.mask_path, file=file) if transform.mask_path else None
+        mask = file.parent / transform.mask_path if transform.mask_path else None
         frames.append(
-            Frame.of_photo(name, path, lens, pose, background=rules.background, split=split, mask=mask, photos=folder)
+            Frame.of_photo(name, path, lens, pose, background=background, split=split, mask=mask, photos=folder)
         )
     return frames
 

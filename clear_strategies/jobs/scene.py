@@ -10,7 +10,7 @@ from typing import Any, Final, cast
 
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.hr_limit import within_limit
-from clear_strategies.data.photo_folders import Fault, require_faults, require_text
+from clear_strategies.data.photo_folders import require_text
 from clear_strategies.data.points import CloudSettings
 from clear_strategies.data.prepare import at_hr, prepare
 from clear_strategies.data.priors import Bicubic, Ncnn, Prior, cached, network_of
@@ -36,8 +36,6 @@ class DataSettings:
 
     Args:
         reader: reads the capture; called once every setting has been checked.
-        missing: photos that the data set names and that are not there: refuse, or skip them.
-        broken: photos that cannot be decoded: refuse, or skip them.
         save_lr: write the LR images to this folder, for an external SR model, and stop.
         path, root, scene: for the interpolations of conf/: the scene's folder, the folder of the scenes' folders, and the
             name of one of them.
@@ -46,15 +44,12 @@ class DataSettings:
     reader: Callable[[], Any]
     views: ViewSettings = field(default_factory=ViewSettings)
     cloud: CloudSettings = field(default_factory=CloudSettings)
-    missing: Fault = "refuse"
-    broken: Fault = "refuse"
     save_lr: str | None = None
     path: str | None = _variable()
     root: str | None = _variable()
     scene: str | None = _variable()
 
     def __post_init__(self) -> None:
-        require_faults(self.missing, self.broken)
         if self.path is not None and "root" not in getattr(self.reader, "keywords", {}):
             raise SettingError("path is of no use: this data set is read from no folder. Choose another, data=….")
 

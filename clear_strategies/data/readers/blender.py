@@ -9,7 +9,6 @@ from typing import Final
 from clear_strategies.core.checks import as_color
 from clear_strategies.data.capture import Capture, Frame, lens_notes, require_names
 from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.data.photo_folders import Fault, PhotoRules
 from clear_strategies.data.strict_json import read_object
 from clear_strategies.data.transforms import frames_of, photo_transforms
 from clear_strategies.errors import DataError
@@ -24,9 +23,7 @@ def read(
     root: str | Path,
     *,
     background: Color = _WHITE,
-    allow_outside: bool = False,
-    missing: Fault = "refuse",
-    broken: Fault = "refuse",
+    skip_faulty: bool = False,
 ) -> Capture:
     """Read a scene folder. Frames are named by their file (r_2), test frames with the prefix "test/".
 
@@ -34,16 +31,13 @@ def read(
 
     Args:
         background: RGB in [0, 1], behind transparent pixels.
-        allow_outside: follow file names and links that lead out of the folder.
-        missing: frames whose photo is not there: "refuse" or "skip".
-        broken: photos that cannot be decoded: "refuse" or "skip".
+        skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
 
     Raises:
         SettingError: the background is no colour.
         DataError: something is missing or not what it should be.
     """
     root, background = Path(root), as_color("data.reader.background", background)
-    rules = PhotoRules(background, allow_outside, missing, broken)
     if not root.is_dir():
         raise DataError(root, "folder", "is not there", "set data.path to the scene's folder")
     files, frames = [root / "transforms_train.json"], list[Frame]()
@@ -55,9 +49,9 @@ def read(
         transforms, photos = photo_transforms(file, read_object(file)), []
         for transform in transforms:
             ending = "" if transform.file_path.lower().endswith(SUFFIXES) else ".png"
-            path = rules.inside(root, transform.file_path + ending, file=file)
+            path = root / (transform.file_path + ending)
             photos.append((path.stem if split == "train" else f"test/{path.stem}", path, split))
-        frames += frames_of(file, transforms, photos, rules)
+        frames += frames_of(file, transforms, photos, background=background, skip_faulty=skip_faulty)
     require_names(frames, root)
     color = "white" if background == _WHITE else f"RGB {background}"
     notes = {

@@ -12,8 +12,9 @@ from typing import Final
 import numpy as np
 import torch
 
-from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
-from clear_strategies.data.photo_folders import Fault, PhotoRules, by_stem, folder_note, image_folder, images_in
+from clear_strategies.core.checks import as_color
+from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
+from clear_strategies.data.photo_folders import by_stem, folder_note, image_folder, images_in, is_file, usable
 from clear_strategies.data.readers.colmap_model import Model, find_model, pose_of, read_model
 from clear_strategies.errors import DataError
 from rasterizers.interface import Color
@@ -27,39 +28,42 @@ def read(
     root: str | Path,
     images: str | None = "images",
     *,
-    background: Color | None = None,
-    allow_outside: bool = False,
-    missing: Fault = "refuse",
-    broken: Fault = "refuse",
+    background: Color = BLACK,
+    skip_faulty: bool = False,
 ) -> Capture:
     """Read a scene folder with a sparse model in sparse/0, sparse, colmap/sparse/0 or the folder itself.
 
     Args:
         images: folder of the photos below root. Cameras are rescaled if the photos have another size than the model's.
             None: the first that exists of images, images_2, images_4, images_8.
-        background: RGB in [0, 1] behind transparent pixels; None: black.
-        allow_outside: follow file names and links that lead out of that folder.
-        missing: photos of the model that are not there: "refuse" or "skip".
-        broken: photos that cannot be decoded: "refuse" or "skip".
+        background: RGB in [0, 1] behind transparent pixels.
+        skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
 
     Raises:
         SettingError: the background is no colour.
         DataError: the model or an image cannot be used.
     """
-    root, rules = Path(root), PhotoRules(background, allow_outside, missing, broken)
+    root, background = Path(root), as_color("data.reader.background", background)
     model = read_model(find_model(root))
     folder = image_folder(root, images)
     listing = model.folder / f"images{model.ending}"
-    paths = _photos(folder, [image.name for image in model.images], listing, rules)
-    if not any(path.is_file() for path in paths.values()):
+    paths = _photos(folder, [image.name for image in model.images])
+    if not any(map(is_file, paths.values())):
         first = model.images[0].name
         remedy = "set data.reader.images to the folder that the model was made from"
         raise DataError(listing, first, f"is not in {folder}, and no other photo is", remedy)
-    return capture(root, model, folder, paths, rules)
+    return capture(root, model, folder, paths, background=background, skip_faulty=skip_faulty)
 
 
 def capture(
-    root: Path, model: Model, folder: Path, paths: Mapping[str, Path], rules: PhotoRules, *, upright: bool | None = None
+    root: Path,
+    model: Model,
+    folder: Path,
+    paths: Mapping[str, Path],
+    *,
+    background: Color = BLACK,
+    skip_faulty: bool = False,
+    upright: bool | None = None,
 ) -> Capture:
     """The capture of a model and its photos: `paths` by the model's names, below `folder`.
 
@@ -70,11 +74,11 @@ def capture(
         DataError: an image cannot be used.
     """
     listing = model.folder / f"images{model.ending}"
-    kept = rules.usable(listing, model.images, lambda image: paths[image.name])
+    kept = usable(listing, model.images, lambda image: paths[image.name], skip_faulty=skip_faulty)
     frames = [
         Frame.of_photo(
-            paths[image.name].relative_to(folder).as_posix(), paths[image.name], model.lenses[image.camera],
-            pose_of(image), upright=upright, background=rules.background, sfm_id=image.id, photos=folder,
+            _name_below(folder, paths[image.name]), paths[image.name], model.lenses[image.camera],
+            pose_of(image), upright=upright, background=background, sfm_id=image.id, photos=folder,
         )
         for image in kept
     ]  # fmt: skip
@@ -96,9 +100,7 @@ def capture(
     points = sfm_points(model, _label(root, model))
     if points is None:
         notes["points"] = "the model has none"
-    return Capture(
-        root.resolve().name, sorted_by_name(frames, model.folder), points, rules.background or (0.0, 0.0, 0.0), notes
-    )
+    return Capture(root.resolve().name, sorted_by_name(frames, listing), points, background, notes)
 
 
 def sfm_points(model: Model, label: str) -> SfmPoints | None:
@@ -120,7 +122,12 @@ def _label(root: Path, model: Model) -> str:
     return model.folder.relative_to(root).as_posix() if model.folder.is_relative_to(root) else model.folder.name
 
 
-def _photos(folder: Path, names: Sequence[str], listing: Path, rules: PhotoRules) -> dict[str, Path]:
+def _name_below(folder: Path, path: Path) -> str:
+    """The name of a photo's frame; a path that is not below the folder stays whole, which `sorted_by_name` refuses."""
+    return (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix()
+
+
+def _photos(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """The photo of each name, else the only one of the same stem: images_4 often holds PNG files for JPG names.
 
     The path of a missing photo leads to no file.
@@ -128,11 +135,7 @@ def _photos(folder: Path, names: Sequence[str], listing: Path, rules: PhotoRules
     by_stem_in = cache(lambda parent: by_stem(images_in(parent)))
     paths = {}
     for name in names:
-        path = rules.inside(folder, name, file=listing)
-        twins = [] if path.is_file() else by_stem_in(path.parent).get(path.stem, [])
-        if len(twins) == 1:
-            path = twins[0]
-            if not rules.allow_outside:
-                rules.inside(folder, path.relative_to(folder).as_posix(), file=listing)
-        paths[name] = path
+        path = folder / name
+        twins = [] if is_file(path) else by_stem_in(path.parent).get(path.stem, [])
+        paths[name] = twins[0] if len(twins) == 1 else path
     return paths

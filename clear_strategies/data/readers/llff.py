@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.lib import format as npy_format
 
-from clear_strategies.core.checks import require_choice
+from clear_strategies.core.checks import as_color, require_choice
 from clear_strategies.data.cameras import Lens, rigid_inverse
-from clear_strategies.data.capture import Capture, Frame, lens_notes, sorted_by_name
-from clear_strategies.data.photo_folders import Fault, PhotoRules, folder_note, image_folder, list_images
+from clear_strategies.data.capture import BLACK, Capture, Frame, lens_notes, sorted_by_name
+from clear_strategies.data.photo_folders import folder_note, image_folder, list_images, usable
 from clear_strategies.data.readers import colmap
 from clear_strategies.data.readers.colmap_model import Model, find_model, read_model
 from clear_strategies.errors import DataError
@@ -33,41 +33,37 @@ def read(
     images: str | None = None,
     poses: str = "auto",
     *,
-    background: Color | None = None,
-    allow_outside: bool = False,
-    missing: Fault = "refuse",
-    broken: Fault = "refuse",
+    background: Color = BLACK,
+    skip_faulty: bool = False,
 ) -> Capture:
     """Read an LLFF scene folder.
 
     Args:
         images: folder of the photos below root; None: the first that exists of images, images_2, images_4, images_8.
         poses: "colmap" (sparse/0), "poses_bounds", or "auto": COLMAP's if it has a model.
-        background: RGB in [0, 1] behind transparent pixels; None: black.
-        allow_outside: follow links that lead out of the photos' folder.
-        missing: photos of COLMAP's model that are not there: "refuse" or "skip".
-        broken: photos that cannot be decoded: "refuse" or "skip".
+        background: RGB in [0, 1] behind transparent pixels.
+        skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
 
     Raises:
         SettingError: `poses` or the background is none of these.
         DataError: something is missing or not what it should be.
     """
-    root, rules = Path(root), PhotoRules(background, allow_outside, missing, broken)
+    root, background = Path(root), as_color("data.reader.background", background)
     require_choice("data.reader.poses", poses, ("auto", "colmap", "poses_bounds"))
     folder = image_folder(root, images)
     has_model = any((root / layout).is_dir() for layout in ("sparse", "colmap/sparse"))
     if poses == "colmap" or (poses == "auto" and has_model):
-        return _from_colmap(root, folder, rules)
-    return _from_bounds(root, folder, has_model, rules)
+        return _from_colmap(root, folder, background, skip_faulty)
+    return _from_bounds(root, folder, has_model, background, skip_faulty)
 
 
-def _from_colmap(root: Path, folder: Path, rules: PhotoRules) -> Capture:
+def _from_colmap(root: Path, folder: Path, background: Color, skip_faulty: bool) -> Capture:
     model = read_model(find_model(root))
     registered = sorted(image.name for image in model.images)
-    files = {p.name: rules.inside(folder, p.name, file=folder) for p in list_images(folder)}
+    files = {path.name: path for path in list_images(folder)}
     if any(name in files for name in registered):
         paths = {name: files.get(name, folder / name) for name in registered}
-        return colmap.capture(root, model, folder, paths, rules)
+        return colmap.capture(root, model, folder, paths, background=background, skip_faulty=skip_faulty)
     # LLFF's scripts rename the photos of images_4 and the like, in the order of the originals.
     if len(files) != len(registered):
         raise DataError(
@@ -75,12 +71,12 @@ def _from_colmap(root: Path, folder: Path, rules: PhotoRules) -> Capture:
             "set data.reader.images to the folder that the model was made from",
         )  # fmt: skip
     ordered = dict(zip(registered, (files[name] for name in sorted(files)), strict=True))
-    capture = colmap.capture(root, model, folder, ordered, rules)
+    capture = colmap.capture(root, model, folder, ordered, background=background, skip_faulty=skip_faulty)
     first = f"{registered[0]} is {ordered[registered[0]].name}"
     return replace(capture, notes={**capture.notes, "names": f"photos matched to the model's by order ({first})"})
 
 
-def _from_bounds(root: Path, folder: Path, has_model: bool, rules: PhotoRules) -> Capture:
+def _from_bounds(root: Path, folder: Path, has_model: bool, background: Color, skip_faulty: bool) -> Capture:
     file = root / "poses_bounds.npy"
     table = read_bounds(file)
     paths = list_images(folder)
@@ -90,7 +86,7 @@ def _from_bounds(root: Path, folder: Path, has_model: bool, rules: PhotoRules) -
     model = read_model(find_model(root)) if has_model else None
     ids = _ids_by_order(model, len(paths))
     frames = []
-    for i in rules.usable(folder, range(len(paths)), lambda i: paths[i]):
+    for i in usable(folder, range(len(paths)), lambda i: paths[i], skip_faulty=skip_faulty):
         row, path = table[i], paths[i]
         pose = row[:15].reshape(3, 5)
         height, width, focal = pose[:, 4]
@@ -98,10 +94,7 @@ def _from_bounds(root: Path, folder: Path, has_model: bool, rules: PhotoRules) -
         rotation = np.stack((right, down, -back), axis=1)
         lens = Lens(round(width), round(height), focal, focal, width / 2, height / 2).check(file, f"row {i}")
         world_to_camera = rigid_inverse(file, f"row {i}", rotation, pose[:, 3])
-        rules.inside(folder, path.name, file=folder)
-        frames.append(
-            Frame.of_photo(path.name, path, lens, world_to_camera, background=rules.background, sfm_id=ids[i])
-        )
+        frames.append(Frame.of_photo(path.name, path, lens, world_to_camera, background=background, sfm_id=ids[i]))
     near, far = table[:, 15].min(), table[:, 16].max()
     if not 0 < near < far:
         raise DataError(file, "bounds", f"are {near:g} and {far:g}; 0 < near < far must hold", _REMEDY)
@@ -114,9 +107,7 @@ def _from_bounds(root: Path, folder: Path, has_model: bool, rules: PhotoRules) -
     points = None
     if model is not None and ids[0] is not None:  # LLFF's poses are in the coordinates of this model
         points = colmap.sfm_points(model, model.folder.relative_to(root).as_posix())
-    return Capture(
-        root.resolve().name, sorted_by_name(frames, folder), points, rules.background or (0.0, 0.0, 0.0), notes
-    )
+    return Capture(root.resolve().name, sorted_by_name(frames, folder), points, background, notes)
 
 
 def _ids_by_order(model: Model | None, n: int) -> list[int | None]:

@@ -12,9 +12,10 @@ from typing import Final
 import msgspec
 import torch
 
-from clear_strategies.data.capture import Capture, Frame, SfmPoints, lens_notes, sorted_by_name
+from clear_strategies.core.checks import as_color
+from clear_strategies.data.capture import BLACK, Capture, Frame, SfmPoints, lens_notes, sorted_by_name
 from clear_strategies.data.photo_files import SUFFIXES
-from clear_strategies.data.photo_folders import Fault, PhotoRules
+from clear_strategies.data.photo_folders import is_file
 from clear_strategies.data.ply import read_points
 from clear_strategies.data.strict_json import read_object, typed
 from clear_strategies.data.transforms import frames_of, photo_transforms
@@ -38,24 +39,20 @@ class _Lists(msgspec.Struct):
 def read(
     root: str | Path,
     *,
-    background: Color | None = None,
-    allow_outside: bool = False,
-    missing: Fault = "refuse",
-    broken: Fault = "refuse",
+    background: Color = BLACK,
+    skip_faulty: bool = False,
 ) -> Capture:
     """Read a folder with transforms.json, or that file. Poses are taken as they are, `applied_transform` included.
 
     Args:
-        background: RGB in [0, 1] behind transparent pixels; None: black.
-        allow_outside: follow file names and links that lead out of the folder.
-        missing: frames whose photo is not there: "refuse" or "skip".
-        broken: photos that cannot be decoded: "refuse" or "skip".
+        background: RGB in [0, 1] behind transparent pixels.
+        skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
 
     Raises:
         SettingError: the background is no colour.
         DataError: something is missing or not what it should be.
     """
-    root, rules = Path(root), PhotoRules(background, allow_outside, missing, broken)
+    root, background = Path(root), as_color("data.reader.background", background)
     file = root if root.suffix == ".json" else root / "transforms.json"
     folder, content = file.parent, read_object(file)
     transforms = photo_transforms(file, content)
@@ -65,10 +62,11 @@ def read(
     parts = [PurePosixPath(name).parts for name in names]
     shared = os.path.commonprefix([part[:-1] for part in parts])  # noqa: RUF071 - compares tuples of folders
     photos = [
-        ("/".join(part[len(shared) :]), _photo(folder, name, file, rules), splits.get(name))
+        ("/".join(part[len(shared) :]), _photo(folder, name), splits.get(name))
         for name, part in zip(names, parts, strict=True)
     ]
-    frames = frames_of(file, transforms, photos, rules, folder.joinpath(*shared) if shared else None)
+    below = folder.joinpath(*shared) if shared else None
+    frames = frames_of(file, transforms, photos, below, background=background, skip_faulty=skip_faulty)
     notes = {"poses": f"{file.name}, {len(frames)} images", **lens_notes(frames)}
     if splits:
         if strangers := sorted(splits.keys() - set(names)):
@@ -77,20 +75,16 @@ def read(
         notes["split"] = _split_note(file, frames)
     points = None
     if (name := lists.ply_file_path) is not None:
-        cloud = read_points(rules.inside(folder, name, file=file))
+        cloud = read_points(folder / name)
         none = torch.zeros(0, dtype=torch.long)
         points = SfmPoints(cloud.means, cloud.colors, none, none, f"{name}, {len(cloud):,} points without tracks")
-    return Capture(
-        folder.resolve().name, sorted_by_name(frames, file), points, rules.background or (0.0, 0.0, 0.0), notes
-    )
+    return Capture(folder.resolve().name, sorted_by_name(frames, file), points, background, notes)
 
 
-def _photo(folder: Path, name: str, file: Path, rules: PhotoRules) -> Path:
+def _photo(folder: Path, name: str) -> Path:
     """The photo of this name; instant-ngp omits the ending .png."""
-    path = rules.inside(folder, name, file=file)
-    if name.lower().endswith(SUFFIXES) or path.is_file():
-        return path
-    return rules.inside(folder, f"{name}.png", file=file)
+    has_ending = name.lower().endswith(SUFFIXES) or is_file(folder / name)
+    return folder / (name if has_ending else f"{name}.png")
 
 
 def _splits(file: Path, lists: _Lists) -> dict[str, str]:

@@ -13,7 +13,7 @@ from typing import Final, Literal
 from clear_strategies.core.checks import require_choice, require_number, require_whole
 from clear_strategies.data.capture import Capture
 from clear_strategies.data.photo_files import Exif, image_size, read_exif
-from clear_strategies.data.photo_folders import Fault, PhotoRules, list_images, require_text, some
+from clear_strategies.data.photo_folders import list_images, require_text, some, usable
 from clear_strategies.data.priors import cache_folder
 from clear_strategies.data.readers import colmap, sfm
 from clear_strategies.data.readers.colmap_model import read_model
@@ -39,9 +39,7 @@ def read(
     least_placed: float = 0.5,
     threads: int = -1,
     seed: int = 0,
-    allow_outside: bool = False,
-    missing: Fault = "refuse",
-    broken: Fault = "refuse",
+    skip_faulty: bool = False,
 ) -> Capture:
     """Read a folder of photos of one scene, or a video. Poses are estimated from all of them and kept in a cache.
 
@@ -56,9 +54,7 @@ def read(
         least_placed: the least share of the photos whose poses must be found.
         threads: of COLMAP; -1: all. With more than one, the poses' last digits may change from run to run.
         seed: of COLMAP's random samples.
-        allow_outside: follow links that lead out of the folder.
-        missing: photos whose link leads nowhere: "refuse" or "skip".
-        broken: photos that cannot be decoded: "refuse" or "skip".
+        skip_faulty: leave out photos that are missing or damaged, with a warning for each; else they are an error.
 
     Raises:
         SettingError: a number is outside its range.
@@ -72,7 +68,6 @@ def read(
     require_whole("data.reader.seed", seed, least=0)
     if frames is not None:
         require_whole("data.reader.frames", frames, least=sfm.FEWEST)
-    rules = PhotoRules(None, allow_outside, missing, broken)
     root, name, video_note = Path(root), Path(root).resolve().name, {}
     if root.is_file():
         video, root = root, frames_of(root, frames)
@@ -82,8 +77,7 @@ def read(
     base = Path(cache) if cache is not None else cache_folder() / "sfm"
     if base.resolve().is_relative_to(root.resolve()):
         raise DataError(root, "cache", f"{base} lies among the photos", "set data.reader.cache to a folder elsewhere")
-    listed = _once_each([rules.inside(root, p.name, file=root) for p in list_images(root)])
-    paths = rules.usable(root, listed, lambda path: path)
+    paths = usable(root, _once_each(list_images(root)), lambda path: path, skip_faulty=skip_faulty)
     require_text((name, *(path.name for path in paths)))
     if len(paths) < sfm.FEWEST:
         problem = f"there are {len(paths)}, poses need at least {sfm.FEWEST}"
@@ -106,7 +100,7 @@ def _capture(root: Path, photos: Mapping[Path, Exif], folder: Path) -> Capture:
     """The photos that have poses in the model in `folder`, whose images are named by `sfm.copy_name`."""
     model, photo_of = read_model(folder), {sfm.copy_name(i): path for i, path in enumerate(photos)}
     posed = {image.name: photo_of[image.name] for image in model.images}
-    capture = colmap.capture(root, model, root, posed, PhotoRules(), upright=True)
+    capture = colmap.capture(root, model, root, posed, upright=True)
     names = {copy: path.name for copy, path in photo_of.items()}
     entries = read_object(folder / sfm.UNPLACED)
     unplaced = {names[copy]: sfm.why_unplaced(entry, names) for copy, entry in entries.items()}

@@ -79,6 +79,7 @@ READ: dict[str, tuple[Callable[[Path], object], list[str]]] = {
     "HEIC that calls itself JPEG": (lambda f: as_heic(f, "b.jpg"), ["a.png", "b.jpg", "c.png"]),
     "a photo saved as HEIC and as JPEG": (lambda f: beside(f, "b.HEIC"), ALL),
     "what a Mac and a phone leave": (lambda f: beside(f, "._a.png", ".DS_Store", "clip.mov", "Thumbs.db"), ALL),
+    "links to another folder": (lambda f: captures.link(f, f.parent / "elsewhere"), ALL),
     "a link to nowhere": (lambda f: (f / "d.png").symlink_to(f / "gone.png"), ALL),
     "an ending in capitals, a name with spaces": (lambda f: again(f, "b é (1).JPG"), ["a.png", "b é (1).JPG", "c.png"]),
     "a grey photo": (lambda f: image_of(f / "b.png").convert("L").save(f / "b.png"), ALL),
@@ -110,16 +111,12 @@ class Refusal(NamedTuple):
     setting: dict[str, object] | None = None
 
 
-SKIP, BROKEN = {"broken": "skip"}, "data.broken=skip"
+SKIP, BROKEN = {"skip_faulty": True}, "data.reader.skip_faulty=true"
 REFUSED = {
     "a truncated photo": Refusal(lambda f: (f / "d.png").write_bytes((f / "b.png").read_bytes()[:200]), ("d.png", BROKEN), SKIP),
     "an empty file": Refusal(lambda f: (f / "d.jpg").touch(), ("d.jpg", BROKEN), SKIP),
     "colours for print": Refusal(
         lambda f: image_of(f / "a.png").convert("CMYK").save(f / "d.jpg"), ("d.jpg", "CMYK", "convert the image"), SKIP
-    ),
-    "links out of the folder": Refusal(
-        lambda f: captures.link(f, f.parent / "elsewhere"),
-        ("leads out of", "data.reader.allow_outside=true"), {"allow_outside": True},
     ),
     "two files of one name": Refusal(lambda f: image_of(f / "a.png").save(f / "a.jpg"), ("'a' has several files", "keep one")),
     "two photos": Refusal(lambda f: (f / "b.png").unlink(), ("there are 2, poses need at least 3", "take more photos")),

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from clear_strategies.data.photo_folders import PhotoRules, image_folder, list_images
+from clear_strategies.data.photo_folders import image_folder, list_images
 from clear_strategies.data.readers import colmap
 from clear_strategies.jobs import resume
 from clear_strategies.jobs.lock import hold
@@ -37,10 +37,6 @@ def _finished(metrics: object) -> Callable[[Path], object]:
     return at("metrics.json", lambda path: resume.finished(path.parent, {}), content.encode())
 
 
-def _named(name: str) -> Callable[[Path], object]:
-    return lambda folder: PhotoRules().inside(folder, name, file=folder)
-
-
 def _hidden_photos_only(folder: Path) -> None:
     (folder / ".a.png").write_bytes(b"")
     (folder / "notes.txt").write_text("")
@@ -56,10 +52,6 @@ _CASES: dict[str, tuple[Callable[[Path], object], str]] = {
     "folder of photos by a name that is not there": (lambda folder: image_folder(folder, "images_16"), "is no folder"),
     "photos at a path that is absent": (at("none", list_images), "folder: is not there"),
     "folder without images": (at("", list_images, _hidden_photos_only), "images: holds no image"),
-    "name of a photo that is empty": (_named(""), "'' is no file name"),
-    "name of a photo with a zero": (_named("a\0.png"), "is no file name"),
-    "name of a photo with 300 letters": (_named("x" * 300), "is no file name"),
-    "name of a photo with 200 accents": (_named("é" * 200), "is no file name"),
     "lock held by this process": (_held_twice, "is at work in this folder"),
     "run that is absent": (at("none", open_splat), "none"),
     "run that is an empty folder": (open_splat, ": "),

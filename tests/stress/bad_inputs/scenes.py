@@ -119,16 +119,9 @@ def raw_pickle(root: Path) -> None:
     (root / "poses_bounds.npy").write_bytes(pickle.dumps(Canary(root / "canary")))
 
 
-def link_outside(name: str) -> Spoil:
-    """Replace a photo by a link to a file outside the scene's folder."""
-
-    def spoil(root: Path) -> None:
-        outside = root.parent / "outside.png"
-        outside.write_bytes((root / name).read_bytes())
-        (root / name).unlink()
-        (root / name).symlink_to(outside)
-
-    return spoil
+def photo_outside(root: Path) -> None:
+    (root / "images/a.png").rename(root / "outside.png")
+    replace(IMAGES_TXT, "a.png", "../outside.png")(root)
 
 
 def link_in_circle(name: str) -> Spoil:
@@ -172,7 +165,7 @@ INPUTS = [
     # COLMAP, binary
     case("no model", "colmap", remove(CAMERAS), r"cameras\.bin: file"),
     case("no photos", "colmap", lambda root: (root / "images").rename(root / "photos"), r"scene/images: images: is no folder"),
-    case("photo absent", "colmap", remove("images/b.png"), r"images\.bin: photos: 1 of 3 .* b\.png: .*data\.missing=skip"),
+    case("photo absent", "colmap", remove("images/b.png"), r"images\.bin: photos: 1 of 3 .* b\.png: .*skip_faulty=true"),
     case("empty file", "colmap", write(IMAGES, b""), r"images\.bin: number of images: .*truncated"),
     case("cameras truncated", "colmap", cut(CAMERAS, -1), r"cameras\.bin: .*bytes"),
     case("images truncated", "colmap", cut(IMAGES, -9), r"images\.bin: .*left"),
@@ -201,7 +194,6 @@ INPUTS = [
     case("name is no UTF-8", "colmap", patch(IMAGES, NAME_AT, "<B", 0xFF), r"images\.bin: name of image 0: .*UTF-8"),
     case("name without end", "colmap", name_without_end, r"images\.bin: name of image 0: is no text"),
     case("images of another shape", "colmap", save_image("images/b.png", size=(16, 9)), r"b\.png: size: is 16x9"),
-    case("symlink leads out", "colmap", link_outside("images/b.png"), r"images\.bin: file name: 'b\.png' leads out"),
     case("symlink in a circle", "colmap", link_in_circle("images/b.png"), r"images\.bin: .*b\.png"),
     case("image bomb", "colmap", write("images/b.png", bomb(60000, 60000)), r"b\.png: (size|file): .*(pixels|Bomb)"),
     case("text named .png", "colmap", write("images/b.png", b"not a picture\n" * 9), r"b\.png: file: is no readable"),
@@ -224,8 +216,7 @@ INPUTS = [
     case("txt odd track", "colmap_txt", replace(POINTS_TXT, "0.5 1 0", "0.5 1"), r"points3D\.txt: line 2: has 11 col"),
     case("txt colour 300", "colmap_txt", replace(POINTS_TXT, "255", "300"), r"points3D\.txt: line 2: has the colour"),
     case("txt 5000 digits", "colmap_txt", replace(CAMERAS_TXT, "16", "1" * 5000), r"cameras\.txt: line 2: .*whole"),
-    case("txt absolute path", "colmap_txt", replace(IMAGES_TXT, "a.png", "/etc/passwd"), r"images\.txt: .*leads out"),
-    case("txt path traversal", "colmap_txt", replace(IMAGES_TXT, "a.png", "../../x.png"), r"images\.txt: .*leads out"),
+    case("txt path traversal", "colmap_txt", photo_outside, r"images\.txt: file name: '\.\./outside\.png' leads out"),
     # LLFF
     case("npy absent", "llff", remove("poses_bounds.npy"), r"poses_bounds\.npy: file: .*No such file"),
     case("npy truncated", "llff", cut("poses_bounds.npy", -8), r"poses_bounds\.npy: size: .*asks for 408 bytes, 400"),
@@ -255,9 +246,8 @@ INPUTS = [
     case("angle beyond pi", "blender", edit(TRAIN, lambda v: v.update(camera_angle_x=4)), r"camera_angle_x: is 4"),
     case("two frames of one file", "blender", edit_frame(TRAIN, file_path="./train/a"), r"'a' belongs to two"),
     case("frame without image", "blender", edit_frame(TRAIN, file_path="./train/x"), r"train\.json: photos: 1 of 2 .* x\.png: "),
-    case("path leads out", "blender", edit_frame(TRAIN, file_path="../../x"), r"train\.json: file name: .*leads out"),
-    case("path with a surrogate", "blender", edit_frame(TRAIN, file_path="\ud800"), r"train\.json: file name"),
-    case("path of 5000 letters", "blender", edit_frame(TRAIN, file_path="x" * 5000), r"file name: 'x+' is no file name"),
+    case("path with a surrogate", "blender", edit_frame(TRAIN, file_path="\ud800"), r"photos: 1 of 2 .* \\ud800\.png: "),
+    case("path of 5000 letters", "blender", edit_frame(TRAIN, file_path="x" * 5000), r"photos: 1 of 2 .* x{80}: "),
     # nerfstudio
     case("NaN constant", "nerfstudio", replace(SHARED, '"fl_x": 20.0', '"fl_x": NaN'), r"json: is not valid \(NaN"),
     case("1e999", "nerfstudio", replace(SHARED, '"fl_x": 20.0', '"fl_x": 1e999'), r"json: is not valid \(1e999"),
@@ -283,7 +273,6 @@ INPUTS = [
     case("matrix last row", "nerfstudio", edit_frame(SHARED, transform_matrix=np.diag([1.0, 1, 1, 2]).tolist()),
          r"frames\[1\]\.transform_matrix: has the last row"),
     case("file_path missing", "nerfstudio", edit_frame(SHARED, file_path=None), r"frames\[1\]\.file_path: must be"),
-    case("absolute file_path", "nerfstudio", edit_frame(SHARED, file_path="/etc/hostname"), r"file name: .*leads out"),
     case("w and h of another shape", "nerfstudio", edit(SHARED, lambda v: v.update(w=12, h=16)), r"a\.png: size"),
     case("split lists overlap", "nerfstudio",
          edit(SHARED, lambda v: v.update(train_filenames=["images/a.png"], test_filenames=["images/a.png"])),
@@ -291,5 +280,4 @@ INPUTS = [
     case("split lists a stranger", "nerfstudio", edit(SHARED, lambda v: v.update(test_filenames=["images/z.png"])),
          r"split: lists 'images/z\.png'"),
     case("PLY absent", "nerfstudio", edit(SHARED, lambda v: v.update(ply_file_path="p.ply")), r"p\.ply: file"),
-    case("PLY leads out", "nerfstudio", edit(SHARED, lambda v: v.update(ply_file_path="../p.ply")), r"file name"),
 ]  # fmt: skip
