@@ -49,6 +49,18 @@ def show(*, verbose: bool = False) -> None:
         logging.getLogger(name).setLevel(logging.DEBUG)
 
 
+def show_in_host() -> None:
+    """Print our messages as "[clear] …" to stderr in another trainer, unless it handles logging itself."""
+    if logging.getLogger().handlers:
+        return
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("[clear] %(message)s"))
+    for logger in map(logging.getLogger, _OURS):
+        if not logger.handlers:
+            logger.addHandler(handler)
+            logger.setLevel(logging.INFO)
+
+
 @contextlib.contextmanager
 def logged(path: Path) -> Iterator[None]:
     """Write all messages of the packages to a file, those that are shown with -v alone included, as Hydra does for its jobs."""

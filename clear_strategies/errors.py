@@ -49,6 +49,10 @@ class AnchorError(ClearError, RuntimeError):
     """The number of Gaussians changed after their anchor was taken (Eq. 16)."""
 
 
+class HostError(ClearError, RuntimeError):
+    """Another trainer does something that is not supported. The message says what, and what to change there."""
+
+
 def one_line(text: object) -> str:
     """A text, or the message of an error, in one line."""
     return " ".join(str(text).split())

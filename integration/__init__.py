@@ -1,7 +1,7 @@
 """The strategies inside other trainers. Imports nothing of this package's training loop, and no heavy library."""
 
+from clear_strategies.errors import HostError
 from integration.autograd_shot import AutogradShot
-from integration.errors import HostError
 from integration.host_score import ScoreScaler
 from integration.loss import extra_loss, joint_loss
 from integration.views import view

@@ -19,7 +19,8 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final
@@ -33,13 +34,12 @@ from clear_strategies.core import deferred
 from clear_strategies.core.gradients import Grads, conflict_columns
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import View
+from clear_strategies.errors import HostError, SettingError
 from clear_strategies.merging.conductor import Conductor
 from clear_strategies.merging.iteration import HrGradients, only
-from integration.errors import HostError
+from integration.autograd_shot import HostOutput, RenderAt
 from integration.extra_steps import ExtraSteps
-from integration.host_rendering import HostRendering, RenderAt, called_at, random_state_kept
 from integration.host_score import ScoreScaler, write_score
-from integration.start import announce, require_supported
 from integration.views import by_name, enlarged_mask
 from rasterizers.interface import Color
 
@@ -85,7 +85,7 @@ class Attachment:
         masks: Mapping[str, Tensor] | None = None,
         own_background: bool = True,
     ) -> None:
-        require_supported(conductor, accumulation)
+        _require_supported(conductor, accumulation)
         self._views = by_name(views)
         self.conductor, self.params, self.accumulation = conductor, params, accumulation
         self._masks, self._own_background = dict(masks or {}), own_background
@@ -98,7 +98,7 @@ class Attachment:
         self._passes = 0  # backward passes of this iteration
         self._merges_before_step = 0  # at the host's last step
         self._detail_gradients = 0
-        self._pending: tuple[int, HostRendering, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
+        self._pending: tuple[int, HostOutput, HrGradients[Grads] | None] | None = None  # rendered, not merged yet
         self._step: Step | None = None  # of the rendering, until `after_step`
         self._extra = ExtraSteps(conductor, params)
         self._grads_before: dict[str, Tensor] = {}  # .grad when the backward pass began
@@ -106,7 +106,7 @@ class Attachment:
         self._logged: dict[str, deferred.Number] = {}
         self._hooks: list[Any] = []
         conductor.on_fit_start(len(views), seed, params()["means"].device, views)
-        announce(conductor, views, own_background=own_background)
+        _announce(conductor, views, own_background=own_background)
 
     def render_view(self, view: View, render_at: RenderAt) -> Any:
         """Render a training view at both scales; returns what the host's render function returns at LR."""
@@ -119,7 +119,7 @@ class Attachment:
         hr_grads = None
         if conductor.wants_hr(t):
             self.counts["HR renders"] += 1
-            with random_state_kept(means.device):
+            with _random_state_kept(means.device):
                 shot = render_at("hr", z).shot
             if (mask := self._masks.get(view.name)) is not None:
                 shot = replace(shot, image=shot.image * enlarged_mask(mask.to(shot.image), view.factor)[..., None])
@@ -128,14 +128,14 @@ class Attachment:
         if self._passes == 0:  # one step of the host, however many passes it accumulates
             self._extra.forget()
             if extra_views := conductor.extra_views(t):
-                with random_state_kept(means.device):
+                with _random_state_kept(means.device):
                     self._extra.render(extra_views, t, lambda camera: render_at(camera, None).shot)
-        rendering = render_at("lr", z)
+        output = render_at("lr", z)
         self.counts["LR renders"] += 1
-        if rendering.output.requires_grad:
-            self._pending = (nth := self.counts["LR renders"]), rendering, hr_grads
-            rendering.output.register_hook(called_at(WeakMethod(self._on_backward), nth))  # type: ignore[no-untyped-call]
-        return rendering.returned
+        if output.hooked.requires_grad:
+            self._pending = (nth := self.counts["LR renders"]), output, hr_grads
+            output.hooked.register_hook(_called_at(WeakMethod(self._on_backward), nth))  # type: ignore[no-untyped-call]
+        return output.returned
 
     @property
     def background(self) -> Color | None:
@@ -273,7 +273,7 @@ class Attachment:
         """
         if self._pending is None or ((versions := self._grad_versions()) and versions == self._versions_before):
             return
-        (_, rendering, hr_grads), self._pending = self._pending, None
+        (_, output, hr_grads), self._pending = self._pending, None
         grad_scale = (self._loss_scale() if self._loss_scale is not None else 1.0) / self.accumulation
         trained = {name: p for name, p in self.params().items() if p.grad is not None or name == "detail"}
         g_lr = Grads({
@@ -290,7 +290,7 @@ class Attachment:
             p.grad = (g + self._grads_before[name] if name in self._grads_before else g).to(p)
         if screen_gradient is not None and hr_grads is not None:
             scores = partial(self.conductor.scores, hr=hr_grads, t=self.t)
-            if write_score(rendering.shot, screen_gradient / grad_scale, scores, self._scaler, grad_scale):
+            if write_score(output.shot, screen_gradient / grad_scale, scores, self._scaler, grad_scale):
                 self.counts["scores written"] += 1
         self._grads_before = {}
         self._passes += 1
@@ -329,3 +329,53 @@ class Attachment:
                 "rasterization(sparse_grad=False)."
             )
         return grad - self._grads_before[name] if name in self._grads_before else grad
+
+
+def _require_supported(conductor: Conductor, accumulation: int) -> None:
+    """Raise a SettingError for what no host can do."""
+    if accumulation < 1:
+        raise SettingError(f"accumulation: must be at least 1 backward pass per step, got {accumulation}.")
+    if not conductor.wants_lr:
+        raise SettingError(
+            "objective: a host renders LR itself, so lambda_lr must be > 0 and lr_from must be lr, got "
+            f"lambda_lr={conductor.objective.lambda_lr}, lr_from={conductor.objective.lr_from!r}."
+        )
+    distributed = torch.distributed
+    if distributed.is_available() and distributed.is_initialized() and (n := distributed.get_world_size()) > 1:
+        raise SettingError(f"CLEAR trains in one process, got {n}. Start the training without torchrun, on one device.")
+
+
+def _announce(conductor: Conductor, views: Sequence[View], *, own_background: bool) -> None:
+    """Log what each strategy will do, and which have no effect. After `on_fit_start`.
+
+    Args:
+        own_background: the host chooses its background by itself.
+    """
+    for s in conductor.strategies:
+        if (prepared := s.summary()) is not None:
+            _log.info("%s: %s.", type(s).__name__, prepared)
+    if not conductor.decorated and any(view.factor > 1 for view in views):
+        _log.warning(
+            "%s has no effect: the views were made without it. Make them with sr=conductor.prior(sr).",
+            ", ".join(getattr(getattr(d, "func", d), "__name__", str(d)) for d in conductor.decorators),
+        )
+    for hook, reason in {
+        "densifier": "keeps its own density control",
+        **({"background": "chooses its background itself"} if own_background else {}),
+    }.items():
+        if (owner := conductor.owner(hook)) is not None:
+            _log.info("%s has no effect here: the host %s.", type(owner).__name__, reason)
+    if not conductor.strategies:
+        _log.info("no strategy is attached: both losses are summed, as in the paper's baseline.")
+
+
+def _called_at(on_backward: WeakMethod[Callable[[int], None]], nth: int) -> Callable[[Tensor], None]:
+    """A tensor hook that calls `on_backward(nth)`. Its reference is weak: with a strong one, its tensor would never be freed."""
+    return lambda _: None if (alive := on_backward()) is None else alive(nth)
+
+
+@contextmanager
+def _random_state_kept(device: torch.device) -> Iterator[None]:
+    """Restore torch's random generators, so that a dropout inside the host's render drops the same at both scales."""
+    with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
+        yield

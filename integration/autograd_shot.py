@@ -1,15 +1,17 @@
-"""A host's rendering as a `Shot`: gradients come from `torch.autograd.grad` through the host's own graph."""
+"""What a host renders, as a `Shot`: gradients come from `torch.autograd.grad` through the host's own graph."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from clear_strategies.core.gradients import Grads
+from rasterizers.interface import Camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,3 +99,25 @@ class AutogradShot:
             screen = gradients[-1] if projected else torch.zeros_like(slot.tensor)
             results.append(Grads(values, screen=slot.per_gaussian(screen, len(self.visible))))
         return results
+
+
+Target = Literal["lr", "hr"] | Camera
+"""What a host draws: the view of this iteration at one of its sizes, or what a camera without a photo sees."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HostOutput:
+    """What a host's render function returned, as its adapter passes it to an `Attachment`.
+
+    Args:
+        hooked: a tensor that the host computes its loss from. Its gradient marks the start of the host's backward pass.
+        returned: what the host's own render function returns.
+    """
+
+    shot: AutogradShot
+    hooked: Tensor
+    returned: Any
+
+
+RenderAt = Callable[[Target, Float[Tensor, " N"] | None], HostOutput]
+"""Renders by the host's own renderer, opacities multiplied by the gate: with f_det at HR, without it for any other target."""

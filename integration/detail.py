@@ -1,17 +1,14 @@
-"""The detail feature f_det in a host, which has no such parameter."""
+"""The detail feature f_det in hosts, which have no such parameter: its Adam, and how it shows in the colours."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.merging.detail import DetailRates
-from integration.errors import HostError
-from integration.lineage import Change, Lineage
 from rasterizers.geometry import SH_C0
 
 _EPS: Final = 1e-15  # Adam's, as in 3DGS: gradients of mean losses are near 1e-6
@@ -32,109 +29,3 @@ def detail_adam(detail: torch.nn.Parameter, rates: DetailRates) -> torch.optim.A
 def sh0_offset(detail: Float[Tensor, "N 3"], sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
     """f_det as an offset of the constant SH band."""
     return (detail / SH_C0).view_as(sh0)
-
-
-class DetailFeature:
-    """f_det and its Adam beside the host's parameters, for hosts that look parameters up by name and allow no other.
-
-    Its rows follow the host's Gaussians.
-
-    Args:
-        means: returns the host's current positions.
-        lineage: finds the host's changes of structure.
-        rates: of the run's conductor.
-    """
-
-    def __init__(self, means: Callable[[], Tensor], lineage: Lineage, rates: DetailRates) -> None:
-        self._means, self._lineage, self._rates = means, lineage, rates
-        self._parents: Int[Tensor, " M"] | None = None  # since the last `poll_parents`
-        self._value = torch.nn.Parameter(torch.zeros_like(means(), requires_grad=False))
-        self._adam = detail_adam(self._value, self._rates)
-
-    @property
-    def value(self) -> Float[Tensor, "N 3"]:
-        """f_det, one row per Gaussian of the host."""
-        self._follow_host()
-        return self._value
-
-    def offset(self, sh0: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
-        """f_det as an offset of the constant SH band."""
-        return sh0_offset(self.value.detach(), sh0)
-
-    def poll_parents(self, state: Callable[[], Mapping[str, Tensor]]) -> Int[Tensor, " M"] | None:
-        """parents[M] of the changes since the last call; None: there were none.
-
-        Args:
-            state: returns what strategies store per Gaussian.
-
-        Raises:
-            HostError: the parent of a new Gaussian is unknown, but there is per-Gaussian state.
-        """
-        self._follow_host()
-        parents, self._parents = self._parents, None
-        if parents is None:
-            return None
-        unknown = int((parents < 0).sum())
-        if unknown and (names := ", ".join(state())):
-            raise HostError(
-                f"{unknown:,} new Gaussians have the colour and rotation of no old one, so their parents are unknown, but "
-                f"{names} is stored per Gaussian. End densification first."
-            )
-        return parents.clamp_min(0)
-
-    def step(self) -> None:
-        """One optimizer step, if there is a gradient; called when the host steps."""
-        self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
-
-    def state_dict(self) -> dict[str, Any]:
-        """f_det and the moments of its Adam, for the host's checkpoint."""
-        return {"value": self.value.detach().clone(), "adam": self._adam.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue from a state; the host has loaded its parameters already.
-
-        Raises:
-            HostError: the state holds another number of Gaussians.
-        """
-        self._lineage.restart()
-        self._parents = None
-        means = self._means()
-        if len(state["value"]) != len(means):
-            raise HostError(
-                f"the checkpoint holds f_det of {len(state['value']):,} Gaussians, but {len(means):,} Gaussians were loaded. "
-                "Load both from one checkpoint."
-            )
-        self._value = torch.nn.Parameter(state["value"].to(means))
-        self._adam = detail_adam(self._value, self._rates)
-        self._adam.load_state_dict(state["adam"])
-
-    @torch.no_grad()
-    def _follow_host(self) -> None:
-        """Apply a change of the host's structure to f_det, and add it to the parents to report."""
-        change = self._lineage.poll()
-        if change is not None:
-            self._gather(change)
-            earlier = self._parents
-            parents = change.parents if earlier is None else earlier[change.parents.clamp_min(0)]
-            self._parents = torch.where(change.parents < 0, -1, parents)
-        if len(now := self._means()) != len(self._value):
-            raise HostError(
-                f"the host changed the number of Gaussians from {len(self._value):,} to {len(now):,} inside its parameters. A "
-                "changed set must be a new parameter, as in 3DGS."
-            )
-
-    def _gather(self, change: Change) -> None:
-        """Give each row its parent's f_det, or 0 without a parent; only old rows keep their Adam moments."""
-        rows, unknown = change.parents.clamp_min(0), change.parents < 0
-        state = self._adam.state.pop(self._value, {})
-        value = self._value[rows]
-        value[unknown] = 0
-        self._value = torch.nn.Parameter(value)
-        self._adam.param_groups[0]["params"] = [self._value]
-        for name, moment in state.items():
-            if moment.dim():  # Adam's step count has no rows
-                state[name] = moment[rows]
-                state[name][change.fresh | unknown] = 0
-        if state:
-            self._adam.state[self._value] = state

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from clear_strategies.compose import conductor
+from clear_strategies.console import show_in_host
 from clear_strategies.errors import ClearError, DataError
-from integration.log import show_log
 from integration.points import wants_stereo
 from integration.views import sr_source
 
@@ -35,7 +35,7 @@ def main(
             the list of what was attached (`Attached` of this host), which the script fills.
         otherwise: why that list may be empty at the end.
     """
-    show_log()
+    show_in_host()
     options = _parser(module, f"Run {script} with CLEAR.").parse_args(arguments)
     try:
         settings = _install_settings(options)

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from integration.errors import HostError
+from clear_strategies.errors import HostError
 
 ROWS: Final = "clear_rows"
 """Key of the row numbers."""
@@ -31,18 +31,6 @@ class Change:
 
     parents: Int[Tensor, " M"]
     fresh: Bool[Tensor, " M"]
-
-
-class Lineage(Protocol):
-    """What follows a host's changes of structure."""
-
-    def poll(self) -> Change | None:
-        """The change since the last call; None: there was none."""
-        ...
-
-    def restart(self) -> None:
-        """The host has loaded other parameters, which come from no earlier ones."""
-        ...
 
 
 def is_same(parents: Int[Tensor, " M"], n: int) -> bool:

@@ -9,10 +9,9 @@ from typing import Literal
 import torch
 
 from clear_strategies.core.points import MAX_POINTS, PointCloud
-from clear_strategies.errors import SettingError
+from clear_strategies.errors import HostError, SettingError
 from clear_strategies.geometry import stereo
 from clear_strategies.geometry.projection import intrinsics
-from integration.errors import HostError
 from integration.views import HostPhoto
 
 _log = logging.getLogger(__name__)

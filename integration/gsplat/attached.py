@@ -14,14 +14,13 @@ from torch import Tensor
 
 from clear_strategies.core.gradients import PARAMETERS
 from clear_strategies.core.view import View
+from clear_strategies.errors import HostError
 from clear_strategies.geometry.projection import intrinsics
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment
-from integration.autograd_shot import AutogradShot, ScreenGradientSlot
+from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
 from integration.densification import require_end
 from integration.detail import detail_adam, sh0_offset
-from integration.errors import HostError
-from integration.host_rendering import HostRendering, Target
 from integration.host_score import warn_if_score_is_unused
 from integration.lineage import RowNumbers
 from integration.replacing import replace_everywhere
@@ -134,7 +133,7 @@ class Attached:
             if view is None:  # a viewer, a camera without a photo
                 return rasterization(**self._with_detail(call, trained=False))
 
-            def render_at(target: Target, gate: Tensor | None) -> HostRendering:
+            def render_at(target: Target, gate: Tensor | None) -> HostOutput:
                 return self._render(rasterization, call, view, target, gate)
 
             return self.attachment.render_view(view, render_at)  # type: ignore[no-any-return]
@@ -208,7 +207,7 @@ class Attached:
 
     def _render(
         self, rasterization: Rasterization, arguments: Mapping[str, Any], view: View, target: Target, gate: Tensor | None
-    ) -> HostRendering:  # fmt: skip
+    ) -> HostOutput:  # fmt: skip
         call, params = {**arguments, **self._background(arguments)}, self.params()
         if len(call["means"]) != len(params["means"]):
             raise HostError(
@@ -243,7 +242,7 @@ class Attached:
 
     def _drawn(
         self, rasterization: Rasterization, call: Mapping[str, Any], params: Mapping[str, Tensor], gate: Tensor | None
-    ) -> HostRendering:
+    ) -> HostOutput:
         """One rendering. Gaussians that the gate drops are marked as not visible in its `info`."""
         if len(result := rasterization(**call)) != 3:
             raise HostError(
@@ -265,7 +264,7 @@ class Attached:
             visible = torch.zeros(n, dtype=torch.bool, device=rows.device).index_copy_(0, rows, visible)
         image = renders[..., :3].reshape(size[1], size[0], 3)
         shot = AutogradShot(image, means2d, visible, params, ScreenGradientSlot(info["means2d"], size, rows=rows))
-        return HostRendering(shot, renders, (renders, alphas, info))
+        return HostOutput(shot, renders, (renders, alphas, info))
 
     def _background(self, call: Mapping[str, Any]) -> dict[str, Tensor]:
         """The `backgrounds` that the strategies choose for a call; none where it names its own."""

@@ -13,14 +13,13 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from clear_strategies.errors import SettingError
+from clear_strategies.console import show_in_host
+from clear_strategies.errors import HostError, SettingError
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
-from integration.errors import HostError
 from integration.gsplat.attached import Attached
 from integration.gsplat.data import photos_of
 from integration.gsplat.points import start_from_stereo
-from integration.log import show_log
 from integration.points import Points, wants_stereo
 from integration.replacing import replace_everywhere
 from integration.views import SuperResolve, sr_source
@@ -77,7 +76,7 @@ def install(
     """
     from clear_strategies.compose import conductor  # brings Hydra
 
-    show_log()
+    show_in_host()
     if wants_stereo(points):
         start_from_stereo(runner_class)
     train, rasterize_splats = runner_class.train, runner_class.rasterize_splats

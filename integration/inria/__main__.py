@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from clear_strategies.errors import HostError
 from integration import launcher
-from integration.errors import HostError
 from integration.inria.cameras import photo_of
 from integration.inria.from_options import install
 from integration.views import save_photos

@@ -13,14 +13,13 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
+from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
+from integration.autograd_shot import Target
 from integration.densification import require_end
-from integration.errors import HostError
-from integration.host_cameras import enlarged_camera
-from integration.host_rendering import Target
-from integration.inria.cameras import HostViews
+from integration.inria.cameras import HostViews, enlarged_camera
+from integration.inria.model_proxy import AttachedModel, Role
 from integration.inria.rows import CarriedRows
-from integration.model_proxy import AttachedModel, Role
 from integration.replacing import replace_everywhere, replace_methods, replaced_attribute
 from integration.views import SuperResolve, sr_source
 

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from clear_strategies.console import show_in_host
+from clear_strategies.errors import HostError
 from integration.densification import end_with_strategies
-from integration.errors import HostError
 from integration.inria.attached import Attached
 from integration.inria.points import start_from_stereo
-from integration.log import show_log
 from integration.points import Points, wants_stereo
 from integration.views import SuperResolve
 
@@ -52,7 +52,7 @@ def install(
     """
     from clear_strategies.compose import conductor  # brings Hydra
 
-    show_log()
+    show_in_host()
     iterations = getattr(opt, "iterations", None)
     if iterations is None:
         raise HostError(f"{type(opt).__name__} has no iterations, which the options of training_setup have in 3DGS.")

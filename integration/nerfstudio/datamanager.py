@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 
-from integration.log import show_log
+from clear_strategies.console import show_in_host
 from integration.nerfstudio.data import seed_with_stereo
 from integration.points import wants_stereo
 
@@ -36,5 +36,5 @@ class ClearDatamanager(FullImageDatamanager):  # type: ignore[misc]
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         if wants_stereo(self.config.points) and self.test_mode == "val":  # otherwise a checkpoint has the Gaussians
-            show_log()
+            show_in_host()
             seed_with_stereo(self)

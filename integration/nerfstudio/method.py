@@ -26,11 +26,11 @@ from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
+from clear_strategies.console import show_in_host
 from clear_strategies.errors import SettingError
 from integration.densification import end_with_strategies
 from integration.detail import sh0_offset
 from integration.gsplat import Attached, attach
-from integration.log import show_log
 from integration.nerfstudio.data import photos_of, prior, views_from_datamanager
 from integration.nerfstudio.datamanager import ClearDatamanagerConfig
 from integration.replacing import replaced_attribute
@@ -150,7 +150,7 @@ class ClearSplatfactoModel(SplatfactoModel):  # type: ignore[misc]
             f"CLEAR: {', '.join(type(s).__name__ for s in chosen.strategies) or 'no strategy'}; "
             f"SR images x{config.factor}: {sr.label}."
         )
-        show_log()
+        show_in_host()
         end_with_strategies(chosen, self.strategy, "refine_stop_iter", first=0)
         for group in host.optimizers.optimizers["detail"].param_groups:
             group["lr"] = chosen.detail.rate

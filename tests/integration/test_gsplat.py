@@ -17,8 +17,8 @@ from clear_strategies.schedules import scaled
 from clear_strategies.training.loop import iterate, view_at
 from clear_strategies.training.optim import LearningRates
 from integration import HostError
+from integration.autograd_shot import HostOutput
 from integration.gsplat import attach
-from integration.host_rendering import HostRendering
 from rasterizers import autograd
 from tests.helpers import toy
 from tests.helpers.gsplat_host import Host, attached, rasterization, started, trained
@@ -260,7 +260,7 @@ def test_a_second_pass_over_the_view_can_stand_beside_it():
 def test_renderings_are_freed_after_their_step_and_with_the_loop(last_one_has_backward):
     def kept():
         gc.collect()
-        return sum(isinstance(thing, HostRendering) for thing in gc.get_objects())
+        return sum(isinstance(thing, HostOutput) for thing in gc.get_objects())
 
     before = kept()
     host, clear, render = started()

@@ -33,10 +33,12 @@ def test_importing_is_light():
 
 @pytest.mark.slow
 def test_messages_are_shown_where_the_host_has_not_configured_logging(tmp_path):
-    alone = "import logging; from integration.log import show_log; show_log(); logging.getLogger('integration.x').info('said')"
-    configured = alone.replace(
-        "show_log();", "logging.basicConfig(format='theirs %(message)s', level='INFO'); show_log();"
+    setup, said = (
+        "logging.basicConfig(format='theirs %(message)s', level='INFO')",
+        "logging.getLogger('integration.x').info('said')",
     )
+    alone = f"import logging; from clear_strategies.console import show_in_host; show_in_host(); {said}"
+    configured = alone.replace("show_in_host();", f"{setup}; show_in_host();")
     for name, code, shown in (("alone", alone, "[clear] said\n"), ("configured", configured, "theirs said\n")):
         assert started("-c", code, cwd=tmp_path, said=tmp_path / name).wait() == 0
         assert (tmp_path / name).read_text() == shown

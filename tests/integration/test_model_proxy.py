@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from integration.host_cameras import enlarged_camera
-from integration.model_proxy import Overrides, proxy
+from integration.inria.cameras import enlarged_camera
+from integration.inria.model_proxy import Overrides, proxy
 from rasterizers.geometry import SH_C0
 
 N = 8

@@ -1,5 +1,5 @@
-"""For hosts whose `render` takes the whole model (3DGS and its forks): render the model with gated opacities and with f_det
-in its colours, at LR or HR.
+"""`render` of 3DGS and its forks takes the whole model: render it with gated opacities and with f_det in its colours, at LR or
+HR.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from clear_strategies.core.view import View
+from clear_strategies.errors import HostError
 from clear_strategies.merging.conductor import Conductor
 from integration.attachment import Attachment
-from integration.autograd_shot import AutogradShot, ScreenGradientSlot
-from integration.detail import DetailFeature, sh0_offset
-from integration.errors import HostError
-from integration.host_cameras import enlarged_camera, replaced_camera
-from integration.host_rendering import HostRendering, Target
+from integration.autograd_shot import AutogradShot, HostOutput, ScreenGradientSlot, Target
+from integration.detail import sh0_offset
 from integration.host_score import warn_if_score_is_unused
-from integration.lineage import Lineage
+from integration.inria.cameras import enlarged_camera, replaced_camera
+from integration.inria.detail import DetailFeature
+from integration.inria.rows import CarriedRows
 from rasterizers.interface import Camera
 
 _log = logging.getLogger(__name__)
@@ -115,7 +115,7 @@ class AttachedModel:
 
     Args:
         roles: see `proxy`. params: returns the host's current leaves, by gsplat's names.
-        lineage: finds the host's changes of structure.
+        rows: finds the host's changes of structure.
         detail: train f_det.
         densifier, threshold: what densifies in the host, and its threshold on the screen gradient.
         views, masks, seed, own_background: see `Attachment`.
@@ -129,7 +129,7 @@ class AttachedModel:
         model: Any,
         roles: tuple[tuple[str, Role], ...],
         params: Callable[[], Mapping[str, Tensor]],
-        lineage: Lineage,
+        rows: CarriedRows,
         conductor: Conductor,
         views: Sequence[View],
         *,
@@ -142,7 +142,7 @@ class AttachedModel:
     ) -> None:
         warn_if_score_is_unused(conductor, densifier, threshold)
         self._model, self._roles, self._host_params = model, roles, params
-        self.detail, self._has_detail = DetailFeature(lambda: params()["means"], lineage, conductor.detail), detail
+        self.detail, self._has_detail = DetailFeature(lambda: params()["means"], rows, conductor.detail), detail
         self._scoring = conductor.owner("score")
         self._warned: set[str] = set()
         self.attachment = Attachment(
@@ -167,7 +167,7 @@ class AttachedModel:
             render: the host's function of a model and a camera; the third argument is what is drawn.
         """
 
-        def render_at(target: Target, gate: Tensor | None) -> HostRendering:
+        def render_at(target: Target, gate: Tensor | None) -> HostOutput:
             if target == "lr":
                 sized, pinhole = camera, view.lr.camera
             elif target == "hr":
@@ -177,26 +177,24 @@ class AttachedModel:
             params = self.params() if target == "hr" else self._host_params()
             overrides = Overrides(gate, params.get("detail"))
             result = render(proxy(self._model, overrides, self._roles), sized, target)
-            return self._rendering(result, overrides, pinhole, params)
+            return self._output(result, overrides, pinhole, params)
 
         return self.attachment.render_view(view, render_at)
 
-    def _rendering(
-        self, result: Any, overrides: Overrides, camera: Camera, params: Mapping[str, Tensor]
-    ) -> HostRendering:
+    def _output(self, result: Any, overrides: Overrides, camera: Camera, params: Mapping[str, Tensor]) -> HostOutput:
         if overrides.gate is not None and "gate" not in overrides.used:
             self._warn_once("render reads none of the model's opacity getters: dropout has no effect.")
         if overrides.detail is not None and "detail" not in overrides.used:
             self._warn_once("render does not read the model's constant colours: the detail feature has no effect.")
         # Mip-Splatting splits as many Gaussians by the absolute gradient as by the gradient: only its order counts.
         ranks = hasattr(self._model, "xyz_gradient_accum_abs")
-        rendering = host_rendering(result, camera, params, overrides.gate, ranks_by_third_column=ranks)
-        if rendering.shot.gradient_slot.tensor.shape[-1] == 4 and self._scoring is not None:
+        output = host_output(result, camera, params, overrides.gate, ranks_by_third_column=ranks)
+        if output.shot.gradient_slot.tensor.shape[-1] == 4 and self._scoring is not None:
             self._warn_once(
                 "viewspace_points have 4 columns: absolute gradients stay those of the LR image, and the densification "
                 "score of %s goes to the first two columns only.", type(self._scoring).__name__,
             )  # fmt: skip
-        return rendering
+        return output
 
     def state_dict(self) -> dict[str, Any]:
         """What the host's checkpoint must hold to continue."""
@@ -213,14 +211,14 @@ class AttachedModel:
             self._warned.add(message)
 
 
-def host_rendering(
+def host_output(
     result: Any,
     camera: Camera,
     params: Mapping[str, Tensor],
     gate: Float[Tensor, " N"] | None,
     *,
     ranks_by_third_column: bool,
-) -> HostRendering:
+) -> HostOutput:
     """The result of a host's `render`: a dict with "render" [3, H, W], "viewspace_points" [N, 2 or more] in NDC, "radii" and
     "visibility_filter" [N]. Gaussians that the gate drops are marked as not visible in it.
 
@@ -258,7 +256,7 @@ def host_rendering(
     ranked = 2 if ranks_by_third_column and centres.shape[-1] == 3 else None
     slot = ScreenGradientSlot(centres, (width, height), (2 / width, 2 / height), ranked=ranked)
     means2d = project(params["means"].detach(), camera)
-    return HostRendering(AutogradShot(image.permute(1, 2, 0), means2d, visible, params, slot), image, result)
+    return HostOutput(AutogradShot(image.permute(1, 2, 0), means2d, visible, params, slot), image, result)
 
 
 def project(means: Float[Tensor, "N 3"], camera: Camera) -> Float[Tensor, "N 2"]:
