@@ -1,4 +1,4 @@
-"""A strategy's arithmetic as data, in the form that the compiled per-Gaussian step takes."""
+"""A strategy's arithmetic as data, in the form that the compiled per-Gaussian passes take."""
 
 from __future__ import annotations
 
@@ -8,29 +8,12 @@ from typing import Final
 
 from torch import Tensor
 
-from clear_strategies.core.deferred import Number
-from clear_strategies.core.evidence import Evidence
+from clear_strategies.core.conflicts import ConflictCounts
 from clear_strategies.core.gradients import CONFLICT_GROUPS
 
 # A Gaussian whose axes are equally long does not change when it is rotated: in exact arithmetic its
 # rotation gradient is 0, in floating point it is noise that would "conflict" one time in five.
 ROTATION_NOISE: Final = 2.0**-18
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GroupReport:
-    """What a correction did to one attribute group.
-
-    Args:
-        compared, corrected: Gaussians. omega: the sum of ω over the corrected ones.
-        at_lower_bound: how many of these have ω at its lower bound.
-    """
-
-    group: str
-    compared: Number
-    corrected: Number
-    omega: Number
-    at_lower_bound: Number
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,14 +23,14 @@ class CorrectionRule:
     Args:
         groups: the attributes that are compared and corrected.
         tolerance: τ_c. weight_min, weight_max: bounds of ω.
-        report: called with one `GroupReport` per group, and the evidence, after every step.
+        report: called with what was counted, the groups that were compared, and whether there was evidence.
     """
 
     groups: Sequence[str]
     tolerance: float
     weight_min: float
     weight_max: float
-    report: Callable[[Sequence[GroupReport], Evidence | None], None]
+    report: Callable[[ConflictCounts, Sequence[str], bool], None]
 
     @property
     def corrects(self) -> list[bool]:

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from clear_strategies.core import deferred
 from clear_strategies.core.deferred import Number
 
 PARAMETERS: Final = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -20,8 +19,6 @@ ATTRIBUTES: Final = (*PARAMETERS, "detail")
 
 CONFLICT_GROUPS: Final = ("means", "sh0", "shN", "opacities", "scales", "quats")
 """The paper's six: position, base appearance, higher-order appearance, opacity, scale, rotation."""
-
-_ROWS: Final = 4096  # of the highest bands in float64: 1.5 MB
 
 
 class Grads(dict[str, Tensor]):
@@ -84,51 +81,9 @@ def scale_rows(value: Float[Tensor, "N ..."], weight: float | Float[Tensor, " N"
     return value * weight
 
 
-def row_dot(a: Float[Tensor, "N ..."], b: Float[Tensor, "N ..."]) -> Float[Tensor, " N"]:
-    """⟨a_i, b_i⟩ in float64: no product of two finite float32 numbers over- or underflows there."""
-    if a.dim() == 1:
-        return a.double() * b.double()
-    if not deferred.is_immediate(a):
-        return (a.double() * b.double()).flatten(1).sum(1)
-    # In blocks that stay in the processor's cache: copies of all rows in float64 take twice the memory of the gradients.
-    blocks = zip(torch.split(a, _ROWS), torch.split(b, _ROWS), strict=True)
-    return torch.cat([(x.double() * y.double()).flatten(1).sum(1) for x, y in blocks])
-
-
-def row_norm(a: Float[Tensor, "N ..."]) -> Float[Tensor, " N"]:
-    """‖a_i‖₂ in float64."""
-    return row_dot(a, a).sqrt()
-
-
-def conflict_ratio(lr: Grads, hr: Grads) -> dict[str, Number]:
-    """Share of Gaussians whose LR and HR gradients point apart (cosine < 0), by group and for the groups together.
-
-    Counted among Gaussians where neither gradient is zero: invisible and dropped ones do not count (F38, F42).
-    "gaussian" is one decision per Gaussian over its concatenated groups. NaN where nothing could be compared.
-    """
-    shares: dict[str, Number] = {}
-    totals: list[Tensor] = []  # over the groups, as if they were one vector
-    for group in CONFLICT_GROUPS:
-        if group in lr and group in hr:
-            g_lr, g_hr = lr[group], hr[group]
-            products = [row_dot(a, b) for a, b in ((g_lr, g_hr), (g_lr, g_lr), (g_hr, g_hr))]
-            shares[group] = _share_below_zero(*products)
-            totals = [a + b for a, b in zip(totals, products, strict=True)] if totals else products
-    if totals:
-        shares["gaussian"] = _share_below_zero(*totals)
-    return shares
-
-
 def conflict_columns(conflict: Mapping[str, Number]) -> dict[str, Number]:
     """The shares by their column in the history: "conflict" of Gaussians, "conflict_means" … of groups."""
     return {("conflict" if group == "gaussian" else f"conflict_{group}"): share for group, share in conflict.items()}
-
-
-def _share_below_zero(dot: Tensor, l2: Tensor, h2: Tensor) -> Number:
-    comparable = (l2 > 0) & (h2 > 0)
-    return deferred.defer(
-        deferred.ratio, deferred.scalar(((dot < 0) & comparable).sum()), deferred.scalar(comparable.sum())
-    )
 
 
 def to_ndc(screen: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor, "N 2"]:

@@ -12,9 +12,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from clear_strategies.core import images
+from clear_strategies.core.conflicts import conflict_ratio
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.finite import require_finite, require_finite_losses
-from clear_strategies.core.gradients import Grads, Shot, conflict_ratio, screen_in_ndc, screen_norm
+from clear_strategies.core.gradients import Grads, Shot, screen_in_ndc, screen_norm
 from clear_strategies.core.step import Step
 from clear_strategies.core.view import ExtraView, View
 from clear_strategies.core.work_log import WorkLog

@@ -27,7 +27,8 @@ from torch import Tensor
 from clear_strategies import files
 from clear_strategies.core import images
 from clear_strategies.core.evidence import PatchMaps
-from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot
+from clear_strategies.core.conflicts import GradientColumns
+from clear_strategies.core.gradients import Grads
 from clear_strategies.core.view import View
 from clear_strategies.data.photo_files import write_png
 from clear_strategies.data.view_names import file_stem
@@ -143,17 +144,13 @@ def _gradients(
 
 def _compare(lr: Grads, hr: Grads, corrected: Grads | None) -> tuple[dict[str, Tensor], Bool[Tensor, " N"]]:
     """A number in [0, 1] per Gaussian for each map, and which Gaussians have both gradients: the others are 0."""
-    dot, lr2, hr2 = _inner(lr, hr), _inner(lr, lr), _inner(hr, hr)
+    p = GradientColumns.of(lr, hr).products()
+    dot, lr2, hr2 = (x.sum(1) for x in (p.dot, p.l2, p.h2))
     compared = (lr2 > 0) & (hr2 > 0)
     numbers = {}
     if corrected is not None:
         step = corrected + hr * -1.0
-        share = (_inner(step, step) / hr2.clamp_min(torch.finfo(hr2.dtype).tiny)).sqrt()
+        share = (GradientColumns.of(step, step).products().l2.sum(1) / hr2.clamp_min(torch.finfo(hr2.dtype).tiny)).sqrt()
         numbers["corrected"] = torch.where(compared, share.clamp(0, 1), 0.0)
     numbers["conflict"] = ((dot < 0) & compared).to(dot)
     return numbers, compared
-
-
-def _inner(a: Grads, b: Grads) -> Float[Tensor, " N"]:
-    """⟨a_i, b_i⟩ over the concatenated groups."""
-    return torch.stack([row_dot(a[name], b[name]) for name in CONFLICT_GROUPS if name in a]).sum(0)

@@ -6,28 +6,26 @@ reaches the margin, for each Gaussian and each attribute group. LR gradients are
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from clear_strategies.core import deferred
 from clear_strategies.core.checks import refuse, require_choice, require_number
-from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule, GroupReport
-from clear_strategies.core.evidence import Evidence
-from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads, row_dot, row_norm, scale_rows
+from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
+from clear_strategies.core.conflicts import ConflictCounts, GradientColumns, counted, numbers
+from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.core.step import Step
+from clear_strategies.kernels import merge
 from clear_strategies.strategies.base import Strategy
 
-_log = logging.getLogger(__name__)
-
-# ω at its lower bound in this share of the corrections means that the prior agrees with LR and GCO does nothing.
-_INACTIVE_SHARE: Final = 0.9
-_AT_LOWER_BOUND: Final = "omega_at_lower_bound"  # the column of that share
+_AT_LOWER_BOUND: Final = "omega_at_lower_bound"  # the column of their share of the corrections: near 1, the prior agrees with LR
+_SCALES: Final = CONFLICT_GROUPS.index("scales")
+_QUATS: Final = CONFLICT_GROUPS.index("quats")
 _TINY: Final = torch.finfo(torch.float64).tiny
 
 
@@ -71,85 +69,69 @@ class GCO(Strategy):
             return "lambda_LR is 0, so nothing can conflict"
         return "lambda_HR is 0 throughout" if lambda_hr == 0 else None
 
-    def in_hindsight(self, means: Mapping[str, float]) -> str | None:
-        share = means.get(_AT_LOWER_BOUND, 0.0)
-        if share <= _INACTIVE_SHARE:
-            return None
-        return (
-            f"GCO was inactive: omega sat at its lower bound {self.weight_min:g} in {share:.0%} of the corrections, because the "
-            "prior agrees with the LR images (reliability near 1)."
-        )
-
     def correction_rule(self) -> CorrectionRule:
         return CorrectionRule(self.groups, self.tolerance, self.weight_min, self.weight_max, self.report)
 
     def correct(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], step: Step | None = None) -> Grads:
-        """g̃_HR for every group; logs what was corrected.
+        """g̃_HR for every group; logs what was corrected. In one compiled pass where there is one for these tensors, with the same
+        decisions as `correct_in_torch` except where a cosine lies within 2e-7 of its bound.
 
         Args:
-            lr, hr: attribute -> gradient [N, …], any of `CONFLICT_GROUPS`; what only one of them has is not compared.
+            lr, hr: attribute -> gradient [N, …], any of `CONFLICT_GROUPS`; what only one of them has is not compared, and what
+                is None is left out.
             step: gives the reliability of Eq. 11; None: nothing is known of it, and conflicts are corrected in full.
 
         Raises:
             ValueError: both have gradients, but none of the same group, so that nothing could be corrected.
         """
-        evidence = None if step is None else step.evidence
-        corrected, reports = Grads(hr), []
-        for group in self.groups:
-            if group in lr and group in hr:
-                corrected[group], report = self._correct_group(group, lr, hr, evidence)
-                reports.append(report)
-        if lr and hr and not reports:
-            raise ValueError(
-                f"GCO compares the groups {', '.join(self.groups)}, and no two gradients are of one: lr has "
-                f"{', '.join(lr)}, hr has {', '.join(hr)}. Name them so."
-            )
-        self.report(reports, evidence)
-        return corrected
+        lr, hr = ({name: g for name, g in grads.items() if g is not None} for grads in (lr, hr))
+        q = None if step is None or step.evidence is None else step.evidence.reliability
+        both = [group for group in self.groups if group in lr and group in hr]
+        if not both or (compiled := merge.compiled(hr[name] for name in both)) is None:
+            return self.correct_in_torch(lr, hr, step)
+        rows = {name: merge.Rows(torch.empty_like(hr[name]), lr=lr[name], hr=hr[name]) for name in both}
+        counts, _ = compiled(rows, self.correction_rule(), q, keeps_lr=False)
+        self.report(counts, both, q is not None)
+        return Grads(hr | {name: row.out for name, row in rows.items()})
 
-    def _correct_group(
-        self, group: str, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], evidence: Evidence | None
-    ) -> tuple[Tensor, GroupReport]:
-        g_lr, g_hr = lr[group], hr[group]
-        dot, n_lr, n_hr = row_dot(g_lr, g_hr), row_norm(g_lr), row_norm(g_hr)
-        comparable = (n_lr > 0) & (n_hr > 0)
-        n = n_lr * n_hr
-        c = torch.where(n > 0, dot / n.clamp_min(_TINY), 0.0)  # Eq. 6
-        conflict = c < -self.tolerance
-        if group == "quats":
-            conflict &= ~(_turns_nothing(lr) | _turns_nothing(hr))
+    def correct_in_torch(self, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor], step: Step | None = None) -> Grads:
+        """The same as equations, on any device: the specification of every compiled pass."""
+        if not lr or not hr:
+            return Grads(hr)
+        columns = GradientColumns.of({name: g for name, g in lr.items() if name in self.groups}, hr)
+        p, τ = columns.products(), self.tolerance
+        n = (p.l2 * p.h2).sqrt()
+        c = torch.where(n > 0, p.dot / n.clamp_min(_TINY), 0.0)  # Eq. 6
+        conflict = c < -τ
+        conflict[:, _QUATS] &= _turns_something(p.l2) & _turns_something(p.h2)
+        q = 0.0 if step is None or step.evidence is None else step.evidence.reliability.double()[:, None]
+        s = ((-c - τ) / (1 - τ)).clamp(0, 1)
+        ω = (s * (1 - q)).clamp(self.weight_min, self.weight_max)  # Eq. 11
+        multiple = torch.where(conflict, ω * (p.dot + τ * n) / p.l2, 0.0)
+        corrected = columns.minus(multiple, like=hr)  # Eq. 7
+        counts = replace(
+            counted(p), corrected=numbers(conflict.sum(0)), omega=numbers((ω * conflict).sum(0)),
+            at_lower_bound=numbers((conflict & (ω <= self.weight_min)).sum(0)),
+        )  # fmt: skip
+        self.report(counts, columns.names, isinstance(q, Tensor))
+        return Grads({**hr, **corrected})
 
-        # Only the rows in conflict change; every other row keeps its bits. On the CPU these rows are gathered. On a device
-        # gathering would wait for their number, so all rows are corrected and the others restored.
-        i = conflict.nonzero()[:, 0] if deferred.is_immediate(conflict) else slice(None)
-        conflicting = conflict[i]
-        q = evidence.reliability[i].double() if evidence is not None else 0.0
-        s = ((-c[i] - self.tolerance) / (1 - self.tolerance)).clamp(0, 1)
-        omega = (s * (1 - q)).clamp(self.weight_min, self.weight_max)  # Eq. 11
-        d = dot[i] + self.tolerance * n[i]
-        multiple = omega * (d / n_lr[i].square())
-        corrected = g_hr.clone()
-        moved = (g_hr[i].double() - scale_rows(g_lr[i].double(), multiple)).to(g_hr.dtype)  # Eq. 7
-        corrected[i] = torch.where(conflicting.view(-1, *[1] * (moved.dim() - 1)), moved, corrected[i])
-        at_bound = conflicting & (omega <= self.weight_min)
-        compared, touched, bound = (deferred.scalar(rows.sum()) for rows in (comparable, conflict, at_bound))
-        return corrected, GroupReport(group, compared, touched, deferred.total(omega, conflicting), bound)
-
-    def report(self, reports: Sequence[GroupReport], evidence: Evidence | None) -> None:
-        compared, corrected, omega, at_bound = (
-            deferred.defer(deferred.added, *(getattr(c, name) for c in reports))
-            for name in ("compared", "corrected", "omega", "at_lower_bound")
+    def report(self, counts: ConflictCounts, groups: Sequence[str], has_evidence: bool) -> None:
+        """Log what was corrected in these groups."""
+        at = [CONFLICT_GROUPS.index(group) for group in groups if group in self.groups]
+        compared, corrected, ω, at_bound = (
+            deferred.defer(deferred.added, *(values[k] for k in at))
+            for values in (counts.comparable, counts.corrected, counts.omega, counts.at_lower_bound)
         )
         self.log("corrected", deferred.defer(deferred.ratio, corrected, compared))
-        self.log("mean_omega", deferred.defer(deferred.ratio, omega, corrected))
-        for c in reports:
-            self.log(f"corrected_{c.group}", deferred.defer(deferred.ratio, c.corrected, c.compared))
-        if corrected != 0 and evidence is not None and self.weight_min > 0:
+        self.log("mean_omega", deferred.defer(deferred.ratio, ω, corrected))
+        for k in at:
+            share = deferred.defer(deferred.ratio, counts.corrected[k], counts.comparable[k])
+            self.log(f"corrected_{CONFLICT_GROUPS[k]}", share)
+        if corrected != 0 and has_evidence and self.weight_min > 0:
             self.log(_AT_LOWER_BOUND, deferred.defer(deferred.ratio, at_bound, corrected))
 
 
-def _turns_nothing(g: Mapping[str, Tensor]) -> Bool[Tensor, " N"]:
-    """Whether a gradient of the rotation is rounding noise, see `ROTATION_NOISE`."""
-    if "scales" not in g:
-        return torch.zeros_like(g["quats"][:, 0], dtype=torch.bool)
-    return row_norm(g["quats"]) <= ROTATION_NOISE * row_norm(g["scales"])
+def _turns_something(squares: Float[Tensor, "N G"]) -> Bool[Tensor, " N"]:
+    """Whether a gradient of the rotation is more than rounding noise, see `ROTATION_NOISE`."""
+    return squares[:, _QUATS] > ROTATION_NOISE**2 * squares[:, _SCALES]

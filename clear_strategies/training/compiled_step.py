@@ -21,8 +21,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from clear_strategies.core import deferred
-from clear_strategies.core.compiled_rules import Anchor, CorrectionRule, GroupReport
+from clear_strategies.core.compiled_rules import Anchor, CorrectionRule
 from clear_strategies.core.deferred import Number
 from clear_strategies.core.gradients import CONFLICT_GROUPS, Grads
 from clear_strategies.kernels import gaussian_step as kernel
@@ -175,12 +174,8 @@ class CompiledStep:
             merged: receives the dense gradient; nothing is left out. anchor: in place of the strategies' own.
         """
         gaussians, λ = self._gaussians(g_lr, hr), self.conductor.objective.lambda_hr(t)
-        conflict: dict[str, Number] = {}
-        rule, compared = None, None
-        if hr is not None and λ > 0:
-            rule, compared = self._rule, gaussians.compare()  # before correction
-            shares = zip((*CONFLICT_GROUPS, "gaussian"), compared.opposed, compared.comparable, strict=True)
-            conflict = {group: deferred.defer(deferred.ratio, opposed, n) for group, opposed, n in shares}
+        compares = hr is not None and λ > 0
+        rule = self._rule if compares else None
         anchor = self._anchor(len(params["means"])) if anchor is None else anchor
         decays = (hr is not None and hr.hf is not None) or "detail" in anchor.targets
         keep = 1 - self.optimizer.rates.detail_decay if decays else 1.0
@@ -199,14 +194,14 @@ class CompiledStep:
         q = None if evidence is None else evidence.reliability.float().contiguous()
         settings = kernel.StepSettings(BETA1, BETA2, bias2, self.optimizer.rates.eps, λ, skips, 3 * bands)
         stepped = gaussians.step(attributes, rule, q, settings)
-        if rule is not None and compared is not None:
-            rule.report(_reports(rule, compared, stepped), evidence)
+        if rule is not None:
+            rule.report(stepped.conflicts, CONFLICT_GROUPS, evidence is not None)
         if merged is None:
             self._note_skips(stepped, bands, shN.shape[1])
-        return conflict
+        return stepped.conflicts.ratios(CONFLICT_GROUPS) if compares else {}
 
     def _gaussians(self, g_lr: Factors, hr: HrGradients[Factors] | None) -> kernel.GaussianStep:
-        """The two passes over the gradients of one view."""
+        """The pass over the gradients of one view."""
         a, m = g_lr.activation, None if hr is None else hr.m
         activation = {
             "scales": a.scales, "filtered": a.filtered, "filter": a.filter_3d, "sigmoid": a.sigmoid,
@@ -247,11 +242,3 @@ class CompiledStep:
             skip("optimizer rows", "gradient, moments and anchor's pull are 0", stepped.still)
         if bands < all_bands:
             skip("SH bands in the optimizer", "above the active degree", all_bands - bands)
-
-
-def _reports(rule: CorrectionRule, compared: kernel.Comparison, stepped: kernel.StepCounts) -> list[GroupReport]:
-    index = {group: k for k, group in enumerate(CONFLICT_GROUPS)}
-    return [
-        GroupReport(group, compared.comparable[k], stepped.corrected[k], stepped.omega[k], stepped.at_lower_bound[k])
-        for group, k in ((group, index[group]) for group in rule.groups)
-    ]

@@ -1,4 +1,4 @@
-"""The per-Gaussian step of one iteration in compiled code: its inputs, its outputs, and its two passes.
+"""The per-Gaussian step of one iteration in compiled code: its inputs and its outputs.
 
 It computes what the readable path computes, which specifies it: `merging.conductor.Conductor.merge`,
 `strategies.gco.GCO.correct`, `strategies.svs.SVS.regularize`, `training.field.Activation.vjp`, `training.optim.Adam.step` and
@@ -10,27 +10,15 @@ there, so the host does not wait.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from clear_strategies.core.compiled_rules import CorrectionRule
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """Conflicts before correction, by conflict group and then for the whole Gaussian.
-
-    Args:
-        comparable: Gaussians whose LR and HR gradients are both nonzero.
-        opposed: comparable Gaussians whose LR and HR gradients have a negative inner product.
-    """
-
-    comparable: Sequence[int] | Int[Tensor, " 7"]
-    opposed: Sequence[int] | Int[Tensor, " 7"]
+from clear_strategies.core.conflicts import ConflictCounts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,33 +63,25 @@ class StepSettings:
     width: int
 
 
-@dataclass(frozen=True, slots=True)
-class StepCounts:
+class StepCounts(NamedTuple):
     """What a step did.
 
     Args:
-        corrected, omega, at_lower_bound: by conflict group, rows corrected, Σ ω, and rows with ω at its lower bound.
-        still: rows that were skipped because they would not change.
+        conflicts: before and by the correction. still: rows that were skipped because they would not change.
     """
 
-    corrected: Sequence[int] | Int[Tensor, " 6"]
-    omega: Sequence[float] | Float[Tensor, " 6"]
-    at_lower_bound: Sequence[int] | Int[Tensor, " 6"]
+    conflicts: ConflictCounts
     still: int | Int[Tensor, ""]
 
 
 @runtime_checkable
 class GaussianStep(Protocol):
-    """The two passes over one view's gradients. Implementations take them as `cpp.CppGaussianStep` does."""
-
-    def compare(self) -> Comparison:
-        """Count the conflicts before correction."""
-        ...
+    """The pass over one view's gradients. Implementations take them as `cpp.CppGaussianStep` does."""
 
     def step(
         self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
     ) -> StepCounts:
-        """Merge, correct, add the anchor's gradient and apply Adam, in place.
+        """Count conflicts, merge, correct, add the anchor's gradient and apply Adam, in place.
 
         Args:
             rule: None: nothing is corrected. q: reliability [N], None: 0.

@@ -8,13 +8,15 @@ from typing import Any
 
 from torch import Tensor
 
-from clear_strategies.core.compiled_rules import ROTATION_NOISE, CorrectionRule
-from clear_strategies.kernels.gaussian_step import Attribute, Comparison, StepCounts, StepSettings
+from clear_strategies.core.compiled_rules import CorrectionRule
+from clear_strategies.core.conflicts import ConflictCounts
+from clear_strategies.kernels.gaussian_step import Attribute, StepCounts, StepSettings
+from clear_strategies.kernels.merge.cpp import correction_table
 from rasterizers.native import load_kernels, threads
 
 
 class CppGaussianStep:
-    """The gradients of one view's losses, as the rasterizer returns them, and the two passes over them.
+    """The gradients of one view's losses, as the rasterizer returns them, and the pass over them.
 
     Args:
         activation: scales, filtered [N, 3], filter, sigmoid, factor [N], and route: m [N], None: 1.
@@ -37,9 +39,6 @@ class CppGaussianStep:
         kernels: Any = load_kernels("clear_strategies.kernels")
         self._step = kernels.GaussianStep(dict(activation), lr, base, hf, lr["basis"].shape[1], lambda_hf)
 
-    def compare(self) -> Comparison:
-        return Comparison(*self._step.compare(threads()))
-
     def step(
         self, attributes: Mapping[str, Attribute], rule: CorrectionRule | None, q: Tensor | None, settings: StepSettings
     ) -> StepCounts:
@@ -47,9 +46,6 @@ class CppGaussianStep:
             name: {slot: getattr(a, slot) for slot in Attribute.__slots__} | {"width": math.prod(a.p.shape[1:])}
             for name, a in attributes.items()
         }
-        correction = None if rule is None else {
-            "groups": rule.corrects, "tolerance": rule.tolerance, "weight_min": rule.weight_min,
-            "weight_max": rule.weight_max, "rotation_noise": ROTATION_NOISE, "reliability": q,
-        }  # fmt: skip
         numbers = {slot: getattr(settings, slot) for slot in StepSettings.__slots__}
-        return StepCounts(*self._step.step(tables, correction, numbers, threads()))
+        conflicts, still = self._step.step(tables, correction_table(rule, q), numbers, threads())
+        return StepCounts(ConflictCounts(*conflicts), still)

@@ -1,48 +1,12 @@
-// Python bindings of the per-Gaussian step: checks the tensors' types and shapes and takes their pointers.
+// Python bindings of the per-Gaussian step.
 #pragma once
 
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
-#include <nanobind/stl/vector.h>
-
-#include <string>
-#include <vector>
-
+#include "bind_tensors.hpp"
 #include "step.hpp"
 
 namespace clear {
 
-namespace nb = nanobind;
-
-// Hands out pointers to tensors, and keeps those tensors alive.
-class Tensors {
- public:
-  // `table[name]` as n rows of `width` numbers; null if it is None and optional.
-  template <class T>
-  T* rows(const nb::dict& table, const char* name, std::int64_t n, std::int64_t width, bool optional = false) {
-    if (!table.contains(name)) throw nb::key_error(name);
-    nb::handle value = table[name];
-    if (value.is_none() && optional) return nullptr;
-    nb::ndarray<T, nb::c_contig, nb::device::cpu> array;
-    if (!nb::try_cast(value, array, false))
-      throw nb::type_error((std::string(name) + " must be a contiguous float32 tensor in the CPU's memory").c_str());
-    bool fits = array.ndim() >= 1 && std::int64_t(array.shape(0)) == n && std::int64_t(array.size()) == n * width;
-    if (!fits) {
-      std::string found;
-      for (std::size_t d = 0; d < array.ndim(); ++d) found += (d ? ", " : "") + std::to_string(array.shape(d));
-      throw nb::value_error((std::string(name) + " must have " + std::to_string(n) + " rows of " + std::to_string(width) +
-                             " numbers, got shape (" + found + ")").c_str());
-    }
-    T* data = array.data();
-    kept_.push_back(nb::cast(array));
-    return data;
-  }
-
- private:
-  std::vector<nb::object> kept_;
-};
-
-// The gradients of one view, and the two passes over them: compare and step.
+// The gradients of one view, and the pass over them.
 class GaussianStep {
  public:
   GaussianStep(nb::dict activation, nb::dict lr, nb::object base, nb::object hf, std::int64_t bases, double lambda_hf) {
@@ -60,19 +24,8 @@ class GaussianStep {
     if (base.is_none() && !hf.is_none()) throw nb::value_error("hf needs base");
   }
 
-  // Returns (comparable, opposed) by group.
-  nb::tuple compare(int threads) const {
-    if (g_.n && !g_.base) throw nb::value_error("there is no HR gradient to compare with");
-    Comparison c;
-    {
-      nb::gil_scoped_release release;
-      c = clear::compare(g_, threads);
-    }
-    return nb::make_tuple(list(c.comparable), list(c.opposed));
-  }
-
   // Steps `attributes` {name: {p, m, v, anchor, merged, width, stiffness, rate, keep, limit}} in place.
-  // Returns (corrected rows, Σ ω, rows with ω at its lower bound) by group, and still rows.
+  // Returns `counts`, and the still rows.
   nb::tuple step(nb::dict attributes, nb::object correction, nb::dict settings, int threads) const {
     Tensors tensors;
     Step s;
@@ -93,15 +46,14 @@ class GaussianStep {
     bool corrects = !correction.is_none();
     if (corrects) {
       if (g_.n && !g_.base) throw nb::value_error("there is no HR gradient to correct");
-      c = correction_of(tensors, nb::cast<nb::dict>(correction));
+      c = correction_of(tensors, g_.n, nb::cast<nb::dict>(correction));
     }
     Stepped done;
     {
       nb::gil_scoped_release release;
       done = clear::step(g_, corrects ? &c : nullptr, s, threads);
     }
-    return nb::make_tuple(list(done.corrected.rows), list(done.corrected.omega), list(done.corrected.at_lower_bound),
-                          done.still);
+    return nb::make_tuple(counts(done.conflicts), done.still);
   }
 
  private:
@@ -127,32 +79,12 @@ class GaussianStep {
     a.stiffness = number("stiffness"), a.rate = -number("rate"), a.keep = number("keep"), a.limit = number("limit");
     return a;
   }
-
-  Correction correction_of(Tensors& tensors, const nb::dict& t) const {
-    auto number = [&](const char* name) { return nb::cast<double>(t[name]); };
-    Correction c;
-    auto groups = nb::cast<std::vector<bool>>(t["groups"]);
-    if (groups.size() != kGroups) throw nb::value_error("groups must have one entry per conflict group");
-    for (int k = 0; k < kGroups; ++k) c.corrects[k] = groups[k];
-    c.tolerance = number("tolerance"), c.weight_min = number("weight_min"), c.weight_max = number("weight_max");
-    c.rotation_noise = number("rotation_noise");
-    c.reliability = tensors.rows<const float>(t, "reliability", g_.n, 1, true);
-    return c;
-  }
-
-  template <class T, std::size_t K>
-  static nb::list list(const T (&values)[K]) {
-    nb::list out;
-    for (const T& value : values) out.append(value);
-    return out;
-  }
 };
 
 inline void bind_step(nb::module_& m) {
   nb::class_<GaussianStep>(m, "GaussianStep")
       .def(nb::init<nb::dict, nb::dict, nb::object, nb::object, std::int64_t, double>(), nb::arg("activation"), nb::arg("lr"),
            nb::arg("base").none(), nb::arg("hf").none(), nb::arg("bases"), nb::arg("lambda_hf"))
-      .def("compare", &GaussianStep::compare, nb::arg("threads"))
       .def("step", &GaussianStep::step, nb::arg("attributes"), nb::arg("correction").none(), nb::arg("settings"),
            nb::arg("threads"));
 }

@@ -1,9 +1,10 @@
-// The Python module: image losses and the per-Gaussian step. The bindings check types and shapes and release the GIL.
+// The Python module: image losses, the merge, and the per-Gaussian step. The bindings check types and shapes and release the GIL.
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include "bind_losses.hpp"
+#include "bind_merge.hpp"
 #include "bind_step.hpp"
 #include "isa.hpp"
 
@@ -11,5 +12,6 @@ NB_MODULE(CLEAR_MODULE, m) {
   m.attr("isa") = CLEAR_NAME;
   m.def("instruction_sets", &clear::instruction_sets);
   clear::bind_losses(m);
+  clear::bind_merge(m);
   clear::bind_step(m);
 }

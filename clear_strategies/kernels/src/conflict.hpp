@@ -42,16 +42,20 @@ CLEAR_INLINE void group_products(const Gradients& g, const Block& b, std::int64_
   p[kShN] = {Y.cross * rgb.dot, Y.lr2 * rgb.l2, Y.hr2 * rgb.h2};
 }
 
-// Counts over a chunk of Gaussians, before correction; chunks are added up in order.
-struct Comparison {
-  std::int64_t comparable[kGroups + 1] = {}, opposed[kGroups + 1] = {};
+// What a chunk of Gaussians shows, by group: comparable and opposed ones before correction, corrected ones, Σ ω over these, and
+// those with ω at its lower bound. Chunks are added up in order.
+struct Conflicts {
+  std::int64_t comparable[kGroups + 1] = {}, opposed[kGroups + 1] = {}, corrected[kGroups] = {}, at_lower_bound[kGroups] = {};
+  double omega[kGroups] = {};
 
-  void add(const Comparison& o) {
+  void add(const Conflicts& o) {
     for (int k = 0; k <= kGroups; ++k) comparable[k] += o.comparable[k], opposed[k] += o.opposed[k];
+    for (int k = 0; k < kGroups; ++k)
+      corrected[k] += o.corrected[k], at_lower_bound[k] += o.at_lower_bound[k], omega[k] += o.omega[k];
   }
 };
 
-// GCO's settings.
+// The settings of GCO, and the reliability of each Gaussian.
 struct Correction {
   bool corrects[kGroups] = {};
   double tolerance, weight_min, weight_max;
@@ -59,29 +63,16 @@ struct Correction {
   const float* reliability;        // q_i, or null for 0
 };
 
-struct Corrected {
-  std::int64_t rows[kGroups] = {}, at_lower_bound[kGroups] = {};
-  double omega[kGroups] = {};  // Σ ω
-
-  void add(const Corrected& o) {
-    for (int k = 0; k < kGroups; ++k) {
-      rows[k] += o.rows[k], at_lower_bound[k] += o.at_lower_bound[k];
-      omega[k] += o.omega[k];
-    }
-  }
-};
-
-// A chunk's counts by lane.
-struct Tally {
-  Doubles omega[kGroups];
-  std::int64_t rows[kGroups] = {}, at_lower_bound[kGroups] = {};
+// A chunk's counts, with Σ ω by lane.
+struct Tally : Conflicts {
+  Doubles omegas[kGroups];
 
   Tally() {
-    for (Doubles& o : omega) o = 0.0;
+    for (Doubles& o : omegas) o = 0.0;
   }
-  Corrected total() const {
-    Corrected c;
-    for (int k = 0; k < kGroups; ++k) c.rows[k] = rows[k], c.at_lower_bound[k] = at_lower_bound[k], c.omega[k] = sum(omega[k]);
+  Conflicts total() const {
+    Conflicts c = *this;
+    for (int k = 0; k < kGroups; ++k) c.omega[k] = sum(omegas[k]);
     return c;
   }
 };
@@ -101,16 +92,57 @@ CLEAR_INLINE bool correction_multiples(const Correction& c, Group group, const P
   Doubles s = clamp((-cosine - tau) / (one - tau), zero, one);
   Doubles omega = clamp(s * (one - q), low, high);  // Eq. 11
   multiple = where(conflict, omega * ((p.dot + tau * n) / p.l2));
-  done.omega[group] += where(conflict, omega);
-  done.rows[group] += __builtin_popcount(conflict.bits());
+  done.omegas[group] += where(conflict, omega);
+  done.corrected[group] += __builtin_popcount(conflict.bits());
   done.at_lower_bound[group] += __builtin_popcount((conflict & (omega <= low)).bits());
   return true;
+}
+
+// A Gaussian with equal axes does not change under rotation, so its rotation gradient is noise.
+CLEAR_INLINE Mask<double> turns_something(const Products (&p)[kGroups], double rotation_noise) {
+  Doubles noise2 = rotation_noise * rotation_noise;
+  return (p[kQuats].l2 > noise2 * p[kScales].l2) & (p[kQuats].h2 > noise2 * p[kScales].h2);
+}
+
+// By group, the multiple of g_LR that is subtracted from g_HR, and whether it is other than 0 for any of sixteen Gaussians.
+struct Multiples {
+  Doubles of[kGroups];
+  bool any[kGroups] = {};
+};
+
+// Counts the conflicts of sixteen Gaussians, and decides on their correction; null: none. Lanes beyond the last Gaussian are
+// zeros, which do not conflict.
+CLEAR_INLINE Multiples decide(const Products (&p)[kGroups], const Correction* c, std::int64_t i, int count, Tally& tally) {
+  Multiples out;
+  Products whole;
+  Doubles zero = 0.0;
+  for (int k = 0; k <= kGroups; ++k) {
+    const Products& x = k < kGroups ? p[k] : whole;
+    if (k < kGroups) whole += x;
+    auto comparable = (x.l2 > zero) & (x.h2 > zero);
+    tally.comparable[k] += __builtin_popcount(comparable.bits());
+    tally.opposed[k] += __builtin_popcount((comparable & (x.dot < zero)).bits());
+  }
+  if (!c) return out;
+  Doubles q = c->reliability ? widen(load_some(c->reliability + i, count)) : Doubles(0.0);
+  for (int k = 0; k < kGroups; ++k)
+    if (c->corrects[k]) {
+      auto candidates = k == kQuats ? turns_something(p, c->rotation_noise) : zero <= zero;
+      out.any[k] = correction_multiples(*c, Group(k), p[k], candidates, q, out.of[k], tally);
+    }
+  return out;
 }
 
 // h - multiple · l; rows with multiple 0 keep their bits.
 CLEAR_INLINE Floats corrected(const Floats& h, const Floats& l, const Doubles& multiple) {
   auto touched = narrow(where(absolute(multiple) > Doubles(0.0), Doubles(1.0))) > Floats(0.0f);
   return select(touched, narrow(widen(h) - widen(l) * multiple), h);  // Eq. 7
+}
+
+template <int D>
+CLEAR_INLINE void correct(const Multiples& m, Group group, Floats (&h)[D], const Floats (&l)[D]) {
+  if (m.any[group])
+    for (int d = 0; d < D; ++d) h[d] = corrected(h[d], l[d], m.of[group]);
 }
 
 }  // namespace clear

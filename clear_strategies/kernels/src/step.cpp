@@ -2,62 +2,13 @@
 // them, so that the step makes the same decisions as the readable path.
 #include "step.hpp"
 
-#include <iterator>
 #include <vector>
 
+#include "chunks.hpp"
 #include "pool.hpp"
 
 namespace clear {
 namespace {
-
-constexpr std::int64_t kChunk = 1024;  // Gaussians per task, a multiple of sixteen
-
-std::int64_t chunks(std::int64_t n) { return (n + kChunk - 1) / kChunk; }
-
-CLEAR_INLINE std::uint32_t first_bits(int count) { return count == kLanes ? 0xffffu : (1u << count) - 1; }
-
-// Calls task(i, count) for every sixteen Gaussians of chunk `number`.
-template <class Task>
-CLEAR_INLINE void each_sixteen(std::int64_t n, std::int64_t number, Task&& task) {
-  std::int64_t end = std::min(n, (number + 1) * kChunk);
-  for (std::int64_t i = number * kChunk; i < end; i += kLanes) task(i, int(std::min<std::int64_t>(kLanes, end - i)));
-}
-
-Comparison compare_chunk(const Gradients& g, std::int64_t number) {
-  Comparison c;
-  each_sixteen(g.n, number, [&](std::int64_t i, int count) {
-    fetch(g, i + kLanes);
-    Block b;
-    load(g, i, count, b);
-    Products p[kGroups + 1];
-    group_products(g, b, i, count, p);
-    for (int k = 0; k < kGroups; ++k) p[kGaussian] += p[k];
-    for (int k = 0; k <= kGroups; ++k) {
-      Doubles zero = 0.0;
-      auto comparable = (p[k].l2 > zero) & (p[k].h2 > zero);
-      c.comparable[k] += __builtin_popcount(comparable.bits());
-      c.opposed[k] += __builtin_popcount((comparable & (p[k].dot < zero)).bits());
-    }
-  });
-  return c;
-}
-
-// The channel and band of each number of an shN row, in up to three groups of sixteen. The last group ends with the row
-// and overlaps the previous one; all are read before any is written, so the overlap is written twice with the same values.
-struct RowPlan {
-  int sixteens, width, offset[3];
-  std::int32_t channel[3][kLanes], band[3][kLanes];
-
-  explicit RowPlan(int width) : sixteens((width + kLanes - 1) / kLanes), width(width) {
-    for (int k = 0; k < sixteens; ++k) {
-      offset[k] = std::max(0, std::min(kLanes * k, width - kLanes));
-      for (int j = 0; j < kLanes; ++j) {
-        channel[k][j] = (offset[k] + j) % 3;
-        band[k][j] = std::min((offset[k] + j) / 3 + 1, kLanes - 1);  // the basis is 0 for inactive bands
-      }
-    }
-  }
-};
 
 struct RowTables {
   Floats Y_lr, Y_hr, lr, base, hf;
@@ -88,7 +39,7 @@ class ChunkStep {
     Stepped done;
     Tally tally;
     each_sixteen(g.n, number, [&](std::int64_t i, int count) { sixteen(i, count, done, tally); });
-    done.corrected = tally.total();
+    done.conflicts = tally.total();
     return done;
   }
 
@@ -108,7 +59,15 @@ class ChunkStep {
     std::uint32_t moving = rows & ~still;
 
     double shN_multiple[kLanes] = {};
-    if (correction) correct(b, i, count, shN_multiple, tally);
+    if (g.base && s.lambda_hr > 0) {
+      Products p[kGroups];
+      group_products(g, b, i, count, p);
+      Multiples m = decide(p, correction, i, count, tally);
+      correct(m, kMeans, b.hr.means, b.lr.means), correct(m, kSh0, b.hr.sh0, b.lr.sh0);
+      correct(m, kOpacities, b.hr.opacities, b.lr.opacities), correct(m, kScales, b.hr.scales, b.lr.scales);
+      correct(m, kQuats, b.hr.quats, b.lr.quats);
+      if (m.any[kShN]) m.of[kShN].store(shN_multiple);
+    }
     if (moving) {  // still rows beside a moving one step too, which leaves them unchanged
       step_columns(s.means, b.lr.means, b.hr.means, i, count);
       step_columns(s.quats, b.lr.quats, b.hr.quats, i, count);
@@ -126,33 +85,6 @@ class ChunkStep {
   // Prefetches the rows that follow sixteen later. Spread over the step, because a processor has few loads under way at once.
   static CLEAR_INLINE void fetch_next(const Attribute& a, std::int64_t row, std::int64_t end) {
     for (const float* tensor : {a.p, a.m, a.v}) fetch_rows(tensor, row + kLanes, end + kLanes, a.width);
-  }
-
-  // Corrects the HR gradients (Eq. 6, 7, 11). Lanes beyond the last Gaussian are zeros, which do not conflict.
-  CLEAR_INLINE void correct(Block& b, std::int64_t i, int count, double (&shN_multiple)[kLanes], Tally& done) const {
-    const Correction& c = *correction;
-    Products p[kGroups];
-    group_products(g, b, i, count, p);
-    Doubles q = c.reliability ? widen(load_some(c.reliability + i, count)) : Doubles(0.0);
-    auto every = Doubles(0.0) <= Doubles(0.0);
-    auto columns = [&](Group group, auto& h, const auto& l, const Mask<double>& candidates) {
-      Doubles multiple;
-      if (c.corrects[group] && correction_multiples(c, group, p[group], candidates, q, multiple, done))
-        for (std::size_t d = 0; d < std::size(h); ++d) h[d] = corrected(h[d], l[d], multiple);
-    };
-    columns(kMeans, b.hr.means, b.lr.means, every);
-    columns(kSh0, b.hr.sh0, b.lr.sh0, every);
-    columns(kOpacities, b.hr.opacities, b.lr.opacities, every);
-    columns(kScales, b.hr.scales, b.lr.scales, every);
-    columns(kQuats, b.hr.quats, b.lr.quats, turns_something(p));
-    Doubles multiple;
-    if (c.corrects[kShN] && correction_multiples(c, kShN, p[kShN], every, q, multiple, done)) multiple.store(shN_multiple);
-  }
-
-  // A Gaussian with equal axes does not change under rotation, so its rotation gradient is noise.
-  CLEAR_INLINE Mask<double> turns_something(const Products (&p)[kGroups]) const {
-    Doubles noise2 = correction->rotation_noise * correction->rotation_noise;
-    return (p[kQuats].l2 > noise2 * p[kScales].l2) & (p[kQuats].h2 > noise2 * p[kScales].h2);
   }
 
   template <int D>
@@ -258,21 +190,13 @@ class ChunkStep {
 
 }  // namespace
 
-Comparison compare(const Gradients& g, int threads) {
-  std::vector<Comparison> parts(chunks(g.n));
-  Pool::instance().run(threads, std::int64_t(parts.size()), [&](std::int64_t k) { parts[k] = compare_chunk(g, k); });
-  Comparison total;
-  for (const Comparison& part : parts) total.add(part);
-  return total;
-}
-
 Stepped step(const Gradients& g, const Correction* correction, const Step& s, int threads) {
   std::vector<Stepped> parts(chunks(g.n));
   ChunkStep chunk_step(g, correction, s);
   Pool::instance().run(threads, std::int64_t(parts.size()), [&](std::int64_t k) { parts[k] = chunk_step.run(k); });
   Stepped total;
   for (const Stepped& part : parts) {
-    total.corrected.add(part.corrected);
+    total.conflicts.add(part.conflicts);
     total.still += part.still;
   }
   return total;

@@ -1,7 +1,7 @@
-// The per-Gaussian step of one iteration, in two passes over the Gaussians: `compare` counts conflicts; `step` merges,
-// corrects, adds the anchor's gradient, and applies Adam.
+// The per-Gaussian step of one iteration, in one pass over the Gaussians: it counts conflicts, merges, corrects, adds the anchor's
+// gradient, and applies Adam.
 //
-// Both passes compute the gradients from their factors, which is cheaper than storing 59 numbers for each of three losses.
+// It computes the gradients from their factors, which is cheaper than storing 59 numbers for each of three losses.
 // Sums are taken by chunk of Gaussians and added in the order of the chunks: the same bits for any number of threads.
 #pragma once
 
@@ -19,12 +19,9 @@ struct Step {
 };
 
 struct Stepped {
-  Corrected corrected;
+  Conflicts conflicts;
   std::int64_t still = 0;  // rows that were skipped, because they would not change
 };
-
-// Counts comparable and opposed Gaussians by group.
-Comparison compare(const Gradients& g, int threads);
 
 // Steps every attribute in place, or writes its merged gradient where `merged` is set.
 Stepped step(const Gradients& g, const Correction* correction, const Step& s, int threads);

@@ -1,0 +1,123 @@
+"""The conflict between the LR and HR gradients of a Gaussian: inner products by attribute group, and what is counted of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from clear_strategies.core import deferred
+from clear_strategies.core.deferred import Number
+from clear_strategies.core.gradients import CONFLICT_GROUPS
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Products:
+    """⟨l, h⟩, ‖l‖² and ‖h‖² of every Gaussian by group; 0 for a group that one of both lacks."""
+
+    dot: Float[Tensor, "N G"]
+    l2: Float[Tensor, "N G"]
+    h2: Float[Tensor, "N G"]
+
+    def whole(self) -> Products:
+        """The same, and in a last column those of the groups together, as if they were one vector."""
+        return Products(*(torch.cat((x, x.sum(1, keepdim=True)), 1) for x in (self.dot, self.l2, self.h2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GradientColumns:
+    """The groups that both gradients have, side by side in float64, where no product of two floats over- or underflows.
+
+    Args:
+        names: the groups. member: 1 where column d belongs to group k of `CONFLICT_GROUPS`.
+    """
+
+    names: Sequence[str]
+    lr: Float[Tensor, "N D"]
+    hr: Float[Tensor, "N D"]
+    member: Float[Tensor, "D G"]
+
+    @classmethod
+    def of(cls, lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> GradientColumns:
+        """Raises ValueError where both have gradients, but none of the same group."""
+        names = [group for group in CONFLICT_GROUPS if group in lr and group in hr]
+        if not names:
+            raise ValueError(
+                f"gradients are compared by the groups {', '.join(CONFLICT_GROUPS)}, and no two are of one: lr has "
+                f"{', '.join(lr) or 'none'}, hr has {', '.join(hr) or 'none'}. Name them so."
+            )
+        widths = tuple((name, lr[name].shape[1:].numel()) for name in names)
+        return cls(names, _side_by_side(lr, names), _side_by_side(hr, names), _member(widths, str(lr[names[0]].device)))
+
+    def products(self) -> Products:
+        work = self.lr * self.hr  # one buffer for all three: fresh pages cost more than the arithmetic
+        dot = work @ self.member
+        l2 = torch.mul(self.lr, self.lr, out=work) @ self.member
+        return Products(dot, l2, torch.mul(self.hr, self.hr, out=work) @ self.member)
+
+    def minus(self, multiple: Float[Tensor, "N G"], like: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """h - multiple · l by group, each with the shape and type of `like`. This object's `hr` is the result, in float64."""
+        corrected = self.hr.sub_((multiple @ self.member.T).mul_(self.lr))
+        widths = [like[name].shape[1:].numel() for name in self.names]
+        parts = corrected.to(like[self.names[0]].dtype).split(widths, 1)
+        return {name: part.view(like[name].shape).to(like[name].dtype) for name, part in zip(self.names, parts, strict=True)}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConflictCounts:
+    """What a comparison of all Gaussians shows, by group of `CONFLICT_GROUPS`.
+
+    Args:
+        comparable: Gaussians where neither gradient is zero: invisible and dropped ones do not count (F38, F42); a seventh
+            number is for the Gaussian as a whole. opposed: of them, those with a cosine below 0, before correction.
+        corrected: Gaussians. omega: Σ ω over these. at_lower_bound: those with ω at its lower bound.
+    """
+
+    comparable: Sequence[Number]
+    opposed: Sequence[Number]
+    corrected: Sequence[Number] = (0,) * len(CONFLICT_GROUPS)
+    omega: Sequence[Number] = (0.0,) * len(CONFLICT_GROUPS)
+    at_lower_bound: Sequence[Number] = (0,) * len(CONFLICT_GROUPS)
+
+    def ratios(self, groups: Sequence[str]) -> dict[str, Number]:
+        """The share of comparable Gaussians that are opposed, by group, and as "gaussian" for the groups together; NaN where
+        nothing could be compared.
+        """
+        at = {name: k for k, name in enumerate((*CONFLICT_GROUPS, "gaussian")) if name in groups or name == "gaussian"}
+        return {name: deferred.defer(deferred.ratio, self.opposed[k], self.comparable[k]) for name, k in at.items()}
+
+
+def counted(p: Products) -> ConflictCounts:
+    """Comparable and opposed Gaussians."""
+    whole = p.whole()
+    comparable = (whole.l2 > 0) & (whole.h2 > 0)
+    return ConflictCounts(numbers(comparable.sum(0)), numbers(((whole.dot < 0) & comparable).sum(0)))
+
+
+def conflict_ratio(lr: Mapping[str, Tensor], hr: Mapping[str, Tensor]) -> dict[str, Number]:
+    """Share of Gaussians whose LR and HR gradients point apart, by group and for the groups together; {} without a common one."""
+    if not any(group in lr and group in hr for group in CONFLICT_GROUPS):
+        return {}
+    columns = GradientColumns.of(lr, hr)
+    return counted(columns.products()).ratios(columns.names)
+
+
+def numbers(x: Int[Tensor, " K"] | Float[Tensor, " K"]) -> Sequence[Number]:
+    """The numbers of a tensor: read at once on the CPU, else one 0-dim tensor each."""
+    return x.tolist() if deferred.is_immediate(x) else x.unbind()
+
+
+def _side_by_side(grads: Mapping[str, Tensor], names: Sequence[str]) -> Float[Tensor, "N D"]:
+    rows = [(g if g.dim() > 1 else g[:, None]).detach().flatten(1) for g in (grads[name] for name in names)]
+    out = rows[0].new_empty(len(rows[0]), sum(x.shape[1] for x in rows), dtype=torch.float64)
+    return torch.cat(rows, 1, out=out)
+
+
+@lru_cache(maxsize=16)
+def _member(widths: tuple[tuple[str, int], ...], device: str) -> Float[Tensor, "D G"]:
+    groups = [CONFLICT_GROUPS.index(name) for name, width in widths for _ in range(width)]
+    return torch.eye(len(CONFLICT_GROUPS), dtype=torch.float64, device="cpu")[groups].to(device)
